@@ -1,0 +1,300 @@
+"""The results as values, and their files."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from scipy.spatial.transform import Rotation
+
+from autocalib_ros.camera import Camera
+from autocalib_ros.errors import InputError
+
+JSON_VERSION = 1
+EQUIDISTANT_FLOOR = 1e-9
+"""image_proc and image_geometry take an all-zero D for "no distortion" whatever the model is called."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvidenceSummary:
+    """What a result rests on."""
+
+    image_size: tuple[int, int]
+    seconds: float
+    frames: int
+    tracks: int
+    segments: int
+    vehicles: int
+    coverage: float
+
+
+@dataclass(frozen=True)
+class GroundPlane:
+    """The pose of the camera over the road: a point in the camera optical frame goes to the ground frame.
+
+    Ground frame: origin at the camera's foot point on the road, z up, x along the dominant traffic
+    direction, y left. `rotation` is ground_from_camera, shape (3, 3); `height_m` is in metres, or 1 when
+    `metric` is false: then all lengths are in units of the camera's height.
+    """
+
+    rotation: np.ndarray
+    height_m: float
+    metric: bool = True
+
+    @property
+    def translation_m(self) -> np.ndarray:
+        """The camera in the ground frame, shape (3,)."""
+        return np.array([0.0, 0.0, self.height_m])
+
+    @property
+    def rotation_xyzw(self) -> np.ndarray:
+        """The rotation as a unit quaternion x, y, z, w with w >= 0, shape (4,)."""
+        return quaternion_xyzw(self.rotation)
+
+    @property
+    def normal_in_camera(self) -> np.ndarray:
+        """Unit vector up from the road in the camera optical frame, shape (3,)."""
+        return self.rotation[2]
+
+
+@dataclass(frozen=True, kw_only=True)
+class StandardDeviations:
+    """One sigma of what is published; None where it is not estimated."""
+
+    focal_px: float | None = None
+    principal_point_px: tuple[float, float] | None = None
+    k1: float | None = None
+    tilt_deg: float | None = None
+    roll_deg: float | None = None
+    height_m: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class PaperReport:
+    """Quantities of the published method, reported whichever method gave the result."""
+
+    focal_px: float
+    polynomial_k: tuple[float, float, float]
+    straightness_px2: tuple[float, float]
+    """Mean squared line-fit error per track before and after undistortion (the paper's table 2)."""
+    focal_from_vanishing_points_px: float | None = None
+    """The paper's f_new."""
+    translation_m: tuple[float, float, float] | None = None
+    """The paper's t = (0, 0, H / |r33|), whose origin is where the optical axis meets the road."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Figures:
+    """What a report draws; not part of a result's identity and not written to calibration.json."""
+
+    focal_sweep_px: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+    """Trial focal length and its error, shape (n, 2)."""
+    track_labels: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
+    """For each track of the evidence: -1 not used, -2 rejected, else the index of its road direction."""
+    orientation_histogram: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+    """Orientation in degrees and the number of segments, shape (n, 2)."""
+    orientation_peaks_deg: tuple[float, ...] = ()
+    paper_tracks: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
+    """Indices of the tracks that the published method keeps."""
+
+
+@dataclass(frozen=True)
+class Reason:
+    """Why something is not given: a code for programs, numbers in words, and what to do."""
+
+    code: str
+    message: str
+    remedy: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Refusal:
+    """No calibration, and why. It is false, so that `if result:` asks whether there is a calibration."""
+
+    code: str
+    message: str
+    remedy: str
+    method: str
+    evidence: EvidenceSummary
+    figures: Figures = field(default_factory=Figures, compare=False, repr=False)
+
+    def __bool__(self) -> bool:
+        return False
+
+    @classmethod
+    def because(cls, reason: Reason, method: str, evidence: EvidenceSummary, figures: Figures) -> Refusal:
+        """Make a refusal of a reason."""
+        return cls(code=reason.code, message=reason.message, remedy=reason.remedy, method=method, evidence=evidence,
+                   figures=figures)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Calibration:
+    """A lens, and the ground plane where the evidence and the height give one."""
+
+    method: str
+    grade: str
+    """'full': lens and metric ground plane; 'unit_scale': the plane in units of the height; 'lens': no plane."""
+    assumptions: tuple[str, ...]
+    camera: Camera
+    ground: GroundPlane | None
+    ground_refusal: Reason | None
+    """Why there is no ground plane, where there is none."""
+    road_directions: np.ndarray
+    """Unit vectors in the camera optical frame, shape (n, 3)."""
+    stddev: StandardDeviations
+    paper: PaperReport | None
+    evidence: EvidenceSummary
+    newest_stamp_ns: int
+    """Stamp of the newest image that the result rests on."""
+    figures: Figures = field(default_factory=Figures, compare=False, repr=False)
+
+
+def quaternion_xyzw(rotation: np.ndarray) -> np.ndarray:
+    """Return the unit quaternion x, y, z, w (w >= 0) of a rotation matrix (3, 3)."""
+    quaternion = Rotation.from_matrix(rotation).as_quat()
+    return quaternion if quaternion[3] >= 0 else -quaternion
+
+
+@dataclass(frozen=True)
+class CameraInfo:
+    """The fields of sensor_msgs/CameraInfo that a lens decides; lists as the message wants them."""
+
+    width: int
+    height: int
+    distortion_model: str
+    k: list[float]
+    d: list[float]
+    r: list[float]
+    p: list[float]
+
+
+def camera_info(camera: Camera) -> CameraInfo:
+    """Return the CameraInfo of a lens in the 'equidistant' model, P chosen so that no border is empty."""
+    coefficients = [float(value) for value in camera.k]
+    if not any(abs(value) >= EQUIDISTANT_FLOOR for value in coefficients):
+        coefficients[0] = EQUIDISTANT_FLOOR
+    rectified = rectified_matrix(camera)
+    return CameraInfo(
+        width=camera.width, height=camera.height, distortion_model='equidistant',
+        k=[float(value) for value in camera.matrix.ravel()], d=coefficients,
+        r=[float(value) for value in np.eye(3).ravel()],
+        p=[float(value) for value in np.hstack([rectified, np.zeros((3, 1))]).ravel()])
+
+
+def rectified_matrix(camera: Camera) -> np.ndarray:
+    """Return the K, shape (3, 3), of a distortion-free image of equal size that the lens fills wholly.
+
+    The largest axis-parallel rectangle about the axis inside the undistorted border decides. Border
+    points beyond 80 degrees are brought in to 80, where the tangent is still tame.
+    """
+    width, height = camera.width, camera.height
+    across, down = np.linspace(0, width - 1, 65), np.linspace(0, height - 1, 65)
+
+    def slopes(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        bearings, _ = camera.unproject(np.stack(np.broadcast_arrays(x, y), axis=-1))
+        theta = np.minimum(np.arctan2(np.hypot(bearings[:, 0], bearings[:, 1]), bearings[:, 2]), np.radians(80.0))
+        direction = bearings[:, :2] / np.maximum(np.hypot(bearings[:, 0], bearings[:, 1]), 1e-12)[:, None]
+        return np.tan(theta)[:, None] * direction
+
+    left, right = slopes(0.0, down)[:, 0].max(), slopes(width - 1.0, down)[:, 0].min()
+    top, bottom = slopes(across, 0.0)[:, 1].max(), slopes(across, height - 1.0)[:, 1].min()
+    focal = max((width - 1) / max(right - left, 1e-6), (height - 1) / max(bottom - top, 1e-6))
+    centre_x, centre_y = (right + left) / 2, (bottom + top) / 2
+    return np.array([[focal, 0, (width - 1) / 2 - focal * centre_x],
+                     [0, focal, (height - 1) / 2 - focal * centre_y], [0, 0, 1]])
+
+
+def to_json(result: Calibration | Refusal, *, accepted_at_s: float | None = None) -> dict[str, Any]:
+    """Return the document of calibration.json, version 1."""
+    evidence = result.evidence
+    document: dict[str, Any] = {
+        'version': JSON_VERSION, 'state': 'calibrated' if result else 'refused', 'grade': None,
+        'method': result.method, 'assumptions': [], 'refusal': None, 'image_size': list(evidence.image_size),
+        'camera': None, 'camera_info': None, 'ground_from_camera': None, 'road_directions_in_camera': [],
+        'stddev': None, 'paper': None,
+        'evidence': {'seconds': evidence.seconds, 'frames': evidence.frames, 'tracks': evidence.tracks,
+                     'segments': evidence.segments, 'vehicles': evidence.vehicles,
+                     'coverage': evidence.coverage, 'accepted_at_s': accepted_at_s}}
+    if isinstance(result, Refusal):
+        document['refusal'] = _refusal_json(result)
+    else:
+        document.update(_calibration_json(result))
+    return document
+
+
+def _refusal_json(refusal: Refusal | Reason) -> dict[str, str]:
+    return {'code': refusal.code, 'message': refusal.message, 'remedy': refusal.remedy}
+
+
+def _calibration_json(result: Calibration) -> dict[str, Any]:
+    camera, info, sigma = result.camera, camera_info(result.camera), result.stddev
+    return {
+        'grade': result.grade, 'assumptions': list(result.assumptions),
+        'refusal': _refusal_json(result.ground_refusal) if result.ground_refusal else None,
+        'camera': {'model': 'kannala_brandt', 'focal_px': camera.focal_px,
+                   'principal_point_px': list(camera.principal_point_px), 'k': list(camera.k)},
+        'camera_info': {'distortion_model': info.distortion_model, 'k': info.k, 'd': info.d, 'r': info.r,
+                        'p': info.p},
+        'ground_from_camera': None if result.ground is None else {
+            'translation_m': result.ground.translation_m.tolist(),
+            'rotation_xyzw': result.ground.rotation_xyzw.tolist()},
+        'road_directions_in_camera': np.asarray(result.road_directions).tolist(),
+        'stddev': {'focal_px': sigma.focal_px,
+                   'principal_point_px': None if sigma.principal_point_px is None else list(sigma.principal_point_px),
+                   'k1': sigma.k1, 'tilt_deg': sigma.tilt_deg, 'roll_deg': sigma.roll_deg,
+                   'height_m': sigma.height_m},
+        'paper': None if result.paper is None else {
+            'focal_px': result.paper.focal_px, 'polynomial_k': list(result.paper.polynomial_k),
+            'straightness_px2': dict(zip(('before', 'after'), result.paper.straightness_px2, strict=True)),
+            'focal_from_vanishing_points_px': result.paper.focal_from_vanishing_points_px,
+            'translation_m': None if result.paper.translation_m is None else list(result.paper.translation_m)}}
+
+
+def write_calibration_json(path: Path, result: Calibration | Refusal, *, accepted_at_s: float | None = None) -> None:
+    """Write calibration.json in full precision, atomically."""
+    text = json.dumps(to_json(result, accepted_at_s=accepted_at_s), indent=1, allow_nan=False)
+    write_atomically(path, text + '\n')
+
+
+def write_camera_info_yaml(path: Path, camera: Camera, camera_name: str) -> None:
+    """Write the file of camera_info_manager, atomically; `camera_name` is reduced to letters, digits and _."""
+    info = camera_info(camera)
+
+    def matrix(rows: int, cols: int, data: list[float]) -> dict[str, Any]:
+        return {'rows': rows, 'cols': cols, 'data': data}
+
+    document = {
+        'image_width': info.width, 'image_height': info.height,
+        'camera_name': ''.join(c if c.isascii() and c.isalnum() else '_' for c in camera_name) or 'camera',
+        'camera_matrix': matrix(3, 3, info.k), 'distortion_model': info.distortion_model,
+        'distortion_coefficients': matrix(1, len(info.d), info.d),
+        'rectification_matrix': matrix(3, 3, info.r), 'projection_matrix': matrix(3, 4, info.p)}
+    write_atomically(path, yaml.safe_dump(document, sort_keys=False, default_flow_style=None))
+
+
+def write_atomically(path: Path, text: str) -> None:
+    """Replace the file in one step: a reader sees the old text or the new, never a part."""
+    path = Path(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f'.{path.name}.')
+        try:
+            with os.fdopen(handle, 'w', encoding='utf-8') as stream:
+                stream.write(text)
+                stream.flush()
+                os.fsync(stream.fileno())
+            os.chmod(temporary, 0o644)
+            os.replace(temporary, path)
+        except BaseException:
+            os.unlink(temporary)
+            raise
+    except OSError as error:
+        raise InputError(f'cannot write {path}: {error.strerror or error}') from error
+

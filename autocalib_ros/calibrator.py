@@ -1,0 +1,168 @@
+"""The method on one page: images in, a calibration or a refusal out. Live and replayed alike."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from autocalib_ros.calibration import Calibration, Figures, Reason, Refusal, StandardDeviations
+from autocalib_ros.config import Options
+from autocalib_ros.errors import InputError
+from autocalib_ros.estimation.evidence_gate import shortfall
+from autocalib_ros.estimation.great_circles import TrackSet, select_tracks
+from autocalib_ros.estimation.ground_plane import ground_plane, tilt_and_roll_deg
+from autocalib_ros.estimation.paper import scale, solve_paper
+from autocalib_ros.estimation.roads import Roads, find_roads, normal_of
+from autocalib_ros.estimation.straightness import paper_intrinsics
+from autocalib_ros.estimation.vanishing_points import paper_directions
+from autocalib_ros.evidence import Evidence, EvidenceBuffer
+from autocalib_ros.perception.observer import Observer
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far the evidence has come: 0 to 100, and what is missing in an installer's words."""
+
+    percent: float
+    missing: tuple[str, ...]
+
+
+class AutoCalibrator:
+    """Gathers evidence frame by frame; bounded in memory on an endless stream; not thread-safe."""
+
+    def __init__(self, options: Options) -> None:
+        self._options = options
+        self._observer: Observer | None = None
+
+    def add_image(self, stamp_ns: int, image: np.ndarray) -> None:
+        """Take one image: grey (H, W) or BGR (H, W, 3), uint8; it is not kept nor changed.
+
+        A stamp that goes backwards, or a new image size, starts the evidence anew.
+        """
+        if image.dtype != np.uint8 or image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
+            raise InputError(f'an image is grey (H, W) or BGR (H, W, 3) in 8 bits, got {image.dtype} {image.shape}')
+        size = (image.shape[1], image.shape[0])
+        if self._observer is None or size != self._size or stamp_ns < self._newest_stamp_ns:
+            self._begin(stamp_ns, size)
+        elif stamp_ns == self._newest_stamp_ns:
+            return
+        time_s = (stamp_ns - self._first_stamp_ns) * 1e-9
+        observed = self._observer.observe(image, time_s)
+        for track in observed.tracks:
+            self._buffer.add_track(track)
+        self._tracks_seen += len(observed.tracks)
+        if observed.segments is not None:
+            self._buffer.add_segments(observed.segments)
+        self._buffer.forget_before(time_s - self._options.buffer.seconds)
+        self._newest_stamp_ns = stamp_ns
+        self._frames += 1
+
+    def _begin(self, stamp_ns: int, size: tuple[int, int]) -> None:
+        self._observer = Observer(self._options, size)
+        self._buffer = EvidenceBuffer(self._options.buffer)
+        self._size, self._first_stamp_ns, self._newest_stamp_ns = size, stamp_ns, stamp_ns - 1
+        self._frames = 0
+        self._tracks_seen = 0
+        self._due_s, self._due_tracks = self._options.first_solve_s, float(self._options.gate.min_tracks)
+
+    def take_due(self) -> Evidence | None:
+        """Return a snapshot when a new solution is worth trying now, else None.
+
+        Depends on the images and their stamps alone, so that a live run and a replay solve the same evidence.
+        """
+        if self._observer is None:
+            return None
+        time_s = (self._newest_stamp_ns - self._first_stamp_ns) * 1e-9
+        if time_s < self._due_s or self._tracks_seen < self._due_tracks:
+            return None
+        held = min(self._tracks_seen, self._options.buffer.max_tracks)
+        self._due_tracks = self._tracks_seen + (self._options.solve_growth - 1.0) * held
+        self._due_s = time_s + self._options.solve_interval_s
+        return self.snapshot()
+
+    def snapshot(self) -> Evidence | None:
+        """Freeze the evidence so far; None before the first image."""
+        if self._observer is None:
+            return None
+        return self._buffer.snapshot(
+            image_size=self._size, first_stamp_ns=self._first_stamp_ns, newest_stamp_ns=self._newest_stamp_ns,
+            frames=self._frames, drift_px=self._observer.drift_px, unfinished=self._observer.unfinished())
+
+    def progress(self) -> Progress:
+        """Say how much of the evidence that a solution needs is there."""
+        evidence, gate = self.snapshot(), self._options.gate
+        if evidence is None:
+            return Progress(0.0, ('no image yet',))
+        shares = [evidence.track_count / gate.min_tracks, evidence.coverage / max(gate.min_coverage, 1e-9),
+                  evidence.seconds / max(self._options.first_solve_s, 1e-9)]
+        reason = shortfall(evidence, gate)
+        missing = [reason.message] if reason else []
+        if shares[2] < 1:
+            missing.append(f'{evidence.seconds:.0f} s of the first {self._options.first_solve_s:g} s watched')
+        return Progress(100.0 * min(1.0, *shares), tuple(missing))
+
+    def background(self) -> np.ndarray | None:
+        """Return the road without its traffic, BGR uint8 of the full size, for people to look at."""
+        return None if self._observer is None else self._observer.background()
+
+
+def solve(evidence: Evidence, options: Options) -> Calibration | Refusal:
+    """Estimate lens and ground plane from a snapshot; a pure function of its arguments."""
+    intrinsics = paper_intrinsics(evidence, options.paper)
+    figures = Figures(
+        track_labels=np.full(evidence.track_count, -1),
+        focal_sweep_px=np.zeros((0, 2)) if intrinsics is None else intrinsics.sweep,
+        paper_tracks=np.zeros(0, int) if intrinsics is None else intrinsics.tracks)
+
+    def refused(reason: Reason) -> Refusal:
+        return Refusal.because(reason, options.method, evidence.summary(), figures)
+
+    reason = shortfall(evidence, options.gate)
+    if reason:
+        return refused(reason)
+    if options.method == 'paper':
+        published = solve_paper(evidence, options, intrinsics, figures)
+        return refused(published) if isinstance(published, Reason) else published
+    tracks = select_tracks(evidence, options.joint.max_tracks)
+    roads = find_roads(tracks, evidence.image_size, options.joint, options.gate,
+                       np.random.default_rng(options.random_seed))
+    if isinstance(roads, Reason):
+        return refused(roads)
+    figures = _figures(figures, roads, tracks, evidence, options)
+    paper = None if intrinsics is None else intrinsics.report
+    return _calibration(evidence, options, roads, tracks, Calibration(
+        method=options.method, grade='lens', assumptions=roads.assumptions, camera=roads.fit.state.camera, ground=None,
+        ground_refusal=roads.no_plane, road_directions=roads.fit.state.directions, stddev=_lens_deviations(roads),
+        paper=paper, evidence=evidence.summary(), newest_stamp_ns=evidence.newest_stamp_ns, figures=figures))
+
+
+def _figures(figures: Figures, roads: Roads, tracks: TrackSet, evidence: Evidence, options: Options) -> Figures:
+    """Add what became of each track, and the orientations of the segments in the solved lens."""
+    labels = figures.track_labels.copy()
+    labels[tracks.indices] = np.where(roads.fit.explained(), roads.fit.labels, -2)
+    found = paper_directions(roads.fit.state.camera, evidence.segments_px, options.paper)
+    return replace(figures, track_labels=labels, orientation_histogram=found.histogram,
+                   orientation_peaks_deg=found.peaks_deg)
+
+
+def _lens_deviations(roads: Roads) -> StandardDeviations:
+    focal, cx, cy, k1 = roads.fit.sigma(lambda state: np.array(
+        [state.camera.focal_px, *state.camera.principal_point_px, state.camera.k[0]]))
+    return StandardDeviations(focal_px=float(focal), principal_point_px=(float(cx), float(cy)), k1=float(k1))
+
+
+def _calibration(evidence: Evidence, options: Options, roads: Roads, tracks: TrackSet,
+                 lens: Calibration) -> Calibration:
+    """Add the ground plane to a lens where the roads and the height give one."""
+    height, metric, grade, no_height = scale(options)
+    reason = roads.no_plane or no_height
+    if reason:
+        return replace(lens, ground_refusal=reason)
+    normal, _ = normal_of(roads.fit.state, tracks)
+    busiest = max(range(len(roads.support)), key=lambda road: len(np.unique(tracks.vehicles[roads.support[road]])))
+    plane = ground_plane(normal, roads.fit.state.directions[busiest], height, metric=metric)
+    side = np.sign(roads.fit.state.rotation[:, 2] @ normal)
+    tilt, roll = roads.fit.sigma(lambda state: tilt_and_roll_deg(side * state.rotation[:, 2]))
+    return replace(lens, grade=grade, ground=plane,
+                   stddev=replace(lens.stddev, tilt_deg=float(tilt), roll_deg=float(roll)))

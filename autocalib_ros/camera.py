@@ -1,0 +1,116 @@
+"""The lens: a central Kannala-Brandt camera.
+
+A bearing at the angle theta from the optical axis is imaged at the distance
+
+    r(theta) = focal_px * (theta + k1 theta^3 + k2 theta^5 + k3 theta^7 + k4 theta^9)
+
+from the principal point (Kannala & Brandt 2006, equation 6). An equidistant lens is k = 0, a
+distortion-free one k1 = 1/3, k2 = 2/15. Pixel (0, 0) is the centre of the top-left pixel; the camera
+optical frame is x right, y down, z forward (REP-103).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from autocalib_ros.errors import UsageError
+
+NEWTON_STEPS = 20
+"""Most: Newton's iteration doubles its digits, so that four or five are the rule."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Kannala-Brandt camera with square pixels and no skew; lengths in pixels, angles in radians."""
+
+    width: int
+    height: int
+    focal_px: float
+    principal_point_px: tuple[float, float]
+    k: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        numbers = (self.focal_px, *self.principal_point_px, *self.k)
+        if not np.isfinite(numbers).all() or self.focal_px <= 0 or min(self.width, self.height) < 1:
+            raise UsageError(f'a camera needs a positive focal length, a size and finite numbers, got {self}')
+
+    @classmethod
+    def equidistant(cls, width: int, height: int, focal_px: float) -> Camera:
+        """Return the equidistant camera whose principal point is the image centre."""
+        return cls(width, height, float(focal_px), image_centre(width, height))
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """K, shape (3, 3), pixels."""
+        cx, cy = self.principal_point_px
+        return np.array([[self.focal_px, 0.0, cx], [0.0, self.focal_px, cy], [0.0, 0.0, 1.0]])
+
+    def radius(self, theta_rad: np.ndarray) -> np.ndarray:
+        """Return the image radius in pixels of the angles `theta_rad`."""
+        t2 = theta_rad * theta_rad
+        k1, k2, k3, k4 = self.k
+        return self.focal_px * theta_rad * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+
+    def radius_slope(self, theta_rad: np.ndarray) -> np.ndarray:
+        """Return dr/dtheta in pixels per radian."""
+        t2 = theta_rad * theta_rad
+        k1, k2, k3, k4 = self.k
+        return self.focal_px * (1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4))))
+
+    @property
+    def max_angle_rad(self) -> float:
+        """Largest theta up to which r(theta) grows: beyond it the model folds back on itself."""
+        theta = np.linspace(0.0, np.pi, 721)
+        falling = np.flatnonzero(self.radius_slope(theta) <= 0)
+        return float(theta[falling[0] - 1]) if len(falling) else float(np.pi)
+
+    def project(self, bearings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Project bearings (..., 3), of any length, to pixels (..., 2); and say where that is valid (...)."""
+        bearings = np.asarray(bearings, float)
+        across = np.hypot(bearings[..., 0], bearings[..., 1])
+        theta = np.arctan2(across, bearings[..., 2])
+        on_axis = across < 1e-12
+        scale = np.where(on_axis, 0.0, self.radius(theta) / np.where(on_axis, 1.0, across))
+        pixels = scale[..., None] * bearings[..., :2] + self.principal_point_px
+        return pixels, theta <= self.max_angle_rad
+
+    def unproject(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return unit bearings (..., 3) of pixels (..., 2), and where the lens model reaches them (...)."""
+        offset = np.asarray(pixels, float) - self.principal_point_px
+        r = np.hypot(offset[..., 0], offset[..., 1])
+        theta, valid = self.angle(r)
+        on_axis = r < 1e-12
+        scale = np.where(on_axis, 0.0, np.sin(theta) / np.where(on_axis, 1.0, r))
+        return np.concatenate([scale[..., None] * offset, np.cos(theta)[..., None]], axis=-1), valid
+
+    def angle(self, radius_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Invert r(theta) by Newton's method: angles in radians, and where the inversion holds."""
+        radius_px = np.asarray(radius_px, float)
+        limit = self.max_angle_rad
+        theta = np.clip(radius_px / self.focal_px, 0.0, limit)
+        if any(self.k):
+            for _ in range(NEWTON_STEPS):
+                slope = np.maximum(self.radius_slope(theta), 1e-3 * self.focal_px)
+                error = self.radius(theta) - radius_px
+                theta = np.clip(theta - error / slope, 0.0, limit)
+                if np.abs(error).max(initial=0.0) < 1e-9 * self.focal_px:
+                    break
+        return theta, np.abs(self.radius(theta) - radius_px) < 1e-6 * self.focal_px
+
+    def undistort(self, pixels: np.ndarray, focal_px: float | None = None) -> np.ndarray:
+        """Map pixels (..., 2) to those of a distortion-free camera with the same principal point.
+
+        Equation of the paper's section on undistortion, `x_u = x_d tan(theta) / theta_d`, for any lens
+        of the model. Pixels at 90 degrees from the axis or more have no image there: nan.
+        """
+        bearings, valid = self.unproject(pixels)
+        ahead = valid & (bearings[..., 2] > 1e-6)
+        scale = np.where(ahead, (focal_px or self.focal_px) / np.where(ahead, bearings[..., 2], 1.0), np.nan)
+        return scale[..., None] * bearings[..., :2] + self.principal_point_px
+
+
+def image_centre(width: int, height: int) -> tuple[float, float]:
+    """Return the centre of an image in pixels, where (0, 0) is the centre of the top-left pixel."""
+    return (width - 1) / 2.0, (height - 1) / 2.0

@@ -1,0 +1,209 @@
+"""Every option of the program and its default: they live here and nowhere else.
+
+The replay, the live node and `config/autocalib.yaml` walk these dataclasses. An option's full name is
+its path, `tracking.max_points` say; an unknown name is an error.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+from typing import Any
+
+from autocalib_ros.errors import UsageError
+
+
+def option(default: Any, doc: str, *, low: float | None = None, high: float | None = None,
+           choices: tuple[str, ...] = ()) -> Any:
+    """Declare a field with its default, description and permitted values."""
+    return field(default=default, metadata={'doc': doc, 'low': low, 'high': high, 'choices': choices})
+
+
+class _Checked:
+    """Checks every field against its declared type, range and choices."""
+
+    def __post_init__(self) -> None:
+        for item in dataclasses.fields(self):  # type: ignore[arg-type]
+            if 'doc' in item.metadata:
+                object.__setattr__(self, item.name, _checked(item, getattr(self, item.name)))
+
+
+def _checked(item: dataclasses.Field, value: Any) -> Any:
+    """Return the value of `item` in its declared type, or say what would be accepted."""
+    kind, meta = type(item.default), item.metadata
+    if kind is float and isinstance(value, int) and not isinstance(value, bool):
+        value = float(value)
+    if type(value) is not kind:
+        raise UsageError(f"option '{item.name}' takes a {kind.__name__}, got {value!r}")
+    if meta['choices'] and value not in meta['choices']:
+        raise UsageError(f"option '{item.name}' is one of {', '.join(meta['choices'])}; got {value!r}")
+    low, high = meta['low'], meta['high']
+    if (low is not None and not value >= low) or (high is not None and not value <= high):
+        raise UsageError(f"option '{item.name}' lies between {low} and {high}; got {value!r}")
+    return value
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackingOptions(_Checked):
+    """Points on moving objects, followed by pyramidal Lucas-Kanade optical flow."""
+
+    max_points: int = option(300, 'points followed at once', low=20, high=5000)
+    window_px: int = option(15, 'side of the square patch that is followed', low=5, high=61)
+    pyramid_levels: int = option(3, 'image pyramid levels above the full resolution', low=0, high=6)
+    detect_every: int = option(6, 'frames between two searches for new points and segments', low=1, high=100)
+    min_spacing_px: float = option(7.0, 'least distance between two points when they are found', low=1, high=100)
+    round_trip_px: float = option(0.7, 'a point is lost when following it back misses by more', low=0.05, high=10)
+    max_samples: int = option(32, 'points kept of one track, spread evenly along it', low=8, high=500)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionOptions(_Checked):
+    """Vehicle mask by motion: what differs from a slowly learned background."""
+
+    width_px: int = option(320, 'width at which motion is looked for', low=80, high=1920)
+    history_s: float = option(20.0, 'time constant of the learned background', low=1, high=600)
+    min_area: float = option(0.00015, 'least area of a moving region, share of the image', low=0, high=0.1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BufferOptions(_Checked):
+    """The rolling buffer of evidence."""
+
+    seconds: float = option(900.0, 'evidence older than this is forgotten', low=5, high=86400)
+    max_tracks: int = option(2000, 'tracks kept; the oldest go first', low=50, high=100000)
+    max_segments: int = option(20000, 'segments kept; the oldest go first', low=100, high=1000000)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PaperOptions(_Checked):
+    """Constants of Jain & Saunier's method as published."""
+
+    window_s: float = option(6.0, 'observed interval that a track has to fill', low=1, high=600)
+    min_lifetime: float = option(0.8, 'least share of the interval that a track lived', low=0, high=1)
+    max_path_ratio: float = option(1.2, 'largest path length / displacement', low=1, high=10)
+    longest: int = option(10, 'number of tracks used for the focal length', low=1, high=10000)
+    focal_steps: int = option(300, 'trial focal lengths up to the image diagonal', low=10, high=10000)
+    cluster_deg: float = option(5.0, 'half width of a cluster of orientations', low=0.5, high=30)
+    min_separation_deg: float = option(25.0, 'least angle between the two orientations', low=5, high=90)
+    vote_share: float = option(0.8, 'a cell counts when it has this share of the most votes', low=0.1, high=1)
+    vote_sigmas: float = option(2.0, 'the vanishing point lies so many sigmas outwards of the mean', low=0, high=5)
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointOptions(_Checked):
+    """The robust method."""
+
+    max_tracks: int = option(500, 'tracks in one solution, spread over image, roads and time', low=20, high=10000)
+    noise_px: float = option(0.5, 'standard deviation of a tracked position', low=0.01, high=10)
+    k1_sigma: float = option(0.03, 'standard deviation of the prior k1 = 0', low=0, high=1)
+    principal_point_sigma: float = option(
+        0.01, 'standard deviation of the principal point about the image centre, share of the width', low=0, high=0.5)
+    road_angle: str = option(
+        'auto', 'angle between the two roads: test whether it is 90 degrees, never use it, or trust that it is',
+        choices=('auto', 'free', 'perpendicular'))
+
+
+@dataclass(frozen=True, kw_only=True)
+class GateOptions(_Checked):
+    """What has to hold before a calibration is accepted."""
+
+    min_tracks: int = option(40, 'tracks needed', low=4, high=100000)
+    min_tracks_per_road: int = option(10, 'tracks needed of each of two roads', low=2, high=100000)
+    min_coverage: float = option(0.15, 'share of image cells that tracks have crossed', low=0, high=1)
+    max_sigma_focal_rel: float = option(0.05, 'largest standard deviation of the focal length, relative', low=0, high=1)
+    max_sigma_tilt_deg: float = option(1.5, 'largest standard deviation of the ground normal', low=0, high=45)
+    max_drift_px: float = option(3.0, 'background drift that a fixed camera stays below, at 1280 px width', low=0.1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(_Checked):
+    """All that the core is told from outside."""
+
+    method: str = option('joint', "'joint' is the robust method, 'paper' the published one", choices=('joint', 'paper'))
+    camera_height: float = option(0.0, 'height of the camera above the road, metres; 0 is unknown', low=0, high=500)
+    allow_unit_scale: bool = option(False, 'without a height, give the ground plane in units of the height')
+    max_image_width: int = option(1280, 'wider images are reduced to this width for tracking', low=160, high=16384)
+    random_seed: int = option(0, 'seed of the consensus searches', low=0)
+    first_solve_s: float = option(10.0, 'seconds of recording before the first solution is tried', low=0)
+    solve_growth: float = option(1.3, 'a new solution is tried when the evidence has grown by this factor', low=1.01)
+    solve_interval_s: float = option(5.0, 'least seconds of recording between two solutions', low=0.1)
+    tracking: TrackingOptions = field(default_factory=TrackingOptions)
+    motion: MotionOptions = field(default_factory=MotionOptions)
+    buffer: BufferOptions = field(default_factory=BufferOptions)
+    paper: PaperOptions = field(default_factory=PaperOptions)
+    joint: JointOptions = field(default_factory=JointOptions)
+    gate: GateOptions = field(default_factory=GateOptions)
+
+
+@dataclass(frozen=True, kw_only=True)
+class NodeOptions(_Checked):
+    """What only the live node needs; the replay accepts these names in a shared file and ignores them."""
+
+    image_transport: str = option('raw', 'image topic: sensor_msgs/Image or CompressedImage on <image>/compressed',
+                                  choices=('raw', 'compressed'))
+    image_reliability: str = option('auto', "reliability of the image subscription; 'auto' matches the publisher",
+                                    choices=('auto', 'reliable', 'best_effort'))
+    camera_name: str = option('', "name used for frames and files; '' takes the namespace or the image's frame_id")
+    camera_frame: str = option('', "frame of the camera; '' takes the image's frame_id")
+    ground_frame: str = option('', "frame of the ground plane; '' is <camera_name>_ground")
+    camera_info_mode: str = option('per_image', 'publish camera_info with each image or when it changes',
+                                   choices=('per_image', 'latched_only'))
+    idle_solve_s: float = option(3.0, 'when no image came for this long, what is left is solved', low=0.1)
+
+
+@dataclass(frozen=True)
+class Declared:
+    """One option by its full name, as the node's parameters and the documented YAML need it."""
+
+    name: str
+    default: Any
+    doc: str
+    low: float | None
+    high: float | None
+    choices: tuple[str, ...]
+
+
+def declared(options: Any, prefix: str = '') -> Iterator[Declared]:
+    """Walk an option dataclass instance, yielding each option with its present value as the default."""
+    for item in dataclasses.fields(options):
+        value = getattr(options, item.name)
+        if dataclasses.is_dataclass(value):
+            yield from declared(value, f'{prefix}{item.name}.')
+        else:
+            meta = item.metadata
+            yield Declared(prefix + item.name, value, meta['doc'], meta['low'], meta['high'], meta['choices'])
+
+
+def with_values(options: Any, values: Mapping[str, Any]) -> Any:
+    """Return `options` with the values given by full name, or raise UsageError at an unknown name."""
+    names = [item.name for item in declared(options)]
+    for name in values:
+        if name not in names:
+            near = get_close_matches(name, names, n=1)
+            hint = f"; did you mean '{near[0]}'?" if near else '; see config/autocalib.yaml for all names'
+            raise UsageError(f"unknown option '{name}'{hint}")
+    return _replaced(options, values, '')
+
+
+def _replaced(options: Any, values: Mapping[str, Any], prefix: str) -> Any:
+    changes: dict[str, Any] = {}
+    for item in dataclasses.fields(options):
+        name, value = prefix + item.name, getattr(options, item.name)
+        if dataclasses.is_dataclass(value):
+            changes[item.name] = _replaced(value, values, name + '.')
+        elif name in values:
+            changes[item.name] = values[name]
+    return dataclasses.replace(options, **changes)
+
+
+def flattened(tree: Mapping[str, Any], prefix: str = '') -> dict[str, Any]:
+    """Turn a nested mapping, as YAML gives it, into values by full name."""
+    flat: dict[str, Any] = {}
+    for key, value in tree.items():
+        if isinstance(value, Mapping):
+            flat.update(flattened(value, f'{prefix}{key}.'))
+        else:
+            flat[f'{prefix}{key}'] = value
+    return flat

@@ -1,0 +1,1 @@
+"""Observations to geometry: numpy and scipy only; no image, file or ROS is seen here."""

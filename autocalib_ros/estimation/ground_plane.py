@@ -1,0 +1,57 @@
+"""The pose of the camera over the road: rotation from road directions, translation from the height."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from autocalib_ros.calibration import GroundPlane
+
+BELOW_HORIZON = 0.95
+"""Vehicles drive on the road: at least this share of what moves lies below the horizon."""
+
+
+def upward(normal: np.ndarray, bearings: np.ndarray) -> tuple[np.ndarray, float]:
+    """Turn a plane normal (3,) away from the road, and say which share of the bearings (n, 3) lies below."""
+    below = bearings @ normal < 0
+    return (normal, float(below.mean())) if below.mean() >= 0.5 else (-normal, float(1 - below.mean()))
+
+
+def ground_plane(normal: np.ndarray, direction: np.ndarray, height: float, *, metric: bool) -> GroundPlane:
+    """Return the plane with z along the upward `normal` (3,) and x along the road `direction` (3,), camera frame.
+
+    Of the two ways along the road x takes the one that leads away from the camera.
+    """
+    z = normal / np.linalg.norm(normal)
+    x = direction - (direction @ z) * z
+    x /= np.linalg.norm(x)
+    forward = np.array([0.0, 0.0, 1.0])
+    if x @ forward < 0:
+        x = -x
+    return GroundPlane(np.stack([x, np.cross(z, x), z]), float(height), metric)
+
+
+def tilt_and_roll_deg(normal: np.ndarray) -> np.ndarray:
+    """Angles (2,) of the upward normal (3,): the optical axis below the horizontal, and the roll about it."""
+    return np.degrees([np.arcsin(np.clip(-normal[2], -1, 1)), np.arctan2(-normal[0], -normal[1])])
+
+
+def focal_from_vanishing_points(first: np.ndarray, second: np.ndarray) -> float | None:
+    """The paper's f_new from two vanishing points (2,) of perpendicular roads, relative to the principal point.
+
+    Its equation `(ux-cx)(vx-cx) + (uy-cy)(vy-cy) + f^2 = 0`; None where no focal length satisfies it.
+    """
+    squared = -float(first @ second)
+    return squared**0.5 if squared > 0 else None
+
+
+def rotation_from_vanishing_points(first: np.ndarray, second: np.ndarray, focal_px: float) -> np.ndarray:
+    """The paper's R, shape (3, 3): columns are the roads and their normal in the camera frame, made a rotation by SVD."""
+    columns = [np.append(point, focal_px) / np.hypot(np.linalg.norm(point), focal_px) for point in (first, second)]
+    matrix = np.column_stack([*columns, np.cross(*columns)])
+    left, _, right = np.linalg.svd(matrix)
+    return left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+
+
+def paper_translation(rotation: np.ndarray, height: float) -> tuple[float, float, float]:
+    """The paper's t = (0, 0, H / |r33|): the world origin is where the optical axis meets the road."""
+    return (0.0, 0.0, float(height / max(abs(rotation[2, 2]), 1e-9)))

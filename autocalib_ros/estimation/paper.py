@@ -1,0 +1,77 @@
+"""The method of Jain & Saunier as published, from evidence to a calibration."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from autocalib_ros.calibration import Calibration, Figures, Reason, StandardDeviations
+from autocalib_ros.camera import Camera
+from autocalib_ros.config import Options
+from autocalib_ros.estimation.ground_plane import (
+    focal_from_vanishing_points,
+    ground_plane,
+    paper_translation,
+    rotation_from_vanishing_points,
+    upward,
+)
+from autocalib_ros.estimation.straightness import PaperIntrinsics
+from autocalib_ros.estimation.vanishing_points import PaperDirections, paper_directions
+from autocalib_ros.evidence import Evidence
+
+ASSUMPTIONS = ('equidistant lens with the principal point at the image centre', 'the two roads are perpendicular',
+               'the published method gives no uncertainty')
+
+
+def solve_paper(evidence: Evidence, options: Options, intrinsics: PaperIntrinsics | None,
+                figures: Figures) -> Calibration | Reason:
+    """Run both stages; the reason instead when a stage has nothing to work on."""
+    if intrinsics is None:
+        paper = options.paper
+        return Reason(
+            'too_few_tracks', f'no track lived for {paper.min_lifetime:.0%} of an interval of {paper.window_s:g} s with '
+            f'a path of at most {paper.max_path_ratio:g} x its displacement',
+            'record slower traffic, shorten paper.window_s, or use method joint')
+    camera = Camera.equidistant(*evidence.image_size, intrinsics.report.focal_px)
+    found = paper_directions(camera, evidence.segments_px, options.paper)
+    figures = replace(figures, orientation_histogram=found.histogram, orientation_peaks_deg=found.peaks_deg)
+    result = Calibration(
+        method='paper', grade='lens', assumptions=ASSUMPTIONS, camera=camera, ground=None, ground_refusal=None,
+        road_directions=np.zeros((0, 3)), stddev=StandardDeviations(), paper=intrinsics.report,
+        evidence=evidence.summary(), newest_stamp_ns=evidence.newest_stamp_ns, figures=figures)
+    return _with_ground(result, found, evidence, options)
+
+
+def _with_ground(result: Calibration, found: PaperDirections, evidence: Evidence, options: Options) -> Calibration:
+    """Add the extrinsic stage to the lens, or say why it has none."""
+    if len(found.points_px) < 2:
+        return replace(result, ground_refusal=Reason(
+            'one_direction', f'the orientation histogram of {len(evidence.segments_px)} segments has '
+            f'{len(found.points_px)} peaks, not two', 'wait for traffic on a second road'))
+    focal = focal_from_vanishing_points(*found.points_px)
+    if focal is None or result.paper is None:
+        return replace(result, ground_refusal=Reason(
+            'vanishing_points_disagree', 'no focal length makes the two vanishing points perpendicular '
+            f'(orientations {found.peaks_deg[0]:.0f} and {found.peaks_deg[1]:.0f} degrees)',
+            'the roads are not perpendicular or the lens is wrong: use method joint'))
+    rotation = rotation_from_vanishing_points(*found.points_px, focal)
+    bearings, _ = result.camera.unproject(evidence.points_px)
+    normal, _ = upward(rotation[:, 2], bearings)
+    height, metric, grade, reason = scale(options)
+    plane = None if reason else ground_plane(normal, rotation[:, 0], height, metric=metric)
+    report = replace(result.paper, focal_from_vanishing_points_px=focal,
+                     translation_m=paper_translation(rotation, height) if plane else None)
+    return replace(result, grade=grade, ground=plane, ground_refusal=reason, paper=report,
+                   road_directions=rotation[:, :2].T)
+
+
+def scale(options: Options) -> tuple[float, bool, str, Reason | None]:
+    """Return height, whether it is in metres, the grade that it allows, and why there is no plane if so."""
+    if options.camera_height > 0:
+        return options.camera_height, True, 'full', None
+    if options.allow_unit_scale:
+        return 1.0, False, 'unit_scale', None
+    return 0.0, False, 'lens', Reason(
+        'no_height', 'the ground plane needs the height of the camera above the road, which was not given',
+        'give camera_height in metres, or allow_unit_scale for a plane in units of the height')

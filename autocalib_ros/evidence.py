@@ -1,0 +1,194 @@
+"""What the traffic has shown: a rolling, bounded buffer, and the frozen values that estimators read."""
+
+from __future__ import annotations
+
+import zipfile
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from autocalib_ros.calibration import EvidenceSummary
+from autocalib_ros.config import BufferOptions
+from autocalib_ros.errors import InputError
+
+FORMAT = 1
+COVERAGE_CELLS = (16, 9)
+"""Columns and rows of the grid in which coverage of the image is counted."""
+
+
+@dataclass(frozen=True)
+class Track:
+    """One point of one vehicle over time, in observed pixels of the full image."""
+
+    vehicle: int
+    times_s: np.ndarray
+    """Seconds since the first image, shape (n,), increasing."""
+    points_px: np.ndarray
+    """Shape (n, 2)."""
+
+
+@dataclass(frozen=True)
+class Segments:
+    """Matches between two masked frames: where keypoints of vehicles were and where they went."""
+
+    time_s: float
+    vehicles: np.ndarray
+    """Vehicle of each segment, shape (n,)."""
+    ends_px: np.ndarray
+    """x0, y0, x1, y1 in observed pixels, shape (n, 4)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evidence:
+    """A snapshot of the buffer: every estimator can be run on it again without images."""
+
+    image_size: tuple[int, int]
+    first_stamp_ns: int
+    newest_stamp_ns: int
+    frames: int
+    track_starts: np.ndarray
+    """Where each track begins in `points_px`, with the total at the end, shape (tracks + 1,)."""
+    points_px: np.ndarray
+    """Shape (points, 2)."""
+    times_s: np.ndarray
+    """Seconds since the first image, shape (points,)."""
+    track_vehicles: np.ndarray
+    """Vehicle of each track, shape (tracks,)."""
+    segments_px: np.ndarray
+    """x0, y0, x1, y1, shape (segments, 4)."""
+    segment_vehicles: np.ndarray
+    """Shape (segments,)."""
+    segment_times_s: np.ndarray
+    """Shape (segments,)."""
+    drift_px: float
+    """How far the still background has moved at most, pixels of the full image; 0 for a fixed camera."""
+
+    @property
+    def track_count(self) -> int:
+        """Number of tracks."""
+        return len(self.track_vehicles)
+
+    @property
+    def seconds(self) -> float:
+        """Recording time covered."""
+        return (self.newest_stamp_ns - self.first_stamp_ns) * 1e-9
+
+    def track(self, index: int) -> Track:
+        """Return one track."""
+        part = slice(self.track_starts[index], self.track_starts[index + 1])
+        return Track(int(self.track_vehicles[index]), self.times_s[part], self.points_px[part])
+
+    def tracks(self) -> Iterator[Track]:
+        """Iterate over all tracks."""
+        return (self.track(index) for index in range(self.track_count))
+
+    @property
+    def coverage(self) -> float:
+        """Share of the image's cells that tracks have crossed, 0 to 1."""
+        if not len(self.points_px):
+            return 0.0
+        cells = np.floor(self.points_px / self.image_size * COVERAGE_CELLS).astype(int)
+        cells = np.clip(cells, 0, np.array(COVERAGE_CELLS) - 1)
+        return len(np.unique(cells @ [1, COVERAGE_CELLS[0]])) / (COVERAGE_CELLS[0] * COVERAGE_CELLS[1])
+
+    def summary(self) -> EvidenceSummary:
+        """Return the counts that a result carries."""
+        return EvidenceSummary(
+            image_size=self.image_size, seconds=self.seconds, frames=self.frames, tracks=self.track_count,
+            segments=len(self.segments_px), vehicles=len(np.unique(self.track_vehicles)), coverage=self.coverage)
+
+    def selected(self, keep: np.ndarray) -> Evidence:
+        """Return the evidence with only the tracks whose indices are in `keep`, segments unchanged."""
+        return replace(self, **_track_arrays([self.track(index) for index in keep]))
+
+    def save(self, path: Path) -> None:
+        """Write the snapshot as .npz."""
+        arrays = {name: getattr(self, name) for name in ARRAYS}
+        path = Path(path)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with path.open('wb') as stream:
+                np.savez_compressed(
+                    stream, format=FORMAT, image_size=self.image_size, drift_px=self.drift_px, frames=self.frames,
+                    stamps_ns=np.array([self.first_stamp_ns, self.newest_stamp_ns], np.int64), **arrays)
+        except OSError as error:
+            raise InputError(f'cannot write {path}: {error.strerror or error}') from error
+
+    @classmethod
+    def load(cls, path: Path) -> Evidence:
+        """Read what `save` wrote, or raise InputError."""
+        try:
+            with np.load(path, allow_pickle=False) as data:
+                if int(data['format']) != FORMAT:
+                    raise InputError(f'{path} holds evidence of format {int(data["format"])}, not {FORMAT}')
+                first, newest = (int(stamp) for stamp in data['stamps_ns'])
+                width, height = (int(value) for value in data['image_size'])
+                return cls(image_size=(width, height), first_stamp_ns=first, newest_stamp_ns=newest,
+                           frames=int(data['frames']), drift_px=float(data['drift_px']),
+                           **{name: data[name] for name in ARRAYS})
+        except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+            raise InputError(f'{path} is not a file of saved evidence (.npz): {error}') from error
+
+
+ARRAYS = ('track_starts', 'points_px', 'times_s', 'track_vehicles', 'segments_px', 'segment_vehicles',
+          'segment_times_s')
+
+
+def _track_arrays(tracks: list[Track]) -> dict[str, np.ndarray]:
+    lengths = np.array([len(track.times_s) for track in tracks], int)
+    return {
+        'track_starts': np.concatenate([[0], np.cumsum(lengths)]).astype(int),
+        'points_px': np.concatenate([t.points_px for t in tracks] or [np.zeros((0, 2))]).astype(float),
+        'times_s': np.concatenate([t.times_s for t in tracks] or [np.zeros(0)]).astype(float),
+        'track_vehicles': np.array([track.vehicle for track in tracks], int)}
+
+
+class EvidenceBuffer:
+    """Rolling buffer of finished tracks and segments, bounded in age and number."""
+
+    def __init__(self, options: BufferOptions) -> None:
+        self._options = options
+        self._tracks: deque[Track] = deque(maxlen=options.max_tracks)
+        self._segments: deque[Segments] = deque()
+        self._segment_count = 0
+
+    def add_track(self, track: Track) -> None:
+        """Take a finished track; the oldest makes room."""
+        self._tracks.append(track)
+
+    def add_segments(self, segments: Segments) -> None:
+        """Take the segments of one pair of frames; the oldest pairs make room."""
+        if not len(segments.ends_px):
+            return
+        self._segments.append(segments)
+        self._segment_count += len(segments.ends_px)
+        while self._segment_count > self._options.max_segments and len(self._segments) > 1:
+            self._segment_count -= len(self._segments.popleft().ends_px)
+
+    def forget_before(self, time_s: float) -> None:
+        """Drop what ended before `time_s`."""
+        while self._tracks and self._tracks[0].times_s[-1] < time_s:
+            self._tracks.popleft()
+        while self._segments and self._segments[0].time_s < time_s:
+            self._segment_count -= len(self._segments.popleft().ends_px)
+
+    @property
+    def track_count(self) -> int:
+        """Number of finished tracks held."""
+        return len(self._tracks)
+
+    def snapshot(self, *, image_size: tuple[int, int], first_stamp_ns: int, newest_stamp_ns: int, frames: int,
+                 drift_px: float, unfinished: list[Track]) -> Evidence:
+        """Freeze what is held, with the tracks that are still being followed."""
+        parts = list(self._segments)
+        return Evidence(
+            image_size=image_size, first_stamp_ns=first_stamp_ns, newest_stamp_ns=newest_stamp_ns, frames=frames,
+            drift_px=drift_px,
+            segments_px=np.concatenate([s.ends_px for s in parts] or [np.zeros((0, 4))]).astype(float),
+            segment_vehicles=np.concatenate([s.vehicles for s in parts] or [np.zeros(0)]).astype(int),
+            segment_times_s=np.concatenate(
+                [np.full(len(s.ends_px), s.time_s) for s in parts] or [np.zeros(0)]).astype(float),
+            **_track_arrays([*self._tracks, *unfinished]))

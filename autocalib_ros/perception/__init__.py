@@ -1,0 +1,1 @@
+"""Images to observations: the only rooms that track, detect or match."""

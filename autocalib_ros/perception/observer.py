@@ -1,0 +1,116 @@
+"""One image in, observations out: the order in which the perception rooms are visited."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from autocalib_ros.config import Options
+from autocalib_ros.evidence import Segments, Track
+from autocalib_ros.perception.background import Background
+from autocalib_ros.perception.segments import Keypoints, find_keypoints, match_segments
+from autocalib_ros.perception.stillness import Stillness
+from autocalib_ros.perception.tracks import PointTracker
+from autocalib_ros.perception.vehicles import MotionMask, Region
+
+MASK_EVERY = 2
+"""Images between two updates of the background: traffic needs no finer step in time."""
+
+
+@dataclass(frozen=True)
+class Observations:
+    """What one image added, in pixels of the full image."""
+
+    tracks: list[Track]
+    segments: Segments | None
+
+
+class Observer:
+    """Watches one stream of images of one size; times are seconds since its first image."""
+
+    def __init__(self, options: Options, image_size: tuple[int, int]) -> None:
+        self._options = options
+        self._image_size = image_size
+        self._reduction = max(1.0, image_size[0] / options.max_image_width)
+        self._motion = MotionMask(options.motion)
+        self._tracker = PointTracker(options.tracking)
+        self._stillness = Stillness(options.buffer.seconds)
+        self._background = Background()
+        self._sift = cv2.SIFT_create(contrastThreshold=0.03)
+        self._keypoints: Keypoints | None = None
+        self._frames = 0
+        self._vehicles = 0
+
+    def observe(self, image: np.ndarray, time_s: float) -> Observations:
+        """Take a grey (H, W) or BGR (H, W, 3) uint8 image."""
+        grey = self._tracked_image(image)
+        self._background.update(image, time_s)
+        tracks = self._tracker.follow(grey, time_s)
+        detect = self._frames % self._options.tracking.detect_every == 0
+        if detect or self._frames % MASK_EVERY == 0:
+            self._motion.update(grey, time_s)
+        segments = self._detect(grey, time_s) if detect else None
+        self._stillness.update(grey, time_s)
+        self._frames += 1
+        return Observations([self._full_size(track) for track in tracks], segments)
+
+    def _tracked_image(self, image: np.ndarray) -> np.ndarray:
+        grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image.copy()
+        if self._reduction > 1:
+            width, height = self._image_size
+            size = (round(width / self._reduction), round(height / self._reduction))
+            grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+        return grey
+
+    def _detect(self, grey: np.ndarray, time_s: float) -> Segments | None:
+        """Look for keypoints in the moving regions: they start tracks, and matched they are segments."""
+        regions = self._motion.regions()
+        vehicles = self._vehicles_of(regions)
+        keypoints = find_keypoints(grey, regions, self._sift)
+        strongest = np.argsort(-keypoints.responses, kind='stable')
+        of_keypoint = vehicles[keypoints.regions]
+        self._tracker.add_points(keypoints.points_px[strongest], of_keypoint[strongest])
+        before, self._keypoints = self._keypoints, keypoints
+        if before is None:
+            return None
+        ends, matched = match_segments(before, keypoints, grey.shape[1])
+        return Segments(time_s, of_keypoint[matched], self._full_pixels(ends.reshape(-1, 2)).reshape(-1, 4))
+
+    def _vehicles_of(self, regions: list[Region]) -> np.ndarray:
+        """Give each region (n,) the vehicle that most points followed inside it belong to, or a new one."""
+        points, owners = self._tracker.positions()
+        columns, rows = np.round(points).astype(int).T
+        vehicles = np.zeros(len(regions), int)
+        for index, region in enumerate(regions):
+            height, width = region.mask.shape
+            x, y = columns - region.x, rows - region.y
+            near = np.flatnonzero((x >= 0) & (y >= 0) & (x < width) & (y < height))
+            inside = owners[near[region.mask[y[near], x[near]] > 0]]
+            if len(inside):
+                vehicles[index] = np.bincount(inside).argmax()
+            else:
+                self._vehicles += 1
+                vehicles[index] = self._vehicles
+        return vehicles
+
+    def unfinished(self) -> list[Track]:
+        """Return the tracks so far of what is still followed."""
+        return [self._full_size(track) for track in self._tracker.unfinished()]
+
+    @property
+    def drift_px(self) -> float:
+        """How far the background has moved, pixels of the full image."""
+        return self._stillness.drift_px * self._reduction
+
+    def background(self) -> np.ndarray | None:
+        """Return the road without its traffic, BGR uint8 (H, W, 3)."""
+        return self._background.image()
+
+    def _full_size(self, track: Track) -> Track:
+        return Track(track.vehicle, track.times_s, self._full_pixels(track.points_px))
+
+    def _full_pixels(self, points_px: np.ndarray) -> np.ndarray:
+        """Bring pixels (n, 2) of the tracked image to the full one; pixel centres lie at whole numbers."""
+        return (points_px + 0.5) * self._reduction - 0.5 if self._reduction > 1 else points_px

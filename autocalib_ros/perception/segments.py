@@ -1,0 +1,81 @@
+"""SIFT keypoints inside the vehicle mask, and segments: matches between consecutive masked frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from autocalib_ros.perception.vehicles import Region
+
+RATIO = 0.75
+"""A match counts when its distance is below this share of the second best's (Lowe 2004)."""
+FINE_SIDE_PX = 64
+"""Regions beyond this side are searched at half size: their finest texture is noise, and costs most."""
+MAX_PER_REGION = 60
+MIN_LENGTH_PX = 5.0
+MAX_LENGTH = 0.2
+"""Longest plausible motion between two masked frames, share of the image width."""
+
+
+@dataclass(frozen=True)
+class Keypoints:
+    """SIFT keypoints of one masked frame."""
+
+    points_px: np.ndarray
+    """Pixels of the tracked image, shape (n, 2), strongest first within a region."""
+    responses: np.ndarray
+    """Shape (n,)."""
+    regions: np.ndarray
+    """Index of the region of each, shape (n,)."""
+    descriptors: np.ndarray
+    """Shape (n, 128), float32."""
+
+
+def find_keypoints(grey: np.ndarray, regions: list[Region], sift: cv2.SIFT) -> Keypoints:
+    """Find SIFT keypoints inside the moving regions of a grey image (H, W)."""
+    found = [_region_keypoints(grey, region, sift) for region in regions]
+    labels = [np.full(len(points), index) for index, (points, _, _) in enumerate(found)]
+    return Keypoints(
+        points_px=np.concatenate([points for points, _, _ in found] or [np.zeros((0, 2))]),
+        responses=np.concatenate([responses for _, responses, _ in found] or [np.zeros(0)]),
+        regions=np.concatenate(labels or [np.zeros(0)]).astype(int),
+        descriptors=np.concatenate(
+            [descriptors for _, _, descriptors in found] or [np.zeros((0, 128))]).astype(np.float32))
+
+
+def _region_keypoints(grey: np.ndarray, region: Region,
+                      sift: cv2.SIFT) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    height, width = region.mask.shape
+    crop = grey[region.y:region.y + height, region.x:region.x + width]
+    mask = region.mask
+    coarse = max(height, width) > FINE_SIDE_PX
+    if coarse:
+        size = (max(1, width // 2), max(1, height // 2))
+        crop = cv2.resize(crop, size, interpolation=cv2.INTER_AREA)
+        mask = cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST)
+    found, descriptors = sift.detectAndCompute(np.ascontiguousarray(crop), mask)
+    if descriptors is None or not len(found):
+        return np.zeros((0, 2)), np.zeros(0), np.zeros((0, 128))
+    responses = np.array([keypoint.response for keypoint in found])
+    best = np.argsort(-responses, kind='stable')[:MAX_PER_REGION]
+    points = np.array([found[index].pt for index in best])
+    if coarse:
+        points = (points + 0.5) * [width / size[0], height / size[1]] - 0.5
+    return points + [region.x, region.y], responses[best], descriptors[best]
+
+
+def match_segments(before: Keypoints, after: Keypoints, image_width: int) -> tuple[np.ndarray, np.ndarray]:
+    """Match two masked frames: segments x0, y0, x1, y1 (n, 4) and the index in `after` of each (n,)."""
+    if len(before.points_px) < 2 or len(after.points_px) < 2:
+        return np.zeros((0, 4)), np.zeros(0, int)
+    pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(after.descriptors, before.descriptors, k=2)
+    good = [(m.queryIdx, m.trainIdx) for m, second in pairs if m.distance < RATIO * second.distance]
+    if not good:
+        return np.zeros((0, 4)), np.zeros(0, int)
+    query, train = np.array(good).T
+    ends = np.hstack([before.points_px[train], after.points_px[query]])
+    length = np.hypot(ends[:, 2] - ends[:, 0], ends[:, 3] - ends[:, 1])
+    keep = (length >= MIN_LENGTH_PX) & (length <= MAX_LENGTH * image_width)
+    return ends[keep], query[keep]

@@ -1,0 +1,160 @@
+"""Points on moving objects, followed by pyramidal Lucas-Kanade optical flow (KLT)."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from autocalib_ros.config import TrackingOptions
+from autocalib_ros.evidence import Track
+
+CAPACITY = 256
+"""Images of one track at the most; a longer one is finished and goes on as a new one."""
+MIN_POINTS = 6
+MIN_DISPLACEMENT = 0.02
+"""Shortest displacement of a track worth keeping, share of the image width."""
+STILL_S = 1.0
+STILL_PX = 1.5
+"""A point that moved less than this in `STILL_S` stands still: its track ends."""
+MAX_GAP_S = 1.0
+"""Across a longer gap between two images nothing is followed."""
+TURN_SHARE = 0.6
+TURN_PX = 3.0
+"""A step that differs from the one before by more than both is a point that jumped to something else."""
+
+
+class PointTracker:
+    """Follows points from image to image and hands out finished tracks, in pixels of the tracked image."""
+
+    def __init__(self, options: TrackingOptions) -> None:
+        self._options = options
+        self._grey: np.ndarray | None = None
+        self._time_s = 0.0
+        slots = options.max_points
+        self._history = np.zeros((slots, CAPACITY, 3))
+        self._count = np.zeros(slots, int)
+        self._vehicle = np.zeros(slots, int)
+        self._step = np.zeros((slots, 2))
+
+    def follow(self, grey: np.ndarray, time_s: float) -> list[Track]:
+        """Follow all points into a new grey image (H, W); return the tracks that ended."""
+        finished: list[Track] = []
+        if self._grey is not None:
+            gap = not 0 < time_s - self._time_s <= MAX_GAP_S
+            finished = self.finish_all() if gap else self._follow(self._grey, grey, time_s)
+        self._grey, self._time_s = grey, time_s
+        return finished
+
+    def _follow(self, before: np.ndarray, after: np.ndarray, time_s: float) -> list[Track]:
+        active = np.flatnonzero(self._count)
+        if not len(active):
+            return []
+        start = self._newest(active)
+        found, followed = self._flow(before, after, start, start + self._step[active])
+        step = found - start
+        known = self._count[active] > 1
+        jump = np.hypot(*(step - self._step[active]).T)
+        speed = np.hypot(*self._step[active].T)
+        followed &= ~(known & (jump > TURN_PX) & (jump > TURN_SHARE * speed))
+        kept = active[followed]
+        self._history[kept, self._count[kept]] = np.column_stack([np.full(len(kept), time_s), found[followed]])
+        self._count[kept] += 1
+        self._step[kept] = step[followed]
+        ended = np.concatenate([active[~followed], kept[self._still(kept, time_s)]])
+        finished = self._finish(ended)
+        return finished + self._restart(np.flatnonzero(self._count == CAPACITY))
+
+    def _flow(self, before: np.ndarray, after: np.ndarray, start: np.ndarray,
+              guess: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Follow forwards from a guess, then back at full resolution; both have to agree."""
+        side = self._options.window_px
+        criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.02)
+        origin = _points(start)
+        found, forward, _ = cv2.calcOpticalFlowPyrLK(
+            before, after, origin, _points(guess), winSize=(side, side),
+            maxLevel=self._options.pyramid_levels, criteria=criteria, flags=cv2.OPTFLOW_USE_INITIAL_FLOW)
+        back, backward, _ = cv2.calcOpticalFlowPyrLK(
+            after, before, found, origin.copy(), winSize=(side, side), maxLevel=0, criteria=criteria,
+            flags=cv2.OPTFLOW_USE_INITIAL_FLOW)
+        miss = np.hypot(*(back - origin)[:, 0].T)
+        found = found[:, 0].astype(float)
+        margin, (height, width) = side / 2, after.shape
+        inside = ((found >= margin) & (found < [width - margin, height - margin])).all(axis=1)
+        good = (forward.ravel() == 1) & (backward.ravel() == 1) & (miss <= self._options.round_trip_px) & inside
+        return found, good
+
+    def _newest(self, slots: np.ndarray) -> np.ndarray:
+        return self._history[slots, self._count[slots] - 1, 1:]
+
+    def _still(self, slots: np.ndarray, time_s: float) -> np.ndarray:
+        """Which of the points have moved less than `STILL_PX` in the last `STILL_S`, shape of `slots`."""
+        if not len(slots):
+            return np.zeros(0, bool)
+        times = self._history[slots, :, 0]
+        filled = np.arange(CAPACITY) < self._count[slots, None]
+        earlier = ((times <= time_s - STILL_S) & filled).sum(axis=1) - 1
+        old_enough = earlier >= 0
+        then = self._history[slots, np.maximum(earlier, 0), 1:]
+        return old_enough & (np.hypot(*(self._newest(slots) - then).T) < STILL_PX)
+
+    def positions(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return where the followed points are now (n, 2) and their vehicles (n,)."""
+        active = np.flatnonzero(self._count)
+        return self._newest(active), self._vehicle[active]
+
+    def add_points(self, points_px: np.ndarray, vehicles: np.ndarray) -> None:
+        """Begin to follow points (n, 2), best first, that keep their distance from those followed already."""
+        free = list(np.flatnonzero(self._count == 0))
+        near, _ = self.positions()
+        taken = list(near)
+        for point, vehicle in zip(points_px, vehicles, strict=True):
+            if not free:
+                return
+            if taken and (np.abs(np.array(taken) - point).max(axis=1) < self._options.min_spacing_px).any():
+                continue
+            slot = free.pop(0)
+            self._history[slot, 0] = (self._time_s, *point)
+            self._count[slot], self._vehicle[slot], self._step[slot] = 1, vehicle, 0.0
+            taken.append(point)
+
+    def unfinished(self) -> list[Track]:
+        """Return the tracks so far of the points still followed."""
+        return self._tracks(np.flatnonzero(self._count))
+
+    def finish_all(self) -> list[Track]:
+        """End all tracks and return them."""
+        return self._finish(np.flatnonzero(self._count))
+
+    def _finish(self, slots: np.ndarray) -> list[Track]:
+        tracks = self._tracks(slots)
+        self._count[slots] = 0
+        return tracks
+
+    def _restart(self, slots: np.ndarray) -> list[Track]:
+        """Finish tracks that are full; their points are followed on."""
+        tracks = self._tracks(slots)
+        self._history[slots, 0] = self._history[slots, CAPACITY - 1]
+        self._count[slots] = 1
+        return tracks
+
+    def _tracks(self, slots: np.ndarray) -> list[Track]:
+        tracks = (self._track(slot) for slot in slots)
+        return [track for track in tracks if track is not None]
+
+    def _track(self, slot: int) -> Track | None:
+        """Thin a point's path to samples spread evenly along it; None when it is too short to say anything."""
+        path = self._history[slot, :self._count[slot]]
+        width = self._grey.shape[1] if self._grey is not None else 1
+        if len(path) < MIN_POINTS or np.hypot(*(path[-1, 1:] - path[0, 1:])) < MIN_DISPLACEMENT * width:
+            return None
+        along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path[:, 1:], axis=0).T))])
+        wanted = np.linspace(0.0, along[-1], min(self._options.max_samples, len(path)))
+        chosen = np.unique(np.searchsorted(along, wanted - 1e-9))
+        if len(chosen) < MIN_POINTS:
+            return None
+        return Track(int(self._vehicle[slot]), path[chosen, 0].copy(), path[chosen, 1:].copy())
+
+
+def _points(points_px: np.ndarray) -> np.ndarray:
+    """Return points (n, 2) in the layout that OpenCV writes into, (n, 1, 2) float32."""
+    return np.ascontiguousarray(points_px, np.float32).reshape(-1, 1, 2)

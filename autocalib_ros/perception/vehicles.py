@@ -1,0 +1,73 @@
+"""Where the vehicles are: a mask of what moves against a slowly learned background.
+
+A detector can stand in this room beside motion: whatever returns `Region`s will do.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from autocalib_ros.config import MotionOptions
+
+VARIANCE_THRESHOLD = 25.0
+"""Squared distance, in variances of the background, beyond which a pixel is moving: five sigmas."""
+
+
+@dataclass(frozen=True)
+class Region:
+    """One moving region: a rectangle in pixels of the tracked image and the mask inside it."""
+
+    x: int
+    y: int
+    mask: np.ndarray
+    """255 where something moves, uint8, shape (height, width)."""
+
+
+class MotionMask:
+    """Learns the background at a reduced size and says what differs from it."""
+
+    def __init__(self, options: MotionOptions) -> None:
+        self._options = options
+        self._subtractor = cv2.createBackgroundSubtractorMOG2(
+            varThreshold=VARIANCE_THRESHOLD, detectShadows=False)
+        self._mask: np.ndarray | None = None
+        self._size = (0, 0)
+        self._newest_s = 0.0
+
+    def update(self, grey: np.ndarray, time_s: float) -> None:
+        """Learn from a grey image (H, W); `time_s` is its time in seconds."""
+        height, width = grey.shape
+        reduced_width = min(self._options.width_px, width)
+        reduced = cv2.resize(grey, (reduced_width, max(1, round(height * reduced_width / width))),
+                             interpolation=cv2.INTER_AREA)
+        first = self._mask is None
+        rate = 1.0 if first else min(max((time_s - self._newest_s) / self._options.history_s, 1e-4), 0.2)
+        foreground = self._subtractor.apply(reduced, learningRate=rate)
+        self._mask = np.zeros_like(foreground) if first else foreground
+        self._size, self._newest_s = (width, height), time_s
+
+    def regions(self) -> list[Region]:
+        """Return the moving regions of the newest image, largest first."""
+        if self._mask is None:
+            return []
+        closed = cv2.morphologyEx(cv2.medianBlur(self._mask, 3), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+        count, labels, stats, _ = cv2.connectedComponentsWithStats(closed)
+        least = max(6.0, self._options.min_area * closed.size)
+        large = [label for label in range(1, count) if stats[label, cv2.CC_STAT_AREA] >= least]
+        large.sort(key=lambda label: -stats[label, cv2.CC_STAT_AREA])
+        return [self._region(labels == label, stats[label]) for label in large]
+
+    def _region(self, inside: np.ndarray, stats: np.ndarray) -> Region:
+        """Bring one region to the size of the tracked image, grown by one reduced pixel for its outline."""
+        width, height = self._size
+        factor_x, factor_y = width / inside.shape[1], height / inside.shape[0]
+        x0, y0 = max(stats[0] - 1, 0), max(stats[1] - 1, 0)
+        x1 = min(stats[0] + stats[2] + 1, inside.shape[1])
+        y1 = min(stats[1] + stats[3] + 1, inside.shape[0])
+        part = cv2.dilate(inside[y0:y1, x0:x1].astype(np.uint8) * 255, np.ones((3, 3), np.uint8))
+        left, top = round(x0 * factor_x), round(y0 * factor_y)
+        right, bottom = round(x1 * factor_x), round(y1 * factor_y)
+        return Region(left, top, cv2.resize(part, (right - left, bottom - top), interpolation=cv2.INTER_NEAREST))
