@@ -23,7 +23,7 @@ setup(
         'scipy>=1.11',
         'opencv-python-headless>=4.6',
         'PyYAML>=6',
-        'rosbags>=0.10',
+        'rosbags>=0.11.9',
         'tqdm>=4.64',
         'jinja2>=3',
         'matplotlib>=3.7',

@@ -15,7 +15,7 @@ from autocalib_ros.estimation.ground_plane import ground_plane, tilt_and_roll_de
 from autocalib_ros.estimation.paper import scale, solve_paper
 from autocalib_ros.estimation.roads import Roads, find_roads, normal_of
 from autocalib_ros.estimation.straightness import paper_intrinsics
-from autocalib_ros.estimation.vanishing_points import paper_directions
+from autocalib_ros.estimation.vanishing_points import segment_orientations
 from autocalib_ros.evidence import Evidence, EvidenceBuffer
 from autocalib_ros.perception.observer import Observer
 
@@ -141,7 +141,7 @@ def _figures(figures: Figures, roads: Roads, tracks: TrackSet, evidence: Evidenc
     """Add what became of each track, and the orientations of the segments in the solved lens."""
     labels = figures.track_labels.copy()
     labels[tracks.indices] = np.where(roads.fit.explained(), roads.fit.labels, -2)
-    found = paper_directions(roads.fit.state.camera, evidence.segments_px, options.paper)
+    found = segment_orientations(roads.fit.state.camera, evidence.segments_px, options.paper)
     return replace(figures, track_labels=labels, orientation_histogram=found.histogram,
                    orientation_peaks_deg=found.peaks_deg)
 

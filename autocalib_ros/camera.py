@@ -12,6 +12,7 @@ optical frame is x right, y down, z forward (REP-103).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -59,9 +60,11 @@ class Camera:
         k1, k2, k3, k4 = self.k
         return self.focal_px * (1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4))))
 
-    @property
+    @cached_property
     def max_angle_rad(self) -> float:
         """Largest theta up to which r(theta) grows: beyond it the model folds back on itself."""
+        if not any(self.k):
+            return float(np.pi)
         theta = np.linspace(0.0, np.pi, 721)
         falling = np.flatnonzero(self.radius_slope(theta) <= 0)
         return float(theta[falling[0] - 1]) if len(falling) else float(np.pi)

@@ -49,11 +49,11 @@ def _checked(item: dataclasses.Field, value: Any) -> Any:
 class TrackingOptions(_Checked):
     """Points on moving objects, followed by pyramidal Lucas-Kanade optical flow."""
 
-    max_points: int = option(300, 'points followed at once', low=20, high=5000)
+    max_points: int = option(200, 'points followed at once', low=20, high=5000)
     window_px: int = option(15, 'side of the square patch that is followed', low=5, high=61)
     pyramid_levels: int = option(3, 'image pyramid levels above the full resolution', low=0, high=6)
     detect_every: int = option(6, 'frames between two searches for new points and segments', low=1, high=100)
-    min_spacing_px: float = option(7.0, 'least distance between two points when they are found', low=1, high=100)
+    min_spacing_px: float = option(10.0, 'side of the cells of which each holds one point at the most', low=1, high=100)
     round_trip_px: float = option(0.7, 'a point is lost when following it back misses by more', low=0.05, high=10)
     max_samples: int = option(32, 'points kept of one track, spread evenly along it', low=8, high=500)
 

@@ -120,8 +120,9 @@ class Evidence:
     @classmethod
     def load(cls, path: Path) -> Evidence:
         """Read what `save` wrote, or raise InputError."""
+        path = Path(path)
         try:
-            with np.load(path, allow_pickle=False) as data:
+            with path.open('rb') as stream, np.load(stream, allow_pickle=False) as data:
                 if int(data['format']) != FORMAT:
                     raise InputError(f'{path} holds evidence of format {int(data["format"])}, not {FORMAT}')
                 first, newest = (int(stamp) for stamp in data['stamps_ns'])

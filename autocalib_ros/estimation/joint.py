@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from autocalib_ros.camera import Camera, image_centre
 from autocalib_ros.config import JointOptions
 from autocalib_ros.estimation.great_circles import (
+    Rays,
     TrackSet,
     fit_circles,
     fit_circles_through,
@@ -34,12 +35,18 @@ TIGHTENING = (8.0, 4.0, 2.0, 1.0, 1.0, 1.0)
 The bulk of the tracks says what noise is; a lane change or a slow turn a few pixels beyond it is few in number
 but long in lever. From loose to tight, so that a start some per cent off still reaches the best solution.
 """
+EVALUATIONS = (4, 4, 4, 4, 4, 20)
+"""Evaluations of the residuals in each round: only the last one needs to converge."""
+MIN_TRACKS = 4
+"""Fewer tracks on any road do not go on with a solution: it is judged, and refused, as it stands."""
 OUTLIER_PX = 4.0
 """A track farther than this from every road, root mean square, belongs to none."""
 EXPLAINED = 2.0
 """A track counts for its road when it is no farther from it than so many medians."""
 DISCRIMINATION = 5.0
 """A track tells two roads apart when it is so many times farther from the one than from the other."""
+DIFFERENCE = 1e-6
+"""Step of the lens parameters, in their sigmas or in log f, by which the residuals are differentiated."""
 SCALE_PX = 1.0
 """Distance at which a track stops being evidence for a solution when solutions are compared."""
 
@@ -98,8 +105,56 @@ class Problem:
     def residuals(self, step: np.ndarray) -> np.ndarray:
         """Weighted pixel distances of all points, then the priors."""
         state = self.state(step)
-        distances = track_distances(state, self.tracks, self.labels, self.scale)
-        return np.concatenate([(distances * self.root).ravel(), self.priors(state)])
+        rays = rays_of(state.camera, self.tracks.pixels)
+        normals = self.circles(state, rays)
+        return np.concatenate([(rays.distance_px(normals[:, None]) * self.root).ravel(), self.priors(state)])
+
+    def circles(self, state: State, rays: Rays) -> np.ndarray:
+        """Normals (tracks, 3) of each track's best circle through its road's direction.
+
+        `scale` only weighs the points when the circle is fitted; distances from it are exact.
+        """
+        matrix = scatter(rays, self.tracks.weights, self.scale)
+        normals, _ = fit_circles_through(matrix, state.directions[self.labels])
+        return normals
+
+    def jacobian(self, step: np.ndarray) -> np.ndarray:
+        """Derivative of `residuals`, shape (residuals, parameters), circles refitted.
+
+        The lens by differences, because a lens also changes what a pixel is worth, and that term decides where
+        the minimum lies. The roads in closed form: a direction d that moves by dd turns a normal n by
+        -(n.dd) d, and the circle's own angle is projected out (Kaufman 1975).
+        """
+        state = self.state(step)
+        rays = rays_of(state.camera, self.tracks.pixels)
+        normals = self.circles(state, rays)[:, None]
+        directions = state.directions[self.labels]
+        here = self.residuals(step)
+        lens = [(self.residuals(step + DIFFERENCE * unit) - here) / DIFFERENCE for unit in np.eye(self.size)[:4]]
+        free = self._slope(rays, normals, np.cross(directions, normals[:, 0])[:, None])
+        weight = np.maximum((free * free).sum(-1), 1e-12)
+        columns = []
+        for turn in self._turns(state):
+            column = self._slope(rays, normals, -((normals[:, 0] * turn).sum(-1)[:, None] * directions)[:, None])
+            column -= free * ((free * column).sum(-1) / weight)[:, None]
+            columns.append(np.concatenate([column.ravel(), np.zeros(3)]))
+        return np.column_stack([*lens, *columns])
+
+    def _slope(self, rays: Rays, normals: np.ndarray, change: np.ndarray) -> np.ndarray:
+        """Change (tracks, samples) of the weighted distances with a change (tracks, 1, 3) of the normals."""
+        scale = rays.pixel_scale(normals)
+        outward, around = ((side * normals).sum(-1) for side in (rays.radial, rays.tangential))
+        widening = outward * (rays.radial * change).sum(-1) + around * (rays.tangential * change).sum(-1)
+        along, across = (rays.bearings * change).sum(-1), (rays.bearings * normals).sum(-1)
+        return (along - across * widening * scale**2) * scale * self.root
+
+    def _turns(self, state: State) -> list[np.ndarray]:
+        """Change (tracks, 3) of each track's direction with each parameter of the roads."""
+        flat = np.column_stack([np.cos(state.angles_rad), np.sin(state.angles_rad), np.zeros(len(state.angles_rad))])
+        axes = np.eye(3)[3 - self.turns:]
+        turns = [np.cross(axis, flat)[self.labels] @ state.rotation.T for axis in axes]
+        sideways = np.cross([0.0, 0.0, 1.0], flat)[self.labels] @ state.rotation.T
+        return turns + [sideways * (self.labels == road + 1)[:, None] for road in range(self.free_angles)]
 
     def priors(self, state: State) -> np.ndarray:
         """Deviations from the prior lens, in sigmas."""
@@ -139,7 +194,8 @@ class JointFit:
 
     def explained(self) -> np.ndarray:
         """Which tracks follow their road as closely as the bulk does, shape (tracks,)."""
-        return (self.labels >= 0) & (self.distance_px < EXPLAINED * self.median_px)
+        typical = max(self.median_px, self.problem.options.noise_px)
+        return (self.labels >= 0) & (self.distance_px < EXPLAINED * typical)
 
     def covariance(self) -> np.ndarray:
         """Covariance of the parameters, shape (parameters, parameters)."""
@@ -158,24 +214,14 @@ def _pixel_scale(state: State, tracks: TrackSet) -> np.ndarray:
     return rays.pixel_scale(normals[:, None])
 
 
-def track_distances(state: State, tracks: TrackSet, labels: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """Pixel distances (tracks, samples) of points from their track's best circle through its road's direction.
-
-    `scale` only weighs the points when the circle is fitted; the distances themselves are exact.
-    """
-    rays = rays_of(state.camera, tracks.pixels)
-    normals, _ = fit_circles_through(scatter(rays, tracks.weights, scale), state.directions[labels])
-    return rays.distance_px(normals[:, None])
-
-
-def assign(state: State, tracks: TrackSet) -> tuple[np.ndarray, np.ndarray]:
-    """Give each track its nearest road (-2 beyond `OUTLIER_PX`) and its mean squared distance in px^2."""
+def assign(state: State, tracks: TrackSet, limit_px: float = OUTLIER_PX) -> tuple[np.ndarray, np.ndarray]:
+    """Give each track its nearest road (-2 beyond `limit_px`) and its mean squared distance in px^2."""
     rays = rays_of(state.camera, tracks.pixels)
     _, _, matrix = fit_circles(rays, tracks.weights)
     distance2 = distances2_through(matrix, state.directions)
     nearest = np.argmin(distance2, axis=0)
     least = distance2[nearest, np.arange(len(tracks))]
-    return np.where(least < OUTLIER_PX**2, nearest, -2), least
+    return np.where(least < limit_px**2, nearest, -2), least
 
 
 def initial_state(camera: Camera, found: Directions) -> State:
@@ -193,13 +239,16 @@ def solve_joint(start: State, tracks: TrackSet, options: JointOptions, *, perpen
     """Alternate between assigning tracks to roads and robust least squares, from a start."""
     state = squared(start) if perpendicular else start
     share = np.sqrt(tracks.share_of_vehicle)
-    for tightness in TIGHTENING:
-        labels, distance2 = assign(state, tracks)
+    for tightness, evaluations in zip(TIGHTENING, EVALUATIONS, strict=True):
+        # a start may be off by more than a true track ever is: only the last rounds cut off
+        labels, distance2 = assign(state, tracks, OUTLIER_PX if tightness <= 1.0 else np.inf)
+        if np.count_nonzero(labels >= 0) < MIN_TRACKS:
+            break
         noise2 = max(options.noise_px**2, _typical(distance2[labels >= 0]))
         influence = PATH_FREEDOM * share / noise2 / (1.0 + distance2 / (tightness * noise2)) ** 2
         problem = Problem(state, tracks, labels, influence, options, perpendicular)
-        solution = least_squares(problem.residuals, np.zeros(problem.size), method='trf', max_nfev=12, xtol=1e-7,
-                                 ftol=1e-7)
+        solution = least_squares(problem.residuals, np.zeros(problem.size), problem.jacobian, method='lm',
+                                 max_nfev=evaluations, xtol=1e-6, ftol=1e-7)
         state = problem.state(solution.x)
     labels, distance2 = assign(state, tracks)
     return JointFit(state, labels, np.sqrt(distance2), robust_cost(state, distance2, tracks, options),

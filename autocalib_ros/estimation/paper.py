@@ -17,7 +17,7 @@ from autocalib_ros.estimation.ground_plane import (
     upward,
 )
 from autocalib_ros.estimation.straightness import PaperIntrinsics
-from autocalib_ros.estimation.vanishing_points import PaperDirections, paper_directions
+from autocalib_ros.estimation.vanishing_points import Orientations, segment_orientations, voted_points
 from autocalib_ros.evidence import Evidence
 
 ASSUMPTIONS = ('equidistant lens with the principal point at the image centre', 'the two roads are perpendicular',
@@ -30,11 +30,11 @@ def solve_paper(evidence: Evidence, options: Options, intrinsics: PaperIntrinsic
     if intrinsics is None:
         paper = options.paper
         return Reason(
-            'too_few_tracks', f'no track lived for {paper.min_lifetime:.0%} of an interval of {paper.window_s:g} s with '
-            f'a path of at most {paper.max_path_ratio:g} x its displacement',
+            'too_few_tracks', f'no track lived for {paper.min_lifetime:.0%} of an interval of {paper.window_s:g} s '
+            f'with a path of at most {paper.max_path_ratio:g} x its displacement',
             'record slower traffic, shorten paper.window_s, or use method joint')
     camera = Camera.equidistant(*evidence.image_size, intrinsics.report.focal_px)
-    found = paper_directions(camera, evidence.segments_px, options.paper)
+    found = segment_orientations(camera, evidence.segments_px, options.paper)
     figures = replace(figures, orientation_histogram=found.histogram, orientation_peaks_deg=found.peaks_deg)
     result = Calibration(
         method='paper', grade='lens', assumptions=ASSUMPTIONS, camera=camera, ground=None, ground_refusal=None,
@@ -43,19 +43,20 @@ def solve_paper(evidence: Evidence, options: Options, intrinsics: PaperIntrinsic
     return _with_ground(result, found, evidence, options)
 
 
-def _with_ground(result: Calibration, found: PaperDirections, evidence: Evidence, options: Options) -> Calibration:
+def _with_ground(result: Calibration, found: Orientations, evidence: Evidence, options: Options) -> Calibration:
     """Add the extrinsic stage to the lens, or say why it has none."""
-    if len(found.points_px) < 2:
+    points = voted_points(found, result.camera.focal_px, options.paper)
+    if len(points) < 2:
         return replace(result, ground_refusal=Reason(
             'one_direction', f'the orientation histogram of {len(evidence.segments_px)} segments has '
-            f'{len(found.points_px)} peaks, not two', 'wait for traffic on a second road'))
-    focal = focal_from_vanishing_points(*found.points_px)
+            f'{len(points)} peaks, not two', 'wait for traffic on a second road'))
+    focal = focal_from_vanishing_points(*points)
     if focal is None or result.paper is None:
         return replace(result, ground_refusal=Reason(
             'vanishing_points_disagree', 'no focal length makes the two vanishing points perpendicular '
             f'(orientations {found.peaks_deg[0]:.0f} and {found.peaks_deg[1]:.0f} degrees)',
             'the roads are not perpendicular or the lens is wrong: use method joint'))
-    rotation = rotation_from_vanishing_points(*found.points_px, focal)
+    rotation = rotation_from_vanishing_points(*points, focal)
     bearings, _ = result.camera.unproject(evidence.points_px)
     normal, _ = upward(rotation[:, 2], bearings)
     height, metric, grade, reason = scale(options)

@@ -10,8 +10,8 @@ from autocalib_ros.camera import Camera
 from autocalib_ros.config import PaperOptions
 from autocalib_ros.estimation.great_circles import TrackSet, fit_circles, orthonormal_basis, rays_of
 
-HYPOTHESES = 600
-PROBES = 300
+HYPOTHESES = 400
+PROBES = 200
 """Random directions by which a track's power to tell directions apart is measured."""
 INLIER_PX = 2.0
 """A track supports a direction when its great circle through it stays this close, root mean square."""
@@ -43,7 +43,8 @@ def distances2_through(matrix: np.ndarray, directions: np.ndarray) -> np.ndarray
     return np.maximum(0.5 * (a + c - np.sqrt((a - c) ** 2 + 4 * b * b)), 0.0)
 
 
-def consensus_directions(camera: Camera, tracks: TrackSet, generator: np.random.Generator, count: int = 2) -> Directions:
+def consensus_directions(camera: Camera, tracks: TrackSet, generator: np.random.Generator,
+                         count: int = 2) -> Directions:
     """Find up to `count` directions, strongest first, that tracks' great circles share.
 
     A track counts by its surprise: minus the logarithm of the share of random directions that it would
@@ -118,30 +119,41 @@ OUTERMOST_DEG = 89.5
 """A vanishing point at infinity is held at this angle, so that it keeps finite coordinates."""
 
 
-@dataclass(frozen=True)
-class PaperDirections:
-    """Orientation clusters and vanishing points of the published method."""
+MAX_VOTERS = 2000
+"""Segments of one cluster that vote; more move no maximum."""
 
+
+@dataclass(frozen=True)
+class Orientations:
+    """Segments in the undistorted image, by orientation."""
+
+    ends_px: np.ndarray
+    """Segments relative to the principal point, shape (n, 2, 2)."""
+    orientation_deg: np.ndarray
+    """Shape (n,), 0 to 180."""
     histogram: np.ndarray
     """Orientation in degrees and number of segments, shape (180, 2)."""
     peaks_deg: tuple[float, ...]
     """Orientations of the two roads, or fewer where the histogram has no second peak."""
-    points_px: np.ndarray
-    """Vanishing points relative to the principal point, in pixels of the undistorted image, shape (peaks, 2)."""
 
 
-def paper_directions(camera: Camera, segments_px: np.ndarray, options: PaperOptions) -> PaperDirections:
-    """Run steps 7 to 9 of the paper on segments x0, y0, x1, y1 (n, 4): undistort, cluster, vote."""
+def segment_orientations(camera: Camera, segments_px: np.ndarray, options: PaperOptions) -> Orientations:
+    """Run steps 7 and 8 of the paper on segments x0, y0, x1, y1 (n, 4): undistort, histogram of orientation."""
     ends = camera.undistort(segments_px.reshape(-1, 2, 2)) - np.asarray(camera.principal_point_px)
     ends = ends[np.isfinite(ends).all(axis=(1, 2))]
     step = ends[:, 1] - ends[:, 0]
     orientation = np.degrees(np.arctan2(step[:, 1], step[:, 0])) % 180.0
     counts, edges = np.histogram(orientation, bins=HISTOGRAM_BINS, range=(0.0, 180.0))
     centres = (edges[:-1] + edges[1:]) / 2
-    peaks = _peaks(centres, counts, options.min_separation_deg)
-    points = [_voted_point(ends[_turn(orientation, peak) <= options.cluster_deg], camera.focal_px, options)
-              for peak in peaks]
-    return PaperDirections(np.column_stack([centres, counts]), peaks, np.array(points).reshape(-1, 2))
+    return Orientations(ends, orientation, np.column_stack([centres, counts]),
+                        _peaks(centres, counts, options.min_separation_deg))
+
+
+def voted_points(found: Orientations, focal_px: float, options: PaperOptions) -> np.ndarray:
+    """Run step 9 of the paper: vanishing points (peaks, 2) in undistorted pixels about the principal point."""
+    points = [_voted_point(found.ends_px[_turn(found.orientation_deg, peak) <= options.cluster_deg], focal_px, options)
+              for peak in found.peaks_deg]
+    return np.array(points).reshape(-1, 2)
 
 
 def _turn(first_deg: np.ndarray, second_deg: float) -> np.ndarray:
@@ -164,7 +176,8 @@ def _voted_point(ends: np.ndarray, focal_px: float, options: PaperOptions) -> np
     The canvas is the half sphere of viewing directions, by angle from the axis: a line is a great circle on it,
     and a point at infinity has its place on the rim.
     """
-    votes = _votes(ends, focal_px)
+    voters = np.linspace(0, len(ends) - 1, min(len(ends), MAX_VOTERS)).astype(int)
+    votes = _votes(ends[voters], focal_px)
     half = (votes.shape[0] - 1) / 2
     rows, columns = np.nonzero(votes >= options.vote_share * votes.max())
     weight = votes[rows, columns].astype(float)

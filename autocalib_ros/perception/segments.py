@@ -11,7 +11,7 @@ from autocalib_ros.perception.vehicles import Region
 
 RATIO = 0.75
 """A match counts when its distance is below this share of the second best's (Lowe 2004)."""
-FINE_SIDE_PX = 64
+FINE_SIDE_PX = 48
 """Regions beyond this side are searched at half size: their finest texture is noise, and costs most."""
 MAX_PER_REGION = 60
 MIN_LENGTH_PX = 5.0

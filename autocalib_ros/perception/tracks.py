@@ -104,18 +104,20 @@ class PointTracker:
 
     def add_points(self, points_px: np.ndarray, vehicles: np.ndarray) -> None:
         """Begin to follow points (n, 2), best first, that keep their distance from those followed already."""
-        free = list(np.flatnonzero(self._count == 0))
+        spacing = self._options.min_spacing_px
         near, _ = self.positions()
-        taken = list(near)
-        for point, vehicle in zip(points_px, vehicles, strict=True):
-            if not free:
-                return
-            if taken and (np.abs(np.array(taken) - point).max(axis=1) < self._options.min_spacing_px).any():
+        taken = {(int(x), int(y)) for x, y in near // spacing}
+        free = iter(np.flatnonzero(self._count == 0))
+        for point, cell, vehicle in zip(points_px, np.floor(points_px / spacing).astype(int).tolist(), vehicles,
+                                        strict=True):
+            if tuple(cell) in taken:
                 continue
-            slot = free.pop(0)
+            slot = next(free, None)
+            if slot is None:
+                return
+            taken.add((cell[0], cell[1]))
             self._history[slot, 0] = (self._time_s, *point)
             self._count[slot], self._vehicle[slot], self._step[slot] = 1, vehicle, 0.0
-            taken.append(point)
 
     def unfinished(self) -> list[Track]:
         """Return the tracks so far of the points still followed."""

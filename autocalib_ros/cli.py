@@ -1,0 +1,220 @@
+"""The `autocalib` command: replay a recording, simulate one, or demonstrate both."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import shutil
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+from autocalib_ros import __version__
+from autocalib_ros.config import Options
+from autocalib_ros.errors import AutocalibError, UsageError
+
+if TYPE_CHECKING:
+    from autocalib_ros.offline.replay import ReplayResult
+    from autocalib_ros.offline.sources import Source
+
+# Everything heavy (OpenCV, rosbags, matplotlib) is imported where it is used, so that --help is quick.
+
+CALIBRATED, WRONG_USE, REFUSED, INTERRUPTED = 0, 2, 3, 130
+DEFAULT_OUT = Path('autocalib_out')
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command; return 0 calibrated, 3 refused, 2 wrong usage or unreadable input, 130 interrupted."""
+    _silence_libraries()
+    _speak_to_any_terminal()
+    try:
+        with _warnings_on_stderr():
+            arguments = _parser(sys.argv[1:] if argv is None else list(argv))
+            return arguments.run(arguments)
+    except AutocalibError as error:
+        print(f'autocalib: error: {error}', file=sys.stderr)
+        return WRONG_USE
+    except KeyboardInterrupt:
+        print(file=sys.stderr)
+        return INTERRUPTED
+    except SystemExit as leave:  # argparse after --help and --version
+        return int(leave.code or 0)
+
+
+def _silence_libraries() -> None:
+    """Keep FFmpeg and OpenCV from writing to stderr on their own: what matters is said in one line."""
+    os.environ.setdefault('OPENCV_FFMPEG_LOGLEVEL', '-8')
+    os.environ.setdefault('OPENCV_LOG_LEVEL', 'OFF')
+    logging.getLogger('matplotlib').setLevel(logging.ERROR)
+
+
+def _speak_to_any_terminal() -> None:
+    """Print a replacement for what a terminal cannot show, such as the plus-minus sign, instead of failing."""
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, 'reconfigure'):
+            stream.reconfigure(errors='replace')
+
+
+@contextmanager
+def _warnings_on_stderr() -> Iterator[None]:
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(logging.Formatter('autocalib: warning: %(message)s'))
+    handler.setLevel(logging.WARNING)
+    logger = logging.getLogger('autocalib_ros')
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+
+
+class _Parser(argparse.ArgumentParser):
+    """argparse that answers wrong usage in one line, through the one place where errors are caught."""
+
+    def error(self, message: str) -> NoReturn:
+        """Raise UsageError."""
+        raise UsageError(f'{message} (see {self.prog} --help)')
+
+
+def _parser(argv: list[str]) -> argparse.Namespace:
+    parser = _Parser(prog='autocalib', description='Calibrate a fixed roadside camera from the traffic that it sees.')
+    parser.add_argument('--version', action='version', version=f'autocalib {__version__}')
+    commands = parser.add_subparsers(title='commands', metavar='COMMAND', required=True, parser_class=_Parser)
+    _add_replay(commands.add_parser('replay', help='calibrate from a recording', description=(
+        'Calibrate from a recording. Exit status: 0 calibrated, 3 refused, 2 wrong usage or unreadable input.')))
+    _add_simulate(commands.add_parser('simulate', help='write a recording of simulated traffic with known truth'), argv)
+    _add_demo(commands.add_parser('demo', help='simulate traffic, calibrate from it, compare with the truth'))
+    return parser.parse_args(argv)
+
+
+def _add_replay(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument('source', metavar='SOURCE', type=Path,
+                        help='rosbag2 folder, .mcap, .db3, ROS 1 .bag or video file')
+    parser.add_argument('--camera-height', type=float, metavar='H',
+                        help='height of the camera above the road in metres; without it only the lens is calibrated')
+    parser.add_argument('--topic', metavar='T', help='image topic; needed when there are several')
+    parser.add_argument('--params-file', type=Path, metavar='F', help='ROS 2 parameter file with options')
+    parser.add_argument('--method', choices=('joint', 'paper'), help='robust method (default) or the published one')
+    parser.add_argument('--allow-unit-scale', action='store_true',
+                        help="without a height, give the ground plane in units of the camera's height")
+    parser.add_argument('-p', '--param', action='append', default=[], metavar='NAME=VALUE',
+                        help='any option by its full name, for example tracking.max_points=400; may be repeated')
+    parser.add_argument('--out', type=Path, default=DEFAULT_OUT, metavar='DIR', help='folder for the results '
+                        '(default: %(default)s)')
+    parser.add_argument('--write-bag', type=Path, metavar='BAG',
+                        help='write a new rosbag2 with the images, CameraInfo and the ground transform')
+    parser.add_argument('--start', type=float, default=0.0, metavar='S', help='seconds to skip at the beginning')
+    parser.add_argument('--duration', type=float, metavar='S', help='seconds to use')
+    parser.add_argument('--quiet', action='store_true', help='no progress and no summary')
+    parser.set_defaults(run=_replay)
+
+
+def _add_simulate(parser: argparse.ArgumentParser, argv: list[str]) -> None:
+    if 'simulate' not in argv:
+        return  # the simulator's options come with the simulator, which takes a while to import
+    from autocalib_ros.offline import simulate
+
+    simulate.add_arguments(parser)
+    parser.set_defaults(run=lambda arguments: simulate.run(arguments) or 0)
+
+
+def _add_demo(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument('--out', type=Path, default=DEFAULT_OUT, metavar='DIR', help='folder for the results '
+                        '(default: %(default)s)')
+    parser.add_argument('--seed', type=int, default=0, metavar='N', help='seed of the simulated traffic')
+    parser.add_argument('--keep-bag', action='store_true', help='leave the simulated recording in DIR/recording')
+    parser.set_defaults(run=_demo)
+
+
+def _options(arguments: argparse.Namespace) -> Options:
+    """Put the options together: defaults, then the parameter file, then the command line."""
+    from autocalib_ros.offline.params import options_with, parse_assignments, read_params_file
+
+    values: dict[str, Any] = read_params_file(arguments.params_file) if arguments.params_file else {}
+    values.update(parse_assignments(arguments.param))
+    if arguments.camera_height is not None:
+        values['camera_height'] = arguments.camera_height
+    if arguments.method is not None:
+        values['method'] = arguments.method
+    if arguments.allow_unit_scale:
+        values['allow_unit_scale'] = True
+    return options_with(Options(), values)
+
+
+def _replay(arguments: argparse.Namespace) -> int:
+    options = _options(arguments)
+    from autocalib_ros.offline.sources import open_source
+
+    source = open_source(arguments.source, arguments.topic, arguments.start, arguments.duration)
+    from autocalib_ros.offline import outputs
+
+    outputs.prepare(arguments.out, arguments.write_bag)
+    replayed = _replay_and_tell(source, options, arguments.out, quiet=arguments.quiet)
+    if arguments.write_bag is not None:
+        _write_bag(arguments.write_bag, replayed, source)
+    return CALIBRATED if replayed.result else REFUSED
+
+
+def _replay_and_tell(source: Source, options: Options, out: Path, *, quiet: bool = False) -> ReplayResult:
+    """Replay, write the results, and say what came out: the summary on stdout, a refusal's reason on stderr."""
+    from autocalib_ros.offline.outputs import write_outputs
+    from autocalib_ros.offline.progress import progress_bar
+    from autocalib_ros.offline.replay import replay
+    from autocalib_ros.offline.summary import remedy, text_summary, verdict
+
+    if options.camera_height == 0 and not quiet:
+        scale = 'is given in units of that height' if options.allow_unit_scale else 'is left out'
+        _tell(f'No camera height given: the lens is calibrated, the ground plane {scale} (see --camera-height).')
+    with progress_bar(source.total, 'images', 'replay', quiet=quiet) as progress:
+        replayed = replay(source, options, progress.update_to)
+    names = write_outputs(out, replayed, source)
+    if not replayed.result:
+        _tell(f'{verdict(replayed.result)} {remedy(replayed.result)}'.rstrip())
+    if not quiet:
+        lines = text_summary(replayed.result, replayed.accepted_at_s).splitlines()
+        print('\n'.join(lines if replayed.result else lines[1:]))
+        print(f'Written to {out}: {", ".join(names)}')
+    return replayed
+
+
+def _write_bag(path: Path, replayed: ReplayResult, source: Source) -> None:
+    if not replayed.result:
+        _tell(f'{path} is not written: there is no calibration')
+        return
+    from autocalib_ros.offline.write_bag import write_bag
+
+    write_bag(path, replayed.result, source)
+
+
+def _tell(line: str) -> None:
+    print(line, file=sys.stderr)
+
+
+def _demo(arguments: argparse.Namespace) -> int:
+    from autocalib_ros.offline import outputs
+    from autocalib_ros.offline.demo import compare, simulate_into
+    from autocalib_ros.offline.sources import open_source
+
+    bag = arguments.out / 'recording'
+    outputs.prepare(arguments.out, bag)
+    try:
+        truth = simulate_into(bag, arguments.seed)
+        options = Options(camera_height=truth['camera']['height'])
+        replayed = _replay_and_tell(open_source(bag), options, arguments.out)
+    finally:
+        if not arguments.keep_bag:
+            shutil.rmtree(bag, ignore_errors=True)
+    comparison = compare(replayed.result, truth)
+    if comparison is None:
+        return REFUSED
+    print(comparison.table())
+    if not comparison.good:
+        _tell('The demonstration failed: the result is farther from the truth than promised.')
+    return CALIBRATED if comparison.good else REFUSED
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,266 @@
+"""Recordings of ROS through rosbags: topics, stamps, and what is left of a damaged file."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from rosbags.interfaces import Connection
+from rosbags.rosbag1 import Reader as Reader1
+from rosbags.rosbag2 import Reader as Reader2
+from rosbags.typesys import Stores, get_typestore
+
+from autocalib_ros.errors import AutocalibError, InputError, UsageError
+from autocalib_ros.offline.sources import Frame, StoredImage, Window, nothing_in_window
+from autocalib_ros.offline.torn_mcap import is_torn, sealed
+from autocalib_ros.perception.images import ImageDecoder
+
+LOG = logging.getLogger(__name__)
+
+IMAGE_TYPES = ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage')
+PEEKED = 5
+"""Images looked at beforehand to learn whether their header stamps can be trusted."""
+REORDERED_NS = 1_000_000_000
+"""Images that step back by less than this came late; by more, the clock was set."""
+ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
+
+
+@dataclass(frozen=True)
+class _Stored:
+    """One message: when it was recorded, its bytes as CDR or ROS 1, and the message."""
+
+    recorded_ns: int
+    raw: bytes | memoryview
+    message: Any
+
+
+class BagSource:
+    """The images of one topic of a rosbag2 folder, a lone .mcap or .db3, or a ROS 1 .bag."""
+
+    def __init__(self, path: Path, topic: str | None, window: Window) -> None:
+        self.name = str(path)
+        self._path, self._window = path, window
+        self._ros1 = path.suffix.lower() == '.bag'
+        self._types = get_typestore(Stores.ROS1_NOETIC if self._ros1 else Stores.ROS2_JAZZY)
+        with _clear_errors(path), _opened(path) as readers:
+            topics = _Topics(self.name, readers)
+            self.topic, self.image_type = topics.choose(topic)
+            count = topics.counts[self.topic]
+            first = self._peek(readers)
+            recording_s = (max(reader.end_time for reader in readers) - self._first_ns) * 1e-9
+        self.camera_frame = first.header.frame_id.lstrip('/') if first else ''
+        self.duration_s = window.seconds_of(recording_s)
+        if any(is_torn(part) for part in _parts(path)):
+            LOG.warning('%s ended early, its recorder did not close it; what is whole of it is used', self.name)
+        self.total = count if window.whole else round(count * self.duration_s / max(recording_s, 1e-9))
+
+    def frames(self) -> Iterator[Frame]:
+        """Decode the images of the window; InputError when there is none."""
+        decoder, order = ImageDecoder(), _Order()
+        decoded, broken, reason = 0, 0, ''
+        for stored in self._messages():
+            try:
+                if stored.message is None:
+                    raise InputError('the message is damaged')
+                image = decoder.decode(stored.message)
+            except InputError as error:
+                broken, reason = broken + 1, reason or str(error)
+                continue
+            decoded += 1
+            stamp_ns = self._stamp_ns(stored)
+            if order.accepts(stamp_ns):
+                yield Frame(stamp_ns, image)
+        if broken and not decoded:
+            raise InputError(f'none of the {broken} images on {self.topic} of {self.name} can be decoded: {reason}')
+        if broken:
+            LOG.warning('%d of %d images could not be decoded and were skipped; the first: %s', broken,
+                        broken + decoded, reason)
+        if order.late:
+            LOG.warning('%d images came late or twice and were skipped', order.late)
+
+    def stored(self) -> Iterator[StoredImage]:
+        """Go through the messages of the window as CDR."""
+        for stored in self._messages():
+            if stored.message is not None:
+                header = stored.message.header
+                cdr = self._ros2_cdr(stored.message) if self._ros1 else stored.raw
+                yield StoredImage(stored.recorded_ns, _header_ns(header), header.frame_id, cdr)
+
+    def _messages(self) -> Iterator[_Stored]:
+        """Read the window's messages; a recording that breaks off midway gives what it has, and a warning."""
+        start_ns, stop_ns = self._window.bounds_ns
+        start_ns += self._first_ns
+        stop_ns = None if stop_ns is None else stop_ns + self._first_ns
+        given = 0
+        with ExitStack() as stack:
+            with _clear_errors(self._path):
+                readers = stack.enter_context(_opened(self._path))
+            try:
+                for stored in self._read(readers, None if self._window.start_s == 0 else start_ns, stop_ns):
+                    given += 1
+                    yield stored
+            except AutocalibError:
+                raise
+            except Exception as error:  # a damaged file can raise anything from the depths of its decoder
+                if not given:
+                    raise InputError(f'cannot read {self.name}: {_one_line(error)}') from error
+                LOG.warning('%s ended early, after %d images: %s', self.name, given, _one_line(error))
+        if not given:
+            raise nothing_in_window(self.name, self._window, None)
+
+    def _read(self, readers: list[Any], start_ns: int | None, stop_ns: int | None) -> Iterator[_Stored]:
+        for reader in readers:
+            wanted = [c for c in reader.connections if (c.topic, c.msgtype) == (self.topic, self.image_type)]
+            for _, recorded_ns, raw in reader.messages(wanted, start_ns, stop_ns) if wanted else ():
+                raw = _unpacked(raw)
+                yield _Stored(recorded_ns, raw, self._message(raw))
+
+    def _message(self, raw: bytes | memoryview) -> Any:
+        """Return the message, or None where its bytes make no sense."""
+        read = self._types.deserialize_ros1 if self._ros1 else self._types.deserialize_cdr
+        try:
+            return read(raw, self.image_type)
+        except Exception:  # noqa: BLE001  a damaged message can raise anything; one is no reason to stop
+            return None
+
+    def _peek(self, readers: list[Any]) -> Any:
+        """Look at the first images: where time begins, and whether the stamps in their headers can be used."""
+        first = list(islice(self._read(readers, None, None), PEEKED))
+        if not first:
+            raise InputError(f'{self.name} gives no image on {self.topic}')
+        self._first_ns = first[0].recorded_ns
+        messages = [stored.message for stored in first if stored.message is not None]
+        stamps = [_header_ns(message.header) for message in messages]
+        self._use_headers = bool(stamps) and stamps[0] > 0 and (len(stamps) == 1 or len(set(stamps)) > 1)
+        if stamps and not self._use_headers:
+            what = 'zero' if stamps[0] <= 0 else 'always the same'
+            LOG.warning('the stamps in the headers on %s are %s; the times of recording are used', self.topic, what)
+        return messages[0] if messages else None
+
+    def _stamp_ns(self, stored: _Stored) -> int:
+        return _header_ns(stored.message.header) if self._use_headers else stored.recorded_ns
+
+    def _ros2_cdr(self, message: Any) -> memoryview:
+        """Return a message of ROS 1 as CDR; its header loses its `seq`."""
+        types = get_typestore(Stores.ROS2_JAZZY)
+        time, header = types.types['builtin_interfaces/msg/Time'], types.types['std_msgs/msg/Header']
+        stamp = message.header.stamp
+        fields = {name: value for name, value in vars(message).items() if name not in ('header', '__msgtype__')}
+        copied = types.types[self.image_type](
+            header=header(stamp=time(sec=stamp.sec, nanosec=stamp.nanosec), frame_id=message.header.frame_id), **fields)
+        return types.serialize_cdr(copied, self.image_type)
+
+
+class _Topics:
+    """The topics of a recording, for the choice of one and for what is said when it cannot be made."""
+
+    def __init__(self, name: str, readers: list[Any]) -> None:
+        self._name = name
+        self.counts: dict[str, int] = {}
+        self._types: dict[str, str] = {}
+        for connection in (c for reader in readers for c in reader.connections):
+            self._add(connection)
+        if not any(self.counts.values()):
+            raise InputError(f'{name} is an empty recording: it holds no message')
+
+    def _add(self, connection: Connection) -> None:
+        self.counts[connection.topic] = self.counts.get(connection.topic, 0) + connection.msgcount
+        self._types[connection.topic] = connection.msgtype
+
+    def choose(self, topic: str | None) -> tuple[str, str]:
+        """Return the image topic and its type: the one asked for, or the only one there is."""
+        images = [name for name in self.counts if self._types[name] in IMAGE_TYPES and self.counts[name]]
+        if not images:
+            raise InputError(f'{self._name} holds no images; its topics: {self._listed(self.counts)}')
+        if topic is None and len(images) > 1:
+            raise UsageError(f'{self._name} has {len(images)} image topics, choose one with --topic:'
+                             f' {self._listed(images)}')
+        chosen = images[0] if topic is None else '/' + topic.lstrip('/')
+        if chosen not in self.counts:
+            raise UsageError(f'{self._name} has no topic {chosen}; its image topics: {self._listed(images)}')
+        if chosen not in images:
+            raise UsageError(f'{chosen} holds no images but {self._listed([chosen])}; image topics:'
+                             f' {self._listed(images)}')
+        return chosen, self._types[chosen]
+
+    def _listed(self, topics: Any) -> str:
+        return ', '.join(f'{topic} ({self._types[topic]}, {self.counts[topic]} messages)' for topic in sorted(topics))
+
+
+class _Order:
+    """Lets stamps pass that grow, or that step back so far that the clock must have been set."""
+
+    def __init__(self) -> None:
+        self._newest_ns: int | None = None
+        self.late = 0
+
+    def accepts(self, stamp_ns: int) -> bool:
+        """Say whether an image of that stamp is to be used."""
+        newest = self._newest_ns
+        if newest is not None and newest - REORDERED_NS < stamp_ns <= newest:
+            self.late += 1
+            return False
+        self._newest_ns = stamp_ns
+        return True
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[list[Any]]:
+    """Open all files of a recording; a folder without metadata.yaml is what a recorder leaves that was killed."""
+    with ExitStack() as stack:
+        readers = [stack.enter_context(Reader1(part) if part.suffix.lower() == '.bag' else Reader2(sealed(part)))
+                   for part in _parts(path)]
+        yield sorted(readers, key=lambda reader: reader.start_time)
+
+
+def _parts(path: Path) -> list[Path]:
+    """Return what is to be opened: the recording itself, or the files of a folder whose metadata.yaml is no use."""
+    if not path.is_dir():
+        return [path]
+    parts = sorted(part for part in path.iterdir() if part.suffix in ('.mcap', '.db3'))
+    metadata = path / 'metadata.yaml'
+    if metadata.exists() and (not parts or metadata.stat().st_size) and not any(is_torn(part) for part in parts):
+        return [path]
+    if not parts:
+        raise InputError(f'{path} is not a recording: it has neither a metadata.yaml nor .mcap or .db3 files')
+    if len({part.suffix for part in parts}) > 1:
+        raise InputError(f'{path} has no metadata.yaml and holds both .mcap and .db3 files: give one of them')
+    return parts
+
+
+@contextmanager
+def _clear_errors(path: Path) -> Iterator[None]:
+    """Turn whatever a damaged file makes rosbags raise into one line."""
+    try:
+        yield
+    except AutocalibError:
+        raise
+    except Exception as error:
+        raise InputError(f'cannot read {path}: {_one_line(error)}') from error
+
+
+def _one_line(error: Exception) -> str:
+    text = ' '.join(str(error).split()).rstrip('.')
+    if 'disk image is malformed' in text:
+        text += " (a damaged SQLite file: 'sqlite3 FILE .recover' may save a part)"
+    return text or f'it is damaged ({type(error).__name__})'
+
+
+def _header_ns(header: Any) -> int:
+    return header.stamp.sec * 1_000_000_000 + header.stamp.nanosec
+
+
+def _unpacked(raw: bytes | memoryview) -> bytes | memoryview:
+    """Unpack a message of a lone file whose metadata.yaml, gone by now, said that messages are compressed."""
+    if bytes(raw[:4]) != ZSTD_MAGIC:  # a CDR message begins with 00, a ROS 1 image with its counter
+        return raw
+    try:
+        from compression import zstd  # Python 3.14
+    except ImportError:
+        from backports import zstd  # comes with rosbags
+    return zstd.decompress(raw)

@@ -1,0 +1,61 @@
+"""The files of a replay: checked for before the work, written after it."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from autocalib_ros.calibration import Calibration, write_calibration_json, write_camera_info_yaml
+from autocalib_ros.errors import InputError, UsageError
+from autocalib_ros.offline.replay import ReplayResult
+from autocalib_ros.offline.sources import Source
+
+CAMERA_INFO, CALIBRATION, EVIDENCE, REPORT = 'camera_info.yaml', 'calibration.json', 'evidence.npz', 'report.html'
+
+
+def prepare(out_dir: Path, bag: Path | None) -> None:
+    """Make the folder for the results, and make sure that nothing stands in the way; UsageError otherwise."""
+    if out_dir.exists() and not out_dir.is_dir():
+        raise UsageError(f'{out_dir} is a file, not a folder for the results')
+    try:
+        out_dir.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f'cannot make the folder {out_dir}: {error.strerror or error}') from error
+    if not os.access(out_dir, os.W_OK):
+        raise UsageError(f'cannot write into the folder {out_dir}')
+    if bag is not None and bag.exists():
+        raise UsageError(f'{bag} exists already and is not overwritten; remove it or choose another name')
+
+
+def camera_name(source: Source) -> str:
+    """Return the namespace of the image topic, else the frame of its images, else 'camera'."""
+    namespace = '_'.join(image_topic(source).strip('/').split('/')[:-1])
+    return namespace or source.camera_frame or 'camera'
+
+
+def image_topic(source: Source) -> str:
+    """Return the image topic without the suffix that image_transport gives to compressed images."""
+    compressed = source.image_type.endswith('/CompressedImage')
+    return source.topic.removesuffix('/compressed') if compressed else source.topic
+
+
+def write_outputs(out_dir: Path, replayed: ReplayResult, source: Source) -> list[str]:
+    """Write all results, and remove those of an earlier run that no longer hold; return the names written."""
+    from autocalib_ros.offline.report import write_report  # imported late: it needs matplotlib
+
+    result = replayed.result
+    if isinstance(result, Calibration):
+        write_camera_info_yaml(out_dir / CAMERA_INFO, result.camera, camera_name(source))
+    else:
+        _remove(out_dir / CAMERA_INFO)
+    write_calibration_json(out_dir / CALIBRATION, result, accepted_at_s=replayed.accepted_at_s)
+    replayed.evidence.save(out_dir / EVIDENCE)
+    write_report(out_dir / REPORT, replayed, source.name)
+    return ([CAMERA_INFO] if result else []) + [CALIBRATION, REPORT, EVIDENCE]
+
+
+def _remove(path: Path) -> None:
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise InputError(f'cannot remove {path} of an earlier run: {error.strerror or error}') from error

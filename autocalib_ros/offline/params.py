@@ -1,0 +1,89 @@
+"""Options from a ROS 2 parameter file and from `name=value` on the command line."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from autocalib_ros.config import NodeOptions, Options, declared, flattened, with_values
+from autocalib_ros.errors import InputError, UsageError
+
+WILDCARDS = ('*', '**')
+OF_ROS = ('use_sim_time', 'start_type_description_service')
+OVERRIDES_OF_ROS = 'qos_overrides.'
+
+
+def read_params_file(path: Path) -> dict[str, Any]:
+    """Return the core's options in a ROS 2 parameter file by full name; what only a live node needs is left out."""
+    try:
+        tree = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
+    except OSError as error:
+        raise InputError(f'cannot read {path}: {error.strerror or error}') from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise InputError(f'{path} is not YAML: {" ".join(str(error).split())}') from error
+    values: dict[str, Any] = {}
+    for section in _chosen(path, _sections(tree)):
+        values.update(flattened(section))
+    return {name: value for name, value in values.items() if not _only_for_nodes(name)}
+
+
+def _sections(tree: Any, name: str = '') -> dict[str, Mapping[str, Any]]:
+    """Find every `ros__parameters` with the full name of its node; namespaces may be nested."""
+    found: dict[str, Mapping[str, Any]] = {}
+    for key, value in tree.items() if isinstance(tree, Mapping) else ():
+        if key == 'ros__parameters':
+            found[name] = value if isinstance(value, Mapping) else {}
+        else:
+            found.update(_sections(value, f'{name}/{key}'.replace('//', '/')))
+    return found
+
+
+def _chosen(path: Path, sections: dict[str, Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """Return the sections that hold for a replay, those for all nodes first: a file may serve several nodes."""
+    if not sections:
+        raise InputError(f"{path} is not a ROS 2 parameter file: it has no 'ros__parameters'")
+    general = [name for name in sections if name.split('/')[-1] in WILDCARDS]
+    named = [name for name in sections if name not in general]
+    if len(named) > 1:
+        named = [name for name in named if 'autocalib' in name.split('/')[-1]]
+    if len(named) > 1:
+        raise UsageError(f'{path} holds parameters for several nodes: {", ".join(named)}; a replay needs one of them')
+    return [sections[name] for name in general + named]
+
+
+def _only_for_nodes(name: str) -> bool:
+    node_names = {item.name for item in declared(NodeOptions())}
+    return name in node_names or name in OF_ROS or name.startswith(OVERRIDES_OF_ROS)
+
+
+def parse_assignments(assignments: list[str]) -> dict[str, Any]:
+    """Return the values of `name=value` or `name:=value`, read as YAML."""
+    values: dict[str, Any] = {}
+    for text in assignments:
+        name, equals, value = text.replace(':=', '=', 1).partition('=')
+        if not name.strip() or not equals:
+            raise UsageError(f"'-p {text}' is not of the form name=value")
+        try:
+            values[name.strip()] = yaml.safe_load(value)
+        except yaml.YAMLError as error:
+            raise UsageError(f"'-p {text}' has a value that is not YAML") from error
+    return values
+
+
+def options_with(options: Options, values: Mapping[str, Any]) -> Options:
+    """Return `options` with values by full name; YAML takes `1e-05`, without a point, for text."""
+    floats = {item.name for item in declared(options) if isinstance(item.default, float)}
+    return with_values(options, {name: _as_float(value) if name in floats else value
+                                 for name, value in values.items()})
+
+
+def _as_float(value: Any) -> Any:
+    if not isinstance(value, str):
+        return value
+    try:
+        return float(value)
+    except ValueError:
+        return value  # the option itself says best what it takes

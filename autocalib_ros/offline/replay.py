@@ -1,0 +1,55 @@
+"""A recording through the same AutoCalibrator that the live node holds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from autocalib_ros.calibration import Calibration, Refusal
+from autocalib_ros.calibrator import AutoCalibrator, solve
+from autocalib_ros.config import Options
+from autocalib_ros.errors import InputError
+from autocalib_ros.evidence import Evidence
+from autocalib_ros.offline.sources import Source
+
+NOTE_EVERY = 15
+"""Frames between two questions for the progress: it is for people, who read slowly."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplayResult:
+    """What a recording gave."""
+
+    result: Calibration | Refusal
+    evidence: Evidence
+    accepted_at_s: float | None
+    """Seconds of recording until the first accepted calibration."""
+    background: np.ndarray | None
+    """The road without its traffic, BGR uint8."""
+    frames: int
+
+
+def replay(source: Source, options: Options, on_progress: Callable[[int, str], None] | None = None) -> ReplayResult:
+    """Go through a recording and solve at its end; `on_progress` is told the frames done and a short note."""
+    calibrator, accepted_at_s, count, note = AutoCalibrator(options), None, 0, ''
+    for count, frame in enumerate(source.frames(), start=1):
+        calibrator.add_image(frame.stamp_ns, frame.image)
+        # a live run would have been accepted then; afterwards only the last solution counts
+        if accepted_at_s is None and (due := calibrator.take_due()) is not None and solve(due, options):
+            accepted_at_s = due.seconds
+        if on_progress is not None:
+            if count % NOTE_EVERY == 1:
+                note = f'{calibrator.progress().percent:.0f} % of the evidence'
+            on_progress(count, note)
+    evidence = calibrator.snapshot()
+    if evidence is None:
+        raise InputError(f'{source.name} gives no image')
+    if on_progress is not None:
+        on_progress(count, 'solving')
+    result = solve(evidence, options)
+    if result and accepted_at_s is None:
+        accepted_at_s = evidence.seconds
+    return ReplayResult(result=result, evidence=evidence, accepted_at_s=accepted_at_s,
+                        background=calibrator.background(), frames=count)

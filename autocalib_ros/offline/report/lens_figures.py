@@ -1,0 +1,119 @@
+"""What the lens does and how sure it is."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from autocalib_ros.calibration import Calibration, rectified_matrix
+from autocalib_ros.camera import Camera
+from autocalib_ros.offline.report.canvas import (
+    INK,
+    MUTED,
+    Scene,
+    chart,
+    draw_legend,
+    draw_paths,
+    image_axes,
+    road_colour,
+)
+
+LEAST_ERROR_PX = 1e-3
+"""Below this a track counts as straight; it keeps the logarithmic axes finite."""
+
+
+def undistorted(scene: Scene) -> Figure | None:
+    """Show the road as a distortion-free camera would see it, with the kept tracks, which are straight there."""
+    if scene.calibration is None or scene.background is None:
+        return None
+    camera = scene.calibration.camera
+    matrix = rectified_matrix(camera)
+    figure, axes = image_axes(scene, picture=undistorted_picture(scene.background, camera, matrix))
+    for label in range(int(scene.labels.max(initial=-1)) + 1):
+        paths = [in_undistorted(camera, matrix, path) for path in _paths(scene, label)]
+        draw_paths(axes, paths, road_colour(label), alpha=0.6, width=0.8)
+    return figure
+
+
+def undistorted_picture(picture: np.ndarray, camera: Camera, matrix: np.ndarray) -> np.ndarray:
+    """Resample a picture into the distortion-free camera of a matrix (3, 3)."""
+    pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1)
+    ones = np.ones((*pixels.shape[:2], 1))
+    bearings = np.concatenate([pixels, ones], axis=2) @ np.linalg.inv(matrix).T
+    sources, _ = camera.project(bearings)
+    return cv2.remap(picture, sources.astype(np.float32), None, cv2.INTER_LINEAR)
+
+
+def in_undistorted(camera: Camera, matrix: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Return where pixels (n, 2) lie in the distortion-free picture; nan where it does not reach."""
+    bearings, valid = camera.unproject(pixels)
+    ahead = valid & (bearings[:, 2] > 1e-6)
+    flat = bearings[:, :2] / np.where(ahead, bearings[:, 2], np.nan)[:, None]
+    return flat * matrix[[0, 1], [0, 1]] + matrix[:2, 2]
+
+
+def straightness(scene: Scene) -> Figure | None:
+    """Compare how far each kept track strays from its line before and after undistortion."""
+    if scene.calibration is None or not (scene.labels >= 0).any():
+        return None
+    figure, axes = chart(4.8)
+    camera, ends = scene.calibration.camera, []
+    for label in range(int(scene.labels.max()) + 1):
+        errors = np.array([(line_error_px(path), line_error_px(camera.undistort(path)))
+                           for path in _paths(scene, label)]).reshape(-1, 2)
+        errors = np.maximum(errors[np.isfinite(errors).all(axis=1)], LEAST_ERROR_PX)
+        if len(errors):
+            before, after = np.median(errors, axis=0)
+            ends.append(errors)
+            axes.loglog(*errors.T, 'o', color=road_colour(label), alpha=0.6, markersize=4,
+                        label=f'road direction {label + 1}: median {before:.2f} px before, {after:.2f} px after')
+    if not ends:
+        return None
+    span = [np.concatenate(ends).min(), np.concatenate(ends).max()]
+    axes.plot(span, span, color=MUTED, linewidth=1, label='no change')
+    axes.set_xlabel('distance from a straight line before, px (root mean square)', color=INK)
+    axes.set_ylabel('after undistortion, px', color=INK)
+    axes.legend(fontsize=9, frameon=False, loc='upper left')
+    return figure
+
+
+def line_error_px(points: np.ndarray) -> float:
+    """Return the root mean square distance of points (n, 2) from their best line."""
+    if not np.isfinite(points).all():
+        return np.nan
+    return float(np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[-1] / np.sqrt(len(points)))
+
+
+def focal_sweep(scene: Scene) -> Figure | None:
+    """Draw the straightness error over trial focal lengths, with what was chosen."""
+    sweep = scene.result.figures.focal_sweep_px
+    sweep = sweep[np.isfinite(sweep).all(axis=1)] if len(sweep) else sweep
+    if not len(sweep):
+        return None
+    figure, axes = chart(3.6)
+    axes.plot(*sweep.T, color=INK, linewidth=1.6)
+    if (sweep[:, 1] > 0).all():
+        axes.set_yscale('log')
+    if scene.calibration is not None:
+        _mark_focal(axes, scene.calibration)
+    axes.set_xlabel('trial focal length, px', color=INK)
+    axes.set_ylabel('error of straightness, px²', color=INK)
+    draw_legend(axes, 'upper center')
+    return figure
+
+
+def _mark_focal(axes: Axes, calibration: Calibration) -> None:
+    """Mark the result with its sigma, and what the published method takes."""
+    focal, sigma = calibration.camera.focal_px, calibration.stddev.focal_px
+    axes.axvline(focal, color=road_colour(0), linewidth=2, label=f'result: {focal:.1f} px')
+    if sigma:
+        axes.axvspan(focal - sigma, focal + sigma, color=road_colour(0), alpha=0.2, linewidth=0)
+    if calibration.paper is not None:
+        axes.axvline(calibration.paper.focal_px, color=road_colour(1), linestyle='--', linewidth=1.6,
+                     label=f"the paper's: {calibration.paper.focal_px:.1f} px")
+
+
+def _paths(scene: Scene, label: int) -> list[np.ndarray]:
+    return [scene.evidence.track(index).points_px for index in np.flatnonzero(scene.labels == label)]

@@ -1,0 +1,28 @@
+"""A synthetic junction seen through a known lens, as a recording with its truth beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from .command import add_arguments, options_from, run
+from .options import SimulationOptions
+from .simulation import Simulation
+
+__all__ = [
+    'Simulation', 'SimulationOptions', 'add_arguments', 'options_from', 'run', 'write_bag'
+]
+
+
+def write_bag(
+    path: Path | str,
+    options: SimulationOptions,
+    *,
+    workers: int | None = None,
+    overwrite: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> Path:
+    """Simulate a recording into a new bag folder; see `bag.write_bag`."""
+    from .bag import write_bag as write  # rosbags is needed for nothing else
+
+    return write(path, options, workers=workers, overwrite=overwrite, progress=progress)

@@ -1,0 +1,210 @@
+"""A simulated recording as a rosbag2 folder with truth.json in it."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.rosbag2.errors import WriterError
+from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.store import Typestore
+
+from autocalib_ros.errors import InputError, UsageError
+
+from .options import SimulationOptions
+from .simulation import Simulation
+
+TRUTH_NAME = 'truth.json'
+_BAG_VERSION: Literal[9] = 9
+_LATENCY_NS = 5_000_000  # recorders see an image a little after its stamp
+_BATCH = 64
+_JPEG_QUALITY = 92
+
+
+def write_bag(
+    path: Path | str,
+    options: SimulationOptions,
+    *,
+    workers: int | None = None,
+    overwrite: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> Path:
+    """Simulate a recording into a new bag folder, with truth.json in it; return the folder.
+
+    workers: processes that draw (default: one for each core); the result does not depend on it.
+    overwrite: replace a bag of that name.  progress: called with (frames done, frames in all).
+    """
+    path = Path(path)
+    if workers is not None and workers < 1:
+        raise UsageError(f'workers is {workers}: choose 1 or more')
+    _make_room(path, overwrite)
+    simulation = Simulation(options)
+    try:
+        with _writer(path, options) as writer:
+            _write_messages(writer, simulation, workers or _cores(), progress)
+        text = json.dumps(simulation.truth(), indent=1)
+        (path / TRUTH_NAME).write_text(text, encoding='utf-8')
+    except BaseException as error:
+        shutil.rmtree(path, ignore_errors=True)  # half a bag is worse than none
+        if isinstance(error, (OSError, WriterError)):
+            raise InputError(f'cannot write {path}: {error}') from error
+        raise
+    return path
+
+
+def _make_room(path: Path, overwrite: bool) -> None:
+    """Make sure that nothing stands at the path; remove only what is a bag, and only if told to."""
+    if not path.exists():
+        return
+    if path.is_dir() and not any(path.iterdir()):
+        path.rmdir()
+        return
+    if not overwrite:
+        raise UsageError(
+            f'{path} exists already: choose another name, or --overwrite to replace the bag'
+        )
+    if not (path / 'metadata.yaml').is_file():
+        raise UsageError(
+            f'{path} is not a bag (no metadata.yaml in it), so it is not overwritten: '
+            'remove it yourself or choose another name'
+        )
+    shutil.rmtree(path)
+
+
+def _writer(path: Path, options: SimulationOptions) -> Writer:
+    """Return a writer for the storage that the options name."""
+    plugin = StoragePlugin.MCAP if options.storage == 'mcap' else StoragePlugin.SQLITE3
+    path.parent.mkdir(parents=True, exist_ok=True)
+    writer = Writer(path, version=_BAG_VERSION, storage_plugin=plugin)
+    if options.zstd:
+        writer.set_compression(CompressionMode.MESSAGE, CompressionFormat.ZSTD)
+    return writer
+
+
+def _cores() -> int:
+    if hasattr(os, 'sched_getaffinity'):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _write_messages(
+    writer: Writer, simulation: Simulation, workers: int,
+    progress: Callable[[int, int], None] | None,
+) -> None:
+    options, store = simulation.options, _typestore()
+    kind = 'CompressedImage' if options.compressed else 'Image'
+    topic = options.topic + '/compressed' * options.compressed
+    images = writer.add_connection(topic, f'sensor_msgs/msg/{kind}', typestore=store)
+    infos = writer.add_connection(
+        options.truth_topic, 'sensor_msgs/msg/CameraInfo', typestore=store
+    )
+    with _drawn(simulation, min(workers, options.frame_count)) as messages:
+        for index, message in enumerate(messages):
+            recorded_ns = simulation.stamp_ns(index) + _LATENCY_NS
+            writer.write(images, recorded_ns, message)
+            writer.write(infos, recorded_ns, _camera_info(simulation, index))
+            if progress is not None:
+                progress(index + 1, options.frame_count)
+
+
+@contextmanager
+def _drawn(simulation: Simulation, workers: int) -> Iterator[Iterator[bytes]]:
+    """Hand out the serialised images in order, drawn here or by other processes."""
+    count = simulation.options.frame_count
+    if workers == 1:
+        yield (_image(simulation, index) for index in range(count))
+        return
+    # Spawned, not forked: OpenCV and BLAS have threads of their own. The backdrop goes along.
+    simulation.artist().prepare()
+    context = multiprocessing.get_context('spawn')
+    with context.Pool(workers, _start_worker, (simulation,)) as pool:
+        yield _in_batches(pool, count)
+
+
+def _in_batches(pool: Any, count: int) -> Iterator[bytes]:
+    """Hand out images in order; only a batch at a time, or a slow disk would fill the memory."""
+    for start in range(0, count, _BATCH):
+        yield from pool.imap(_work, range(start, min(start + _BATCH, count)))
+
+
+_worker_simulation: Simulation | None = None
+
+
+def _start_worker(simulation: Simulation) -> None:
+    global _worker_simulation
+    cv2.setNumThreads(1)
+    _worker_simulation = simulation
+
+
+def _work(index: int) -> bytes:
+    if _worker_simulation is None:
+        raise RuntimeError('worker process without a simulation')
+    return _image(_worker_simulation, index)
+
+
+@lru_cache(maxsize=1)
+def _typestore() -> Typestore:
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+def _header(simulation: Simulation, index: int) -> Any:
+    types = _typestore().types
+    seconds, nanoseconds = divmod(simulation.stamp_ns(index), 1_000_000_000)
+    stamp = types['builtin_interfaces/msg/Time'](sec=seconds, nanosec=nanoseconds)
+    return types['std_msgs/msg/Header'](stamp=stamp, frame_id=simulation.options.frame_id)
+
+
+def _image(simulation: Simulation, index: int) -> bytes:
+    """Draw a frame and return it as a serialised message."""
+    frame, options = simulation.frame(index), simulation.options
+    encoding = 'mono16' if options.thermal else 'bgr8'
+    store, header = _typestore(), _header(simulation, index)
+    if options.compressed:
+        name, fields = 'CompressedImage', _compressed(frame, encoding)
+    else:
+        name = 'Image'
+        fields = {
+            'height': frame.shape[0], 'width': frame.shape[1], 'encoding': encoding,
+            'is_bigendian': 0, 'step': frame.strides[0],
+            'data': np.ascontiguousarray(frame).reshape(-1).view(np.uint8),
+        }
+    name = f'sensor_msgs/msg/{name}'
+    return bytes(store.serialize_cdr(store.types[name](header=header, **fields), name))
+
+
+def _compressed(frame: np.ndarray, encoding: str) -> dict[str, Any]:
+    """Compress as image_transport does: JPEG, or PNG for 16 bits."""
+    if encoding == 'mono16':
+        _, data = cv2.imencode('.png', frame, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+        return {'format': 'mono16; png compressed ', 'data': data.reshape(-1)}
+    _, data = cv2.imencode('.jpg', frame, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+    return {'format': 'bgr8; jpeg compressed bgr8', 'data': data.reshape(-1)}
+
+
+def _camera_info(simulation: Simulation, index: int) -> bytes | memoryview:
+    """Return the true CameraInfo of a frame, serialised."""
+    store, options, lens = _typestore(), simulation.options, simulation.lens
+    (cx, cy), f = lens.centre_px, lens.focal_px
+    name = 'sensor_msgs/msg/CameraInfo'
+    roi = store.types['sensor_msgs/msg/RegionOfInterest'](
+        x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
+    )
+    # Readers take all-zero coefficients of this model for "no distortion at all".
+    d = [k or 1e-9 if i == 0 else k for i, k in enumerate(lens.k)]
+    message = store.types[name](
+        header=_header(simulation, index), height=options.height_px, width=options.width_px,
+        distortion_model='equidistant', d=np.array(d), k=np.array([f, 0, cx, 0, f, cy, 0, 0, 1.0]),
+        r=np.eye(3).reshape(-1), p=np.array([f, 0, cx, 0, 0, f, cy, 0, 0, 0, 1.0, 0]),
+        binning_x=0, binning_y=0, roi=roi,
+    )
+    return store.serialize_cdr(message, name)

@@ -1,0 +1,81 @@
+"""Light at night: beams on the road, pools under street lamps, blobs of head and tail lamps."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+
+from .faces import SAMPLES, Canvas, Faces, Texture
+from .lens import CameraPose
+from .paint import mixed
+from .sensor import add_glow
+from .shapes import SHAPES
+from .traffic import Vehicle, VehicleState
+
+_HEAD = (215, 240, 255)
+_TAIL = (40, 30, 230)
+_BEAM_M = (16.0, 6.0)
+
+
+@lru_cache(maxsize=16)
+def beam_of(kind: str) -> Faces:
+    """Return the light that a vehicle throws on the road before it, to be drawn as a gain."""
+    length, width = _BEAM_M
+    start = SHAPES[kind].length_m / 2
+    # Texture x runs along the beam, y across it.
+    x, y = np.linspace(0, 1, 96)[None], np.linspace(-1, 1, 48)[:, None]
+    spread = 0.25 + 0.5 * x
+    light = np.exp(-((y / spread) ** 2)) * np.clip(x * 12, 0, 1) * (1 - x) ** 1.3
+    return _gain_faces(light, [(start, width / 2, 0.02), (length, 0, 0), (0, -width, 0)])
+
+
+@lru_cache(maxsize=1)
+def pool() -> Faces:
+    """Return the pool of light under a street lamp, to be drawn as a gain."""
+    line = np.linspace(-1, 1, 64)
+    light = np.exp(-3.5 * (line[None] ** 2 + line[:, None] ** 2))
+    return _gain_faces(0.6 * light, [(-10, 10, 0.01), (20, 0, 0), (0, -20, 0)])
+
+
+def _gain_faces(light: np.ndarray, corners: list[tuple[float, float, float]]) -> Faces:
+    picture = np.full((*light.shape, 4), 255, np.uint8)
+    picture[..., :3] = (100 + 155 * np.clip(light, 0, 1))[..., None]
+    return Faces(np.array([corners], float), (Texture(picture),))
+
+
+def add_lamps(
+    picture: np.ndarray, canvas: Canvas, pose: CameraPose,
+    vehicles: list[tuple[Vehicle, VehicleState]],
+) -> None:
+    """Add the blobs of all lamps that are turned to the camera and not hidden, in place."""
+    for vehicle, state in vehicles:
+        shape = vehicle.shape
+        ahead = np.array([np.cos(state.heading), np.sin(state.heading)])
+        left = np.array([-ahead[1], ahead[0]])
+        for end, colour, size in ((1, _HEAD, 0.24), (-1, _TAIL, 0.13)):
+            for side in (0.36, -0.36):
+                xy = np.array([state.x, state.y]) + ahead * end * (shape.length_m / 2 + 0.05)
+                lamp = np.array([*(xy + left * side * shape.width_m), 0.7])
+                _add_lamp(picture, canvas, pose, lamp, ahead * end, colour, size)
+
+
+def _add_lamp(
+    picture: np.ndarray, canvas: Canvas, pose: CameraPose, lamp: np.ndarray, outward: np.ndarray,
+    colour: tuple[int, int, int], size_m: float,
+) -> None:
+    to_camera = pose.position_m - lamp
+    distance = float(np.linalg.norm(to_camera))
+    turned = float(outward @ to_camera[:2]) / distance
+    pixel, valid = canvas.lens.project(pose.to_camera(lamp))
+    column, row = (int(round(c)) for c in pixel)
+    if turned < 0.05 or not valid:
+        return
+    if not (0 <= row < picture.shape[0] and 0 <= column < picture.shape[1]):
+        return
+    if canvas.distance[row * SAMPLES, column * SAMPLES] < distance - 0.5:
+        return
+    # A lamp is dazzling along its axis and fades to the side; far ones stay visible.
+    radius = max(1.2, size_m * canvas.lens.focal_px / distance * (0.6 + 1.4 * turned**2))
+    strength = min(1.0, 0.35 + turned)
+    add_glow(picture, pixel, radius, mixed((0, 0, 0), colour, strength))

@@ -1,0 +1,164 @@
+"""Everything that can be chosen about a simulated recording, and nothing else."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+from autocalib_ros.errors import UsageError
+
+from .lens import Lens
+
+SCENES = ('junction', 'road')
+STORAGES = ('sqlite3', 'mcap')
+
+
+def _option(default: Any, help_text: str) -> Any:
+    return field(default=default, metadata={'help': help_text})
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulationOptions:
+    """What is simulated; every default of the simulator lives here.
+
+    Valid by construction: an impossible combination raises `UsageError`.
+    """
+
+    scene: str = _option('junction', 'road network: ' + ' or '.join(SCENES))
+    seed: int = _option(0, 'seed of everything random')
+
+    width_px: int = _option(1280, 'image width')
+    height_px: int = _option(720, 'image height')
+    rate_hz: float = _option(15.0, 'frames per second')
+    duration_s: float = _option(60.0, 'length of the recording')
+
+    focal_px: float = _option(560.0, 'focal length of the lens')
+    k: tuple[float, float, float, float] = _option(
+        (0.01, 0.0, 0.0, 0.0), 'Kannala-Brandt coefficients k1..k4'
+    )
+    principal_point_offset_px: tuple[float, float] = _option(
+        (6.0, -4.0), 'principal point minus image centre'
+    )
+
+    camera_height_m: float = _option(8.0, 'height of the camera above the road')
+    pitch_deg: float = _option(32.0, 'how far the camera looks down')
+    yaw_deg: float | None = _option(
+        None, 'heading of the optical axis from the first road; default: towards the traffic'
+    )
+    roll_deg: float = _option(0.8, 'roll about the optical axis')
+    position_m: tuple[float, float] | None = _option(
+        None, 'foot point of the camera; default: beside the road'
+    )
+
+    density: float = _option(9.0, 'vehicles a minute and lane')
+    turning_fraction: float = _option(0.18, 'part of the vehicles that turn')
+    road_angle_deg: float = _option(90.0, 'angle between the two roads of a junction')
+    one_way: bool = _option(False, 'one road only, driven in one direction')
+    wander_m: float = _option(0.1, 'standard deviation of the wander within the lane')
+    pedestrians: int = _option(10, 'people on the pavements')
+    empty: bool = _option(False, 'no vehicles and no pedestrians')
+
+    noise_sigma: float = _option(2.0, 'sensor noise in grey levels')
+    night: bool = _option(False, 'darkness, head lamps, more noise')
+    thermal: bool = _option(False, 'thermal camera: mono16 instead of bgr8')
+    shake_px: float = _option(0.0, 'standard deviation of the camera shake')
+    bump_at_s: float | None = _option(None, 'time at which the camera is knocked askew')
+    bump_deg: float = _option(2.0, 'angle by which it is knocked askew')
+
+    topic: str = _option('/camera/image_raw', 'image topic')
+    truth_topic: str = _option('/camera/truth/camera_info', 'topic of the true CameraInfo')
+    frame_id: str = _option('camera_optical_frame', 'frame of the images')
+    compressed: bool = _option(False, 'write CompressedImage on TOPIC/compressed')
+    storage: str = _option('sqlite3', 'rosbag2 storage: ' + ' or '.join(STORAGES))
+    zstd: bool = _option(False, 'compress every message with zstd')
+
+    def __post_init__(self) -> None:
+        self._check_names()
+        for name, (low, high) in _RANGES.items():
+            _check_range(name, getattr(self, name), low, high)
+        self._check_combinations()
+        self._check_lens()
+
+    @property
+    def frame_count(self) -> int:
+        """Number of frames of the recording, at least one."""
+        return max(1, round(self.duration_s * self.rate_hz))
+
+    @property
+    def lens(self) -> Lens:
+        """The true lens."""
+        dx, dy = self.principal_point_offset_px
+        centre = ((self.width_px - 1) / 2 + dx, (self.height_px - 1) / 2 + dy)
+        return Lens(self.focal_px, tuple(self.k), centre)
+
+    def _check_names(self) -> None:
+        for name, allowed in (('scene', SCENES), ('storage', STORAGES)):
+            if getattr(self, name) not in allowed:
+                raise UsageError(
+                    f'unknown {name} {getattr(self, name)!r}: choose {" or ".join(allowed)}'
+                )
+        for name in ('topic', 'truth_topic'):
+            if not getattr(self, name).startswith('/'):
+                raise UsageError(
+                    f'{name} {getattr(self, name)!r} is not absolute: begin it with a "/"'
+                )
+        if self.topic == self.truth_topic:
+            raise UsageError(f'topic and truth_topic are both {self.topic!r}: name two topics')
+
+    def _check_combinations(self) -> None:
+        if self.night and self.thermal:
+            raise UsageError('night and thermal exclude each other: choose one')
+        if self.bump_at_s is not None and not 0.0 < self.bump_at_s < self.duration_s:
+            raise UsageError(
+                f'bump_at_s is {self.bump_at_s:g}, outside the recording: '
+                f'choose a time between 0 and {self.duration_s:g} s'
+            )
+
+    def _check_lens(self) -> None:
+        if len(self.k) != 4:
+            raise UsageError(f'k has {len(self.k)} numbers, not four: give k1 k2 k3 k4')
+        lens = self.lens
+        corner_px = max(
+            math.dist(lens.centre_px, (x, y))
+            for x in (0, self.width_px - 1)
+            for y in (0, self.height_px - 1)
+        )
+        if corner_px > lens.radius_limit_px:
+            raise UsageError(
+                f'the lens forms no image beyond {lens.radius_limit_px:.0f} px from its centre, '
+                f'but the image corner is {corner_px:.0f} px away: '
+                'use a longer focal length, a smaller image or smaller coefficients'
+            )
+
+
+_RANGES = {
+    'width_px': (64, 8192),
+    'height_px': (64, 8192),
+    'seed': (0, 2**63 - 1),
+    'rate_hz': (0.1, 240.0),
+    'duration_s': (0.01, 24 * 3600.0),
+    'focal_px': (10.0, 1e5),
+    'camera_height_m': (2.0, 100.0),
+    'pitch_deg': (-10.0, 90.0),
+    'yaw_deg': (-360.0, 360.0),
+    'roll_deg': (-180.0, 180.0),
+    'density': (0.0, 60.0),
+    'turning_fraction': (0.0, 1.0),
+    'road_angle_deg': (45.0, 135.0),
+    'wander_m': (0.0, 1.0),
+    'pedestrians': (0, 200),
+    'noise_sigma': (0.0, 30.0),
+    'shake_px': (0.0, 20.0),
+    'bump_deg': (-30.0, 30.0),
+}
+
+
+def _check_range(name: str, value: float | None, low: float, high: float) -> None:
+    if value is not None and not low <= value <= high:
+        raise UsageError(f'{name} is {value:g}: choose a value between {low:g} and {high:g}')
+
+
+def option_help() -> dict[str, str]:
+    """Return the one-line explanation of every option, by field name."""
+    return {f.name: f.metadata['help'] for f in fields(SimulationOptions)}

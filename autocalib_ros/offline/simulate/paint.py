@@ -1,0 +1,87 @@
+"""Painting of textures: grain, panels, windows, lettering."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import cv2
+import numpy as np
+
+from .palette import Colour
+
+_SHIFT = 4  # fractional bits of the drawing functions of OpenCV
+
+
+def filled(height: int, width: int, colour: Colour) -> np.ndarray:
+    """Return an opaque BGRA picture (h, w, 4) of one colour."""
+    picture = np.empty((max(height, 2), max(width, 2), 4), np.uint8)
+    picture[:] = (*colour, 255)
+    return picture
+
+
+def grain(
+    height: int, width: int, octaves: Iterable[tuple[float, float]], rng: np.random.Generator
+) -> np.ndarray:
+    """Return smooth noise (h, w) float32: a sum over (size in texels, standard deviation)."""
+    total = np.zeros((height, width), np.float32)
+    for size, stddev in octaves:
+        rows, columns = max(2, int(height / size) + 2), max(2, int(width / size) + 2)
+        coarse = rng.standard_normal((rows, columns), np.float32) * np.float32(stddev)
+        if size > 1:
+            full = (int(columns * size), int(rows * size))
+            total += cv2.resize(coarse, full, interpolation=cv2.INTER_CUBIC)[:height, :width]
+        else:
+            total += coarse[:height, :width]
+    return total
+
+
+def roughen(picture: np.ndarray, noise: np.ndarray) -> None:
+    """Add noise (h, w) in grey levels to the colours of a picture (h, w, 3 or 4), in place."""
+    rough = picture[..., :3].astype(np.float32) + noise[..., None]
+    picture[..., :3] = np.clip(rough, 0, 255).astype(np.uint8)
+
+
+def polygon(picture: np.ndarray, points: np.ndarray, colour: tuple[int, ...]) -> None:
+    """Fill a polygon (n, 2) given in texels, (0, 0) being the corner of the picture."""
+    fixed = np.round((np.asarray(points, float) - 0.5) * (1 << _SHIFT)).astype(np.int32)
+    cv2.fillPoly(picture, [fixed], colour, cv2.LINE_AA, _SHIFT)
+
+
+def line(
+    picture: np.ndarray, start: tuple[float, float], end: tuple[float, float],
+    colour: tuple[int, ...], width: int = 1,
+) -> None:
+    """Draw a line between two points given in texels."""
+    ends = [tuple(int(round((c - 0.5) * (1 << _SHIFT))) for c in p) for p in (start, end)]
+    cv2.line(picture, ends[0], ends[1], colour, width, cv2.LINE_AA, _SHIFT)
+
+
+def disc(
+    picture: np.ndarray, centre: tuple[float, float], radius: float, colour: tuple[int, ...]
+) -> None:
+    """Fill a circle given in texels."""
+    x, y = (int(round((c - 0.5) * (1 << _SHIFT))) for c in centre)
+    radius_fixed = int(round(radius * (1 << _SHIFT)))
+    cv2.circle(picture, (x, y), radius_fixed, colour, -1, cv2.LINE_AA, _SHIFT)
+
+
+def letters(
+    picture: np.ndarray, text: str, box: tuple[float, float, float, float], colour: Colour
+) -> None:
+    """Write a text as large as it fits into the box (x0, y0, x1, y1) of texels."""
+    x0, y0, x1, y1 = box
+    (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_DUPLEX, 1.0, 2)
+    scale = min((x1 - x0) / width, (y1 - y0) / height)
+    if scale * height < 5:
+        return
+    place = (round((x0 + x1 - scale * width) / 2), round((y0 + y1 + scale * height) / 2))
+    thickness = max(1, round(3 * scale))
+    cv2.putText(
+        picture, text, place, cv2.FONT_HERSHEY_DUPLEX, scale, (*colour, 255), thickness, cv2.LINE_AA
+    )
+
+
+def mixed(a: Colour, b: Colour, part: float) -> Colour:
+    """Return the colour this part of the way from a to b."""
+    blue, green, red = (round(x + part * (y - x)) for x, y in zip(a, b, strict=True))
+    return (blue, green, red)

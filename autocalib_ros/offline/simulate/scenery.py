@@ -1,0 +1,189 @@
+"""What stands still beside the road: buildings, trees, poles."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from . import paint
+from .faces import Faces, Texture, join
+from .ground import PAVEMENT_M, edge_distance, on_road
+from .network import Network, Road
+from .palette import Palette
+
+_TEXELS_PER_M = 24
+_PANEL_M = 6.0
+_LAMPS_M = np.arange(-105.0, 106.0, 30.0)
+
+
+def scenery_of(
+    network: Network, viewpoint: np.ndarray, palette: Palette, seed: int
+) -> Faces:
+    """Return all standing things; viewpoint (2,) is the foot of the camera, kept in the clear."""
+    rng = np.random.default_rng([seed, 4])
+    parts: list[Faces] = []
+    crowns = [_crown(palette, rng) for _ in range(6)]
+    for road in network.roads:
+        for side in (1, -1):
+            parts += _buildings(road, side, network, viewpoint, palette, rng)
+            parts += _trees(road, side, network, viewpoint, palette, crowns, rng)
+            parts += _poles(road, side, network, viewpoint, palette)
+    return join(parts)
+
+
+def _clear(network: Network, viewpoint: np.ndarray, points: np.ndarray, kerb_m: float,
+           camera_m: float) -> bool:
+    """Tell whether points (n, 2) keep off the roads, the camera and its view of the centre."""
+    if edge_distance(network, points).min() < kerb_m:
+        return False
+    offset = points - viewpoint
+    if np.hypot(*offset.T).min() < camera_m:
+        return False
+    towards = -viewpoint / max(float(np.hypot(*viewpoint)), 1e-6)
+    along, aside = offset @ towards, np.abs(offset @ np.array([-towards[1], towards[0]]))
+    return not bool(((along > 0) & (along < np.hypot(*viewpoint)) & (aside < 12.0)).any())
+
+
+def _buildings(road: Road, side: int, network: Network, viewpoint: np.ndarray, palette: Palette,
+               rng: np.random.Generator) -> list[Faces]:
+    parts = []
+    for along in np.arange(-110.0, 111.0, 24.0):
+        length, depth = rng.uniform(14, 22), rng.uniform(10, 14)
+        height = float(rng.choice([6.4, 9.6, 12.8]))
+        wall = palette.walls[int(rng.integers(len(palette.walls)))]
+        aside = side * (road.half_width_m + PAVEMENT_M + rng.uniform(3.0, 6.0) + depth / 2)
+        centre = on_road(road, along, aside)
+        box = _ring(centre, road.heading, length, depth)
+        if _clear(network, viewpoint, _dense(box), PAVEMENT_M + 1.0, 20.0):
+            parts.append(_block(box, height, wall, palette, rng))
+    return parts
+
+
+def _ring(centre: np.ndarray, heading: float, length: float, depth: float) -> np.ndarray:
+    """Return the four corners (4, 2) of a rectangle, counter-clockwise."""
+    axis = np.array([math.cos(heading), math.sin(heading)]) * length / 2
+    normal = np.array([-math.sin(heading), math.cos(heading)]) * depth / 2
+    return np.array([centre - axis - normal, centre + axis - normal, centre + axis + normal,
+                     centre - axis + normal])
+
+
+def _dense(ring: np.ndarray) -> np.ndarray:
+    """Return points along the sides of a ring (4, 2)."""
+    following = np.roll(ring, -1, axis=0)
+    return np.concatenate([ring + f * (following - ring) for f in (0, 0.25, 0.5, 0.75)])
+
+
+def _block(ring: np.ndarray, height: float, wall: tuple[int, int, int], palette: Palette,
+           rng: np.random.Generator) -> Faces:
+    """Return a building: walls in panels a few metres wide, and a flat roof."""
+    corners, textures = [], []
+    panel = _wall_texture(height, wall, palette, rng)
+    for start, end in zip(ring, np.roll(ring, -1, axis=0), strict=True):
+        count = max(1, round(float(np.hypot(*(end - start))) / _PANEL_M))
+        step = (end - start) / count
+        for i in range(count):
+            corners.append([(*(start + i * step), height), (*step, 0), (0, 0, -height)])
+            textures.append(panel)
+    roof = paint.filled(32, 32, paint.mixed(wall, palette.asphalt, 0.5))
+    corners.append([(*ring[3], height), (*(ring[2] - ring[3]), 0), (*(ring[0] - ring[3]), 0)])
+    textures.append(Texture(roof))
+    return Faces(np.array(corners, float), tuple(textures))
+
+
+def _wall_texture(height: float, wall: tuple[int, int, int], palette: Palette,
+                  rng: np.random.Generator) -> Texture:
+    """Paint one panel with two windows to the storey."""
+    rows, columns = round(height * _TEXELS_PER_M), round(_PANEL_M * _TEXELS_PER_M)
+    picture = paint.filled(rows, columns, wall)
+    octaves = [(s, 5.0 * palette.texture) for s in (1.5, 5.0, 20.0)]
+    paint.roughen(picture, paint.grain(rows, columns, octaves, rng))
+    storey = 3.2 * _TEXELS_PER_M
+    for top in np.arange(0.8 * _TEXELS_PER_M, rows - storey / 2, storey):
+        for left in (0.12, 0.60):
+            x0, x1 = left * columns, (left + 0.27) * columns
+            y0, y1 = top, top + 1.5 * _TEXELS_PER_M
+            glass = paint.mixed(palette.window, palette.sky_low, float(rng.uniform(0, 0.5)))
+            box = np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)])
+            frame = box + [(-2, -2), (2, -2), (2, 2), (-2, 2)]
+            paint.polygon(picture, frame, (*palette.kerb, 255))
+            paint.polygon(picture, box, (*glass, 255))
+            paint.line(picture, ((x0 + x1) / 2, y0), ((x0 + x1) / 2, y1), (*palette.kerb, 255), 2)
+    return Texture(picture)
+
+
+def _upright(place: np.ndarray, viewpoint: np.ndarray, width: float, low: float,
+             high: float) -> list[tuple[float, ...]]:
+    """Return an upright rectangle that faces the camera."""
+    away = place - viewpoint
+    across = np.array([away[1], -away[0]]) / max(float(np.hypot(*away)), 1e-6) * width
+    return [(*(place - across / 2), high), (*across, 0.0), (0.0, 0.0, low - high)]
+
+
+def _trees(road: Road, side: int, network: Network, viewpoint: np.ndarray, palette: Palette,
+           crowns: list[Texture], rng: np.random.Generator) -> list[Faces]:
+    parts = []
+    for along in np.arange(-100.0, 101.0, 11.0):
+        aside = side * (road.half_width_m + PAVEMENT_M + rng.uniform(0.5, 2.0))
+        place = on_road(road, along + rng.uniform(-3, 3), aside)
+        height = rng.uniform(4.5, 8.0)
+        if not _clear(network, viewpoint, place[None], PAVEMENT_M - 0.2, 14.0):
+            continue
+        width = 0.7 * height
+        corners = [_upright(place, viewpoint, 0.25, 0.0, 0.5 * height),
+                   _upright(place, viewpoint, width, 0.3 * height, height)]
+        trunk = Texture(paint.filled(32, 4, palette.trunk))
+        parts.append(Faces(np.array(corners), (trunk, crowns[int(rng.integers(len(crowns)))])))
+    return parts
+
+
+def _crown(palette: Palette, rng: np.random.Generator) -> Texture:
+    """Paint leaves: overlapping discs, lit from above."""
+    size = 128
+    picture = paint.filled(size, size, palette.foliage)
+    alpha = np.zeros((size, size), np.uint8)
+    for _ in range(160):
+        angle, radius = rng.uniform(0, 2 * np.pi), 0.40 * np.sqrt(rng.uniform())
+        x, y = 0.5 + radius * np.cos(angle), 0.5 + radius * np.sin(angle)
+        light = (0.45 - y) + rng.normal(0, 0.15)
+        other = palette.sky_low if light > 0 else palette.trim
+        colour = paint.mixed(palette.foliage, other, min(0.5, abs(light) * 0.5))
+        centre, spread = (x * size, y * size), rng.uniform(0.04, 0.10) * size
+        paint.disc(picture, centre, spread, (*colour, 255))
+        paint.disc(alpha, centre, spread, (255,))
+    picture[..., 3] = alpha
+    return Texture(picture)
+
+
+def _poles(road: Road, side: int, network: Network, viewpoint: np.ndarray,
+           palette: Palette) -> list[Faces]:
+    """Street lamps along the road and signal posts at the stop lines."""
+    metal = Texture(paint.filled(32, 4, palette.pole))
+    head = paint.filled(48, 16, palette.trim)
+    for i, colour in enumerate(((40, 40, 200), (40, 160, 200), (80, 180, 60))):
+        paint.disc(head, (8.0, 8.0 + 16 * i), 5.0, (*paint.mixed(palette.trim, colour, 0.4), 255))
+    plans = [(along, 0.6, 0.14, 8.0) for along in _LAMPS_M]
+    if network.stop_m is not None:
+        plans += [(side * network.stop_m, 0.5, 0.16, 4.2)]
+    parts = []
+    for along, kerb, width, height in plans:
+        place = on_road(road, along, side * (road.half_width_m + kerb))
+        if edge_distance(network, place) < 0.2 or np.hypot(*(place - viewpoint)) < 9.0:
+            continue
+        corners, textures = [_upright(place, viewpoint, width, 0.0, height)], [metal]
+        if height < 5.0:
+            corners.append(_upright(place, viewpoint, 0.36, height - 1.0, height + 0.1))
+            textures.append(Texture(head))
+        parts.append(Faces(np.array(corners), tuple(textures)))
+    return parts
+
+
+def lamp_places(network: Network) -> list[tuple[float, float]]:
+    """Return the ground points (x, y) under the street lamps."""
+    places = []
+    for road in network.roads:
+        for side in (1, -1):
+            for along in _LAMPS_M:
+                x, y = on_road(road, along, side * (road.half_width_m - 1.5)).tolist()
+                places.append((x, y))
+    return places

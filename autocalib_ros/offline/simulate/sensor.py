@@ -1,0 +1,71 @@
+"""From the drawn picture to the sensor's: darkness and lamps, heat, noise."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+
+from .options import SimulationOptions
+
+_NOISE_MARGIN_PX = 64
+NIGHT_GAIN = 0.28
+THERMAL_COUNTS = 14.0  # counts of the 14-bit range to one grey level of the palette
+THERMAL_BASE = 6400.0
+
+
+class Noise:
+    """Sensor noise: a crop, at a random place and flipped at random, of one large noise picture."""
+
+    def __init__(self, options: SimulationOptions) -> None:
+        self._seed = options.seed
+        self._size = (options.height_px, options.width_px)
+        sigma = options.noise_sigma * (1.8 if options.night else 1.0)
+        channels = 1 if options.thermal else 3
+        if options.thermal:
+            sigma *= THERMAL_COUNTS * 0.35
+        rng = np.random.default_rng([options.seed, 6])
+        shape = (*(n + _NOISE_MARGIN_PX for n in self._size), channels)
+        self._bank = np.round(rng.standard_normal(shape, np.float32) * sigma).astype(np.int16)
+
+    def of(self, index: int) -> np.ndarray:
+        """Return the noise (h, w, channels) int16 of a frame."""
+        rng = np.random.default_rng([self._seed, 7, index])
+        y, x = (int(n) for n in rng.integers(0, _NOISE_MARGIN_PX, 2))
+        crop = self._bank[y:y + self._size[0], x:x + self._size[1]]
+        return cv2.flip(crop, int(rng.integers(-1, 2))).reshape(*self._size, -1)
+
+
+def darken(picture: np.ndarray) -> np.ndarray:
+    """Return a BGR picture (h, w, 3) as it looks at night without lamps."""
+    levels = np.arange(256) * NIGHT_GAIN
+    table = np.stack([levels * 1.15, levels, levels * 0.9], -1).round().astype(np.uint8)
+    return cv2.LUT(picture, table[None])
+
+
+def add_glow(
+    picture: np.ndarray, pixel: np.ndarray, radius_px: float, colour: tuple[int, int, int]
+) -> None:
+    """Add a soft bright blob around a pixel (2,) to a BGR picture, in place."""
+    reach = max(2.0, 3.0 * radius_px)
+    x0, y0 = (max(0, math.floor(c - reach)) for c in pixel)
+    x1 = min(picture.shape[1], math.ceil(pixel[0] + reach) + 1)
+    y1 = min(picture.shape[0], math.ceil(pixel[1] + reach) + 1)
+    if x1 <= x0 or y1 <= y0:
+        return
+    dx, dy = np.arange(x0, x1) - pixel[0], np.arange(y0, y1) - pixel[1]
+    square = (dx[None] ** 2 + dy[:, None] ** 2) / radius_px**2
+    core = np.exp(-square / 0.35) + 0.30 * np.exp(-square / 2.2)
+    light = np.clip(core, 0, 1)[..., None] * np.array(colour, float)
+    patch = picture[y0:y1, x0:x1]
+    patch[:] = np.clip(patch + light, 0, 255).astype(np.uint8)
+
+
+def thermal_counts(picture: np.ndarray, time_s: float, noise: np.ndarray) -> np.ndarray:
+    """Return mono16 counts (h, w) of a drawn heat picture (h, w, 3); offset and gain drift."""
+    heat = cv2.GaussianBlur(np.ascontiguousarray(picture[..., 0]).astype(np.float32), (0, 0), 0.6)
+    gain = THERMAL_COUNTS * (1 + 0.03 * math.sin(2 * math.pi * time_s / 47.0))
+    offset = THERMAL_BASE + 60.0 * math.sin(2 * math.pi * time_s / 31.0 + 1.0) + 0.8 * time_s
+    counts = heat * gain + offset + noise[..., 0]
+    return np.clip(np.round(counts), 0, 16383).astype(np.uint16)

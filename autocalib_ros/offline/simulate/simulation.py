@@ -1,0 +1,108 @@
+"""A simulated recording: every frame is a function of the options and its index alone."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from . import people
+from .lens import CameraPose, look, rotation
+from .network import network_of
+from .options import SimulationOptions
+from .render import Artist, Scene
+from .traffic import Vehicle, VehicleState, simulate_traffic
+from .truth import truth_of
+
+_START_NS = 1_700_000_000_000_000_000
+_BUMP_AXIS = np.array([0.80, 0.50, 0.33])
+
+
+class Simulation:
+    """The world, its traffic and the camera; pictures are drawn on demand."""
+
+    def __init__(self, options: SimulationOptions) -> None:
+        self.options = options
+        self.lens = options.lens
+        self.network = network_of(options)
+        self.traffic = simulate_traffic(self.network, options)
+        self.people = people.people_of(self.network, self.traffic.greens, options)
+        x, y = options.position_m or self.network.viewpoint_m
+        yaw = self.network.view_yaw_deg if options.yaw_deg is None else options.yaw_deg
+        self.pose = CameraPose(
+            look(yaw, options.pitch_deg, options.roll_deg),
+            np.array([x, y, options.camera_height_m]),
+        )
+        self.yaw_deg = float(yaw)
+        self._shake_rad = _shake(options)
+        self._artist: Artist | None = None
+
+    def frame(self, index: int) -> np.ndarray:
+        """Return a frame: BGR (h, w, 3) uint8, or for a thermal camera (h, w) uint16."""
+        return self.artist().frame(self.scene(index))
+
+    def artist(self) -> Artist:
+        """Return what draws the pictures; made when first needed."""
+        if self._artist is None:
+            self._artist = Artist(self.options, self.network, self.pose, self.bumped_pose())
+        return self._artist
+
+    def scene(self, index: int) -> Scene:
+        """Return everything that a frame shows."""
+        time_s = self.time_s(index)
+        walking = ((person, person.place(time_s)) for person in self.people)
+        return Scene(
+            index,
+            time_s,
+            self.is_bumped(time_s),
+            self.shake(index) if self.options.shake_px else None,
+            self.states(time_s),
+            [(person, place) for person, place in walking if place is not None],
+        )
+
+    def stamp_ns(self, index: int) -> int:
+        """Return the time stamp of a frame in nanoseconds."""
+        return _START_NS + round(index * 1e9 / self.options.rate_hz)
+
+    def time_s(self, index: int) -> float:
+        """Return the time of a frame since the first one."""
+        return index / self.options.rate_hz
+
+    def bumped_pose(self) -> CameraPose:
+        """Return the pose of the camera after it was knocked askew."""
+        axis = _BUMP_AXIS / np.linalg.norm(_BUMP_AXIS)
+        return self.pose.rotated(rotation(axis * math.radians(self.options.bump_deg)))
+
+    def resting_pose(self, time_s: float) -> CameraPose:
+        """Return the pose at a time without the shake."""
+        return self.bumped_pose() if self.is_bumped(time_s) else self.pose
+
+    def is_bumped(self, time_s: float) -> bool:
+        """Tell whether the camera has been knocked askew by then."""
+        return self.options.bump_at_s is not None and time_s >= self.options.bump_at_s
+
+    def shake(self, index: int) -> np.ndarray:
+        """Return the rotation (3, 3) that shakes the camera in a frame."""
+        return rotation(self._shake_rad[index])
+
+    def states(self, time_s: float) -> list[tuple[Vehicle, VehicleState]]:
+        """Return all vehicles under way at a time."""
+        found = ((vehicle, vehicle.state(time_s)) for vehicle in self.traffic.vehicles)
+        return [(vehicle, state) for vehicle, state in found if state is not None]
+
+    def truth(self) -> dict[str, Any]:
+        """Return the truth in the format of truth.json."""
+        return truth_of(self)
+
+
+def _shake(options: SimulationOptions) -> np.ndarray:
+    """Return rotation vectors (frames, 3): a random walk that is drawn back to rest."""
+    rng = np.random.default_rng([options.seed, 8])
+    kept = math.exp(-1.0 / (0.3 * options.rate_hz))
+    fresh = math.sqrt(1 - kept * kept)
+    steps = rng.standard_normal((options.frame_count, 3)) * fresh
+    walk = np.zeros_like(steps)
+    for i in range(1, len(walk)):
+        walk[i] = kept * walk[i - 1] + steps[i]
+    return walk * (options.shake_px / options.focal_px) * (1.0, 1.0, 0.5)

@@ -1,0 +1,143 @@
+"""The truth beside a recording, in the format of truth.json."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .ground import PAVEMENT_M, edge_distance
+from .lens import CameraPose
+
+if TYPE_CHECKING:
+    from .simulation import Simulation
+    from .traffic import Vehicle
+
+TRACK_RATE_HZ = 5
+_RANGE_M = 60.0
+_GROUND_POINTS = 48
+_GROUND_RANGE_M = 45.0
+_HIDDEN_M = 0.5  # a static thing hides a point when it is nearer to the camera by more than this
+
+
+def truth_of(simulation: Simulation) -> dict[str, Any]:
+    """Return lens, camera, road directions, ground points and vehicle tracks."""
+    options = simulation.options
+    truth = {
+        'case': 'simulated',
+        'scene': 'one_way' if options.one_way else options.scene,
+        'width': options.width_px,
+        'height': options.height_px,
+        'fps': options.rate_hz,
+        'duration_s': options.frame_count / options.rate_hz,
+        'mode': 'night' if options.night else 'thermal' if options.thermal else 'day',
+        'pixel_convention': 'OpenCV: centre of the top-left pixel is (0,0)',
+        'lens': _lens(simulation),
+        'camera': _camera(simulation.pose),
+        'world': 'X,Y on the ground (z=0), Z up, metres; '
+                 'camera optical frame x right, y down, z forward',
+        'road_directions': [[*road.axis.round(9).tolist(), 0.0]
+                            for road in simulation.network.roads],
+        'ground_points': _ground_points(simulation, bumped=False),
+        'vehicles': _vehicles(simulation),
+        'options': asdict(options),
+    }
+    if options.bump_at_s is not None:
+        truth['bump'] = {
+            't': options.bump_at_s,
+            'camera': _camera(simulation.bumped_pose()),
+            'ground_points': _ground_points(simulation, bumped=True),
+        }
+    return truth
+
+
+def _lens(simulation: Simulation) -> dict[str, Any]:
+    cx, cy = simulation.lens.centre_px
+    return {
+        'model': 'kannala_brandt',
+        'f': simulation.lens.focal_px,
+        'k': list(simulation.lens.k),
+        'cx': cx,
+        'cy': cy,
+        'note': 'r=f*(theta+k1 theta^3+k2 theta^5+k3 theta^7+k4 theta^9)',
+    }
+
+
+def _camera(pose: CameraPose) -> dict[str, Any]:
+    """Describe a pose; angles as in the options."""
+    rotation = pose.world_from_camera
+    return {
+        'R_world_from_camera': rotation.round(9).tolist(),
+        'position': pose.position_m.round(6).tolist(),
+        'height': float(pose.position_m[2]),
+        'yaw_deg': _degrees(np.arctan2(rotation[1, 2], rotation[0, 2])),
+        'pitch_down_deg': _degrees(np.arcsin(-rotation[2, 2])),
+        'roll_deg': _degrees(np.arctan2(-rotation[2, 0], -rotation[2, 1])),
+    }
+
+
+def _degrees(angle: float) -> float:
+    return round(float(np.degrees(angle)), 6)
+
+
+def _visible(
+    simulation: Simulation, pose: CameraPose, bumped: bool, points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pixels (n, 2) of world points (n, 3) and whether each is seen."""
+    camera = pose.to_camera(points)
+    pixels, seen = simulation.lens.project(camera)
+    limit = np.array([simulation.options.width_px - 1, simulation.options.height_px - 1])
+    seen &= ((pixels >= 0) & (pixels <= limit)).all(1)
+    index = np.flatnonzero(seen)
+    behind = simulation.artist().static_distance_m(bumped, pixels[index])
+    seen[index] = behind > np.linalg.norm(camera[index], axis=1) - _HIDDEN_M
+    return pixels, seen
+
+
+def _ground_points(simulation: Simulation, bumped: bool) -> dict[str, Any]:
+    """Return visible points of the road and the pavements around the camera."""
+    pose = simulation.bumped_pose() if bumped else simulation.pose
+    rng = np.random.default_rng([simulation.options.seed, 9])
+    reach = _GROUND_RANGE_M * np.sqrt(rng.uniform(0.01, 1.0, 4000))
+    angle = rng.uniform(0, 2 * np.pi, 4000)
+    xy = pose.position_m[:2] + reach[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1)
+    xy = xy[edge_distance(simulation.network, xy) < PAVEMENT_M].round(2)
+    pixels, seen = _visible(simulation, pose, bumped, np.pad(xy, ((0, 0), (0, 1))))
+    rows = np.concatenate([xy, pixels.round(4)], 1)[seen][:_GROUND_POINTS]
+    return {'columns': ['X', 'Y', 'u', 'v'], 'rows': rows.tolist()}
+
+
+def _vehicles(simulation: Simulation) -> dict[str, Any]:
+    tracks = []
+    for vehicle in simulation.traffic.vehicles:
+        rows = _track(simulation, vehicle)
+        if rows:
+            tracks.append({'id': f'v{vehicle.number}', 'type': vehicle.kind, 'rows': rows})
+    return {
+        'columns': ['t', 'X', 'Y', 'heading_rad', 'speed_mps', 'u', 'v'],
+        'note': f'ground-plane centre of the vehicle footprint, {TRACK_RATE_HZ} Hz, only while in '
+                f'view, within {_RANGE_M:.0f} m and not hidden by static objects (may be hidden '
+                'by other vehicles); shake of the camera not included',
+        'tracks': tracks,
+    }
+
+
+def _track(simulation: Simulation, vehicle: Vehicle) -> list[list[float]]:
+    """Return the rows of a vehicle while it can be seen."""
+    duration = simulation.options.frame_count / simulation.options.rate_hz
+    times = np.arange(int(np.ceil(duration * TRACK_RATE_HZ - 1e-9))) / TRACK_RATE_HZ
+    found = [(t, state) for t in times.tolist() if (state := vehicle.state(t)) is not None]
+    rows: list[list[float]] = []
+    for bumped in (False, True):
+        part = [(t, s) for t, s in found if simulation.is_bumped(t) == bumped]
+        if not part:
+            continue
+        values = np.array([(t, s.x, s.y, s.heading, s.speed_mps) for t, s in part])
+        pose = simulation.bumped_pose() if bumped else simulation.pose
+        centres = np.pad(values[:, 1:3], ((0, 0), (0, 1)))
+        pixels, seen = _visible(simulation, pose, bumped, centres)
+        seen &= np.hypot(*(centres - pose.position_m)[:, :2].T) <= _RANGE_M
+        kept = np.concatenate([values.round(4), pixels.round(3)], 1)[seen]
+        rows += kept.tolist()
+    return rows

@@ -1,0 +1,113 @@
+"""An .mcap file whose recorder was killed: it has no footer, and readers refuse it.
+
+What is whole in it is presented with a footer that says "no index", so that a reader scans it. Nothing is
+written and nothing copied. Records are an opcode (1 byte), a length (8 bytes, little-endian) and a content;
+https://mcap.dev/spec.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+from pathlib import Path
+from typing import Any, BinaryIO
+
+MAGIC = b'\x89MCAP0\r\n'
+FOOTER = b'\x02' + struct.pack('<QQQI', 20, 0, 0, 0) + MAGIC
+"""No summary section and no checksum."""
+DATA_END = 0x0F
+RECORD_HEAD = struct.Struct('<BQ')
+
+
+def is_torn(path: Path) -> bool:
+    """Say whether a file is an .mcap without its end; what is no .mcap at all is not."""
+    if path.suffix != '.mcap':
+        return False
+    with path.open('rb') as stream:
+        if stream.read(len(MAGIC)) != MAGIC:
+            return False
+        size = stream.seek(0, io.SEEK_END)
+        stream.seek(max(size - len(MAGIC), 0))
+        return size < 2 * len(MAGIC) or stream.read() != MAGIC
+
+
+def sealed(path: Path) -> Any:
+    """Return the path itself, or for a torn .mcap a stand-in whose `open` gives the whole records and a footer."""
+    if not is_torn(path):
+        return path
+    with path.open('rb') as stream:
+        return _Sealed(path, _whole_bytes(stream, stream.seek(0, io.SEEK_END)))
+
+
+def _whole_bytes(stream: BinaryIO, size: int) -> int:
+    """Return where the last whole record of the data section ends."""
+    position = len(MAGIC)
+    while position + RECORD_HEAD.size <= size:
+        stream.seek(position)
+        opcode, length = RECORD_HEAD.unpack(stream.read(RECORD_HEAD.size))
+        if opcode in (0, DATA_END) or position + RECORD_HEAD.size + length > size:
+            break
+        position += RECORD_HEAD.size + length
+    return position
+
+
+class _Sealed:
+    """Stands in for the path of a torn file, as far as rosbags uses it."""
+
+    def __init__(self, path: Path, whole: int) -> None:
+        self._path, self._whole = path, whole
+        self.suffix, self.stem = path.suffix, path.stem
+
+    def __str__(self) -> str:
+        return str(self._path)
+
+    def exists(self) -> bool:
+        """It does."""
+        return True
+
+    def is_dir(self) -> bool:
+        """It is a file."""
+        return False
+
+    def open(self, *_: Any, **__: Any) -> BinaryIO:
+        """Open the whole part and the footer behind it, for reading."""
+        return io.BufferedReader(_WithFooter(self._path.open('rb', buffering=0), self._whole))
+
+
+class _WithFooter(io.RawIOBase):
+    """The first `whole` bytes of a file, then FOOTER."""
+
+    def __init__(self, stream: Any, whole: int) -> None:
+        super().__init__()
+        self._stream, self._whole, self._position = stream, whole, 0
+
+    def readable(self) -> bool:
+        """Yes."""
+        return True
+
+    def seekable(self) -> bool:
+        """Yes."""
+        return True
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        """Move to a position and return it."""
+        base = {io.SEEK_SET: 0, io.SEEK_CUR: self._position, io.SEEK_END: self._whole + len(FOOTER)}[whence]
+        self._position = max(base + offset, 0)
+        return self._position
+
+    def readinto(self, buffer: Any) -> int:
+        """Fill the buffer from the file or from the footer."""
+        if self._position < self._whole:
+            self._stream.seek(self._position)
+            data = self._stream.read(min(len(buffer), self._whole - self._position))
+        else:
+            behind = self._position - self._whole
+            data = FOOTER[behind:behind + len(buffer)]
+        buffer[:len(data)] = data
+        self._position += len(data)
+        return len(data)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._stream.close()
+        super().close()

@@ -1,0 +1,108 @@
+"""Video files through OpenCV."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import cv2
+
+from autocalib_ros.errors import InputError
+from autocalib_ros.offline.sources import Frame, StoredImage, Window, nothing_in_window
+
+LOG = logging.getLogger(__name__)
+
+SANE_FPS = (0.01, 1000.0)
+FALLBACK_FPS = 25.0
+ENDED_EARLY_BELOW = 0.95
+"""Share of the frames promised by the file's header; some containers only estimate their number."""
+
+
+class VideoSource:
+    """One video file; stamps in nanoseconds since its first frame."""
+
+    topic = image_type = camera_frame = ''
+
+    def __init__(self, path: Path, window: Window) -> None:
+        self.name = str(path)
+        self._path, self._window = path, window
+        with self._capture() as capture:
+            fps, promised = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
+            if not capture.grab():
+                raise InputError(f'{self.name} holds no frame that can be decoded')
+        if not SANE_FPS[0] <= fps <= SANE_FPS[1]:
+            LOG.warning('%s does not say its frame rate; taken for %g frames/s', self.name, FALLBACK_FPS)
+            fps = FALLBACK_FPS
+        self._fps = fps
+        self._promised = int(promised) if 0 < promised < 1e9 else None
+        self.duration_s = self.total = None
+        if self._promised:
+            self.duration_s = window.seconds_of(self._promised / fps)
+            self.total = round(self.duration_s * fps)
+
+    def frames(self) -> Iterator[Frame]:
+        """Decode the frames of the window; InputError when there is none."""
+        for stamp_ns, capture in self._stamped():
+            decoded, image = capture.retrieve()
+            if decoded:
+                yield Frame(stamp_ns, image)
+
+    def stored(self) -> Iterator[StoredImage]:
+        """Go through the stamps of the window; a video holds no messages."""
+        return (StoredImage(stamp_ns, stamp_ns, '') for stamp_ns, _ in self._stamped())
+
+    def _stamped(self) -> Iterator[tuple[int, cv2.VideoCapture]]:
+        """Yield the stamp of each frame of the window, and the capture that holds the frame."""
+        start_ns, stop_ns = self._window.bounds_ns
+        clock, given = _Clock(self._fps), 0
+        with self._capture() as capture:
+            while capture.grab():
+                stamp_ns = clock.next_ns(capture.get(cv2.CAP_PROP_POS_MSEC))
+                if stop_ns is not None and stamp_ns >= stop_ns:
+                    break
+                if stamp_ns >= start_ns:
+                    given += 1
+                    yield stamp_ns, capture
+            else:
+                self._judge_end(clock.ticks)
+        if not given:
+            raise nothing_in_window(self.name, self._window, clock.ticks / self._fps)
+
+    def _judge_end(self, frames: int) -> None:
+        if frames and self._promised and frames < ENDED_EARLY_BELOW * self._promised - 2:
+            LOG.warning('%s ended early: %d of %d frames could be read', self.name, frames, self._promised)
+
+    @contextmanager
+    def _capture(self) -> Iterator[cv2.VideoCapture]:
+        capture = cv2.VideoCapture(str(self._path))
+        try:
+            if not capture.isOpened():
+                raise InputError(f'{self.name} is not a video that can be read: it is damaged, cut off or of another'
+                                 ' kind')
+            yield capture
+        finally:
+            capture.release()
+
+
+class _Clock:
+    """Presentation times where the container has sane ones, counted frames elsewhere."""
+
+    def __init__(self, fps: float) -> None:
+        self._step_ns = 1e9 / fps
+        self._offset_ms: float | None = None
+        self._previous_ns = 0
+        self.ticks = 0
+
+    def next_ns(self, position_ms: float) -> int:
+        """Return the next frame's stamp; it always grows."""
+        if self._offset_ms is None:
+            self._offset_ms, stamp_ns = position_ms, 0
+        else:
+            stamp_ns = round((position_ms - self._offset_ms) * 1e6)
+            if not stamp_ns > self._previous_ns:
+                stamp_ns = self._previous_ns + round(self._step_ns)
+        self._previous_ns = stamp_ns
+        self.ticks += 1
+        return stamp_ns

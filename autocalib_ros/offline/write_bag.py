@@ -1,0 +1,112 @@
+"""A calibration as a rosbag2 recording, next to the images it belongs to."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from autocalib_ros.calibration import Calibration, GroundPlane, camera_info
+from autocalib_ros.errors import InputError, UsageError
+from autocalib_ros.offline.outputs import camera_name, image_topic
+from autocalib_ros.offline.sources import Source, StoredImage
+
+BAG_VERSION = 9
+"""What Jazzy writes."""
+DEFAULT_FRAME = 'camera_optical_frame'
+GROUND_TOPIC = '/autocalib/ground_transform'
+FOREVER = QosTime(2147483647, 4294967295)
+LATCHED = Qos(QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL, FOREVER, FOREVER,
+              QosLiveliness.AUTOMATIC, FOREVER, False)
+
+
+def write_bag(path: Path, result: Calibration, source: Source) -> None:
+    """Write a new bag: the images, a CameraInfo with the header of each, and the ground transform where there is one.
+
+    CameraInfo goes to the sibling of the image topic. All but the images are latched, so that a node that
+    starts late during playback gets them too.
+    """
+    if path.exists():
+        raise UsageError(f'{path} exists already and is not overwritten')
+    try:
+        with Writer(path, version=BAG_VERSION, storage_plugin=StoragePlugin.MCAP) as writer:
+            _Recording(writer, result, source).write()
+    except BaseException as error:
+        shutil.rmtree(path, ignore_errors=True)  # half a bag is worse than none
+        if isinstance(error, OSError):
+            raise InputError(f'cannot write {path}: {error.strerror or error}') from error
+        raise
+
+
+def camera_info_topic(source: Source) -> str:
+    """Return the sibling of the image topic, as image_transport finds it."""
+    parts = image_topic(source).split('/')[:-1]
+    return '/'.join([*parts, 'camera_info']) if source.topic else '/camera/camera_info'
+
+
+class _Recording:
+    """The connections and messages of one new bag."""
+
+    def __init__(self, writer: Writer, result: Calibration, source: Source) -> None:
+        self._writer, self._result, self._source = writer, result, source
+        self._store = get_typestore(Stores.ROS2_JAZZY)
+        self._ground_frame = f'{camera_name(source)}_ground'
+
+    def write(self) -> None:
+        """Write everything in the order of recording."""
+        info = self._connect(camera_info_topic(self._source), 'sensor_msgs/msg/CameraInfo')
+        images = self._connect(self._source.topic, self._source.image_type, ()) if self._source.topic else None
+        for index, stored in enumerate(self._source.stored()):
+            if index == 0 and self._result.ground is not None:
+                self._write_ground(self._result.ground, stored)
+            self._put(info, stored.recorded_ns, self._camera_info(stored))
+            if images is not None:
+                self._writer.write(images, stored.recorded_ns, stored.cdr)
+
+    def _write_ground(self, ground: GroundPlane, first: StoredImage) -> None:
+        transform = self._transform(ground, first.frame_id.lstrip('/') or DEFAULT_FRAME)
+        together = self._make('tf2_msgs/msg/TFMessage', transforms=[transform])
+        for topic, message in ((GROUND_TOPIC, transform), ('/tf_static', together)):
+            self._put(self._connect(topic, message.__msgtype__), first.recorded_ns, message)
+
+    def _camera_info(self, stored: StoredImage) -> Any:
+        info = camera_info(self._result.camera)
+        region = self._make('sensor_msgs/msg/RegionOfInterest', x_offset=0, y_offset=0, height=0, width=0,
+                            do_rectify=False)
+        lists = {name: np.array(getattr(info, name), float) for name in 'dkrp'}
+        return self._make('sensor_msgs/msg/CameraInfo', header=self._header(stored.stamp_ns, stored.frame_id),
+                          height=info.height, width=info.width, distortion_model=info.distortion_model, **lists,
+                          binning_x=0, binning_y=0, roi=region)
+
+    def _transform(self, ground: GroundPlane, camera_frame: str) -> Any:
+        """Return the camera's pose in the ground frame: parent ground, child camera (REP-105)."""
+        vector = self._make('geometry_msgs/msg/Vector3', **dict(zip('xyz', _floats(ground.translation_m), strict=True)))
+        quaternion = self._make('geometry_msgs/msg/Quaternion',
+                                **dict(zip('xyzw', _floats(ground.rotation_xyzw), strict=True)))
+        return self._make('geometry_msgs/msg/TransformStamped',
+                          header=self._header(self._result.newest_stamp_ns, self._ground_frame),
+                          child_frame_id=camera_frame,
+                          transform=self._make('geometry_msgs/msg/Transform', translation=vector, rotation=quaternion))
+
+    def _header(self, stamp_ns: int, frame_id: str) -> Any:
+        stamp = self._make('builtin_interfaces/msg/Time', sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+        return self._make('std_msgs/msg/Header', stamp=stamp, frame_id=frame_id)
+
+    def _connect(self, topic: str, kind: str, qos: tuple[Qos, ...] = (LATCHED,)) -> Any:
+        return self._writer.add_connection(topic, kind, typestore=self._store, offered_qos_profiles=qos)
+
+    def _put(self, connection: Any, recorded_ns: int, message: Any) -> None:
+        self._writer.write(connection, recorded_ns, self._store.serialize_cdr(message, message.__msgtype__))
+
+    def _make(self, kind: str, **fields: Any) -> Any:
+        return self._store.types[kind](**fields)
+
+
+def _floats(values: np.ndarray) -> Iterator[float]:
+    return (float(value) for value in values)

@@ -1,0 +1,178 @@
+"""Any sensor_msgs image as grey (H, W) or BGR (H, W, 3) uint8, without cv_bridge.
+
+Messages are read by their attributes alone: those of rclpy (data is an array.array) and of rosbags (data is
+a read-only ndarray) serve alike. What needs no conversion is returned as a view of the message's own data.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from typing import Any
+
+import cv2
+import numpy as np
+
+from autocalib_ros.errors import InputError
+from autocalib_ros.perception.stretch import Stretch
+
+LOG = logging.getLogger(__name__)
+
+COLOUR_CODES = {
+    'rgb': cv2.COLOR_RGB2BGR, 'bgr': None, 'rgba': cv2.COLOR_RGBA2BGR, 'bgra': cv2.COLOR_BGRA2BGR, 'mono': None,
+    # OpenCV names a Bayer pattern by the second and third pixel of its second row, ROS by the first ones
+    'bayer_rggb': cv2.COLOR_BayerBG2BGR, 'bayer_bggr': cv2.COLOR_BayerRG2BGR,
+    'bayer_gbrg': cv2.COLOR_BayerGR2BGR, 'bayer_grbg': cv2.COLOR_BayerGB2BGR,
+}
+PACKED = {
+    **{f'{order}{bits}': (order, bits) for order in COLOUR_CODES for bits in (8, 16)},
+    '8UC1': ('mono', 8), '16UC1': ('mono', 16), '8UC3': ('bgr', 8),
+}
+"""Encoding to the order of its channels and the bits of each."""
+YUV422 = {
+    'yuv422': cv2.COLOR_YUV2BGR_UYVY, 'uyvy': cv2.COLOR_YUV2BGR_UYVY,
+    'yuv422_yuy2': cv2.COLOR_YUV2BGR_YUY2, 'yuyv': cv2.COLOR_YUV2BGR_YUY2,
+}
+ASSUMED = {'8UC1': 'mono8', '8UC3': 'bgr8'}
+"""Encodings that do not say what they mean, and what they are taken for."""
+BT601 = np.array([[1.164, 2.018, 0.0, -16 * 1.164 - 128 * 2.018],
+                  [1.164, -0.391, -0.813, -16 * 1.164 + 128 * (0.391 + 0.813)],
+                  [1.164, 0.0, 1.596, -16 * 1.164 - 128 * 1.596]])
+"""ITU-R BT.601, limited range: B, G, R from Y, U, V, 1."""
+JPEG_END_WITHIN = 4096
+"""Bytes at the end of a JPEG among which its end marker stands; some cameras pad their buffers."""
+
+
+class ImageDecoder:
+    """Decodes the images of one stream; remembers only how dark and bright its 16-bit images are."""
+
+    def __init__(self) -> None:
+        self._stretch = Stretch()
+        self._told: set[str] = set()
+
+    def decode(self, message: Any) -> np.ndarray:
+        """Return a sensor_msgs Image or CompressedImage as grey or BGR uint8; never changes the message.
+
+        The result may be a read-only view of the message. Raises InputError with the reason.
+        """
+        try:
+            if hasattr(message, 'encoding'):
+                return self._raw(message)
+            return self._compressed(message)
+        except cv2.error as error:
+            what = getattr(message, 'encoding', '') or getattr(message, 'format', '')
+            raise InputError(f"image of encoding '{what}' cannot be converted: {_first_line(error)}") from error
+
+    def _raw(self, message: Any) -> np.ndarray:
+        encoding = message.encoding
+        if message.width < 1 or message.height < 1:
+            raise InputError(f"image of encoding '{encoding}' has no pixels: {message.width} x {message.height}")
+        if encoding in ASSUMED:
+            self._tell_once(encoding)
+        if encoding in PACKED:
+            return self._packed(message, *PACKED[encoding])
+        if encoding in YUV422:
+            pixels = _rows(message, 2 * message.width, 1).reshape(message.height, message.width, 2)
+            return cv2.cvtColor(np.ascontiguousarray(pixels), YUV422[encoding])
+        if encoding in PLANAR:
+            return PLANAR[encoding](message)
+        raise InputError(f"image encoding '{encoding}' is not supported")
+
+    def _packed(self, message: Any, order: str, bits: int) -> np.ndarray:
+        channels = {'mono': 1, 'rgb': 3, 'bgr': 3, 'rgba': 4, 'bgra': 4}.get(order, 1)
+        rows = _rows(message, message.width * channels * bits // 8, 1)
+        if bits == 16:
+            rows = np.ascontiguousarray(rows).view('>u2' if message.is_bigendian else '<u2')
+            rows = self._stretch.to_8_bit(rows, message.encoding)
+        pixels = rows.reshape(message.height, message.width, channels) if channels > 1 else rows
+        code = COLOUR_CODES[order]
+        pixels = np.ascontiguousarray(pixels)
+        return pixels if code is None else cv2.cvtColor(pixels, code)
+
+    def _compressed(self, message: Any) -> np.ndarray:
+        said = str(message.format)
+        if 'compressedDepth' in said:
+            raise InputError(f"compressed image of format '{said}' holds depths, not a picture")
+        data = np.frombuffer(message.data, np.uint8)
+        _check_container(data, said)
+        # the pixels as the sensor delivered them: a turn asked for by EXIF would change the camera's geometry
+        image = cv2.imdecode(data, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
+        if image is None:
+            raise InputError(f"compressed image of format '{said}', {len(data)} bytes, cannot be decoded")
+        if image.dtype == np.uint16:
+            image = self._stretch.to_8_bit(image, said)
+        # image_transport compresses a raw Bayer mosaic as it is: grey, with its pattern in the format
+        pattern = said.split(';')[0].rstrip('168')
+        if image.ndim == 2 and pattern.startswith('bayer_') and pattern in COLOUR_CODES:
+            return cv2.cvtColor(image, COLOUR_CODES[pattern])
+        return image
+
+    def _tell_once(self, encoding: str) -> None:
+        if encoding not in self._told:
+            self._told.add(encoding)
+            LOG.warning("image encoding '%s' does not name its colours; taken for %s", encoding, ASSUMED[encoding])
+
+
+def _rows(message: Any, row_bytes: int, planes: float) -> np.ndarray:
+    """Return the image's rows without their padding, a view of shape (rows, row_bytes), after checking lengths.
+
+    `planes` is the number of rows in units of the image's height.
+    """
+    if message.step < row_bytes:
+        raise InputError(f"image of encoding '{message.encoding}' and width {message.width} needs rows of {row_bytes}"
+                         f' bytes, but its step is {message.step}')
+    data, rows = np.frombuffer(message.data, np.uint8), int(message.height * planes)
+    expected = message.step * rows
+    if len(data) < expected:
+        raise InputError(f"image of encoding '{message.encoding}' needs {expected} bytes ({rows} rows of"
+                         f' {message.step}), found {len(data)}')
+    return data[:expected].reshape(rows, message.step)[:, :row_bytes]
+
+
+def _nv21(message: Any) -> np.ndarray:
+    """Y at full size, then V and U in turns at half the height and width."""
+    rows = _rows(_LumaStep(message, 1.5), message.width, 1.5)
+    return cv2.cvtColor(np.ascontiguousarray(rows), cv2.COLOR_YUV2BGR_NV21)
+
+
+def _nv24(message: Any) -> np.ndarray:
+    """Y at full size, then U and V in turns at full size: OpenCV has no conversion of its own."""
+    message = _LumaStep(message, 3)
+    height, width, step = message.height, message.width, message.step
+    _rows(message, width, 3)
+    data = np.frombuffer(message.data, np.uint8)
+    luma = data[:step * height].reshape(height, step)[:, :width, None]
+    chroma = data[step * height:3 * step * height].reshape(height, 2 * step)[:, :2 * width].reshape(height, width, 2)
+    return cv2.transform(np.concatenate([luma, chroma], axis=2), BT601)
+
+
+PLANAR: dict[str, Callable[[Any], np.ndarray]] = {'nv21': _nv21, 'nv24': _nv24}
+
+
+class _LumaStep:
+    """A planar message whose step is that of its luma plane.
+
+    Drivers disagree: some give the bytes of a luma row, some those of a whole pixel row of all planes; the length
+    of the data tells.
+    """
+
+    def __init__(self, message: Any, planes: float) -> None:
+        self.encoding, self.data = message.encoding, message.data
+        self.width, self.height = message.width, message.height
+        tight = len(message.data) == int(message.width * message.height * planes)
+        self.step = message.width if tight else message.step
+
+
+def _check_container(data: np.ndarray, said: str) -> None:
+    """Go by the bytes: `format` is often wrong, and OpenCV fills what a torn JPEG lacks with grey."""
+    head = data[:8].tobytes()
+    if head.startswith(b'\xff\xd8\xff'):
+        if b'\xff\xd9' not in data[-JPEG_END_WITHIN:].tobytes():
+            raise InputError(f"compressed image of format '{said}' is a JPEG cut off after {len(data)} bytes")
+    elif head != b'\x89PNG\r\n\x1a\n':
+        begin = head.hex(' ') or 'nothing'
+        raise InputError(f"compressed image of format '{said}' is neither JPEG nor PNG, it begins with {begin}")
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip().splitlines() or ['unknown reason'])[0]

@@ -1,0 +1,1 @@
+"""The live shell: the only rooms that import rclpy and message packages."""

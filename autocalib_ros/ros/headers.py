@@ -1,0 +1,56 @@
+"""What image headers say, put right where drivers get it wrong, with one warning for each kind of fault."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+
+from builtin_interfaces.msg import Time
+
+from autocalib_ros.config import NodeOptions
+from autocalib_ros.ros.messages import stamp_ns
+
+DEFAULT_FRAME = 'camera_optical_frame'
+
+
+class Headers:
+    """Stamps and frames of one camera; `warn` and `now_ns` come from the node."""
+
+    def __init__(self, options: NodeOptions, namespace: str, warn: Callable[[str], None],
+                 now_ns: Callable[[], int]) -> None:
+        self._options, self._namespace, self._warn, self._now_ns = options, namespace.strip('/'), warn, now_ns
+        self._warned: set[str] = set()
+
+    def stamp_ns(self, stamp: Time) -> int:
+        """Return the time of an image in nanoseconds; the time of receipt when the driver sets none."""
+        if stamp.sec or stamp.nanosec:
+            return stamp_ns(stamp)
+        self._warn_once('images carry no time stamp: the time of receipt is used')
+        return self._now_ns()
+
+    def frame_id(self, given: str) -> str:
+        """Return the frame that tf2 knows an image by: as given but for a leading '/', and never empty."""
+        if not given:
+            frame = self._options.camera_frame.lstrip('/') or DEFAULT_FRAME
+            self._warn_once(f"images carry no frame_id: '{frame}' is used")
+            return frame
+        if given.startswith('/'):
+            self._warn_once(f"images carry the frame_id '{given}': its leading '/' is left out, tf2 rejects it")
+        return given.lstrip('/') or DEFAULT_FRAME
+
+    def camera_frame(self, image_frame: str) -> str:
+        """Return the frame whose pose is published."""
+        return self._options.camera_frame.lstrip('/') or image_frame
+
+    def camera_name(self, image_frame: str) -> str:
+        """Return the camera's name in letters, digits and _, as camera_info_manager wants it."""
+        return re.sub(r'[^A-Za-z0-9_]', '_', self._options.camera_name or self._namespace or image_frame)
+
+    def ground_frame(self, image_frame: str) -> str:
+        """Return the frame of the ground plane; it holds the camera's name, so that two cameras do not collide."""
+        return self._options.ground_frame.lstrip('/') or f'{self.camera_name(image_frame)}_ground'
+
+    def _warn_once(self, text: str) -> None:
+        if text not in self._warned:
+            self._warned.add(text)
+            self._warn(text)

@@ -1,0 +1,75 @@
+"""The options of config.py as ROS parameters: declared by walking the dataclasses, read back into them."""
+
+from __future__ import annotations
+
+import sys
+from difflib import get_close_matches
+from typing import Any
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.node import Node
+
+from autocalib_ros.config import Declared, NodeOptions, Options, declared, with_values
+from autocalib_ros.errors import UsageError
+
+OF_ROS = ('use_sim_time', 'start_type_description_service')
+"""Parameters that rclpy declares for every node."""
+INT64_MAX = 2 ** 63 - 1
+
+
+def options_of(node: Node) -> tuple[Options, NodeOptions]:
+    """Declare every option as a read-only parameter and return what was given, or raise UsageError.
+
+    The node has to be created with `automatically_declare_parameters_from_overrides=True`: rclpy has no
+    other public way to see a parameter that was given but that nobody declares, a misspelt one.
+    """
+    given = {name: parameter.value for name, parameter in node.get_parameters_by_prefix('').items()
+             if name not in OF_ROS and not name.startswith('qos_overrides.')}
+    options, node_options = read(given)
+    for item in (*declared(Options()), *declared(NodeOptions())):
+        if item.name in given:
+            node.undeclare_parameter(item.name)
+        node.declare_parameter(item.name, item.default, descriptor(item))
+    return options, node_options
+
+
+def read(given: dict[str, Any]) -> tuple[Options, NodeOptions]:
+    """Return the options with the parameters that were given, by full name."""
+    items = {item.name: item for item in (*declared(Options()), *declared(NodeOptions()))}
+    for name, value in given.items():
+        if name not in items:
+            raise UsageError(_unknown(name, list(items)))
+        _refuse_int_for_float(items[name], value)
+    of_node = {item.name for item in declared(NodeOptions())}
+    return (with_values(Options(), {name: value for name, value in given.items() if name not in of_node}),
+            with_values(NodeOptions(), {name: value for name, value in given.items() if name in of_node}))
+
+
+def _unknown(name: str, names: list[str]) -> str:
+    near = get_close_matches(name, names, n=1)
+    hint = f"did you mean '{near[0]}'?" if near else 'config/autocalib.yaml lists all of them'
+    return f"unknown parameter '{name}': {hint}"
+
+
+def _refuse_int_for_float(item: Declared, value: Any) -> None:
+    """ROS keeps the type of a parameter: a float cannot be set to an int, here or by anybody later."""
+    if type(item.default) is float and type(value) is int:
+        raise UsageError(f"parameter '{item.name}' is a float: write {item.name}:={float(value)}, not {value}")
+
+
+def descriptor(item: Declared) -> ParameterDescriptor:
+    """Describe one option; all of them shape the evidence from the first image on, so none changes while running."""
+    described = ParameterDescriptor(name=item.name, description=item.doc, read_only=True)
+    if item.choices:
+        described.additional_constraints = f'one of: {", ".join(repr(choice) for choice in item.choices)}'
+    if item.low is None and item.high is None:
+        return described
+    if isinstance(item.default, float):
+        low = -sys.float_info.max if item.low is None else float(item.low)
+        high = sys.float_info.max if item.high is None else float(item.high)
+        described.floating_point_range = [FloatingPointRange(from_value=low, to_value=high, step=0.0)]
+    else:
+        low = -INT64_MAX if item.low is None else int(item.low)
+        high = INT64_MAX if item.high is None else int(item.high)
+        described.integer_range = [IntegerRange(from_value=low, to_value=high, step=1)]
+    return described

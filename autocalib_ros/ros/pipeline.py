@@ -1,0 +1,208 @@
+"""Two threads between the image callback and the calibration, so that nothing in ROS waits for either.
+
+    image callback -> newest image -> perception thread -> newest snapshot -> solver thread -> listener
+
+Both hand-overs keep only the newest: what is late is dropped and counted, never queued. Snapshots are
+taken and solved in order, so a result never follows one that rests on newer evidence.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any, Protocol
+
+import numpy as np
+
+from autocalib_ros.calibration import Calibration, Refusal
+from autocalib_ros.calibrator import AutoCalibrator, Progress
+from autocalib_ros.config import Options
+from autocalib_ros.errors import AutocalibError
+from autocalib_ros.evidence import Evidence
+
+PROGRESS_PERIOD_S = 1.0
+"""Real time between two looks at the progress."""
+Result = Calibration | Refusal
+Solve = Callable[[Evidence, Options], Result]
+
+
+class Listener(Protocol):
+    """Who is told what the threads find; called from the threads."""
+
+    def image_taken(self, width: int, height: int) -> None:
+        """An image of this size has been decoded."""
+
+    def image_unreadable(self, error: AutocalibError) -> None:
+        """An image could not be used."""
+
+    def solved(self, result: Result) -> None:
+        """A snapshot has been solved."""
+
+    def failed(self, error: Exception) -> None:
+        """The program itself is at fault; both threads go on."""
+
+
+@dataclass
+class Counters:
+    """What became of the images so far."""
+
+    received: int = 0
+    dropped: int = 0
+    unreadable: int = 0
+    used: int = 0
+
+    def __str__(self) -> str:
+        return (f'images received {self.received}, used {self.used}, dropped {self.dropped}, '
+                f'unreadable {self.unreadable}')
+
+
+@dataclass
+class _Job:
+    evidence: Evidence
+    waiting: list[Future] = field(default_factory=list)
+    """Callers of the service, who get the result of this snapshot or of a newer one that replaced it."""
+
+
+class Pipeline:
+    """Owns the calibrator and the two threads; `offer` and `solve_now` may be called from any thread."""
+
+    def __init__(self, options: Options, *, idle_solve_s: float, decode: Callable[[Any], np.ndarray], solve: Solve,
+                 listener: Listener) -> None:
+        self._options, self._idle_solve_s = options, idle_solve_s
+        self._decode, self._solve, self._listener = decode, solve, listener
+        self._calibrator = AutoCalibrator(options)
+        self._changed = threading.Condition()
+        self._image: tuple[int, Any] | None = None
+        self._requests: list[Future] = []
+        self._job: _Job | None = None
+        self._running: _Job | None = None
+        self._closed = False
+        self._unsolved = 0
+        self._arrived = time.monotonic()
+        self._looked = -PROGRESS_PERIOD_S
+        self.counters = Counters()
+        self.progress: Progress | None = None
+        self._threads = [threading.Thread(target=run, name=name, daemon=True)
+                         for run, name in ((self._perceive, 'perception'), (self._estimate, 'solver'))]
+        for thread in self._threads:
+            thread.start()
+
+    def offer(self, stamp_ns: int, message: Any) -> None:
+        """Leave an image for the perception thread; one that still lies there is dropped."""
+        with self._changed:
+            self.counters.received += 1
+            self.counters.dropped += self._image is not None
+            self._image = (stamp_ns, message)
+            self._arrived = time.monotonic()
+            self._changed.notify_all()
+
+    def solve_now(self) -> Future:
+        """Ask for a solution of what is there now; the future holds None when there is nothing yet."""
+        future: Future = Future()
+        with self._changed:
+            if self._closed:
+                future.set_result(None)
+            else:
+                self._requests.append(future)
+                self._changed.notify_all()
+        return future
+
+    def close(self, timeout_s: float) -> bool:
+        """Stop both threads and say whether they ended in time: a solution that runs cannot be interrupted."""
+        with self._changed:
+            self._closed = True
+            for job in (self._job, self._running):
+                self._requests += job.waiting if job else []
+            waiting, self._requests, self._job = self._requests, [], None
+            self._changed.notify_all()
+        self._answer(waiting, None)
+        deadline = time.monotonic() + timeout_s
+        for thread in self._threads:
+            thread.join(max(0.0, deadline - time.monotonic()))
+        return not any(thread.is_alive() for thread in self._threads)
+
+    def _perceive(self) -> None:
+        """Run the perception thread: the only one that touches the calibrator."""
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._closed or self._image or self._requests, self._until_idle())
+                if self._closed:
+                    return
+                (image, self._image), (requests, self._requests) = (self._image, None), (self._requests, [])
+            if image is not None:
+                self._use(*image)
+            if requests or (image is None and self._until_idle() == 0.0):
+                self._submit(self._guarded(self._calibrator.snapshot), requests)
+
+    def _until_idle(self) -> float | None:
+        """Return the seconds until what is left counts as all there is; None when nothing is left to solve."""
+        if not self._unsolved:
+            return None
+        return max(0.0, self._arrived + self._idle_solve_s - time.monotonic())
+
+    def _use(self, stamp_ns: int, message: Any) -> None:
+        """Turn one image into evidence; submit a snapshot when one is due."""
+        try:
+            image = self._decode(message)
+            height, width = image.shape[:2]
+            self._calibrator.add_image(stamp_ns, image)
+        except AutocalibError as error:
+            self.counters.unreadable += 1
+            self._listener.image_unreadable(error)
+            return
+        except Exception as error:  # an unattended camera must survive one bad frame
+            self._listener.failed(error)
+            return
+        self.counters.used += 1
+        self._unsolved += 1
+        self._listener.image_taken(width, height)
+        evidence = self._guarded(self._calibrator.take_due)
+        if evidence is not None:
+            self._submit(evidence, [])
+        if time.monotonic() >= self._looked + PROGRESS_PERIOD_S:
+            self._looked = time.monotonic()
+            self.progress = self._guarded(self._calibrator.progress)
+
+    def _submit(self, evidence: Evidence | None, requests: list[Future]) -> None:
+        """Leave a snapshot for the solver thread; it takes the place, and the callers, of one still waiting."""
+        self._unsolved = 0
+        with self._changed:
+            if evidence is not None and not self._closed:
+                waiting = self._job.waiting if self._job else []
+                self._job = _Job(evidence, [*waiting, *requests])
+                self._changed.notify_all()
+                return
+        self._answer(requests, None)
+
+    def _estimate(self) -> None:
+        """Run the solver thread."""
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._closed or self._job)
+                if self._closed or self._job is None:
+                    return
+                job = self._running = self._job
+                self._job = None
+            result = self._guarded(partial(self._solve, job.evidence, self._options))
+            if result is not None:
+                self._guarded(partial(self._listener.solved, result))
+            self._answer(job.waiting, result)
+
+    def _answer(self, futures: list[Future], result: Result | None) -> None:
+        """Give callers their result; `close` may have sent them away in the meantime."""
+        with self._changed:
+            for future in futures:
+                if not future.done():
+                    future.set_result(result)
+
+    def _guarded(self, step: Callable[[], Any]) -> Any:
+        """Return what a step of the core gives, or None when it fails: a thread that dies would fail silently."""
+        try:
+            return step()
+        except Exception as error:  # reported with its traceback by the listener
+            self._listener.failed(error)
+            return None

@@ -1,0 +1,53 @@
+"""Results and states in one line each, for the log and the answers of services."""
+
+from __future__ import annotations
+
+import math
+
+from autocalib_ros.calibration import Calibration, GroundPlane, Refusal
+from autocalib_ros.calibrator import Progress
+
+
+def described(result: Calibration | Refusal) -> str:
+    """Return a result in one line."""
+    return described_refusal(result) if isinstance(result, Refusal) else described_calibration(result)
+
+
+def described_refusal(refusal: Refusal) -> str:
+    """Return why there is no calibration, and what helps."""
+    return _one_line(f'refused ({refusal.code}): {refusal.message} Remedy: {refusal.remedy}')
+
+
+def described_calibration(result: Calibration) -> str:
+    """Return focal length, tilt and height with their sigma, the grade and what was assumed."""
+    sigma = result.stddev
+    parts = [f'focal length {result.camera.focal_px:.2f} px{_sigma(sigma.focal_px)}']
+    if result.ground is not None:
+        unit = 'm' if result.ground.metric else '(units of the camera height)'
+        parts += [f'tilt {tilt_deg(result.ground):.2f} deg{_sigma(sigma.tilt_deg)}',
+                  f'height {result.ground.height_m:g} {unit}']
+    elif result.ground_refusal is not None:
+        parts.append(f'no ground plane ({result.ground_refusal.code}): {result.ground_refusal.message}')
+    assumptions = '; '.join(result.assumptions) or 'none'
+    return _one_line(f'calibrated, grade {result.grade}: {", ".join(parts)}; assumptions: {assumptions}')
+
+
+def described_progress(progress: Progress | None) -> str:
+    """Return how far the evidence has come and what is missing."""
+    if progress is None:
+        return 'collecting'
+    missing = f', missing: {"; ".join(progress.missing)}' if progress.missing else ''
+    return _one_line(f'collecting: {progress.percent:.0f} %{missing}')
+
+
+def tilt_deg(ground: GroundPlane) -> float:
+    """Return the angle of the optical axis below the horizon, degrees."""
+    return math.degrees(math.asin(max(-1.0, min(1.0, -float(ground.normal_in_camera[2])))))
+
+
+def _sigma(value: float | None) -> str:
+    return '' if value is None else f' (sigma {value:.3g})'
+
+
+def _one_line(text: str) -> str:
+    return ' '.join(text.split())

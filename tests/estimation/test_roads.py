@@ -1,0 +1,145 @@
+"""The robust method on made-up traffic: perfect, noisy, and deliberately poisoned."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from autocalib_ros.calibration import Calibration, Refusal
+from autocalib_ros.calibrator import solve
+from autocalib_ros.camera import Camera
+from autocalib_ros.config import JointOptions, Options
+from autocalib_ros.evidence import Evidence
+from autocalib_ros.offline.synthetic_evidence import Junction, pose, synthetic_evidence
+
+OPTIONS = Options(camera_height=8.0)
+
+
+def solved(junction: Junction, seed: int = 0, options: Options = OPTIONS) -> Calibration | Refusal:
+    return solve(synthetic_evidence(junction, np.random.default_rng(seed)), options)
+
+
+def normal_error_deg(result: Calibration, junction: Junction) -> float:
+    assert result.ground is not None
+    cosine = result.ground.normal_in_camera @ junction.normal_in_camera
+    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+
+
+def test_perfect_traffic_gives_the_truth() -> None:
+    junction = Junction(turning_share=0.0, wander_m=0.0, noise_px=0.0)
+    result = solved(junction)
+    assert isinstance(result, Calibration)
+    assert result.camera.focal_px == pytest.approx(560.0, rel=1e-3)
+    assert normal_error_deg(result, junction) < 0.05
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_real_driving_is_solved_within_two_per_cent_and_half_a_degree(seed: int) -> None:
+    junction = Junction()  # 0.5 px noise, 0.1 m wander, 20 % turning
+    result = solved(junction, seed)
+    assert isinstance(result, Calibration)
+    assert result.camera.focal_px == pytest.approx(560.0, rel=0.02)
+    assert normal_error_deg(result, junction) < 0.5
+
+
+@pytest.mark.parametrize(('k1', 'shift'), [(0.04, (12.0, -8.0)), (-0.03, (-15.0, 5.0))])
+def test_a_lens_that_is_not_quite_equidistant_is_found(k1: float, shift: tuple[float, float]) -> None:
+    camera = Camera(1280, 720, 560.0, (639.5 + shift[0], 359.5 + shift[1]), (k1, 0.0, 0.0, 0.0))
+    junction = Junction(camera=camera, vehicles=120)
+    result = solved(junction)
+    assert isinstance(result, Calibration)
+    assert result.camera.focal_px == pytest.approx(560.0, rel=0.03)
+    assert normal_error_deg(result, junction) < 0.7
+
+
+def test_turning_vehicles_do_not_pull_the_solution() -> None:
+    junction = Junction(turning_share=0.5, vehicles=120)
+    result = solved(junction)
+    assert isinstance(result, Calibration)
+    assert result.camera.focal_px == pytest.approx(560.0, rel=0.03)
+
+
+def test_skewed_roads_are_measured_not_squared() -> None:
+    junction = Junction(road_angles_deg=(0.0, 70.0), vehicles=120)
+    result = solved(junction)
+    assert isinstance(result, Calibration)
+    assert any('measured' in text for text in result.assumptions)
+    assert normal_error_deg(result, junction) < 1.0
+
+
+def test_perpendicularity_is_tested_before_it_is_used() -> None:
+    result = solved(Junction())
+    assert isinstance(result, Calibration)
+    assert any('90 degrees (tested' in text for text in result.assumptions)
+
+
+def test_perpendicularity_can_be_asserted() -> None:
+    result = solved(Junction(), options=replace(OPTIONS, joint=JointOptions(road_angle='perpendicular')))
+    assert isinstance(result, Calibration)
+    first, second = result.road_directions
+    assert first @ second == pytest.approx(0.0, abs=1e-9)
+
+
+def test_one_road_gives_a_lens_and_says_why_there_is_no_plane() -> None:
+    junction = Junction(road_angles_deg=(0.0,), turning_share=0.0, vehicles=120,
+                        camera_from_ground=pose(35.0, 1.0, 60.0), centre_m=(6.0, -10.0))
+    result = solved(junction)
+    assert isinstance(result, Calibration)
+    assert (result.grade, result.ground) == ('lens', None)
+    assert result.ground_refusal is not None and result.ground_refusal.code == 'one_direction'
+
+
+def test_traffic_that_only_turns_is_refused() -> None:
+    result = solved(Junction(turning_share=1.0, vehicles=80))
+    assert isinstance(result, Refusal)
+    assert result.code in ('turning_traffic', 'halves_disagree', 'no_direction')
+
+
+def test_a_lens_without_curvature_is_refused() -> None:
+    camera = Camera(1280, 720, 1200.0, (639.5, 359.5), (1 / 3, 2 / 15, 17 / 315, 62 / 2835))
+    junction = Junction(camera=camera, vehicles=120, camera_from_ground=pose(25.0, 0.0, 35.0))
+    result = solved(junction)
+    assert isinstance(result, Refusal)
+    assert result.code in ('too_little_curvature', 'lens_model')
+
+
+def test_too_few_tracks_are_refused_with_both_numbers() -> None:
+    result = solved(Junction(vehicles=5))
+    assert isinstance(result, Refusal)
+    assert result.code == 'too_few_tracks' and '40 needed' in result.message
+
+
+def test_without_a_height_the_lens_still_comes() -> None:
+    result = solved(Junction(), options=Options())
+    assert isinstance(result, Calibration)
+    assert result.ground is None and result.grade == 'lens'
+    assert result.ground_refusal is not None and result.ground_refusal.code == 'no_height'
+
+
+def test_unit_scale_comes_only_when_asked_for() -> None:
+    result = solved(Junction(), options=Options(allow_unit_scale=True))
+    assert isinstance(result, Calibration) and result.ground is not None
+    assert (result.grade, result.ground.metric, result.ground.height_m) == ('unit_scale', False, 1.0)
+
+
+def test_the_same_evidence_gives_the_same_answer_to_the_last_bit() -> None:
+    first, second = solved(Junction()), solved(Junction())
+    assert isinstance(first, Calibration) and isinstance(second, Calibration)
+    assert first.camera == second.camera
+    np.testing.assert_array_equal(first.ground.rotation, second.ground.rotation)  # type: ignore[union-attr]
+
+
+def test_standard_deviations_have_the_size_of_the_errors() -> None:
+    results = [solved(Junction(), seed) for seed in range(8)]
+    errors = [(result.camera.focal_px - 560.0) / result.stddev.focal_px for result in results
+              if isinstance(result, Calibration) and result.stddev.focal_px]
+    assert len(errors) == 8
+    assert 0.2 < np.sqrt(np.mean(np.square(errors))) < 2.0  # eight runs tell a factor of two, no more
+
+
+def test_a_moving_camera_is_refused() -> None:
+    evidence: Evidence = replace(synthetic_evidence(Junction(), np.random.default_rng(0)), drift_px=12.0)
+    result = solve(evidence, OPTIONS)
+    assert isinstance(result, Refusal) and result.code == 'camera_moving'

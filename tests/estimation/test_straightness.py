@@ -1,0 +1,75 @@
+"""Focal length from straightness, published and robust."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from autocalib_ros.camera import Camera
+from autocalib_ros.config import PaperOptions
+from autocalib_ros.estimation.great_circles import select_tracks
+from autocalib_ros.estimation.straightness import (
+    distortion_polynomial,
+    focal_trials,
+    paper_intrinsics,
+    paper_tracks,
+    straightness_sweep,
+)
+from autocalib_ros.offline.synthetic_evidence import Junction, synthetic_evidence
+
+STRAIGHT = Junction(turning_share=0.0, wander_m=0.0, noise_px=0.2)
+WINDOW = PaperOptions(window_s=3.0)  # synthetic vehicles cross the image in three to eight seconds
+
+
+def test_published_sweep_finds_the_focal_length_of_clean_straight_traffic() -> None:
+    evidence = synthetic_evidence(STRAIGHT, np.random.default_rng(0))
+    found = paper_intrinsics(evidence, WINDOW)
+    assert found is not None
+    assert found.report.focal_px == pytest.approx(560.0, rel=0.05)  # the published method's own error is 7 %
+
+
+def test_straightness_improves_by_undistortion() -> None:
+    found = paper_intrinsics(synthetic_evidence(STRAIGHT, np.random.default_rng(0)), WINDOW)
+    assert found is not None
+    before, after = found.report.straightness_px2
+    assert after < before / 4
+
+
+def test_published_sweep_never_reaches_ninety_degrees() -> None:
+    evidence = synthetic_evidence(STRAIGHT, np.random.default_rng(0))
+    found = paper_intrinsics(evidence, WINDOW)
+    assert found is not None
+    paths, _ = paper_tracks(evidence, WINDOW)
+    radius = max(np.hypot(*(path - (639.5, 359.5)).T).max() for path in paths)
+    assert radius / found.sweep[0, 0] < np.pi / 2
+    assert np.isfinite(found.sweep).all()
+
+
+def test_published_filters_keep_the_ten_longest() -> None:
+    evidence = synthetic_evidence(STRAIGHT, np.random.default_rng(0))
+    paths, indices = paper_tracks(evidence, WINDOW)
+    assert len(paths) == len(indices) == 10
+    lengths = [np.hypot(*(path[-1] - path[0])) for path in paths]
+    assert lengths == sorted(lengths, reverse=True)
+
+
+def test_published_filters_drop_short_lives() -> None:
+    evidence = synthetic_evidence(STRAIGHT, np.random.default_rng(0))
+    paths, _ = paper_tracks(evidence, PaperOptions(window_s=60.0))
+    assert not paths
+    assert paper_intrinsics(evidence, PaperOptions(window_s=60.0)) is None
+
+
+def test_polynomial_maps_distorted_to_undistorted() -> None:
+    camera = Camera(1280, 720, 700.0, (639.5, 359.5))
+    k1, k2, k3 = distortion_polynomial(camera)
+    r = 0.8
+    assert r * (1 + k1 * r**2 + k2 * r**4 + k3 * r**6) == pytest.approx(np.tan(r), rel=2e-3)
+
+
+def test_robust_sweep_finds_the_focal_length_among_turning_traffic() -> None:
+    evidence = synthetic_evidence(Junction(turning_share=0.3), np.random.default_rng(3))
+    tracks = select_tracks(evidence, 500)
+    trials = focal_trials(tracks, evidence.image_size, 60)
+    best = trials[np.argmin(straightness_sweep(tracks, evidence.image_size, trials))]
+    assert best == pytest.approx(560.0, rel=0.12)  # a start, two steps of the grid; the joint problem refines it

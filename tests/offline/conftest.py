@@ -1,0 +1,214 @@
+"""Tiny recordings, written with rosbags and OpenCV, and results built by hand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from autocalib_ros.calibration import (
+    Calibration,
+    Figures,
+    GroundPlane,
+    PaperReport,
+    Reason,
+    Refusal,
+    StandardDeviations,
+)
+from autocalib_ros.camera import Camera
+from autocalib_ros.config import BufferOptions
+from autocalib_ros.evidence import Evidence, EvidenceBuffer, Track
+from autocalib_ros.offline.replay import ReplayResult
+
+WIDTH, HEIGHT = 32, 24
+SECOND = 1_000_000_000
+TYPES = get_typestore(Stores.ROS2_JAZZY)
+TYPES1 = get_typestore(Stores.ROS1_NOETIC)
+
+
+def picture(index: int) -> np.ndarray:
+    """Return a grey image that tells its number by its brightness."""
+    return np.full((HEIGHT, WIDTH), (10 * index + 5) % 256, np.uint8)
+
+
+def header(stamp_ns: int, frame_id: str = 'cam1_optical', types: Any = TYPES) -> Any:
+    """Return a std_msgs/Header of ROS 2 or ROS 1."""
+    stamp = types.types['builtin_interfaces/msg/Time'](sec=stamp_ns // SECOND, nanosec=stamp_ns % SECOND)
+    more = {'seq': 0} if types is TYPES1 else {}
+    return types.types['std_msgs/msg/Header'](stamp=stamp, frame_id=frame_id, **more)
+
+
+def raw_image(index: int, stamp_ns: int, types: Any = TYPES, **changes: Any) -> Any:
+    """Return a mono8 sensor_msgs/Image."""
+    fields = {'header': header(stamp_ns, types=types), 'height': HEIGHT, 'width': WIDTH, 'encoding': 'mono8',
+              'is_bigendian': 0, 'step': WIDTH, 'data': picture(index).ravel()}
+    return types.types['sensor_msgs/msg/Image'](**{**fields, **changes})
+
+
+def jpeg_image(index: int, stamp_ns: int) -> Any:
+    """Return a sensor_msgs/CompressedImage."""
+    data = cv2.imencode('.jpg', picture(index))[1].ravel()
+    return TYPES.types['sensor_msgs/msg/CompressedImage'](header=header(stamp_ns), format='jpeg', data=data)
+
+
+@pytest.fixture
+def write_bag() -> Callable[..., Path]:
+    """Return a function that writes a rosbag2 folder of (topic, recorded_ns, message)."""
+    def write(path: Path, messages: list[tuple[str, int, Any]], *, mcap: bool = False,
+              compression: str = 'NONE', topics: tuple[tuple[str, str], ...] = ()) -> Path:
+        writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP if mcap else StoragePlugin.SQLITE3)
+        writer.set_compression(CompressionMode[compression], CompressionFormat.ZSTD)
+        with writer:
+            wanted = dict.fromkeys([*topics, *((topic, message.__msgtype__) for topic, _, message in messages)])
+            connections = {topic: writer.add_connection(topic, kind, typestore=TYPES) for topic, kind in wanted}
+            for topic, recorded_ns, message in messages:
+                writer.write(connections[topic], recorded_ns, TYPES.serialize_cdr(message, message.__msgtype__))
+        return path
+    return write
+
+
+@pytest.fixture
+def write_bag1() -> Callable[..., Path]:
+    """Return a function that writes a ROS 1 bag of (topic, recorded_ns, message)."""
+    def write(path: Path, messages: list[tuple[str, int, Any]]) -> Path:
+        with Writer1(path) as writer:
+            kinds = dict.fromkeys((topic, message.__msgtype__) for topic, _, message in messages)
+            connections = {topic: writer.add_connection(topic, kind, typestore=TYPES1) for topic, kind in kinds}
+            for topic, recorded_ns, message in messages:
+                writer.write(connections[topic], recorded_ns, TYPES1.serialize_ros1(message, message.__msgtype__))
+        return path
+    return write
+
+
+@pytest.fixture
+def images() -> Callable[..., list[tuple[str, int, Any]]]:
+    """Return a function that gives images at 10 Hz, recorded 5 ms after their stamps."""
+    def make(count: int = 8, topic: str = '/cam1/image_raw', make_one: Callable[..., Any] = raw_image,
+             begin_ns: int = 100 * SECOND, **changes: Any) -> list[tuple[str, int, Any]]:
+        stamps = [begin_ns + index * SECOND // 10 for index in range(count)]
+        return [(topic, stamp + 5_000_000, make_one(index, stamp, **changes)) for index, stamp in enumerate(stamps)]
+    return make
+
+
+@pytest.fixture
+def write_video() -> Callable[..., Path]:
+    """Return a function that writes a small video of `count` frames."""
+    def write(path: Path, count: int = 30, fps: float = 10.0, size: tuple[int, int] = (64, 48)) -> Path:
+        code = {'.mp4': 'mp4v', '.avi': 'MJPG', '.mkv': 'MJPG'}[path.suffix]
+        writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*code), fps, size)
+        noise = np.random.default_rng(0).integers(0, 255, (size[1], size[0], 3), np.uint8)
+        for index in range(count):
+            writer.write(np.roll(noise, index, axis=1))
+        writer.release()
+        return path
+    return write
+
+
+@pytest.fixture
+def ros1_image() -> Callable[..., Any]:
+    """Return the maker of mono8 images of ROS 1."""
+    return lambda index, stamp_ns: raw_image(index, stamp_ns, TYPES1)
+
+
+@pytest.fixture
+def jpeg() -> Callable[..., Any]:
+    """Return the maker of JPEG images."""
+    return jpeg_image
+
+
+@pytest.fixture
+def a_header_at() -> Callable[[int], Any]:
+    """Return the maker of headers with a given stamp."""
+    return header
+
+
+@pytest.fixture
+def a_header() -> Any:
+    """Return a message that is no image."""
+    return header(SECOND)
+
+
+def look(down_deg: float = 40.0) -> np.ndarray:
+    """Return ground_from_camera of a camera that looks down and along the ground's x and y alike."""
+    down = np.radians(down_deg)
+    forward = np.array([np.cos(down) * np.sqrt(0.5), np.cos(down) * np.sqrt(0.5), -np.sin(down)])
+    right = np.cross(forward, [0, 0, 1])
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(forward, right), forward], axis=1)
+
+
+def street_tracks(camera: Camera, ground: GroundPlane) -> list[Track]:
+    """Return straight tracks along x and along y that the camera sees."""
+    along, tracks = np.linspace(-30, 30, 200), []
+    for vehicle in range(24):
+        points = np.zeros((len(along), 3))
+        points[:, vehicle % 2], points[:, 1 - vehicle % 2] = 8 + along, 3 + vehicle / 2
+        bearings = (points - ground.translation_m) @ ground.rotation
+        pixels, valid = camera.project(bearings)
+        seen = valid & (bearings[:, 2] > 0) & (pixels > 0).all(axis=1) & (pixels < [319, 179]).all(axis=1)
+        if seen.sum() > 5:
+            tracks.append(Track(vehicle, along[seen], pixels[seen]))
+    return tracks
+
+
+@pytest.fixture
+def evidence_of_a_junction() -> Evidence:
+    """Return exact tracks on two roads seen by a small camera."""
+    camera, ground = Camera.equidistant(320, 180, 140.0), GroundPlane(look(), 8.0)
+    buffer = EvidenceBuffer(BufferOptions())
+    for track in street_tracks(camera, ground):
+        buffer.add_track(track)
+    return buffer.snapshot(image_size=(320, 180), first_stamp_ns=0, newest_stamp_ns=60 * SECOND, frames=600,
+                           drift_px=0.0, unfinished=[])
+
+
+@pytest.fixture
+def full(evidence_of_a_junction: Evidence) -> ReplayResult:
+    """Return a calibrated replay with everything that a report can show."""
+    ground, evidence = GroundPlane(look(), 8.0), evidence_of_a_junction
+    trials = np.linspace(80, 300, 50)
+    labels = evidence.track_vehicles % 2
+    labels[:2] = -1, -2
+    figures = Figures(
+        focal_sweep_px=np.stack([trials, 1 + (trials / 140 - 1)**2], axis=1), track_labels=labels,
+        orientation_histogram=np.stack([np.arange(-89.5, 90), np.arange(180) % 30], axis=1),
+        orientation_peaks_deg=(-30.0, 45.0), paper_tracks=np.arange(3))
+    result = Calibration(
+        method='joint', grade='full', assumptions=('the two roads are perpendicular',),
+        camera=Camera.equidistant(320, 180, 140.0), ground=ground, ground_refusal=None,
+        road_directions=ground.rotation[:2], newest_stamp_ns=evidence.newest_stamp_ns, evidence=evidence.summary(),
+        stddev=StandardDeviations(focal_px=1.5, tilt_deg=0.2), figures=figures,
+        paper=PaperReport(focal_px=150.0, polynomial_k=(0.3, 0.0, 0.0), straightness_px2=(4.0, 0.5)))
+    background = np.random.default_rng(0).integers(90, 160, (180, 320, 3)).astype(np.uint8)
+    return ReplayResult(result=result, evidence=evidence, accepted_at_s=30.0, background=background, frames=600)
+
+
+@pytest.fixture
+def refused(full: ReplayResult) -> ReplayResult:
+    """Return a refused replay."""
+    refusal = Refusal(code='too_few_tracks', message='only 12 of 40 tracks were seen', method='joint',
+                      remedy='Record at a busier time.', evidence=full.evidence.summary())
+    return replace(full, result=refusal, accepted_at_s=None)
+
+
+@pytest.fixture
+def lens_only(full: ReplayResult) -> ReplayResult:
+    """Return a replay that gave a lens and no ground plane."""
+    why = Reason(code='one_direction', message='one direction only', remedy='Aim at a crossing.')
+    lens = replace(full.result, grade='lens', ground=None, ground_refusal=why,
+                   road_directions=full.result.road_directions[:1])
+    return replace(full, result=lens)
+
+
+@pytest.fixture
+def jazzy() -> Any:
+    """Return the message types of Jazzy."""
+    return TYPES

@@ -1,0 +1,255 @@
+"""Recordings of ROS: kinds, topics, stamps, damage."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+
+import numpy as np
+import pytest
+
+from autocalib_ros.errors import InputError, UsageError
+from autocalib_ros.offline.sources import open_source
+
+SECOND = 1_000_000_000
+KINDS = [(False, 'NONE'), (False, 'MESSAGE'), (False, 'FILE'), (True, 'NONE'), (True, 'MESSAGE'), (True, 'FILE'),
+         (True, 'STORAGE')]
+
+
+def brightness(source):
+    return [int(frame.image.mean()) for frame in source.frames()]
+
+
+@pytest.mark.parametrize(('mcap', 'compression'), KINDS)
+def test_every_kind_of_rosbag2_gives_its_images(tmp_path, write_bag, images, mcap, compression):
+    path = write_bag(tmp_path / 'bag', images(4), mcap=mcap, compression=compression)
+    source = open_source(path)
+    assert (source.topic, source.camera_frame, source.total) == ('/cam1/image_raw', 'cam1_optical', 4)
+    frames = list(source.frames())
+    assert [frame.stamp_ns for frame in frames] == [100 * SECOND + index * SECOND // 10 for index in range(4)]
+    assert [int(frame.image[0, 0]) for frame in frames] == [5, 15, 25, 35]
+
+
+@pytest.mark.parametrize(('mcap', 'compression'), [kind for kind in KINDS if kind[1] != 'FILE'])
+def test_a_lone_file_without_metadata_is_read(tmp_path, write_bag, images, mcap, compression):
+    bag = write_bag(tmp_path / 'bag', images(4), mcap=mcap, compression=compression)
+    suffix = '.mcap' if mcap else '.db3'
+    lone = shutil.copy(bag / f'bag{suffix}', tmp_path / f'lone{suffix}')
+    assert brightness(open_source(lone)) == [5, 15, 25, 35]
+
+
+def test_a_folder_without_metadata_gives_all_its_parts_in_order(tmp_path, write_bag, images):
+    folder = tmp_path / 'killed'
+    folder.mkdir()
+    for name, begin_s in (('b', 100), ('a', 200)):
+        part = write_bag(tmp_path / name, images(3, begin_ns=begin_s * SECOND), mcap=True)
+        shutil.copy(part / f'{name}.mcap', folder)
+    seconds = [frame.stamp_ns // SECOND for frame in open_source(folder).frames()]
+    assert seconds == [100] * 3 + [200] * 3
+
+
+def test_an_old_sqlite_bag_without_message_definitions_is_read(tmp_path, write_bag, images):
+    bag = write_bag(tmp_path / 'bag', images(3))
+    old = tmp_path / 'old.db3'
+    with sqlite3.connect(bag / 'bag.db3') as new:
+        rows = new.execute('SELECT topic_id, timestamp, data FROM messages').fetchall()
+    new.close()
+    with sqlite3.connect(old) as database:
+        database.execute('CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT)')
+        database.execute('CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INT, timestamp INT, data BLOB)')
+        database.execute("INSERT INTO topics VALUES (1, '/image', 'sensor_msgs/msg/Image', 'cdr')")
+        database.executemany('INSERT INTO messages(topic_id, timestamp, data) VALUES (?, ?, ?)', rows)
+    database.close()
+    assert brightness(open_source(old)) == [5, 15, 25]
+
+
+def test_a_ros1_bag_is_read(tmp_path, write_bag1, images, ros1_image):
+    source = open_source(write_bag1(tmp_path / 'one.bag', images(3, make_one=ros1_image)))
+    assert brightness(source) == [5, 15, 25]
+    assert source.camera_frame == 'cam1_optical'
+
+
+def test_compressed_images_are_read(tmp_path, write_bag, images, jpeg):
+    source = open_source(write_bag(tmp_path / 'bag', images(3, topic='/cam1/image_raw/compressed', make_one=jpeg)))
+    # JPEG keeps a flat grey within two levels
+    assert np.allclose(brightness(source), [5, 15, 25], atol=2)
+
+
+def test_two_image_topics_have_to_be_chosen_from(tmp_path, write_bag, images):
+    path = write_bag(tmp_path / 'bag', images(2, '/a') + images(3, '/b'))
+    with pytest.raises(UsageError, match=r'2 image topics.*--topic.*/a \(sensor_msgs/msg/Image, 2 messages\), /b'):
+        open_source(path)
+    assert open_source(path, topic='b').total == 3
+
+
+def test_an_image_topic_without_messages_is_no_choice(tmp_path, write_bag, images):
+    path = write_bag(tmp_path / 'bag', images(2, '/a'), topics=(('/b', 'sensor_msgs/msg/Image'),))
+    assert open_source(path).topic == '/a'
+
+
+@pytest.mark.parametrize(('topic', 'message'), [
+    ('/nowhere', 'has no topic /nowhere; its image topics: /cam1/image_raw'),
+    ('/heads', 'holds no images but /heads .std_msgs/msg/Header'),
+])
+def test_a_wrong_topic_is_answered_with_the_right_ones(tmp_path, write_bag, images, a_header, topic, message):
+    path = write_bag(tmp_path / 'bag', [*images(2), ('/heads', 100 * SECOND, a_header)])
+    with pytest.raises(UsageError, match=message):
+        open_source(path, topic=topic)
+
+
+def test_a_bag_without_images_says_what_it_holds(tmp_path, write_bag, a_header):
+    path = write_bag(tmp_path / 'bag', [('/heads', SECOND, a_header)])
+    with pytest.raises(InputError, match='holds no images; its topics: /heads'):
+        open_source(path)
+
+
+@pytest.mark.parametrize('mcap', [False, True])
+def test_an_empty_bag_is_said_to_be_empty(tmp_path, write_bag, mcap):
+    path = write_bag(tmp_path / 'bag', [], mcap=mcap, topics=(('/a', 'sensor_msgs/msg/Image'),))
+    with pytest.raises(InputError, match='empty recording'):
+        open_source(path)
+
+
+@pytest.mark.parametrize(('stamps', 'what'), [(lambda _: 0, 'zero'), (lambda _: 7 * SECOND, 'always the same')])
+def test_useless_header_stamps_give_way_to_the_time_of_recording(
+        tmp_path, write_bag, images, a_header_at, caplog, stamps, what):
+    messages = images(4)
+    for _, recorded_ns, message in messages:
+        message.header = a_header_at(stamps(recorded_ns))
+    source = open_source(write_bag(tmp_path / 'bag', messages))
+    assert [frame.stamp_ns for frame in source.frames()] == [recorded_ns for _, recorded_ns, _ in messages]
+    assert len(caplog.records) == 1
+    assert what in caplog.text
+
+
+def test_late_images_are_skipped_and_a_set_clock_is_not(tmp_path, write_bag, images, a_header_at, caplog):
+    messages = images(6)
+    for (_, _, message), tenth in zip(messages, [0, 1, 3, 2, 4, -500], strict=True):
+        message.header = a_header_at(100 * SECOND + tenth * SECOND // 10)
+    frames = open_source(write_bag(tmp_path / 'bag', messages)).frames()
+    assert [(frame.stamp_ns - 100 * SECOND) * 10 // SECOND for frame in frames] == [0, 1, 3, 4, -500]
+    assert '1 images came late' in caplog.text
+
+
+def test_an_image_that_cannot_be_decoded_is_skipped_and_counted(tmp_path, write_bag, images, caplog):
+    messages = images(5)
+    messages[2][2].encoding = 'unheard_of'
+    messages[3][2].data = messages[3][2].data[:10]
+    assert brightness(open_source(write_bag(tmp_path / 'bag', messages))) == [5, 15, 45]
+    assert [record.message for record in caplog.records] == [
+        "2 of 5 images could not be decoded and were skipped; the first: image encoding 'unheard_of' is not supported"]
+
+
+def test_only_images_that_cannot_be_decoded_are_an_error(tmp_path, write_bag, images):
+    path = write_bag(tmp_path / 'bag', images(3, encoding='32FC1'))
+    with pytest.raises(InputError, match="none of the 3 images on /cam1/image_raw.*encoding '32FC1' is not supported"):
+        list(open_source(path).frames())
+
+
+def test_the_window_counts_from_the_first_image(tmp_path, write_bag, images):
+    source = open_source(write_bag(tmp_path / 'bag', images(8)), start_s=0.2, duration_s=0.3)
+    assert brightness(source) == [25, 35, 45]
+    assert source.total == 3
+    assert source.duration_s == pytest.approx(0.3)
+
+
+def test_a_window_behind_the_end_is_an_error(tmp_path, write_bag, images):
+    source = open_source(write_bag(tmp_path / 'bag', images(8)), start_s=60)
+    with pytest.raises(InputError, match='no image 60 s after the start'):
+        list(source.frames())
+
+
+def test_a_source_can_be_gone_through_twice(tmp_path, write_bag, images):
+    source = open_source(write_bag(tmp_path / 'bag', images(3)))
+    assert brightness(source) == brightness(source)
+
+
+def noisy(images, count):
+    """Images of noise: they do not compress away, so that a cut hits them."""
+    messages = images(count)
+    random = np.random.default_rng(1)
+    for _, _, message in messages:
+        message.data = random.integers(0, 255, message.data.shape, np.uint8)
+    return messages
+
+
+def test_a_torn_mcap_without_its_footer_gives_all_whole_images(tmp_path, write_bag, images, caplog):
+    bag = write_bag(tmp_path / 'bag', noisy(images, 6), mcap=True)
+    whole = (bag / 'bag.mcap').read_bytes()
+    torn = tmp_path / 'torn.mcap'
+    torn.write_bytes(whole[:-20])
+    assert len(brightness(open_source(torn))) == 6
+    assert len(caplog.records) == 1
+    assert 'ended early, its recorder did not close it' in caplog.text
+
+
+def test_a_folder_with_a_torn_mcap_gives_all_whole_images(tmp_path, write_bag, images, caplog):
+    bag = write_bag(tmp_path / 'bag', noisy(images, 6), mcap=True)
+    (bag / 'bag.mcap').write_bytes((bag / 'bag.mcap').read_bytes()[:-20])
+    assert len(brightness(open_source(bag))) == 6
+    assert 'ended early' in caplog.text
+
+
+def test_an_empty_metadata_file_is_as_good_as_none(tmp_path, write_bag, images):
+    bag = write_bag(tmp_path / 'bag', images(3))
+    (bag / 'metadata.yaml').write_text('')
+    assert brightness(open_source(bag)) == [5, 15, 25]
+
+
+def test_a_torn_mcap_without_a_whole_image_is_an_error(tmp_path, write_bag, images, caplog):
+    bag = write_bag(tmp_path / 'bag', noisy(images, 6), mcap=True)
+    torn = tmp_path / 'torn.mcap'
+    torn.write_bytes((bag / 'bag.mcap').read_bytes()[:2000])
+    with pytest.raises(InputError, match='empty recording'):
+        open_source(torn)
+    assert not caplog.records
+
+
+def test_a_ros1_bag_that_breaks_off_is_an_error(tmp_path, write_bag1, images, ros1_image):
+    path = write_bag1(tmp_path / 'one.bag', images(6, make_one=ros1_image))
+    path.write_bytes(path.read_bytes()[:-300])
+    with pytest.raises(InputError, match='cannot read'):
+        open_source(path)
+
+
+@pytest.mark.parametrize('share', [0.3, 0.6, 0.9])
+def test_a_torn_sqlite_file_gives_images_or_one_line(tmp_path, write_bag, images, share):
+    bag = write_bag(tmp_path / 'bag', noisy(images, 60))
+    whole = (bag / 'bag.db3').read_bytes()
+    torn = tmp_path / 'torn.db3'
+    torn.write_bytes(whole[:int(share * len(whole))])
+    try:
+        assert brightness(open_source(torn))
+    except InputError as error:
+        assert '\n' not in str(error)
+
+
+@pytest.mark.parametrize('name', ['text.mcap', 'text.db3', 'text.bag'])
+def test_a_text_file_named_as_a_recording_is_one_clear_line(tmp_path, name):
+    path = tmp_path / name
+    path.write_text('this is no recording, only a few words that somebody saved under the wrong name\n' * 3)
+    with pytest.raises(InputError, match='cannot read .*text') as raised:
+        open_source(path)
+    assert '\n' not in str(raised.value)
+
+
+@pytest.mark.parametrize(('yaml', 'message'), [
+    ('{', 'cannot read'), ('rosbag2_bagfile_information: {version: 9}', 'cannot read'), ('[]', 'cannot read')])
+def test_broken_metadata_is_one_clear_line(tmp_path, yaml, message):
+    (tmp_path / 'metadata.yaml').write_text(yaml)
+    with pytest.raises(InputError, match=message) as raised:
+        open_source(tmp_path)
+    assert '\n' not in str(raised.value)
+
+
+def test_a_folder_that_is_no_recording_is_said_to_be_none(tmp_path):
+    with pytest.raises(InputError, match='is not a recording'):
+        open_source(tmp_path)
+
+
+def test_a_missing_and_an_empty_file_are_told_apart(tmp_path):
+    with pytest.raises(InputError, match='does not exist'):
+        open_source(tmp_path / 'nowhere.mcap')
+    (tmp_path / 'nothing.mcap').touch()
+    with pytest.raises(InputError, match=r'is empty \(0 bytes\)'):
+        open_source(tmp_path / 'nothing.mcap')

@@ -1,0 +1,67 @@
+"""The comparison with the truth that the demonstration ends with."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from autocalib_ros.calibration import GroundPlane
+from autocalib_ros.errors import InputError
+from autocalib_ros.offline.demo import compare, read_truth
+from autocalib_ros.offline.projection import ground_to_image
+
+
+@pytest.fixture
+def truth(full):
+    """Return the truth of the calibration built by hand."""
+    camera, ground = full.result.camera, full.result.ground
+    x, y = np.meshgrid(np.linspace(2, 20, 6), np.linspace(2, 20, 6))
+    points = np.stack([x.ravel(), y.ravel(), np.zeros(36)], axis=1)
+    rows = np.concatenate([points[:, :2] + [5, -3], ground_to_image(camera, ground, points)], axis=1)
+    return {'lens': {'f': 140.0}, 'ground_points': {'rows': rows.tolist()},
+            'camera': {'R_world_from_camera': ground.rotation.tolist(), 'height': 8.0, 'position': [5, -3, 8]}}
+
+
+def test_the_truth_itself_has_no_error(full, truth):
+    comparison = compare(full.result, truth)
+    assert comparison.good
+    assert comparison.focal_percent == pytest.approx(0)
+    assert comparison.normal_deg == pytest.approx(0, abs=1e-6)
+    assert comparison.distance_percent == pytest.approx(0, abs=1e-6)
+    assert 'within 3 %' in comparison.table()
+
+
+def test_a_wrong_scale_shows_in_height_and_distances(full, truth):
+    ground = GroundPlane(full.result.ground.rotation, 8.8)
+    comparison = compare(replace(full.result, ground=ground), truth)
+    assert comparison.height_m == pytest.approx(0.8)
+    assert comparison.distance_percent == pytest.approx(10)
+
+
+def test_a_tilted_ground_is_not_good(full, truth):
+    angle = np.radians(1.5)
+    tilt = np.array([[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]])
+    comparison = compare(replace(full.result, ground=GroundPlane(tilt @ full.result.ground.rotation, 8.0)), truth)
+    assert comparison.normal_deg == pytest.approx(1.5)
+    assert not comparison.good
+
+
+def test_a_wrong_focal_length_is_not_good(full, truth):
+    truth['lens']['f'] = 130.0
+    assert not compare(full.result, truth).good
+
+
+def test_a_lens_without_ground_is_not_good_and_a_refusal_is_nothing(lens_only, refused, truth):
+    assert not compare(lens_only.result, truth).good
+    assert compare(refused.result, truth) is None
+
+
+@pytest.mark.parametrize('text', [None, '{'])
+def test_a_truth_that_cannot_be_read_is_one_line(tmp_path, text):
+    path = tmp_path / 'truth.json'
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(InputError, match='truth.json'):
+        read_truth(path)

@@ -1,0 +1,63 @@
+"""The loop of a replay on a recording of a box that drives across."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from autocalib_ros.config import Options
+from autocalib_ros.errors import InputError
+from autocalib_ros.offline.replay import replay
+from autocalib_ros.offline.sources import Frame, open_source
+
+
+class Drive:
+    """A source made of arrays: what replay needs of one and no more."""
+
+    name, topic, image_type, camera_frame, duration_s = 'drive', '', '', '', None
+
+    def __init__(self, total: int) -> None:
+        self.total = total
+        texture = np.random.default_rng(0)
+        self._road = texture.integers(90, 110, (120, 160)).astype(np.uint8)
+        self._box = texture.integers(0, 255, (24, 40)).astype(np.uint8)
+
+    def frames(self):
+        for index in range(self.total):
+            image = self._road.copy()
+            image[50:74, 2 * index % 120:][:, :40] = self._box
+            image.flags.writeable = False
+            yield Frame(index * 100_000_000, image)
+
+
+def test_a_replay_counts_its_frames_and_reports_them():
+    told = []
+    replayed = replay(Drive(40), Options(), lambda done, note: told.append((done, note)))
+    assert replayed.frames == replayed.evidence.frames == 40
+    assert [done for done, _ in told] == [*range(1, 41), 40]
+    assert told[-1][1] == 'solving'
+    assert '% of the evidence' in told[0][1]
+    assert replayed.background.shape == (120, 160, 3)
+
+
+def test_one_box_is_no_calibration_and_nothing_was_accepted():
+    replayed = replay(Drive(40), Options())
+    assert not replayed.result
+    assert replayed.accepted_at_s is None
+    assert replayed.result.evidence.seconds == pytest.approx(3.9)
+
+
+def test_the_same_recording_gives_the_same_evidence():
+    first, second = (replay(Drive(40), Options()).evidence for _ in range(2))
+    assert np.array_equal(first.points_px, second.points_px)
+    assert first.track_count > 0
+
+
+def test_a_recording_without_images_is_an_error():
+    with pytest.raises(InputError, match='drive gives no image'):
+        replay(Drive(0), Options())
+
+
+def test_a_tiny_bag_goes_all_the_way(tmp_path, write_bag, images):
+    replayed = replay(open_source(write_bag(tmp_path / 'bag', images(8))), Options())
+    assert (replayed.frames, bool(replayed.result)) == (8, False)

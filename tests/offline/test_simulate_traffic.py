@@ -1,0 +1,166 @@
+"""The simulated traffic moves as traffic does."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from autocalib_ros.offline.simulate import SimulationOptions
+from autocalib_ros.offline.simulate.network import Network, junction, network_of
+from autocalib_ros.offline.simulate.traffic import (
+    STEP_S,
+    Traffic,
+    Vehicle,
+    Wander,
+    simulate_traffic,
+)
+
+MINUTE = SimulationOptions()
+
+
+@pytest.fixture(scope='module')
+def network() -> Network:
+    return network_of(MINUTE)
+
+
+@pytest.fixture(scope='module')
+def traffic(network) -> Traffic:
+    return simulate_traffic(network, MINUTE)
+
+
+def _crossing_time(vehicle: Vehicle) -> float | None:
+    """When a vehicle passes the middle of the junction, or None."""
+    passed = vehicle.s > vehicle.route.stop_s + 10.0
+    return vehicle.start_s + STEP_S * int(passed.argmax()) if passed.any() else None
+
+
+def _crossings(traffic: Traffic, movement: str) -> list[Vehicle]:
+    return [
+        v for v in traffic.vehicles
+        if v.route.movement == movement
+        and (t := _crossing_time(v)) is not None and 0 <= t < MINUTE.duration_s
+    ]
+
+
+@pytest.mark.parametrize('signal', ['main0', 'main1'])
+def test_straight_traffic_crosses_on_both_roads_within_a_minute(traffic, signal):
+    assert sum(v.route.signal == signal for v in _crossings(traffic, 'straight')) >= 6
+
+
+@pytest.mark.parametrize('movement', ['left', 'right'])
+def test_some_vehicles_turn_within_a_minute(traffic, movement):
+    assert _crossings(traffic, movement)
+
+
+def test_every_path_is_smooth(network):
+    for route in network.routes:
+        s = np.arange(0.0, route.path.length, 0.1)
+        x, y, heading = route.path.at(s).T
+        tangent = np.arctan2(np.diff(y), np.diff(x))
+        bend = np.angle(np.exp(1j * (tangent - heading[:-1])))
+        assert np.hypot(np.diff(x), np.diff(y)) == pytest.approx(0.1, abs=1e-4)
+        assert np.abs(bend).max() < 0.02
+
+
+@pytest.mark.parametrize('angle_deg', [60.0, 90.0, 120.0])
+def test_routes_leave_on_the_lanes_of_straight_traffic(angle_deg):
+    routes = junction(math.radians(angle_deg), 0.2).routes
+    ends = {r.leave: r.path.at(r.path.length)[:2] for r in routes if r.movement == 'straight'}
+    for route in routes:
+        assert route.path.at(route.path.length)[:2] == pytest.approx(ends[route.leave], abs=1e-6)
+
+
+def test_wander_has_the_stated_standard_deviation():
+    rng = np.random.default_rng(1)
+    values = np.concatenate([Wander.draw(0.1, rng).at(np.arange(0, 200, 5.0)) for _ in range(300)])
+    assert values.std() == pytest.approx(0.1, rel=0.05)
+
+
+def test_straight_vehicles_keep_their_lane_but_for_the_wander(traffic):
+    offsets = []
+    for vehicle in (v for v in traffic.vehicles if v.route.movement == 'straight'):
+        for s in np.arange(20.0, 200.0, 10.0):
+            x, y, heading = vehicle.route.path.at(s)
+            there = np.array(vehicle.pose(s)[:2]) - (x, y)
+            offsets.append(there @ (-math.sin(heading), math.cos(heading)))
+    assert np.std(offsets) == pytest.approx(MINUTE.wander_m, rel=0.2)
+
+
+def test_some_vehicles_stop_at_the_signals(traffic):
+    waiting = [v for v in traffic.vehicles if (v.speeds_mps[20:] == 0).sum() * STEP_S > 5.0]
+    assert len(waiting) >= 5
+
+
+def test_waiting_vehicles_stand_still(traffic):
+    vehicle = max(traffic.vehicles, key=lambda v: int((v.speeds_mps == 0).sum()))
+    first = int(np.flatnonzero(vehicle.speeds_mps == 0)[0]) + 1
+    a, b = (vehicle.state(vehicle.start_s + STEP_S * (first + n)) for n in (0.3, 5.7))
+    assert (a.x, a.y, a.heading) == (b.x, b.y, b.heading)
+
+
+def _outline(state, vehicle: Vehicle) -> np.ndarray:
+    """Points (n, 2) along the sides of a vehicle."""
+    fractions = np.linspace(-0.5, 0.5, 7)
+    body = np.concatenate([np.stack([fractions, 0 * fractions + side], 1) for side in (-0.5, 0.5)])
+    body = body * (vehicle.shape.length_m, vehicle.shape.width_m)
+    c, s = math.cos(state.heading), math.sin(state.heading)
+    return body @ np.array([[c, s], [-s, c]]) + (state.x, state.y)
+
+
+def _overlap(a, b) -> bool:
+    (first, at), (second, there) = a, b
+    if math.hypot(at.x - there.x, at.y - there.y) > 12.0:
+        return False
+    offset = _outline(there, second) - (at.x, at.y)
+    c, s = math.cos(at.heading), math.sin(at.heading)
+    inside = np.abs(offset @ np.array([[c, -s], [s, c]]))
+    half = np.array([first.shape.length_m, first.shape.width_m]) / 2
+    return bool((inside < half).all(1).any())
+
+
+@pytest.mark.parametrize('time_s', range(0, 60, 4))
+def test_vehicles_do_not_overlap(traffic, time_s):
+    states = [(v, s) for v in traffic.vehicles if (s := v.state(time_s + 0.03)) is not None]
+    pairs = [
+        (a[0].number, b[0].number)
+        for i, a in enumerate(states) for b in states[:i] if _overlap(a, b) or _overlap(b, a)
+    ]
+    assert not pairs
+
+
+def test_no_vehicle_brakes_or_accelerates_beyond_reason(traffic):
+    steps = np.concatenate([np.diff(v.speeds_mps) for v in traffic.vehicles]) / STEP_S
+    assert steps.max() < 3.0
+    assert steps.min() > -7.5
+
+
+def test_turning_vehicles_slow_down_in_the_curve(traffic):
+    vehicle = _crossings(traffic, 'right')[0]
+    (start, end, radius), = vehicle.route.path.curves()
+    inside = (vehicle.s > start + 1) & (vehicle.s < end)
+    assert vehicle.speeds_mps[inside].max() ** 2 / radius < 4.0  # m/s^2
+
+
+@pytest.mark.parametrize('given', [{'empty': True}, {'density': 0.0}])
+def test_empty_road_has_no_vehicles(given, network):
+    assert not simulate_traffic(network, SimulationOptions(**given)).vehicles
+
+
+def test_one_way_traffic_has_one_heading():
+    options = SimulationOptions(one_way=True)
+    traffic = simulate_traffic(network_of(options), options)
+    headings = {round(float(v.route.path.at(50.0)[2]), 6) for v in traffic.vehicles}
+    assert headings == {0.0}
+
+
+def test_same_seed_gives_the_same_traffic(network, traffic):
+    again = simulate_traffic(network, MINUTE)
+    assert [v.number for v in again.vehicles] == [v.number for v in traffic.vehicles]
+    assert np.array_equal(*(np.concatenate([v.s for v in t.vehicles]) for t in (traffic, again)))
+
+
+def test_another_seed_gives_other_traffic(network, traffic):
+    other = simulate_traffic(network, SimulationOptions(seed=1))
+    assert [v.start_s for v in other.vehicles] != [v.start_s for v in traffic.vehicles]

@@ -1,0 +1,89 @@
+"""Video files: stamps, windows, damage."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from autocalib_ros.errors import InputError, UsageError
+from autocalib_ros.offline.sources import open_source
+from autocalib_ros.offline.videos import _Clock
+
+
+@pytest.mark.parametrize('suffix', ['.mp4', '.avi', '.mkv'])
+def test_a_video_gives_its_frames_and_times(tmp_path, write_video, suffix):
+    source = open_source(write_video(tmp_path / f'clip{suffix}', count=30, fps=10))
+    frames = list(source.frames())
+    assert len(frames) == source.total == 30
+    assert frames[0].image.shape == (48, 64, 3)
+    # Matroska keeps times in whole milliseconds
+    assert np.allclose([frame.stamp_ns * 1e-9 for frame in frames], np.arange(30) / 10, atol=1.1e-3)
+    assert source.duration_s == pytest.approx(3.0, abs=0.2)
+
+
+def test_the_window_of_a_video_counts_from_its_first_frame(tmp_path, write_video):
+    source = open_source(write_video(tmp_path / 'clip.mp4', count=30, fps=10), start_s=1.0, duration_s=0.5)
+    assert [round(frame.stamp_ns * 1e-8) for frame in source.frames()] == [10, 11, 12, 13, 14]
+    assert source.total == 5
+
+
+def test_a_window_behind_the_end_of_a_video_is_an_error(tmp_path, write_video):
+    source = open_source(write_video(tmp_path / 'clip.mp4', count=30, fps=10), start_s=60)
+    with pytest.raises(InputError, match=r'no image 60 s after the start of .*clip.mp4, which lasts 3.0 s'):
+        list(source.frames())
+
+
+@pytest.mark.parametrize('window', [{'start_s': -1.0}, {'start_s': float('nan')}, {'duration_s': 0.0},
+                                    {'duration_s': float('inf')}])
+def test_a_senseless_window_is_wrong_usage(tmp_path, write_video, window):
+    with pytest.raises(UsageError):
+        open_source(write_video(tmp_path / 'clip.mp4'), **window)
+
+
+def test_a_truncated_video_gives_what_it_has_and_says_so(tmp_path, write_video, caplog):
+    path = write_video(tmp_path / 'clip.avi', count=60)
+    path.write_bytes(path.read_bytes()[:path.stat().st_size // 2])
+    frames = list(open_source(path).frames())
+    assert 5 < len(frames) < 50
+    assert 'ended early' in caplog.text
+
+
+def test_a_video_that_lost_its_index_is_one_clear_line(tmp_path, write_video):
+    path = write_video(tmp_path / 'clip.mp4')
+    path.write_bytes(path.read_bytes()[:path.stat().st_size // 2])
+    with pytest.raises(InputError, match=r'clip.mp4 is not a video that can be read'):
+        open_source(path)
+
+
+def test_a_video_without_frames_is_one_clear_line(tmp_path, write_video):
+    with pytest.raises(InputError, match='clip.avi'):
+        open_source(write_video(tmp_path / 'clip.avi', count=0))
+
+
+def test_a_text_file_named_as_a_video_is_one_clear_line(tmp_path):
+    path = tmp_path / 'text1.mp4'
+    path.write_text('not a video\n' * 100)
+    with pytest.raises(InputError, match='text1.mp4 is not a video that can be read'):
+        open_source(path)
+
+
+def test_a_video_has_no_topics(tmp_path, write_video):
+    with pytest.raises(UsageError, match='is a video'):
+        open_source(write_video(tmp_path / 'clip.mp4'), topic='/image')
+
+
+def test_a_compressed_part_of_a_recording_is_explained(tmp_path):
+    path = tmp_path / 'bag_0.mcap.zstd'
+    path.write_bytes(b'\x28\xb5\x2f\xfd')
+    with pytest.raises(InputError, match='give the folder with its metadata.yaml'):
+        open_source(path)
+
+
+def test_positions_that_stand_still_give_way_to_the_frame_rate():
+    clock = _Clock(10.0)
+    assert [clock.next_ns(0.0) for _ in range(3)] == [0, 100_000_000, 200_000_000]
+
+
+def test_uneven_positions_are_kept():
+    clock = _Clock(10.0)
+    assert [clock.next_ns(ms) for ms in (40.0, 140.0, 340.0)] == [0, 100_000_000, 300_000_000]

@@ -1,0 +1,237 @@
+"""Every encoding against a reference made here by hand."""
+
+from __future__ import annotations
+
+import array
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+
+from autocalib_ros.errors import InputError
+from autocalib_ros.perception.images import ImageDecoder
+
+HEIGHT, WIDTH = 12, 16
+
+
+def scene() -> np.ndarray:
+    """Return a BGR picture of smooth colours."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    return np.stack([40 + 10 * x, 60 + 12 * y, 200 - 5 * x - 3 * y], axis=-1).astype(np.uint8)
+
+
+def message(encoding: str, rows: np.ndarray, *, padding: int = 0, width: int = WIDTH, height: int = HEIGHT,
+            is_bigendian: int = 0, as_array: bool = False) -> SimpleNamespace:
+    """Return a message of rows (n, bytes), each followed by `padding` bytes."""
+    rows = np.ascontiguousarray(rows).view(np.uint8).reshape(len(rows), -1)
+    step = rows.shape[1] + padding
+    data = np.pad(rows, ((0, 0), (0, padding)), constant_values=77).ravel()
+    data.flags.writeable = False
+    return SimpleNamespace(encoding=encoding, width=width, height=height, step=step, is_bigendian=is_bigendian,
+                           data=array.array('B', data.tobytes()) if as_array else data)
+
+
+def decoded(msg: SimpleNamespace) -> np.ndarray:
+    image = ImageDecoder().decode(msg)
+    assert image.dtype == np.uint8
+    assert image.flags.c_contiguous
+    return image
+
+
+@pytest.mark.parametrize('as_array', [False, True])
+@pytest.mark.parametrize('padding', [0, 5])
+@pytest.mark.parametrize(('encoding', 'order'), [('bgr8', [0, 1, 2]), ('rgb8', [2, 1, 0]), ('8UC3', [0, 1, 2]),
+                                                 ('bgra8', [0, 1, 2, 0]), ('rgba8', [2, 1, 0, 0])])
+def test_colours_are_put_in_order(encoding, order, padding, as_array):
+    image = decoded(message(encoding, scene()[:, :, order], padding=padding, as_array=as_array))
+    assert np.array_equal(image, scene())
+
+
+@pytest.mark.parametrize('padding', [0, 3])
+@pytest.mark.parametrize('encoding', ['mono8', '8UC1'])
+def test_grey_stays_grey(encoding, padding):
+    assert np.array_equal(decoded(message(encoding, scene()[:, :, 0], padding=padding)), scene()[:, :, 0])
+
+
+@pytest.mark.parametrize(('encoding', 'rows'), [('mono8', scene()[:, :, 0]), ('bgr8', scene())])
+def test_what_needs_no_conversion_is_not_copied(encoding, rows):
+    msg = message(encoding, rows)
+    assert np.shares_memory(ImageDecoder().decode(msg), msg.data)
+
+
+@pytest.mark.parametrize('is_bigendian', [0, 1])
+@pytest.mark.parametrize('padding', [0, 6])
+@pytest.mark.parametrize('encoding', ['mono16', '16UC1'])
+def test_16_bit_grey_fills_the_range(encoding, padding, is_bigendian):
+    grey = np.linspace(300, 4000, HEIGHT * WIDTH).reshape(HEIGHT, WIDTH)  # a 12-bit camera
+    rows = grey.astype('>u2' if is_bigendian else '<u2')
+    image = decoded(message(encoding, rows, padding=padding, is_bigendian=is_bigendian))
+    low, high = np.percentile(grey.astype(int), [1, 99])
+    # rounding to a grey level
+    assert np.abs(image - np.clip((grey - low) / (high - low) * 255, 0, 255)).max() <= 1
+
+
+@pytest.mark.parametrize('is_bigendian', [0, 1])
+@pytest.mark.parametrize(('encoding', 'order'), [('bgr16', [0, 1, 2]), ('rgb16', [2, 1, 0])])
+def test_16_bit_colours_keep_their_proportion(encoding, order, is_bigendian):
+    wide = scene().astype(int) * 257
+    low, high = np.percentile(wide, [1, 99])
+    rows = wide[:, :, order].astype('>u2' if is_bigendian else '<u2')
+    image = decoded(message(encoding, rows, is_bigendian=is_bigendian))
+    assert np.abs(image - np.clip((wide - low) / (high - low) * 255, 0, 255)).max() <= 1
+
+
+def test_the_stretch_moves_slowly():
+    decoder, rng = ImageDecoder(), np.random.default_rng(0)
+    grey = rng.integers(1000, 2000, (HEIGHT, WIDTH)).astype('<u2')
+    before = decoder.decode(message('mono16', grey)).astype(int)
+    flash = decoder.decode(message('mono16', grey * 20))
+    after = decoder.decode(message('mono16', grey)).astype(int)
+    assert flash.min() == 255
+    # one flash moves the upper limit by half a per cent of the way: some levels, not the whole range
+    assert 0 < np.abs(after - before).max() < 50
+
+
+def test_a_dark_start_does_not_fix_the_stretch():
+    decoder = ImageDecoder()
+    decoder.decode(message('mono16', np.zeros((HEIGHT, WIDTH), '<u2')))
+    grey = np.linspace(300, 4000, HEIGHT * WIDTH).reshape(HEIGHT, WIDTH).astype('<u2')
+    assert np.ptp(decoder.decode(message('mono16', grey))) > 240
+
+
+def mosaic(pattern: str, colour: dict[str, int]) -> np.ndarray:
+    """Return a Bayer mosaic of one colour, its first two rows beginning with the pattern's letters."""
+    cell = np.array([colour[letter] for letter in pattern]).reshape(2, 2)
+    return np.tile(cell, (HEIGHT // 2, WIDTH // 2))
+
+
+@pytest.mark.parametrize('pattern', ['rggb', 'bggr', 'gbrg', 'grbg'])
+def test_bayer_patterns_are_named_as_ros_names_them(pattern):
+    image = decoded(message(f'bayer_{pattern}8', mosaic(pattern, {'r': 200, 'g': 120, 'b': 40}).astype(np.uint8)))
+    assert (image == [40, 120, 200]).all()
+
+
+@pytest.mark.parametrize('pattern', ['rggb', 'bggr', 'gbrg', 'grbg'])
+def test_16_bit_bayer_is_stretched_and_then_coloured(pattern):
+    rows = mosaic(pattern, {'r': 40000, 'g': 20000, 'b': 0}).astype('<u2')
+    image = decoded(message(f'bayer_{pattern}16', rows))
+    assert np.abs(image.astype(int) - [0, 128, 255]).max() <= 1
+
+
+def yuv_of_scene() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return Y, U, V (ITU-R BT.601, limited range) of a grey-blue picture whose colour is the same everywhere."""
+    y = (30 + 10 * np.mgrid[:HEIGHT, :WIDTH][1]).astype(np.uint8)
+    return y, np.full_like(y, 150), np.full_like(y, 110)
+
+
+def bgr_of(y: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    y, u, v = 1.164 * (y.astype(float) - 16), u.astype(float) - 128, v.astype(float) - 128
+    return np.clip(np.stack([y + 2.018 * u, y - 0.813 * v - 0.391 * u, y + 1.596 * v], axis=-1), 0, 255)
+
+
+@pytest.mark.parametrize('padding', [0, 4])
+@pytest.mark.parametrize(('encoding', 'layout'), [('yuv422', 'uyvy'), ('uyvy', 'uyvy'), ('yuv422_yuy2', 'yuyv'),
+                                                  ('yuyv', 'yuyv')])
+def test_yuv422_in_both_orders(encoding, layout, padding):
+    y, u, v = yuv_of_scene()
+    planes = {'y': iter((y[:, 0::2], y[:, 1::2])), 'u': iter((u[:, ::2],)), 'v': iter((v[:, ::2],))}
+    rows = np.stack([next(planes[letter]) for letter in layout], axis=-1).reshape(HEIGHT, -1)
+    image = decoded(message(encoding, rows, padding=padding))
+    # OpenCV computes in integers
+    assert np.abs(image - bgr_of(y, u, v)).max() <= 2
+
+
+@pytest.mark.parametrize('padding', [0, 4])
+def test_nv21(padding):
+    y, u, v = yuv_of_scene()
+    chroma = np.stack([v[::2, ::2], u[::2, ::2]], axis=-1).reshape(HEIGHT // 2, WIDTH)
+    image = decoded(message('nv21', np.concatenate([y, chroma]), padding=padding))
+    assert np.abs(image - bgr_of(y, u, v)).max() <= 2
+
+
+def test_nv24():
+    y, u, v = yuv_of_scene()
+    data = np.concatenate([y.ravel(), np.stack([u, v], axis=-1).ravel()])
+    image = decoded(message('nv24', data.reshape(3 * HEIGHT, WIDTH)))
+    assert np.abs(image - bgr_of(y, u, v)).max() <= 2
+
+
+def test_nv21_whose_step_counts_all_planes():
+    y, u, v = yuv_of_scene()
+    chroma = np.stack([v[::2, ::2], u[::2, ::2]], axis=-1).reshape(HEIGHT // 2, WIDTH)
+    msg = message('nv21', np.concatenate([y, chroma]))
+    msg.step = 2 * WIDTH
+    assert np.abs(decoded(msg) - bgr_of(y, u, v)).max() <= 2
+
+
+def compressed(data: bytes, said: str) -> SimpleNamespace:
+    return SimpleNamespace(format=said, data=array.array('B', data))
+
+
+def test_jpeg_by_its_content_whatever_the_format_says():
+    data = cv2.imencode('.jpg', scene(), [cv2.IMWRITE_JPEG_QUALITY, 100])[1].tobytes()
+    image = decoded(compressed(data, 'rgb8; png compressed'))
+    # chroma is halved by JPEG
+    assert np.abs(image.astype(int) - scene()).mean() < 4
+
+
+def test_png_is_exact_and_grey_stays_grey():
+    data = cv2.imencode('.png', scene()[:, :, 0])[1].tobytes()
+    assert np.array_equal(decoded(compressed(data, 'jpeg')), scene()[:, :, 0])
+
+
+def test_16_bit_png_is_stretched():
+    grey = np.linspace(300, 4000, HEIGHT * WIDTH).reshape(HEIGHT, WIDTH).astype(np.uint16)
+    assert np.ptp(decoded(compressed(cv2.imencode('.png', grey)[1].tobytes(), 'mono16; png compressed'))) > 250
+
+
+def test_a_compressed_bayer_mosaic_is_coloured():
+    rows = mosaic('rggb', {'r': 200, 'g': 120, 'b': 40}).astype(np.uint8)
+    image = decoded(compressed(cv2.imencode('.png', rows)[1].tobytes(), 'bayer_rggb8; png compressed '))
+    assert (image == [40, 120, 200]).all()
+
+
+@pytest.mark.parametrize(('change', 'reason'), [
+    ({'encoding': '32FC1'}, "image encoding '32FC1' is not supported"),
+    ({'encoding': ''}, "image encoding '' is not supported"),
+    ({'data': b'\0' * 100}, r"'bgr8' needs 576 bytes \(12 rows of 48\), found 100"),
+    ({'data': b''}, r"'bgr8' needs 576 bytes \(12 rows of 48\), found 0"),
+    ({'step': 16}, 'needs rows of 48 bytes, but its step is 16'),
+    ({'width': 0}, "'bgr8' has no pixels: 0 x 12"),
+    ({'height': 0}, "'bgr8' has no pixels: 16 x 0"),
+])
+def test_a_broken_image_is_refused_with_the_reason(change, reason):
+    msg = message('bgr8', scene())
+    vars(msg).update(change)
+    with pytest.raises(InputError, match=reason):
+        ImageDecoder().decode(msg)
+
+
+@pytest.mark.parametrize('encoding', ['nv21', 'nv24', 'yuv422'])
+def test_a_short_planar_image_is_refused_with_the_lengths(encoding):
+    with pytest.raises(InputError, match=f"'{encoding}'.*(needs|step)"):
+        ImageDecoder().decode(message(encoding, scene()[:, :, 0]))
+
+
+JPEG = cv2.imencode('.jpg', scene())[1].tobytes()
+
+
+@pytest.mark.parametrize(('data', 'said', 'reason'), [
+    (JPEG, '16UC1; compressedDepth png', 'holds depths'),
+    (JPEG[:len(JPEG) // 2], 'jpeg', 'is a JPEG cut off after'),
+    (b'GIF89a' + bytes(20), 'jpeg', 'neither JPEG nor PNG, it begins with 47 49 46'),
+    (b'', 'jpeg', 'it begins with nothing'),
+    (b'\x89PNG\r\n\x1a\n' + bytes(50), 'png', 'cannot be decoded'),
+])
+def test_a_broken_compressed_image_is_refused_with_the_reason(data, said, reason):
+    with pytest.raises(InputError, match=reason):
+        ImageDecoder().decode(compressed(data, said))
+
+
+def test_an_encoding_without_colours_is_warned_of_once(caplog):
+    decoder = ImageDecoder()
+    for _ in range(3):
+        decoder.decode(message('8UC3', scene()))
+    assert [record.message for record in caplog.records] == [
+        "image encoding '8UC3' does not name its colours; taken for bgr8"]

@@ -1,0 +1,33 @@
+"""Tests of the live shell run in ROS domains of their own, with rclpy's field checks on."""
+
+import importlib.util
+import os
+
+import pytest
+
+# Domains 1 to 100 are free of the port ranges that Linux hands out. Set before rclpy and messages are imported.
+os.environ['ROS_DOMAIN_ID'] = str(os.getpid() % 100 + 1)
+os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
+HAS_ROS = all(importlib.util.find_spec(name) for name in ('rclpy', 'sensor_msgs', 'std_srvs'))
+
+
+class WithoutRos(pytest.Module):
+    """A test module that says why it is not run."""
+
+    def collect(self):
+        pytest.skip("rclpy is not importable: pip install '.[ros]'", allow_module_level=True)
+
+
+def pytest_pycollect_makemodule(module_path, parent):
+    """Skip this folder's modules where there is no ROS."""
+    return None if HAS_ROS else WithoutRos.from_parent(parent, path=module_path)
+
+
+@pytest.fixture
+def bench():
+    """Yield a running executor to put nodes on, with a client node beside them."""
+    from bench import Bench
+    running = Bench()
+    yield running
+    running.close()

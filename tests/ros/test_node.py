@@ -1,0 +1,245 @@
+"""A real node in this process, heard and asked over DDS."""
+
+import threading
+import time
+
+import cv2
+import pytest
+from geometry_msgs.msg import TransformStamped
+from rcl_interfaces.srv import GetParameters
+from rclpy.qos import ReliabilityPolicy
+from sensor_msgs.msg import CameraInfo, CompressedImage
+
+from autocalib_ros.calibration import camera_info
+from autocalib_ros.ros.messages import stamp_ns
+from bench import PATIENCE_S, PIXELS, SIZE, Bench, calibration, image, refusal, wait_for
+
+START_NS = 1_700_000_000_123_456_789
+FRAME_NS = 100_000_001
+INFO, GROUND = '/autocalib/camera_info', '/autocalib/ground_transform'
+
+
+def instantly(evidence, options):
+    return calibration(evidence)
+
+
+def lens_only(evidence, options):
+    return calibration(evidence, height_m=None)
+
+
+def unit_scale(evidence, options):
+    return calibration(evidence, height_m=1.0, metric=False)
+
+
+def publish_until(publisher, condition, what: str, make=image) -> int:
+    """Publish images until something holds; return the stamp of the last."""
+    number = 0
+
+    def step():
+        nonlocal number
+        number += 1
+        publisher.publish(make(START_NS + number * FRAME_NS))
+        return condition()
+
+    wait_for(step, what)
+    return START_NS + number * FRAME_NS
+
+
+def used(node) -> bool:
+    return node._pipeline.counters.used > 0
+
+
+def calibrated(bench: Bench, solve=instantly, make=image, publisher=None, **parameters):
+    """Return a node that has calibrated from an image, and the publisher of its images."""
+    node = bench.start(solve, camera_height=8.0, idle_solve_s=1000.0, **parameters)
+    publisher = bench.connected(publisher or bench.publisher())
+    publish_until(publisher, lambda: used(node), 'an image', make)
+    answer = bench.calibrate()
+    assert answer.success, answer.message
+    return node, publisher
+
+
+@pytest.mark.parametrize('reliability', [ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE])
+def test_publisher_that_comes_late_is_found_and_matched(bench, reliability):
+    node = bench.start(instantly)
+    wait_for(lambda: bench.client.count_publishers(INFO) > 0, 'the node')
+    publisher = bench.connected(bench.publisher(reliability=reliability))
+    publish_until(publisher, lambda: used(node), 'an image')
+    subscriber, = bench.client.get_subscriptions_info_by_topic('image')
+    assert subscriber.qos_profile.reliability == reliability
+
+
+def test_publisher_that_comes_back_with_another_reliability_is_matched(bench):
+    node = bench.start(instantly)
+    first = bench.connected(bench.publisher())
+    publish_until(first, lambda: used(node), 'an image')
+    bench.client.destroy_publisher(first)
+    second = bench.publisher(reliability=ReliabilityPolicy.BEST_EFFORT)
+    before = node._pipeline.counters.received
+    publish_until(second, lambda: node._pipeline.counters.received > before, 'an image of the second publisher')
+
+
+def test_each_image_gets_camera_info_with_exactly_its_header(bench):
+    infos = bench.collect(CameraInfo, INFO)
+    _, publisher = calibrated(bench)
+    bench.listening(INFO)
+    sent = image(START_NS + 10 ** 12)
+    publisher.publish(sent)
+    wait_for(lambda: infos and infos[-1].header == sent.header, 'camera_info with the header of the image')
+    assert (sent.header.frame_id, stamp_ns(sent.header.stamp)) == ('cam_optical', START_NS + 10 ** 12)
+
+
+def test_camera_info_holds_the_lens(bench):
+    node, _ = calibrated(bench)
+    infos = bench.collect(CameraInfo, INFO, latched=True)
+    info = wait_for(lambda: infos, 'camera_info')[0]
+    fields = camera_info(node._published.result.camera)
+    assert (info.width, info.height, info.distortion_model) == (*SIZE, 'equidistant')
+    assert [list(info.k), list(info.d), list(info.r), list(info.p)] == [fields.k, fields.d, fields.r, fields.p]
+
+
+def test_late_joiner_gets_both_latched_messages(bench):
+    calibrated(bench, camera_name='north')
+    infos, transforms = (bench.collect(kind, topic, latched=True)
+                         for kind, topic in ((CameraInfo, INFO), (TransformStamped, GROUND)))
+    wait_for(lambda: infos and transforms, 'both messages')
+    assert (transforms[0].header.frame_id, transforms[0].child_frame_id) == ('north_ground', 'cam_optical')
+    assert transforms[0].transform.translation.z == 8.0
+    assert infos[0].header.frame_id == 'cam_optical'
+
+
+def test_camera_info_stays_silent_image_by_image_when_latched_only(bench):
+    infos = bench.collect(CameraInfo, INFO)
+    node, publisher = calibrated(bench, camera_info_mode='latched_only')
+    bench.listening(INFO)
+    before = node._pipeline.counters.received
+    publish_until(publisher, lambda: node._pipeline.counters.received > before + 3, 'four images')
+    assert bench.calibrate().success
+    wait_for(lambda: infos, 'camera_info')
+    assert len(infos) <= 2  # one for each solution, the first of which may have come before this subscriber
+
+
+def test_images_services_and_parameters_do_not_wait_for_a_solution(bench):
+    release, running = threading.Event(), threading.Event()
+
+    def slow(evidence, options):
+        if running.is_set() or evidence.frames <= node_frames['first']:
+            return calibration(evidence)
+        running.set()
+        release.wait(PATIENCE_S)
+        return calibration(evidence, 400.0)
+
+    node_frames = {'first': 10 ** 9}
+    infos = bench.collect(CameraInfo, INFO)
+    node, publisher = calibrated(bench, slow)
+    bench.listening(INFO)
+    node_frames['first'] = 0
+    answer = bench.ask_calibrate()
+    assert running.wait(PATIENCE_S)
+    infos.clear()
+    began = time.monotonic()
+    publish_until(publisher, lambda: len(infos) > 20, 'camera_info of twenty images')
+    parameters = bench.client.create_client(GetParameters, '/autocalib/get_parameters')
+    asked = parameters.call_async(GetParameters.Request(names=['camera_height']))
+    wait_for(asked.done, 'a parameter')
+    assert asked.result().values[0].double_value == 8.0
+    assert time.monotonic() - began < 10.0  # twenty images and a parameter take a second or two, a wait takes forever
+    assert not answer.done()
+    release.set()
+    wait_for(answer.done, 'the solution')
+    assert node._published.result.camera.focal_px == 400.0
+
+
+def test_calibrate_answers_with_the_refusal(bench):
+    node = bench.start(lambda evidence, options: refusal(evidence))
+    publish_until(bench.connected(bench.publisher()), lambda: used(node), 'an image')
+    answer = bench.calibrate()
+    assert not answer.success
+    assert 'too_few_tracks' in answer.message and '12 tracks of the 40 needed.' in answer.message
+
+
+def test_calibrate_before_the_first_image_says_so(bench):
+    bench.start(instantly)
+    answer = bench.calibrate()
+    assert (answer.success, answer.message) == (False, 'no image yet on /image')
+
+
+def test_refusal_keeps_the_calibration_before(bench):
+    results = [calibration, refusal]
+    node, publisher = calibrated(bench, lambda evidence, options: results.pop(0)(evidence))
+    infos = bench.collect(CameraInfo, INFO)
+    bench.listening(INFO)
+    assert not bench.calibrate().success
+    publish_until(publisher, lambda: infos, 'camera_info after a refusal')
+    assert node._published.result.camera.focal_px == 300.0
+
+
+def test_new_calibration_replaces_the_latched_one(bench):
+    focals = [300.0, 310.0]
+    calibrated(bench, lambda evidence, options: calibration(evidence, focals.pop(0)))
+    assert bench.calibrate().success
+    infos = bench.collect(CameraInfo, INFO, latched=True)
+    wait_for(lambda: infos, 'camera_info')
+    assert infos[0].k[0] == 310.0
+
+
+@pytest.mark.parametrize('solve', [lens_only, unit_scale])
+def test_no_ground_transform_without_a_height(bench, solve):
+    calibrated(bench, solve)
+    infos = bench.collect(CameraInfo, INFO, latched=True)
+    transforms = bench.collect(TransformStamped, GROUND, latched=True)
+    wait_for(lambda: infos, 'camera_info')
+    bench.listening(GROUND)
+    assert not threading.Event().wait(0.5)  # a latched transform would have come with the camera_info
+    assert not transforms
+
+
+def test_unit_scale_is_published_when_it_is_allowed(bench):
+    calibrated(bench, unit_scale, allow_unit_scale=True)
+    transforms = bench.collect(TransformStamped, GROUND, latched=True)
+    assert wait_for(lambda: transforms, 'the transform')[0].transform.translation.z == 1.0
+
+
+def test_driver_without_stamp_and_frame_is_served(bench):
+    infos = bench.collect(CameraInfo, INFO)
+    node, publisher = calibrated(bench, make=lambda stamp: image(0, frame_id=''))
+    bench.listening(INFO)
+    publish_until(publisher, lambda: infos and not stamp_ns(infos[-1].header.stamp), 'camera_info of an image',
+                  lambda stamp: image(0, frame_id=''))
+    assert infos[-1].header.frame_id == 'camera_optical_frame'
+    assert node._published.result.evidence.frames >= 1
+
+
+def test_image_that_cannot_be_decoded_does_not_stop_the_stream(bench):
+    node, publisher = calibrated(bench)
+    publish_until(publisher, lambda: node._pipeline.counters.unreadable > 0, 'an unreadable image',
+                  lambda stamp: image(stamp, encoding='no_such_encoding'))
+    before = node._pipeline.counters.used
+    publish_until(publisher, lambda: node._pipeline.counters.used > before, 'a readable image')
+
+
+def test_compressed_images_come_from_the_topic_beside_the_resolved_one(bench):
+    def make(stamp: int) -> CompressedImage:
+        message = CompressedImage(format='jpeg', data=cv2.imencode('.jpg', PIXELS)[1].tobytes())
+        message.header = image(stamp).header
+        return message
+
+    publisher = bench.publisher(CompressedImage, '/image/compressed')
+    infos = bench.collect(CameraInfo, INFO, latched=True)
+    calibrated(bench, make=make, publisher=publisher, image_transport='compressed')
+    assert (wait_for(lambda: infos, 'camera_info')[0].width, infos[0].height) == SIZE
+
+
+def test_calibration_of_another_image_size_is_withdrawn(bench):
+    node, publisher = calibrated(bench)
+    infos = bench.collect(CameraInfo, INFO)
+    bench.listening(INFO)
+    publish_until(publisher, lambda: node._published is None, 'the withdrawal',
+                  lambda stamp: image(stamp, size=(160, 120)))
+    assert not infos
+
+
+def test_solution_is_tried_when_the_images_end(bench):
+    node = bench.start(instantly, camera_height=8.0, idle_solve_s=0.5)
+    publish_until(bench.connected(bench.publisher()), lambda: used(node), 'an image')
+    wait_for(lambda: node._published, 'a calibration that nobody asked for')

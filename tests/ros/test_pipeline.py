@@ -1,0 +1,181 @@
+"""The two threads between the image callback and the calibration."""
+
+import threading
+from concurrent.futures import Future
+
+import numpy as np
+import pytest
+
+from autocalib_ros.config import Options
+from autocalib_ros.errors import InputError
+from autocalib_ros.ros.pipeline import Pipeline
+from bench import PATIENCE_S, PIXELS, calibration, refusal, wait_for
+
+FRAME_NS = 66_000_000
+NEVER_S = 1e6
+
+
+class Heard:
+    """A listener that writes down what it is told."""
+
+    def __init__(self):
+        self.sizes, self.unreadable, self.results, self.faults = [], [], [], []
+
+    def image_taken(self, width, height):
+        self.sizes.append((width, height))
+
+    def image_unreadable(self, error):
+        self.unreadable.append(str(error))
+
+    def solved(self, result):
+        self.results.append(result)
+
+    def failed(self, error):
+        self.faults.append(error)
+
+
+def decode(message) -> np.ndarray:
+    if message is None:
+        raise InputError('torn image')
+    return message
+
+
+@pytest.fixture
+def heard() -> Heard:
+    return Heard()
+
+
+@pytest.fixture
+def start(heard):
+    """Start a pipeline around a solver; closed at the end."""
+    started = []
+
+    def make(solve, idle_solve_s: float = NEVER_S) -> Pipeline:
+        started.append(Pipeline(Options(), idle_solve_s=idle_solve_s, decode=decode,
+                                solve=lambda evidence, options: solve(evidence), listener=heard))
+        return started[-1]
+
+    yield make
+    for pipeline in started:
+        pipeline.close(PATIENCE_S)
+
+
+def feed(pipeline: Pipeline, heard: Heard, count: int, first: int = 0) -> None:
+    """Offer images one by one, each after the one before has been used."""
+    for number in range(first, first + count):
+        pipeline.offer(number * FRAME_NS, PIXELS)
+        wait_for(lambda wanted=number + 1: len(heard.sizes) >= wanted, f'image {number}')
+
+
+def result_of(future: Future):
+    return future.result(timeout=PATIENCE_S)
+
+
+def test_what_is_left_is_solved_once_when_no_image_comes(start, heard):
+    pipeline = start(calibration, idle_solve_s=0.1)
+    feed(pipeline, heard, 3)
+    wait_for(lambda: heard.results and heard.results[-1].evidence.frames == 3, 'the idle solution')
+    solved = len(heard.results)
+    assert not threading.Event().wait(0.5)  # five times the idle time: long enough for a second solution to show
+    assert len(heard.results) == solved
+
+
+def test_images_keep_flowing_while_a_solution_runs(start, heard):
+    running, release = threading.Event(), threading.Event()
+
+    def slow(evidence):
+        running.set()
+        release.wait(PATIENCE_S)
+        return calibration(evidence)
+
+    pipeline = start(slow)
+    feed(pipeline, heard, 2)
+    answer = pipeline.solve_now()
+    assert running.wait(PATIENCE_S)
+    feed(pipeline, heard, 20, first=2)
+    assert not answer.done()
+    release.set()
+    assert result_of(answer).evidence.frames == 2
+
+
+def test_newest_snapshot_takes_the_place_and_the_callers_of_one_that_waits(start, heard):
+    running, release = threading.Event(), threading.Event()
+
+    def slow(evidence):
+        running.set()
+        release.wait(PATIENCE_S)
+        return calibration(evidence)
+
+    pipeline = start(slow)
+    feed(pipeline, heard, 1)
+    answers = [pipeline.solve_now()]
+    assert running.wait(PATIENCE_S)
+    for number in (1, 2):
+        feed(pipeline, heard, 1, first=number)
+        answers.append(pipeline.solve_now())
+        wait_for(lambda: not pipeline._requests, 'the snapshot')
+    release.set()
+    assert [result_of(answer).evidence.frames for answer in answers] == [1, 3, 3]
+    assert [result.evidence.frames for result in heard.results] == [1, 3]
+
+
+def test_late_images_are_dropped_and_counted(start, heard):
+    entered, release = threading.Event(), threading.Event()
+    pipeline = start(calibration)
+    pipeline._decode = lambda message: (entered.set(), release.wait(PATIENCE_S), message)[2]
+    pipeline.offer(0, PIXELS)
+    assert entered.wait(PATIENCE_S)
+    for number in range(1, 5):
+        pipeline.offer(number * FRAME_NS, PIXELS)
+    release.set()
+    wait_for(lambda: len(heard.sizes) == 2, 'the first and the newest image')
+    assert str(pipeline.counters) == 'images received 5, used 2, dropped 3, unreadable 0'
+
+
+def test_unreadable_image_is_told_and_the_stream_goes_on(start, heard):
+    pipeline = start(calibration)
+    pipeline.offer(0, None)
+    wait_for(lambda: heard.unreadable == ['torn image'], 'the complaint')
+    feed(pipeline, heard, 1)
+    assert (pipeline.counters.unreadable, pipeline.counters.used) == (1, 1)
+
+
+def test_fault_of_a_solver_is_told_and_the_next_solution_works(start, heard):
+    faults = [ZeroDivisionError('a bug')]
+
+    def faulty(evidence):
+        if faults:
+            raise faults.pop()
+        return refusal(evidence)
+
+    pipeline = start(faulty)
+    feed(pipeline, heard, 1)
+    assert result_of(pipeline.solve_now()) is None
+    assert isinstance(heard.faults[0], ZeroDivisionError)
+    assert result_of(pipeline.solve_now()).code == 'too_few_tracks'
+
+
+def test_nothing_to_solve_before_the_first_image(start):
+    assert result_of(start(calibration).solve_now()) is None
+
+
+def test_close_sends_callers_away_and_says_that_a_solution_still_runs(start, heard):
+    running, release = threading.Event(), threading.Event()
+
+    def slow(evidence):
+        running.set()
+        release.wait(PATIENCE_S)
+        return calibration(evidence)
+
+    pipeline = start(slow)
+    feed(pipeline, heard, 1)
+    answer = pipeline.solve_now()
+    assert running.wait(PATIENCE_S)
+    assert not pipeline.close(timeout_s=0.1)
+    assert result_of(answer) is None
+    release.set()
+    assert pipeline.close(PATIENCE_S)
+
+
+def test_close_ends_idle_threads(start):
+    assert start(calibration).close(PATIENCE_S)

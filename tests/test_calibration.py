@@ -1,0 +1,114 @@
+"""Results as values, and the files that are made of them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from autocalib_ros.calibration import (
+    Calibration,
+    EvidenceSummary,
+    GroundPlane,
+    Reason,
+    Refusal,
+    StandardDeviations,
+    camera_info,
+    quaternion_xyzw,
+    rectified_matrix,
+    to_json,
+    write_calibration_json,
+    write_camera_info_yaml,
+)
+from autocalib_ros.camera import Camera
+from autocalib_ros.errors import InputError
+
+CAMERA = Camera(1280, 720, 560.0, (639.5, 359.5))
+EVIDENCE = EvidenceSummary(image_size=(1280, 720), seconds=60.0, frames=900, tracks=300, segments=4000, vehicles=70,
+                           coverage=0.6)
+
+
+def calibration(ground: GroundPlane | None) -> Calibration:
+    return Calibration(
+        method='joint', grade='full', assumptions=('square pixels',), camera=CAMERA, ground=ground, ground_refusal=None,
+        road_directions=np.eye(3)[:2], stddev=StandardDeviations(focal_px=5.0, tilt_deg=0.3), paper=None,
+        evidence=EVIDENCE, newest_stamp_ns=1)
+
+
+def test_distortion_is_never_all_zero() -> None:
+    # all-zero D reads as "no distortion" to image_proc, whatever the model is called
+    assert any(abs(value) >= 1e-9 for value in camera_info(CAMERA).d)
+
+
+def test_camera_info_has_the_lengths_of_the_message() -> None:
+    info = camera_info(CAMERA)
+    assert [len(info.k), len(info.d), len(info.r), len(info.p)] == [9, 4, 9, 12]
+    assert all(isinstance(value, float) for value in (*info.k, *info.d, *info.r, *info.p))
+
+
+@pytest.mark.parametrize('focal', [300.0, 560.0, 2000.0])
+def test_the_rectified_image_shows_no_empty_border(focal: float) -> None:
+    camera = Camera(1280, 720, focal, (632.0, 364.0))
+    border = np.array([(x, y) for x in np.linspace(0, 1279, 30) for y in (0, 719)]
+                      + [(x, y) for x in (0, 1279) for y in np.linspace(0, 719, 30)])
+    rays = np.column_stack([border, np.ones(len(border))]) @ np.linalg.inv(rectified_matrix(camera)).T
+    pixels, _ = camera.project(rays)
+    assert (pixels >= -0.5).all() and (pixels <= (1279.5, 719.5)).all()
+
+
+def test_a_refusal_is_false_and_a_calibration_true() -> None:
+    refusal = Refusal(code='no_motion', message='nothing', remedy='wait', method='joint', evidence=EVIDENCE)
+    assert not refusal
+    assert calibration(None)
+
+
+def test_json_of_a_refusal_keeps_code_message_and_remedy() -> None:
+    refusal = Refusal(code='no_motion', message='nothing', remedy='wait', method='joint', evidence=EVIDENCE)
+    document = to_json(refusal)
+    assert document['state'] == 'refused' and document['camera'] is None
+    assert document['refusal'] == {'code': 'no_motion', 'message': 'nothing', 'remedy': 'wait'}
+
+
+def test_json_says_why_a_calibrated_lens_has_no_plane() -> None:
+    from dataclasses import replace
+    result = replace(calibration(None), grade='lens', ground_refusal=Reason('no_height', 'none given', 'give it'))
+    document = to_json(result)
+    assert document['state'] == 'calibrated' and document['ground_from_camera'] is None
+    assert document['refusal']['code'] == 'no_height'
+
+
+def test_the_pose_survives_its_file(tmp_path: Path) -> None:
+    rotation = np.array([[0.0, -0.5, np.sqrt(0.75)], [-1.0, 0.0, 0.0], [0.0, -np.sqrt(0.75), -0.5]])
+    write_calibration_json(tmp_path / 'c.json', calibration(GroundPlane(rotation, 7.5)), accepted_at_s=20.0)
+    pose = json.loads((tmp_path / 'c.json').read_text())['ground_from_camera']
+    assert pose['translation_m'] == [0.0, 0.0, 7.5]
+    np.testing.assert_allclose(pose['rotation_xyzw'], quaternion_xyzw(rotation), atol=0)
+
+
+def test_the_yaml_is_that_of_camera_info_manager(tmp_path: Path) -> None:
+    write_camera_info_yaml(tmp_path / 'c.yaml', CAMERA, 'cam/1 é')
+    document = yaml.safe_load((tmp_path / 'c.yaml').read_text())
+    assert list(document) == ['image_width', 'image_height', 'camera_name', 'camera_matrix', 'distortion_model',
+                              'distortion_coefficients', 'rectification_matrix', 'projection_matrix']
+    assert document['camera_name'] == 'cam_1__'
+    assert document['camera_matrix'] == {'rows': 3, 'cols': 3, 'data': camera_info(CAMERA).k}
+    assert document['distortion_coefficients']['data'] == camera_info(CAMERA).d
+
+
+def test_a_file_that_cannot_be_written_is_an_input_error(tmp_path: Path) -> None:
+    (tmp_path / 'file').write_text('')
+    with pytest.raises(InputError, match='cannot write'):
+        write_camera_info_yaml(tmp_path / 'file' / 'c.yaml', CAMERA, 'camera')
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
+    path = tmp_path / 'c.json'
+    write_calibration_json(path, calibration(None))
+    before = path.read_text()
+    broken = calibration(GroundPlane(np.eye(3), float('nan')))
+    with pytest.raises(ValueError, match='JSON'):
+        write_calibration_json(path, broken)
+    assert path.read_text() == before and len(list(tmp_path.iterdir())) == 1

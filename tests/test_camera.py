@@ -1,0 +1,92 @@
+"""The lens model against itself and against OpenCV's."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from autocalib_ros.camera import Camera
+from autocalib_ros.errors import UsageError
+
+LENSES = {
+    'equidistant': Camera(1280, 720, 560.0, (639.5, 359.5)),
+    'kannala_brandt': Camera(1280, 720, 560.0, (630.0, 371.0), (0.015, -0.003, 0.001, -0.0002)),
+    'narrow': Camera(640, 480, 900.0, (320.0, 240.0), (0.05, 0.0, 0.0, 0.0)),
+    'nearly distortion-free': Camera(1280, 720, 700.0, (640.0, 360.0), (1 / 3, 2 / 15, 17 / 315, 62 / 2835)),
+}
+
+
+@pytest.fixture(params=LENSES.values(), ids=LENSES.keys())
+def camera(request: pytest.FixtureRequest) -> Camera:
+    return request.param
+
+
+@pytest.fixture
+def pixels(camera: Camera) -> np.ndarray:
+    generator = np.random.default_rng(0)
+    return generator.uniform((0, 0), (camera.width, camera.height), (500, 2))
+
+
+def test_unproject_inverts_project(camera: Camera, pixels: np.ndarray) -> None:
+    bearings, reached = camera.unproject(pixels)
+    back, valid = camera.project(bearings)
+    assert reached.all() and valid.all()
+    np.testing.assert_allclose(back, pixels, atol=1e-7)  # a ten-millionth of a pixel: the inversion's tolerance
+
+
+def test_bearings_are_unit_vectors(camera: Camera, pixels: np.ndarray) -> None:
+    bearings, _ = camera.unproject(pixels)
+    np.testing.assert_allclose(np.linalg.norm(bearings, axis=1), 1.0, atol=1e-12)
+
+
+def test_projection_agrees_with_opencv(camera: Camera) -> None:
+    points = np.random.default_rng(1).uniform((-2, -1, 1), (2, 1, 3), (100, 3))
+    expected, _ = cv2.fisheye.projectPoints(
+        points[:, None], np.zeros(3), np.zeros(3), camera.matrix, np.array(camera.k))
+    np.testing.assert_allclose(camera.project(points)[0], expected[:, 0], atol=1e-8)
+
+
+def test_projection_is_valid_behind_the_image_plane() -> None:
+    camera = LENSES['equidistant']
+    pixels, valid = camera.project(np.array([np.sin(2.0), 0.0, np.cos(2.0)]))  # 115 degrees off the axis
+    assert valid
+    np.testing.assert_allclose(pixels, (639.5 + 2.0 * 560.0, 359.5))
+
+
+def test_the_principal_point_looks_along_the_axis(camera: Camera) -> None:
+    bearing, _ = camera.unproject(np.array(camera.principal_point_px))
+    np.testing.assert_allclose(bearing, (0, 0, 1))
+
+
+def test_a_lens_that_folds_back_says_where_it_is_invalid() -> None:
+    camera = Camera(1280, 720, 560.0, (639.5, 359.5), (-0.2, 0.0, 0.0, 0.0))
+    assert np.radians(70) < camera.max_angle_rad < np.radians(75)  # 1 = 3 * 0.2 theta^2 at 74 degrees
+    _, valid = camera.project(np.array([1.0, 0.0, -0.2]))
+    assert not valid
+
+
+def test_a_pixel_beyond_the_model_is_marked_unreached() -> None:
+    camera = Camera(4000, 2000, 300.0, (2000.0, 1000.0), (-0.2, 0.0, 0.0, 0.0))
+    _, reached = camera.unproject(np.array([0.0, 0.0]))
+    assert not reached
+
+
+def test_undistortion_follows_the_published_equation() -> None:
+    camera = LENSES['equidistant']
+    distorted = np.array([200.0, -100.0])
+    radius = np.hypot(*distorted)
+    expected = distorted * np.tan(radius / 560.0) / (radius / 560.0)
+    undistorted = camera.undistort(distorted + camera.principal_point_px) - camera.principal_point_px
+    np.testing.assert_allclose(undistorted, expected)
+
+
+def test_undistortion_past_ninety_degrees_has_no_image() -> None:
+    camera = Camera(1280, 720, 300.0, (639.5, 359.5))  # the corner is 140 degrees from the axis
+    assert np.isnan(camera.undistort(np.array([0.0, 0.0]))).all()
+
+
+@pytest.mark.parametrize('focal', [0.0, -5.0, float('nan'), float('inf')])
+def test_an_impossible_focal_length_is_refused(focal: float) -> None:
+    with pytest.raises(UsageError, match='positive focal length'):
+        Camera(1280, 720, focal, (640.0, 360.0))

@@ -1,0 +1,166 @@
+"""The command as a person meets it: messages and exit statuses."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import autocalib_ros
+from autocalib_ros.cli import main
+
+
+@pytest.fixture
+def still_video(tmp_path) -> Path:
+    """Return a short video in which nothing moves."""
+    path = tmp_path / 'still.avi'
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*'MJPG'), 10.0, (160, 96))
+    picture = np.random.default_rng(0).integers(0, 255, (96, 160, 3)).astype(np.uint8)
+    for _ in range(20):
+        writer.write(picture)
+    writer.release()
+    return path
+
+
+def autocalib(*arguments: object, folder: Path, **more: str) -> subprocess.CompletedProcess:
+    environment = {**os.environ, 'PYTHONPATH': str(Path(autocalib_ros.__file__).parents[1]), **more}
+    return subprocess.run([sys.executable, '-m', 'autocalib_ros', *map(str, arguments)], capture_output=True,
+                          text=True, timeout=60, cwd=folder, env=environment, check=False)
+
+
+def one_line(text: str) -> str:
+    assert text.startswith('autocalib: error: '), text
+    assert text.count('\n') == 1, text
+    return text
+
+
+def test_help_and_version_end_well(capsys):
+    assert main(['--version']) == 0
+    assert capsys.readouterr().out == f'autocalib {autocalib_ros.__version__}\n'
+    assert main(['--help']) == 0
+    assert main(['replay', '--help']) == 0
+    assert main(['simulate', '--help']) == 0
+    assert main(['demo', '--help']) == 0
+
+
+def test_help_imports_nothing_heavy(tmp_path):
+    code = ("import sys; from autocalib_ros.cli import main; main(['--help']);"
+            "print(sorted({'cv2', 'numpy', 'rosbags', 'matplotlib', 'scipy'} & set(sys.modules)))")
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True,
+                          env={**os.environ, 'PYTHONPATH': str(Path(autocalib_ros.__file__).parents[1])})
+    assert done.stdout.endswith('[]\n')
+
+
+@pytest.mark.parametrize(('arguments', 'message'), [
+    ([], 'the following arguments are required: COMMAND'),
+    (['replay'], 'the following arguments are required: SOURCE'),
+    (['explode'], "invalid choice: 'explode'"),
+    (['replay', 'x', '--camera-height', 'high'], "invalid float value: 'high'"),
+    (['replay', 'x', '--method', 'magic'], "invalid choice: 'magic'"),
+    (['replay', 'x', '--unheard-of'], 'unrecognized arguments: --unheard-of'),
+    (['replay', 'x', '--camera-height', '-3'], "'camera_height' lies between 0 and 500; got -3.0"),
+    (['replay', 'x', '--camera-height', 'nan'], "'camera_height' lies between 0 and 500; got nan"),
+    (['replay', 'x', '--camera-height', 'inf'], "'camera_height' lies between 0 and 500; got inf"),
+    (['replay', 'x', '-p', 'camera_hight=3'], "did you mean 'camera_height'?"),
+    (['replay', 'x', '-p', 'camera_height'], 'is not of the form name=value'),
+    (['replay', 'x', '-p', 'tracking.max_points=many'], "'max_points' takes a int, got 'many'"),
+    (['replay', 'x', '--params-file', 'nowhere.yaml'], 'cannot read nowhere.yaml'),
+    (['replay', 'nowhere.mp4'], 'nowhere.mp4 does not exist'),
+    (['demo', '--seed', 'x'], "invalid int value: 'x'"),
+])
+def test_wrong_usage_is_one_line_and_status_2(arguments, message, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    assert message in one_line(capsys.readouterr().err)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize('name', ['text.mp4', 'text.mcap', 'text.db3', 'text.bag', 'folder'])
+def test_unreadable_input_is_one_line_and_status_2(name, tmp_path):
+    if name == 'folder':
+        (tmp_path / name).mkdir()
+    else:
+        (tmp_path / name).write_text('only words\n' * 100)
+    done = autocalib('replay', name, folder=tmp_path)
+    assert done.returncode == 2
+    assert name in one_line(done.stderr)
+    assert done.stdout == ''
+    assert not (tmp_path / 'autocalib_out').exists()
+
+
+def test_a_truncated_video_is_one_line_from_the_libraries_too(tmp_path):
+    path = tmp_path / 'clip.mp4'
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*'mp4v'), 10.0, (160, 96))
+    for index in range(20):
+        writer.write(np.full((96, 160, 3), 10 * index, np.uint8))
+    writer.release()
+    path.write_bytes(path.read_bytes()[:-300])
+    done = autocalib('replay', path, folder=tmp_path)
+    assert done.returncode == 2
+    one_line(done.stderr)
+
+
+def test_nothing_that_moves_is_refused_with_the_reason(still_video, tmp_path):
+    # a terminal that knows no more than ASCII is no reason to fail
+    done = autocalib('replay', still_video, '--camera-height', 8, '--out', 'out', folder=tmp_path,
+                     PYTHONIOENCODING='ascii')
+    assert done.returncode == 3, done.stderr
+    assert 'Not calibrated: ' in done.stderr
+    assert 'Traceback' not in done.stderr
+    document = json.loads((tmp_path / 'out' / 'calibration.json').read_text())
+    assert document['state'] == 'refused'
+    assert document['refusal']['message'].rstrip('.') in done.stderr
+    assert sorted(path.name for path in (tmp_path / 'out').iterdir()) == [
+        'calibration.json', 'evidence.npz', 'figures', 'report.html']
+    assert 'Written to out: calibration.json, report.html, evidence.npz' in done.stdout
+
+
+def test_no_height_is_said_in_one_line(still_video, tmp_path, capsys):
+    assert main(['replay', str(still_video), '--out', str(tmp_path / 'out')]) == 3
+    lines = capsys.readouterr().err.splitlines()
+    assert sum('No camera height given' in line for line in lines) == 1
+
+
+def test_quiet_says_only_the_reason(still_video, tmp_path, capsys):
+    bag = tmp_path / 'bag'
+    assert main(['replay', str(still_video), '--quiet', '--out', str(tmp_path / 'out'), '--write-bag', str(bag)]) == 3
+    captured = capsys.readouterr()
+    assert captured.out == ''
+    assert [line.split(':')[0] for line in captured.err.splitlines()] == [
+        'Not calibrated', f'{bag} is not written']
+    assert not bag.exists()
+
+
+def test_an_existing_bag_is_noticed_before_the_work(still_video, tmp_path, capsys):
+    assert main(['replay', str(still_video), '--out', str(tmp_path / 'out'), '--write-bag', str(tmp_path)]) == 2
+    assert 'exists already and is not overwritten' in one_line(capsys.readouterr().err)
+
+
+def test_the_command_line_overrides_the_file(still_video, tmp_path):
+    (tmp_path / 'p.yaml').write_text('/**: {ros__parameters: {method: paper, camera_height: 5.0}}')
+    base = ['replay', str(still_video), '--quiet', '--out', str(tmp_path / 'out'), '--params-file',
+            str(tmp_path / 'p.yaml')]
+    for more, method in (([], 'paper'), (['--method', 'joint'], 'joint'), (['-p', 'method=joint'], 'joint')):
+        assert main([*base, *more]) == 3
+        assert json.loads((tmp_path / 'out' / 'calibration.json').read_text())['method'] == method
+
+
+def test_two_runs_write_the_same_calibration(still_video, tmp_path):
+    for name in 'ab':
+        main(['replay', str(still_video), '--quiet', '--out', str(tmp_path / name)])
+    first, second = ((tmp_path / name / 'calibration.json').read_bytes() for name in 'ab')
+    assert first == second
+
+
+def test_an_interrupt_ends_quietly(still_video, tmp_path, monkeypatch, capsys):
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+    monkeypatch.setattr('autocalib_ros.offline.sources.open_source', interrupted)
+    assert main(['replay', str(still_video), '--out', str(tmp_path / 'out')]) == 130
+    assert 'Traceback' not in capsys.readouterr().err

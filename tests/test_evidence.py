@@ -1,0 +1,81 @@
+"""The rolling buffer and its snapshots."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from autocalib_ros.config import BufferOptions
+from autocalib_ros.errors import InputError
+from autocalib_ros.evidence import Evidence, EvidenceBuffer, Segments, Track
+
+
+def track(vehicle: int, end_s: float) -> Track:
+    times = np.linspace(end_s - 1.0, end_s, 10)
+    return Track(vehicle, times, np.column_stack([100 + 50 * times, np.full(10, 80.0)]))
+
+
+def segments(time_s: float, count: int) -> Segments:
+    return Segments(time_s, np.arange(count), np.ones((count, 4)))
+
+
+def snapshot(buffer: EvidenceBuffer) -> Evidence:
+    return buffer.snapshot(image_size=(640, 360), first_stamp_ns=0, newest_stamp_ns=2_000_000_000, frames=30,
+                           drift_px=0.1, unfinished=[])
+
+
+def test_a_snapshot_survives_its_file_to_the_last_bit(tmp_path: Path) -> None:
+    buffer = EvidenceBuffer(BufferOptions())
+    buffer.add_track(track(3, 5.0))
+    buffer.add_segments(segments(5.0, 4))
+    before = snapshot(buffer)
+    before.save(tmp_path / 'evidence.npz')
+    after = Evidence.load(tmp_path / 'evidence.npz')
+    for name in vars(before):
+        np.testing.assert_array_equal(getattr(after, name), getattr(before, name), err_msg=name)
+
+
+def test_the_buffer_keeps_no_more_tracks_than_allowed() -> None:
+    buffer = EvidenceBuffer(BufferOptions(max_tracks=50))
+    for index in range(500):
+        buffer.add_track(track(index, float(index)))
+    assert snapshot(buffer).track_count == 50
+    assert snapshot(buffer).track_vehicles.min() == 450  # the oldest went first
+
+
+def test_the_buffer_keeps_no_more_segments_than_allowed() -> None:
+    buffer = EvidenceBuffer(BufferOptions(max_segments=100))
+    for index in range(50):
+        buffer.add_segments(segments(float(index), 30))
+    assert len(snapshot(buffer).segments_px) <= 100
+
+
+def test_old_evidence_is_forgotten() -> None:
+    buffer = EvidenceBuffer(BufferOptions())
+    for end in (1.0, 10.0, 20.0):
+        buffer.add_track(track(0, end))
+        buffer.add_segments(segments(end, 2))
+    buffer.forget_before(15.0)
+    assert snapshot(buffer).track_count == 1 and len(snapshot(buffer).segments_px) == 2
+
+
+def test_coverage_counts_crossed_cells() -> None:
+    buffer = EvidenceBuffer(BufferOptions())
+    assert snapshot(buffer).coverage == 0.0
+    buffer.add_track(Track(0, np.arange(2.0), np.array([[10.0, 10.0], [15.0, 12.0]])))
+    assert snapshot(buffer).coverage == pytest.approx(1 / (16 * 9))
+
+
+@pytest.mark.parametrize('content', [b'', b'not a file of numpy', b'PK\x03\x04 torn'])
+def test_a_broken_file_is_an_input_error(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / 'evidence.npz'
+    path.write_bytes(content)
+    with pytest.raises(InputError, match='not a file of saved evidence'):
+        Evidence.load(path)
+
+
+def test_a_missing_file_is_an_input_error(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match='No such file'):
+        Evidence.load(tmp_path / 'none.npz')
