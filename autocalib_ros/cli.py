@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from autocalib_ros import __version__
 from autocalib_ros.config import Options
 from autocalib_ros.errors import AutocalibError, UsageError
+from autocalib_ros.threads import use_one_thread_for_linear_algebra
 
 if TYPE_CHECKING:
     from autocalib_ros.offline.replay import ReplayResult
@@ -28,6 +29,7 @@ DEFAULT_OUT = Path('autocalib_out')
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; return 0 calibrated, 3 refused, 2 wrong usage or unreadable input, 130 interrupted."""
+    use_one_thread_for_linear_algebra()
     _silence_libraries()
     _speak_to_any_terminal()
     try:

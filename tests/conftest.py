@@ -1,6 +1,5 @@
-"""One thread for linear algebra: the problems are small, and threads that wait for each other cost more."""
+"""Tests run as the programs do: with one thread for linear algebra."""
 
-import os
+from autocalib_ros.threads import use_one_thread_for_linear_algebra
 
-for variable in ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS'):
-    os.environ.setdefault(variable, '1')
+use_one_thread_for_linear_algebra()

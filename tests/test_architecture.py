@@ -12,7 +12,7 @@ import autocalib_ros
 
 PACKAGE = Path(autocalib_ros.__file__).parent
 # From the ground up. A room imports from rooms in lower lines only; rooms of one line do not know each other.
-STOREYS = (('errors',), ('config',), ('camera',), ('calibration',), ('evidence',), ('perception', 'estimation'),
+STOREYS = (('errors', 'threads'), ('config',), ('camera',), ('calibration',), ('evidence',), ('perception', 'estimation'),
            ('calibrator',), ('ros', 'offline'), ('cli',), ('__main__',))
 STOREY = {room: height for height, rooms in enumerate(STOREYS) for room in rooms}
 ROS_PACKAGES = ('rclpy', 'ament_index_python', 'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs',

@@ -15,7 +15,7 @@ import numpy as np
 from autocalib_ros.camera import Camera
 from autocalib_ros.evidence import Evidence
 
-SAMPLES = 14
+SAMPLES = 10
 """Points of a track that enter a fit; more of one path add correlated noise, not information."""
 MIN_LENGTH = 0.04
 """Shortest displacement of a track that says something of the lens, share of the image diagonal."""

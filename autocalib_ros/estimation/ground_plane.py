@@ -45,7 +45,7 @@ def focal_from_vanishing_points(first: np.ndarray, second: np.ndarray) -> float 
 
 
 def rotation_from_vanishing_points(first: np.ndarray, second: np.ndarray, focal_px: float) -> np.ndarray:
-    """The paper's R, shape (3, 3): columns are the roads and their normal in the camera frame, made a rotation by SVD."""
+    """The paper's R, shape (3, 3): its columns are the roads and their normal in the camera frame; nearest by SVD."""
     columns = [np.append(point, focal_px) / np.hypot(np.linalg.norm(point), focal_px) for point in (first, second)]
     matrix = np.column_stack([*columns, np.cross(*columns)])
     left, _, right = np.linalg.svd(matrix)

@@ -29,14 +29,17 @@ from autocalib_ros.estimation.vanishing_points import Directions, distances2_thr
 
 PATH_FREEDOM = 4.0
 """Independent deviations of one driven path: a few slow sways, however many images show it."""
-TIGHTENING = (8.0, 4.0, 2.0, 1.0, 1.0, 1.0)
+TIGHTENING = (8.0, 4.0, 2.0) + 12 * (1.0,)
 """Squared distance at which a track's influence has fallen to a quarter, in medians, round by round.
 
 The bulk of the tracks says what noise is; a lane change or a slow turn a few pixels beyond it is few in number
-but long in lever. From loose to tight, so that a start some per cent off still reaches the best solution.
+but long in lever. From loose to tight, so that a start some per cent off still reaches the best solution; then
+until assignment, influence and state stand still.
 """
-EVALUATIONS = (4, 4, 4, 4, 4, 20)
-"""Evaluations of the residuals in each round: only the last one needs to converge."""
+EVALUATIONS = 4
+"""Evaluations of the residuals in one round."""
+SETTLED = 3e-4
+"""The rounds end when no parameter moves by more: 0.03 % of the focal length, 0.02 degrees, 3e-4 prior sigmas."""
 MIN_TRACKS = 4
 """Fewer tracks on any road do not go on with a solution: it is judged, and refused, as it stands."""
 OUTLIER_PX = 4.0
@@ -239,7 +242,7 @@ def solve_joint(start: State, tracks: TrackSet, options: JointOptions, *, perpen
     """Alternate between assigning tracks to roads and robust least squares, from a start."""
     state = squared(start) if perpendicular else start
     share = np.sqrt(tracks.share_of_vehicle)
-    for tightness, evaluations in zip(TIGHTENING, EVALUATIONS, strict=True):
+    for tightness in TIGHTENING:
         # a start may be off by more than a true track ever is: only the last rounds cut off
         labels, distance2 = assign(state, tracks, OUTLIER_PX if tightness <= 1.0 else np.inf)
         if np.count_nonzero(labels >= 0) < MIN_TRACKS:
@@ -248,8 +251,10 @@ def solve_joint(start: State, tracks: TrackSet, options: JointOptions, *, perpen
         influence = PATH_FREEDOM * share / noise2 / (1.0 + distance2 / (tightness * noise2)) ** 2
         problem = Problem(state, tracks, labels, influence, options, perpendicular)
         solution = least_squares(problem.residuals, np.zeros(problem.size), problem.jacobian, method='lm',
-                                 max_nfev=evaluations, xtol=1e-6, ftol=1e-7)
+                                 max_nfev=EVALUATIONS, xtol=1e-6, ftol=1e-7)
         state = problem.state(solution.x)
+        if tightness <= 1.0 and np.abs(solution.x).max() < SETTLED:
+            break
     labels, distance2 = assign(state, tracks)
     return JointFit(state, labels, np.sqrt(distance2), robust_cost(state, distance2, tracks, options),
                     np.asarray(solution.jac), solution.fun, np.concatenate([problem.groups, np.full(3, -1)]), problem,

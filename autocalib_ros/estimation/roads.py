@@ -15,8 +15,11 @@ from autocalib_ros.estimation.joint import JointFit, State, initial_state, road_
 from autocalib_ros.estimation.straightness import focal_trials
 from autocalib_ros.estimation.vanishing_points import Directions, consensus_directions
 
-TRIALS = 20
+TRIALS = 16
+"""Focal lengths tried as starts: steps of about 15 %, within which the joint problem converges."""
 STARTS = 2
+VOTERS = 250
+"""Tracks that vote for directions, evenly out of all; the solution then uses every track."""
 MIN_VEHICLES = 4
 """Vehicles, distinct, that make a road; fewer may be one driver's whim."""
 STRAIGHT_SHARE = 0.35
@@ -66,7 +69,8 @@ def _best_fit(tracks: TrackSet, image_size: tuple[int, int], options: JointOptio
               generator: np.random.Generator) -> JointFit | None:
     """Start from the focal lengths at which most tracks agree on directions; keep the cheapest solution."""
     trials = focal_trials(tracks, image_size, TRIALS)
-    found = [consensus_directions(Camera.equidistant(*image_size, trial), tracks, generator) for trial in trials]
+    voters = tracks.subset(np.unique(np.linspace(0, len(tracks) - 1, VOTERS).astype(int)))
+    found = [consensus_directions(Camera.equidistant(*image_size, trial), voters, generator) for trial in trials]
     fits = [solve_joint(initial_state(Camera.equidistant(*image_size, trials[index]), found[index]), tracks, options)
             for index in _peaks(found)[:STARTS]]
     return min(fits, key=lambda fit: fit.cost, default=None)

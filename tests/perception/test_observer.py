@@ -1,0 +1,133 @@
+"""Images to observations: regions, vehicles, segments, stillness and the background."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from autocalib_ros.config import MotionOptions, Options
+from autocalib_ros.perception.background import Background
+from autocalib_ros.perception.observer import Observer
+from autocalib_ros.perception.stillness import Stillness
+from autocalib_ros.perception.vehicles import MotionMask
+
+SIZE = (360, 640)
+
+
+def texture(seed: int, shape: tuple[int, int], sigma: float = 1.5) -> np.ndarray:
+    noise = np.random.default_rng(seed).normal(0, 1, shape)
+    smooth = cv2.GaussianBlur(noise, (0, 0), sigma)
+    return np.clip(128 + 60 * smooth / smooth.std(), 0, 255)
+
+
+ROAD = texture(0, SIZE) * 0.5 + 40
+CARS = (texture(1, (60, 90)), texture(2, (50, 80)))
+
+
+def scene(time_s: float, cars: int = 2) -> np.ndarray:
+    """Two textured cars on a still road, one to the right and one to the left, grey uint8."""
+    image = ROAD.copy()
+    for index, (car, row, start, speed) in enumerate(zip(CARS, (80, 220), (20, 540), (45.0, -40.0), strict=True)):
+        if index < cars:
+            shift = np.array([[1.0, 0, start + speed * time_s], [0, 1.0, row]])
+            mask = cv2.warpAffine(np.ones_like(car), shift, SIZE[::-1])
+            image = image * (1 - mask) + cv2.warpAffine(car, shift, SIZE[::-1]) * mask
+    noise = np.random.default_rng(int(time_s * 1000)).normal(0, 1.5, SIZE)
+    return np.clip(image + noise, 0, 255).astype(np.uint8)
+
+
+def test_moving_cars_are_regions_and_the_road_is_not() -> None:
+    motion = MotionMask(MotionOptions())
+    for index in range(30):
+        motion.update(scene(0.1 * index, cars=0 if index < 20 else 2), 0.1 * index)
+    regions = motion.regions()
+    assert len(regions) == 2
+    rows = sorted(region.y + region.mask.shape[0] / 2 for region in regions)
+    np.testing.assert_allclose(rows, (110, 245), atol=10)  # a few pixels of the reduced mask
+
+
+def test_a_still_scene_has_no_regions() -> None:
+    motion = MotionMask(MotionOptions())
+    for index in range(30):
+        motion.update(scene(0.1 * index, cars=0), 0.1 * index)
+    assert not motion.regions()
+
+
+@pytest.fixture(scope='module')
+def watched() -> tuple[list, list, Observer]:
+    observer = Observer(Options(), (SIZE[1], SIZE[0]))
+    tracks, segments = [], []
+    for index in range(80):
+        observed = observer.observe(scene(max(0.0, 0.1 * (index - 10)), cars=2 if index > 10 else 0), 0.1 * index)
+        tracks += observed.tracks
+        segments += [observed.segments] if observed.segments is not None else []
+    return tracks + observer.unfinished(), segments, observer
+
+
+def test_tracks_go_the_way_of_their_cars(watched: tuple[list, list, Observer]) -> None:
+    tracks, _, _ = watched
+    speeds = [(track.points_px[-1] - track.points_px[0]) / (track.times_s[-1] - track.times_s[0]) for track in tracks
+              if track.times_s[-1] - track.times_s[0] > 1.0]
+    assert len(speeds) > 10
+    right = [abs(y) < 1.0 and min(abs(x - 45.0), abs(x + 40.0)) < 1.0 for x, y in speeds]  # px/s
+    assert np.mean(right) > 0.9  # the rest slid along an outline, which a later stage has to bear
+
+
+def test_cars_are_different_vehicles(watched: tuple[list, list, Observer]) -> None:
+    tracks, _, _ = watched
+    upper = {track.vehicle for track in tracks if track.points_px[:, 1].mean() < 180}
+    lower = {track.vehicle for track in tracks if track.points_px[:, 1].mean() > 180}
+    assert upper and lower and not upper & lower
+
+
+def test_segments_point_along_the_motion(watched: tuple[list, list, Observer]) -> None:
+    _, segments, _ = watched
+    ends = np.concatenate([item.ends_px for item in segments])
+    step = ends[:, 2:] - ends[:, :2]
+    assert len(step) > 50
+    assert np.median(np.abs(step[:, 1])) < 1.0  # px; the cars move along rows
+    assert np.percentile(np.abs(np.abs(step[:, 0]) - 0.6 * 42.5), 80) < 3.0  # six images of 0.1 s at 40 to 45 px/s
+
+
+def test_a_wide_image_is_tracked_reduced_and_reported_in_full_pixels() -> None:
+    wide = Observer(Options(max_image_width=320), (SIZE[1], SIZE[0]))
+    tracks = []
+    for index in range(80):
+        tracks += wide.observe(scene(max(0.0, 0.1 * (index - 10)), cars=2 if index > 10 else 0), 0.1 * index).tracks
+    tracks += wide.unfinished()
+    assert max(track.points_px[:, 0].max() for track in tracks) > 330
+    speeds = [np.diff(track.points_px[[0, -1], 0])[0] / (track.times_s[-1] - track.times_s[0]) for track in tracks
+              if track.times_s[-1] - track.times_s[0] > 1.0]
+    assert np.median(np.abs(np.abs(speeds) - 42.5)) < 4.0
+
+
+@pytest.mark.parametrize('shift', [(0.0, 0.0), (4.0, -3.0)])
+def test_stillness_measures_how_far_the_background_moved(shift: tuple[float, float]) -> None:
+    stillness = Stillness(600.0)
+    for index in range(60):
+        share = float(index >= 30)
+        moved = cv2.warpAffine(ROAD, np.array([[1.0, 0, share * shift[0]], [0, 1.0, share * shift[1]]]), SIZE[::-1],
+                               borderMode=cv2.BORDER_REFLECT)
+        stillness.update(moved.astype(np.uint8), float(index))
+    assert stillness.drift_px == pytest.approx(np.hypot(*shift), abs=0.4)
+
+
+def test_passing_cars_are_not_drift(watched: tuple[list, list, Observer]) -> None:
+    assert watched[2].drift_px < 0.5
+
+
+def test_the_background_shows_the_road_without_cars() -> None:
+    background = Background()
+    for index in range(200):
+        background.update(scene((0.05 * index) % 10.0), 0.05 * index)
+    image = background.image()
+    assert image is not None and image.shape == (*SIZE, 3)
+    assert np.median(np.abs(image[:, :, 0] - ROAD)) < 6  # grey levels, of which JPEG takes two or three
+
+
+def test_the_background_keeps_few_images() -> None:
+    background = Background()
+    for index in range(2000):
+        background.update(np.zeros((36, 64), np.uint8), float(index))
+    assert len(background._samples) <= 9

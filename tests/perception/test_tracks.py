@@ -1,0 +1,103 @@
+"""Point tracking on drawn traffic whose motion is known."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from autocalib_ros.config import TrackingOptions
+from autocalib_ros.evidence import Track
+from autocalib_ros.perception.tracks import PointTracker
+
+SIZE = (160, 320)
+
+
+def texture(seed: int, shape: tuple[int, int]) -> np.ndarray:
+    noise = np.random.default_rng(seed).uniform(0, 255, shape)
+    return cv2.GaussianBlur(noise, (0, 0), 1.5) * 3 % 256
+
+
+ROAD = texture(0, SIZE) * 0.2 + 100
+CAR = texture(1, (40, 60))
+
+
+def scene(offset: tuple[float, float] | None) -> np.ndarray:
+    """A still road with a textured car at a sub-pixel offset, uint8 (160, 320)."""
+    image = ROAD.copy()
+    if offset is not None:
+        moved = cv2.warpAffine(CAR, np.array([[1.0, 0, offset[0]], [0, 1.0, offset[1]]]), SIZE[::-1])
+        mask = cv2.warpAffine(np.ones_like(CAR), np.array([[1.0, 0, offset[0]], [0, 1.0, offset[1]]]), SIZE[::-1])
+        image = image * (1 - mask) + moved * mask
+    return image.astype(np.uint8)
+
+
+def follow(offsets: list[tuple[float, float] | None], interval_s: float = 0.1) -> tuple[PointTracker, list[Track]]:
+    tracker, finished = PointTracker(TrackingOptions()), []
+    for index, offset in enumerate(offsets):
+        finished += tracker.follow(scene(offset), index * interval_s)
+        if index == 0:
+            inside = np.array([(20.0, 20.0), (35.0, 15.0), (45.0, 28.0)]) + (offset or (0.0, 0.0))
+            tracker.add_points(inside, np.array([7, 7, 7]))
+    return tracker, finished
+
+
+def test_points_follow_sub_pixel_motion() -> None:
+    path = [(20 + 3.3 * index, 40 + 0.7 * index) for index in range(20)]
+    tracker, _ = follow(path)
+    tracks = tracker.unfinished()
+    assert len(tracks) == 3
+    for track in tracks:
+        step = track.points_px[-1] - track.points_px[0]
+        np.testing.assert_allclose(step, (3.3 * 19, 0.7 * 19), atol=0.3)  # KLT's own accuracy over 19 steps
+
+
+def test_a_track_keeps_its_vehicle_and_times() -> None:
+    tracker, _ = follow([(20 + 3.0 * index, 40) for index in range(15)])
+    track = tracker.unfinished()[0]
+    assert track.vehicle == 7
+    assert track.times_s[0] == 0.0 and track.times_s[-1] == pytest.approx(1.4)
+    assert (np.diff(track.times_s) > 0).all()
+
+
+def test_a_point_that_vanishes_ends_its_track() -> None:
+    tracker, finished = follow([(20 + 3.0 * index, 40) for index in range(12)] + [None, None])
+    assert len(finished) == 3 and not tracker.unfinished()
+
+
+def test_a_point_that_stops_ends_its_track() -> None:
+    moving = [(20 + 3.0 * index, 40.0) for index in range(12)]
+    _, finished = follow(moving + 20 * [moving[-1]])
+    assert len(finished) == 3
+
+
+def test_still_points_never_become_tracks() -> None:
+    tracker, finished = follow(30 * [(20.0, 40.0)])
+    assert not finished and not tracker.unfinished()
+
+
+def test_a_gap_in_time_ends_all_tracks() -> None:
+    tracker, _ = follow([(20 + 3.0 * index, 40) for index in range(12)])
+    finished = tracker.follow(scene((53.0, 40)), 60.0)
+    assert len(finished) == 3 and not tracker.unfinished()
+
+
+def test_points_keep_their_distance() -> None:
+    tracker = PointTracker(TrackingOptions(min_spacing_px=10.0))
+    tracker.follow(scene((20, 40)), 0.0)
+    tracker.add_points(np.array([(41.0, 61.0), (43.0, 63.0), (75.0, 61.0)]), np.zeros(3, int))
+    points, _ = tracker.positions()
+    assert points.tolist() == [[41.0, 61.0], [75.0, 61.0]]
+
+
+def test_no_more_points_than_allowed() -> None:
+    tracker = PointTracker(TrackingOptions(max_points=20))
+    tracker.follow(scene(None), 0.0)
+    grid = np.stack(np.meshgrid(np.arange(15, 300, 12.0), np.arange(15, 150, 12.0)), -1).reshape(-1, 2)
+    tracker.add_points(grid, np.zeros(len(grid), int))
+    assert len(tracker.positions()[0]) == 20
+
+
+def test_a_track_has_no_more_samples_than_allowed() -> None:
+    tracker, _ = follow([(20 + 1.7 * index, 40) for index in range(100)])
+    assert max(len(track.times_s) for track in tracker.unfinished()) <= TrackingOptions().max_samples

@@ -1,0 +1,107 @@
+"""The one object that live node and replay share."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from autocalib_ros.calibrator import AutoCalibrator
+from autocalib_ros.config import GateOptions, Options
+from autocalib_ros.errors import InputError
+
+OPTIONS = Options(first_solve_s=2.0, solve_interval_s=1.0, gate=GateOptions(min_tracks=4))
+
+
+def image(index: int, size: tuple[int, int] = (180, 320)) -> np.ndarray:
+    """A textured block that crosses a still road."""
+    generator = np.random.default_rng(5)
+    picture = generator.integers(60, 120, size).astype(np.uint8)
+    block = np.kron(generator.integers(0, 255, (8, 12)), np.ones((5, 5))).astype(np.uint8)
+    left = 6 * (index % 40)
+    picture[60:100, left:left + 60] = block[:, :max(0, min(60, size[1] - left))]
+    return picture
+
+
+def fed(count: int, interval_ns: int = 100_000_000) -> AutoCalibrator:
+    calibrator = AutoCalibrator(OPTIONS)
+    for index in range(count):
+        calibrator.add_image(index * interval_ns, image(index))
+    return calibrator
+
+
+def test_nothing_is_known_before_the_first_image() -> None:
+    calibrator = AutoCalibrator(OPTIONS)
+    assert calibrator.snapshot() is None and calibrator.take_due() is None and calibrator.background() is None
+    assert calibrator.progress().percent == 0.0
+
+
+def test_the_snapshot_counts_images_and_time() -> None:
+    evidence = fed(30).snapshot()
+    assert evidence is not None
+    assert (evidence.frames, evidence.seconds, evidence.image_size) == (30, pytest.approx(2.9), (320, 180))
+
+
+def test_moving_things_become_tracks() -> None:
+    evidence = fed(60).snapshot()
+    assert evidence is not None and evidence.track_count > 4
+
+
+def test_the_same_images_give_the_same_evidence_to_the_last_bit() -> None:
+    first, second = fed(60).snapshot(), fed(60).snapshot()
+    assert first is not None and second is not None
+    for name in vars(first):
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name), err_msg=name)
+
+
+@pytest.mark.parametrize('colour', [False, True])
+def test_the_image_given_is_not_changed(colour: bool) -> None:
+    picture = np.repeat(image(0)[..., None], 3, axis=2) if colour else image(0)
+    before = picture.copy()
+    calibrator = AutoCalibrator(OPTIONS)
+    calibrator.add_image(0, picture)
+    picture[:] = 0  # nor kept: a caller may use its buffer again
+    calibrator.add_image(1, before)
+    np.testing.assert_array_equal(before, np.repeat(image(0)[..., None], 3, axis=2) if colour else image(0))
+
+
+def test_a_backward_stamp_begins_anew() -> None:
+    calibrator = fed(30)
+    calibrator.add_image(0, image(0))
+    evidence = calibrator.snapshot()
+    assert evidence is not None and evidence.frames == 1
+
+
+def test_a_new_size_begins_anew() -> None:
+    calibrator = fed(30)
+    calibrator.add_image(3_000_000_000, image(0, (240, 320)))
+    evidence = calibrator.snapshot()
+    assert evidence is not None and (evidence.frames, evidence.image_size) == (1, (320, 240))
+
+
+def test_a_repeated_stamp_is_left_out() -> None:
+    calibrator = fed(10)
+    calibrator.add_image(900_000_000, image(30))
+    evidence = calibrator.snapshot()
+    assert evidence is not None and evidence.frames == 10
+
+
+@pytest.mark.parametrize('picture', [np.zeros((10, 10), np.uint16), np.zeros((10, 10, 4), np.uint8), np.zeros(10, np.uint8)])
+def test_another_kind_of_array_is_refused(picture: np.ndarray) -> None:
+    with pytest.raises(InputError, match='8 bits'):
+        AutoCalibrator(OPTIONS).add_image(0, picture)
+
+
+def test_a_solution_is_due_when_there_are_time_and_tracks() -> None:
+    calibrator = AutoCalibrator(OPTIONS)
+    due = []
+    for index in range(150):
+        calibrator.add_image(index * 100_000_000, image(index))
+        if calibrator.take_due() is not None:
+            due.append(index)
+    assert due and due[0] >= 20  # first_solve_s
+    assert all(later - earlier >= 10 for earlier, later in zip(due, due[1:], strict=False))  # solve_interval_s
+
+
+def test_progress_says_what_is_missing() -> None:
+    progress = fed(5).progress()
+    assert progress.percent < 100 and progress.missing
