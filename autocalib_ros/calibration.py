@@ -142,6 +142,9 @@ class Calibration:
     grade: str
     """'full': lens and metric ground plane; 'unit_scale': the plane in units of the height; 'lens': no plane."""
     assumptions: tuple[str, ...]
+    """What was taken for granted, in words."""
+    checks: tuple[str, ...] = ()
+    """What was measured or cross-checked, in words."""
     camera: Camera
     ground: GroundPlane | None
     ground_refusal: Reason | None
@@ -216,7 +219,8 @@ def to_json(result: Calibration | Refusal, *, accepted_at_s: float | None = None
     evidence = result.evidence
     document: dict[str, Any] = {
         'version': JSON_VERSION, 'state': 'calibrated' if result else 'refused', 'grade': None,
-        'method': result.method, 'assumptions': [], 'refusal': None, 'image_size': list(evidence.image_size),
+        'method': result.method, 'assumptions': [], 'checks': [], 'refusal': None,
+        'image_size': list(evidence.image_size),
         'camera': None, 'camera_info': None, 'ground_from_camera': None, 'road_directions_in_camera': [],
         'stddev': None, 'paper': None,
         'evidence': {'seconds': evidence.seconds, 'frames': evidence.frames, 'tracks': evidence.tracks,
@@ -236,7 +240,7 @@ def _refusal_json(refusal: Refusal | Reason) -> dict[str, str]:
 def _calibration_json(result: Calibration) -> dict[str, Any]:
     camera, info, sigma = result.camera, camera_info(result.camera), result.stddev
     return {
-        'grade': result.grade, 'assumptions': list(result.assumptions),
+        'grade': result.grade, 'assumptions': list(result.assumptions), 'checks': list(result.checks),
         'refusal': _refusal_json(result.ground_refusal) if result.ground_refusal else None,
         'camera': {'model': 'kannala_brandt', 'focal_px': camera.focal_px,
                    'principal_point_px': list(camera.principal_point_px), 'k': list(camera.k)},

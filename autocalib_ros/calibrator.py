@@ -132,9 +132,10 @@ def solve(evidence: Evidence, options: Options) -> Calibration | Refusal:
     figures = _figures(figures, roads, tracks, evidence, options)
     paper = None if intrinsics is None else intrinsics.report
     return _calibration(evidence, options, roads, tracks, Calibration(
-        method=options.method, grade='lens', assumptions=roads.assumptions, camera=roads.fit.state.camera, ground=None,
-        ground_refusal=roads.no_plane, road_directions=roads.fit.state.directions, stddev=_lens_deviations(roads),
-        paper=paper, evidence=evidence.summary(), newest_stamp_ns=evidence.newest_stamp_ns, figures=figures))
+        method=options.method, grade='lens', assumptions=roads.assumptions, checks=roads.checks,
+        camera=roads.fit.state.camera, ground=None, ground_refusal=roads.no_plane,
+        road_directions=roads.fit.state.directions, stddev=_lens_deviations(roads), paper=paper,
+        evidence=evidence.summary(), newest_stamp_ns=evidence.newest_stamp_ns, figures=figures))
 
 
 def _figures(figures: Figures, roads: Roads, tracks: TrackSet, evidence: Evidence, options: Options) -> Figures:

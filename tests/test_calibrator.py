@@ -85,7 +85,8 @@ def test_a_repeated_stamp_is_left_out() -> None:
     assert evidence is not None and evidence.frames == 10
 
 
-@pytest.mark.parametrize('picture', [np.zeros((10, 10), np.uint16), np.zeros((10, 10, 4), np.uint8), np.zeros(10, np.uint8)])
+@pytest.mark.parametrize('picture', [np.zeros((10, 10), np.uint16), np.zeros((10, 10, 4), np.uint8),
+                                     np.zeros(10, np.uint8)])
 def test_another_kind_of_array_is_refused(picture: np.ndarray) -> None:
     with pytest.raises(InputError, match='8 bits'):
         AutoCalibrator(OPTIONS).add_image(0, picture)

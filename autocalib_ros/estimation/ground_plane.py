@@ -32,7 +32,7 @@ def ground_plane(normal: np.ndarray, direction: np.ndarray, height: float, *, me
 
 def tilt_and_roll_deg(normal: np.ndarray) -> np.ndarray:
     """Angles (2,) of the upward normal (3,): the optical axis below the horizontal, and the roll about it."""
-    return np.degrees([np.arcsin(np.clip(-normal[2], -1, 1)), np.arctan2(-normal[0], -normal[1])])
+    return np.degrees([np.arcsin(np.clip(-normal[2], -1, 1)), np.arctan2(-normal[0] + 0.0, -normal[1])])
 
 
 def focal_from_vanishing_points(first: np.ndarray, second: np.ndarray) -> float | None:

@@ -38,6 +38,8 @@ until assignment, influence and state stand still.
 """
 EVALUATIONS = 4
 """Evaluations of the residuals in one round."""
+HELD = 1e-6
+"""Prior sigma of a parameter that is held."""
 SETTLED = 3e-4
 """The rounds end when no parameter moves by more: 0.03 % of the focal length, 0.02 degrees, 3e-4 prior sigmas."""
 MIN_TRACKS = 4
@@ -77,6 +79,7 @@ class Problem:
     def __init__(self, base: State, tracks: TrackSet, labels: np.ndarray, influence: np.ndarray,
                  options: JointOptions, perpendicular: bool) -> None:
         used = labels >= 0
+        self.all_labels = labels
         self.base, self.tracks, self.labels = base, tracks.subset(used), labels[used]
         self.options, self.perpendicular = options, perpendicular
         self.root = np.sqrt(self.tracks.weights * influence[used, None])
@@ -185,9 +188,7 @@ class JointFit:
     groups: np.ndarray
     """Vehicle of each residual, -1 for a prior, shape (residuals,)."""
     problem: Problem
-    """The last problem solved: its steps from `problem.base` are the parameters of the covariance."""
-    step: np.ndarray
-    """The solution as a step from `problem.base`, shape (parameters,)."""
+    """The problem at the solution: steps from there are the parameters of the covariance."""
 
     @property
     def median_px(self) -> float:
@@ -206,7 +207,7 @@ class JointFit:
 
     def sigma(self, function: Callable[[State], np.ndarray]) -> np.ndarray:
         """Standard deviation of a function of the state, shape of its result."""
-        return propagate(lambda step: function(self.problem.state(self.step + step)), self.problem.size,
+        return propagate(lambda step: function(self.problem.state(step)), self.problem.size,
                          self.covariance())
 
 
@@ -239,7 +240,13 @@ def initial_state(camera: Camera, found: Directions) -> State:
 
 
 def solve_joint(start: State, tracks: TrackSet, options: JointOptions, *, perpendicular: bool = False) -> JointFit:
-    """Alternate between assigning tracks to roads and robust least squares, from a start."""
+    """Alternate between assigning tracks to roads and robust least squares, from a start.
+
+    One road alone cannot tell k1 and the principal point from the focal length: there they stay where the start
+    has them; what their priors leave open is still part of the uncertainty.
+    """
+    one_road = len(start.angles_rad) == 1
+    solved = replace(options, k1_sigma=HELD, principal_point_sigma=HELD) if one_road else options
     state = squared(start) if perpendicular else start
     share = np.sqrt(tracks.share_of_vehicle)
     for tightness in TIGHTENING:
@@ -249,16 +256,17 @@ def solve_joint(start: State, tracks: TrackSet, options: JointOptions, *, perpen
             break
         noise2 = max(options.noise_px**2, _typical(distance2[labels >= 0]))
         influence = PATH_FREEDOM * share / noise2 / (1.0 + distance2 / (tightness * noise2)) ** 2
-        problem = Problem(state, tracks, labels, influence, options, perpendicular)
+        problem = Problem(state, tracks, labels, influence, solved, perpendicular)
         solution = least_squares(problem.residuals, np.zeros(problem.size), problem.jacobian, method='lm',
                                  max_nfev=EVALUATIONS, xtol=1e-6, ftol=1e-7)
         state = problem.state(solution.x)
         if tightness <= 1.0 and np.abs(solution.x).max() < SETTLED:
             break
+    final = Problem(state, tracks, problem.all_labels, influence, options, perpendicular)
+    here = np.zeros(final.size)
     labels, distance2 = assign(state, tracks)
     return JointFit(state, labels, np.sqrt(distance2), robust_cost(state, distance2, tracks, options),
-                    np.asarray(solution.jac), solution.fun, np.concatenate([problem.groups, np.full(3, -1)]), problem,
-                    solution.x)
+                    final.jacobian(here), final.residuals(here), np.concatenate([final.groups, np.full(3, -1)]), final)
 
 
 def squared(state: State) -> State:

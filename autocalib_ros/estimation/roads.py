@@ -44,6 +44,7 @@ class Roads:
     support: list[np.ndarray]
     """Masks of the tracks (tracks,) that tell each road from the others."""
     assumptions: tuple[str, ...]
+    checks: tuple[str, ...]
     no_plane: Reason | None
 
 
@@ -89,11 +90,12 @@ def _is_road(mask: np.ndarray, tracks: TrackSet, gate: GateOptions) -> bool:
 
 
 def _strongest_alone(fit: JointFit, support: list[np.ndarray], tracks: TrackSet, options: JointOptions) -> JointFit:
-    """Solve again with the one road that explains most vehicles."""
+    """Solve again with the one road that explains most vehicles, from an equidistant lens."""
     explained = fit.explained()
     counts = [len(np.unique(tracks.vehicles[explained & (fit.labels == road)])) for road in range(len(support))]
     direction = fit.state.directions[int(np.argmax(counts))]
-    alone = initial_state(fit.state.camera, Directions(direction[None], np.zeros(0, int), 0.0))
+    camera = Camera.equidistant(fit.state.camera.width, fit.state.camera.height, fit.state.camera.focal_px)
+    alone = initial_state(camera, Directions(direction[None], np.zeros(0, int), 0.0))
     return solve_joint(alone, tracks, options)
 
 
@@ -136,16 +138,19 @@ def _doubted(fit: JointFit, support: list[np.ndarray], angle: str | None, tracks
                    f'{options.principal_point_sigma * camera.width:.0f} px']
     if angle is None:
         tracks_seen = int(fit.explained().sum())
-        return Roads(fit, support, (*assumptions, 'one road only'), Reason(
+        assumptions += ['k1 and the principal point held there: one road cannot determine them']
+        return Roads(fit, support, tuple(assumptions), (), Reason(
             'one_direction', f'all {tracks_seen} tracks that agree follow one road: rotation about it is free',
             'wait for traffic across the main road'))
+    checks = [] if fit.problem.perpendicular else [angle]
+    assumptions += [angle] if fit.problem.perpendicular else []
     plane_doubt = _plane_doubt(fit, tracks, gate)
     if plane_doubt:
-        return Roads(fit, support, (*assumptions, angle), plane_doubt)
+        return Roads(fit, support, tuple(assumptions), tuple(checks), plane_doubt)
     halves = _halves_doubt(fit, tracks, options, gate)
     if isinstance(halves, Reason):
         return halves
-    return Roads(fit, support, (*assumptions, angle, halves), None)
+    return Roads(fit, support, tuple(assumptions), (*checks, halves), None)
 
 
 def _lens_doubt(fit: JointFit, tracks: TrackSet, options: JointOptions, gate: GateOptions) -> Reason | None:

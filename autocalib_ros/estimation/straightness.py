@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from autocalib_ros.calibration import PaperReport
-from autocalib_ros.camera import Camera
+from autocalib_ros.camera import Camera, image_centre
 from autocalib_ros.config import PaperOptions
 from autocalib_ros.estimation.great_circles import TrackSet, fit_circles, rays_of
 from autocalib_ros.evidence import Evidence, Track
@@ -20,7 +21,7 @@ TRACK_SCALE_PX = 1.0
 
 @dataclass(frozen=True)
 class PaperIntrinsics:
-    """Result of the published intrinsic stage."""
+    """Result of the published intrinsic stage, with the interval that it comes from."""
 
     report: PaperReport
     sweep: np.ndarray
@@ -29,63 +30,86 @@ class PaperIntrinsics:
     """Indices in the evidence of the tracks used."""
 
 
-def paper_tracks(evidence: Evidence, options: PaperOptions) -> tuple[list[np.ndarray], np.ndarray]:
-    """Apply the paper's two filters and take the longest: pixel paths (n, 2) and their track indices.
+@dataclass(frozen=True)
+class Interval:
+    """One observed interval: pixel paths (n, 2) of the tracks that the paper keeps, longest first."""
 
-    The observed interval is a window of `window_s`; the recording is a row of such windows. A track is kept
-    if it lived for `min_lifetime` of its window and its path is at most `max_path_ratio` its displacement.
+    paths: list[np.ndarray]
+    tracks: list[int]
+
+
+def paper_intervals(evidence: Evidence, options: PaperOptions) -> list[Interval]:
+    """Apply the paper's two filters in each observed interval of `window_s` and take the longest tracks.
+
+    A track is kept if it lived for `min_lifetime` of the interval and its path is at most `max_path_ratio` its
+    displacement. Intervals with fewer tracks than the fullest are left out: all estimates rest on as many.
     """
-    kept = []
+    kept: dict[int, list[tuple[float, int, np.ndarray]]] = {}
     for index, track in enumerate(evidence.tracks()):
-        path = _longest_in_a_window(track, options)
-        if path is None:
-            continue
-        displacement = np.hypot(*(path[-1] - path[0]))
-        length = np.hypot(*np.diff(path, axis=0).T).sum()
-        if displacement > 0 and length <= options.max_path_ratio * displacement:
-            kept.append((-displacement, index, path))
-    kept.sort(key=lambda item: item[:2])
-    kept = kept[:options.longest]
-    return [path for _, _, path in kept], np.array([index for _, index, _ in kept], int)
+        for window, path in _parts(track, options):
+            displacement = float(np.hypot(*(path[-1] - path[0])))
+            length = np.hypot(*np.diff(path, axis=0).T).sum()
+            if displacement > 0 and length <= options.max_path_ratio * displacement:
+                kept.setdefault(window, []).append((-displacement, index, path))
+    longest = [sorted(kept[window], key=lambda item: item[:2])[:options.longest] for window in sorted(kept)]
+    fullest = max(map(len, longest), default=0)
+    return [Interval([path for _, _, path in items], [index for _, index, _ in items])
+            for items in longest if len(items) == fullest]
 
 
-def _longest_in_a_window(track: Track, options: PaperOptions) -> np.ndarray | None:
-    """Return the longest part of a track that fills an observed interval, or None."""
-    best, best_length = None, 0.0
+def _parts(track: Track, options: PaperOptions) -> Iterator[tuple[int, np.ndarray]]:
+    """Yield the parts of a track that live long enough in an interval, with the number of the interval."""
     windows = np.floor(track.times_s / options.window_s).astype(int)
     for window in np.unique(windows):
         inside = windows == window
         times, path = track.times_s[inside], track.points_px[inside]
-        length = np.hypot(*(path[-1] - path[0]))
-        if len(path) > 2 and times[-1] - times[0] >= options.min_lifetime * options.window_s and length > best_length:
-            best, best_length = path, length
-    return best
+        if len(path) > 2 and times[-1] - times[0] >= options.min_lifetime * options.window_s:
+            yield int(window), path
 
 
 def paper_intrinsics(evidence: Evidence, options: PaperOptions) -> PaperIntrinsics | None:
-    """Run the paper's intrinsic stage (its sections on focal length and polynomial); None without a track."""
-    paths, indices = paper_tracks(evidence, options)
-    if not paths:
+    """Run the paper's intrinsic stage on each observed interval; the result is that of the median focal length.
+
+    One interval is the paper's clip. Of many, the median is the one that a person would believe; intervals
+    whose error still falls at an end of the sweep have no least error, and count only where all are like that.
+    None where no track fills an interval.
+    """
+    intervals = paper_intervals(evidence, options)
+    if not intervals:
         return None
-    width, height = evidence.image_size
-    farthest = max(np.hypot(*(path - Camera.equidistant(width, height, 1.0).principal_point_px).T).max()
-                   for path in paths)
-    lowest, diagonal = RIM * farthest / (np.pi / 2), np.hypot(width, height)
-    trials = np.linspace(max(lowest, diagonal / options.focal_steps), diagonal, options.focal_steps)
-    errors = np.array([sum(_line_error(Camera.equidistant(width, height, trial).undistort(path)) for path in paths)
-                       for trial in trials])
-    camera = Camera.equidistant(width, height, float(trials[np.argmin(errors)]))
-    before = np.mean([_line_error(path) / len(path) for path in paths])
-    after = np.mean([_line_error(camera.undistort(path)) / len(path) for path in paths])
+    sweeps = [_sweep(interval, evidence.image_size, options) for interval in intervals]
+    least = [int(np.argmin(sweep[:, 1])) for sweep in sweeps]
+    inside = [index for index, place in enumerate(least) if 0 < place < options.focal_steps - 1]
+    candidates = sorted(inside or range(len(sweeps)), key=lambda index: sweeps[index][least[index], 0])
+    median = candidates[(len(candidates) - 1) // 2]
+    focal, paths = float(sweeps[median][least[median], 0]), intervals[median].paths
+    camera = Camera.equidistant(*evidence.image_size, focal)
+    before = np.mean([_line_errors(path) / len(path) for path in paths])
+    after = np.mean([_line_errors(camera.undistort(path)) / len(path) for path in paths])
     report = PaperReport(focal_px=camera.focal_px, polynomial_k=distortion_polynomial(camera),
                          straightness_px2=(float(before), float(after)))
-    return PaperIntrinsics(report, np.column_stack([trials, errors]), indices)
+    return PaperIntrinsics(report, sweeps[median], np.array(intervals[median].tracks, int))
 
 
-def _line_error(points: np.ndarray) -> float:
-    """Summed squared distance of points (n, 2) from their best line."""
-    centred = points - points.mean(axis=0)
-    return float(np.linalg.eigvalsh(centred.T @ centred)[0])
+def _sweep(interval: Interval, image_size: tuple[int, int], options: PaperOptions) -> np.ndarray:
+    """Trial focal lengths up to the image diagonal with their summed squared errors, shape (n, 2)."""
+    centre = np.asarray(image_centre(*image_size))
+    radii = [np.hypot(*(path - centre).T) for path in interval.paths]
+    lowest = RIM * max(radius.max() for radius in radii) / (np.pi / 2)
+    diagonal = float(np.hypot(*image_size))
+    trials = np.linspace(max(lowest, diagonal / options.focal_steps), diagonal, options.focal_steps)
+    errors = np.zeros(len(trials))
+    for path, radius in zip(interval.paths, radii, strict=True):
+        theta = np.maximum(radius, 1e-9) / trials[:, None]
+        errors += _line_errors((path - centre) * (np.tan(theta) / theta)[..., None])
+    return np.column_stack([trials, errors])
+
+
+def _line_errors(points: np.ndarray) -> np.ndarray:
+    """Summed squared distances of points (..., n, 2) from their best line, shape (...)."""
+    x, y = np.moveaxis(points - points.mean(axis=-2, keepdims=True), -1, 0)
+    xx, xy, yy = (x * x).sum(-1), (x * y).sum(-1), (y * y).sum(-1)
+    return np.maximum(0.5 * (xx + yy - np.hypot(xx - yy, 2 * xy)), 0.0)
 
 
 def distortion_polynomial(camera: Camera) -> tuple[float, float, float]:

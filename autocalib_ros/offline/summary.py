@@ -8,6 +8,7 @@ import numpy as np
 
 from autocalib_ros.calibration import Calibration, Refusal
 from autocalib_ros.camera import Camera
+from autocalib_ros.estimation.ground_plane import tilt_and_roll_deg
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,7 @@ def verdict(result: Calibration | Refusal) -> str:
     if result.ground is None:
         why = '' if result.ground_refusal is None else ' ' + _sentence(_capital(result.ground_refusal.message))
         return f'The lens is calibrated ({focal}); there is no ground plane.{why}'
-    down, _ = down_and_roll_deg(result.ground.normal_in_camera)
+    down, _ = tilt_and_roll_deg(result.ground.normal_in_camera)
     pose = f'the camera looks {_with_sigma(down, result.stddev.tilt_deg, 1)} degrees down'
     if result.ground.metric:
         return f'Calibrated: {focal}; {pose} from {result.ground.height_m:.2f} m above the road.'
@@ -76,7 +77,7 @@ def _lens_rows(result: Calibration) -> list[Row]:
 def _ground_rows(result: Calibration) -> list[Row]:
     if result.ground is None:
         return []
-    down, roll = down_and_roll_deg(result.ground.normal_in_camera)
+    down, roll = tilt_and_roll_deg(result.ground.normal_in_camera)
     height, note = (f'{result.ground.height_m:.2f} m', 'as given') if result.ground.metric else ('1 (unit)', '')
     return [Row('camera height', height, _number(result.stddev.height_m, 2), note),
             Row('looks down by', f'{down:.2f} degrees', _number(result.stddev.tilt_deg, 2)),
@@ -111,12 +112,6 @@ def field_of_view_deg(camera: Camera) -> tuple[float, float]:
     return float(across), float(down)
 
 
-def down_and_roll_deg(normal_in_camera: np.ndarray) -> tuple[float, float]:
-    """Return how far a camera looks down and how far it is rolled, from the upward normal of the road."""
-    x, y, z = normal_in_camera
-    return float(np.degrees(np.arcsin(np.clip(-z, -1, 1)))), float(np.degrees(np.arctan2(-x + 0.0, -y)))
-
-
 def _number(value: float | None, digits: int) -> str:
     return '' if value is None else f'{value:.{digits}f}'
 
@@ -129,5 +124,6 @@ def text_summary(result: Calibration | Refusal, accepted_at_s: float | None = No
         lines.append(f'  {row.name + ":":<26}{row.value}{sigma}')
     if isinstance(result, Calibration):
         lines += [f'  {"assumed:":<26}{assumption}' for assumption in result.assumptions]
+        lines += [f'  {"checked:":<26}{check}' for check in result.checks]
     lines += [f'  {"what helps:":<26}{remedy(result)}'] if remedy(result) else []
     return '\n'.join(lines)

@@ -14,6 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
 from autocalib_ros.errors import AutocalibError, UsageError
+from autocalib_ros.threads import use_one_thread_for_linear_algebra
 
 if TYPE_CHECKING:
     from autocalib_ros.ros.autocalib_node import AutocalibNode
@@ -26,6 +27,7 @@ WRONG_USAGE = 2
 
 def main(args: list[str] | None = None) -> int:
     """Run the node until it is interrupted; return the exit status: 0, or 2 for wrong usage."""
+    use_one_thread_for_linear_algebra()
     try:
         import rclpy  # noqa: F401
         import sensor_msgs.msg  # noqa: F401

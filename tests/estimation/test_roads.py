@@ -65,7 +65,7 @@ def test_skewed_roads_are_measured_not_squared() -> None:
     junction = Junction(road_angles_deg=(0.0, 70.0), vehicles=120)
     result = solved(junction)
     assert isinstance(result, Calibration)
-    assert any('measured' in text for text in result.assumptions)
+    assert any('measured' in text for text in result.checks)
     assert normal_error_deg(result, junction) < 1.0
 
 

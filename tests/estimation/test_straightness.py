@@ -11,8 +11,8 @@ from autocalib_ros.estimation.great_circles import select_tracks
 from autocalib_ros.estimation.straightness import (
     distortion_polynomial,
     focal_trials,
+    paper_intervals,
     paper_intrinsics,
-    paper_tracks,
     straightness_sweep,
 )
 from autocalib_ros.offline.synthetic_evidence import Junction, synthetic_evidence
@@ -39,24 +39,24 @@ def test_published_sweep_never_reaches_ninety_degrees() -> None:
     evidence = synthetic_evidence(STRAIGHT, np.random.default_rng(0))
     found = paper_intrinsics(evidence, WINDOW)
     assert found is not None
-    paths, _ = paper_tracks(evidence, WINDOW)
-    radius = max(np.hypot(*(path - (639.5, 359.5)).T).max() for path in paths)
+    paths = [evidence.track(int(index)).points_px for index in found.tracks]
+    radius = min(np.hypot(*(path - (639.5, 359.5)).T).min() for path in paths)
     assert radius / found.sweep[0, 0] < np.pi / 2
     assert np.isfinite(found.sweep).all()
+    assert found.sweep[-1, 0] == pytest.approx(np.hypot(1280, 720))
 
 
-def test_published_filters_keep_the_ten_longest() -> None:
-    evidence = synthetic_evidence(STRAIGHT, np.random.default_rng(0))
-    paths, indices = paper_tracks(evidence, WINDOW)
-    assert len(paths) == len(indices) == 10
-    lengths = [np.hypot(*(path[-1] - path[0])) for path in paths]
-    assert lengths == sorted(lengths, reverse=True)
+def test_published_filters_keep_the_longest_of_each_interval() -> None:
+    intervals = paper_intervals(synthetic_evidence(STRAIGHT, np.random.default_rng(0)), WINDOW)
+    assert len({len(interval.paths) for interval in intervals}) == 1
+    for interval in intervals:
+        lengths = [np.hypot(*(path[-1] - path[0])) for path in interval.paths]
+        assert len(lengths) <= 10 and lengths == sorted(lengths, reverse=True)
 
 
 def test_published_filters_drop_short_lives() -> None:
     evidence = synthetic_evidence(STRAIGHT, np.random.default_rng(0))
-    paths, _ = paper_tracks(evidence, PaperOptions(window_s=60.0))
-    assert not paths
+    assert not paper_intervals(evidence, PaperOptions(window_s=60.0))
     assert paper_intrinsics(evidence, PaperOptions(window_s=60.0)) is None
 
 

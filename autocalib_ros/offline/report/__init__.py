@@ -90,6 +90,7 @@ def _page(replayed: ReplayResult, source_name: str, drawn: list[tuple[_Entry, by
         verdict=verdict(result), state=_state(result), method=result.method, source=source_name, version=__version__,
         rows=number_rows(result, replayed.accepted_at_s), remedy=remedy(result), code=_code(result),
         assumptions=result.assumptions if isinstance(result, Calibration) else (),
+        checks=result.checks if isinstance(result, Calibration) else (),
         figures=[{'name': entry.name, 'title': entry.title, 'caption': entry.caption,
                   'data': base64.b64encode(data).decode()} for entry, data in drawn])
 
