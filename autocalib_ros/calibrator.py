@@ -20,6 +20,10 @@ from autocalib_ros.evidence import Evidence, EvidenceBuffer
 from autocalib_ros.perception.observer import Observer
 
 
+REORDERED_NS = 1_000_000_000
+"""Images overtake each other by less than this on any transport; a longer step back is another time."""
+
+
 @dataclass(frozen=True)
 class Progress:
     """How far the evidence has come: 0 to 100, and what is missing in an installer's words."""
@@ -38,14 +42,16 @@ class AutoCalibrator:
     def add_image(self, stamp_ns: int, image: np.ndarray) -> None:
         """Take one image: grey (H, W) or BGR (H, W, 3), uint8; it is not kept nor changed.
 
-        A stamp that goes backwards, or a new image size, starts the evidence anew.
+        An image whose stamp repeats or steps back by less than `REORDERED_NS` is late and left out; a stamp that
+        steps back further (a clock that was set, a recording that begins again) or a new image size starts the
+        evidence anew.
         """
         if image.dtype != np.uint8 or image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
             raise InputError(f'an image is grey (H, W) or BGR (H, W, 3) in 8 bits, got {image.dtype} {image.shape}')
         size = (image.shape[1], image.shape[0])
-        if self._observer is None or size != self._size or stamp_ns < self._newest_stamp_ns:
+        if self._observer is None or size != self._size or stamp_ns <= self._newest_stamp_ns - REORDERED_NS:
             self._begin(stamp_ns, size)
-        elif stamp_ns == self._newest_stamp_ns:
+        elif stamp_ns <= self._newest_stamp_ns:
             return
         time_s = (stamp_ns - self._first_stamp_ns) * 1e-9
         observed = self._observer.observe(image, time_s)

@@ -78,9 +78,10 @@ def test_a_new_size_begins_anew() -> None:
     assert evidence is not None and (evidence.frames, evidence.image_size) == (1, (320, 240))
 
 
-def test_a_repeated_stamp_is_left_out() -> None:
+@pytest.mark.parametrize('stamp_ns', [900_000_000, 850_000_000])
+def test_a_repeated_or_late_stamp_is_left_out(stamp_ns: int) -> None:
     calibrator = fed(10)
-    calibrator.add_image(900_000_000, image(30))
+    calibrator.add_image(stamp_ns, image(30))
     evidence = calibrator.snapshot()
     assert evidence is not None and evidence.frames == 10
 

@@ -15,6 +15,7 @@ from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag2 import Reader as Reader2
 from rosbags.typesys import Stores, get_typestore
 
+from autocalib_ros.calibrator import REORDERED_NS
 from autocalib_ros.errors import AutocalibError, InputError, UsageError
 from autocalib_ros.offline.sources import Frame, StoredImage, Window, nothing_in_window
 from autocalib_ros.offline.torn_mcap import is_torn, sealed
@@ -25,8 +26,6 @@ LOG = logging.getLogger(__name__)
 IMAGE_TYPES = ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage')
 PEEKED = 5
 """Images looked at beforehand to learn whether their header stamps can be trusted."""
-REORDERED_NS = 1_000_000_000
-"""Images that step back by less than this came late; by more, the clock was set."""
 ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 
 
