@@ -19,7 +19,6 @@ from autocalib_ros.estimation.vanishing_points import segment_orientations
 from autocalib_ros.evidence import Evidence, EvidenceBuffer
 from autocalib_ros.perception.observer import Observer
 
-
 REORDERED_NS = 1_000_000_000
 """Images overtake each other by less than this on any transport; a longer step back is another time."""
 

@@ -89,7 +89,22 @@ def _parser(argv: list[str]) -> argparse.Namespace:
         'Calibrate from a recording. Exit status: 0 calibrated, 3 refused, 2 wrong usage or unreadable input.')))
     _add_simulate(commands.add_parser('simulate', help='write a recording of simulated traffic with known truth'), argv)
     _add_demo(commands.add_parser('demo', help='simulate traffic, calibrate from it, compare with the truth'))
+    _add_benchmark(commands.add_parser('benchmark', help='measure what the program costs on this machine'))
     return parser.parse_args(argv)
+
+
+def _add_benchmark(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument('what', choices=('cost',), help='processor time of a frame and of a solution, and memory')
+    parser.add_argument('source', metavar='SOURCE', type=Path, help='recording to measure on')
+    parser.add_argument('--duration', type=float, metavar='S', help='seconds of it to use')
+    parser.set_defaults(run=_benchmark)
+
+
+def _benchmark(arguments: argparse.Namespace) -> int:
+    from autocalib_ros.offline.benchmark import cost
+
+    print(cost(arguments.source, arguments.duration))
+    return 0
 
 
 def _add_replay(parser: argparse.ArgumentParser) -> None:

@@ -50,7 +50,7 @@ class TrackingOptions(_Checked):
     """Points on moving objects, followed by pyramidal Lucas-Kanade optical flow."""
 
     max_points: int = option(200, 'points followed at once', low=20, high=5000)
-    window_px: int = option(15, 'side of the square patch that is followed', low=5, high=61)
+    window_px: int = option(11, 'side of the square patch that is followed', low=5, high=61)
     pyramid_levels: int = option(3, 'image pyramid levels above the full resolution', low=0, high=6)
     detect_every: int = option(6, 'frames between two searches for new points and segments', low=1, high=100)
     min_spacing_px: float = option(10.0, 'side of the cells of which each holds one point at the most', low=1, high=100)

@@ -27,6 +27,8 @@ STRAIGHT_SHARE = 0.35
 RIGHT_ANGLE_SIGMAS = 2.0
 RIGHT_ANGLE_FLOOR_DEG = 1.0
 """Junctions are built to about a degree: a difference within it does not speak against 90 degrees."""
+MIN_CONTRAST = 1.3
+"""Agreement at the best trial focal length over that at the median one: wrong lenses bend straight paths apart."""
 LONGEST_FOCAL = 1.5
 """Focal length, in image diagonals, beyond which no lens curvature can be seen."""
 PRIOR_SIGMAS = 3.5
@@ -54,27 +56,31 @@ def find_roads(tracks: TrackSet, image_size: tuple[int, int], options: JointOpti
     if len(tracks) < gate.min_tracks:
         return Reason('too_few_tracks', f'{len(tracks)} tracks of the {gate.min_tracks} needed are long enough',
                       'wait for more traffic, or record for longer')
-    fit = _best_fit(tracks, image_size, options, generator)
-    if fit is None:
+    trials = focal_trials(tracks, image_size, TRIALS)
+    found = _found_at(trials, tracks, image_size, generator)
+    starts = _peaks(found)[:STARTS]
+    if not starts:
         return Reason('no_direction', f'{len(tracks)} tracks agree on no common direction',
                       'straight traffic is needed: wait for it, or turn the camera towards a straight road')
+    fits = [solve_joint(initial_state(Camera.equidistant(*image_size, trials[index]), found[index]), tracks, options)
+            for index in starts]
+    fit = min(fits, key=lambda candidate: candidate.cost)
     support = road_support(fit, tracks)
     if not all(_is_road(mask, tracks, gate) for mask in support):
         fit = _strongest_alone(fit, support, tracks, options)
         support = road_support(fit, tracks)
     fit, angle = _with_right_angle(fit, tracks, options)
-    return _doubted(fit, support, angle, tracks, options, gate)
+    scores = np.array([item.score for item in found])
+    contrast = float(scores.max() / max(np.median(scores), 1e-9))
+    doubt = _lens_doubt(fit, contrast, tracks, options, gate)
+    return doubt or _doubted(fit, support, angle, tracks, options, gate)
 
 
-def _best_fit(tracks: TrackSet, image_size: tuple[int, int], options: JointOptions,
-              generator: np.random.Generator) -> JointFit | None:
-    """Start from the focal lengths at which most tracks agree on directions; keep the cheapest solution."""
-    trials = focal_trials(tracks, image_size, TRIALS)
+def _found_at(trials: np.ndarray, tracks: TrackSet, image_size: tuple[int, int],
+              generator: np.random.Generator) -> list[Directions]:
+    """Look for the directions that most tracks agree on at each trial focal length."""
     voters = tracks.subset(np.unique(np.linspace(0, len(tracks) - 1, VOTERS).astype(int)))
-    found = [consensus_directions(Camera.equidistant(*image_size, trial), voters, generator) for trial in trials]
-    fits = [solve_joint(initial_state(Camera.equidistant(*image_size, trials[index]), found[index]), tracks, options)
-            for index in _peaks(found)[:STARTS]]
-    return min(fits, key=lambda fit: fit.cost, default=None)
+    return [consensus_directions(Camera.equidistant(*image_size, trial), voters, generator) for trial in trials]
 
 
 def _peaks(found: list[Directions]) -> list[int]:
@@ -128,32 +134,27 @@ def normal_of(state: State, tracks: TrackSet) -> tuple[np.ndarray, float]:
 
 def _doubted(fit: JointFit, support: list[np.ndarray], angle: str | None, tracks: TrackSet, options: JointOptions,
              gate: GateOptions) -> Roads | Reason:
-    """Return the roads, or the first doubt about the lens; doubts about the plane only take the plane away."""
-    doubt = _lens_doubt(fit, tracks, options, gate)
-    if doubt:
-        return doubt
+    """Return the roads, or why the halves of the evidence disagree; doubts about the plane only take it away."""
     camera = fit.state.camera
     assumptions = [f'lens near equidistant: k1 = 0 +- {options.k1_sigma:g}',
                    'principal point at the image centre +- '
                    f'{options.principal_point_sigma * camera.width:.0f} px']
+    halves = _halves_doubt(fit, tracks, options, gate)
+    if isinstance(halves, Reason):
+        return halves
     if angle is None:
         tracks_seen = int(fit.explained().sum())
         assumptions += ['k1 and the principal point held there: one road cannot determine them']
-        return Roads(fit, support, tuple(assumptions), (), Reason(
+        return Roads(fit, support, tuple(assumptions), (halves,), Reason(
             'one_direction', f'all {tracks_seen} tracks that agree follow one road: rotation about it is free',
             'wait for traffic across the main road'))
     checks = [] if fit.problem.perpendicular else [angle]
     assumptions += [angle] if fit.problem.perpendicular else []
-    plane_doubt = _plane_doubt(fit, tracks, gate)
-    if plane_doubt:
-        return Roads(fit, support, tuple(assumptions), tuple(checks), plane_doubt)
-    halves = _halves_doubt(fit, tracks, options, gate)
-    if isinstance(halves, Reason):
-        return halves
-    return Roads(fit, support, tuple(assumptions), (*checks, halves), None)
+    return Roads(fit, support, tuple(assumptions), (*checks, halves), _plane_doubt(fit, tracks, gate))
 
 
-def _lens_doubt(fit: JointFit, tracks: TrackSet, options: JointOptions, gate: GateOptions) -> Reason | None:
+def _lens_doubt(fit: JointFit, contrast: float, tracks: TrackSet, options: JointOptions,
+                gate: GateOptions) -> Reason | None:
     camera, share = fit.state.camera, tracks.share_of_vehicle
     straight = float((share * fit.explained()).sum() / share.sum())
     if straight < STRAIGHT_SHARE:
@@ -161,6 +162,17 @@ def _lens_doubt(fit: JointFit, tracks: TrackSet, options: JointOptions, gate: Ga
             'turning_traffic', f'only {straight:.0%} of the vehicles follow the best straight roads, '
             f'{STRAIGHT_SHARE:.0%} are needed: the traffic turns, or the road bends',
             'wait for straight traffic, or turn the camera towards a straight road')
+    if contrast < MIN_CONTRAST:
+        return Reason(
+            'no_agreement', f'the traffic singles out no focal length: the best agrees {contrast:.2f} times as well as '
+            f'the middling one, {MIN_CONTRAST:g} is needed',
+            'wait for straight traffic, above all near the borders of the image; the traffic may be turning, or the '
+            'lens may have no distortion')
+    _, below = normal_of(fit.state, tracks)
+    if len(fit.state.angles_rad) > 1 and below < BELOW_HORIZON:
+        return Reason(
+            'horizon', f'{1 - below:.0%} of the tracked points lie above the horizon that the roads imply',
+            'the directions found do not belong to one plane: wait for more straight traffic on both roads')
     sigma = float(fit.sigma(lambda state: np.array([np.log(state.camera.focal_px)]))[0])
     diagonals = camera.focal_px / np.hypot(camera.width, camera.height)
     if diagonals > LONGEST_FOCAL or not sigma <= gate.max_sigma_focal_rel:
@@ -177,11 +189,7 @@ def _lens_doubt(fit: JointFit, tracks: TrackSet, options: JointOptions, gate: Ga
 
 
 def _plane_doubt(fit: JointFit, tracks: TrackSet, gate: GateOptions) -> Reason | None:
-    normal, below = normal_of(fit.state, tracks)
-    if below < BELOW_HORIZON:
-        return Reason(
-            'horizon', f'{1 - below:.0%} of the tracked points lie above the horizon that the roads imply',
-            'the two directions do not belong to one plane: wait for more traffic on both roads')
+    normal, _ = normal_of(fit.state, tracks)
     sigma = fit.sigma(lambda state: tilt_and_roll_deg(_same_side(state.rotation[:, 2], normal)))
     if not sigma.max() <= gate.max_sigma_tilt_deg:
         return Reason(
@@ -201,13 +209,16 @@ def _halves_doubt(fit: JointFit, tracks: TrackSet, options: JointOptions, gate: 
     fits = [solve_joint(fit.state, half, options, perpendicular=angle_held) for half in halves]
     masks = [road_support(part, half) for part, half in zip(fits, halves, strict=True)]
     if min(mask.sum() for pair in masks for mask in pair) < gate.min_tracks_per_road // 2:
-        return 'not cross-checked in time: one half of the evidence has too little traffic on one road'
+        return 'not cross-checked in time: one half of the evidence has too little traffic on a road'
     (focal, focal_sigma), (turn, turn_sigma) = _difference(*fits)
+    if len(fit.state.angles_rad) < 2:
+        turn = 0.0  # one road leaves the normal free
     if focal > max(HALVES_SIGMAS * focal_sigma, HALVES_FOCAL) or turn > max(HALVES_SIGMAS * turn_sigma, HALVES_DEG):
         return Reason(
             'halves_disagree', f'the earlier and the later half of the traffic disagree: focal length by {focal:.1%}, '
             f'ground normal by {turn:.1f} degrees', 'record for longer; check that the camera is firmly fixed')
-    return f'cross-checked in time: halves differ by {focal:.1%} in focal length, {turn:.1f} degrees in the normal'
+    normal = f' and {turn:.1f} degrees in the ground normal' if len(fit.state.angles_rad) > 1 else ''
+    return f'cross-checked in time: the two halves differ by {focal:.1%} in focal length{normal}'
 
 
 def _time_halves(tracks: TrackSet) -> tuple[np.ndarray, np.ndarray]:

@@ -1,0 +1,59 @@
+"""What the program costs: `autocalib benchmark cost SOURCE`.
+
+Figures of one run on one machine: compare ratios, not milliseconds of different days.
+"""
+
+from __future__ import annotations
+
+import resource
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from autocalib_ros.calibrator import AutoCalibrator, solve
+from autocalib_ros.config import Options
+from autocalib_ros.offline.sources import open_source
+
+BARE_POINTS = 300
+BARE_REPEATS = 30
+
+
+def cost(path: Path, duration_s: float | None) -> str:
+    """Tell processor time per frame beside that of bare optical flow, of one solution, and the largest memory."""
+    cv2.setNumThreads(1)
+    source = open_source(path, duration_s=duration_s)
+    calibrator = AutoCalibrator(Options(camera_height=8.0))
+    spent, images = [], []
+    for frame in source.frames():
+        began = time.thread_time()
+        calibrator.add_image(frame.stamp_ns, frame.image)
+        spent.append(time.thread_time() - began)
+        if len(images) < 2:
+            images.append(frame.image)
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    began = time.thread_time()
+    evidence = calibrator.snapshot()
+    result = solve(evidence, Options(camera_height=8.0)) if evidence is not None else None
+    solution = time.thread_time() - began
+    mean, bare = 1e3 * float(np.mean(spent)), 1e3 * bare_optical_flow_s(images)
+    height, width = images[0].shape[:2]
+    after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return '\n'.join([
+        f'{width}x{height}, {len(spent)} frames of {source.name}, one thread',
+        f'processor time per frame: mean {mean:.1f} ms, 95 % of frames below {1e3 * np.quantile(spent, 0.95):.1f} ms',
+        f'bare optical flow of {BARE_POINTS} points: {bare:.1f} ms; a frame costs {mean / bare:.1f} times that',
+        f'one solution: {solution:.1f} s of processor time ({"calibrated" if result else "refused"})',
+        f'largest memory of the process: {memory:.0f} MB before the solution, {after:.0f} MB after'])
+
+
+def bare_optical_flow_s(images: list[np.ndarray]) -> float:
+    """Processor time of one pyramidal Lucas-Kanade step of `BARE_POINTS` points between two images."""
+    before, after = (cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image for image in images)
+    points = cv2.goodFeaturesToTrack(before, BARE_POINTS, 0.01, 10)
+    began = time.thread_time()
+    for _ in range(BARE_REPEATS):
+        cv2.calcOpticalFlowPyrLK(before, after, points, None, winSize=(15, 15), maxLevel=3)
+    return (time.thread_time() - began) / BARE_REPEATS
+
