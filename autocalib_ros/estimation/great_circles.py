@@ -113,12 +113,17 @@ class Rays:
 
     def pixel_scale(self, normals: np.ndarray) -> np.ndarray:
         """Pixels per unit of n.b for circle normals (..., 3) that broadcast against the bearings."""
-        gradient = np.hypot((self.radial * normals).sum(-1), (self.tangential * normals).sum(-1))
+        gradient = np.hypot(dot(self.radial, normals), dot(self.tangential, normals))
         return 1.0 / np.maximum(gradient, 1e-9)
 
     def distance_px(self, normals: np.ndarray) -> np.ndarray:
         """Signed distance in observed pixels of each bearing from the great circle of its normal."""
-        return (self.bearings * normals).sum(-1) * self.pixel_scale(normals)
+        return dot(self.bearings, normals) * self.pixel_scale(normals)
+
+
+def dot(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Scalar products of vectors (..., 3) that broadcast against each other, shape (...)."""
+    return np.einsum('...i,...i->...', first, second)
 
 
 def rays_of(camera: Camera, pixels: np.ndarray) -> Rays:
@@ -130,16 +135,18 @@ def rays_of(camera: Camera, pixels: np.ndarray) -> Rays:
     x, y = offset[..., 0] / radius, offset[..., 1] / radius
     outward = 1.0 / np.maximum(camera.radius_slope(theta), 1e-3 * camera.focal_px)
     around = sine / radius
-    zero = np.zeros_like(x)
-    return Rays(np.stack([sine * x, sine * y, cosine], -1),
-                np.stack([cosine * x, cosine * y, -sine], -1) * outward[..., None],
-                np.stack([-y, x, zero], -1) * around[..., None])
+    rays = Rays(*(np.empty((*radius.shape, 3)) for _ in range(3)))
+    rays.bearings[..., 0], rays.bearings[..., 1], rays.bearings[..., 2] = sine * x, sine * y, cosine
+    along = cosine * outward
+    rays.radial[..., 0], rays.radial[..., 1], rays.radial[..., 2] = along * x, along * y, -sine * outward
+    rays.tangential[..., 0], rays.tangential[..., 1], rays.tangential[..., 2] = -y * around, x * around, 0.0
+    return rays
 
 
 def scatter(rays: Rays, weights: np.ndarray, scale: np.ndarray) -> np.ndarray:
     """Sum w s^2 b b^T per track, shape (tracks, 3, 3): n^T S n is the mean squared distance in pixels."""
     weighted = rays.bearings * (weights * scale * scale)[..., None]
-    return np.einsum('tmi,tmj->tij', weighted, rays.bearings)
+    return weighted.transpose(0, 2, 1) @ rays.bearings
 
 
 def fit_circles(rays: Rays, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

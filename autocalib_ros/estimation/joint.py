@@ -19,6 +19,7 @@ from autocalib_ros.config import JointOptions
 from autocalib_ros.estimation.great_circles import (
     Rays,
     TrackSet,
+    dot,
     fit_circles,
     fit_circles_through,
     rays_of,
@@ -40,8 +41,8 @@ EVALUATIONS = 4
 """Evaluations of the residuals in one round."""
 HELD = 1e-6
 """Prior sigma of a parameter that is held."""
-SETTLED = 3e-4
-"""The rounds end when no parameter moves by more: 0.03 % of the focal length, 0.02 degrees, 3e-4 prior sigmas."""
+SETTLED, SETTLED_SIGMAS = 3e-4, 3e-3
+"""The rounds end when log f and all angles (radians), and what is counted in prior sigmas, move by less."""
 MIN_TRACKS = 4
 """Fewer tracks on any road do not go on with a solution: it is judged, and refused, as it stands."""
 OUTLIER_PX = 4.0
@@ -137,22 +138,20 @@ class Problem:
         directions = state.directions[self.labels]
         here = self.residuals(step)
         lens = [(self.residuals(step + DIFFERENCE * unit) - here) / DIFFERENCE for unit in np.eye(self.size)[:4]]
-        free = self._slope(rays, normals, np.cross(directions, normals[:, 0])[:, None])
+        scale = rays.pixel_scale(normals)
+        across = dot(rays.bearings, normals) * scale**2
+        # distance over gradient: the second term is how the gradient itself turns with the normal
+        pull = rays.bearings - across[..., None] * (dot(rays.radial, normals)[..., None] * rays.radial
+                                                    + dot(rays.tangential, normals)[..., None] * rays.tangential)
+        pull *= (scale * self.root)[..., None]
+        free = np.einsum('tmi,ti->tm', pull, np.cross(directions, normals[:, 0]))
         weight = np.maximum((free * free).sum(-1), 1e-12)
         columns = []
         for turn in self._turns(state):
-            column = self._slope(rays, normals, -((normals[:, 0] * turn).sum(-1)[:, None] * directions)[:, None])
+            column = np.einsum('tmi,ti->tm', pull, -dot(normals[:, 0], turn)[:, None] * directions)
             column -= free * ((free * column).sum(-1) / weight)[:, None]
             columns.append(np.concatenate([column.ravel(), np.zeros(3)]))
         return np.column_stack([*lens, *columns])
-
-    def _slope(self, rays: Rays, normals: np.ndarray, change: np.ndarray) -> np.ndarray:
-        """Change (tracks, samples) of the weighted distances with a change (tracks, 1, 3) of the normals."""
-        scale = rays.pixel_scale(normals)
-        outward, around = ((side * normals).sum(-1) for side in (rays.radial, rays.tangential))
-        widening = outward * (rays.radial * change).sum(-1) + around * (rays.tangential * change).sum(-1)
-        along, across = (rays.bearings * change).sum(-1), (rays.bearings * normals).sum(-1)
-        return (along - across * widening * scale**2) * scale * self.root
 
     def _turns(self, state: State) -> list[np.ndarray]:
         """Change (tracks, 3) of each track's direction with each parameter of the roads."""
@@ -260,13 +259,18 @@ def solve_joint(start: State, tracks: TrackSet, options: JointOptions, *, perpen
         solution = least_squares(problem.residuals, np.zeros(problem.size), problem.jacobian, method='lm',
                                  max_nfev=EVALUATIONS, xtol=1e-6, ftol=1e-7)
         state = problem.state(solution.x)
-        if tightness <= 1.0 and np.abs(solution.x).max() < SETTLED:
+        if tightness <= 1.0 and _settled(solution.x):
             break
     final = Problem(state, tracks, problem.all_labels, influence, options, perpendicular)
     here = np.zeros(final.size)
     labels, distance2 = assign(state, tracks)
     return JointFit(state, labels, np.sqrt(distance2), robust_cost(state, distance2, tracks, options),
                     final.jacobian(here), final.residuals(here), np.concatenate([final.groups, np.full(3, -1)]), final)
+
+
+def _settled(step: np.ndarray) -> bool:
+    shape, rest = np.abs(step[1:4]), np.abs(np.delete(step, (1, 2, 3)))
+    return bool(shape.max() < SETTLED_SIGMAS and rest.max() < SETTLED)
 
 
 def squared(state: State) -> State:

@@ -19,7 +19,7 @@ TRIALS = 16
 """Focal lengths tried as starts: steps of about 15 %, within which the joint problem converges."""
 STARTS = 2
 VOTERS = 250
-"""Tracks that vote for directions, evenly out of all; the solution then uses every track."""
+"""Tracks, evenly out of all, from which the starts are made and compared; the solution then uses every track."""
 MIN_VEHICLES = 4
 """Vehicles, distinct, that make a road; fewer may be one driver's whim."""
 STRAIGHT_SHARE = 0.35
@@ -57,14 +57,15 @@ def find_roads(tracks: TrackSet, image_size: tuple[int, int], options: JointOpti
         return Reason('too_few_tracks', f'{len(tracks)} tracks of the {gate.min_tracks} needed are long enough',
                       'wait for more traffic, or record for longer')
     trials = focal_trials(tracks, image_size, TRIALS)
-    found = _found_at(trials, tracks, image_size, generator)
+    voters = tracks.subset(np.unique(np.linspace(0, len(tracks) - 1, VOTERS).astype(int)))
+    found = [consensus_directions(Camera.equidistant(*image_size, trial), voters, generator) for trial in trials]
     starts = _peaks(found)[:STARTS]
     if not starts:
         return Reason('no_direction', f'{len(tracks)} tracks agree on no common direction',
                       'straight traffic is needed: wait for it, or turn the camera towards a straight road')
-    fits = [solve_joint(initial_state(Camera.equidistant(*image_size, trials[index]), found[index]), tracks, options)
+    fits = [solve_joint(initial_state(Camera.equidistant(*image_size, trials[index]), found[index]), voters, options)
             for index in starts]
-    fit = min(fits, key=lambda candidate: candidate.cost)
+    fit = solve_joint(min(fits, key=lambda candidate: candidate.cost).state, tracks, options)
     support = road_support(fit, tracks)
     if not all(_is_road(mask, tracks, gate) for mask in support):
         fit = _strongest_alone(fit, support, tracks, options)
@@ -74,13 +75,6 @@ def find_roads(tracks: TrackSet, image_size: tuple[int, int], options: JointOpti
     contrast = float(scores.max() / max(np.median(scores), 1e-9))
     doubt = _lens_doubt(fit, contrast, tracks, options, gate)
     return doubt or _doubted(fit, support, angle, tracks, options, gate)
-
-
-def _found_at(trials: np.ndarray, tracks: TrackSet, image_size: tuple[int, int],
-              generator: np.random.Generator) -> list[Directions]:
-    """Look for the directions that most tracks agree on at each trial focal length."""
-    voters = tracks.subset(np.unique(np.linspace(0, len(tracks) - 1, VOTERS).astype(int)))
-    return [consensus_directions(Camera.equidistant(*image_size, trial), voters, generator) for trial in trials]
 
 
 def _peaks(found: list[Directions]) -> list[int]:
