@@ -72,7 +72,7 @@ class BufferOptions(_Checked):
     """The rolling buffer of evidence."""
 
     seconds: float = option(900.0, 'evidence older than this is forgotten', low=5, high=86400)
-    max_tracks: int = option(2000, 'tracks kept; the oldest go first', low=50, high=100000)
+    max_tracks: int = option(8000, 'tracks kept; the oldest go first', low=50, high=100000)
     max_segments: int = option(20000, 'segments kept; the oldest go first', low=100, high=1000000)
 
 

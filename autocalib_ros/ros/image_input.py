@@ -14,6 +14,8 @@ from sensor_msgs.msg import CompressedImage, Image
 
 from autocalib_ros.config import NodeOptions
 
+DEPTH = 5
+"""Images that DDS keeps while the executor is busy; the callback takes microseconds, so none grows old there."""
 POLL_S = 1.0
 SILENCE_S = 5.0
 REMIND_S = 60.0
@@ -62,7 +64,7 @@ class ImageInput:
         if self._subscription is not None:
             self._node.destroy_subscription(self._subscription)
         self._reliability = reliability
-        profile = QoSProfile(depth=1, history=HistoryPolicy.KEEP_LAST, reliability=reliability)
+        profile = QoSProfile(depth=DEPTH, history=HistoryPolicy.KEEP_LAST, reliability=reliability)
         self._subscription = self._node.create_subscription(self._type, self.topic, self._take, profile)
         self._node.get_logger().info(f'subscribed to {self.topic} ({self._type_name()}, {reliability.name.lower()})')
 

@@ -8,7 +8,7 @@ import pytest
 
 from autocalib_ros.config import Options
 from autocalib_ros.errors import InputError
-from autocalib_ros.ros.pipeline import Pipeline
+from autocalib_ros.ros.pipeline import WAITING_IMAGES, Pipeline
 from bench import PATIENCE_S, PIXELS, calibration, refusal, wait_for
 
 FRAME_NS = 66_000_000
@@ -125,11 +125,24 @@ def test_late_images_are_dropped_and_counted(start, heard):
     pipeline._decode = lambda message: (entered.set(), release.wait(PATIENCE_S), message)[2]
     pipeline.offer(0, PIXELS)
     assert entered.wait(PATIENCE_S)
-    for number in range(1, 5):
+    for number in range(1, WAITING_IMAGES + 4):
         pipeline.offer(number * FRAME_NS, PIXELS)
     release.set()
-    wait_for(lambda: len(heard.sizes) == 2, 'the first and the newest image')
-    assert str(pipeline.counters) == 'images received 5, used 2, dropped 3, unreadable 0'
+    wait_for(lambda: pipeline.counters.used == WAITING_IMAGES + 1, 'the first and the newest images')
+    assert (pipeline.counters.received, pipeline.counters.dropped) == (WAITING_IMAGES + 4, 3)
+
+
+def test_a_hiccup_loses_no_image(start, heard):
+    entered, release = threading.Event(), threading.Event()
+    pipeline = start(calibration)
+    pipeline._decode = lambda message: (entered.set(), release.wait(PATIENCE_S), message)[2]
+    pipeline.offer(0, PIXELS)
+    assert entered.wait(PATIENCE_S)
+    for number in range(1, WAITING_IMAGES + 1):
+        pipeline.offer(number * FRAME_NS, PIXELS)
+    release.set()
+    wait_for(lambda: pipeline.counters.used == WAITING_IMAGES + 1, 'all images')
+    assert pipeline.counters.dropped == 0
 
 
 def test_unreadable_image_is_told_and_the_stream_goes_on(start, heard):
