@@ -203,7 +203,7 @@ def _halves_doubt(fit: JointFit, tracks: TrackSet, options: JointOptions, gate: 
     fits = [solve_joint(fit.state, half, options, perpendicular=angle_held) for half in halves]
     masks = [road_support(part, half) for part, half in zip(fits, halves, strict=True)]
     if min(mask.sum() for pair in masks for mask in pair) < gate.min_tracks_per_road // 2:
-        return 'not cross-checked in time: one half of the evidence has too little traffic on a road'
+        return 'not cross-checked in time: the earlier or the later half has too little traffic on a road'
     (focal, focal_sigma), (turn, turn_sigma) = _difference(*fits)
     if len(fit.state.angles_rad) < 2:
         turn = 0.0  # one road leaves the normal free
@@ -212,7 +212,7 @@ def _halves_doubt(fit: JointFit, tracks: TrackSet, options: JointOptions, gate: 
             'halves_disagree', f'the earlier and the later half of the traffic disagree: focal length by {focal:.1%}, '
             f'ground normal by {turn:.1f} degrees', 'record for longer; check that the camera is firmly fixed')
     normal = f' and {turn:.1f} degrees in the ground normal' if len(fit.state.angles_rad) > 1 else ''
-    return f'cross-checked in time: the two halves differ by {focal:.1%} in focal length{normal}'
+    return f'the earlier and the later half of the traffic differ by {focal:.1%} in focal length{normal}'
 
 
 def _time_halves(tracks: TrackSet) -> tuple[np.ndarray, np.ndarray]:
