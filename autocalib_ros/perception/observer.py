@@ -19,6 +19,11 @@ MASK_EVERY = 2
 """Images between two updates of the background: traffic needs no finer step in time."""
 
 
+REPEATED_LEVELS = 4
+"""A reduced image that differs from the last one used by no more than this anywhere is the same picture again."""
+REPEATED_WIDTH_PX = 320
+
+
 @dataclass(frozen=True)
 class Observations:
     """What one image added, in pixels of the full image."""
@@ -40,12 +45,15 @@ class Observer:
         self._background = Background()
         self._sift = cv2.SIFT_create(contrastThreshold=0.03)
         self._keypoints: Keypoints | None = None
+        self._last: np.ndarray | None = None
         self._frames = 0
         self._vehicles = 0
 
     def observe(self, image: np.ndarray, time_s: float) -> Observations:
         """Take a grey (H, W) or BGR (H, W, 3) uint8 image."""
         grey = self._tracked_image(image)
+        if self._repeats(grey):
+            return Observations([], None)
         self._background.update(image, time_s)
         tracks = self._tracker.follow(grey, time_s)
         detect = self._frames % self._options.tracking.detect_every == 0
@@ -55,6 +63,16 @@ class Observer:
         self._stillness.update(grey, time_s)
         self._frames += 1
         return Observations([self._full_size(track) for track in tracks], segments)
+
+    def _repeats(self, grey: np.ndarray) -> bool:
+        """Say whether nothing has changed since the last image used: cameras and recorders send pictures twice."""
+        height, width = grey.shape
+        size = (min(REPEATED_WIDTH_PX, width), max(1, height * min(REPEATED_WIDTH_PX, width) // width))
+        reduced = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+        if self._last is not None and cv2.absdiff(reduced, self._last).max() <= REPEATED_LEVELS:
+            return True
+        self._last = reduced
+        return False
 
     def _tracked_image(self, image: np.ndarray) -> np.ndarray:
         grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image.copy()

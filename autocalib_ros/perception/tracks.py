@@ -18,9 +18,13 @@ STILL_PX = 1.5
 """A point that moved less than this in `STILL_S` stands still: its track ends."""
 MAX_GAP_S = 1.0
 """Across a longer gap between two images nothing is followed."""
-TURN_SHARE = 0.6
 TURN_PX = 3.0
-"""A step that differs from the one before by more than both is a point that jumped to something else."""
+TURN_SHARE = 0.6
+SHORTEST_STEP, LONGEST_STEP = 0.3, 2.3
+"""A step goes on from the one before, faster than `TURN_PX`, when it leaves its line by no more than `TURN_PX` or
+`TURN_SHARE` of it, and is not much below half nor above twice as long: so much an image that came late or was lost
+does to it. A point that stops dead holds on to what hides the vehicle; one that jumps has found something else.
+"""
 
 
 class PointTracker:
@@ -53,9 +57,7 @@ class PointTracker:
         found, followed = self._flow(before, after, start, start + self._step[active])
         step = found - start
         known = self._count[active] > 1
-        jump = np.hypot(*(step - self._step[active]).T)
-        speed = np.hypot(*self._step[active].T)
-        followed &= ~(known & (jump > TURN_PX) & (jump > TURN_SHARE * speed))
+        followed &= ~(known & _jumped(self._step[active], step))
         kept = active[followed]
         self._history[kept, self._count[kept]] = np.column_stack([np.full(len(kept), time_s), found[followed]])
         self._count[kept] += 1
@@ -155,6 +157,16 @@ class PointTracker:
         if len(chosen) < MIN_POINTS:
             return None
         return Track(int(self._vehicle[slot]), path[chosen, 0].copy(), path[chosen, 1:].copy())
+
+
+def _jumped(before: np.ndarray, now: np.ndarray) -> np.ndarray:
+    """Say which steps (n, 2) do not go on from the steps before (n, 2), shape (n,)."""
+    speed = np.maximum(np.hypot(*before.T), 1e-9)
+    along = (before * now).sum(axis=1) / speed
+    aside = np.abs(before[:, 0] * now[:, 1] - before[:, 1] * now[:, 0]) / speed
+    astray = aside > np.maximum(TURN_PX, TURN_SHARE * speed)
+    uneven = (along < SHORTEST_STEP * speed) | (along > np.maximum(LONGEST_STEP * speed, speed + TURN_PX))
+    return (speed > TURN_PX) & (astray | uneven)
 
 
 def _points(points_px: np.ndarray) -> np.ndarray:

@@ -131,3 +131,17 @@ def test_the_background_keeps_few_images() -> None:
     for index in range(2000):
         background.update(np.zeros((36, 64), np.uint8), float(index))
     assert len(background._samples) <= 9
+
+
+def test_repeated_pictures_change_nothing() -> None:
+    once, twice = (Observer(Options(), (SIZE[1], SIZE[0])) for _ in range(2))
+    tracks: tuple[list, list] = ([], [])
+    for index in range(60):
+        picture = scene(max(0.0, 0.1 * (index - 10)), cars=2 if index > 10 else 0)
+        tracks[0].extend(once.observe(picture, 0.1 * index).tracks)
+        tracks[1].extend(twice.observe(picture, 0.1 * index).tracks)
+        tracks[1].extend(twice.observe(picture, 0.1 * index + 0.05).tracks)
+    first, second = [*tracks[0], *once.unfinished()], [*tracks[1], *twice.unfinished()]
+    assert len(first) == len(second) > 10
+    for one, other in zip(first, second, strict=True):
+        np.testing.assert_array_equal(one.points_px, other.points_px)

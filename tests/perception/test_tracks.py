@@ -8,7 +8,7 @@ import pytest
 
 from autocalib_ros.config import TrackingOptions
 from autocalib_ros.evidence import Track
-from autocalib_ros.perception.tracks import PointTracker
+from autocalib_ros.perception.tracks import PointTracker, _jumped
 
 SIZE = (160, 320)
 
@@ -101,3 +101,16 @@ def test_no_more_points_than_allowed() -> None:
 def test_a_track_has_no_more_samples_than_allowed() -> None:
     tracker, _ = follow([(20 + 1.7 * index, 40) for index in range(100)])
     assert max(len(track.times_s) for track in tracker.unfinished()) <= TrackingOptions().max_samples
+
+
+def test_uneven_steps_along_one_line_are_followed() -> None:
+    # a recorder that drops and delays images: steps of 5, 10 and 3 px
+    along = np.cumsum([0, 5, 5, 10, 5, 5, 3, 5, 10, 5, 5, 10])
+    tracker, finished = follow([(20.0 + step, 40.0) for step in along])
+    assert not finished and len(tracker.unfinished()) == 3
+
+
+def test_a_point_thrown_off_its_line_is_given_up() -> None:
+    before = np.array([[10.0, 0.0]] * 6)
+    now = np.array([[12.0, 1.0], [5.0, 0.0], [20.0, 1.0], [0.0, 0.0], [8.0, 9.0], [-8.0, 0.0]])
+    assert _jumped(before, now).tolist() == [False, False, False, True, True, True]
