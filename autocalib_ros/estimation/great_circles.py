@@ -48,11 +48,6 @@ class TrackSet:
                         self.indices[keep])
 
     @property
-    def displacement_px(self) -> np.ndarray:
-        """Distance between the ends of each track, shape (tracks,)."""
-        return np.hypot(*(self.pixels[:, -1] - self.pixels[:, 0]).T)
-
-    @property
     def share_of_vehicle(self) -> np.ndarray:
         """One over the number of tracks of the same vehicle: they share its path, so they share one weight."""
         _, inverse, counts = np.unique(self.vehicles, return_inverse=True, return_counts=True)

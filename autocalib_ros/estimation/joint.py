@@ -68,10 +68,14 @@ class State:
     """Shape (roads,)."""
 
     @property
+    def in_plane(self) -> np.ndarray:
+        """The roads' unit vectors in the frame of their plane, shape (roads, 3)."""
+        return np.column_stack([np.cos(self.angles_rad), np.sin(self.angles_rad), np.zeros(len(self.angles_rad))])
+
+    @property
     def directions(self) -> np.ndarray:
         """Unit vectors in the camera frame, shape (roads, 3)."""
-        flat = np.column_stack([np.cos(self.angles_rad), np.sin(self.angles_rad), np.zeros(len(self.angles_rad))])
-        return flat @ self.rotation.T
+        return self.in_plane @ self.rotation.T
 
 
 class Problem:
@@ -114,7 +118,8 @@ class Problem:
         state = self.state(step)
         rays = rays_of(state.camera, self.tracks.pixels)
         normals = self.circles(state, rays)
-        return np.concatenate([(rays.distance_px(normals[:, None]) * self.root).ravel(), self.priors(state)])
+        distances = rays.distance_px(normals[:, None]) * self.root
+        return np.concatenate([distances.ravel(), prior_deviations(state.camera, self.options)])
 
     def circles(self, state: State, rays: Rays) -> np.ndarray:
         """Normals (tracks, 3) of each track's best circle through its road's direction.
@@ -155,18 +160,18 @@ class Problem:
 
     def _turns(self, state: State) -> list[np.ndarray]:
         """Change (tracks, 3) of each track's direction with each parameter of the roads."""
-        flat = np.column_stack([np.cos(state.angles_rad), np.sin(state.angles_rad), np.zeros(len(state.angles_rad))])
+        flat = state.in_plane
         axes = np.eye(3)[3 - self.turns:]
         turns = [np.cross(axis, flat)[self.labels] @ state.rotation.T for axis in axes]
         sideways = np.cross([0.0, 0.0, 1.0], flat)[self.labels] @ state.rotation.T
         return turns + [sideways * (self.labels == road + 1)[:, None] for road in range(self.free_angles)]
 
-    def priors(self, state: State) -> np.ndarray:
-        """Deviations from the prior lens, in sigmas."""
-        camera, options = state.camera, self.options
-        shift = np.asarray(camera.principal_point_px) - image_centre(camera.width, camera.height)
-        return np.array([*(shift / max(options.principal_point_sigma * camera.width, 1e-6)),
-                         camera.k[0] / max(options.k1_sigma, 1e-6)])
+
+def prior_deviations(camera: Camera, options: JointOptions) -> np.ndarray:
+    """Deviations of a lens from the prior one in sigmas, shape (3,): principal point x, y and k1."""
+    shift = np.asarray(camera.principal_point_px) - image_centre(camera.width, camera.height)
+    return np.array([*(shift / max(options.principal_point_sigma * camera.width, 1e-6)),
+                     camera.k[0] / max(options.k1_sigma, 1e-6)])
 
 
 @dataclass(frozen=True)
@@ -206,8 +211,7 @@ class JointFit:
 
     def sigma(self, function: Callable[[State], np.ndarray]) -> np.ndarray:
         """Standard deviation of a function of the state, shape of its result."""
-        return propagate(lambda step: function(self.problem.state(step)), self.problem.size,
-                         self.covariance())
+        return propagate(lambda step: function(self.problem.state(step)), self.problem.size, self.covariance())
 
 
 def _pixel_scale(state: State, tracks: TrackSet) -> np.ndarray:
@@ -286,9 +290,7 @@ def _typical(distance2: np.ndarray) -> float:
 
 def robust_cost(state: State, distance2: np.ndarray, tracks: TrackSet, options: JointOptions) -> float:
     """Logarithmic cost over all tracks, roads or not, with the priors; vehicles count once."""
-    shift = np.asarray(state.camera.principal_point_px) - image_centre(state.camera.width, state.camera.height)
-    priors = (np.square(shift / max(options.principal_point_sigma * state.camera.width, 1e-6)).sum()
-              + (state.camera.k[0] / max(options.k1_sigma, 1e-6)) ** 2)
+    priors = np.square(prior_deviations(state.camera, options)).sum()
     share = np.sqrt(tracks.share_of_vehicle)
     return float(PATH_FREEDOM * (share * np.log1p(distance2 / SCALE_PX**2)).sum() + priors)
 

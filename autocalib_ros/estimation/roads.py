@@ -11,7 +11,14 @@ from autocalib_ros.camera import Camera
 from autocalib_ros.config import GateOptions, JointOptions
 from autocalib_ros.estimation.great_circles import TrackSet, rays_of
 from autocalib_ros.estimation.ground_plane import BELOW_HORIZON, tilt_and_roll_deg, upward
-from autocalib_ros.estimation.joint import JointFit, State, initial_state, road_support, solve_joint
+from autocalib_ros.estimation.joint import (
+    MIN_TRACKS,
+    JointFit,
+    State,
+    initial_state,
+    road_support,
+    solve_joint,
+)
 from autocalib_ros.estimation.straightness import focal_trials
 from autocalib_ros.estimation.vanishing_points import Directions, consensus_directions
 
@@ -36,6 +43,8 @@ HALVES_SIGMAS = 3.5
 HALVES_FOCAL = 0.03
 HALVES_DEG = 1.5
 """Two halves of the evidence may always differ by so much: it is within what the program promises."""
+
+NOT_CROSS_CHECKED = 'not cross-checked in time: the earlier or the later half has too little traffic on a road'
 
 
 @dataclass(frozen=True)
@@ -199,11 +208,13 @@ def _same_side(normal: np.ndarray, reference: np.ndarray) -> np.ndarray:
 def _halves_doubt(fit: JointFit, tracks: TrackSet, options: JointOptions, gate: GateOptions) -> Reason | str:
     """Solve the earlier and the later half of the vehicles; they have to agree within what they know."""
     halves = [tracks.subset(mask) for mask in _time_halves(tracks)]
+    if min(map(len, halves)) < MIN_TRACKS:
+        return NOT_CROSS_CHECKED
     angle_held = fit.problem.perpendicular
     fits = [solve_joint(fit.state, half, options, perpendicular=angle_held) for half in halves]
     masks = [road_support(part, half) for part, half in zip(fits, halves, strict=True)]
     if min(mask.sum() for pair in masks for mask in pair) < gate.min_tracks_per_road // 2:
-        return 'not cross-checked in time: the earlier or the later half has too little traffic on a road'
+        return NOT_CROSS_CHECKED
     (focal, focal_sigma), (turn, turn_sigma) = _difference(*fits)
     if len(fit.state.angles_rad) < 2:
         turn = 0.0  # one road leaves the normal free

@@ -10,7 +10,10 @@ import pytest
 from autocalib_ros.calibration import Calibration, Refusal
 from autocalib_ros.calibrator import solve
 from autocalib_ros.camera import Camera
-from autocalib_ros.config import JointOptions, Options
+from autocalib_ros.config import GateOptions, JointOptions, Options
+from autocalib_ros.estimation.great_circles import select_tracks
+from autocalib_ros.estimation.joint import State, solve_joint
+from autocalib_ros.estimation.roads import NOT_CROSS_CHECKED, _halves_doubt
 from autocalib_ros.evidence import Evidence
 from autocalib_ros.offline.synthetic_evidence import Junction, pose, synthetic_evidence
 
@@ -137,6 +140,14 @@ def test_standard_deviations_have_the_size_of_the_errors() -> None:
               if isinstance(result, Calibration) and result.stddev.focal_px]
     assert len(errors) == 8
     assert 0.2 < np.sqrt(np.mean(np.square(errors))) < 2.0  # eight runs tell a factor of two, no more
+
+
+def test_a_half_without_tracks_is_said_not_to_be_cross_checked() -> None:
+    tracks = select_tracks(synthetic_evidence(Junction(), np.random.default_rng(0)), 500)
+    one_vehicle = replace(tracks, vehicles=np.zeros(len(tracks), int))  # then all of it is in the earlier half
+    state = State(Junction().camera, Junction().camera_from_ground, np.array([0.0, np.pi / 2]))
+    fit = solve_joint(state, one_vehicle, JointOptions())
+    assert _halves_doubt(fit, one_vehicle, JointOptions(), GateOptions()) == NOT_CROSS_CHECKED
 
 
 def test_a_moving_camera_is_refused() -> None:
