@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import json
-import os
-import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from scipy.spatial.transform import Rotation
 
 from autocalib_ros.camera import Camera
-from autocalib_ros.errors import InputError
+from autocalib_ros.camera_info import camera_info
+from autocalib_ros.files import write_atomically
 
 JSON_VERSION = 1
-EQUIDISTANT_FLOOR = 1e-9
-"""image_proc and image_geometry take an all-zero D for "no distortion" whatever the model is called."""
+GROUND_DISTANCES_M = (10.0, 20.0, 40.0)
+"""Distances from the camera's foot at which the accuracy on the road is told."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,6 +71,9 @@ class StandardDeviations:
     tilt_deg: float | None = None
     roll_deg: float | None = None
     height_m: float | None = None
+    k2: float | None = None
+    ground_point_m: tuple[float | None, ...] = ()
+    """Of where a pixel meets the road straight ahead, `GROUND_DISTANCES_M` away; None outside the image."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -165,55 +166,6 @@ def quaternion_xyzw(rotation: np.ndarray) -> np.ndarray:
     return quaternion if quaternion[3] >= 0 else -quaternion
 
 
-@dataclass(frozen=True)
-class CameraInfo:
-    """The fields of sensor_msgs/CameraInfo that a lens decides; lists as the message wants them."""
-
-    width: int
-    height: int
-    distortion_model: str
-    k: list[float]
-    d: list[float]
-    r: list[float]
-    p: list[float]
-
-
-def camera_info(camera: Camera) -> CameraInfo:
-    """Return the CameraInfo of a lens in the 'equidistant' model, P chosen so that no border is empty."""
-    coefficients = [float(value) for value in camera.k]
-    if not any(abs(value) >= EQUIDISTANT_FLOOR for value in coefficients):
-        coefficients[0] = EQUIDISTANT_FLOOR
-    rectified = rectified_matrix(camera)
-    return CameraInfo(
-        width=camera.width, height=camera.height, distortion_model='equidistant',
-        k=[float(value) for value in camera.matrix.ravel()], d=coefficients,
-        r=[float(value) for value in np.eye(3).ravel()],
-        p=[float(value) for value in np.hstack([rectified, np.zeros((3, 1))]).ravel()])
-
-
-def rectified_matrix(camera: Camera) -> np.ndarray:
-    """Return the K, shape (3, 3), of a distortion-free image of equal size that the lens fills wholly.
-
-    The largest axis-parallel rectangle about the axis inside the undistorted border decides. Border
-    points beyond 80 degrees are brought in to 80, where the tangent is still tame.
-    """
-    width, height = camera.width, camera.height
-    across, down = np.linspace(0, width - 1, 65), np.linspace(0, height - 1, 65)
-
-    def slopes(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        bearings, _ = camera.unproject(np.stack(np.broadcast_arrays(x, y), axis=-1))
-        theta = np.minimum(np.arctan2(np.hypot(bearings[:, 0], bearings[:, 1]), bearings[:, 2]), np.radians(80.0))
-        direction = bearings[:, :2] / np.maximum(np.hypot(bearings[:, 0], bearings[:, 1]), 1e-12)[:, None]
-        return np.tan(theta)[:, None] * direction
-
-    left, right = slopes(0.0, down)[:, 0].max(), slopes(width - 1.0, down)[:, 0].min()
-    top, bottom = slopes(across, 0.0)[:, 1].max(), slopes(across, height - 1.0)[:, 1].min()
-    focal = max((width - 1) / max(right - left, 1e-6), (height - 1) / max(bottom - top, 1e-6))
-    centre_x, centre_y = (right + left) / 2, (bottom + top) / 2
-    return np.array([[focal, 0, (width - 1) / 2 - focal * centre_x],
-                     [0, focal, (height - 1) / 2 - focal * centre_y], [0, 0, 1]])
-
-
 def to_json(result: Calibration | Refusal, *, accepted_at_s: float | None = None) -> dict[str, Any]:
     """Return the document of calibration.json, version 1."""
     evidence = result.evidence
@@ -253,7 +205,9 @@ def _calibration_json(result: Calibration) -> dict[str, Any]:
         'stddev': {'focal_px': sigma.focal_px,
                    'principal_point_px': None if sigma.principal_point_px is None else list(sigma.principal_point_px),
                    'k1': sigma.k1, 'tilt_deg': sigma.tilt_deg, 'roll_deg': sigma.roll_deg,
-                   'height_m': sigma.height_m},
+                   'height_m': sigma.height_m, 'k2': sigma.k2,
+                   'ground_point_m': {f'{distance:g}': value for distance, value in zip(
+                       GROUND_DISTANCES_M, sigma.ground_point_m, strict=False)}},
         'paper': None if result.paper is None else {
             'focal_px': result.paper.focal_px, 'polynomial_k': list(result.paper.polynomial_k),
             'straightness_px2': dict(zip(('before', 'after'), result.paper.straightness_px2, strict=True)),
@@ -265,40 +219,3 @@ def write_calibration_json(path: Path, result: Calibration | Refusal, *, accepte
     """Write calibration.json in full precision, atomically."""
     text = json.dumps(to_json(result, accepted_at_s=accepted_at_s), indent=1, allow_nan=False)
     write_atomically(path, text + '\n')
-
-
-def write_camera_info_yaml(path: Path, camera: Camera, camera_name: str) -> None:
-    """Write the file of camera_info_manager, atomically; `camera_name` is reduced to letters, digits and _."""
-    info = camera_info(camera)
-
-    def matrix(rows: int, cols: int, data: list[float]) -> dict[str, Any]:
-        return {'rows': rows, 'cols': cols, 'data': data}
-
-    document = {
-        'image_width': info.width, 'image_height': info.height,
-        'camera_name': ''.join(c if c.isascii() and c.isalnum() else '_' for c in camera_name) or 'camera',
-        'camera_matrix': matrix(3, 3, info.k), 'distortion_model': info.distortion_model,
-        'distortion_coefficients': matrix(1, len(info.d), info.d),
-        'rectification_matrix': matrix(3, 3, info.r), 'projection_matrix': matrix(3, 4, info.p)}
-    write_atomically(path, yaml.safe_dump(document, sort_keys=False, default_flow_style=None))
-
-
-def write_atomically(path: Path, text: str) -> None:
-    """Replace the file in one step: a reader sees the old text or the new, never a part."""
-    path = Path(path)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f'.{path.name}.')
-        try:
-            with os.fdopen(handle, 'w', encoding='utf-8') as stream:
-                stream.write(text)
-                stream.flush()
-                os.fsync(stream.fileno())
-            os.chmod(temporary, 0o644)
-            os.replace(temporary, path)
-        except BaseException:
-            os.unlink(temporary)
-            raise
-    except OSError as error:
-        raise InputError(f'cannot write {path}: {error.strerror or error}') from error
-

@@ -6,14 +6,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from autocalib_ros.calibration import Calibration, Figures, Reason, Refusal, StandardDeviations
+from autocalib_ros.calibration import GROUND_DISTANCES_M, Calibration, Figures, Reason, Refusal, StandardDeviations
+from autocalib_ros.camera import Camera
 from autocalib_ros.config import Options
 from autocalib_ros.errors import InputError
+from autocalib_ros.estimation.doubts import normal_of
 from autocalib_ros.estimation.evidence_gate import shortfall
 from autocalib_ros.estimation.great_circles import TrackSet, select_tracks
-from autocalib_ros.estimation.ground_plane import ground_plane, tilt_and_roll_deg
+from autocalib_ros.estimation.ground_plane import ground_plane, ground_points, pixels_ahead, tilt_and_roll_deg
 from autocalib_ros.estimation.paper import scale, solve_paper
-from autocalib_ros.estimation.roads import Roads, find_roads, normal_of
+from autocalib_ros.estimation.roads import Roads, find_roads
 from autocalib_ros.estimation.straightness import paper_intrinsics
 from autocalib_ros.estimation.vanishing_points import segment_orientations
 from autocalib_ros.evidence import Evidence, EvidenceBuffer
@@ -112,8 +114,11 @@ class AutoCalibrator:
         return None if self._observer is None else self._observer.background()
 
 
-def solve(evidence: Evidence, options: Options) -> Calibration | Refusal:
-    """Estimate lens and ground plane from a snapshot; a pure function of its arguments."""
+def solve(evidence: Evidence, options: Options, *, lens: Camera | None = None) -> Calibration | Refusal:
+    """Estimate lens and ground plane from a snapshot; a pure function of its arguments.
+
+    With a known `lens`, of the size of the images, only the pose is solved; the published method knows no such thing.
+    """
     intrinsics = paper_intrinsics(evidence, options.paper)
     figures = Figures(
         track_labels=np.full(evidence.track_count, -1),
@@ -131,7 +136,7 @@ def solve(evidence: Evidence, options: Options) -> Calibration | Refusal:
         return refused(published) if isinstance(published, Reason) else published
     tracks = select_tracks(evidence, options.joint.max_tracks)
     roads = find_roads(tracks, evidence.image_size, options.joint, options.gate,
-                       np.random.default_rng(options.random_seed))
+                       np.random.default_rng(options.random_seed), height_m=options.camera_height, lens=lens)
     if isinstance(roads, Reason):
         return refused(roads)
     figures = _figures(figures, roads, tracks, evidence, options)
@@ -153,9 +158,21 @@ def _figures(figures: Figures, roads: Roads, tracks: TrackSet, evidence: Evidenc
 
 
 def _lens_deviations(roads: Roads) -> StandardDeviations:
-    focal, cx, cy, k1 = roads.fit.sigma(lambda state: np.array(
-        [state.camera.focal_px, *state.camera.principal_point_px, state.camera.k[0]]))
-    return StandardDeviations(focal_px=float(focal), principal_point_px=(float(cx), float(cy)), k1=float(k1))
+    focal, cx, cy, k1, k2 = roads.fit.sigma(lambda state: np.array(
+        [state.camera.focal_px, *state.camera.principal_point_px, *state.camera.k[:2]]))
+    return StandardDeviations(focal_px=float(focal), principal_point_px=(float(cx), float(cy)), k1=float(k1),
+                              k2=float(k2))
+
+
+def _ground_deviations(roads: Roads, side: float, height: float) -> tuple[float | None, ...]:
+    """Standard deviation in metres of road points ahead, None where they are not in the image."""
+    normal = side * roads.fit.state.rotation[:, 2]
+    pixels = pixels_ahead(roads.fit.state.camera, normal, height, np.array(GROUND_DISTANCES_M))
+    seen = np.isfinite(pixels).all(axis=1)
+    spread = roads.fit.sigma(lambda state: ground_points(
+        state.camera, side * state.rotation[:, 2], height, pixels[seen]).ravel()) if seen.any() else np.zeros(0)
+    sigmas = iter(np.hypot(*spread.reshape(-1, 2).T))
+    return tuple(float(next(sigmas)) if here else None for here in seen)
 
 
 def _calibration(evidence: Evidence, options: Options, roads: Roads, tracks: TrackSet,
@@ -170,5 +187,6 @@ def _calibration(evidence: Evidence, options: Options, roads: Roads, tracks: Tra
     plane = ground_plane(normal, roads.fit.state.directions[busiest], height, metric=metric)
     side = np.sign(roads.fit.state.rotation[:, 2] @ normal)
     tilt, roll = roads.fit.sigma(lambda state: tilt_and_roll_deg(side * state.rotation[:, 2]))
-    return replace(lens, grade=grade, ground=plane,
-                   stddev=replace(lens.stddev, tilt_deg=float(tilt), roll_deg=float(roll)))
+    return replace(lens, grade=grade, ground=plane, stddev=replace(
+        lens.stddev, tilt_deg=float(tilt), roll_deg=float(roll),
+        ground_point_m=_ground_deviations(roads, float(side), height) if metric else ()))

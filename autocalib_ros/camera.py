@@ -11,7 +11,8 @@ optical frame is x right, y down, z forward (REP-103).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -41,6 +42,22 @@ class Camera:
     def equidistant(cls, width: int, height: int, focal_px: float) -> Camera:
         """Return the equidistant camera whose principal point is the image centre."""
         return cls(width, height, float(focal_px), image_centre(width, height))
+
+    def scaled_to(self, width: int, height: int) -> Camera:
+        """Return the same lens for images of another size but the same shape; UsageError for another shape.
+
+        The image's borders are scaled, which lie half a pixel outside the centres of its outer pixels.
+        """
+        if (width, height) == (self.width, self.height):
+            return self
+        across, down = width / self.width, height / self.height
+        # rounding to whole pixels may have changed the shape by half of one
+        if min(abs(self.height * across - height), abs(self.width * down - width)) > 0.5:
+            raise UsageError(f'the lens was calibrated in images of {self.width}x{self.height}, and these images have'
+                             f' {width}x{height}, another shape: give a calibration of their size')
+        cx, cy = self.principal_point_px
+        return replace(self, width=width, height=height, focal_px=self.focal_px * math.sqrt(across * down),
+                       principal_point_px=((cx + 0.5) * across - 0.5, (cy + 0.5) * down - 0.5))
 
     @property
     def matrix(self) -> np.ndarray:

@@ -1,8 +1,9 @@
-"""The `autocalib` command: replay a recording, simulate one, or demonstrate both."""
+"""The `autocalib` command: replay a recording, solve its evidence again, simulate one, or demonstrate all."""
 
 from __future__ import annotations
 
 import argparse
+import json
 import logging
 import os
 import shutil
@@ -18,6 +19,7 @@ from autocalib_ros.errors import AutocalibError, UsageError
 from autocalib_ros.threads import use_one_thread_for_linear_algebra
 
 if TYPE_CHECKING:
+    from autocalib_ros.camera import Camera
     from autocalib_ros.offline.replay import ReplayResult
     from autocalib_ros.offline.sources import Source
 
@@ -87,6 +89,9 @@ def _parser(argv: list[str]) -> argparse.Namespace:
     commands = parser.add_subparsers(title='commands', metavar='COMMAND', required=True, parser_class=_Parser)
     _add_replay(commands.add_parser('replay', help='calibrate from a recording', description=(
         'Calibrate from a recording. Exit status: 0 calibrated, 3 refused, 2 wrong usage or unreadable input.')))
+    _add_evidence(commands.add_parser('evidence', help='solve saved evidence again with other options', description=(
+        'Solve the evidence.npz of a replay again, without its pictures. Options of tracking, motion and buffer shape'
+        ' the gathering and change nothing here. Exit status as of replay.')))
     _add_simulate(commands.add_parser('simulate', help='write a recording of simulated traffic with known truth'), argv)
     _add_demo(commands.add_parser('demo', help='simulate traffic, calibrate from it, compare with the truth'))
     _add_benchmark(commands.add_parser('benchmark', help='measure what the program costs on this machine'))
@@ -94,39 +99,70 @@ def _parser(argv: list[str]) -> argparse.Namespace:
 
 
 def _add_benchmark(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument('what', choices=('cost',), help='processor time of a frame and of a solution, and memory')
-    parser.add_argument('source', metavar='SOURCE', type=Path, help='recording to measure on')
-    parser.add_argument('--duration', type=float, metavar='S', help='seconds of it to use')
+    what = parser.add_subparsers(title='benchmarks', metavar='WHAT', dest='what', required=True)
+    cost = what.add_parser('cost', help='processor time of a frame and of a solution, and memory')
+    cost.add_argument('source', metavar='SOURCE', type=Path, help='recording to measure on')
+    cost.add_argument('--duration', type=float, metavar='S', help='seconds of it to use')
+    accuracy = what.add_parser('accuracy', help='errors against the truth of made-up traffic, by Monte Carlo')
+    accuracy.add_argument('--runs', type=int, default=20, metavar='N', help='draws per family (default: %(default)s)')
+    accuracy.add_argument('--family', nargs='+', default=[], metavar='NAME', help='kinds of evidence (default: all)')
+    accuracy.add_argument('--method', nargs='+', choices=('joint', 'paper'), default=['joint', 'paper'],
+                          help='robust method, the published one, or both (default)')
+    accuracy.add_argument('--jobs', type=int, default=1, metavar='J', help='processes (default: %(default)s)')
+    accuracy.add_argument('--seed', type=int, default=0, metavar='S', help='seed of the draws (default: %(default)s)')
+    accuracy.add_argument('--out', type=Path, metavar='FILE', help='CSV to write, one row a run')
     parser.set_defaults(run=_benchmark)
 
 
 def _benchmark(arguments: argparse.Namespace) -> int:
-    from autocalib_ros.offline.benchmark import cost
+    if arguments.what == 'cost':
+        from autocalib_ros.offline.benchmark import cost
 
-    print(cost(arguments.source, arguments.duration))
+        print(cost(arguments.source, arguments.duration))
+        return 0
+    from autocalib_ros.offline.accuracy import measure
+    from autocalib_ros.offline.accuracy_table import tables
+
+    print(tables(measure(arguments.family, arguments.method, arguments.runs, seed=arguments.seed, jobs=arguments.jobs,
+                         out=arguments.out)))
     return 0
 
 
 def _add_replay(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('source', metavar='SOURCE', type=Path,
                         help='rosbag2 folder, .mcap, .db3, ROS 1 .bag or video file')
-    parser.add_argument('--camera-height', type=float, metavar='H',
-                        help='height of the camera above the road in metres; without it only the lens is calibrated')
+    _add_solving(parser)
     parser.add_argument('--topic', metavar='T', help='image topic; needed when there are several')
-    parser.add_argument('--params-file', type=Path, metavar='F', help='ROS 2 parameter file with options')
-    parser.add_argument('--method', choices=('joint', 'paper'), help='robust method (default) or the published one')
-    parser.add_argument('--allow-unit-scale', action='store_true',
-                        help="without a height, give the ground plane in units of the camera's height")
-    parser.add_argument('-p', '--param', action='append', default=[], metavar='NAME=VALUE',
-                        help='any option by its full name, for example tracking.max_points=400; may be repeated')
     parser.add_argument('--out', type=Path, default=DEFAULT_OUT, metavar='DIR', help='folder for the results '
                         '(default: %(default)s)')
     parser.add_argument('--write-bag', type=Path, metavar='BAG',
                         help='write a new rosbag2 with the images, CameraInfo and the ground transform')
     parser.add_argument('--start', type=float, default=0.0, metavar='S', help='seconds to skip at the beginning')
     parser.add_argument('--duration', type=float, metavar='S', help='seconds to use')
-    parser.add_argument('--quiet', action='store_true', help='no progress and no summary')
     parser.set_defaults(run=_replay)
+
+
+def _add_evidence(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument('file', metavar='FILE.npz', type=Path, help='evidence that a replay has saved')
+    _add_solving(parser)
+    parser.add_argument('--out', type=Path, metavar='DIR', help='folder for the results (default: nothing is written)')
+    parser.add_argument('--json', action='store_true', help='print calibration.json instead of the summary')
+    parser.set_defaults(run=_evidence)
+
+
+def _add_solving(parser: argparse.ArgumentParser) -> None:
+    """Add what is told to the solution, whatever it is fed from."""
+    parser.add_argument('--camera-height', type=float, metavar='H',
+                        help='height of the camera above the road in metres; without it only the lens is calibrated')
+    parser.add_argument('--camera-info', type=Path, metavar='FILE',
+                        help='file of camera_info_manager with the known lens: only the pose is solved')
+    parser.add_argument('--params-file', type=Path, metavar='F', help='ROS 2 parameter file with options')
+    parser.add_argument('--method', choices=('joint', 'paper'), help='robust method (default) or the published one')
+    parser.add_argument('--allow-unit-scale', action='store_true',
+                        help="without a height, give the ground plane in units of the camera's height")
+    parser.add_argument('-p', '--param', action='append', default=[], metavar='NAME=VALUE',
+                        help='any option by its full name, for example joint.noise_px=0.7; may be repeated')
+    parser.add_argument('--quiet', action='store_true', help='no progress and no summary')
 
 
 def _add_simulate(parser: argparse.ArgumentParser, argv: list[str]) -> None:
@@ -161,40 +197,101 @@ def _options(arguments: argparse.Namespace) -> Options:
     return options_with(Options(), values)
 
 
+def _lens(arguments: argparse.Namespace) -> Camera | None:
+    """Read the known lens: that of the command line, else the one that the parameter file gives to a live node."""
+    from autocalib_ros.offline.params import camera_info_file
+
+    file = arguments.camera_info
+    if file is None and arguments.params_file is not None:
+        file = camera_info_file(arguments.params_file) or None
+    if file is None:
+        return None
+    from autocalib_ros.camera_info import read_camera_info
+
+    return read_camera_info(file)
+
+
 def _replay(arguments: argparse.Namespace) -> int:
-    options = _options(arguments)
+    options, lens = _options(arguments), _lens(arguments)
     from autocalib_ros.offline.sources import open_source
 
     source = open_source(arguments.source, arguments.topic, arguments.start, arguments.duration)
     from autocalib_ros.offline import outputs
 
     outputs.prepare(arguments.out, arguments.write_bag)
-    replayed = _replay_and_tell(source, options, arguments.out, quiet=arguments.quiet)
+    replayed = _replay_and_tell(source, options, arguments.out, lens=lens, quiet=arguments.quiet)
     if arguments.write_bag is not None:
         _write_bag(arguments.write_bag, replayed, source)
     return CALIBRATED if replayed.result else REFUSED
 
 
-def _replay_and_tell(source: Source, options: Options, out: Path, *, quiet: bool = False) -> ReplayResult:
+def _evidence(arguments: argparse.Namespace) -> int:
+    options, lens = _options(arguments), _lens(arguments)
+    from autocalib_ros.evidence import Evidence
+    from autocalib_ros.offline import outputs
+    from autocalib_ros.offline.replay import solve_again
+
+    evidence, out, quiet = Evidence.load(arguments.file), arguments.out, arguments.quiet
+    if out is not None:
+        outputs.prepare(out)
+    if not quiet:
+        _tell_missing_height(options, lens)
+    solved = solve_again(evidence, options, lens)
+    names = [] if out is None else outputs.write_result(out, solved, arguments.file.name)
+    _tell_refusal(solved)
+    if arguments.json:
+        _print_json(solved)
+    elif not quiet:
+        _print_summary(solved, out, names)
+    return CALIBRATED if solved.result else REFUSED
+
+
+def _replay_and_tell(source: Source, options: Options, out: Path, *, lens: Camera | None = None,
+                     quiet: bool = False) -> ReplayResult:
     """Replay, write the results, and say what came out: the summary on stdout, a refusal's reason on stderr."""
     from autocalib_ros.offline.outputs import write_outputs
     from autocalib_ros.offline.progress import progress_bar
     from autocalib_ros.offline.replay import replay
-    from autocalib_ros.offline.summary import remedy, text_summary, verdict
 
-    if options.camera_height == 0 and not quiet:
-        scale = 'is given in units of that height' if options.allow_unit_scale else 'is left out'
-        _tell(f'No camera height given: the lens is calibrated, the ground plane {scale} (see --camera-height).')
+    if not quiet:
+        _tell_missing_height(options, lens)
     with progress_bar(source.total, 'images', 'replay', quiet=quiet) as progress:
-        replayed = replay(source, options, progress.update_to)
+        replayed = replay(source, options, progress.update_to, lens=lens)
     names = write_outputs(out, replayed, source)
+    _tell_refusal(replayed)
+    if not quiet:
+        _print_summary(replayed, out, names)
+    return replayed
+
+
+def _tell_missing_height(options: Options, lens: Camera | None) -> None:
+    if options.camera_height == 0:
+        scale = 'is given in units of that height' if options.allow_unit_scale else 'is left out'
+        calibrated = 'the lens is calibrated' if lens is None else 'the lens is known'
+        _tell(f'No camera height given: {calibrated}, the ground plane {scale} (see --camera-height).')
+
+
+def _tell_refusal(replayed: ReplayResult) -> None:
+    from autocalib_ros.offline.summary import remedy, verdict
+
     if not replayed.result:
         _tell(f'{verdict(replayed.result)} {remedy(replayed.result)}'.rstrip())
-    if not quiet:
-        lines = text_summary(replayed.result, replayed.accepted_at_s).splitlines()
-        print('\n'.join(lines if replayed.result else lines[1:]))
+
+
+def _print_summary(replayed: ReplayResult, out: Path | None, names: list[str]) -> None:
+    from autocalib_ros.offline.summary import text_summary
+
+    lines = text_summary(replayed.result, replayed.accepted_at_s).splitlines()
+    print('\n'.join(lines if replayed.result else lines[1:]))
+    if names:
         print(f'Written to {out}: {", ".join(names)}')
-    return replayed
+
+
+def _print_json(replayed: ReplayResult) -> None:
+    """Print what calibration.json holds, and nothing else, so that a program can read it."""
+    from autocalib_ros.calibration import to_json
+
+    print(json.dumps(to_json(replayed.result, accepted_at_s=replayed.accepted_at_s), indent=1, allow_nan=False))
 
 
 def _write_bag(path: Path, replayed: ReplayResult, source: Source) -> None:

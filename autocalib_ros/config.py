@@ -35,6 +35,8 @@ def _checked(item: dataclasses.Field, value: Any) -> Any:
     kind, meta = type(item.default), item.metadata
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
+    if kind is str and isinstance(value, (int, float)) and not isinstance(value, bool):
+        value = f'{value:g}'
     if type(value) is not kind:
         raise UsageError(f"option '{item.name}' takes a {kind.__name__}, got {value!r}")
     if meta['choices'] and value not in meta['choices']:
@@ -95,14 +97,36 @@ class PaperOptions(_Checked):
 class JointOptions(_Checked):
     """The robust method."""
 
-    max_tracks: int = option(500, 'tracks in one solution, spread over image, roads and time', low=20, high=10000)
+    max_tracks: int = option(1500, 'tracks in one solution, spread over image, roads and time', low=20, high=10000)
     noise_px: float = option(0.5, 'standard deviation of a tracked position', low=0.01, high=10)
-    k1_sigma: float = option(0.03, 'standard deviation of the prior k1 = 0', low=0, high=1)
-    principal_point_sigma: float = option(
-        0.01, 'standard deviation of the principal point about the image centre, share of the width', low=0, high=0.5)
+    wander_m: float = option(0.1, "standard deviation of a driver's way from a straight line, metres", low=0.0, high=2)
+    lens_prior: str = option(
+        'auto', 'family of the lens: let the traffic choose, near equidistant, free of distortion, or any in between',
+        choices=('auto', 'equidistant', 'distortion_free', 'kannala_brandt'))
+    focal_prior_px: float = option(0.0, 'focal length that is known beforehand; 0 is unknown', low=0, high=1e6)
+    focal_sigma_px: float = option(0.0, 'standard deviation of focal_prior_px; 0 holds it', low=0, high=1e6)
+    k1_sigma: float = option(0.03, "standard deviation of k1 about its family's; 0 holds it", low=0, high=1)
+    principal_point_sigma_px: float = option(
+        -1.0, 'standard deviation of the principal point about the image centre; 0 holds it there, negative is 1 % '
+        'of the width', low=-1, high=10000)
     road_angle: str = option(
-        'auto', 'angle between the two roads: test whether it is 90 degrees, never use it, or trust that it is',
-        choices=('auto', 'free', 'perpendicular'))
+        'auto', 'angle between the two busiest roads: auto tests whether it is 90 degrees, free never uses it, a '
+        'number of degrees asserts it')
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.road_angle not in ('auto', 'free') and self.crossing_deg is None:
+            raise UsageError("option 'road_angle' is auto, free, or degrees between 10 and 170; "
+                             f'got {self.road_angle!r}')
+
+    @property
+    def crossing_deg(self) -> float | None:
+        """The asserted angle between the roads in degrees, None where none is."""
+        try:
+            angle = float(self.road_angle)
+        except ValueError:
+            return None
+        return angle if 10.0 <= angle <= 170.0 else None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,6 +172,8 @@ class NodeOptions(_Checked):
     camera_name: str = option('', "name used for frames and files; '' takes the namespace or the image's frame_id")
     camera_frame: str = option('', "frame of the camera; '' takes the image's frame_id")
     ground_frame: str = option('', "frame of the ground plane; '' is <camera_name>_ground")
+    camera_info_file: str = option('', "file with the lens, as camera_info_manager writes it: only the pose is then "
+                                   "solved; '' finds the lens too")
     camera_info_mode: str = option('per_image', 'publish camera_info with each image or when it changes',
                                    choices=('per_image', 'latched_only'))
     idle_solve_s: float = option(3.0, 'when no image came for this long, what is left is solved', low=0.1)

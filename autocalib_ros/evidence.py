@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+import zlib
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -127,15 +128,43 @@ class Evidence:
                     raise InputError(f'{path} holds evidence of format {int(data["format"])}, not {FORMAT}')
                 first, newest = (int(stamp) for stamp in data['stamps_ns'])
                 width, height = (int(value) for value in data['image_size'])
-                return cls(image_size=(width, height), first_stamp_ns=first, newest_stamp_ns=newest,
-                           frames=int(data['frames']), drift_px=float(data['drift_px']),
-                           **{name: data[name] for name in ARRAYS})
-        except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
-            raise InputError(f'{path} is not a file of saved evidence (.npz): {error}') from error
+                evidence = cls(image_size=(width, height), first_stamp_ns=first, newest_stamp_ns=newest,
+                               frames=int(data['frames']), drift_px=float(data['drift_px']),
+                               **{name: data[name] for name in ARRAYS})
+            _require_consistent(evidence)
+        except UNREADABLE as error:
+            reason = ' '.join(str(error).split())
+            raise InputError(f'{path} is not a file of saved evidence (.npz): {reason}') from error
+        return evidence
 
 
 ARRAYS = ('track_starts', 'points_px', 'times_s', 'track_vehicles', 'segments_px', 'segment_vehicles',
           'segment_times_s')
+
+
+UNREADABLE = (OSError, LookupError, ValueError, TypeError, AttributeError, EOFError, OverflowError, MemoryError,
+              NotImplementedError, RuntimeError, zipfile.BadZipFile, zlib.error)
+"""What NumPy and zipfile raise at files that are damaged, encrypted, or of another kind."""
+
+
+def _require_consistent(evidence: Evidence) -> None:
+    """Raise ValueError unless shapes, kinds and numbers are those that a snapshot has."""
+    points, tracks = len(evidence.points_px), len(evidence.track_vehicles)
+    shapes = {'track_starts': (tracks + 1,), 'points_px': (points, 2), 'times_s': (points,),
+              'track_vehicles': (tracks,), 'segments_px': (len(evidence.segments_px), 4),
+              'segment_vehicles': (len(evidence.segments_px),), 'segment_times_s': (len(evidence.segments_px),)}
+    for name, shape in shapes.items():
+        array = getattr(evidence, name)
+        kinds = 'iu' if name == 'track_starts' or name.endswith('vehicles') else 'f'
+        if array.shape != shape or array.dtype.kind not in kinds or not np.isfinite(array).all():
+            raise ValueError(f'{name} of {array.dtype} {array.shape} does not fit the rest')
+    starts = evidence.track_starts
+    if starts[0] != 0 or starts[-1] != points or (np.diff(starts) < 1).any():
+        raise ValueError('track_starts does not divide points_px into tracks')
+    if min(evidence.image_size) < 1 or evidence.newest_stamp_ns < evidence.first_stamp_ns or evidence.frames < 0:
+        raise ValueError(f'an image size of {evidence.image_size}, {evidence.frames} frames in {evidence.seconds} s')
+    if not evidence.drift_px >= 0:
+        raise ValueError(f'a drift of {evidence.drift_px} px')
 
 
 def _track_arrays(tracks: list[Track]) -> dict[str, np.ndarray]:

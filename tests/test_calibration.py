@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 
 from autocalib_ros.calibration import (
     Calibration,
@@ -16,15 +15,11 @@ from autocalib_ros.calibration import (
     Reason,
     Refusal,
     StandardDeviations,
-    camera_info,
     quaternion_xyzw,
-    rectified_matrix,
     to_json,
     write_calibration_json,
-    write_camera_info_yaml,
 )
 from autocalib_ros.camera import Camera
-from autocalib_ros.errors import InputError
 
 CAMERA = Camera(1280, 720, 560.0, (639.5, 359.5))
 EVIDENCE = EvidenceSummary(image_size=(1280, 720), seconds=60.0, frames=900, tracks=300, segments=4000, vehicles=70,
@@ -36,27 +31,6 @@ def calibration(ground: GroundPlane | None) -> Calibration:
         method='joint', grade='full', assumptions=('square pixels',), camera=CAMERA, ground=ground, ground_refusal=None,
         road_directions=np.eye(3)[:2], stddev=StandardDeviations(focal_px=5.0, tilt_deg=0.3), paper=None,
         evidence=EVIDENCE, newest_stamp_ns=1)
-
-
-def test_distortion_is_never_all_zero() -> None:
-    # all-zero D reads as "no distortion" to image_proc, whatever the model is called
-    assert any(abs(value) >= 1e-9 for value in camera_info(CAMERA).d)
-
-
-def test_camera_info_has_the_lengths_of_the_message() -> None:
-    info = camera_info(CAMERA)
-    assert [len(info.k), len(info.d), len(info.r), len(info.p)] == [9, 4, 9, 12]
-    assert all(isinstance(value, float) for value in (*info.k, *info.d, *info.r, *info.p))
-
-
-@pytest.mark.parametrize('focal', [300.0, 560.0, 2000.0])
-def test_the_rectified_image_shows_no_empty_border(focal: float) -> None:
-    camera = Camera(1280, 720, focal, (632.0, 364.0))
-    border = np.array([(x, y) for x in np.linspace(0, 1279, 30) for y in (0, 719)]
-                      + [(x, y) for x in (0, 1279) for y in np.linspace(0, 719, 30)])
-    rays = np.column_stack([border, np.ones(len(border))]) @ np.linalg.inv(rectified_matrix(camera)).T
-    pixels, _ = camera.project(rays)
-    assert (pixels >= -0.5).all() and (pixels <= (1279.5, 719.5)).all()
 
 
 def test_a_refusal_is_false_and_a_calibration_true() -> None:
@@ -86,22 +60,6 @@ def test_the_pose_survives_its_file(tmp_path: Path) -> None:
     pose = json.loads((tmp_path / 'c.json').read_text())['ground_from_camera']
     assert pose['translation_m'] == [0.0, 0.0, 7.5]
     np.testing.assert_allclose(pose['rotation_xyzw'], quaternion_xyzw(rotation), atol=0)
-
-
-def test_the_yaml_is_that_of_camera_info_manager(tmp_path: Path) -> None:
-    write_camera_info_yaml(tmp_path / 'c.yaml', CAMERA, 'cam/1 é')
-    document = yaml.safe_load((tmp_path / 'c.yaml').read_text())
-    assert list(document) == ['image_width', 'image_height', 'camera_name', 'camera_matrix', 'distortion_model',
-                              'distortion_coefficients', 'rectification_matrix', 'projection_matrix']
-    assert document['camera_name'] == 'cam_1__'
-    assert document['camera_matrix'] == {'rows': 3, 'cols': 3, 'data': camera_info(CAMERA).k}
-    assert document['distortion_coefficients']['data'] == camera_info(CAMERA).d
-
-
-def test_a_file_that_cannot_be_written_is_an_input_error(tmp_path: Path) -> None:
-    (tmp_path / 'file').write_text('')
-    with pytest.raises(InputError, match='cannot write'):
-        write_camera_info_yaml(tmp_path / 'file' / 'c.yaml', CAMERA, 'camera')
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:

@@ -90,3 +90,30 @@ def test_undistortion_past_ninety_degrees_has_no_image() -> None:
 def test_an_impossible_focal_length_is_refused(focal: float) -> None:
     with pytest.raises(UsageError, match='positive focal length'):
         Camera(1280, 720, focal, (640.0, 360.0))
+
+
+@pytest.mark.parametrize('size', [(640, 360), (2560, 1440), (1920, 1080)])
+def test_a_scaled_lens_sees_the_same_through_the_same_part_of_the_image(camera, pixels, size):
+    width, height = size if camera.height == 720 else (size[0], size[0] * 3 // 4)
+    scale = width / camera.width
+    before, _ = camera.unproject(pixels)
+    # the border of the first pixel, at -0.5, is the border in every size
+    after, valid = camera.scaled_to(width, height).unproject((pixels + 0.5) * scale - 0.5)
+    assert valid.all()
+    np.testing.assert_allclose(after, before, atol=1e-9)
+
+
+def test_a_lens_of_the_same_size_is_not_touched(camera):
+    assert camera.scaled_to(camera.width, camera.height) is camera
+
+
+def test_half_a_pixel_of_rounding_is_the_same_shape():
+    scaled = Camera(1920, 1080, 800.0, (959.5, 539.5)).scaled_to(854, 480)
+    assert scaled.principal_point_px == pytest.approx((426.5, 239.5))
+    assert scaled.focal_px == pytest.approx(800 * 854 / 1920, rel=1e-3)  # half a pixel of 480
+
+
+@pytest.mark.parametrize('size', [(640, 480), (1280, 719), (720, 1280), (640, 359)])
+def test_another_shape_is_wrong_usage_and_tells_both_sizes(size):
+    with pytest.raises(UsageError, match=f'images of 1280x720, and these images have {size[0]}x{size[1]}'):
+        LENSES['equidistant'].scaled_to(*size)

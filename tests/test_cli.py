@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 
 import autocalib_ros
+from autocalib_ros.camera import Camera
+from autocalib_ros.camera_info import write_camera_info_yaml
 from autocalib_ros.cli import main
 
 
@@ -45,6 +47,7 @@ def test_help_and_version_end_well(capsys):
     assert capsys.readouterr().out == f'autocalib {autocalib_ros.__version__}\n'
     assert main(['--help']) == 0
     assert main(['replay', '--help']) == 0
+    assert main(['evidence', '--help']) == 0
     assert main(['simulate', '--help']) == 0
     assert main(['demo', '--help']) == 0
 
@@ -72,6 +75,10 @@ def test_help_imports_nothing_heavy(tmp_path):
     (['replay', 'x', '-p', 'tracking.max_points=many'], "'max_points' takes a int, got 'many'"),
     (['replay', 'x', '--params-file', 'nowhere.yaml'], 'cannot read nowhere.yaml'),
     (['replay', 'nowhere.mp4'], 'nowhere.mp4 does not exist'),
+    (['replay', 'x', '--camera-info', 'nowhere.yaml'], 'cannot read nowhere.yaml'),
+    (['evidence'], 'the following arguments are required: FILE.npz'),
+    (['evidence', 'nowhere.npz'], 'nowhere.npz'),
+    (['evidence', 'nowhere.npz', '-p', 'camera_hight=3'], "did you mean 'camera_height'?"),
     (['demo', '--seed', 'x'], "invalid int value: 'x'"),
 ])
 def test_wrong_usage_is_one_line_and_status_2(arguments, message, capsys, tmp_path, monkeypatch):
@@ -119,6 +126,13 @@ def test_nothing_that_moves_is_refused_with_the_reason(still_video, tmp_path):
     assert sorted(path.name for path in (tmp_path / 'out').iterdir()) == [
         'calibration.json', 'evidence.npz', 'figures', 'report.html']
     assert 'Written to out: calibration.json, report.html, evidence.npz' in done.stdout
+
+
+def test_a_lens_of_another_shape_is_noticed_at_the_first_image(still_video, tmp_path, capsys):
+    write_camera_info_yaml(tmp_path / 'lens.yaml', Camera.equidistant(640, 480, 300.0), 'north')
+    command = ['replay', str(still_video), '--quiet', '--out', str(tmp_path / 'out')]
+    assert main([*command, '--camera-info', str(tmp_path / 'lens.yaml')]) == 2
+    assert 'images of 640x480, and these images have 160x96, another shape' in one_line(capsys.readouterr().err)
 
 
 def test_no_height_is_said_in_one_line(still_video, tmp_path, capsys):

@@ -76,6 +76,59 @@ def test_a_broken_file_is_an_input_error(tmp_path: Path, content: bytes) -> None
         Evidence.load(path)
 
 
+def test_an_array_that_is_no_archive_is_an_input_error(tmp_path: Path) -> None:
+    with (tmp_path / 'evidence.npz').open('wb') as stream:
+        np.save(stream, np.zeros(3))
+    with pytest.raises(InputError, match='not a file of saved evidence'):
+        Evidence.load(tmp_path / 'evidence.npz')
+
+
+@pytest.mark.parametrize('position', range(60, 1500, 120))
+def test_a_damaged_byte_is_an_input_error_or_does_no_harm(tmp_path: Path, position: int) -> None:
+    buffer = EvidenceBuffer(BufferOptions())
+    buffer.add_track(track(3, 5.0))
+    path = tmp_path / 'evidence.npz'
+    snapshot(buffer).save(path)
+    damaged = bytearray(path.read_bytes())
+    damaged[position] ^= 0x55
+    path.write_bytes(damaged)
+    try:
+        after = Evidence.load(path)
+    except InputError as error:
+        assert '\n' not in str(error)
+    else:
+        assert len(after.track(0).points_px) == 10
+
+
+@pytest.mark.parametrize(('changes', 'told'), [
+    ({'points_px': np.zeros((9, 2))}, 'times_s of float64'),
+    ({'points_px': np.zeros(10)}, 'points_px of float64'),
+    ({'points_px': np.full((10, 2), np.nan)}, 'points_px of float64'),
+    ({'points_px': np.full((10, 2), 'x')}, 'points_px of <U1'),
+    ({'points_px': np.array(3.0)}, 'not a file'),
+    ({'track_vehicles': np.zeros(3, int)}, 'track_starts of int64'),
+    ({'track_starts': np.array([0, 11])}, 'does not divide'),
+    ({'track_starts': np.array([-1, 10])}, 'does not divide'),
+    ({'track_starts': np.array([0.0, 10.0])}, 'track_starts of float64'),
+    ({'segments_px': np.zeros((0, 3))}, 'segments_px of float64'),
+    ({'segment_times_s': np.zeros(2)}, 'segment_times_s of float64'),
+    ({'image_size': np.array([0, 360])}, r'an image size of \(0, 360\)'),
+    ({'image_size': np.array([640])}, 'not a file'),
+    ({'stamps_ns': np.array([5, 1])}, 'in -4e-09 s'),
+    ({'drift_px': np.nan}, 'a drift of nan px'),
+    ({'frames': 'many'}, 'not a file')])
+def test_evidence_that_does_not_fit_together_is_an_input_error(tmp_path: Path, changes: dict, told: str) -> None:
+    buffer = EvidenceBuffer(BufferOptions())
+    buffer.add_track(track(3, 5.0))
+    path = tmp_path / 'evidence.npz'
+    snapshot(buffer).save(path)
+    with np.load(path) as data:
+        arrays = {name: data[name] for name in data.files}
+    np.savez(path, **{**arrays, **changes})
+    with pytest.raises(InputError, match=told):
+        Evidence.load(path)
+
+
 def test_a_missing_file_is_an_input_error(tmp_path: Path) -> None:
     with pytest.raises(InputError, match='No such file'):
         Evidence.load(tmp_path / 'none.npz')

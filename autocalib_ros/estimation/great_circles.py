@@ -49,9 +49,16 @@ class TrackSet:
 
     @property
     def share_of_vehicle(self) -> np.ndarray:
-        """One over the number of tracks of the same vehicle: they share its path, so they share one weight."""
+        """One over the number of tracks of the same vehicle, shape (tracks,)."""
+        return 1.0 / self._of_same_vehicle()
+
+    def independence(self, correlation: float) -> np.ndarray:
+        """Weight (tracks,) of tracks whose errors correlate so much, 0 to 1, within a vehicle: Kish's design effect."""
+        return 1.0 / (1.0 + (self._of_same_vehicle() - 1.0) * correlation)
+
+    def _of_same_vehicle(self) -> np.ndarray:
         _, inverse, counts = np.unique(self.vehicles, return_inverse=True, return_counts=True)
-        return 1.0 / counts[inverse]
+        return counts[inverse].astype(float)
 
 
 def select_tracks(evidence: Evidence, limit: int) -> TrackSet:

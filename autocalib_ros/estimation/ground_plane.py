@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from autocalib_ros.calibration import GroundPlane
+from autocalib_ros.camera import Camera
 
 BELOW_HORIZON = 0.95
 """Vehicles drive on the road: at least this share of what moves lies below the horizon."""
@@ -55,3 +56,24 @@ def rotation_from_vanishing_points(first: np.ndarray, second: np.ndarray, focal_
 def paper_translation(rotation: np.ndarray, height: float) -> tuple[float, float, float]:
     """The paper's t = (0, 0, H / |r33|): the world origin is where the optical axis meets the road."""
     return (0.0, 0.0, float(height / max(abs(rotation[2, 2]), 1e-9)))
+
+
+def ground_points(camera: Camera, normal: np.ndarray, height: float, pixels: np.ndarray) -> np.ndarray:
+    """Where pixels (n, 2) meet the road: ahead of the camera's foot and to the left of it, shape (n, 2).
+
+    Ahead is where the optical axis points; the lengths are in the unit of `height`.
+    """
+    bearings, _ = camera.unproject(pixels)
+    ahead = np.array([0.0, 0.0, 1.0]) - normal[2] * normal
+    ahead /= np.linalg.norm(ahead)
+    reach = height / np.maximum(-(bearings @ normal), 1e-6)
+    return reach[:, None] * np.column_stack([bearings @ ahead, bearings @ np.cross(normal, ahead)])
+
+
+def pixels_ahead(camera: Camera, normal: np.ndarray, height: float, distances: np.ndarray) -> np.ndarray:
+    """Pixels (n, 2) of road points straight ahead at distances (n,) from the camera's foot; nan outside the image."""
+    ahead = np.array([0.0, 0.0, 1.0]) - normal[2] * normal
+    ahead /= np.linalg.norm(ahead)
+    pixels, valid = camera.project(distances[:, None] * ahead - height * normal)
+    inside = valid & (pixels >= 0).all(axis=1) & (pixels <= [camera.width - 1, camera.height - 1]).all(axis=1)
+    return np.where(inside[:, None], pixels, np.nan)

@@ -1,8 +1,10 @@
 """The one robust problem: lens and road directions together, every residual in observed pixels.
 
-Unknowns are the lens (focal length, principal point, k1), the rotation of the ground plane and the angle of
-each road in it. Each track's great circle contains its road's direction, which leaves it one angle; that
-angle is solved inside, in closed form (variable projection), so that the problem stays small.
+Unknowns are the lens (focal length, principal point, k1, k2 where it is set free), the rotation of the ground
+plane and the angle of each road in it. Each track's great circle contains its road's direction, which leaves it
+one angle; that angle is solved inside, in closed form (variable projection), so that the problem stays small.
+Distances are in observed pixels, whitened by what a driver's wander is worth there; a track counts by a
+redescending weight of its mean squared whitened distance (Geman & McClure 1985).
 """
 
 from __future__ import annotations
@@ -11,10 +13,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from autocalib_ros.camera import Camera, image_centre
+from autocalib_ros.camera import Camera
 from autocalib_ros.config import JointOptions
 from autocalib_ros.estimation.great_circles import (
     Rays,
@@ -23,38 +24,37 @@ from autocalib_ros.estimation.great_circles import (
     fit_circles,
     fit_circles_through,
     rays_of,
-    scatter,
 )
-from autocalib_ros.estimation.uncertainty import cluster_covariance, propagate
+from autocalib_ros.estimation.lens_prior import LensPrior
+from autocalib_ros.estimation.path_noise import whitening
+from autocalib_ros.estimation.uncertainty import cluster_covariance, correlation_within, propagate
 from autocalib_ros.estimation.vanishing_points import Directions, distances2_through
 
-PATH_FREEDOM = 4.0
-"""Independent deviations of one driven path: a few slow sways, however many images show it."""
-TIGHTENING = (8.0, 4.0, 2.0) + 12 * (1.0,)
+TIGHTENING = (8.0, 4.0, 2.0)
+TIGHTEST = 1.0
 """Squared distance at which a track's influence has fallen to a quarter, in medians, round by round.
 
 The bulk of the tracks says what noise is; a lane change or a slow turn a few pixels beyond it is few in number
 but long in lever. From loose to tight, so that a start some per cent off still reaches the best solution; then
 until assignment, influence and state stand still.
 """
-EVALUATIONS = 4
-"""Evaluations of the residuals in one round."""
-HELD = 1e-6
-"""Prior sigma of a parameter that is held."""
+ROUNDS = 16
+"""Most rounds; a state that has not settled by then swings between two assignments of a few tracks."""
 SETTLED, SETTLED_SIGMAS = 3e-4, 3e-3
 """The rounds end when log f and all angles (radians), and what is counted in prior sigmas, move by less."""
+BACKTRACKS = 4
+LEAST_SCALE = 0.05
+"""Traffic without noise, as tests make it, still has a spread to divide by."""
 MIN_TRACKS = 4
 """Fewer tracks on any road do not go on with a solution: it is judged, and refused, as it stands."""
 OUTLIER_PX = 4.0
 """A track farther than this from every road, root mean square, belongs to none."""
-EXPLAINED = 2.0
-"""A track counts for its road when it is no farther from it than so many medians."""
+EXPLAINED = 3.0
+"""A track counts for its road when its mean squared whitened distance is below so many medians."""
 DISCRIMINATION = 5.0
 """A track tells two roads apart when it is so many times farther from the one than from the other."""
 DIFFERENCE = 1e-6
-"""Step of the lens parameters, in their sigmas or in log f, by which the residuals are differentiated."""
-SCALE_PX = 1.0
-"""Distance at which a track stops being evidence for a solution when solutions are compared."""
+"""Step of the lens parameters, in their units, by which distances are differentiated."""
 
 
 @dataclass(frozen=True)
@@ -78,100 +78,111 @@ class State:
         return self.in_plane @ self.rotation.T
 
 
-class Problem:
-    """Parameters as steps from a state, and the residuals over labelled tracks."""
+@dataclass(frozen=True)
+class Setting:
+    """What a solution is given besides tracks and a start."""
 
-    def __init__(self, base: State, tracks: TrackSet, labels: np.ndarray, influence: np.ndarray,
-                 options: JointOptions, perpendicular: bool) -> None:
+    prior: LensPrior
+    options: JointOptions
+    height_m: float = 0.0
+    """Height of the camera, 0 unknown: it weighs near against far, no more."""
+    crossing_rad: float | None = None
+    """Angle of the second road to the first where that is held."""
+    vehicle_correlation: float = 0.3
+    """How much the errors of one vehicle's tracks correlate, 0 to 1: a guess until a fit has measured it."""
+
+
+class Problem:
+    """Labelled tracks at a state: whitened residuals, and their derivatives by a step from there."""
+
+    def __init__(self, base: State, tracks: TrackSet, labels: np.ndarray, setting: Setting) -> None:
         used = labels >= 0
-        self.all_labels = labels
-        self.base, self.tracks, self.labels = base, tracks.subset(used), labels[used]
-        self.options, self.perpendicular = options, perpendicular
-        self.root = np.sqrt(self.tracks.weights * influence[used, None])
-        self.scale = _pixel_scale(base, self.tracks)
-        self.groups = np.repeat(self.tracks.vehicles, self.tracks.weights.shape[1])
+        self.base, self.setting, self.used = base, setting, used
+        self.tracks, self.labels = tracks.subset(used), labels[used]
+        self.mask = self.tracks.weights > 0
+        self.freedom = np.maximum(self.mask.sum(axis=1) - 1, 1)
         self.turns = 3 if len(base.angles_rad) > 1 else 2
-        self.free_angles = 0 if perpendicular else len(base.angles_rad) - 1
+        held = 1 if setting.crossing_rad is not None and len(base.angles_rad) > 1 else 0
+        self.free_angles = range(1 + held, len(base.angles_rad))
+        self.lens = len(setting.prior.free)
+        rays = rays_of(base.camera, self.tracks.pixels)
+        normals, _, matrix = fit_circles(rays, self.tracks.weights)
+        normals, _ = fit_circles_through(matrix, base.directions[self.labels])
+        self.scale = rays.pixel_scale(normals[:, None])
+        self.whiten = whitening(rays, self.mask, normals, base.directions[self.labels], ground_up(base, rays),
+                                setting.height_m, setting.options)
 
     @property
     def size(self) -> int:
-        """Number of parameters: log f, principal point in sigmas, k1 in sigmas, rotation, angles."""
-        return 4 + self.turns + self.free_angles
+        """Number of parameters: free ones of the lens in their units, rotation, angles of the roads."""
+        return self.lens + self.turns + len(self.free_angles)
 
     def state(self, step: np.ndarray) -> State:
         """Return the state at a step from the base."""
-        base, options = self.base, self.options
-        width = base.camera.width
-        shift = step[1:3] * options.principal_point_sigma * width
-        cx, cy = np.asarray(base.camera.principal_point_px) + shift
-        k1 = base.camera.k[0] + step[3] * options.k1_sigma
-        camera = replace(base.camera, focal_px=base.camera.focal_px * float(np.exp(np.clip(step[0], -1, 1))),
-                         principal_point_px=(float(cx), float(cy)), k=(float(k1), *base.camera.k[1:]))
         turn = np.zeros(3)
-        turn[3 - self.turns:] = step[4:4 + self.turns]
-        angles = base.angles_rad.copy()
-        angles[1:1 + self.free_angles] += step[4 + self.turns:]
-        return State(camera, base.rotation @ Rotation.from_rotvec(turn).as_matrix(), angles)
-
-    def residuals(self, step: np.ndarray) -> np.ndarray:
-        """Weighted pixel distances of all points, then the priors."""
-        state = self.state(step)
-        rays = rays_of(state.camera, self.tracks.pixels)
-        normals = self.circles(state, rays)
-        distances = rays.distance_px(normals[:, None]) * self.root
-        return np.concatenate([distances.ravel(), prior_deviations(state.camera, self.options)])
+        turn[3 - self.turns:] = step[self.lens:self.lens + self.turns]
+        angles = self.base.angles_rad.copy()
+        angles[list(self.free_angles)] += step[self.lens + self.turns:]
+        return State(self.setting.prior.moved(self.base.camera, step[:self.lens]),
+                     self.base.rotation @ Rotation.from_rotvec(turn).as_matrix(), angles)
 
     def circles(self, state: State, rays: Rays) -> np.ndarray:
-        """Normals (tracks, 3) of each track's best circle through its road's direction.
-
-        `scale` only weighs the points when the circle is fitted; distances from it are exact.
-        """
-        matrix = scatter(rays, self.tracks.weights, self.scale)
-        normals, _ = fit_circles_through(matrix, state.directions[self.labels])
+        """Normals (tracks, 3) of each track's best circle through its road's direction, in whitened distances."""
+        whitened = self.whiten @ (rays.bearings * self.scale[..., None])
+        normals, _ = fit_circles_through(whitened.transpose(0, 2, 1) @ whitened, state.directions[self.labels])
         return normals
 
-    def jacobian(self, step: np.ndarray) -> np.ndarray:
-        """Derivative of `residuals`, shape (residuals, parameters), circles refitted.
-
-        The lens by differences, because a lens also changes what a pixel is worth, and that term decides where
-        the minimum lies. The roads in closed form: a direction d that moves by dd turns a normal n by
-        -(n.dd) d, and the circle's own angle is projected out (Kaufman 1975).
-        """
-        state = self.state(step)
+    def residuals(self, state: State) -> np.ndarray:
+        """Whitened distances, shape (tracks, samples)."""
         rays = rays_of(state.camera, self.tracks.pixels)
-        normals = self.circles(state, rays)[:, None]
-        directions = state.directions[self.labels]
-        here = self.residuals(step)
-        lens = [(self.residuals(step + DIFFERENCE * unit) - here) / DIFFERENCE for unit in np.eye(self.size)[:4]]
+        distance = rays.distance_px(self.circles(state, rays)[:, None])
+        return np.einsum('tij,tj->ti', self.whiten, distance)
+
+    def linearised(self) -> tuple[np.ndarray, np.ndarray]:
+        """Whitened distances (tracks, samples) at the base and their derivatives (tracks, samples, parameters).
+
+        The lens by differences of the exact distance, because a lens also changes what a pixel is worth, and that
+        term decides where the minimum lies. The roads in closed form: a direction d that moves by dd turns a
+        normal n by -(n.dd) d. The circle's own angle is projected out (Kaufman 1975).
+        """
+        rays = rays_of(self.base.camera, self.tracks.pixels)
+        self.scale = rays.pixel_scale(self.circles(self.base, rays)[:, None])
+        normals = self.circles(self.base, rays)[:, None]
+        directions = self.base.directions[self.labels]
         scale = rays.pixel_scale(normals)
-        across = dot(rays.bearings, normals) * scale**2
+        here = dot(rays.bearings, normals) * scale
+        columns = [(self._distance(unit, normals) - here) / DIFFERENCE for unit in np.eye(self.lens)]
+        across = here * scale
         # distance over gradient: the second term is how the gradient itself turns with the normal
         pull = rays.bearings - across[..., None] * (dot(rays.radial, normals)[..., None] * rays.radial
                                                     + dot(rays.tangential, normals)[..., None] * rays.tangential)
-        pull *= (scale * self.root)[..., None]
+        pull *= scale[..., None]
         free = np.einsum('tmi,ti->tm', pull, np.cross(directions, normals[:, 0]))
-        weight = np.maximum((free * free).sum(-1), 1e-12)
-        columns = []
-        for turn in self._turns(state):
-            column = np.einsum('tmi,ti->tm', pull, -dot(normals[:, 0], turn)[:, None] * directions)
-            column -= free * ((free * column).sum(-1) / weight)[:, None]
-            columns.append(np.concatenate([column.ravel(), np.zeros(3)]))
-        return np.column_stack([*lens, *columns])
+        columns += [np.einsum('tmi,ti->tm', pull, -dot(normals[:, 0], turn)[:, None] * directions)
+                    for turn in self._turns()]
+        slopes = self.whiten @ np.stack([free, *columns], axis=-1)
+        free, slopes = slopes[..., :1], slopes[..., 1:]
+        along = (free * slopes).sum(axis=1, keepdims=True) / np.maximum((free * free).sum(axis=1, keepdims=True), 1e-12)
+        return np.einsum('tij,tj->ti', self.whiten, here), slopes - free * along
 
-    def _turns(self, state: State) -> list[np.ndarray]:
+    def _distance(self, unit: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        camera = self.setting.prior.moved(self.base.camera, DIFFERENCE * unit)
+        return rays_of(camera, self.tracks.pixels).distance_px(normals)
+
+    def _turns(self) -> list[np.ndarray]:
         """Change (tracks, 3) of each track's direction with each parameter of the roads."""
-        flat = state.in_plane
+        flat = self.base.in_plane
         axes = np.eye(3)[3 - self.turns:]
-        turns = [np.cross(axis, flat)[self.labels] @ state.rotation.T for axis in axes]
-        sideways = np.cross([0.0, 0.0, 1.0], flat)[self.labels] @ state.rotation.T
-        return turns + [sideways * (self.labels == road + 1)[:, None] for road in range(self.free_angles)]
+        turns = [np.cross(axis, flat)[self.labels] @ self.base.rotation.T for axis in axes]
+        sideways = np.cross([0.0, 0.0, 1.0], flat)[self.labels] @ self.base.rotation.T
+        return turns + [sideways * (self.labels == road)[:, None] for road in self.free_angles]
 
-
-def prior_deviations(camera: Camera, options: JointOptions) -> np.ndarray:
-    """Deviations of a lens from the prior one in sigmas, shape (3,): principal point x, y and k1."""
-    shift = np.asarray(camera.principal_point_px) - image_centre(camera.width, camera.height)
-    return np.array([*(shift / max(options.principal_point_sigma * camera.width, 1e-6)),
-                     camera.k[0] / max(options.k1_sigma, 1e-6)])
+    def prior_gradient(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+        """Gradient (parameters,) and information (parameters,) of the prior at a camera."""
+        gradient, information = np.zeros(self.size), np.zeros(self.size)
+        gradient[:self.lens] = self.setting.prior.deviations(camera)
+        information[:self.lens] = self.setting.prior.information
+        return gradient, information
 
 
 @dataclass(frozen=True)
@@ -183,42 +194,43 @@ class JointFit:
     """Road of each track, -2 for none, shape (tracks,)."""
     distance_px: np.ndarray
     """Root mean square distance of each track from its nearest road's circle, shape (tracks,)."""
+    whitened2: np.ndarray
+    """Mean squared whitened distance of each track from its road, inf for none, shape (tracks,)."""
+    scale: float
+    """Median of `whitened2` over the tracks on roads: 1 when noise and wander are as the options say."""
     cost: float
-    """Robust cost over all tracks, comparable between fits of the same tracks."""
-    jacobian: np.ndarray
-    """Of the weighted residuals, tracks then priors, shape (residuals, parameters)."""
-    residuals: np.ndarray
-    """Shape (residuals,)."""
-    groups: np.ndarray
-    """Vehicle of each residual, -1 for a prior, shape (residuals,)."""
+    """Robust cost over all tracks and the prior, twice a negative logarithm of probability."""
     problem: Problem
     """The problem at the solution: steps from there are the parameters of the covariance."""
+    covariance: np.ndarray
+    """Of the parameters, shape (parameters, parameters)."""
+    information: np.ndarray
+    """Of the evidence alone about the parameters, shape (parameters, parameters)."""
+    vehicle_correlation: float
+    """How much the pulls of one vehicle's tracks on the solution correlate, 0 to 1."""
 
     @property
-    def median_px(self) -> float:
-        """Median distance of the tracks that follow a road."""
-        on_road = self.distance_px[self.labels >= 0]
-        return float(np.median(on_road)) if len(on_road) else float('inf')
+    def crossing_held(self) -> bool:
+        """Whether the angle between the first two roads was held."""
+        return self.problem.setting.crossing_rad is not None
 
     def explained(self) -> np.ndarray:
         """Which tracks follow their road as closely as the bulk does, shape (tracks,)."""
-        typical = max(self.median_px, self.problem.options.noise_px)
-        return (self.labels >= 0) & (self.distance_px < EXPLAINED * typical)
-
-    def covariance(self) -> np.ndarray:
-        """Covariance of the parameters, shape (parameters, parameters)."""
-        return cluster_covariance(self.jacobian, self.residuals, self.groups)
+        return (self.labels >= 0) & (self.whitened2 < EXPLAINED * max(self.scale, LEAST_SCALE))
 
     def sigma(self, function: Callable[[State], np.ndarray]) -> np.ndarray:
         """Standard deviation of a function of the state, shape of its result."""
-        return propagate(lambda step: function(self.problem.state(step)), self.problem.size, self.covariance())
+        return propagate(lambda step: function(self.problem.state(step)), self.problem.size, self.covariance)
 
 
-def _pixel_scale(state: State, tracks: TrackSet) -> np.ndarray:
-    """Pixels per radian at each point (tracks, samples), across its track's own great circle."""
-    rays = rays_of(state.camera, tracks.pixels)
-    normals, _, _ = fit_circles(rays, tracks.weights)
-    return rays.pixel_scale(normals[:, None])
+def ground_up(state: State, rays: Rays) -> np.ndarray:
+    """Normal (3,) of the plane away from the traffic; with one road that of the plane level with the image."""
+    normal = state.rotation[:, 2]
+    if len(state.angles_rad) == 1:
+        along = state.directions[0]
+        normal = np.array([0.0, -1.0, 0.0]) + along[1] * along
+        normal = normal / max(np.linalg.norm(normal), 1e-9)
+    return -normal if np.mean(rays.bearings @ normal > 0) > 0.5 else normal
 
 
 def assign(state: State, tracks: TrackSet, limit_px: float = OUTLIER_PX) -> tuple[np.ndarray, np.ndarray]:
@@ -242,57 +254,126 @@ def initial_state(camera: Camera, found: Directions) -> State:
     return State(camera, rotation, np.arctan2(inplane[:, 1], inplane[:, 0]))
 
 
-def solve_joint(start: State, tracks: TrackSet, options: JointOptions, *, perpendicular: bool = False) -> JointFit:
-    """Alternate between assigning tracks to roads and robust least squares, from a start.
+def solve_joint(start: State, tracks: TrackSet, setting: Setting, *, refine: bool = False) -> JointFit:
+    """Alternate between assigning tracks to roads and a robust Gauss-Newton step, from a start.
 
-    One road alone cannot tell k1 and the principal point from the focal length: there they stay where the start
-    has them; what their priors leave open is still part of the uncertainty.
+    With `refine` the start is a solution already, and nothing is loosened first.
     """
-    one_road = len(start.angles_rad) == 1
-    solved = replace(options, k1_sigma=HELD, principal_point_sigma=HELD) if one_road else options
-    state = squared(start) if perpendicular else start
-    share = np.sqrt(tracks.share_of_vehicle)
-    for tightness in TIGHTENING:
+    state = crossed(start, setting.crossing_rad)
+    share = tracks.independence(setting.vehicle_correlation)
+    problem = None
+    for tightness in (() if refine else TIGHTENING) + ROUNDS * (TIGHTEST,):
         # a start may be off by more than a true track ever is: only the last rounds cut off
-        labels, distance2 = assign(state, tracks, OUTLIER_PX if tightness <= 1.0 else np.inf)
+        labels, _ = assign(state, tracks, OUTLIER_PX if tightness <= TIGHTEST else np.inf)
         if np.count_nonzero(labels >= 0) < MIN_TRACKS:
             break
-        noise2 = max(options.noise_px**2, _typical(distance2[labels >= 0]))
-        influence = PATH_FREEDOM * share / noise2 / (1.0 + distance2 / (tightness * noise2)) ** 2
-        problem = Problem(state, tracks, labels, influence, solved, perpendicular)
-        solution = least_squares(problem.residuals, np.zeros(problem.size), problem.jacobian, method='lm',
-                                 max_nfev=EVALUATIONS, xtol=1e-6, ftol=1e-7)
-        state = problem.state(solution.x)
-        if tightness <= 1.0 and _settled(solution.x):
+        problem = Problem(state, tracks, labels, setting)
+        step, state = _stepped(problem, share[problem.used], tightness)
+        if tightness <= TIGHTEST and _settled(step, setting.prior):
             break
-    final = Problem(state, tracks, problem.all_labels, influence, options, perpendicular)
-    here = np.zeros(final.size)
-    labels, distance2 = assign(state, tracks)
-    return JointFit(state, labels, np.sqrt(distance2), robust_cost(state, distance2, tracks, options),
-                    final.jacobian(here), final.residuals(here), np.concatenate([final.groups, np.full(3, -1)]), final)
+    return _judged(problem or Problem(state, tracks, np.zeros(len(tracks), int), setting), state, tracks, share)
 
 
-def _settled(step: np.ndarray) -> bool:
-    shape, rest = np.abs(step[1:4]), np.abs(np.delete(step, (1, 2, 3)))
-    return bool(shape.max() < SETTLED_SIGMAS and rest.max() < SETTLED)
+def _stepped(problem: Problem, share: np.ndarray, tightness: float) -> tuple[np.ndarray, State]:
+    """Take one Gauss-Newton step on the robust cost, shortened until the cost does not grow."""
+    residuals, slopes = problem.linearised()
+    squared = (residuals**2).sum(axis=1) / problem.freedom
+    scale = max(float(np.median(squared)), LEAST_SCALE)
+    weight = share / scale * influence(squared, tightness * scale)
+    gradient, prior = problem.prior_gradient(problem.base.camera)
+    matrix = np.einsum('t,tmp,tmq->pq', weight, slopes, slopes, optimize=True) + np.diag(prior)
+    gradient = gradient + np.einsum('t,tmp,tm->p', weight, slopes, residuals, optimize=True)
+    step = -np.linalg.lstsq(matrix, gradient, rcond=1e-12)[0]
+
+    def cost(state: State) -> float:
+        apart = (problem.residuals(state)**2).sum(axis=1) / problem.freedom
+        deviations = problem.setting.prior.deviations(state.camera)
+        return float((share / scale * problem.freedom * loss(apart, tightness * scale)).sum() + deviations @ deviations)
+
+    here = float((share / scale * problem.freedom * loss(squared, tightness * scale)).sum()
+                 + np.square(problem.setting.prior.deviations(problem.base.camera)).sum())
+    for _ in range(BACKTRACKS):
+        state = problem.state(step)
+        if cost(state) <= here:
+            return step, state
+        step = step / 2
+    return np.zeros_like(step), problem.base
 
 
-def squared(state: State) -> State:
-    """Return the state with its second road perpendicular to the first."""
+def influence(squared: np.ndarray, limit: float) -> np.ndarray:
+    """Geman-McClure weight of a mean squared distance: 1 at 0, a quarter at `limit`."""
+    return 1.0 / (1.0 + squared / limit) ** 2
+
+
+def loss(squared: np.ndarray, limit: float) -> np.ndarray:
+    """Loss whose derivative by `squared` is `influence`."""
+    return squared / (1.0 + squared / limit)
+
+
+def bounded_loss(squared: np.ndarray, limit: float) -> np.ndarray:
+    """`loss` with its bound, `limit`, for tracks infinitely far away."""
+    far = ~np.isfinite(squared)
+    return np.where(far, limit, loss(np.where(far, 0.0, squared), limit))
+
+
+def _settled(step: np.ndarray, prior: LensPrior) -> bool:
+    limit = np.full(len(step), SETTLED)
+    limit[:len(prior.free)][np.isfinite(prior.sigma[prior.free])] = SETTLED_SIGMAS
+    return bool((np.abs(step) < limit).all())
+
+
+def crossed(state: State, crossing_rad: float | None) -> State:
+    """Return the state with its second road at an angle to the first, on the side where it is."""
+    if crossing_rad is None or len(state.angles_rad) < 2:
+        return state
     angles = state.angles_rad.copy()
-    angles[1] = np.copysign(np.pi / 2, np.sin(angles[1]))
+    sides = np.array([crossing_rad, crossing_rad - np.pi, -crossing_rad, np.pi - crossing_rad])
+    angles[1] = sides[np.argmin(np.abs(np.angle(np.exp(1j * (sides - angles[1])))))]
     return replace(state, angles_rad=angles)
 
 
-def _typical(distance2: np.ndarray) -> float:
-    return float(np.median(distance2)) if len(distance2) else 0.0
+def _judged(last: Problem, state: State, tracks: TrackSet, share: np.ndarray) -> JointFit:
+    """Measure a solution: distances, cost, covariance and information."""
+    labels, distance2 = assign(state, tracks)
+    problem = Problem(state, tracks, labels, last.setting) if np.count_nonzero(labels >= 0) >= MIN_TRACKS else last
+    residuals, slopes = problem.linearised()
+    squared = (residuals**2).sum(axis=1) / problem.freedom
+    scale = max(float(np.median(squared)), LEAST_SCALE)
+    limit = TIGHTEST * scale
+    shared = share[problem.used] / scale
+    deviations, prior = problem.prior_gradient(state.camera)
+    whitened2 = np.full(len(tracks), np.inf)
+    whitened2[problem.used] = squared
+    freedom = np.maximum((tracks.weights > 0).sum(axis=1) - 1, 1)
+    cost = float((share / scale * freedom * bounded_loss(whitened2, limit)).sum() + deviations @ deviations)
+    weight = shared * influence(squared, limit)
+    information = np.einsum('t,tmp,tmq->pq', weight, slopes, slopes, optimize=True)
+    pulls = np.einsum('tmp,tm->tp', slopes, residuals) * np.sqrt(influence(squared, limit))[:, None]
+    pulls = pulls / np.sqrt(np.maximum(np.diag(information), 1e-12))
+    bend = -4.0 / limit / problem.freedom * shared / (1.0 + squared / limit) ** 3
+    covariance = cluster_covariance(slopes, residuals, weight, bend, problem.tracks.vehicles, prior)
+    return JointFit(state, labels, np.sqrt(distance2), whitened2, scale, cost, problem, covariance, information,
+                    correlation_within(problem.tracks.vehicles, pulls))
 
 
-def robust_cost(state: State, distance2: np.ndarray, tracks: TrackSet, options: JointOptions) -> float:
-    """Logarithmic cost over all tracks, roads or not, with the priors; vehicles count once."""
-    priors = np.square(prior_deviations(state.camera, options)).sum()
-    share = np.sqrt(tracks.share_of_vehicle)
-    return float(PATH_FREEDOM * (share * np.log1p(distance2 / SCALE_PX**2)).sum() + priors)
+def judged_with(fit: JointFit, tracks: TrackSet, setting: Setting) -> JointFit:
+    """Measure the uncertainty of a solution under another setting, such as one that holds less."""
+    problem = Problem(fit.state, tracks, fit.labels, setting)
+    return _judged(problem, fit.state, tracks, tracks.independence(setting.vehicle_correlation))
+
+
+def cost_at_scale(fit: JointFit, tracks: TrackSet, scale: float) -> float:
+    """Twice the negative logarithm of a fit's probability, for comparison between fits of one set of tracks.
+
+    All at one `scale`, with the prior and, by Laplace's approximation, the volume that the evidence leaves of it.
+    """
+    limit = TIGHTEST * scale
+    freedom = np.maximum((tracks.weights > 0).sum(axis=1) - 1, 1)
+    cost = bounded_loss(fit.whitened2, limit)
+    share = tracks.independence(fit.problem.setting.vehicle_correlation)
+    deviations, prior = fit.problem.prior_gradient(fit.state.camera)
+    volume = np.linalg.slogdet(fit.information + np.diag(prior) + 1e-9 * np.eye(len(prior)))[1]
+    return float((share / scale * freedom * cost).sum() + deviations @ deviations + volume)
 
 
 def road_support(fit: JointFit, tracks: TrackSet) -> list[np.ndarray]:
@@ -305,10 +386,11 @@ def road_support(fit: JointFit, tracks: TrackSet) -> list[np.ndarray]:
     _, _, matrix = fit_circles(rays, tracks.weights)
     distance = np.sqrt(distances2_through(matrix, fit.state.directions))
     explained = fit.explained()
+    typical = float(np.median(fit.distance_px[explained])) if explained.any() else np.inf
     support = []
     for road in range(len(distance)):
         others = np.delete(distance, road, axis=0)
         nearest_other = others.min(axis=0) if len(others) else np.full(len(tracks), np.inf)
-        apart = nearest_other > DISCRIMINATION * np.maximum(distance[road], fit.median_px)
+        apart = nearest_other > DISCRIMINATION * np.maximum(distance[road], typical)
         support.append(explained & (fit.labels == road) & apart)
     return support

@@ -2,49 +2,53 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from autocalib_ros.calibration import Reason
 from autocalib_ros.camera import Camera
 from autocalib_ros.config import GateOptions, JointOptions
-from autocalib_ros.estimation.great_circles import TrackSet, rays_of
-from autocalib_ros.estimation.ground_plane import BELOW_HORIZON, tilt_and_roll_deg, upward
+from autocalib_ros.estimation.doubts import (
+    crossing_deg,
+    halves_doubt,
+    is_road,
+    lens_doubt,
+    plane_doubt,
+)
+from autocalib_ros.estimation.great_circles import TrackSet, fit_circles, rays_of
 from autocalib_ros.estimation.joint import (
-    MIN_TRACKS,
     JointFit,
-    State,
+    Setting,
+    cost_at_scale,
     initial_state,
+    judged_with,
     road_support,
     solve_joint,
 )
+from autocalib_ros.estimation.lens_prior import PARAMETERS, LensPrior, known_lens, lens_priors
 from autocalib_ros.estimation.straightness import focal_trials
+from autocalib_ros.estimation.uncertainty import told_by_evidence
 from autocalib_ros.estimation.vanishing_points import Directions, consensus_directions
 
-TRIALS = 16
-"""Focal lengths tried as starts: steps of about 15 %, within which the joint problem converges."""
-STARTS = 2
-VOTERS = 250
+TRIALS = 14
+"""Focal lengths tried as starts: steps of about 17 %, within which the joint problem converges."""
+STARTS = 3
+VOTERS = 200
 """Tracks, evenly out of all, from which the starts are made and compared; the solution then uses every track."""
-MIN_VEHICLES = 4
-"""Vehicles, distinct, that make a road; fewer may be one driver's whim."""
-STRAIGHT_SHARE = 0.35
-"""Share of vehicles that follow the roads; below it the traffic turns, and what it agrees on is a turn."""
+MIDDLE = 0.3
+"""A radius in image diagonals at which two lenses of one field of view agree about best."""
+MOST_ROADS = 4
+APART_DEG = 15.0
+"""Roads that differ by less are one road seen with errors."""
+ON_ROAD_DEG = 1.0
+"""A track whose direction in the plane is within this of a further road follows it."""
 RIGHT_ANGLE_SIGMAS = 2.0
 RIGHT_ANGLE_FLOOR_DEG = 1.0
 """Junctions are built to about a degree: a difference within it does not speak against 90 degrees."""
-MIN_CONTRAST = 1.3
-"""Agreement at the best trial focal length over that at the median one: wrong lenses bend straight paths apart."""
-LONGEST_FOCAL = 1.5
-"""Focal length, in image diagonals, beyond which no lens curvature can be seen."""
-PRIOR_SIGMAS = 3.5
-HALVES_SIGMAS = 3.5
-HALVES_FOCAL = 0.03
-HALVES_DEG = 1.5
-"""Two halves of the evidence may always differ by so much: it is within what the program promises."""
-
-NOT_CROSS_CHECKED = 'not cross-checked in time: the earlier or the later half has too little traffic on a road'
+ASKED_FOR = 9.0
+"""k2 is set free, or a rarer family of lenses chosen, when that makes the tracks so much more probable: twice the
+logarithm, three sigmas."""
 
 
 @dataclass(frozen=True)
@@ -60,30 +64,65 @@ class Roads:
 
 
 def find_roads(tracks: TrackSet, image_size: tuple[int, int], options: JointOptions, gate: GateOptions,
-               generator: np.random.Generator) -> Roads | Reason:
-    """Estimate lens and road directions from tracks; a reason instead when the lens cannot be trusted."""
+               generator: np.random.Generator, *, height_m: float = 0.0, lens: Camera | None = None) -> Roads | Reason:
+    """Estimate lens and road directions from tracks; a reason instead when the lens cannot be trusted.
+
+    A known `lens` is kept, and only the roads are found.
+    """
     if len(tracks) < gate.min_tracks:
         return Reason('too_few_tracks', f'{len(tracks)} tracks of the {gate.min_tracks} needed are long enough',
                       'wait for more traffic, or record for longer')
-    trials = focal_trials(tracks, image_size, TRIALS)
+    priors = [known_lens(lens)] if lens is not None else lens_priors(image_size, options)
+    crossing = None if options.crossing_deg is None else float(np.radians(options.crossing_deg))
     voters = tracks.subset(np.unique(np.linspace(0, len(tracks) - 1, VOTERS).astype(int)))
-    found = [consensus_directions(Camera.equidistant(*image_size, trial), voters, generator) for trial in trials]
-    starts = _peaks(found)[:STARTS]
-    if not starts:
+    found = _agreed(voters, Setting(priors[0], options, height_m, crossing), generator)
+    if found is None:
         return Reason('no_direction', f'{len(tracks)} tracks agree on no common direction',
                       'straight traffic is needed: wait for it, or turn the camera towards a straight road')
-    fits = [solve_joint(initial_state(Camera.equidistant(*image_size, trials[index]), found[index]), voters, options)
-            for index in starts]
-    fit = solve_joint(min(fits, key=lambda candidate: candidate.cost).state, tracks, options)
-    support = road_support(fit, tracks)
-    if not all(_is_road(mask, tracks, gate) for mask in support):
-        fit = _strongest_alone(fit, support, tracks, options)
-        support = road_support(fit, tracks)
+    best, contrast = found
+    fit = _with_real_roads(solve_joint(best.state, tracks, best.problem.setting), tracks, gate)
+    fit = _in_likeliest_family(fit, priors[1:], voters, tracks)
+    fit = _with_further_roads(fit, tracks, gate)
     fit, angle = _with_right_angle(fit, tracks, options)
-    scores = np.array([item.score for item in found])
-    contrast = float(scores.max() / max(np.median(scores), 1e-9))
-    doubt = _lens_doubt(fit, contrast, tracks, options, gate)
-    return doubt or _doubted(fit, support, angle, tracks, options, gate)
+    fit, held = _with_what_can_be_told(fit, tracks)
+    doubt = lens_doubt(fit, contrast, tracks, gate)
+    return doubt or _doubted(fit, angle, held, tracks, gate)
+
+
+def _agreed(voters: TrackSet, setting: Setting, generator: np.random.Generator) -> tuple[JointFit, float] | None:
+    """Solve from the directions on which the tracks agree at trial focal lengths; the most probable solution.
+
+    And the contrast: how much better the best trial agreed than the middling one. None without any agreement.
+    """
+    prior = setting.prior
+    known = prior.sigma[0] < np.inf
+    size = (prior.centre.width, prior.centre.height)
+    trials = [prior.centre.focal_px] if known else focal_trials(voters, size, TRIALS)
+    agreed = [consensus_directions(prior.start(trial), voters, generator) for trial in trials]
+    starts = _peaks(agreed)[:STARTS]
+    if not starts:
+        return None
+    fits = [solve_joint(initial_state(prior.start(trials[index]), agreed[index]), voters, setting) for index in starts]
+    scores = np.array([item.score for item in agreed])
+    return _most_probable(fits, voters), np.inf if known else float(scores.max() / max(np.median(scores), 1e-9))
+
+
+def _in_likeliest_family(fit: JointFit, priors: list[LensPrior], voters: TrackSet, tracks: TrackSet) -> JointFit:
+    """Solve for another family of lenses where that makes the tracks clearly more probable; one road cannot tell."""
+    if len(fit.state.angles_rad) < 2 or not priors:
+        return fit
+    usual = solve_joint(fit.state, voters, fit.problem.setting, refine=True)
+    best = _most_probable([usual, *(_in_family(usual, prior, voters) for prior in priors)], voters, ASKED_FOR)
+    return fit if best is usual else solve_joint(best.state, tracks, best.problem.setting)
+
+
+def _in_family(fit: JointFit, prior: LensPrior, voters: TrackSet) -> JointFit:
+    """Solve for a lens of another family, from the one that images the middle of the field at the same place."""
+    camera = fit.state.camera
+    angle, _ = camera.angle(np.array(MIDDLE * np.hypot(camera.width, camera.height)))
+    focal = camera.radius(angle) / replace(prior.centre, focal_px=1.0).radius(angle)
+    start = replace(fit.state, camera=prior.start(float(focal)))
+    return solve_joint(start, voters, replace(fit.problem.setting, prior=prior))
 
 
 def _peaks(found: list[Directions]) -> list[int]:
@@ -94,154 +133,142 @@ def _peaks(found: list[Directions]) -> list[int]:
     return sorted((int(index) for index in peaks), key=lambda index: -scores[index])
 
 
-def _is_road(mask: np.ndarray, tracks: TrackSet, gate: GateOptions) -> bool:
-    return mask.sum() >= gate.min_tracks_per_road and len(np.unique(tracks.vehicles[mask])) >= MIN_VEHICLES
+def _most_probable(fits: list[JointFit], tracks: TrackSet, margin: float = 0.0) -> JointFit:
+    """Choose the solution that makes the tracks most probable; the first unless it is beaten by a margin."""
+    scale = min(fit.scale for fit in fits)
+    costs = [cost_at_scale(fit, tracks, scale) + (margin if index else 0.0) for index, fit in enumerate(fits)]
+    return fits[int(np.argmin(costs))]
 
 
-def _strongest_alone(fit: JointFit, support: list[np.ndarray], tracks: TrackSet, options: JointOptions) -> JointFit:
-    """Solve again with the one road that explains most vehicles, from an equidistant lens."""
+def _with_real_roads(fit: JointFit, tracks: TrackSet, gate: GateOptions) -> JointFit:
+    """Solve again with the one road that explains most vehicles when a second has too little behind it."""
+    support = road_support(fit, tracks)
+    turns = np.abs(np.sin(np.diff(fit.state.angles_rad)))
+    if all(is_road(mask, tracks, gate) for mask in support) and turns.min(initial=1.0) > np.sin(np.radians(APART_DEG)):
+        return fit
     explained = fit.explained()
     counts = [len(np.unique(tracks.vehicles[explained & (fit.labels == road)])) for road in range(len(support))]
     direction = fit.state.directions[int(np.argmax(counts))]
-    camera = Camera.equidistant(fit.state.camera.width, fit.state.camera.height, fit.state.camera.focal_px)
-    alone = initial_state(camera, Directions(direction[None], np.zeros(0, int), 0.0))
-    return solve_joint(alone, tracks, options)
+    setting = fit.problem.setting
+    alone = initial_state(setting.prior.start(fit.state.camera.focal_px),
+                          Directions(direction[None], np.zeros(0, int), 0.0))
+    return solve_joint(alone, tracks, setting)
+
+
+def _with_further_roads(fit: JointFit, tracks: TrackSet, gate: GateOptions) -> JointFit:
+    """Add roads in the same plane as long as tracks that follow none agree on one."""
+    while 2 <= len(fit.state.angles_rad) < MOST_ROADS:
+        angle = _further_angle(fit, tracks)
+        if angle is None:
+            return fit
+        wider = solve_joint(replace(fit.state, angles_rad=np.append(fit.state.angles_rad, angle)), tracks,
+                            fit.problem.setting, refine=True)
+        if not all(is_road(mask, tracks, gate) for mask in road_support(wider, tracks)):
+            return fit
+        fit = wider
+    return fit
+
+
+def _further_angle(fit: JointFit, tracks: TrackSet) -> float | None:
+    """Angle in the plane on which most vehicles agree whose tracks follow no road yet, None where two do not."""
+    rays = rays_of(fit.state.camera, tracks.pixels)
+    normals, own, _ = fit_circles(rays, tracks.weights)
+    left = (fit.labels < 0) & (own < 1.0)
+    along = np.cross(normals[left], fit.state.rotation[:, 2]) @ fit.state.rotation
+    angles = np.arctan2(along[:, 1], along[:, 0])
+    away = np.abs(np.sin(angles[:, None] - fit.state.angles_rad)).min(axis=1, initial=1.0)
+    angles, vehicles = angles[away > np.sin(np.radians(APART_DEG))], tracks.vehicles[left][
+        away > np.sin(np.radians(APART_DEG))]
+    agree = np.abs(np.sin(angles[:, None] - angles)) < np.sin(np.radians(ON_ROAD_DEG))
+    counts = np.array([len(np.unique(vehicles[row])) for row in agree])
+    return float(angles[np.argmax(counts)]) if counts.max(initial=0) > 1 else None
 
 
 def _with_right_angle(fit: JointFit, tracks: TrackSet, options: JointOptions) -> tuple[JointFit, str | None]:
-    """Hold two roads at 90 degrees where the evidence does not speak against it, or where that is asserted."""
-    if len(fit.state.angles_rad) != 2:
+    """Hold two roads at 90 degrees where the evidence does not speak against it, or at what is asserted."""
+    if len(fit.state.angles_rad) < 2:
         return fit, None
-    angle = crossing_deg(fit.state)
-    if options.road_angle == 'free':
-        return fit, f'roads cross at {angle:.1f} degrees (measured)'
+    angle, setting = crossing_deg(fit.state), fit.problem.setting
+    if setting.crossing_rad is not None:
+        return fit, f'roads cross at {options.crossing_deg:g} degrees (asserted)'
     sigma = float(fit.sigma(lambda state: np.array([crossing_deg(state)]))[0])
-    if options.road_angle == 'perpendicular':
-        return solve_joint(fit.state, tracks, options, perpendicular=True), 'roads cross at 90 degrees (asserted)'
-    if abs(90.0 - angle) <= max(RIGHT_ANGLE_SIGMAS * sigma, RIGHT_ANGLE_FLOOR_DEG):
-        text = f'roads cross at 90 degrees (tested: {angle:.1f} +- {sigma:.1f})'
-        return solve_joint(fit.state, tracks, options, perpendicular=True), text
-    return fit, f'roads cross at {angle:.1f} +- {sigma:.1f} degrees (measured)'
+    measured = f'roads cross at {angle:.1f} +- {min(sigma, 90.0):.1f} degrees (measured)'
+    if options.road_angle == 'free' or abs(90.0 - angle) > max(RIGHT_ANGLE_SIGMAS * sigma, RIGHT_ANGLE_FLOOR_DEG):
+        return fit, measured
+    squared = solve_joint(fit.state, tracks, replace(setting, crossing_rad=np.pi / 2))
+    return squared, f'roads cross at 90 degrees (tested: {angle:.1f} +- {sigma:.1f})'
 
 
-def crossing_deg(state: State) -> float:
-    """Angle at which the first two roads cross, 0 to 90 degrees."""
-    return float(np.degrees(np.arccos(np.clip(abs(np.cos(state.angles_rad[1])), 0.0, 1.0))))
+def _with_what_can_be_told(fit: JointFit, tracks: TrackSet) -> tuple[JointFit, tuple[str, ...]]:
+    """Measure how a vehicle's tracks correlate, set k2 free if asked for, hold what the evidence cannot tell."""
+    setting = replace(fit.problem.setting, vehicle_correlation=fit.vehicle_correlation)
+    fit = solve_joint(fit.state, tracks, setting, refine=True)
+    if setting.prior.family == 'equidistant' and setting.prior.sigma[3] > 0 and len(fit.state.angles_rad) > 1:
+        bent = solve_joint(fit.state, tracks, replace(setting, prior=setting.prior.with_k2()), refine=True)
+        if cost_at_scale(bent, tracks, fit.scale) < cost_at_scale(fit, tracks, fit.scale) - ASKED_FOR:
+            fit, setting = bent, bent.problem.setting
+    held = _untold(fit)
+    if not held:
+        return fit, ()
+    at_prior = setting.prior.start(fit.state.camera.focal_px)
+    camera = fit.state.camera
+    for name in held:
+        camera = _restored(camera, at_prior, name)
+    solved = solve_joint(replace(fit.state, camera=camera), tracks,
+                         replace(setting, prior=setting.prior.holding(held)), refine=True)
+    return judged_with(solved, tracks, setting), held
 
 
-def normal_of(state: State, tracks: TrackSet) -> tuple[np.ndarray, float]:
-    """Upward ground normal (3,) in the camera frame, and the share of tracked points below the horizon."""
-    seen = tracks.pixels[tracks.weights > 0]
-    return upward(state.rotation[:, 2], rays_of(state.camera, seen).bearings)
+def _untold(fit: JointFit) -> tuple[str, ...]:
+    """Names of the lens's parameters that the evidence alone leaves wider than their prior."""
+    prior = fit.problem.setting.prior
+    _, known = fit.problem.prior_gradient(fit.state.camera)
+    left = told_by_evidence(fit.information, known, np.ones(fit.problem.size))
+    names = [PARAMETERS[parameter] for parameter in prior.free]
+    return tuple(name for name, sigma, is_known in zip(names, left, known, strict=False) if is_known and sigma > 1.0)
 
 
-def _doubted(fit: JointFit, support: list[np.ndarray], angle: str | None, tracks: TrackSet, options: JointOptions,
+def _restored(camera: Camera, prior: Camera, name: str) -> Camera:
+    """Return the camera with one parameter at the prior's value."""
+    (cx, cy), (k1, k2, *rest) = camera.principal_point_px, camera.k
+    values = {
+        'focal length': {'focal_px': prior.focal_px},
+        'principal point x': {'principal_point_px': (prior.principal_point_px[0], cy)},
+        'principal point y': {'principal_point_px': (cx, prior.principal_point_px[1])},
+        'k1': {'k': (prior.k[0], k2, *rest)}, 'k2': {'k': (k1, prior.k[1], *rest)}}
+    return replace(camera, **values[name])
+
+
+def _doubted(fit: JointFit, angle: str | None, held: tuple[str, ...], tracks: TrackSet,
              gate: GateOptions) -> Roads | Reason:
     """Return the roads, or why the halves of the evidence disagree; doubts about the plane only take it away."""
-    camera = fit.state.camera
-    assumptions = [f'lens near equidistant: k1 = 0 +- {options.k1_sigma:g}',
-                   'principal point at the image centre +- '
-                   f'{options.principal_point_sigma * camera.width:.0f} px']
-    halves = _halves_doubt(fit, tracks, options, gate)
+    halves = halves_doubt(fit, tracks, gate)
     if isinstance(halves, Reason):
         return halves
+    support = road_support(fit, tracks)
+    assumptions = lens_assumptions(fit, held)
     if angle is None:
         tracks_seen = int(fit.explained().sum())
-        assumptions += ['k1 and the principal point held there: one road cannot determine them']
-        return Roads(fit, support, tuple(assumptions), (halves,), Reason(
-            'one_direction', f'all {tracks_seen} tracks that agree follow one road: rotation about it is free',
-            'wait for traffic across the main road'))
-    checks = [] if fit.problem.perpendicular else [angle]
-    assumptions += [angle] if fit.problem.perpendicular else []
-    return Roads(fit, support, tuple(assumptions), (*checks, halves), _plane_doubt(fit, tracks, gate))
+        return Roads(fit, support, assumptions, (halves,), Reason(
+            'one_direction', f'no traffic across the main road yet: {tracks_seen} tracks follow one road, and rotation '
+            'about it is free', 'wait for traffic across the main road'))
+    checks = () if fit.crossing_held else (angle,)
+    return Roads(fit, support, (*assumptions, angle) if fit.crossing_held else assumptions, (*checks, halves),
+                 plane_doubt(fit, tracks, gate))
 
 
-def _lens_doubt(fit: JointFit, contrast: float, tracks: TrackSet, options: JointOptions,
-                gate: GateOptions) -> Reason | None:
-    camera, share = fit.state.camera, tracks.share_of_vehicle
-    straight = float((share * fit.explained()).sum() / share.sum())
-    if straight < STRAIGHT_SHARE:
-        return Reason(
-            'turning_traffic', f'only {straight:.0%} of the vehicles follow the best straight roads, '
-            f'{STRAIGHT_SHARE:.0%} are needed: the traffic turns, or the road bends',
-            'wait for straight traffic, or turn the camera towards a straight road')
-    if contrast < MIN_CONTRAST:
-        return Reason(
-            'no_agreement', f'the traffic singles out no focal length: the best agrees {contrast:.2f} times as well as '
-            f'the middling one, {MIN_CONTRAST:g} is needed',
-            'wait for straight traffic, above all near the borders of the image; the traffic may be turning, or the '
-            'lens may have no distortion')
-    _, below = normal_of(fit.state, tracks)
-    if len(fit.state.angles_rad) > 1 and below < BELOW_HORIZON:
-        return Reason(
-            'horizon', f'{1 - below:.0%} of the tracked points lie above the horizon that the roads imply',
-            'the directions found do not belong to one plane: wait for more straight traffic on both roads')
-    sigma = float(fit.sigma(lambda state: np.array([np.log(state.camera.focal_px)]))[0])
-    diagonals = camera.focal_px / np.hypot(camera.width, camera.height)
-    if diagonals > LONGEST_FOCAL or not sigma <= gate.max_sigma_focal_rel:
-        return Reason(
-            'too_little_curvature', f'straight traffic shows too little lens curvature: focal length '
-            f'{camera.focal_px:.0f} px +- {min(sigma, 9.99):.0%}, {gate.max_sigma_focal_rel:.0%} is needed',
-            'wait for traffic nearer the borders of the image; a lens without distortion needs its focal length given')
-    k1_sigmas = abs(camera.k[0]) / max(options.k1_sigma, 1e-9)
-    if k1_sigmas > PRIOR_SIGMAS:
-        return Reason(
-            'lens_model', f'the lens is not close to equidistant: k1 = {camera.k[0]:.3f}, {k1_sigmas:.1f} sigmas off',
-            'widen joint.k1_sigma if the lens is known to differ')
-    return None
-
-
-def _plane_doubt(fit: JointFit, tracks: TrackSet, gate: GateOptions) -> Reason | None:
-    normal, _ = normal_of(fit.state, tracks)
-    sigma = fit.sigma(lambda state: tilt_and_roll_deg(_same_side(state.rotation[:, 2], normal)))
-    if not sigma.max() <= gate.max_sigma_tilt_deg:
-        return Reason(
-            'plane_uncertain', f'the ground normal is known to {min(sigma.max(), 90.0):.1f} degrees, '
-            f'{gate.max_sigma_tilt_deg:g} are needed', 'wait for more traffic on the quieter road')
-    return None
-
-
-def _same_side(normal: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    return normal if normal @ reference > 0 else -normal
-
-
-def _halves_doubt(fit: JointFit, tracks: TrackSet, options: JointOptions, gate: GateOptions) -> Reason | str:
-    """Solve the earlier and the later half of the vehicles; they have to agree within what they know."""
-    halves = [tracks.subset(mask) for mask in _time_halves(tracks)]
-    if min(map(len, halves)) < MIN_TRACKS:
-        return NOT_CROSS_CHECKED
-    angle_held = fit.problem.perpendicular
-    fits = [solve_joint(fit.state, half, options, perpendicular=angle_held) for half in halves]
-    masks = [road_support(part, half) for part, half in zip(fits, halves, strict=True)]
-    if min(mask.sum() for pair in masks for mask in pair) < gate.min_tracks_per_road // 2:
-        return NOT_CROSS_CHECKED
-    (focal, focal_sigma), (turn, turn_sigma) = _difference(*fits)
-    if len(fit.state.angles_rad) < 2:
-        turn = 0.0  # one road leaves the normal free
-    if focal > max(HALVES_SIGMAS * focal_sigma, HALVES_FOCAL) or turn > max(HALVES_SIGMAS * turn_sigma, HALVES_DEG):
-        return Reason(
-            'halves_disagree', f'the earlier and the later half of the traffic disagree: focal length by {focal:.1%}, '
-            f'ground normal by {turn:.1f} degrees', 'record for longer; check that the camera is firmly fixed')
-    normal = f' and {turn:.1f} degrees in the ground normal' if len(fit.state.angles_rad) > 1 else ''
-    return f'the earlier and the later half of the traffic differ by {focal:.1%} in focal length{normal}'
-
-
-def _time_halves(tracks: TrackSet) -> tuple[np.ndarray, np.ndarray]:
-    """Split the tracks by their vehicles' mean time, so that no vehicle is in both halves."""
-    vehicles, inverse = np.unique(tracks.vehicles, return_inverse=True)
-    mean = np.bincount(inverse, tracks.times_s) / np.bincount(inverse)
-    early = (mean <= np.median(mean))[inverse]
-    return early, ~early
-
-
-def _difference(first: JointFit, second: JointFit) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Differences of relative focal length and of the normal in degrees, each with its standard deviation."""
-    normals = [fit.state.rotation[:, 2] for fit in (first, second)]
-    cosine = abs(float(normals[0] @ normals[1]))
-    sigmas = [fit.sigma(lambda state, at=normal: np.array([
-        np.log(state.camera.focal_px), *np.degrees(np.cross(at, state.rotation[:, 2]))]))
-        for fit, normal in zip((first, second), normals, strict=True)]
-    focal = abs(float(np.log(first.state.camera.focal_px / second.state.camera.focal_px)))
-    total = np.hypot(*sigmas)
-    return (focal, float(total[0])), (float(np.degrees(np.arccos(min(cosine, 1.0)))),
-                                      float(np.linalg.norm(total[1:])))
+def lens_assumptions(fit: JointFit, held: tuple[str, ...]) -> tuple[str, ...]:
+    """Say in words what was taken for granted of the lens."""
+    prior = fit.problem.setting.prior
+    if prior.family == 'known':
+        return ('the lens is as given: only the pose was solved',)
+    words = {'equidistant': 'lens near equidistant: k1 = 0', 'distortion_free': 'lens free of distortion: k1 = 1/3',
+             'kannala_brandt': 'lens between equidistant and free of distortion: k1 = 1/6'}
+    told = [f'{words[prior.family]} +- {prior.sigma[3]:.3g}']
+    point = prior.sigma[1]
+    told.append('principal point at the image centre' + (f' +- {point:.0f} px' if point > 0 else ''))
+    if np.isfinite(prior.sigma[0]):
+        sigma = prior.sigma[0] * prior.centre.focal_px
+        spread = f' +- {sigma:g} px' if sigma > 0 else ''
+        told.append(f'focal length {prior.centre.focal_px:g} px{spread} (given)')
+    return (*told, *(f'{name} held there: the traffic cannot determine it' for name in held))

@@ -1,11 +1,12 @@
-"""The files of a replay: checked for before the work, written after it."""
+"""The files of a result: checked for before the work, written after it."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
 
-from autocalib_ros.calibration import Calibration, write_calibration_json, write_camera_info_yaml
+from autocalib_ros.calibration import Calibration, write_calibration_json
+from autocalib_ros.camera_info import write_camera_info_yaml
 from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.offline.replay import ReplayResult
 from autocalib_ros.offline.sources import Source
@@ -13,7 +14,7 @@ from autocalib_ros.offline.sources import Source
 CAMERA_INFO, CALIBRATION, EVIDENCE, REPORT = 'camera_info.yaml', 'calibration.json', 'evidence.npz', 'report.html'
 
 
-def prepare(out_dir: Path, bag: Path | None) -> None:
+def prepare(out_dir: Path, bag: Path | None = None) -> None:
     """Make the folder for the results, and make sure that nothing stands in the way; UsageError otherwise."""
     if out_dir.exists() and not out_dir.is_dir():
         raise UsageError(f'{out_dir} is a file, not a folder for the results')
@@ -40,18 +41,24 @@ def image_topic(source: Source) -> str:
 
 
 def write_outputs(out_dir: Path, replayed: ReplayResult, source: Source) -> list[str]:
-    """Write all results, and remove those of an earlier run that no longer hold; return the names written."""
+    """Write the results of a replay with its evidence; return the names written."""
+    names = write_result(out_dir, replayed, source.name, camera_name(source))
+    replayed.evidence.save(out_dir / EVIDENCE)
+    return [*names, EVIDENCE]
+
+
+def write_result(out_dir: Path, replayed: ReplayResult, source_name: str, name_of_camera: str = 'camera') -> list[str]:
+    """Write the results, and remove those of an earlier run that no longer hold; return the names written."""
     from autocalib_ros.offline.report import write_report  # imported late: it needs matplotlib
 
     result = replayed.result
     if isinstance(result, Calibration):
-        write_camera_info_yaml(out_dir / CAMERA_INFO, result.camera, camera_name(source))
+        write_camera_info_yaml(out_dir / CAMERA_INFO, result.camera, name_of_camera)
     else:
         _remove(out_dir / CAMERA_INFO)
     write_calibration_json(out_dir / CALIBRATION, result, accepted_at_s=replayed.accepted_at_s)
-    replayed.evidence.save(out_dir / EVIDENCE)
-    write_report(out_dir / REPORT, replayed, source.name)
-    return ([CAMERA_INFO] if result else []) + [CALIBRATION, REPORT, EVIDENCE]
+    write_report(out_dir / REPORT, replayed, source_name)
+    return ([CAMERA_INFO] if result else []) + [CALIBRATION, REPORT]
 
 
 def _remove(path: Path) -> None:

@@ -18,6 +18,18 @@ OVERRIDES_OF_ROS = 'qos_overrides.'
 
 def read_params_file(path: Path) -> dict[str, Any]:
     """Return the core's options in a ROS 2 parameter file by full name; what only a live node needs is left out."""
+    return {name: value for name, value in _values(path).items() if not _only_for_nodes(name)}
+
+
+def camera_info_file(path: Path) -> str:
+    """Return the file with the lens that a ROS 2 parameter file names, '' where it names none.
+
+    A replay uses the lens that the live node uses, so that both give the same.
+    """
+    return NodeOptions(camera_info_file=_values(path).get('camera_info_file', '')).camera_info_file
+
+
+def _values(path: Path) -> dict[str, Any]:
     try:
         tree = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
     except OSError as error:
@@ -27,7 +39,7 @@ def read_params_file(path: Path) -> dict[str, Any]:
     values: dict[str, Any] = {}
     for section in _chosen(path, _sections(tree)):
         values.update(flattened(section))
-    return {name: value for name, value in values.items() if not _only_for_nodes(name)}
+    return values
 
 
 def _sections(tree: Any, name: str = '') -> dict[str, Mapping[str, Any]]:

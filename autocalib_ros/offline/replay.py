@@ -9,6 +9,7 @@ import numpy as np
 
 from autocalib_ros.calibration import Calibration, Refusal
 from autocalib_ros.calibrator import AutoCalibrator, solve
+from autocalib_ros.camera import Camera
 from autocalib_ros.config import Options
 from autocalib_ros.errors import InputError
 from autocalib_ros.evidence import Evidence
@@ -31,13 +32,18 @@ class ReplayResult:
     frames: int
 
 
-def replay(source: Source, options: Options, on_progress: Callable[[int, str], None] | None = None) -> ReplayResult:
-    """Go through a recording and solve at its end; `on_progress` is told the frames done and a short note."""
-    calibrator, accepted_at_s, count, note = AutoCalibrator(options), None, 0, ''
+def replay(source: Source, options: Options, on_progress: Callable[[int, str], None] | None = None,
+           lens: Camera | None = None) -> ReplayResult:
+    """Go through a recording and solve at its end; `on_progress` is told the frames done and a short note.
+
+    With a known `lens` only the pose is solved; UsageError at the first image that is not of its shape.
+    """
+    calibrator, accepted_at_s, count, note, fitting = AutoCalibrator(options), None, 0, '', None
     for count, frame in enumerate(source.frames(), start=1):
+        fitting = _fitting(lens, (frame.image.shape[1], frame.image.shape[0]))
         calibrator.add_image(frame.stamp_ns, frame.image)
         # a live run would have been accepted then; afterwards only the last solution counts
-        if accepted_at_s is None and (due := calibrator.take_due()) is not None and solve(due, options):
+        if accepted_at_s is None and (due := calibrator.take_due()) is not None and solve(due, options, lens=fitting):
             accepted_at_s = due.seconds
         if on_progress is not None:
             if count % NOTE_EVERY == 1:
@@ -48,8 +54,18 @@ def replay(source: Source, options: Options, on_progress: Callable[[int, str], N
         raise InputError(f'{source.name} gives no image')
     if on_progress is not None:
         on_progress(count, 'solving')
-    result = solve(evidence, options)
+    result = solve(evidence, options, lens=fitting)
     if result and accepted_at_s is None:
         accepted_at_s = evidence.seconds
     return ReplayResult(result=result, evidence=evidence, accepted_at_s=accepted_at_s,
                         background=calibrator.background(), frames=count)
+
+
+def solve_again(evidence: Evidence, options: Options, lens: Camera | None = None) -> ReplayResult:
+    """Solve saved evidence; it does not tell when it would first have been accepted, and has no picture."""
+    return ReplayResult(result=solve(evidence, options, lens=_fitting(lens, evidence.image_size)), evidence=evidence,
+                        accepted_at_s=None, background=None, frames=evidence.frames)
+
+
+def _fitting(lens: Camera | None, image_size: tuple[int, int]) -> Camera | None:
+    return None if lens is None else lens.scaled_to(*image_size)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from autocalib_ros.calibration import Calibration, Refusal
+from autocalib_ros.calibration import GROUND_DISTANCES_M, Calibration, Refusal
 from autocalib_ros.camera import Camera
 from autocalib_ros.estimation.ground_plane import tilt_and_roll_deg
 
@@ -81,7 +81,10 @@ def _ground_rows(result: Calibration) -> list[Row]:
     height, note = (f'{result.ground.height_m:.2f} m', 'as given') if result.ground.metric else ('1 (unit)', '')
     return [Row('camera height', height, _number(result.stddev.height_m, 2), note),
             Row('looks down by', f'{down:.2f} degrees', _number(result.stddev.tilt_deg, 2)),
-            Row('rolled by', f'{roll:.2f} degrees', _number(result.stddev.roll_deg, 2))]
+            Row('rolled by', f'{roll:.2f} degrees', _number(result.stddev.roll_deg, 2)),
+            *[Row(f'road {distance:g} m ahead', 'on the road', f'{sigma:.2f} m', 'of where a pixel meets it')
+              for distance, sigma in zip(GROUND_DISTANCES_M, result.stddev.ground_point_m, strict=False)
+              if sigma is not None]]
 
 
 def _paper_rows(result: Calibration) -> list[Row]:

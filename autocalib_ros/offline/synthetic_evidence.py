@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from autocalib_ros.camera import Camera
 from autocalib_ros.config import BufferOptions
+from autocalib_ros.errors import UsageError
 from autocalib_ros.evidence import Evidence, EvidenceBuffer, Segments, Track
+from autocalib_ros.offline.synthetic_traffic import INTERVAL_S, LANE_M, Drive, drive_across
+from autocalib_ros.offline.synthetic_trouble import Sway, background_drift_px, spoil
 
-INTERVAL_S = 0.1
 SEGMENT_INTERVAL_S = 0.4
 MIN_LENGTH_PX = 25.0
-LANE_M = 3.5
+MIN_POINTS = 8
+MAX_POINTS = 32
+RANGE_M = 60.0
+"""Farther points are too small to be followed."""
+HEADWAY_S = 1.5
+MAX_VEHICLES_PER_TRACK = 100
+"""A junction where fewer vehicles leave a track is out of view."""
 
 
 def pose(tilt_deg: float, roll_deg: float, heading_deg: float) -> np.ndarray:
@@ -36,56 +45,74 @@ class Junction:
     centre_m: tuple[float, float] = (18.0, -12.0)
     """Where the roads cross, relative to the camera's foot point in the ground frame."""
     road_angles_deg: tuple[float, ...] = (0.0, 90.0)
+    lanes_m: tuple[float, ...] = (0.5 * LANE_M, 1.5 * LANE_M)
+    """How far to the right of its road's middle a vehicle may drive."""
+    drive: Drive = drive_across
+    """How a road user moves."""
     vehicles: int = 60
+    tracks: int | None = None
+    """When set, vehicles drive until exactly so many tracks are recorded, and `vehicles` does not count."""
     points_per_vehicle: int = 4
     turning_share: float = 0.2
+    lane_change_share: float = 0.0
     wander_m: float = 0.1
     noise_px: float = 0.5
+    outlier_share: float = 0.0
+    """Share of the tracks that are spoilt."""
+    window_px: tuple[float, float] | None = None
+    """Columns between which the road is in view; all of them where it is None."""
+    sway: Sway | None = None
+    """How the camera moves about `camera_from_ground`."""
 
     @property
     def normal_in_camera(self) -> np.ndarray:
         """Upward normal of the road in the camera frame, shape (3,)."""
         return self.camera_from_ground[:, 2]
 
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """Width and height in pixels."""
+        return self.camera.width, self.camera.height
+
 
 def synthetic_evidence(junction: Junction, generator: np.random.Generator) -> Evidence:
     """Drive vehicles through the junction and record their points as a tracker would."""
-    buffer = EvidenceBuffer(BufferOptions())
+    tracks: list[Track] = []
     newest = 0.0
-    for vehicle in range(junction.vehicles):
-        start = 1.5 * vehicle
-        path, heading = _drive(junction, generator)
-        times = start + INTERVAL_S * np.arange(len(path))
+    for vehicle in _vehicles(junction, tracks):
+        path, heading = junction.drive(junction, generator)
+        times = HEADWAY_S * vehicle + INTERVAL_S * np.arange(len(path))
         newest = max(newest, float(times[-1]))
         for _ in range(junction.points_per_vehicle):
             track = _observe(junction, generator, path, heading, times, vehicle)
-            if track is not None:
-                buffer.add_track(track)
-                buffer.add_segments(_segments(track))
+            if track is not None and len(tracks) != junction.tracks:
+                tracks.append(track)
+    drift = 0.0 if junction.sway is None else background_drift_px(junction.camera, junction.sway, newest)
+    return gathered(tracks, junction.image_size, newest, drift)
+
+
+def gathered(tracks: list[Track], image_size: tuple[int, int], newest_s: float, drift_px: float = 0.0) -> Evidence:
+    """Return the evidence of tracks, with the segments that matches between masked frames would give."""
+    buffer = EvidenceBuffer(BufferOptions())
+    for track in tracks:
+        buffer.add_track(track)
+        buffer.add_segments(_segments(track))
     return buffer.snapshot(
-        image_size=(junction.camera.width, junction.camera.height), first_stamp_ns=0,
-        newest_stamp_ns=int(newest * 1e9), frames=int(newest / INTERVAL_S), drift_px=0.0, unfinished=[])
+        image_size=image_size, first_stamp_ns=0, newest_stamp_ns=int(newest_s * 1e9),
+        frames=int(newest_s / INTERVAL_S), drift_px=drift_px, unfinished=[])
 
 
-def _drive(junction: Junction, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions (n, 2) in metres and headings (n,) in radians of one vehicle, every `INTERVAL_S`."""
-    road = np.radians(generator.choice(junction.road_angles_deg))
-    way = generator.choice([0.0, np.pi])
-    speed = generator.uniform(6.0, 13.0)
-    along = np.arange(-45.0, 45.0, speed * INTERVAL_S)
-    heading = np.full(len(along), road + way)
-    lane = -LANE_M * (generator.integers(2) + 0.5)
-    if generator.uniform() < junction.turning_share:
-        radius = generator.uniform(8.0, 25.0)
-        turned = np.clip((along + radius) / radius, 0.0, np.pi / 2) * generator.choice([-1.0, 1.0])
-        heading = heading + turned
-    forward = np.column_stack([np.cos(heading), np.sin(heading)])
-    start = np.array(junction.centre_m) + along[0] * forward[0] + lane * np.array([forward[0, 1], -forward[0, 0]])
-    centre = start + np.concatenate([[[0.0, 0.0]], np.cumsum(forward[:-1], axis=0) * speed * INTERVAL_S])
-    sway = sum(np.sin(along * 2 * np.pi / generator.uniform(25, 80) + generator.uniform(0, 2 * np.pi))
-               for _ in range(2))
-    lateral = junction.wander_m * np.asarray(sway)[:, None] * np.column_stack([-forward[:, 1], forward[:, 0]])
-    return centre + lateral, heading
+def _vehicles(junction: Junction, tracks: list[Track]) -> Iterator[int]:
+    """Count vehicles until all have come, or until the tracks are as many as wanted."""
+    if junction.tracks is None:
+        yield from range(junction.vehicles)
+        return
+    for vehicle in range(MAX_VEHICLES_PER_TRACK * junction.tracks):
+        if len(tracks) == junction.tracks:
+            return
+        yield vehicle
+    raise UsageError(f'{MAX_VEHICLES_PER_TRACK * junction.tracks} vehicles left {len(tracks)} tracks of the '
+                     f'{junction.tracks} wanted: the road is out of view')
 
 
 def _observe(junction: Junction, generator: np.random.Generator, path: np.ndarray, heading: np.ndarray,
@@ -96,15 +123,25 @@ def _observe(junction: Junction, generator: np.random.Generator, path: np.ndarra
     leftward = np.column_stack([-forward[:, 1], forward[:, 0]])
     ground = path + ahead * forward + left * leftward
     relative = np.column_stack([ground, np.full(len(ground), up - junction.height_m)])
-    pixels, valid = junction.camera.project(relative @ junction.camera_from_ground.T)
-    size = (junction.camera.width, junction.camera.height)
-    seen = valid & (pixels >= 0).all(axis=1) & (pixels < size).all(axis=1) & (np.hypot(*ground.T) < 60.0)
+    pixels, valid = junction.camera.project(_bearings(junction, relative, times))
+    seen = valid & (pixels >= 0).all(axis=1) & (pixels < junction.image_size).all(axis=1)
+    seen &= np.hypot(*ground.T) < RANGE_M
+    if junction.window_px is not None:
+        seen &= (pixels[:, 0] >= junction.window_px[0]) & (pixels[:, 0] < junction.window_px[1])
     first, last = _longest_run(seen)
     points = pixels[first:last] + generator.normal(scale=junction.noise_px, size=(last - first, 2))
-    if len(points) < 8 or np.hypot(*(points[-1] - points[0])) < MIN_LENGTH_PX:
+    if len(points) >= MIN_POINTS and junction.outlier_share and generator.uniform() < junction.outlier_share:
+        points = spoil(points, junction.image_size, generator)
+    if len(points) < MIN_POINTS or np.hypot(*(points[-1] - points[0])) < MIN_LENGTH_PX:
         return None
-    chosen = np.unique(np.round(np.linspace(0, len(points) - 1, 32)).astype(int))
+    chosen = np.unique(np.round(np.linspace(0, len(points) - 1, MAX_POINTS)).astype(int))
     return Track(vehicle, times[first:last][chosen], points[chosen])
+
+
+def _bearings(junction: Junction, relative_m: np.ndarray, times_s: np.ndarray) -> np.ndarray:
+    """Turn points (n, 3) relative to the camera, ground axes, into the camera frame of their times (n,)."""
+    steady = relative_m @ junction.camera_from_ground.T
+    return steady if junction.sway is None else np.einsum('nij,nj->ni', junction.sway(times_s), steady)
 
 
 def _longest_run(seen: np.ndarray) -> tuple[int, int]:

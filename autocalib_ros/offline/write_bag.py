@@ -12,7 +12,8 @@ from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, Qo
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from autocalib_ros.calibration import Calibration, GroundPlane, camera_info
+from autocalib_ros.calibration import Calibration, GroundPlane
+from autocalib_ros.camera_info import camera_info
 from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.offline.outputs import camera_name, image_topic
 from autocalib_ros.offline.sources import Source, StoredImage

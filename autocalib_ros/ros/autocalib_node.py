@@ -19,9 +19,10 @@ from rclpy.task import Future
 from sensor_msgs.msg import CameraInfo
 from std_srvs.srv import Trigger
 
-from autocalib_ros.calibration import Calibration, Refusal, camera_info
-from autocalib_ros.calibration import CameraInfo as CameraInfoFields
+from autocalib_ros.calibration import Calibration, Refusal
 from autocalib_ros.calibrator import solve
+from autocalib_ros.camera_info import CameraInfo as CameraInfoFields
+from autocalib_ros.camera_info import camera_info, read_camera_info
 from autocalib_ros.errors import AutocalibError
 from autocalib_ros.perception.images import ImageDecoder
 from autocalib_ros.ros import messages
@@ -55,6 +56,8 @@ class AutocalibNode(Node):
     def __init__(self, *, solve: Solve = solve, **node_arguments: Any) -> None:
         super().__init__('autocalib', automatically_declare_parameters_from_overrides=True, **node_arguments)
         self.options, self.node_options = options_of(self)
+        lens_file = self.node_options.camera_info_file
+        lens = read_camera_info(lens_file) if lens_file else None
         self._headers = Headers(self.node_options, self.get_namespace(), self.get_logger().warning,
                                 lambda: self.get_clock().now().nanoseconds)
         self._lock = threading.Lock()
@@ -65,7 +68,7 @@ class AutocalibNode(Node):
         self._camera_info = self.create_publisher(CameraInfo, '~/camera_info', LATCHED)
         self._ground_transform = self.create_publisher(TransformStamped, '~/ground_transform', LATCHED)
         self._pipeline = Pipeline(self.options, idle_solve_s=self.node_options.idle_solve_s,
-                                  decode=ImageDecoder().decode, solve=solve, listener=self)
+                                  decode=ImageDecoder().decode, solve=solve, listener=self, lens=lens)
         # While a caller waits for its solution, everything outside this group goes on.
         self.create_service(Trigger, '~/calibrate', self._on_calibrate, callback_group=MutuallyExclusiveCallbackGroup())
         self._input = ImageInput(self, self.node_options, self._on_image)

@@ -15,8 +15,8 @@ from geometry_msgs.msg import Quaternion, Transform, TransformStamped, Vector3
 from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import Header
 
-from autocalib_ros.calibration import CameraInfo as CameraInfoFields
 from autocalib_ros.calibration import GroundPlane
+from autocalib_ros.camera_info import CameraInfo as CameraInfoFields
 from autocalib_ros.errors import AutocalibError
 
 COEFFICIENTS = {'plumb_bob': 5, 'rational_polynomial': 8, 'equidistant': 4}

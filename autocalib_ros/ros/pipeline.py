@@ -22,6 +22,7 @@ import numpy as np
 
 from autocalib_ros.calibration import Calibration, Refusal
 from autocalib_ros.calibrator import AutoCalibrator, Progress
+from autocalib_ros.camera import Camera
 from autocalib_ros.config import Options
 from autocalib_ros.errors import AutocalibError
 from autocalib_ros.evidence import Evidence
@@ -31,7 +32,13 @@ WAITING_IMAGES = 8
 PROGRESS_PERIOD_S = 1.0
 """Real time between two looks at the progress."""
 Result = Calibration | Refusal
-Solve = Callable[[Evidence, Options], Result]
+
+
+class Solve(Protocol):
+    """A solver: with a known lens only the pose."""
+
+    def __call__(self, evidence: Evidence, options: Options, /, *, lens: Camera | None) -> Result:
+        """Return a calibration or a refusal."""
 
 
 class Listener(Protocol):
@@ -75,8 +82,8 @@ class Pipeline:
     """Owns the calibrator and the two threads; `offer` and `solve_now` may be called from any thread."""
 
     def __init__(self, options: Options, *, idle_solve_s: float, decode: Callable[[Any], np.ndarray], solve: Solve,
-                 listener: Listener) -> None:
-        self._options, self._idle_solve_s = options, idle_solve_s
+                 listener: Listener, lens: Camera | None = None) -> None:
+        self._options, self._idle_solve_s, self._lens = options, idle_solve_s, lens
         self._decode, self._solve, self._listener = decode, solve, listener
         self._calibrator = AutoCalibrator(options)
         self._changed = threading.Condition()
@@ -157,6 +164,7 @@ class Pipeline:
         try:
             image = self._decode(message)
             height, width = image.shape[:2]
+            self._fitting((width, height))  # an image of another shape than the lens's is left out
             self._calibrator.add_image(stamp_ns, image)
         except AutocalibError as error:
             self.counters.unreadable += 1
@@ -195,10 +203,17 @@ class Pipeline:
                     return
                 job = self._running = self._job
                 self._job = None
-            result = self._guarded(partial(self._solve, job.evidence, self._options))
+            result = self._guarded(partial(self._solved, job.evidence))
             if result is not None:
                 self._guarded(partial(self._listener.solved, result))
             self._answer(job.waiting, result)
+
+    def _solved(self, evidence: Evidence) -> Result:
+        return self._solve(evidence, self._options, lens=self._fitting(evidence.image_size))
+
+    def _fitting(self, image_size: tuple[int, int]) -> Camera | None:
+        """Return the known lens for images of that size; UsageError when they have another shape."""
+        return None if self._lens is None else self._lens.scaled_to(*image_size)
 
     def _answer(self, futures: list[Future], result: Result | None) -> None:
         """Give callers their result; `close` may have sent them away in the meantime."""

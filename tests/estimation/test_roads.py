@@ -11,17 +11,19 @@ from autocalib_ros.calibration import Calibration, Refusal
 from autocalib_ros.calibrator import solve
 from autocalib_ros.camera import Camera
 from autocalib_ros.config import GateOptions, JointOptions, Options
+from autocalib_ros.estimation.doubts import NOT_CROSS_CHECKED, halves_doubt
 from autocalib_ros.estimation.great_circles import select_tracks
-from autocalib_ros.estimation.joint import State, solve_joint
-from autocalib_ros.estimation.roads import NOT_CROSS_CHECKED, _halves_doubt
+from autocalib_ros.estimation.joint import Setting, State, solve_joint
+from autocalib_ros.estimation.lens_prior import lens_priors
 from autocalib_ros.evidence import Evidence
 from autocalib_ros.offline.synthetic_evidence import Junction, pose, synthetic_evidence
 
 OPTIONS = Options(camera_height=8.0)
 
 
-def solved(junction: Junction, seed: int = 0, options: Options = OPTIONS) -> Calibration | Refusal:
-    return solve(synthetic_evidence(junction, np.random.default_rng(seed)), options)
+def solved(junction: Junction, seed: int = 0, options: Options = OPTIONS,
+           lens: Camera | None = None) -> Calibration | Refusal:
+    return solve(synthetic_evidence(junction, np.random.default_rng(seed)), options, lens=lens)
 
 
 def normal_error_deg(result: Calibration, junction: Junction) -> float:
@@ -79,10 +81,79 @@ def test_perpendicularity_is_tested_before_it_is_used() -> None:
 
 
 def test_perpendicularity_can_be_asserted() -> None:
-    result = solved(Junction(), options=replace(OPTIONS, joint=JointOptions(road_angle='perpendicular')))
+    result = solved(Junction(), options=replace(OPTIONS, joint=JointOptions(road_angle='90')))
     assert isinstance(result, Calibration)
     first, second = result.road_directions
     assert first @ second == pytest.approx(0.0, abs=1e-9)
+
+
+def test_an_asserted_angle_that_is_not_90_degrees_is_held() -> None:
+    junction = Junction(road_angles_deg=(0.0, 70.0), vehicles=120)
+    result = solved(junction, options=replace(OPTIONS, joint=JointOptions(road_angle='70')))
+    assert isinstance(result, Calibration)
+    assert 'roads cross at 70 degrees (asserted)' in result.assumptions
+    first, second = result.road_directions
+    assert abs(first @ second) == pytest.approx(np.cos(np.radians(70.0)), abs=1e-9)
+    assert normal_error_deg(result, junction) < 0.5
+
+
+def test_three_roads_are_found_and_agree_with_the_truth() -> None:
+    junction = Junction(road_angles_deg=(0.0, 60.0, 120.0), vehicles=180)
+    result = solved(junction)
+    assert isinstance(result, Calibration)
+    assert len(result.road_directions) == 3
+    assert normal_error_deg(result, junction) < 0.7
+
+
+def test_a_known_lens_is_kept_and_the_pose_solved() -> None:
+    camera = Camera(1280, 720, 560.0, (650.0, 352.0), (0.05, 0.01, 0.0, 0.0))  # no family holds such a lens
+    junction = Junction(camera=camera)
+    result = solved(junction, lens=camera)
+    assert isinstance(result, Calibration)
+    assert result.camera == camera
+    assert result.stddev.focal_px == 0.0
+    assert result.assumptions[0] == 'the lens is as given: only the pose was solved'
+    assert normal_error_deg(result, junction) < 0.5
+
+
+def test_a_focal_length_that_is_given_exactly_is_kept() -> None:
+    result = solved(Junction(), options=replace(OPTIONS, joint=JointOptions(focal_prior_px=560.0)))
+    assert isinstance(result, Calibration)
+    assert result.camera.focal_px == 560.0
+
+
+def test_a_focal_length_given_with_a_spread_is_weighed() -> None:
+    options = replace(OPTIONS, joint=JointOptions(focal_prior_px=560.0, focal_sigma_px=1.0))
+    result = solved(Junction(), options=options)
+    assert isinstance(result, Calibration) and result.stddev.focal_px is not None
+    assert result.camera.focal_px == pytest.approx(560.0, abs=3.0)  # 3 sigma of what is given
+    assert 0.0 < result.stddev.focal_px <= 1.05
+
+
+def test_a_distortion_free_lens_is_found_when_the_angle_of_the_roads_is_given() -> None:
+    camera = Camera(1280, 720, 900.0, (639.5, 359.5), (1 / 3, 2 / 15, 17 / 315, 62 / 2835))
+    junction = Junction(camera=camera, vehicles=150, camera_from_ground=pose(25.0, 0.0, 35.0))
+    options = replace(OPTIONS, joint=JointOptions(road_angle='90', lens_prior='distortion_free', k1_sigma=0.0))
+    result = solved(junction, options=options)
+    assert isinstance(result, Calibration)
+    assert result.camera.focal_px == pytest.approx(900.0, rel=0.03)
+    assert normal_error_deg(result, junction) < 0.7
+
+
+def test_what_one_road_cannot_tell_is_held_and_said() -> None:
+    junction = Junction(road_angles_deg=(0.0,), turning_share=0.0, vehicles=120,
+                        camera_from_ground=pose(35.0, 1.0, 60.0), centre_m=(6.0, -10.0))
+    result = solved(junction)
+    assert isinstance(result, Calibration)
+    assert any('held there: the traffic cannot determine it' in text for text in result.assumptions)
+
+
+def test_ground_points_are_less_sure_farther_away() -> None:
+    result = solved(Junction())
+    assert isinstance(result, Calibration)
+    near, middle, far = result.stddev.ground_point_m
+    assert near is not None and middle is not None and far is not None
+    assert 0.0 < near < middle < far < 4.0  # metres; a tenth of the distance at the most
 
 
 def test_one_road_gives_a_lens_and_says_why_there_is_no_plane() -> None:
@@ -146,8 +217,9 @@ def test_a_half_without_tracks_is_said_not_to_be_cross_checked() -> None:
     tracks = select_tracks(synthetic_evidence(Junction(), np.random.default_rng(0)), 500)
     one_vehicle = replace(tracks, vehicles=np.zeros(len(tracks), int))  # then all of it is in the earlier half
     state = State(Junction().camera, Junction().camera_from_ground, np.array([0.0, np.pi / 2]))
-    fit = solve_joint(state, one_vehicle, JointOptions())
-    assert _halves_doubt(fit, one_vehicle, JointOptions(), GateOptions()) == NOT_CROSS_CHECKED
+    prior = lens_priors((1280, 720), JointOptions())[0]
+    fit = solve_joint(state, one_vehicle, Setting(prior, JointOptions()))
+    assert halves_doubt(fit, one_vehicle, GateOptions()) == NOT_CROSS_CHECKED
 
 
 def test_a_moving_camera_is_refused() -> None:

@@ -5,26 +5,60 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from autocalib_ros.estimation.uncertainty import cluster_covariance, propagate
+from autocalib_ros.estimation.uncertainty import cluster_covariance, correlation_within, propagate, told_by_evidence
 
 
-def test_covariance_covers_errors_shared_within_a_group() -> None:
-    # 40 vehicles of 10 points each share one error: the mean has the spread of 40 values, not of 400
+def plain(slopes: np.ndarray, residuals: np.ndarray, vehicles: np.ndarray, prior: np.ndarray) -> np.ndarray:
+    """Covariance of ordinary least squares, one sample a track."""
+    tracks = len(residuals)
+    return cluster_covariance(slopes[:, None], residuals[:, None], np.ones(tracks), np.zeros(tracks), vehicles, prior)
+
+
+def test_covariance_covers_errors_shared_within_a_vehicle() -> None:
+    # 40 vehicles of 10 tracks each share one error: the mean has the spread of 40 values, not of 400
     generator = np.random.default_rng(0)
-    groups = np.repeat(np.arange(40), 10)
+    vehicles = np.repeat(np.arange(40), 10)
     residuals = np.repeat(generator.normal(size=40), 10)
     residuals -= residuals.mean()
-    sigma = np.sqrt(cluster_covariance(np.ones((400, 1)), residuals, groups)[0, 0])
+    sigma = np.sqrt(plain(np.ones((400, 1)), residuals, vehicles, np.zeros(1))[0, 0])
     assert sigma == pytest.approx(1 / np.sqrt(40), rel=0.3)  # 40 draws tell a spread to a tenth; 3 sigma
 
 
+def test_leaving_out_vehicles_gives_the_jackknife_of_a_mean() -> None:
+    values = np.array([1.0, 4.0, 2.0, 7.0, 3.0])
+    sigma2 = plain(np.ones((5, 1)), values - values.mean(), np.arange(5), np.zeros(1))[0, 0]
+    left_out = np.array([np.delete(values, index).mean() for index in range(5)])
+    assert sigma2 == pytest.approx(((left_out - values.mean())**2).sum())
+
+
+def test_what_only_the_prior_knows_has_the_spread_of_the_prior() -> None:
+    slopes = np.column_stack([np.ones(50), np.zeros(50)])
+    covariance = plain(slopes, np.zeros(50), np.arange(50), np.array([0.0, 1.0]))
+    assert covariance[1, 1] == pytest.approx(1.0)
+
+
 def test_undetermined_parameters_get_an_infinite_variance() -> None:
-    jacobian = np.column_stack([np.ones(20), np.ones(20)])
-    assert np.isinf(cluster_covariance(jacobian, np.ones(20), np.arange(20))).all()
+    slopes = np.column_stack([np.ones(20), np.ones(20)])
+    assert np.isinf(plain(slopes, np.ones(20), np.arange(20), np.zeros(2))).all()
 
 
 def test_one_vehicle_says_nothing_of_its_spread() -> None:
-    assert np.isinf(cluster_covariance(np.ones((5, 1)), np.zeros(5), np.zeros(5, int))).all()
+    assert np.isinf(plain(np.ones((5, 1)), np.zeros(5), np.zeros(5, int), np.zeros(1))).all()
+
+
+def test_correlation_is_that_of_a_shared_part() -> None:
+    generator = np.random.default_rng(0)
+    groups = np.repeat(np.arange(400), 5)
+    pulls = np.sqrt(0.3) * np.repeat(generator.normal(size=(400, 2)), 5, axis=0)
+    pulls += np.sqrt(0.7) * generator.normal(size=(2000, 2))
+    assert correlation_within(groups, pulls) == pytest.approx(0.3, abs=0.08)  # 400 groups: 3 sigma
+
+
+def test_evidence_that_moves_two_parameters_alike_tells_neither() -> None:
+    slopes = np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 2.0]])
+    left = told_by_evidence(slopes.T @ slopes, np.zeros(3), np.ones(3))
+    assert np.isinf(left[:2]).all()
+    assert left[2] == pytest.approx(0.5)
 
 
 def test_propagation_is_linear() -> None:

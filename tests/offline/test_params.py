@@ -6,7 +6,7 @@ import pytest
 
 from autocalib_ros.config import Options
 from autocalib_ros.errors import InputError, UsageError
-from autocalib_ros.offline.params import options_with, parse_assignments, read_params_file
+from autocalib_ros.offline.params import camera_info_file, options_with, parse_assignments, read_params_file
 
 
 def options_from(tmp_path, text: str) -> Options:
@@ -53,6 +53,21 @@ def test_names_of_the_live_node_and_of_ros_are_ignored(tmp_path):
     text = ('/**: {ros__parameters: {image_transport: raw, camera_name: cam1, use_sim_time: true, camera_height: 8.0,'
             ' qos_overrides: {/tf: {publisher: {depth: 3}}}}}')
     assert options_from(tmp_path, text) == Options(camera_height=8.0)
+
+
+def test_the_lens_that_the_live_node_is_given_is_found(tmp_path):
+    path = tmp_path / 'params.yaml'
+    path.write_text('/**: {ros__parameters: {camera_info_file: /etc/north.yaml, camera_height: 8.0}}')
+    assert camera_info_file(path) == '/etc/north.yaml'
+    path.write_text('/**: {ros__parameters: {camera_height: 8.0}}')
+    assert camera_info_file(path) == ''
+
+
+def test_a_lens_that_is_no_file_name_is_wrong_usage(tmp_path):
+    path = tmp_path / 'params.yaml'
+    path.write_text('/**: {ros__parameters: {camera_info_file: 3}}')
+    with pytest.raises(UsageError, match="'camera_info_file' takes a str, got 3"):
+        camera_info_file(path)
 
 
 def test_an_unknown_name_is_an_error_with_a_hint(tmp_path):

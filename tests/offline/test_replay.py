@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from autocalib_ros.config import Options
-from autocalib_ros.errors import InputError
-from autocalib_ros.offline.replay import replay
+from autocalib_ros.calibrator import solve
+from autocalib_ros.camera import Camera
+from autocalib_ros.config import GateOptions, Options
+from autocalib_ros.errors import InputError, UsageError
+from autocalib_ros.offline.replay import replay, solve_again
 from autocalib_ros.offline.sources import Frame, open_source
 
 
@@ -56,6 +58,33 @@ def test_the_same_recording_gives_the_same_evidence():
 def test_a_recording_without_images_is_an_error():
     with pytest.raises(InputError, match='drive gives no image'):
         replay(Drive(0), Options())
+
+
+def test_a_known_lens_goes_into_each_solution_in_the_size_of_the_images(monkeypatch):
+    told = []
+
+    def told_solve(evidence, options, *, lens):
+        told.append(lens)
+        return solve(evidence, options)
+    monkeypatch.setattr('autocalib_ros.offline.replay.solve', told_solve)
+    options = Options(first_solve_s=0.0, gate=GateOptions(min_tracks=4))
+    replay(Drive(150), options, lens=Camera.equidistant(320, 240, 200.0))
+    assert len(told) > 1
+    assert set(told) == {Camera.equidistant(160, 120, 100.0)}
+
+
+def test_a_lens_of_another_shape_is_noticed_at_the_first_image():
+    told = []
+    with pytest.raises(UsageError, match='images of 160x90, and these images have 160x120'):
+        replay(Drive(40), Options(), lambda done, note: told.append(done), lens=Camera.equidistant(160, 90, 100.0))
+    assert not told
+
+
+def test_evidence_solved_again_gives_the_same():
+    replayed = replay(Drive(40), Options())
+    again = solve_again(replayed.evidence, Options())
+    assert again.result == replayed.result
+    assert (again.frames, again.background, again.accepted_at_s) == (40, None, None)
 
 
 def test_a_tiny_bag_goes_all_the_way(tmp_path, write_bag, images):

@@ -12,7 +12,8 @@ import cv2
 import numpy as np
 import pytest
 
-from autocalib_ros.calibration import GroundPlane, rectified_matrix
+from autocalib_ros.calibration import GroundPlane
+from autocalib_ros.camera_info import rectified_matrix
 from autocalib_ros.offline.projection import ground_to_image, image_to_ground
 from autocalib_ros.offline.report import write_report
 from autocalib_ros.offline.report.lens_figures import in_undistorted, line_error_px

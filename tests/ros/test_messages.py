@@ -10,8 +10,9 @@ from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Header
 
-from autocalib_ros.calibration import GroundPlane, camera_info
+from autocalib_ros.calibration import GroundPlane
 from autocalib_ros.camera import Camera
+from autocalib_ros.camera_info import camera_info
 from autocalib_ros.ros.messages import (
     InvalidMessage,
     camera_info_message,

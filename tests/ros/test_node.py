@@ -2,6 +2,7 @@
 
 import threading
 import time
+from dataclasses import replace
 
 import cv2
 import pytest
@@ -10,7 +11,8 @@ from rcl_interfaces.srv import GetParameters
 from rclpy.qos import ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage
 
-from autocalib_ros.calibration import camera_info
+from autocalib_ros.camera import Camera
+from autocalib_ros.camera_info import camera_info, write_camera_info_yaml
 from autocalib_ros.ros.messages import stamp_ns
 from bench import PATIENCE_S, PIXELS, SIZE, Bench, calibration, image, refusal, wait_for
 
@@ -19,15 +21,15 @@ FRAME_NS = 100_000_001
 INFO, GROUND = '/autocalib/camera_info', '/autocalib/ground_transform'
 
 
-def instantly(evidence, options):
+def instantly(evidence, options, lens):
     return calibration(evidence)
 
 
-def lens_only(evidence, options):
+def lens_only(evidence, options, lens):
     return calibration(evidence, height_m=None)
 
 
-def unit_scale(evidence, options):
+def unit_scale(evidence, options, lens):
     return calibration(evidence, height_m=1.0, metric=False)
 
 
@@ -122,7 +124,7 @@ def test_camera_info_stays_silent_image_by_image_when_latched_only(bench):
 def test_images_services_and_parameters_do_not_wait_for_a_solution(bench):
     release, running = threading.Event(), threading.Event()
 
-    def slow(evidence, options):
+    def slow(evidence, options, lens):
         if running.is_set() or evidence.frames <= node_frames['first']:
             return calibration(evidence)
         running.set()
@@ -151,7 +153,7 @@ def test_images_services_and_parameters_do_not_wait_for_a_solution(bench):
 
 
 def test_calibrate_answers_with_the_refusal(bench):
-    node = bench.start(lambda evidence, options: refusal(evidence))
+    node = bench.start(lambda evidence, options, lens: refusal(evidence))
     publish_until(bench.connected(bench.publisher()), lambda: used(node), 'an image')
     answer = bench.calibrate()
     assert not answer.success
@@ -166,7 +168,7 @@ def test_calibrate_before_the_first_image_says_so(bench):
 
 def test_refusal_keeps_the_calibration_before(bench):
     results = [calibration, refusal]
-    node, publisher = calibrated(bench, lambda evidence, options: results.pop(0)(evidence))
+    node, publisher = calibrated(bench, lambda evidence, options, lens: results.pop(0)(evidence))
     infos = bench.collect(CameraInfo, INFO)
     bench.listening(INFO)
     assert not bench.calibrate().success
@@ -176,7 +178,7 @@ def test_refusal_keeps_the_calibration_before(bench):
 
 def test_new_calibration_replaces_the_latched_one(bench):
     focals = [300.0, 310.0]
-    calibrated(bench, lambda evidence, options: calibration(evidence, focals.pop(0)))
+    calibrated(bench, lambda evidence, options, lens: calibration(evidence, focals.pop(0)))
     assert bench.calibrate().success
     infos = bench.collect(CameraInfo, INFO, latched=True)
     wait_for(lambda: infos, 'camera_info')
@@ -243,3 +245,16 @@ def test_solution_is_tried_when_the_images_end(bench):
     node = bench.start(instantly, camera_height=8.0, idle_solve_s=0.5)
     publish_until(bench.connected(bench.publisher()), lambda: used(node), 'an image')
     wait_for(lambda: node._published, 'a calibration that nobody asked for')
+
+
+def test_known_lens_is_read_and_given_to_the_solver_in_the_size_of_the_images(bench, tmp_path):
+    write_camera_info_yaml(tmp_path / 'lens.yaml', Camera.equidistant(2 * SIZE[0], 2 * SIZE[1], 512.0), 'cam')
+    node, _ = calibrated(bench, lambda evidence, options, lens: replace(calibration(evidence), camera=lens),
+                         camera_info_file=str(tmp_path / 'lens.yaml'))
+    assert node._published.result.camera == Camera.equidistant(*SIZE, 256.0)
+
+
+def test_solver_gets_no_lens_unless_one_is_given(bench):
+    told = []
+    calibrated(bench, lambda evidence, options, lens: told.append(lens) or calibration(evidence))
+    assert told and set(told) == {None}

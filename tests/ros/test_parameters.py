@@ -79,6 +79,20 @@ def test_node_ends_with_status_2_and_one_line_at_an_unusable_parameter(argument,
     assert len(done.stderr.splitlines()) == 1
 
 
+@pytest.mark.parametrize(('content', 'told'), [
+    (None, 'No such file or directory'),
+    ('image_width: 640', "it has no 'image_height'"),
+])
+def test_node_ends_with_status_2_and_one_line_at_an_unusable_camera_info_file(tmp_path, content, told):
+    path = tmp_path / 'lens.yaml'
+    if content is not None:
+        path.write_text(content)
+    done = run_node('-p', f'camera_info_file:={path}')
+    assert done.returncode == 2
+    assert str(path) in done.stderr and told in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+
+
 def test_node_ends_with_status_2_at_a_missing_parameter_file():
     done = run_node('--params-file', '/nowhere/autocalib.yaml')
     assert done.returncode == 2

@@ -2,10 +2,12 @@
 
 import threading
 from concurrent.futures import Future
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from autocalib_ros.camera import Camera
 from autocalib_ros.config import Options
 from autocalib_ros.errors import InputError
 from autocalib_ros.ros.pipeline import WAITING_IMAGES, Pipeline
@@ -50,9 +52,13 @@ def start(heard):
     """Start a pipeline around a solver; closed at the end."""
     started = []
 
-    def make(solve, idle_solve_s: float = NEVER_S) -> Pipeline:
-        started.append(Pipeline(Options(), idle_solve_s=idle_solve_s, decode=decode,
-                                solve=lambda evidence, options: solve(evidence), listener=heard))
+    def make(solve, idle_solve_s: float = NEVER_S, **more) -> Pipeline:
+        """`solve` takes the evidence, and the lens too where one is given."""
+        def adapted(evidence, options, *, lens):
+            return solve(evidence) if lens is None else solve(evidence, lens)
+
+        started.append(Pipeline(Options(), idle_solve_s=idle_solve_s, decode=decode, solve=adapted, listener=heard,
+                                **more))
         return started[-1]
 
     yield make
@@ -166,6 +172,26 @@ def test_fault_of_a_solver_is_told_and_the_next_solution_works(start, heard):
     assert result_of(pipeline.solve_now()) is None
     assert isinstance(heard.faults[0], ZeroDivisionError)
     assert result_of(pipeline.solve_now()).code == 'too_few_tracks'
+
+
+def test_known_lens_is_given_to_the_solver_in_the_size_of_the_images(start, heard):
+    height, width = PIXELS.shape
+    lens = replace(Camera.equidistant(2 * width, 2 * height, 500.0), k=(0.01, 0.0, 0.0, 0.0))
+    pipeline = start(lambda evidence, lens: replace(calibration(evidence), camera=lens), lens=lens)
+    feed(pipeline, heard, 1)
+    camera = result_of(pipeline.solve_now()).camera
+    assert camera == replace(Camera.equidistant(width, height, 250.0), k=(0.01, 0.0, 0.0, 0.0))
+
+
+def test_image_of_another_shape_than_the_known_lens_is_left_out_and_told(start, heard):
+    height, width = PIXELS.shape
+    pipeline = start(lambda evidence, lens: calibration(evidence), lens=Camera.equidistant(width, height, 250.0))
+    pipeline.offer(0, np.zeros((height, 2 * width), np.uint8))
+    wait_for(lambda: heard.unreadable, 'the complaint')
+    assert heard.unreadable == [f'the lens was calibrated in images of {width}x{height}, and these images have '
+                                f'{2 * width}x{height}, another shape: give a calibration of their size']
+    feed(pipeline, heard, 1)
+    assert (heard.sizes, heard.faults) == ([(width, height)], [])
 
 
 def test_nothing_to_solve_before_the_first_image(start):

@@ -12,8 +12,9 @@ from jinja2 import Environment, StrictUndefined
 from matplotlib.figure import Figure
 
 from autocalib_ros import __version__
-from autocalib_ros.calibration import Calibration, Refusal, write_atomically
+from autocalib_ros.calibration import Calibration, Refusal
 from autocalib_ros.errors import InputError
+from autocalib_ros.files import write_atomically
 from autocalib_ros.offline.replay import ReplayResult
 from autocalib_ros.offline.report import lens_figures, road_figures, traffic_figures
 from autocalib_ros.offline.report.canvas import Scene, png

@@ -7,8 +7,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from autocalib_ros.calibration import Calibration, rectified_matrix
+from autocalib_ros.calibration import Calibration
 from autocalib_ros.camera import Camera
+from autocalib_ros.camera_info import rectified_matrix
 from autocalib_ros.offline.report.canvas import (
     INK,
     MUTED,

@@ -1,0 +1,169 @@
+"""What speaks against a solution: each doubt gives a reason with numbers and a remedy, or nothing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from autocalib_ros.calibration import Reason
+from autocalib_ros.config import GateOptions
+from autocalib_ros.estimation.great_circles import TrackSet, rays_of
+from autocalib_ros.estimation.ground_plane import BELOW_HORIZON, tilt_and_roll_deg, upward
+from autocalib_ros.estimation.joint import MIN_TRACKS, JointFit, State, road_support, solve_joint
+
+MIN_VEHICLES = 4
+"""Vehicles, distinct, that make a road; fewer may be one driver's whim."""
+STRAIGHT_SHARE = 0.35
+"""Share of vehicles that follow the roads; below it the traffic turns, and what it agrees on is a turn."""
+ONE_ROAD_SHARE = 0.6
+"""The same where one road alone is found: on a ring or a bend some arc always passes for a road, of few vehicles."""
+MIN_CONTRAST = 1.3
+"""Agreement at the best trial focal length over that at the median one: wrong lenses bend straight paths apart."""
+LONGEST_FOCAL = 1.5
+"""Focal length, in image diagonals, beyond which no lens curvature can be seen."""
+PRIOR_SIGMAS = 3.5
+HALVES_SIGMAS = 3.5
+HALVES_FOCAL = 0.03
+HALVES_DEG = 1.5
+"""Two halves of the evidence may always differ by so much: it is within what the program promises."""
+
+NOT_CROSS_CHECKED = 'not cross-checked in time: the earlier or the later half has too little traffic on a road'
+
+
+def is_road(mask: np.ndarray, tracks: TrackSet, gate: GateOptions) -> bool:
+    """Tell whether enough tracks of enough vehicles support a direction."""
+    return mask.sum() >= gate.min_tracks_per_road and len(np.unique(tracks.vehicles[mask])) >= MIN_VEHICLES
+
+
+def crossing_deg(state: State) -> float:
+    """Angle at which the first two roads cross, 0 to 90 degrees."""
+    return float(np.degrees(np.arccos(np.clip(abs(np.cos(state.angles_rad[1])), 0.0, 1.0))))
+
+
+def normal_of(state: State, tracks: TrackSet) -> tuple[np.ndarray, float]:
+    """Upward ground normal (3,) in the camera frame, and the share of tracked points below the horizon."""
+    seen = tracks.pixels[tracks.weights > 0]
+    return upward(state.rotation[:, 2], rays_of(state.camera, seen).bearings)
+
+
+def lens_doubt(fit: JointFit, contrast: float, tracks: TrackSet, gate: GateOptions) -> Reason | None:
+    """Say why the lens cannot be trusted, if so."""
+    prior, roads = fit.problem.setting.prior, len(fit.state.angles_rad)
+    if _straight_share(fit, tracks) < STRAIGHT_SHARE:
+        return _turning(fit, tracks, STRAIGHT_SHARE)
+    if contrast < MIN_CONTRAST and not (prior.family == 'distortion_free' and fit.crossing_held):
+        return Reason(
+            'no_agreement', f'the traffic singles out no focal length: the best agrees {contrast:.2f} times as well as '
+            f'the middling one, {MIN_CONTRAST:g} is needed',
+            'wait for straight traffic, above all near the borders of the image; the traffic may be turning, or the '
+            'lens may have no distortion: then give joint.road_angle or joint.focal_prior_px')
+    _, below = normal_of(fit.state, tracks)
+    if roads > 1 and below < BELOW_HORIZON:
+        return Reason(
+            'horizon', f'{1 - below:.0%} of the tracked points lie above the horizon that the roads imply',
+            'the directions found do not belong to one plane: wait for more straight traffic on both roads')
+    doubt = _curvature_doubt(fit, gate) or _model_doubt(fit)
+    if doubt is None and roads == 1 and _straight_share(fit, tracks) < ONE_ROAD_SHARE:
+        return _turning(fit, tracks, ONE_ROAD_SHARE)
+    return doubt
+
+
+def _straight_share(fit: JointFit, tracks: TrackSet) -> float:
+    share = tracks.share_of_vehicle
+    return float((share * fit.explained()).sum() / share.sum())
+
+
+def _turning(fit: JointFit, tracks: TrackSet, needed: float) -> Reason:
+    where = 'best straight roads' if len(fit.state.angles_rad) > 1 else 'one straight road that was found'
+    return Reason(
+        'turning_traffic', f'only {_straight_share(fit, tracks):.0%} of the vehicles follow the {where}, {needed:.0%} '
+        'are needed: the traffic turns, or the road bends',
+        'wait for straight traffic, or turn the camera towards a straight road')
+
+
+def _curvature_doubt(fit: JointFit, gate: GateOptions) -> Reason | None:
+    camera, prior = fit.state.camera, fit.problem.setting.prior
+    sigma = float(fit.sigma(lambda state: np.array([np.log(state.camera.focal_px)]))[0])
+    diagonals = camera.focal_px / np.hypot(camera.width, camera.height)
+    too_long = diagonals > LONGEST_FOCAL and not np.isfinite(prior.sigma[0])
+    # without distortion only an angle between roads tells the focal length, and one that was found by that focal
+    # length proves nothing
+    circular = prior.family == 'distortion_free' and not (
+        np.isfinite(prior.sigma[0]) or fit.problem.setting.options.crossing_deg is not None)
+    if too_long or circular or not sigma <= gate.max_sigma_focal_rel:
+        return Reason(
+            'too_little_curvature', f'straight traffic shows too little lens curvature: focal length '
+            f'{camera.focal_px:.0f} px +- {min(sigma, 9.99):.0%}, {gate.max_sigma_focal_rel:.0%} is needed',
+            'wait for traffic nearer the borders of the image; a lens without distortion needs the angle between two '
+            'roads (joint.road_angle) or its focal length (joint.focal_prior_px)')
+    return None
+
+
+def _model_doubt(fit: JointFit) -> Reason | None:
+    camera, prior = fit.state.camera, fit.problem.setting.prior
+    if prior.sigma[3] <= 0:
+        return None
+    off = abs(camera.k[0] - prior.centre.k[0]) / prior.sigma[3]
+    if off > PRIOR_SIGMAS:
+        return Reason(
+            'lens_model', f'the lens is not close to {prior.family}: k1 = {camera.k[0]:.3f}, {off:.1f} sigmas off',
+            'widen joint.k1_sigma if the lens is known to differ')
+    return None
+
+
+def plane_doubt(fit: JointFit, tracks: TrackSet, gate: GateOptions) -> Reason | None:
+    """Say why the ground plane cannot be trusted, if so."""
+    normal, _ = normal_of(fit.state, tracks)
+    sigma = fit.sigma(lambda state: tilt_and_roll_deg(_same_side(state.rotation[:, 2], normal)))
+    if not sigma.max() <= gate.max_sigma_tilt_deg:
+        return Reason(
+            'plane_uncertain', f'the ground normal is known to {min(sigma.max(), 90.0):.1f} degrees, '
+            f'{gate.max_sigma_tilt_deg:g} are needed', 'wait for more traffic on the quieter road')
+    return None
+
+
+def _same_side(normal: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    return normal if normal @ reference > 0 else -normal
+
+
+def halves_doubt(fit: JointFit, tracks: TrackSet, gate: GateOptions) -> Reason | str:
+    """Solve the earlier and the later half of the vehicles; they have to agree within what they know."""
+    halves = [tracks.subset(mask) for mask in _time_halves(tracks)]
+    if min(map(len, halves)) < MIN_TRACKS:
+        return NOT_CROSS_CHECKED
+    setting = replace(fit.problem.setting, vehicle_correlation=fit.vehicle_correlation)
+    fits = [solve_joint(fit.state, half, setting, refine=True) for half in halves]
+    masks = [road_support(part, half) for part, half in zip(fits, halves, strict=True)]
+    if min(mask.sum() for pair in masks for mask in pair) < gate.min_tracks_per_road // 2:
+        return NOT_CROSS_CHECKED
+    (focal, focal_sigma), (turn, turn_sigma) = _difference(*fits)
+    if len(fit.state.angles_rad) < 2:
+        turn = 0.0  # one road leaves the normal free
+    if focal > max(HALVES_SIGMAS * focal_sigma, HALVES_FOCAL) or turn > max(HALVES_SIGMAS * turn_sigma, HALVES_DEG):
+        return Reason(
+            'halves_disagree', f'the earlier and the later half of the traffic disagree: focal length by {focal:.1%}, '
+            f'ground normal by {turn:.1f} degrees', 'record for longer; check that the camera is firmly fixed')
+    normal = f' and {turn:.1f} degrees in the ground normal' if len(fit.state.angles_rad) > 1 else ''
+    return f'the earlier and the later half of the traffic differ by {focal:.1%} in focal length{normal}'
+
+
+def _time_halves(tracks: TrackSet) -> tuple[np.ndarray, np.ndarray]:
+    """Split the tracks by their vehicles' mean time, so that no vehicle is in both halves."""
+    vehicles, inverse = np.unique(tracks.vehicles, return_inverse=True)
+    mean = np.bincount(inverse, tracks.times_s) / np.bincount(inverse)
+    early = (mean <= np.median(mean))[inverse]
+    return early, ~early
+
+
+def _difference(first: JointFit, second: JointFit) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Differences of relative focal length and of the normal in degrees, each with its standard deviation."""
+    normals = [fit.state.rotation[:, 2] for fit in (first, second)]
+    cosine = abs(float(normals[0] @ normals[1]))
+    sigmas = [fit.sigma(lambda state, at=normal: np.array([
+        np.log(state.camera.focal_px), *np.degrees(np.cross(at, state.rotation[:, 2]))]))
+        for fit, normal in zip((first, second), normals, strict=True)]
+    focal = abs(float(np.log(first.state.camera.focal_px / second.state.camera.focal_px)))
+    total = np.hypot(*sigmas)
+    return (focal, float(total[0])), (float(np.degrees(np.arccos(min(cosine, 1.0)))),
+                                      float(np.linalg.norm(total[1:])))

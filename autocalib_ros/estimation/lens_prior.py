@@ -1,0 +1,108 @@
+"""What is known of a lens before any traffic: the families of real lenses, and what a person asserts.
+
+Kannala-Brandt coefficients tell the classical projections apart: k = 0 is equidistant, the series of the tangent
+(k1 = 1/3, k2 = 2/15, ...) is free of distortion, and fixed roadside lenses lie near the one or the other. A lens
+family is a centre with standard deviations; a standard deviation of zero holds a parameter.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from autocalib_ros.camera import Camera, image_centre
+from autocalib_ros.config import JointOptions
+
+EQUIDISTANT = (0.0, 0.0, 0.0, 0.0)
+DISTORTION_FREE = (1 / 3, 2 / 15, 17 / 315, 62 / 2835)
+BETWEEN = (1 / 6, 1 / 30, 0.0, 0.0)
+BETWEEN_SIGMA = (1 / 6, 1 / 30)
+"""Any lens between the two families, each a sigma away."""
+K2_SIGMA = 0.02
+"""Standard deviation of k2 about its family: at one radian it moves an image point by 2 %, as k1 does by 3 %."""
+PRINCIPAL_POINT_SHARE = 0.01
+"""Standard deviation of the principal point, share of the image width, unless given in pixels."""
+PARAMETERS = ('focal length', 'principal point x', 'principal point y', 'k1', 'k2')
+
+
+@dataclass(frozen=True)
+class LensPrior:
+    """A family of lenses: centre and standard deviations of focal length, principal point, k1 and k2."""
+
+    family: str
+    centre: Camera
+    """Its focal length counts only where `sigma[0]` is finite."""
+    sigma: np.ndarray
+    """Of log f (inf: unknown), cx and cy in pixels, k1, k2; 0 holds, shape (5,)."""
+
+    @property
+    def free(self) -> np.ndarray:
+        """Indices of the parameters that are not held."""
+        return np.flatnonzero(self.sigma > 0)
+
+    @property
+    def units(self) -> np.ndarray:
+        """What a unit step of each free parameter is: its sigma, or one in log f where that is unknown."""
+        return np.where(np.isfinite(self.sigma), self.sigma, 1.0)[self.free]
+
+    def moved(self, camera: Camera, step: np.ndarray) -> Camera:
+        """Return the camera moved by a step of the free parameters in their units."""
+        change = np.zeros(5)
+        change[self.free] = step * self.units
+        cx, cy = camera.principal_point_px
+        k1, k2, k3, k4 = camera.k
+        return replace(camera, focal_px=camera.focal_px * float(np.exp(np.clip(change[0], -1.0, 1.0))),
+                       principal_point_px=(float(cx + change[1]), float(cy + change[2])),
+                       k=(float(k1 + change[3]), float(k2 + change[4]), k3, k4))
+
+    def deviations(self, camera: Camera) -> np.ndarray:
+        """Deviation from the centre of each free parameter in sigmas, 0 where nothing is known; shape (free,)."""
+        shift = np.subtract(camera.principal_point_px, self.centre.principal_point_px)
+        change = np.array([np.log(camera.focal_px / self.centre.focal_px), *shift,
+                           camera.k[0] - self.centre.k[0], camera.k[1] - self.centre.k[1]])
+        known = np.isfinite(self.sigma[self.free])
+        return np.where(known, change[self.free] / self.units, 0.0)
+
+    @property
+    def information(self) -> np.ndarray:
+        """Diagonal of the prior's information about the free parameters in their units: 1 known, 0 unknown."""
+        return np.isfinite(self.sigma[self.free]).astype(float)
+
+    def start(self, focal_px: float) -> Camera:
+        """Return the centre with a focal length to start from; the prior's own where it has one."""
+        known = np.isfinite(self.sigma[0])
+        return self.centre if known else replace(self.centre, focal_px=float(focal_px))
+
+    def holding(self, names: tuple[str, ...]) -> LensPrior:
+        """Return the prior with parameters held."""
+        held = np.array([name in names for name in PARAMETERS])
+        return replace(self, sigma=np.where(held, 0.0, self.sigma))
+
+    def with_k2(self) -> LensPrior:
+        """Return the prior with k2 set free about its centre."""
+        sigma = self.sigma.copy()
+        sigma[4] = K2_SIGMA
+        return replace(self, sigma=sigma)
+
+
+def known_lens(lens: Camera) -> LensPrior:
+    """Return the prior of a lens that is known: all of it held."""
+    return LensPrior('known', lens, np.zeros(5))
+
+
+def lens_priors(image_size: tuple[int, int], options: JointOptions) -> list[LensPrior]:
+    """Return the families to choose from, the most usual one first."""
+    width, _ = image_size
+    point = options.principal_point_sigma_px
+    point = PRINCIPAL_POINT_SHARE * width if point < 0 else point
+    focal = options.focal_prior_px
+    log_focal = options.focal_sigma_px / focal if focal > 0 else np.inf
+    families = {
+        'equidistant': (EQUIDISTANT, (options.k1_sigma, 0.0)),
+        'distortion_free': (DISTORTION_FREE, (options.k1_sigma, 0.0)),
+        'kannala_brandt': (BETWEEN, BETWEEN_SIGMA)}
+    names = families if options.lens_prior == 'auto' else [options.lens_prior]
+    centre = Camera(*image_size, focal if focal > 0 else float(width), image_centre(*image_size))
+    return [LensPrior(name, replace(centre, k=families[name][0]),
+                      np.array([log_focal, point, point, *families[name][1]])) for name in names]

@@ -1,0 +1,239 @@
+"""How near the results come to the truth, by Monte Carlo: `autocalib benchmark accuracy`.
+
+Every run draws a lens, a pose and traffic of one family of evidence, solves it by each method and compares with the
+truth. The evidence of a run follows from seed, family and number of the run alone: `evidence_of` draws it again.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, fields
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+
+from autocalib_ros.calibration import Calibration, GroundPlane, Refusal
+from autocalib_ros.calibrator import solve
+from autocalib_ros.camera import Camera
+from autocalib_ros.config import Options
+from autocalib_ros.errors import InputError, UsageError
+from autocalib_ros.estimation.ground_plane import tilt_and_roll_deg
+from autocalib_ros.evidence import Evidence
+from autocalib_ros.offline.accuracy_families import families
+from autocalib_ros.offline.demo import LEAST_DISTANCE_M, NEAR_M
+from autocalib_ros.offline.progress import progress_bar
+from autocalib_ros.offline.projection import ground_to_image, image_to_ground
+from autocalib_ros.offline.synthetic_evidence import Junction
+from autocalib_ros.threads import use_one_thread_for_linear_algebra
+
+METHODS = ('joint', 'paper')
+RAY_GRID = (49, 28)
+GROUND_GRID = 5
+"""Distances are compared between so many ranges times so many bearings on the road."""
+BEARINGS_DEG = 40.0
+"""Those points lie so far to either side of where the camera looks."""
+NAN = math.nan
+
+
+@dataclass(frozen=True, kw_only=True)
+class Run:
+    """One solution beside the truth; nan where the result gives nothing to compare."""
+
+    family: str
+    method: str
+    run: int
+    accepted: bool
+    code: str
+    """Why it was refused, or '' where it was accepted."""
+    grade: str = ''
+    focal_error: float = NAN
+    """Relative to the true focal length, as is its sigma."""
+    focal_sigma: float = NAN
+    rays_deg: float = NAN
+    """Mean angle over the image between estimated and true rays after the rotation that aligns them best."""
+    normal_deg: float = NAN
+    tilt_error_deg: float = NAN
+    tilt_sigma_deg: float = NAN
+    roll_error_deg: float = NAN
+    roll_sigma_deg: float = NAN
+    distance_error: float = NAN
+    """Median relative error of distances between points of the road."""
+    cpu_s: float = NAN
+    """Processor time of the solution."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """One draw of evidence, to be solved by each method."""
+
+    family: str
+    seed: int
+    run: int
+    methods: tuple[str, ...]
+
+
+def measure(names: Sequence[str], methods: Sequence[str], runs: int, *, seed: int = 0, jobs: int = 1,
+            out: Path | None = None, quiet: bool = False) -> list[Run]:
+    """Solve `runs` draws of each family by each method; write a row a run to `out` as they come."""
+    for name, value, least in (('runs', runs, 1), ('jobs', jobs, 1), ('seed', seed, 0)):
+        if value < least:
+            raise UsageError(f'--{name} is {least} or more; got {value}')
+    tasks = [Task(family, seed, run, tuple(methods)) for family in known(names) for run in range(runs)]
+    done: list[Run] = []
+    with csv_rows(out) as write, progress_bar(len(tasks), 'draws', 'accuracy', quiet=quiet) as progress:
+        for count, results in enumerate(_results(tasks, jobs), 1):
+            write(results)
+            done += results
+            progress.update_to(count, results[-1].family)
+    return done
+
+
+def known(names: Sequence[str]) -> list[str]:
+    """Return the names of families, all of them for none, or raise UsageError."""
+    every = list(families())
+    for name in names:
+        if name not in every:
+            raise UsageError(f"no family of evidence is called '{name}'; there are {', '.join(every)}")
+    return list(names) or every
+
+
+def _results(tasks: Sequence[Task], jobs: int) -> Iterator[list[Run]]:
+    """Yield the results in the order of the tasks, whatever the number of processes."""
+    if jobs == 1:
+        yield from map(run_task, tasks)
+        return
+    # spawned, not forked: a worker has to set its threads before numpy comes in
+    with ProcessPoolExecutor(jobs, get_context('spawn'), use_one_thread_for_linear_algebra) as pool:
+        try:
+            yield from pool.map(run_task, tasks)
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def run_task(task: Task) -> list[Run]:
+    """Draw the evidence of a task and solve it by each of its methods."""
+    junction, evidence = evidence_of(task.family, task.seed, task.run)
+    return [run_method(task, method, junction, evidence) for method in task.methods]
+
+
+def evidence_of(family: str, seed: int, run: int) -> tuple[Junction, Evidence]:
+    """Draw truth and evidence of one run of a family."""
+    table = families()
+    sequence = np.random.SeedSequence([seed, list(table).index(family), run])
+    return table[family](np.random.default_rng(sequence))
+
+
+def run_method(task: Task, method: str, junction: Junction, evidence: Evidence) -> Run:
+    """Solve with the true camera height; a solver that fails is recorded and does not end the benchmark."""
+    began = time.process_time()
+    try:
+        result = solve(evidence, Options(camera_height=junction.height_m, method=method))
+    except Exception as error:
+        return Run(family=task.family, method=method, run=task.run, accepted=False,
+                   code=f'crash:{type(error).__name__}')
+    return compared(task, method, result, junction, time.process_time() - began)
+
+
+def compared(task: Task, method: str, result: Calibration | Refusal, junction: Junction, cpu_s: float) -> Run:
+    """Return how far a result is from the truth."""
+    if isinstance(result, Refusal):
+        return Run(family=task.family, method=method, run=task.run, accepted=False, code=result.code, cpu_s=cpu_s)
+    true, sigma = junction.camera, result.stddev
+    tilt, roll, normal = _pose_errors_deg(result.ground, junction.normal_in_camera)
+    return Run(
+        family=task.family, method=method, run=task.run, accepted=True, code='', grade=result.grade,
+        focal_error=result.camera.focal_px / true.focal_px - 1, focal_sigma=_number(sigma.focal_px) / true.focal_px,
+        rays_deg=rays_error_deg(result.camera, true), normal_deg=normal,
+        tilt_error_deg=tilt, tilt_sigma_deg=_number(sigma.tilt_deg),
+        roll_error_deg=roll, roll_sigma_deg=_number(sigma.roll_deg),
+        distance_error=distance_error(result.camera, result.ground, junction), cpu_s=cpu_s)
+
+
+def _number(value: float | None) -> float:
+    return NAN if value is None else float(value)
+
+
+def _pose_errors_deg(ground: GroundPlane | None, true_normal: np.ndarray) -> tuple[float, float, float]:
+    """Errors of tilt and roll, and the angle between the normals, in degrees."""
+    if ground is None:
+        return NAN, NAN, NAN
+    normal = ground.normal_in_camera
+    tilt, roll = tilt_and_roll_deg(normal) - tilt_and_roll_deg(true_normal)
+    return float(tilt), float((roll + 180) % 360 - 180), float(angles_deg(normal, true_normal))
+
+
+def rays_error_deg(camera: Camera, true: Camera) -> float:
+    """Mean angle over the image between the rays of two lenses, the one turned onto the other as well as can be."""
+    across, down = np.linspace(0, true.width - 1, RAY_GRID[0]), np.linspace(0, true.height - 1, RAY_GRID[1])
+    pixels = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
+    (found, valid), (wanted, there) = camera.unproject(pixels), true.unproject(pixels)
+    found, wanted = found[valid & there], wanted[valid & there]
+    left, _, right = np.linalg.svd(found.T @ wanted)
+    aligned = found @ left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+    return float(angles_deg(aligned, wanted).mean()) if len(found) else NAN
+
+
+def angles_deg(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Angles in degrees between vectors (..., 3)."""
+    across = np.linalg.norm(np.cross(first, second), axis=-1)
+    return np.degrees(np.arctan2(across, (first * second).sum(axis=-1)))
+
+
+def distance_error(camera: Camera, ground: GroundPlane | None, junction: Junction) -> float:
+    """Median relative error of distances between points of the road in view, up to `NEAR_M` from the camera."""
+    if ground is None:
+        return NAN
+    true_m, pixels = _road_points(junction)
+    found_m = image_to_ground(camera, ground, pixels)
+    first, second = np.triu_indices(len(true_m), 1)
+    true_lengths = np.hypot(*(true_m[first] - true_m[second]).T)
+    lengths = np.hypot(*(found_m[first] - found_m[second]).T)
+    # a point that ends up above the horizon is as wrong as can be, and must not drop out of the median
+    errors = np.where(np.isfinite(lengths), np.abs(lengths / np.maximum(true_lengths, 1e-9) - 1), np.inf)
+    far_apart = true_lengths > LEAST_DISTANCE_M
+    return float(np.median(errors[far_apart])) if far_apart.any() else NAN
+
+
+def _road_points(junction: Junction) -> tuple[np.ndarray, np.ndarray]:
+    """Points (n, 2) on the road before the camera, metres, and where the image shows them (n, 2)."""
+    ahead = junction.camera_from_ground[2]
+    bearings = np.arctan2(ahead[1], ahead[0]) + np.radians(np.linspace(-BEARINGS_DEG, BEARINGS_DEG, GROUND_GRID))
+    ranges, bearings = np.meshgrid(NEAR_M * np.arange(1, GROUND_GRID + 1) / GROUND_GRID, bearings)
+    points = np.stack([ranges * np.cos(bearings), ranges * np.sin(bearings), np.zeros(ranges.shape)], -1).reshape(-1, 3)
+    truth = GroundPlane(junction.camera_from_ground.T, junction.height_m)
+    pixels = ground_to_image(junction.camera, truth, points)
+    seen = (pixels >= 0).all(axis=1) & (pixels < junction.image_size).all(axis=1)
+    return points[seen, :2], pixels[seen]
+
+
+@contextmanager
+def csv_rows(path: Path | None) -> Iterator[Callable[[Sequence[Run]], None]]:
+    """Open a CSV with one row a run; without a path, write nowhere."""
+    if path is None:
+        yield lambda runs: None
+        return
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        stream = path.open('w', newline='', encoding='utf-8')
+    except OSError as error:
+        raise InputError(f'cannot write {path}: {error.strerror or error}') from error
+    with stream:
+        writer = csv.DictWriter(stream, [item.name for item in fields(Run)])
+        writer.writeheader()
+
+        def write(runs: Sequence[Run]) -> None:
+            writer.writerows(_row(run) for run in runs)
+            stream.flush()  # what was measured outlives an interruption
+
+        yield write
+
+
+def _row(run: Run) -> dict[str, object]:
+    return {name: '' if isinstance(value, float) and math.isnan(value) else value
+            for name, value in asdict(run).items()}

@@ -1,0 +1,195 @@
+"""The kinds of made-up evidence on which accuracy is measured, each drawn anew for every run.
+
+`DETERMINED` families hold enough to calibrate from, each but the first a variation of `standard` in one thing;
+`UNDERDETERMINED` ones do not, or hold it in a form that misleads: there a refusal is the right answer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from autocalib_ros.camera import Camera, image_centre
+from autocalib_ros.evidence import Evidence, Track
+from autocalib_ros.offline.synthetic_evidence import HEADWAY_S, Junction, gathered, pose, synthetic_evidence
+from autocalib_ros.offline.synthetic_traffic import INTERVAL_S, drive_bend, drive_ring, stroll
+from autocalib_ros.offline.synthetic_trouble import random_walk, straggle, waving
+
+WIDTH, HEIGHT = 1280, 720
+FOCAL_PX = (500.0, 640.0)
+LONG_FOCAL_PX = (700.0, 1200.0)
+"""Of distortion-free lenses, which are not made as wide."""
+DISTORTION_FREE = (1 / 3, 2 / 15, 17 / 315, 62 / 2835)
+"""The series of the tangent."""
+MAX_K1 = 0.05
+MAX_SHIFT_PX = 20.0
+"""Of the principal point from the image centre, along each axis."""
+
+Family = Callable[[np.random.Generator], tuple[Junction, Evidence]]
+"""Draws the truth, and evidence of it."""
+
+
+def viewpoint(generator: np.random.Generator, heading_deg: tuple[float, float] = (25.0, 65.0)) -> Junction:
+    """Draw the standard case: 60 tracks, one per vehicle, on two perpendicular roads that cross ahead of the camera."""
+    tilt, roll, heading, height = generator.uniform([26, -2, heading_deg[0], 6], [38, 2, heading_deg[1], 10])
+    reach = generator.uniform(1.1, 1.7) * height / np.tan(np.radians(tilt))
+    bearing = np.radians(generator.uniform(-8, 8) - heading)
+    return Junction(
+        camera=lens(generator), camera_from_ground=pose(tilt, roll, heading), height_m=float(height),
+        centre_m=(float(reach * np.cos(bearing)), float(reach * np.sin(bearing))), tracks=60, points_per_vehicle=1)
+
+
+def lens(generator: np.random.Generator) -> Camera:
+    """Draw a lens near equidistant whose principal point is off the image centre."""
+    focal, k1, right, down = generator.uniform([FOCAL_PX[0], -MAX_K1, -MAX_SHIFT_PX, -MAX_SHIFT_PX],
+                                               [FOCAL_PX[1], MAX_K1, MAX_SHIFT_PX, MAX_SHIFT_PX])
+    cx, cy = image_centre(WIDTH, HEIGHT)
+    return Camera(WIDTH, HEIGHT, float(focal), (float(cx + right), float(cy + down)), (float(k1), 0.0, 0.0, 0.0))
+
+
+def distortion_free_lens(generator: np.random.Generator) -> Camera:
+    """Draw a lens that images straight lines as straight lines."""
+    return replace(lens(generator), focal_px=float(generator.uniform(*LONG_FOCAL_PX)), k=DISTORTION_FREE)
+
+
+def driven(junction_of: Callable[[np.random.Generator], Junction]) -> Family:
+    """Make a family of junctions that are drawn and then driven through."""
+    def family(generator: np.random.Generator) -> tuple[Junction, Evidence]:
+        junction = junction_of(generator)
+        return junction, synthetic_evidence(junction, generator)
+
+    return family
+
+
+def varied(**changes: Any) -> Family:
+    """Make a family of standard junctions with other values of some fields."""
+    return driven(lambda generator: replace(viewpoint(generator), **changes))
+
+
+def skew(generator: np.random.Generator) -> Junction:
+    """Two roads that cross at 60 to 85 degrees."""
+    crossing = generator.choice([-1.0, 1.0]) * generator.uniform(60.0, 85.0)
+    return replace(viewpoint(generator), road_angles_deg=(0.0, float(crossing)))
+
+
+def equidistant(generator: np.random.Generator) -> Junction:
+    """An equidistant lens, centred: the solver's prior is the truth."""
+    return replace(viewpoint(generator), camera=Camera.equidistant(WIDTH, HEIGHT, generator.uniform(*FOCAL_PX)))
+
+
+def three_roads(generator: np.random.Generator) -> Junction:
+    """A third road at about 45 degrees to the two perpendicular ones."""
+    return replace(viewpoint(generator), road_angles_deg=(0.0, 90.0, float(generator.uniform(35.0, 55.0))))
+
+
+def one_road(generator: np.random.Generator) -> Junction:
+    """One road, straight, passing off the optical axis: the lens alone can be had."""
+    return replace(_amount(viewpoint(generator, (40.0, 75.0)), generator), road_angles_deg=(0.0,), turning_share=0.0)
+
+
+def distortion_free(generator: np.random.Generator) -> Junction:
+    """A distortion-free lens over perpendicular roads: the right angle alone tells the focal length."""
+    return replace(viewpoint(generator), camera=distortion_free_lens(generator))
+
+
+def radial(generator: np.random.Generator) -> Junction:
+    """One road straight ahead: each track runs through the distortion centre, where no lens bends it."""
+    junction = _amount(viewpoint(generator, (-1.0, 1.0)), generator)
+    lanes = (0.0, float(generator.uniform(0.3, 1.5)))
+    return replace(junction, centre_m=(junction.centre_m[0], 0.0), road_angles_deg=(0.0,), lanes_m=lanes,
+                   turning_share=0.0)
+
+
+def bend(generator: np.random.Generator) -> Junction:
+    """Curved traffic only: one bend of constant radius."""
+    drive = partial(drive_bend, radius_m=generator.uniform(15.0, 60.0), towards_rad=generator.uniform(0, 2 * np.pi))
+    return replace(_amount(viewpoint(generator), generator), drive=drive)
+
+
+def roundabout(generator: np.random.Generator) -> Junction:
+    """Curved traffic only: the ring of a roundabout."""
+    drive = partial(drive_ring, radius_m=generator.uniform(15.0, 30.0))
+    return replace(_amount(viewpoint(generator), generator), drive=drive)
+
+
+def pedestrians(generator: np.random.Generator) -> Junction:
+    """People on pavements, nobody on the road."""
+    return replace(viewpoint(generator), drive=stroll, tracks=int(generator.integers(60, 200)))
+
+
+def short_piece(generator: np.random.Generator) -> Junction:
+    """One road from the side, of which only a short piece is in view."""
+    left = generator.uniform(0.2, 0.6) * WIDTH
+    return replace(_amount(viewpoint(generator, (75.0, 105.0)), generator), road_angles_deg=(0.0,),
+                   turning_share=0.0, window_px=(left, left + generator.uniform(0.15, 0.3) * WIDTH))
+
+
+def distortion_free_skew(generator: np.random.Generator) -> Junction:
+    """A distortion-free lens over skewed roads: neither curvature nor a right angle tells the focal length."""
+    return replace(_amount(skew(generator), generator), camera=distortion_free_lens(generator))
+
+
+def waved_camera(generator: np.random.Generator) -> Junction:
+    """Draw ordinary traffic before a camera that does not stand still."""
+    return replace(_amount(viewpoint(generator), generator), sway=waving(generator))
+
+
+def waved_unseen(generator: np.random.Generator) -> tuple[Junction, Evidence]:
+    """Draw the same, where the monitor of the background sees nothing of it."""
+    junction, evidence = driven(waved_camera)(generator)
+    return junction, replace(evidence, drift_px=0.0)
+
+
+def noise(generator: np.random.Generator) -> tuple[Junction, Evidence]:
+    """Points that stagger or straggle through the image and belong to no road."""
+    junction = viewpoint(generator)
+    tracks = []
+    for number in range(int(generator.integers(60, 240))):
+        count = int(generator.integers(8, 33))
+        draw = random_walk if generator.uniform() < 0.5 else straggle
+        times = HEADWAY_S * number + INTERVAL_S * np.arange(count)
+        tracks.append(Track(number, times, draw(count, junction.image_size, generator)))
+    return junction, gathered(tracks, junction.image_size, float(tracks[-1].times_s[-1]))
+
+
+def _amount(junction: Junction, generator: np.random.Generator) -> Junction:
+    """Give each vehicle one to four points: 60 to 240 tracks."""
+    points = int(generator.integers(1, 5))
+    return replace(junction, tracks=60 * points, points_per_vehicle=points)
+
+
+# A family's place in the two tables is part of the seed of its runs: new ones go to the end.
+DETERMINED: dict[str, Family] = {
+    'standard': varied(),
+    'few': varied(tracks=40),
+    'many': varied(tracks=400, points_per_vehicle=4),
+    'noisy': varied(noise_px=1.5),
+    'wander': varied(wander_m=0.25),
+    'outliers': varied(outlier_share=0.2),
+    'skew': driven(skew),
+    'equidistant': driven(equidistant),
+    'three_roads': driven(three_roads),
+    'lane_changes': varied(lane_change_share=0.3),
+    'one_road': driven(one_road),
+    'distortion_free': driven(distortion_free),
+}
+UNDERDETERMINED: dict[str, Family] = {
+    'radial': driven(radial),
+    'bend': driven(bend),
+    'roundabout': driven(roundabout),
+    'pedestrians': driven(pedestrians),
+    'noise': noise,
+    'waved': driven(waved_camera),
+    'waved_unseen': waved_unseen,
+    'short_piece': driven(short_piece),
+    'distortion_free_skew': driven(distortion_free_skew),
+}
+
+
+def families() -> dict[str, Family]:
+    """Return all families by name, determined ones first."""
+    return {**DETERMINED, **UNDERDETERMINED}

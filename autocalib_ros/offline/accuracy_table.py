@@ -1,0 +1,129 @@
+"""The accuracy benchmark in tables for a terminal of 120 columns: one line for a family and method."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+
+import numpy as np
+
+from autocalib_ros.offline.accuracy import Run
+from autocalib_ros.offline.accuracy_families import UNDERDETERMINED
+
+COVERED_SIGMAS = 1.96
+"""A normal error lies within so many sigmas in 95 % of the cases."""
+FALSE_SIGMAS = 3.0
+FALSE_FOCAL = 0.05
+FALSE_DEG = 1.0
+NAME = '{:<21}{:<6}{:>5}{:>6}'
+ERRORS = NAME + '  {:<21}{:>7}{:>7}{:>7}{:>7}{:>8}{:>7}{:>7}{:>7}'
+SIGMAS = NAME + '{:>7}{:>7}{:>8}{:>7}{:>7}{:>8}{:>7}{:>8}'
+
+
+def tables(runs: Sequence[Run]) -> str:
+    """Return the errors of the families, their standard deviations held against them, and the crashes."""
+    determined = [run for run in runs if run.family not in UNDERDETERMINED]
+    doubtful = [run for run in runs if run.family in UNDERDETERMINED]
+    blocks = [*_blocks('Evidence that determines the calibration', determined),
+              *_blocks('Evidence that does not, or that misleads', doubtful), *_crashes(runs)]
+    return '\n\n'.join(blocks)
+
+
+def falsely_accepted(run: Run) -> bool:
+    """Whether a result was published that is wrong: by its own standard deviations, or beyond 5 % in focal length."""
+    if not run.accepted:
+        return False
+    focal = abs(run.focal_error)
+    tilted = _beyond(run.tilt_error_deg, run.tilt_sigma_deg) or _beyond(run.roll_error_deg, run.roll_sigma_deg)
+    return focal > FALSE_FOCAL or focal > FALSE_SIGMAS * run.focal_sigma or tilted
+
+
+def _beyond(error_deg: float, sigma_deg: float) -> bool:
+    return abs(error_deg) > FALSE_SIGMAS * sigma_deg and abs(error_deg) > FALSE_DEG
+
+
+def _blocks(title: str, runs: Sequence[Run]) -> list[str]:
+    if not runs:
+        return []
+    groups = list(dict.fromkeys((run.family, run.method) for run in runs))
+    grouped = [[run for run in runs if (run.family, run.method) == group] for group in groups]
+    return [_block(f'{title}: errors', ERROR_HEADS, map(_errors, grouped)),
+            _block(f'{title}: stated standard deviations against errors', SIGMA_HEADS, map(_sigmas, grouped))]
+
+
+def _block(title: str, heads: Sequence[str], lines: Iterable[str]) -> str:
+    return '\n'.join([title, '-' * max(map(len, heads)), *heads, *lines])
+
+
+ERROR_HEADS = (
+    ERRORS.format('', '', '', 'acc.', 'most common', 'focal', 'length', '%', '', 'normal', 'deg', 'rays', 'dist.'),
+    ERRORS.format('family', '', 'runs', '%', 'refusal', 'bias', 'spread', 'mean', 'worst', 'mean', 'worst', 'deg', '%'))
+SIGMA_HEADS = (
+    SIGMAS.format('', '', '', 'acc.', 'false', 'plane', 'in 95 %', 'inter-', 'val, %', 'rms', 'z', 'solve'),
+    SIGMAS.format('family', '', 'runs', '%', 'acc.', '%', 'focal', 'tilt', 'roll', 'focal', 'tilt', 'cpu s'))
+
+
+def _errors(runs: Sequence[Run]) -> str:
+    accepted = [run for run in runs if run.accepted]
+    focal, normal = 100 * _column(accepted, 'focal_error'), _column(accepted, 'normal_deg')
+    return ERRORS.format(
+        *_name(runs), _common_refusal(runs), _told(focal, np.mean, '+.2f'), _told(focal, _spread, '.2f'),
+        _told(np.abs(focal), np.mean, '.2f'), _told(np.abs(focal), np.max, '.2f'), _told(normal, np.mean, '.2f'),
+        _told(normal, np.max, '.2f'), _told(_column(accepted, 'rays_deg'), np.mean, '.3f'),
+        _told(100 * _column(accepted, 'distance_error'), np.median, '.2f')).rstrip()
+
+
+def _sigmas(runs: Sequence[Run]) -> str:
+    accepted = [run for run in runs if run.accepted]
+    planes = np.isfinite([run.normal_deg for run in accepted]).astype(float)
+    focal, tilt, roll = (_z(accepted, 'focal_error', 'focal_sigma'), _z(accepted, 'tilt_error_deg', 'tilt_sigma_deg'),
+                         _z(accepted, 'roll_error_deg', 'roll_sigma_deg'))
+    return SIGMAS.format(
+        *_name(runs), sum(map(falsely_accepted, runs)), _told(100 * planes, np.mean, '.0f'),
+        *(_told(z, _coverage, '.0f') for z in (focal, tilt, roll)), *(_told(z, _rms, '.2f') for z in (focal, tilt)),
+        _told(_column(runs, 'cpu_s'), np.mean, '.2f')).rstrip()
+
+
+def _name(runs: Sequence[Run]) -> tuple[str, str, int, str]:
+    share = 100 * sum(run.accepted for run in runs) / len(runs)
+    return runs[0].family, runs[0].method, len(runs), f'{share:.0f}'
+
+
+def _common_refusal(runs: Sequence[Run]) -> str:
+    codes = Counter(run.code for run in runs if run.code)
+    return codes.most_common(1)[0][0] if codes else '-'
+
+
+def _crashes(runs: Sequence[Run]) -> list[str]:
+    crashed = [f'{run.family} {run.run} ({run.method}, {run.code.partition(":")[2]})' for run in runs
+               if run.code.startswith('crash:')]
+    return ['\n'.join([f'{len(crashed)} solutions crashed:', *(f'  {text}' for text in crashed)])] if crashed else []
+
+
+def _column(runs: Sequence[Run], name: str) -> np.ndarray:
+    """Return the values (n,) of a field, without those that are not given."""
+    values = np.array([getattr(run, name) for run in runs], float)
+    return values[~np.isnan(values)]
+
+
+def _z(runs: Sequence[Run], error: str, sigma: str) -> np.ndarray:
+    """Return errors in units of their stated standard deviations, where there is one."""
+    pairs = np.array([(getattr(run, error), getattr(run, sigma)) for run in runs], float).reshape(-1, 2)
+    errors, sigmas = pairs[(pairs[:, 1] > 0) & np.isfinite(pairs[:, 0])].T
+    return errors / sigmas
+
+
+def _told(values: np.ndarray, statistic: Callable[[np.ndarray], float], form: str) -> str:
+    return format(float(statistic(values)), form) if len(values) else '-'
+
+
+def _spread(values: np.ndarray) -> float:
+    return float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
+
+
+def _coverage(z: np.ndarray) -> float:
+    return 100 * float(np.mean(np.abs(z) <= COVERED_SIGMAS))
+
+
+def _rms(z: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(z * z)))

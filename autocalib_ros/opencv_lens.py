@@ -1,0 +1,166 @@
+"""The lens models of OpenCV, and the Kannala-Brandt camera that comes nearest to one of them.
+
+A bearing with the slopes (x, y) = (X / Z, Y / Z) and r^2 = x^2 + y^2 is imaged at K (x', y', 1) with
+
+    x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)
+    y' = y (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y
+
+by 'rational_polynomial' and, without k4 to k6, by 'plumb_bob'. The distortion-free lens is all zero. 'equidistant'
+is the polynomial of camera.py with an x and a y focal length.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from autocalib_ros.camera import Camera
+from autocalib_ros.errors import InputError
+
+MAX_ERROR_PX = 0.5
+"""As much as the position of a tracked point is good for: more would spoil the pose."""
+LEAST_DISC = 0.25
+"""Least share of the image that a fisheye shows."""
+LEAST_FIELD_DEG = 1.0
+GRID = 41
+"""Pixels along each side of the grid on which two lenses are compared, borders included."""
+MAX_SLOPE_ANGLE_RAD = np.radians(89.0)
+RADIUS_STEPS = 8192
+TANGENTIAL_STEPS = 20
+"""Fixed-point steps: the tangential terms are small, and each step is closer by their share."""
+REACHED_PX = 0.05
+"""A pixel counts as reached when the bearing found for it is imaged this near to it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OpencvLens:
+    """A lens as a camera_info gives it."""
+
+    width: int
+    height: int
+    matrix: np.ndarray
+    """K, shape (3, 3), pixels."""
+    equidistant: bool
+    coefficients: tuple[float, ...]
+    """k1 to k4 of an equidistant lens, otherwise k1, k2, p1, p2, k3, k4, k5, k6."""
+
+    @property
+    def square(self) -> bool:
+        """Whether pixels are square and not skewed, as those of a Camera."""
+        return self.matrix[0, 0] == self.matrix[1, 1] and self.matrix[0, 1] == 0.0
+
+    def grid(self) -> np.ndarray:
+        """Return pixels all over the image, shape (n, 2)."""
+        across, down = np.linspace(0, self.width - 1, GRID), np.linspace(0, self.height - 1, GRID)
+        return np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
+
+    def bearings_near(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return bearings (n, 3), exactly where they are imaged (n, 2), and whether that is at `pixels` (n, 2)."""
+        ideal = np.linalg.solve(self.matrix, np.column_stack([pixels, np.ones(len(pixels))]).T).T[:, :2]
+        if self.equidistant:
+            bearings, valid = _camera(self, 1.0, np.zeros(2), self.coefficients).unproject(ideal)
+            return bearings, pixels, valid
+        slopes = undistorted(ideal, self.coefficients)
+        imaged = distorted(slopes, self.coefficients) @ self.matrix[:2, :2].T + self.matrix[:2, 2]
+        near = np.hypot(*(imaged - pixels).T) < REACHED_PX
+        return np.column_stack([slopes, np.ones(len(slopes))]), imaged, near
+
+
+def nearest_camera(lens: OpencvLens) -> Camera:
+    """Return the Kannala-Brandt camera that images the field of the lens's image as the lens does.
+
+    An equidistant lens with square pixels is one itself; any other is fitted. Raises InputError where the lens leaves
+    the image empty, and where the fit misses by more than MAX_ERROR_PX.
+    """
+    bearings, imaged, reached = lens.bearings_near(lens.grid())
+    _require_reach(lens, float(reached.mean()))
+    _require_field(bearings[reached])
+    if lens.equidistant and lens.square:
+        return _camera(lens, lens.matrix[0, 0], lens.matrix[:2, 2], lens.coefficients)
+    camera = _fitted(lens, bearings[reached], imaged[reached])
+    pixels, valid = camera.project(bearings[reached])
+    error_px = np.where(valid, np.hypot(*(pixels - imaged[reached]).T), np.inf).max()
+    if not error_px <= MAX_ERROR_PX:
+        raise InputError(f'the nearest Kannala-Brandt lens misses this one by up to {error_px:.2f} px, and more than'
+                         f' {MAX_ERROR_PX:g} px would spoil the pose; {_cause(lens)}, or leave the file out')
+    return camera
+
+
+def _require_reach(lens: OpencvLens, share: float) -> None:
+    """Raise InputError unless enough of the image is reached; a fisheye's picture may be a disc in the middle."""
+    if share < (LEAST_DISC if lens.equidistant else 1.0):
+        raise InputError(f'its distortion folds back and leaves {100 * (1 - share):.0f} % of the image empty;'
+                         ' calibrate the camera anew, with the pattern near the borders too or with a fisheye model')
+
+
+def _require_field(bearings: np.ndarray) -> None:
+    """Raise InputError when bearings from all over the image are nearly one: the numbers are not of a camera."""
+    one, other = bearings[[0, -1]] / np.linalg.norm(bearings[[0, -1]], axis=1)[:, None]
+    field_deg = np.degrees(np.arctan2(np.linalg.norm(np.cross(one, other)), one @ other))
+    if field_deg < LEAST_FIELD_DEG:
+        raise InputError(f'its lens sees {field_deg:.1g} degrees from corner to corner, which cannot be meant;'
+                         ' calibrate the camera anew, or leave the file out')
+
+
+def _cause(lens: OpencvLens) -> str:
+    """Say what a Camera does not have, and how to calibrate so that it is not needed."""
+    (fx, skew, _), (_, fy, _), _ = lens.matrix
+    causes = {f'two focal lengths, {fx:.1f} and {fy:.1f} px (--fix-aspect-ratio)': fx != fy,
+              'skewed axes': skew != 0.0,
+              'tangential distortion (--zero-tangent-dist)': not lens.equidistant and any(lens.coefficients[2:4])}
+    found = [cause for cause, there in causes.items() if there]
+    if not found:
+        return 'its angle is too wide: calibrate the camera anew with a fisheye model'
+    return f'it has {" and ".join(found)}: calibrate the camera anew without, by the options of camera_calibration'
+
+
+def _camera(lens: OpencvLens, focal_px: float, principal_point_px: np.ndarray, k: Sequence[float]) -> Camera:
+    k1, k2, k3, k4 = (float(value) for value in k)
+    cx, cy = (float(value) for value in principal_point_px)
+    return Camera(lens.width, lens.height, float(focal_px), (cx, cy), (k1, k2, k3, k4))
+
+
+def _fitted(lens: OpencvLens, bearings: np.ndarray, imaged: np.ndarray) -> Camera:
+    """Solve for principal point and f, f k1 to f k4: the pixels are linear in them, so there is no iteration."""
+    across = np.hypot(bearings[:, 0], bearings[:, 1])
+    powers = np.arctan2(across, bearings[:, 2])[:, None] ** [1, 3, 5, 7, 9]
+    outwards = bearings[:, :2] / np.maximum(across, 1e-12)[:, None]
+    ones, zeros = np.ones(len(across)), np.zeros(len(across))
+    rows = np.concatenate([np.column_stack([ones, zeros, powers * outwards[:, :1]]),
+                           np.column_stack([zeros, ones, powers * outwards[:, 1:]])])
+    solution = np.linalg.lstsq(rows, imaged.T.ravel(), rcond=None)[0]
+    return _camera(lens, solution[2], solution[:2], solution[3:] / solution[2])
+
+
+def distorted(slopes: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
+    """Return x', y' of slopes x, y, shape (n, 2)."""
+    return slopes * _radial(np.sum(slopes * slopes, axis=1), coefficients)[:, None] + _tangential(slopes, coefficients)
+
+
+def undistorted(ideal: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
+    """Invert `distorted` as well as it can be: beyond the radius where the model folds back, nothing is right."""
+    radius = np.tan(np.linspace(0.0, MAX_SLOPE_ANGLE_RAD, RADIUS_STEPS))
+    imaged = radius * _radial(radius * radius, coefficients)
+    folds = np.flatnonzero(~(np.diff(imaged) > 0))
+    last = folds[0] + 1 if len(folds) else RADIUS_STEPS
+    slopes = np.zeros_like(ideal)
+    for _ in range(TANGENTIAL_STEPS):
+        target = ideal - _tangential(slopes, coefficients)
+        length = np.hypot(*target.T)
+        slopes = target * (np.interp(length, imaged[:last], radius[:last]) / np.maximum(length, 1e-12))[:, None]
+    return slopes
+
+
+def _radial(r2: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
+    k1, k2, _, _, k3, k4, k5, k6 = coefficients
+    with np.errstate(divide='ignore', invalid='ignore'):
+        return (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+
+
+def _tangential(slopes: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
+    p1, p2 = coefficients[2:4]
+    x, y = slopes.T
+    r2 = x * x + y * y
+    return np.column_stack([2 * p1 * x * y + p2 * (r2 + 2 * x * x), p1 * (r2 + 2 * y * y) + 2 * p2 * x * y])

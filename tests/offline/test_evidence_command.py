@@ -1,0 +1,149 @@
+"""`autocalib evidence`: saved evidence solved again, and a lens that is known."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from autocalib_ros.camera import Camera
+from autocalib_ros.camera_info import read_camera_info, write_camera_info_yaml
+from autocalib_ros.cli import main
+from autocalib_ros.offline.synthetic_evidence import Junction, synthetic_evidence
+
+JUNCTION = Junction(noise_px=0.2, turning_share=0.0)
+SMALL_LENS = Camera(640, 360, 280.0, (319.5, 179.5))
+"""The junction's lens, in images of half the size."""
+REFUSE = ('-p', 'gate.min_tracks=100000')
+
+
+@pytest.fixture(scope='module')
+def saved(tmp_path_factory) -> Path:
+    """Return the saved evidence of a junction."""
+    path = tmp_path_factory.mktemp('evidence') / 'evidence.npz'
+    synthetic_evidence(JUNCTION, np.random.default_rng(0)).save(path)
+    return path
+
+
+@pytest.fixture
+def lens_file(tmp_path) -> Path:
+    write_camera_info_yaml(tmp_path / 'lens.yaml', SMALL_LENS, 'north')
+    return tmp_path / 'lens.yaml'
+
+
+@pytest.fixture
+def evidence(saved, capsys):
+    """Return a function that runs the command: status, stdout and stderr."""
+    def run(*arguments: object) -> tuple[int, str, str]:
+        status = main(['evidence', str(saved), '--camera-height', '8', *map(str, arguments)])
+        return status, *capsys.readouterr()
+    return run
+
+
+def document(stdout: str) -> dict:
+    return json.loads(stdout)
+
+
+def test_a_calibration_is_summed_up_and_written(evidence, tmp_path):
+    status, stdout, stderr = evidence('--out', tmp_path / 'out')
+    assert (status, stderr) == (0, '')
+    assert stdout.startswith('Calibrated: focal length ')
+    assert stdout.endswith(f'Written to {tmp_path / "out"}: camera_info.yaml, calibration.json, report.html\n')
+    assert 'accepted after' not in stdout
+    assert {path.name for path in (tmp_path / 'out').iterdir()} == {
+        'camera_info.yaml', 'calibration.json', 'report.html', 'figures'}
+    figures = {path.stem for path in (tmp_path / 'out' / 'figures').iterdir()}
+    assert {'all_tracks', 'kept_tracks', 'ground_grid'} <= figures
+    assert not {'top_view', 'undistorted'} & figures  # these need a picture
+    assert 'evidence.npz' in (tmp_path / 'out' / 'report.html').read_text()
+    written = document((tmp_path / 'out' / 'calibration.json').read_text())
+    assert written['evidence']['accepted_at_s'] is None
+    assert read_camera_info(tmp_path / 'out' / 'camera_info.yaml').focal_px == written['camera']['focal_px']
+
+
+def test_json_is_the_file_and_nothing_is_written_unless_asked(evidence, tmp_path, monkeypatch):
+    (tmp_path / 'here').mkdir()
+    monkeypatch.chdir(tmp_path / 'here')
+    status, stdout, _ = evidence('--json', '--method', 'paper')
+    assert (status, document(stdout)['method']) == (0, 'paper')
+    assert not list((tmp_path / 'here').iterdir())
+    evidence('--quiet', '--method', 'paper', '--out', 'out')
+    assert stdout == (tmp_path / 'here' / 'out' / 'calibration.json').read_text()
+
+
+def test_a_refusal_is_status_3_with_the_reason_on_stderr(evidence, tmp_path):
+    status, stdout, stderr = evidence(*REFUSE, '--out', tmp_path / 'out')
+    assert status == 3
+    assert stderr.startswith('Not calibrated: ') and stderr.count('\n') == 1
+    assert 'Not calibrated' not in stdout and 'tracks of' in stdout
+    assert not (tmp_path / 'out' / 'camera_info.yaml').exists()
+
+
+def test_json_of_a_refusal_is_on_stdout_alone(evidence):
+    status, stdout, stderr = evidence(*REFUSE, '--json')
+    assert (status, document(stdout)['state']) == (3, 'refused')
+    assert document(stdout)['refusal']['message'].rstrip('.') in stderr
+
+
+def test_quiet_leaves_only_the_reason(evidence):
+    status, stdout, stderr = evidence(*REFUSE, '--quiet')
+    assert (status, stdout) == (3, '')
+    assert stderr.startswith('Not calibrated: ') and stderr.count('\n') == 1
+
+
+def test_no_height_is_said(saved, lens_file, capsys):
+    for more, told in (([], 'the lens is calibrated'), (['--camera-info', str(lens_file)], 'the lens is known')):
+        assert main(['evidence', str(saved), *REFUSE, *more]) == 3
+        assert f'No camera height given: {told}, the ground plane is left out' in capsys.readouterr().err
+
+
+def test_a_known_lens_is_kept_and_the_pose_is_found(evidence, lens_file):
+    status, stdout, _ = evidence('--json', '--camera-info', lens_file)
+    assert status == 0
+    found = document(stdout)
+    assert found['camera'] == {'model': 'kannala_brandt', 'focal_px': 560.0, 'principal_point_px': [639.5, 359.5],
+                               'k': [0.0, 0.0, 0.0, 0.0]}
+    x, y, z, w = found['ground_from_camera']['rotation_xyzw']
+    up_in_camera = np.array([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)])
+    # with the true lens the normal is as good as 0.2 px at the ends of tracks of hundreds of pixels
+    assert np.degrees(np.arccos(up_in_camera @ JUNCTION.normal_in_camera)) < 0.5
+
+
+def test_the_lens_of_the_live_node_is_used_and_the_command_line_wins(evidence, lens_file, tmp_path):
+    params = tmp_path / 'params.yaml'
+    params.write_text(yaml.safe_dump({'/**': {'ros__parameters': {'camera_info_file': str(lens_file)}}}))
+    _, stdout, _ = evidence('--json', '--params-file', params)
+    assert document(stdout)['camera']['focal_px'] == 560.0
+    write_camera_info_yaml(tmp_path / 'other.yaml', replace(SMALL_LENS, focal_px=282.0), 'north')
+    _, stdout, _ = evidence('--json', '--params-file', params, '--camera-info', tmp_path / 'other.yaml')
+    assert document(stdout)['camera']['focal_px'] == 564.0
+
+
+def test_a_lens_of_another_shape_is_wrong_usage(evidence, tmp_path):
+    write_camera_info_yaml(tmp_path / 'square.yaml', Camera.equidistant(500, 500, 200.0), 'north')
+    status, stdout, stderr = evidence('--camera-info', tmp_path / 'square.yaml')
+    assert (status, stdout) == (2, '')
+    assert stderr.startswith('autocalib: error: the lens was calibrated in images of 500x500') and '1280x720' in stderr
+
+
+@pytest.mark.parametrize(('name', 'told'), [
+    ('nowhere.yaml', 'cannot read'), ('evidence.npz', 'it is not YAML'), ('.', 'Is a directory')])
+def test_an_unreadable_lens_is_one_line_and_status_2(evidence, saved, name, told):
+    status, stdout, stderr = evidence('--camera-info', saved.parent / name)
+    assert (status, stdout, stderr.count('\n')) == (2, '', 1)
+    assert told in stderr and str(saved.parent) in stderr
+
+
+@pytest.mark.parametrize(('content', 'told'), [
+    (None, 'No such file'), (b'', 'is not a file of saved evidence'), (b'words', 'is not a file of saved evidence')])
+def test_unreadable_evidence_is_one_line_and_status_2(content, told, tmp_path, capsys):
+    if content is not None:
+        (tmp_path / 'e.npz').write_bytes(content)
+    assert main(['evidence', str(tmp_path / 'e.npz'), '--out', str(tmp_path / 'out')]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith('autocalib: error: ') and told in error and error.count('\n') == 1
+    assert not (tmp_path / 'out').exists()
