@@ -98,8 +98,12 @@ class JointOptions(_Checked):
     """The robust method."""
 
     max_tracks: int = option(1500, 'tracks in one solution, spread over image, roads and time', low=20, high=10000)
-    noise_px: float = option(0.5, 'standard deviation of a tracked position', low=0.01, high=10)
-    wander_m: float = option(0.1, "standard deviation of a driver's way from a straight line, metres", low=0.0, high=2)
+    noise_px: float = option(0.3, 'standard deviation of a tracked position', low=0.01, high=10)
+    wander_m: float = option(0.06, "standard deviation of a driver's way from a straight line, metres", low=0, high=2)
+    drift_px: float = option(0.05, 'where tracked points drift: standard deviation after a way of one pixel, which '
+                             'grows with the root of the way', low=0, high=1)
+    heading_deg: float = option(0.25, "where tracked points drift: standard deviation of a track's heading from that "
+                                'of its road', low=0, high=5)
     lens_prior: str = option(
         'auto', 'family of the lens: let the traffic choose, near equidistant, free of distortion, or any in between',
         choices=('auto', 'equidistant', 'distortion_free', 'kannala_brandt'))

@@ -16,7 +16,7 @@ MIN_VEHICLES = 4
 """Vehicles, distinct, that make a road; fewer may be one driver's whim."""
 STRAIGHT_SHARE = 0.35
 """Share of vehicles that follow the roads; below it the traffic turns, and what it agrees on is a turn."""
-ONE_ROAD_SHARE = 0.6
+ONE_ROAD_SHARE = 0.75
 """The same where one road alone is found: on a ring or a bend some arc always passes for a road, of few vehicles."""
 MIN_CONTRAST = 1.3
 """Agreement at the best trial focal length over that at the median one: wrong lenses bend straight paths apart."""

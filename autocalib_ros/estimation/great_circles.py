@@ -34,8 +34,8 @@ class TrackSet:
     """Shape (tracks, SAMPLES)."""
     vehicles: np.ndarray
     """Shape (tracks,)."""
-    times_s: np.ndarray
-    """Mean time of each track, shape (tracks,)."""
+    sample_times_s: np.ndarray
+    """Time of each point, shape (tracks, SAMPLES)."""
     indices: np.ndarray
     """Index of each track in the evidence, shape (tracks,)."""
 
@@ -44,8 +44,13 @@ class TrackSet:
 
     def subset(self, keep: np.ndarray) -> TrackSet:
         """Return the tracks that `keep`, a mask or indices, selects."""
-        return TrackSet(self.pixels[keep], self.weights[keep], self.vehicles[keep], self.times_s[keep],
+        return TrackSet(self.pixels[keep], self.weights[keep], self.vehicles[keep], self.sample_times_s[keep],
                         self.indices[keep])
+
+    @property
+    def times_s(self) -> np.ndarray:
+        """Mean time of each track, shape (tracks,)."""
+        return self.sample_times_s.mean(axis=1)
 
     @property
     def share_of_vehicle(self) -> np.ndarray:
@@ -93,12 +98,12 @@ def _spread(candidates: list[tuple[int, float, np.ndarray]], evidence: Evidence,
 
 def _track_set(evidence: Evidence, indices: list[int]) -> TrackSet:
     pixels, weights = np.zeros((len(indices), SAMPLES, 2)), np.zeros((len(indices), SAMPLES))
-    times = np.zeros(len(indices))
+    times = np.zeros((len(indices), SAMPLES))
     for row, index in enumerate(indices):
         track = evidence.track(index)
         chosen = np.round(np.linspace(0, len(track.times_s) - 1, SAMPLES)).astype(int)
         first = np.concatenate([[True], np.diff(chosen) > 0])
-        pixels[row], weights[row], times[row] = track.points_px[chosen], first / first.sum(), track.times_s.mean()
+        pixels[row], weights[row], times[row] = track.points_px[chosen], first / first.sum(), track.times_s[chosen]
     return TrackSet(pixels, weights, evidence.track_vehicles[indices].astype(int), times, np.array(indices, int))
 
 

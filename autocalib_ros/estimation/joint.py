@@ -26,9 +26,10 @@ from autocalib_ros.estimation.great_circles import (
     rays_of,
 )
 from autocalib_ros.estimation.lens_prior import LensPrior
-from autocalib_ros.estimation.path_noise import whitening
+from autocalib_ros.estimation.path_noise import USUAL_HEIGHT_M, on_road, whitening
 from autocalib_ros.estimation.uncertainty import cluster_covariance, correlation_within, propagate
 from autocalib_ros.estimation.vanishing_points import Directions, distances2_through
+from autocalib_ros.estimation.vehicles import bodies, corroborated, heading_off_deg
 
 TIGHTENING = (8.0, 4.0, 2.0)
 TIGHTEST = 1.0
@@ -49,6 +50,10 @@ MIN_TRACKS = 4
 """Fewer tracks on any road do not go on with a solution: it is judged, and refused, as it stands."""
 OUTLIER_PX = 4.0
 """A track farther than this from every road, root mean square, belongs to none."""
+ALONG_X = 0.2
+"""Sine of the angle to the camera's x axis below which a road does not tell the plane of a camera without roll."""
+NEAREST_HORIZON = 0.03
+"""Least angle below the horizon at which a point is placed on the road, radians."""
 EXPLAINED = 3.0
 """A track counts for its road when its mean squared whitened distance is below so many medians."""
 DISCRIMINATION = 5.0
@@ -88,6 +93,9 @@ class Setting:
     """Height of the camera, 0 unknown: it weighs near against far, no more."""
     crossing_rad: float | None = None
     """Angle of the second road to the first where that is held."""
+    drifting: bool = False
+    """Whether tracked points drift; then one track hardly tells a slight turn, and those of one body are judged
+    together."""
     vehicle_correlation: float = 0.3
     """How much the errors of one vehicle's tracks correlate, 0 to 1: a guess until a fit has measured it."""
 
@@ -109,8 +117,11 @@ class Problem:
         normals, _, matrix = fit_circles(rays, self.tracks.weights)
         normals, _ = fit_circles_through(matrix, base.directions[self.labels])
         self.scale = rays.pixel_scale(normals[:, None])
-        self.whiten = whitening(rays, self.mask, normals, base.directions[self.labels], ground_up(base, rays),
-                                setting.height_m, setting.options)
+        self.corroboration = np.ones(len(self.tracks))
+        self.up = ground_up(base, rays)
+        self.road = on_road(rays, normals, base.directions[self.labels], self.up, setting.height_m)
+        self.whiten = whitening(self.tracks.pixels, self.mask, self.road, setting.options,
+                                drifting=setting.drifting)
 
     @property
     def size(self) -> int:
@@ -138,6 +149,14 @@ class Problem:
         distance = rays.distance_px(self.circles(state, rays)[:, None])
         return np.einsum('tij,tj->ti', self.whiten, distance)
 
+    def vehicles_influence(self, distance_px: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        """Influence (tracks,) of tracks by whether their vehicles keep to their roads; 1 where nothing drifts."""
+        if not self.setting.drifting:
+            return np.ones(len(self.tracks))
+        side = np.where(normals @ self.up < 0, -1.0, 1.0)[:, None]
+        off, error = heading_off_deg(side * distance_px, self.road.px_per_m, self.road.along_m, self.mask)
+        return corroborated(off, error, self.tracks.vehicles, self.labels)
+
     def linearised(self) -> tuple[np.ndarray, np.ndarray]:
         """Whitened distances (tracks, samples) at the base and their derivatives (tracks, samples, parameters).
 
@@ -163,6 +182,7 @@ class Problem:
         slopes = self.whiten @ np.stack([free, *columns], axis=-1)
         free, slopes = slopes[..., :1], slopes[..., 1:]
         along = (free * slopes).sum(axis=1, keepdims=True) / np.maximum((free * free).sum(axis=1, keepdims=True), 1e-12)
+        self.corroboration = self.vehicles_influence(here, normals[:, 0])
         return np.einsum('tij,tj->ti', self.whiten, here), slopes - free * along
 
     def _distance(self, unit: np.ndarray, normals: np.ndarray) -> np.ndarray:
@@ -224,11 +244,16 @@ class JointFit:
 
 
 def ground_up(state: State, rays: Rays) -> np.ndarray:
-    """Normal (3,) of the plane away from the traffic; with one road that of the plane level with the image."""
+    """Normal (3,) of the plane away from the traffic; with one road that of a camera that is not rolled.
+
+    Such a plane contains the camera's x axis and the road; a road along that axis leaves the one across the image.
+    """
     normal = state.rotation[:, 2]
     if len(state.angles_rad) == 1:
         along = state.directions[0]
-        normal = np.array([0.0, -1.0, 0.0]) + along[1] * along
+        level = np.cross(along, [1.0, 0.0, 0.0])
+        image_up = along[1] * along - [0.0, 1.0, 0.0]
+        normal = level if np.linalg.norm(level) > ALONG_X else image_up
         normal = normal / max(np.linalg.norm(normal), 1e-9)
     return -normal if np.mean(rays.bearings @ normal > 0) > 0.5 else normal
 
@@ -277,6 +302,7 @@ def solve_joint(start: State, tracks: TrackSet, setting: Setting, *, refine: boo
 def _stepped(problem: Problem, share: np.ndarray, tightness: float) -> tuple[np.ndarray, State]:
     """Take one Gauss-Newton step on the robust cost, shortened until the cost does not grow."""
     residuals, slopes = problem.linearised()
+    share = share * problem.corroboration
     squared = (residuals**2).sum(axis=1) / problem.freedom
     scale = max(float(np.median(squared)), LEAST_SCALE)
     weight = share / scale * influence(squared, tightness * scale)
@@ -340,7 +366,7 @@ def _judged(last: Problem, state: State, tracks: TrackSet, share: np.ndarray) ->
     squared = (residuals**2).sum(axis=1) / problem.freedom
     scale = max(float(np.median(squared)), LEAST_SCALE)
     limit = TIGHTEST * scale
-    shared = share[problem.used] / scale
+    shared = share[problem.used] * problem.corroboration / scale
     deviations, prior = problem.prior_gradient(state.camera)
     whitened2 = np.full(len(tracks), np.inf)
     whitened2[problem.used] = squared
@@ -354,6 +380,27 @@ def _judged(last: Problem, state: State, tracks: TrackSet, share: np.ndarray) ->
     covariance = cluster_covariance(slopes, residuals, weight, bend, problem.tracks.vehicles, prior)
     return JointFit(state, labels, np.sqrt(distance2), whitened2, scale, cost, problem, covariance, information,
                     correlation_within(problem.tracks.vehicles, pulls))
+
+
+def noise_cost(fit: JointFit, tracks: TrackSet, *, drifting: bool) -> float:
+    """Twice the negative logarithm of how probable the residuals are with or without drift, their scale fitted."""
+    labels = np.where(fit.explained(), fit.labels, -2)
+    problem = Problem(fit.state, tracks, labels, replace(fit.problem.setting, drifting=drifting))
+    residuals, _ = problem.linearised()
+    scale = max(float(np.median((residuals**2).sum(axis=1) / problem.freedom)), LEAST_SCALE)
+    diagonal = np.diagonal(problem.whiten, axis1=1, axis2=2)
+    logarithms = np.where(problem.mask, np.log(np.where(problem.mask, diagonal, 1.0)), 0.0).sum(axis=1)
+    return float((problem.freedom * np.log(scale) - 2.0 * logarithms).sum())
+
+
+def with_bodies(fit: JointFit, tracks: TrackSet) -> TrackSet:
+    """Return the tracks with vehicles that are bodies on the ground of a solution."""
+    rays = rays_of(fit.state.camera, tracks.pixels)
+    up = ground_up(fit.state, rays)
+    height = fit.problem.setting.height_m or USUAL_HEIGHT_M
+    below = np.maximum(-(rays.bearings @ up), NEAREST_HORIZON)
+    ground_m = height * (rays.bearings @ fit.state.rotation[:, :2]) / below[..., None]
+    return replace(tracks, vehicles=bodies(tracks, ground_m))
 
 
 def judged_with(fit: JointFit, tracks: TrackSet, setting: Setting) -> JointFit:

@@ -1,11 +1,14 @@
-"""How far a straight drive's image may lie from its great circle: pixels of tracking, and metres of wander.
+"""How far a straight drive's image may lie from its great circle: tracking, drift, wander and heading.
 
-A driver wanders in the lane by a tenth of a metre, slowly: that is many pixels close to the camera and few far
-away, and neighbouring points share it. Residuals are whitened by that covariance, so that each track weighs by
-what it tells, near or far, sampled densely or not.
+A tracked position has noise of its own, and a driver wanders in the lane, slowly: many pixels close to the camera
+and few far away. Where points are followed from picture to picture each step may add a little more, a random walk,
+and a track's heading is then off its road's; the residuals themselves tell whether they do. Residuals are whitened
+by that covariance, so that each track weighs by what it tells, near or far, long or short, sampled densely or not.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -20,21 +23,40 @@ SEEN_FROM = 0.02
 """Least height of the road's direction below the horizon, radians: farther away all metres are alike."""
 
 
-def whitening(rays: Rays, mask: np.ndarray, normals: np.ndarray, directions: np.ndarray, up: np.ndarray,
-              height_m: float, options: JointOptions) -> np.ndarray:
+@dataclass(frozen=True)
+class OnRoad:
+    """Where tracks run on the road, as far as that weighs their distances."""
+
+    px_per_m: np.ndarray
+    """Pixels across a circle for a metre across its road, shape (tracks, samples)."""
+    along_m: np.ndarray
+    """Metres along the road, shape (tracks, samples)."""
+
+
+def on_road(rays: Rays, normals: np.ndarray, directions: np.ndarray, up: np.ndarray, height_m: float) -> OnRoad:
+    """Place tracks on the road: circle normals and road directions (tracks, 3), ground normal `up` (3,)."""
+    below = np.maximum(-(rays.bearings @ up), SEEN_FROM) / (height_m if height_m > 0 else USUAL_HEIGHT_M)
+    across = np.abs(dot(normals, np.cross(directions, up)))[:, None]
+    return OnRoad(across * rays.pixel_scale(normals[:, None]) * below, dot(rays.bearings, directions[:, None]) / below)
+
+
+def whitening(pixels: np.ndarray, mask: np.ndarray, road: OnRoad, options: JointOptions, *,
+              drifting: bool) -> np.ndarray:
     """Return W (tracks, samples, samples) with W^T W the inverse covariance of the distances from the circles.
 
-    `normals` (tracks, 3) are the circles', `directions` (tracks, 3) the roads', `up` (3,) the ground normal. Samples
-    where `mask` (tracks, samples) is false get zero rows and columns.
+    W is lower triangular. Samples where `mask` (tracks, samples) is false get zero rows and columns.
     """
-    height = height_m if height_m > 0 else USUAL_HEIGHT_M
-    below = np.maximum(-(rays.bearings @ up), SEEN_FROM) / height
-    across = np.cross(directions, up)
-    px_per_m = np.abs(dot(normals, across))[:, None] * rays.pixel_scale(normals[:, None]) * below
-    along_m = dot(rays.bearings, directions[:, None]) / below
-    apart = (along_m[:, :, None] - along_m[:, None, :]) / WANDER_LENGTH_M
-    wander = options.wander_m * np.where(mask, px_per_m, 0.0)
+    steps = np.hypot(*np.moveaxis(np.diff(pixels, axis=1), -1, 0)) * (mask[:, 1:] & mask[:, :-1])
+    followed = np.concatenate([np.zeros((len(pixels), 1)), np.cumsum(steps, axis=1)], axis=1)
+    apart = (road.along_m[:, :, None] - road.along_m[:, None, :]) / WANDER_LENGTH_M
+    count = np.maximum(mask.sum(axis=1, keepdims=True), 1)
+    lever = road.along_m - (road.along_m * mask).sum(axis=1, keepdims=True) / count
+    wander, heading = options.wander_m * road.px_per_m, np.radians(options.heading_deg) * lever * road.px_per_m
     covariance = np.exp(-0.5 * apart * apart) * wander[:, :, None] * wander[:, None, :]
+    if drifting:
+        covariance += heading[:, :, None] * heading[:, None, :]
+        covariance += options.drift_px**2 * np.minimum(followed[:, :, None], followed[:, None, :])
+    covariance *= mask[:, :, None] & mask[:, None, :]
     diagonal = np.arange(mask.shape[1])
     covariance[:, diagonal, diagonal] += np.where(mask, options.noise_px**2, 1.0)
     return np.linalg.inv(np.linalg.cholesky(covariance)) * mask[:, None, :]

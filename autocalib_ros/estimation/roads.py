@@ -23,8 +23,10 @@ from autocalib_ros.estimation.joint import (
     cost_at_scale,
     initial_state,
     judged_with,
+    noise_cost,
     road_support,
     solve_joint,
+    with_bodies,
 )
 from autocalib_ros.estimation.lens_prior import PARAMETERS, LensPrior, known_lens, lens_priors
 from autocalib_ros.estimation.straightness import focal_trials
@@ -82,6 +84,9 @@ def find_roads(tracks: TrackSet, image_size: tuple[int, int], options: JointOpti
     best, contrast = found
     fit = _with_real_roads(solve_joint(best.state, tracks, best.problem.setting), tracks, gate)
     fit = _in_likeliest_family(fit, priors[1:], voters, tracks)
+    if noise_cost(fit, tracks, drifting=True) < noise_cost(fit, tracks, drifting=False):
+        tracks = with_bodies(fit, tracks) if len(fit.state.angles_rad) > 1 else tracks
+        fit = solve_joint(fit.state, tracks, replace(fit.problem.setting, drifting=True), refine=True)
     fit = _with_further_roads(fit, tracks, gate)
     fit, angle = _with_right_angle(fit, tracks, options)
     fit, held = _with_what_can_be_told(fit, tracks)

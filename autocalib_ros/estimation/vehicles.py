@@ -1,0 +1,115 @@
+"""One vehicle has one heading: tracks that move as one body are judged together.
+
+A tracked point drifts, so that one track hardly tells a straight drive from a slight turn; the tracks of one vehicle
+together do. What moves together is seen on the ground, where bodies have a size in metres.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from autocalib_ros.estimation.great_circles import TrackSet
+
+BODY_M = 4.0
+"""Points of one body lie within this of a neighbour; a car is as long."""
+SAME_MOVE, SAME_MOVE_M = 0.3, 0.2
+"""Points of one body move alike to this share and so many metres: points higher up seem to go farther."""
+SHORTEST_S = 0.4
+"""Two tracks have to be seen together for this long to tell whether they move alike."""
+WITNESSES = 3
+"""So many tracks corroborate each other; fewer say little of their vehicle."""
+ALONE = 0.25
+"""Influence of a track that nothing corroborates."""
+STRAIGHT_DEG = 0.15
+"""Least spread of headings: lanes are marked no better than that."""
+HEADING_NOISE_DEG = 0.3
+"""What the heading of a single short track is off by at least: its point drifts on the body."""
+SPREADS = 2.0
+"""A vehicle has a quarter of its influence left when its heading is so many spreads off."""
+GROUPS_TO_TELL = 10
+"""So many corroborated vehicles tell the spread of headings; with fewer no vehicle is judged by it."""
+
+
+def bodies(tracks: TrackSet, ground_m: np.ndarray) -> np.ndarray:
+    """Number the bodies that tracks belong to, shape (tracks,).
+
+    `ground_m` (tracks, samples, 2) are positions on the road. Two tracks are of one body when they are near each
+    other at the first and the last time that both are seen, and went the same way between.
+    """
+    times = tracks.sample_times_s
+    first, last = times[:, 0], times[:, -1]
+    order = np.argsort(first, kind='stable')
+    pairs: list[np.ndarray] = []
+    for place, one in enumerate(order):
+        end = np.searchsorted(first[order], last[one] - SHORTEST_S, side='right')
+        others = order[place + 1:end]
+        others = others[np.minimum(last[others], last[one]) - first[others] >= SHORTEST_S]
+        if not len(others):
+            continue
+        until = np.minimum(last[others], last[one])
+        begin_one = _at(times[[one]], ground_m[[one]], first[others])
+        end_one = _at(times[[one]], ground_m[[one]], until)
+        begin_other, end_other = ground_m[others, 0], _at(times[others], ground_m[others], until)
+        moved_one, moved_other = end_one - begin_one, end_other - begin_other
+        far = np.maximum(np.hypot(*moved_one.T), np.hypot(*moved_other.T))
+        alike = ((np.hypot(*(begin_other - begin_one).T) < BODY_M) & (np.hypot(*(end_other - end_one).T) < BODY_M)
+                 & (np.hypot(*(moved_other - moved_one).T) < SAME_MOVE * far + SAME_MOVE_M))
+        pairs.append(np.column_stack([np.full(alike.sum(), one), others[alike]]))
+    edges = np.concatenate(pairs) if pairs else np.zeros((0, 2), int)
+    graph = coo_matrix((np.ones(len(edges)), edges.T), shape=(len(tracks), len(tracks)))
+    return connected_components(graph, directed=False)[1]
+
+
+def _at(times: np.ndarray, places: np.ndarray, when: np.ndarray) -> np.ndarray:
+    """Interpolate places (n or 1, samples, 2), seen at times (n or 1, samples), at `when` (n,); shape (n, 2)."""
+    after = np.clip((times <= when[:, None]).sum(axis=1), 1, times.shape[1] - 1)
+    rows = np.arange(len(when)) if len(times) > 1 or len(when) == 1 else np.zeros(len(when), int)
+    t0, t1 = times[rows, after - 1], times[rows, after]
+    part = np.clip((when - t0) / np.maximum(t1 - t0, 1e-9), 0.0, 1.0)[:, None]
+    return places[rows, after - 1] * (1 - part) + places[rows, after] * part
+
+
+def heading_off_deg(distance_px: np.ndarray, px_per_m: np.ndarray, along_m: np.ndarray,
+                    mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How far each track's heading is off its road's, in degrees, and its error for a pixel of noise; (tracks,) each.
+
+    From the line in a parabola through the distances (tracks, samples) along the road.
+    """
+    weight = mask * px_per_m**2
+    count = np.maximum(mask.sum(axis=1, keepdims=True), 1)
+    centred = along_m - (along_m * mask).sum(axis=1, keepdims=True) / count
+    length = np.maximum(np.ptp(np.where(mask, centred, 0.0), axis=1), 0.3)
+    x = centred / length[:, None]
+    basis = np.stack([np.ones_like(x), x, x * x - 1 / 12], axis=-1)
+    matrix = np.einsum('tsi,tsj,ts->tij', basis, basis, weight) + 1e-9 * np.eye(3)
+    inverse = np.linalg.inv(matrix)
+    offset_m = distance_px / np.maximum(px_per_m, 1e-3)
+    fitted = np.einsum('tij,tsj,ts->ti', inverse, basis, weight * offset_m)
+    return np.degrees(fitted[:, 1] / length), np.degrees(np.sqrt(inverse[:, 1, 1]) / length)
+
+
+def corroborated(off_deg: np.ndarray, error_deg: np.ndarray, vehicles: np.ndarray, roads: np.ndarray) -> np.ndarray:
+    """Influence (tracks,) by whether each track's vehicle, all its tracks on one road together, keeps to the road."""
+    groups, inverse, counts = np.unique(np.column_stack([vehicles, roads]), axis=0, return_inverse=True,
+                                        return_counts=True)
+    inverse = inverse.ravel()
+    median = _weighted_medians(off_deg, 1.0 / (error_deg**2 + HEADING_NOISE_DEG**2), inverse, len(groups))
+    sure = counts >= WITNESSES
+    if sure.sum() < GROUPS_TO_TELL:
+        return np.ones(len(off_deg))
+    spread = max(STRAIGHT_DEG, 1.4826 * float(np.median(np.abs(median[sure]))))
+    weight = 1.0 / (1.0 + (median / (SPREADS * spread)) ** 2) ** 2
+    return (weight * np.where(sure, 1.0, ALONE))[inverse]
+
+
+def _weighted_medians(values: np.ndarray, weights: np.ndarray, groups: np.ndarray, count: int) -> np.ndarray:
+    order = np.lexsort((values, groups))
+    sorted_groups, cumulative = groups[order], np.cumsum(weights[order])
+    starts = np.searchsorted(sorted_groups, np.arange(count))
+    ends = np.searchsorted(sorted_groups, np.arange(count), side='right')
+    before = np.concatenate([[0.0], cumulative])[starts]
+    half = before + 0.5 * (cumulative[ends - 1] - before)
+    middle = np.clip(np.searchsorted(cumulative, half), starts, ends - 1)
+    return values[order][middle]
