@@ -82,7 +82,9 @@ def find_roads(tracks: TrackSet, image_size: tuple[int, int], options: JointOpti
         return Reason('no_direction', f'{len(tracks)} tracks agree on no common direction',
                       'straight traffic is needed: wait for it, or turn the camera towards a straight road')
     best, contrast = found
-    fit = _with_real_roads(solve_joint(best.state, tracks, best.problem.setting), tracks, gate)
+    fit = solve_joint(best.state, tracks, best.problem.setting)
+    second = sorted(int(mask.sum()) for mask in road_support(fit, tracks))[:-1]
+    fit = _with_real_roads(fit, tracks, gate)
     fit = _in_likeliest_family(fit, priors[1:], voters, tracks)
     if noise_cost(fit, tracks, drifting=True) < noise_cost(fit, tracks, drifting=False):
         tracks = with_bodies(fit, tracks) if len(fit.state.angles_rad) > 1 else tracks
@@ -91,7 +93,8 @@ def find_roads(tracks: TrackSet, image_size: tuple[int, int], options: JointOpti
     fit, angle = _with_right_angle(fit, tracks, options)
     fit, held = _with_what_can_be_told(fit, tracks)
     doubt = lens_doubt(fit, contrast, tracks, gate)
-    return doubt or _doubted(fit, angle, held, tracks, gate)
+    across = f'{min([gate.min_tracks_per_road, *(second or [0])])} of {gate.min_tracks_per_road} tracks'
+    return doubt or _doubted(fit, angle, held, across, tracks, gate)
 
 
 def _agreed(voters: TrackSet, setting: Setting, generator: np.random.Generator) -> tuple[JointFit, float] | None:
@@ -244,9 +247,12 @@ def _restored(camera: Camera, prior: Camera, name: str) -> Camera:
     return replace(camera, **values[name])
 
 
-def _doubted(fit: JointFit, angle: str | None, held: tuple[str, ...], tracks: TrackSet,
+def _doubted(fit: JointFit, angle: str | None, held: tuple[str, ...], across: str, tracks: TrackSet,
              gate: GateOptions) -> Roads | Reason:
-    """Return the roads, or why the halves of the evidence disagree; doubts about the plane only take it away."""
+    """Return the roads, or why the halves of the evidence disagree; doubts about the plane only take it away.
+
+    `across` counts the tracks on a second road for the one who waits for them.
+    """
     halves = halves_doubt(fit, tracks, gate)
     if isinstance(halves, Reason):
         return halves
@@ -255,8 +261,8 @@ def _doubted(fit: JointFit, angle: str | None, held: tuple[str, ...], tracks: Tr
     if angle is None:
         tracks_seen = int(fit.explained().sum())
         return Roads(fit, support, assumptions, (halves,), Reason(
-            'one_direction', f'no traffic across the main road yet: {tracks_seen} tracks follow one road, and rotation '
-            'about it is free', 'wait for traffic across the main road'))
+            'one_direction', f'too little traffic across the main road yet: {across}; {tracks_seen} follow one road, '
+            'and rotation about it is free', 'wait for traffic across the main road'))
     checks = () if fit.crossing_held else (angle,)
     return Roads(fit, support, (*assumptions, angle) if fit.crossing_held else assumptions, (*checks, halves),
                  plane_doubt(fit, tracks, gate))

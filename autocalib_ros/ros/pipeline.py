@@ -29,6 +29,8 @@ from autocalib_ros.evidence import Evidence
 
 WAITING_IMAGES = 8
 """Images that may wait for the perception thread: half a second of a hiccup at 15 Hz, 22 MB at 1280x720."""
+TRIED_PERCENT = 99.0
+"""The most that is told while the last solution was refused."""
 PROGRESS_PERIOD_S = 1.0
 """Real time between two looks at the progress."""
 Result = Calibration | Refusal
@@ -97,6 +99,7 @@ class Pipeline:
         self._looked = -PROGRESS_PERIOD_S
         self.counters = Counters()
         self.progress: Progress | None = None
+        self._refused = ''
         self._threads = [threading.Thread(target=run, name=name, daemon=True)
                          for run, name in ((self._perceive, 'perception'), (self._estimate, 'solver'))]
         for thread in self._threads:
@@ -181,7 +184,7 @@ class Pipeline:
             self._submit(evidence, [])
         if time.monotonic() >= self._looked + PROGRESS_PERIOD_S:
             self._looked = time.monotonic()
-            self.progress = self._guarded(self._calibrator.progress)
+            self.progress = self._with_refusal(self._guarded(self._calibrator.progress))
 
     def _submit(self, evidence: Evidence | None, requests: list[Future]) -> None:
         """Leave a snapshot for the solver thread; it takes the place, and the callers, of one still waiting."""
@@ -209,7 +212,15 @@ class Pipeline:
             self._answer(job.waiting, result)
 
     def _solved(self, evidence: Evidence) -> Result:
-        return self._solve(evidence, self._options, lens=self._fitting(evidence.image_size))
+        result = self._solve(evidence, self._options, lens=self._fitting(evidence.image_size))
+        self._refused = result.message if isinstance(result, Refusal) else ''
+        return result
+
+    def _with_refusal(self, progress: Progress | None) -> Progress | None:
+        """Add why the last solution was refused: evidence may be enough to try and not to succeed."""
+        if progress is None or not self._refused:
+            return progress
+        return Progress(min(progress.percent, TRIED_PERCENT), tuple(dict.fromkeys((*progress.missing, self._refused))))
 
     def _fitting(self, image_size: tuple[int, int]) -> Camera | None:
         """Return the known lens for images of that size; UsageError when they have another shape."""

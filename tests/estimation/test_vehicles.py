@@ -15,8 +15,8 @@ def moving(starts: list[tuple[float, float]], speeds: list[tuple[float, float]],
     times = np.array(begin_s)[:, None] + np.linspace(0.0, 3.0, SAMPLES)
     ground = (np.array(starts)[:, None] + np.array(speeds)[:, None] * (times - times[:, :1])[..., None])
     count = len(starts)
-    tracks = TrackSet(np.zeros((count, SAMPLES, 2)), np.full((count, SAMPLES), 1 / SAMPLES), np.zeros(count, int), times,
-                      np.arange(count))
+    tracks = TrackSet(np.zeros((count, SAMPLES, 2)), np.full((count, SAMPLES), 1 / SAMPLES),
+                      np.zeros(count, int), times, np.arange(count))
     return tracks, ground
 
 

@@ -75,6 +75,10 @@ def test_json_is_the_file_and_nothing_is_written_unless_asked(evidence, tmp_path
     assert stdout == (tmp_path / 'here' / 'out' / 'calibration.json').read_text()
 
 
+def test_ten_runs_on_one_evidence_give_the_same_bytes(evidence):
+    assert len({evidence('--json')[1] for _ in range(10)}) == 1
+
+
 def test_a_refusal_is_status_3_with_the_reason_on_stderr(evidence, tmp_path):
     status, stdout, stderr = evidence(*REFUSE, '--out', tmp_path / 'out')
     assert status == 3

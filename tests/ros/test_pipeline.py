@@ -194,6 +194,16 @@ def test_image_of_another_shape_than_the_known_lens_is_left_out_and_told(start, 
     assert (heard.sizes, heard.faults) == ([(width, height)], [])
 
 
+def test_progress_says_why_the_last_solution_was_refused(start, heard, monkeypatch):
+    monkeypatch.setattr('autocalib_ros.ros.pipeline.PROGRESS_PERIOD_S', 0.0)
+    pipeline = start(refusal)
+    pipeline.offer(0, PIXELS)
+    pipeline.solve_now().result(PATIENCE_S)
+    pipeline.offer(FRAME_NS, PIXELS)
+    wait_for(lambda: pipeline.progress and '12 tracks of the 40 needed.' in pipeline.progress.missing, 'the reason')
+    assert pipeline.progress.percent <= 99.0
+
+
 def test_nothing_to_solve_before_the_first_image(start):
     assert result_of(start(calibration).solve_now()) is None
 
