@@ -35,8 +35,6 @@ def _checked(item: dataclasses.Field, value: Any) -> Any:
     kind, meta = type(item.default), item.metadata
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
-    if kind is str and isinstance(value, (int, float)) and not isinstance(value, bool):
-        value = f'{value:g}'
     if type(value) is not kind:
         raise UsageError(f"option '{item.name}' takes a {kind.__name__}, got {value!r}")
     if meta['choices'] and value not in meta['choices']:
@@ -118,6 +116,8 @@ class JointOptions(_Checked):
         'number of degrees asserts it')
 
     def __post_init__(self) -> None:
+        if isinstance(self.road_angle, (int, float)) and not isinstance(self.road_angle, bool):
+            object.__setattr__(self, 'road_angle', f'{self.road_angle:g}')  # YAML reads degrees as a number
         super().__post_init__()
         if self.road_angle not in ('auto', 'free') and self.crossing_deg is None:
             raise UsageError("option 'road_angle' is auto, free, or degrees between 10 and 170; "

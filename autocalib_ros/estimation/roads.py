@@ -31,13 +31,15 @@ from autocalib_ros.estimation.joint import (
 from autocalib_ros.estimation.lens_prior import PARAMETERS, LensPrior, known_lens, lens_priors
 from autocalib_ros.estimation.straightness import focal_trials
 from autocalib_ros.estimation.uncertainty import told_by_evidence
-from autocalib_ros.estimation.vanishing_points import Directions, consensus_directions
+from autocalib_ros.estimation.vanishing_points import INLIER_PX, Directions, consensus_directions
 
 TRIALS = 14
 """Focal lengths tried as starts: steps of about 17 %, within which the joint problem converges."""
 STARTS = 3
 VOTERS = 200
 """Tracks, evenly out of all, from which the starts are made and compared; the solution then uses every track."""
+WELL_EXPLAINED, LOOSE = 0.5, 3.0
+"""Below this share of explained tracks, agreement is looked for again with so many times wider limits."""
 MIDDLE = 0.3
 """A radius in image diagonals at which two lenses of one field of view agree about best."""
 MOST_ROADS = 4
@@ -101,18 +103,36 @@ def _agreed(voters: TrackSet, setting: Setting, generator: np.random.Generator) 
     """Solve from the directions on which the tracks agree at trial focal lengths; the most probable solution.
 
     And the contrast: how much better the best trial agreed than the middling one. None without any agreement.
+    Where little is explained the agreement is looked for again less strictly: a lens that is neither centred nor
+    equidistant bends long tracks by many pixels at every trial.
     """
-    prior = setting.prior
-    known = prior.sigma[0] < np.inf
-    size = (prior.centre.width, prior.centre.height)
-    trials = [prior.centre.focal_px] if known else focal_trials(voters, size, TRIALS)
-    agreed = [consensus_directions(prior.start(trial), voters, generator) for trial in trials]
-    starts = _peaks(agreed)[:STARTS]
-    if not starts:
+    fits, scores = _from_trials(voters, setting, generator, INLIER_PX)
+    if not fits:
         return None
-    fits = [solve_joint(initial_state(prior.start(trials[index]), agreed[index]), voters, setting) for index in starts]
-    scores = np.array([item.score for item in agreed])
-    return _most_probable(fits, voters), np.inf if known else float(scores.max() / max(np.median(scores), 1e-9))
+    best = _most_probable(fits, voters)
+    if best.explained().mean() < WELL_EXPLAINED:
+        best = _most_probable([best, *_from_trials(voters, setting, generator, LOOSE * INLIER_PX)[0]], voters)
+    known = setting.prior.sigma[0] < np.inf
+    return best, np.inf if known else float(scores.max() / max(np.median(scores), 1e-9))
+
+
+def _from_trials(voters: TrackSet, setting: Setting, generator: np.random.Generator,
+                 inlier_px: float) -> tuple[list[JointFit], np.ndarray]:
+    """Solutions from the trial focal lengths of best agreement, and the scores of all trials, shape (trials,)."""
+    prior = setting.prior
+    size = (prior.centre.width, prior.centre.height)
+    known = prior.sigma[0] < np.inf
+    trials = [prior.centre.focal_px] if known else focal_trials(voters, size, TRIALS)
+    agreed = [consensus_directions(prior.start(trial), voters, generator, inlier_px=inlier_px) for trial in trials]
+    starts = [initial_state(prior.start(trials[index]), agreed[index]) for index in _peaks(agreed)[:STARTS]]
+    fits = [solve_joint(start, voters, setting) for start in starts]
+    # two roads that fell together describe one road twice, and its errors the better for it
+    return [fit for fit in fits if _apart(fit)] or fits, np.array([item.score for item in agreed])
+
+
+def _apart(fit: JointFit) -> bool:
+    turns = np.abs(np.sin(np.diff(fit.state.angles_rad)))
+    return bool(turns.min(initial=1.0) > np.sin(np.radians(APART_DEG)))
 
 
 def _in_likeliest_family(fit: JointFit, priors: list[LensPrior], voters: TrackSet, tracks: TrackSet) -> JointFit:
@@ -151,8 +171,7 @@ def _most_probable(fits: list[JointFit], tracks: TrackSet, margin: float = 0.0) 
 def _with_real_roads(fit: JointFit, tracks: TrackSet, gate: GateOptions) -> JointFit:
     """Solve again with the one road that explains most vehicles when a second has too little behind it."""
     support = road_support(fit, tracks)
-    turns = np.abs(np.sin(np.diff(fit.state.angles_rad)))
-    if all(is_road(mask, tracks, gate) for mask in support) and turns.min(initial=1.0) > np.sin(np.radians(APART_DEG)):
+    if all(is_road(mask, tracks, gate) for mask in support) and _apart(fit):
         return fit
     explained = fit.explained()
     counts = [len(np.unique(tracks.vehicles[explained & (fit.labels == road)])) for road in range(len(support))]

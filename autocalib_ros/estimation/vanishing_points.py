@@ -44,7 +44,7 @@ def distances2_through(matrix: np.ndarray, directions: np.ndarray) -> np.ndarray
 
 
 def consensus_directions(camera: Camera, tracks: TrackSet, generator: np.random.Generator,
-                         count: int = 2) -> Directions:
+                         count: int = 2, inlier_px: float = INLIER_PX) -> Directions:
     """Find up to `count` directions, strongest first, that tracks' great circles share.
 
     A track counts by its surprise: minus the logarithm of the share of random directions that it would
@@ -54,17 +54,17 @@ def consensus_directions(camera: Camera, tracks: TrackSet, generator: np.random.
     normals, own, matrix = fit_circles(rays, tracks.weights)
     probes = generator.normal(size=(PROBES, 3))
     probes /= np.linalg.norm(probes, axis=1, keepdims=True)
-    chance = _support(distances2_through(matrix, probes)).mean(axis=0)
-    surprise = -np.log(np.clip(chance, 1.0 / PROBES, 1.0)) * np.sqrt(tracks.share_of_vehicle) * (own < INLIER_PX**2)
+    chance = _support(distances2_through(matrix, probes), inlier_px).mean(axis=0)
+    surprise = -np.log(np.clip(chance, 1.0 / PROBES, 1.0)) * np.sqrt(tracks.share_of_vehicle) * (own < inlier_px**2)
     found: list[np.ndarray] = []
     labels = np.full(len(tracks), -2)
     score = 0.0
     left = surprise.copy()
     for label in range(count):
-        candidate = _strongest(normals, matrix, left, found, generator)
+        candidate = _strongest(normals, matrix, left, found, generator, inlier_px)
         if candidate is None:
             break
-        support = _support(distances2_through(matrix, candidate[None])[0])
+        support = _support(distances2_through(matrix, candidate[None])[0], inlier_px)
         score += float((left * support).sum())
         labels[(support > 0) & (left > 0)] = label
         left = np.where(support > 0, 0.0, left)
@@ -72,12 +72,12 @@ def consensus_directions(camera: Camera, tracks: TrackSet, generator: np.random.
     return Directions(np.array(found).reshape(-1, 3), labels, score)
 
 
-def _support(distance2: np.ndarray) -> np.ndarray:
-    return np.maximum(0.0, 1.0 - distance2 / INLIER_PX**2)
+def _support(distance2: np.ndarray, inlier_px: float) -> np.ndarray:
+    return np.maximum(0.0, 1.0 - distance2 / inlier_px**2)
 
 
 def _strongest(normals: np.ndarray, matrix: np.ndarray, surprise: np.ndarray, found: list[np.ndarray],
-               generator: np.random.Generator) -> np.ndarray | None:
+               generator: np.random.Generator, inlier_px: float) -> np.ndarray | None:
     """Return the direction with the most support among intersections of pairs of great circles."""
     total = surprise.sum()
     if np.count_nonzero(surprise) < 3:
@@ -90,21 +90,21 @@ def _strongest(normals: np.ndarray, matrix: np.ndarray, surprise: np.ndarray, fo
         candidates = candidates[np.abs(candidates @ other) < np.cos(np.radians(MIN_ANGLE_DEG))]
     if not len(candidates):
         return None
-    support = _support(distances2_through(matrix, candidates)) @ surprise
+    support = _support(distances2_through(matrix, candidates), inlier_px) @ surprise
     best = candidates[np.argmax(support)]
-    return _refined(best, matrix, surprise)
+    return _refined(best, matrix, surprise, inlier_px)
 
 
-def _refined(direction: np.ndarray, matrix: np.ndarray, surprise: np.ndarray) -> np.ndarray:
+def _refined(direction: np.ndarray, matrix: np.ndarray, surprise: np.ndarray, inlier_px: float) -> np.ndarray:
     """Climb to the local best by halving steps around the direction."""
     step = np.radians(2.0)
-    best = float(_support(distances2_through(matrix, direction[None])[0]) @ surprise)
+    best = float(_support(distances2_through(matrix, direction[None])[0], inlier_px) @ surprise)
     while step > np.radians(0.02):
         first, second = orthonormal_basis(direction)
         around = np.linspace(0, 2 * np.pi, 8, endpoint=False)[:, None]
         trials = direction + step * (np.cos(around) * first + np.sin(around) * second)
         trials /= np.linalg.norm(trials, axis=1, keepdims=True)
-        support = _support(distances2_through(matrix, trials)) @ surprise
+        support = _support(distances2_through(matrix, trials), inlier_px) @ surprise
         if support.max() > best:
             best, direction = float(support.max()), trials[np.argmax(support)]
         else:
