@@ -383,8 +383,13 @@ def _judged(last: Problem, state: State, tracks: TrackSet, share: np.ndarray) ->
 
 
 def noise_cost(fit: JointFit, tracks: TrackSet, *, drifting: bool) -> float:
-    """Twice the negative logarithm of how probable the residuals are with or without drift, their scale fitted."""
+    """Twice the negative logarithm of how probable the residuals are with or without drift, their scale fitted.
+
+    Infinite where hardly a track is explained.
+    """
     labels = np.where(fit.explained(), fit.labels, -2)
+    if np.count_nonzero(labels >= 0) < MIN_TRACKS:
+        return np.inf
     problem = Problem(fit.state, tracks, labels, replace(fit.problem.setting, drifting=drifting))
     residuals, _ = problem.linearised()
     scale = max(float(np.median((residuals**2).sum(axis=1) / problem.freedom)), LEAST_SCALE)
