@@ -215,7 +215,11 @@ def _calibration_json(result: Calibration) -> dict[str, Any]:
             'translation_m': None if result.paper.translation_m is None else list(result.paper.translation_m)}}
 
 
+def calibration_json(result: Calibration | Refusal, *, accepted_at_s: float | None = None) -> str:
+    """Return the text of calibration.json in full precision."""
+    return json.dumps(to_json(result, accepted_at_s=accepted_at_s), indent=1, allow_nan=False)
+
+
 def write_calibration_json(path: Path, result: Calibration | Refusal, *, accepted_at_s: float | None = None) -> None:
-    """Write calibration.json in full precision, atomically."""
-    text = json.dumps(to_json(result, accepted_at_s=accepted_at_s), indent=1, allow_nan=False)
-    write_atomically(path, text + '\n')
+    """Write calibration.json, atomically."""
+    write_atomically(path, calibration_json(result, accepted_at_s=accepted_at_s) + '\n')

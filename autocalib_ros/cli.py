@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import logging
 import os
 import shutil
@@ -289,9 +288,9 @@ def _print_summary(replayed: ReplayResult, out: Path | None, names: list[str]) -
 
 def _print_json(replayed: ReplayResult) -> None:
     """Print what calibration.json holds, and nothing else, so that a program can read it."""
-    from autocalib_ros.calibration import to_json
+    from autocalib_ros.calibration import calibration_json
 
-    print(json.dumps(to_json(replayed.result, accepted_at_s=replayed.accepted_at_s), indent=1, allow_nan=False))
+    print(calibration_json(replayed.result, accepted_at_s=replayed.accepted_at_s))
 
 
 def _write_bag(path: Path, replayed: ReplayResult, source: Source) -> None:

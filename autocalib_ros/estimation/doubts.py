@@ -86,11 +86,11 @@ def _curvature_doubt(fit: JointFit, gate: GateOptions) -> Reason | None:
     camera, prior = fit.state.camera, fit.problem.setting.prior
     sigma = float(fit.sigma(lambda state: np.array([np.log(state.camera.focal_px)]))[0])
     diagonals = camera.focal_px / np.hypot(camera.width, camera.height)
-    too_long = diagonals > LONGEST_FOCAL and not np.isfinite(prior.sigma[0])
+    too_long = diagonals > LONGEST_FOCAL and not prior.focal_known
     # without distortion only an angle between roads tells the focal length, and one that was found by that focal
     # length proves nothing
     circular = prior.family == 'distortion_free' and not (
-        np.isfinite(prior.sigma[0]) or fit.problem.setting.options.crossing_deg is not None)
+        prior.focal_known or fit.problem.setting.options.crossing_deg is not None)
     if too_long or circular or not sigma <= gate.max_sigma_focal_rel:
         return Reason(
             'too_little_curvature', f'straight traffic shows too little lens curvature: focal length '

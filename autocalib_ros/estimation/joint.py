@@ -218,8 +218,6 @@ class JointFit:
     """Mean squared whitened distance of each track from its road, inf for none, shape (tracks,)."""
     scale: float
     """Median of `whitened2` over the tracks on roads: 1 when noise and wander are as the options say."""
-    cost: float
-    """Robust cost over all tracks and the prior, twice a negative logarithm of probability."""
     problem: Problem
     """The problem at the solution: steps from there are the parameters of the covariance."""
     covariance: np.ndarray
@@ -311,16 +309,15 @@ def _stepped(problem: Problem, share: np.ndarray, tightness: float) -> tuple[np.
     gradient = gradient + np.einsum('t,tmp,tm->p', weight, slopes, residuals, optimize=True)
     step = -np.linalg.lstsq(matrix, gradient, rcond=1e-12)[0]
 
-    def cost(state: State) -> float:
-        apart = (problem.residuals(state)**2).sum(axis=1) / problem.freedom
-        deviations = problem.setting.prior.deviations(state.camera)
+    def cost(whitened: np.ndarray, camera: Camera) -> float:
+        apart = (whitened**2).sum(axis=1) / problem.freedom
+        deviations = problem.setting.prior.deviations(camera)
         return float((share / scale * problem.freedom * loss(apart, tightness * scale)).sum() + deviations @ deviations)
 
-    here = float((share / scale * problem.freedom * loss(squared, tightness * scale)).sum()
-                 + np.square(problem.setting.prior.deviations(problem.base.camera)).sum())
+    here = cost(residuals, problem.base.camera)
     for _ in range(BACKTRACKS):
         state = problem.state(step)
-        if cost(state) <= here:
+        if cost(problem.residuals(state), state.camera) <= here:
             return step, state
         step = step / 2
     return np.zeros_like(step), problem.base
@@ -367,18 +364,16 @@ def _judged(last: Problem, state: State, tracks: TrackSet, share: np.ndarray) ->
     scale = max(float(np.median(squared)), LEAST_SCALE)
     limit = TIGHTEST * scale
     shared = share[problem.used] * problem.corroboration / scale
-    deviations, prior = problem.prior_gradient(state.camera)
+    _, prior = problem.prior_gradient(state.camera)
     whitened2 = np.full(len(tracks), np.inf)
     whitened2[problem.used] = squared
-    freedom = np.maximum((tracks.weights > 0).sum(axis=1) - 1, 1)
-    cost = float((share / scale * freedom * bounded_loss(whitened2, limit)).sum() + deviations @ deviations)
     weight = shared * influence(squared, limit)
     information = np.einsum('t,tmp,tmq->pq', weight, slopes, slopes, optimize=True)
     pulls = np.einsum('tmp,tm->tp', slopes, residuals) * np.sqrt(influence(squared, limit))[:, None]
     pulls = pulls / np.sqrt(np.maximum(np.diag(information), 1e-12))
     bend = -4.0 / limit / problem.freedom * shared / (1.0 + squared / limit) ** 3
     covariance = cluster_covariance(slopes, residuals, weight, bend, problem.tracks.vehicles, prior)
-    return JointFit(state, labels, np.sqrt(distance2), whitened2, scale, cost, problem, covariance, information,
+    return JointFit(state, labels, np.sqrt(distance2), whitened2, scale, problem, covariance, information,
                     correlation_within(problem.tracks.vehicles, pulls))
 
 

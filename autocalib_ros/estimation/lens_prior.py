@@ -32,9 +32,14 @@ class LensPrior:
 
     family: str
     centre: Camera
-    """Its focal length counts only where `sigma[0]` is finite."""
+    """Its focal length counts only where `focal_known`."""
     sigma: np.ndarray
     """Of log f (inf: unknown), cx and cy in pixels, k1, k2; 0 holds, shape (5,)."""
+
+    @property
+    def focal_known(self) -> bool:
+        """Whether anything is known of the focal length."""
+        return bool(np.isfinite(self.sigma[0]))
 
     @property
     def free(self) -> np.ndarray:
@@ -71,8 +76,7 @@ class LensPrior:
 
     def start(self, focal_px: float) -> Camera:
         """Return the centre with a focal length to start from; the prior's own where it has one."""
-        known = np.isfinite(self.sigma[0])
-        return self.centre if known else replace(self.centre, focal_px=float(focal_px))
+        return self.centre if self.focal_known else replace(self.centre, focal_px=float(focal_px))
 
     def holding(self, names: tuple[str, ...]) -> LensPrior:
         """Return the prior with parameters held."""

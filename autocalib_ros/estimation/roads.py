@@ -85,8 +85,9 @@ def find_roads(tracks: TrackSet, image_size: tuple[int, int], options: JointOpti
                       'straight traffic is needed: wait for it, or turn the camera towards a straight road')
     best, contrast = found
     fit = solve_joint(best.state, tracks, best.problem.setting)
-    second = sorted(int(mask.sum()) for mask in road_support(fit, tracks))[:-1]
-    fit = _with_real_roads(fit, tracks, gate)
+    support = road_support(fit, tracks)
+    second = sorted(int(mask.sum()) for mask in support)[:-1]
+    fit = _with_real_roads(fit, support, tracks, gate)
     fit = _in_likeliest_family(fit, priors[1:], voters, tracks)
     if noise_cost(fit, tracks, drifting=True) < noise_cost(fit, tracks, drifting=False):
         tracks = with_bodies(fit, tracks) if len(fit.state.angles_rad) > 1 else tracks
@@ -112,8 +113,7 @@ def _agreed(voters: TrackSet, setting: Setting, generator: np.random.Generator) 
     best = _most_probable(fits, voters)
     if best.explained().mean() < WELL_EXPLAINED:
         best = _most_probable([best, *_from_trials(voters, setting, generator, LOOSE * INLIER_PX)[0]], voters)
-    known = setting.prior.sigma[0] < np.inf
-    return best, np.inf if known else float(scores.max() / max(np.median(scores), 1e-9))
+    return best, np.inf if setting.prior.focal_known else float(scores.max() / max(np.median(scores), 1e-9))
 
 
 def _from_trials(voters: TrackSet, setting: Setting, generator: np.random.Generator,
@@ -121,8 +121,7 @@ def _from_trials(voters: TrackSet, setting: Setting, generator: np.random.Genera
     """Solutions from the trial focal lengths of best agreement, and the scores of all trials, shape (trials,)."""
     prior = setting.prior
     size = (prior.centre.width, prior.centre.height)
-    known = prior.sigma[0] < np.inf
-    trials = [prior.centre.focal_px] if known else focal_trials(voters, size, TRIALS)
+    trials = [prior.centre.focal_px] if prior.focal_known else focal_trials(voters, size, TRIALS)
     agreed = [consensus_directions(prior.start(trial), voters, generator, inlier_px=inlier_px) for trial in trials]
     starts = [initial_state(prior.start(trials[index]), agreed[index]) for index in _peaks(agreed)[:STARTS]]
     fits = [solve_joint(start, voters, setting) for start in starts]
@@ -168,9 +167,8 @@ def _most_probable(fits: list[JointFit], tracks: TrackSet, margin: float = 0.0) 
     return fits[int(np.argmin(costs))]
 
 
-def _with_real_roads(fit: JointFit, tracks: TrackSet, gate: GateOptions) -> JointFit:
+def _with_real_roads(fit: JointFit, support: list[np.ndarray], tracks: TrackSet, gate: GateOptions) -> JointFit:
     """Solve again with the one road that explains most vehicles when a second has too little behind it."""
-    support = road_support(fit, tracks)
     if all(is_road(mask, tracks, gate) for mask in support) and _apart(fit):
         return fit
     explained = fit.explained()
@@ -203,9 +201,9 @@ def _further_angle(fit: JointFit, tracks: TrackSet) -> float | None:
     left = (fit.labels < 0) & (own < 1.0)
     along = np.cross(normals[left], fit.state.rotation[:, 2]) @ fit.state.rotation
     angles = np.arctan2(along[:, 1], along[:, 0])
-    away = np.abs(np.sin(angles[:, None] - fit.state.angles_rad)).min(axis=1, initial=1.0)
-    angles, vehicles = angles[away > np.sin(np.radians(APART_DEG))], tracks.vehicles[left][
-        away > np.sin(np.radians(APART_DEG))]
+    turned = np.abs(np.sin(angles[:, None] - fit.state.angles_rad)).min(axis=1, initial=1.0)
+    away = turned > np.sin(np.radians(APART_DEG))
+    angles, vehicles = angles[away], tracks.vehicles[left][away]
     agree = np.abs(np.sin(angles[:, None] - angles)) < np.sin(np.radians(ON_ROAD_DEG))
     counts = np.array([len(np.unique(vehicles[row])) for row in agree])
     return float(angles[np.argmax(counts)]) if counts.max(initial=0) > 1 else None
@@ -250,7 +248,7 @@ def _untold(fit: JointFit) -> tuple[str, ...]:
     """Names of the lens's parameters that the evidence alone leaves wider than their prior."""
     prior = fit.problem.setting.prior
     _, known = fit.problem.prior_gradient(fit.state.camera)
-    left = told_by_evidence(fit.information, known, np.ones(fit.problem.size))
+    left = told_by_evidence(fit.information, known)
     names = [PARAMETERS[parameter] for parameter in prior.free]
     return tuple(name for name, sigma, is_known in zip(names, left, known, strict=False) if is_known and sigma > 1.0)
 
@@ -297,7 +295,7 @@ def lens_assumptions(fit: JointFit, held: tuple[str, ...]) -> tuple[str, ...]:
     told = [f'{words[prior.family]} +- {prior.sigma[3]:.3g}']
     point = prior.sigma[1]
     told.append('principal point at the image centre' + (f' +- {point:.0f} px' if point > 0 else ''))
-    if np.isfinite(prior.sigma[0]):
+    if prior.focal_known:
         sigma = prior.sigma[0] * prior.centre.focal_px
         spread = f' +- {sigma:g} px' if sigma > 0 else ''
         told.append(f'focal length {prior.centre.focal_px:g} px{spread} (given)')

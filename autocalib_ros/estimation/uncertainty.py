@@ -69,19 +69,18 @@ def propagate(function: Callable[[np.ndarray], np.ndarray], size: int, covarianc
     return np.sqrt(np.maximum(np.einsum('pi,pq,qi->i', slopes, covariance, slopes), 0.0))
 
 
-def told_by_evidence(information: np.ndarray, prior: np.ndarray, units: np.ndarray) -> np.ndarray:
-    """Return the standard deviation that the evidence alone leaves each parameter, in `units`; shape (parameters,).
+def told_by_evidence(information: np.ndarray, prior: np.ndarray) -> np.ndarray:
+    """Return the standard deviation that the evidence alone leaves each parameter, shape (parameters,).
 
     `information` (parameters, parameters) is the evidence's, `prior` (parameters,) the prior's on the other
-    parameters, which stays. Singular values of the scaled problem below 1e-6 count as none.
+    parameters, which stays. Infinite where less than 1e-6 of a parameter's information is its own.
     """
-    size = len(units)
+    size = len(prior)
     result = np.full(size, np.inf)
-    scaled = information * units[:, None] * units[None, :]
     for index in range(size):
         rest = np.delete(np.arange(size), index)
-        others = scaled[np.ix_(rest, rest)] + np.diag(prior[rest] * units[rest] ** 2)
-        left = scaled[index, index] - scaled[index, rest] @ np.linalg.pinv(others, rcond=1e-9) @ scaled[rest, index]
-        if left > 1e-6 * max(scaled[index, index], 1e-12):
+        others, shared = information[np.ix_(rest, rest)] + np.diag(prior[rest]), information[index, rest]
+        left = information[index, index] - shared @ np.linalg.pinv(others, rcond=1e-9) @ shared
+        if left > 1e-6 * max(information[index, index], 1e-12):
             result[index] = 1.0 / np.sqrt(left)
     return result

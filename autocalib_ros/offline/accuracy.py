@@ -26,13 +26,12 @@ from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.estimation.ground_plane import tilt_and_roll_deg
 from autocalib_ros.evidence import Evidence
 from autocalib_ros.offline.accuracy_families import families
-from autocalib_ros.offline.demo import LEAST_DISTANCE_M, NEAR_M
+from autocalib_ros.offline.demo import NEAR_M
 from autocalib_ros.offline.progress import progress_bar
-from autocalib_ros.offline.projection import ground_to_image, image_to_ground
+from autocalib_ros.offline.projection import angles_deg, distances_error, ground_to_image, image_to_ground
 from autocalib_ros.offline.synthetic_evidence import Junction
 from autocalib_ros.threads import use_one_thread_for_linear_algebra
 
-METHODS = ('joint', 'paper')
 RAY_GRID = (49, 28)
 GROUND_GRID = 5
 """Distances are compared between so many ranges times so many bearings on the road."""
@@ -179,25 +178,12 @@ def rays_error_deg(camera: Camera, true: Camera) -> float:
     return float(angles_deg(aligned, wanted).mean()) if len(found) else NAN
 
 
-def angles_deg(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Angles in degrees between vectors (..., 3)."""
-    across = np.linalg.norm(np.cross(first, second), axis=-1)
-    return np.degrees(np.arctan2(across, (first * second).sum(axis=-1)))
-
-
 def distance_error(camera: Camera, ground: GroundPlane | None, junction: Junction) -> float:
     """Median relative error of distances between points of the road in view, up to `NEAR_M` from the camera."""
     if ground is None:
         return NAN
     true_m, pixels = _road_points(junction)
-    found_m = image_to_ground(camera, ground, pixels)
-    first, second = np.triu_indices(len(true_m), 1)
-    true_lengths = np.hypot(*(true_m[first] - true_m[second]).T)
-    lengths = np.hypot(*(found_m[first] - found_m[second]).T)
-    # a point that ends up above the horizon is as wrong as can be, and must not drop out of the median
-    errors = np.where(np.isfinite(lengths), np.abs(lengths / np.maximum(true_lengths, 1e-9) - 1), np.inf)
-    far_apart = true_lengths > LEAST_DISTANCE_M
-    return float(np.median(errors[far_apart])) if far_apart.any() else NAN
+    return distances_error(true_m, image_to_ground(camera, ground, pixels))
 
 
 def _road_points(junction: Junction) -> tuple[np.ndarray, np.ndarray]:

@@ -12,13 +12,12 @@ import numpy as np
 
 from autocalib_ros.calibration import Calibration, Refusal
 from autocalib_ros.errors import InputError
-from autocalib_ros.offline.projection import image_to_ground
+from autocalib_ros.offline.projection import angles_deg, distances_error, image_to_ground
 
 MAX_FOCAL_ERROR_PERCENT = 3.0
 MAX_NORMAL_ERROR_DEG = 1.0
 NEAR_M = 40.0
 """Distances are compared between points of the road this near to the camera."""
-LEAST_DISTANCE_M = 2.0
 
 
 @dataclass(frozen=True)
@@ -77,8 +76,7 @@ def compare(result: Calibration | Refusal, truth: dict[str, Any]) -> Comparison 
     if result.ground is None:
         return Comparison(focal_percent, np.nan, np.nan, np.nan)
     up = np.array(truth['camera']['R_world_from_camera'])[2]
-    normal = result.ground.normal_in_camera
-    angle = np.degrees(np.arctan2(np.linalg.norm(np.cross(normal, up)), normal @ up))
+    angle = angles_deg(result.ground.normal_in_camera, up)
     return Comparison(focal_percent, float(angle), result.ground.height_m - truth['camera']['height'],
                       _distance_percent(result, truth))
 
@@ -88,13 +86,4 @@ def _distance_percent(result: Calibration, truth: dict[str, Any]) -> float:
     points = np.array(truth['ground_points']['rows']).reshape(-1, 4)
     near = np.hypot(*(points[:, :2] - truth['camera']['position'][:2]).T) <= NEAR_M
     true_m, pixels = points[near, :2], points[near, 2:]
-    found_m = image_to_ground(result.camera, result.ground, pixels)
-    first, second = np.triu_indices(len(true_m), 1)
-    true_lengths = np.hypot(*(true_m[first] - true_m[second]).T)
-    lengths = np.hypot(*(found_m[first] - found_m[second]).T)
-    far_apart = true_lengths > LEAST_DISTANCE_M
-    if not far_apart.any():
-        return float('nan')
-    # a point that ends up above the horizon is as wrong as can be, and must not drop out of the median
-    errors = np.where(np.isfinite(lengths), np.abs(lengths / np.maximum(true_lengths, 1e-9) - 1), np.inf)
-    return float(100 * np.median(errors[far_apart]))
+    return 100 * distances_error(true_m, image_to_ground(result.camera, result.ground, pixels))

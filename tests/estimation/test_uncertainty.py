@@ -56,7 +56,7 @@ def test_correlation_is_that_of_a_shared_part() -> None:
 
 def test_evidence_that_moves_two_parameters_alike_tells_neither() -> None:
     slopes = np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 2.0]])
-    left = told_by_evidence(slopes.T @ slopes, np.zeros(3), np.ones(3))
+    left = told_by_evidence(slopes.T @ slopes, np.zeros(3))
     assert np.isinf(left[:2]).all()
     assert left[2] == pytest.approx(0.5)
 

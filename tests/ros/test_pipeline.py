@@ -73,6 +73,17 @@ def feed(pipeline: Pipeline, heard: Heard, count: int, first: int = 0) -> None:
         wait_for(lambda wanted=number + 1: len(heard.sizes) >= wanted, f'image {number}')
 
 
+def offer_while_held_up(pipeline: Pipeline, count: int) -> None:
+    """Offer `count` images, all but the first while the first one is being decoded."""
+    entered, release = threading.Event(), threading.Event()
+    pipeline._decode = lambda message: (entered.set(), release.wait(PATIENCE_S), message)[2]
+    pipeline.offer(0, PIXELS)
+    assert entered.wait(PATIENCE_S)
+    for number in range(1, count):
+        pipeline.offer(number * FRAME_NS, PIXELS)
+    release.set()
+
+
 def result_of(future: Future):
     return future.result(timeout=PATIENCE_S)
 
@@ -126,27 +137,15 @@ def test_newest_snapshot_takes_the_place_and_the_callers_of_one_that_waits(start
 
 
 def test_late_images_are_dropped_and_counted(start, heard):
-    entered, release = threading.Event(), threading.Event()
     pipeline = start(calibration)
-    pipeline._decode = lambda message: (entered.set(), release.wait(PATIENCE_S), message)[2]
-    pipeline.offer(0, PIXELS)
-    assert entered.wait(PATIENCE_S)
-    for number in range(1, WAITING_IMAGES + 4):
-        pipeline.offer(number * FRAME_NS, PIXELS)
-    release.set()
+    offer_while_held_up(pipeline, WAITING_IMAGES + 4)
     wait_for(lambda: pipeline.counters.used == WAITING_IMAGES + 1, 'the first and the newest images')
     assert (pipeline.counters.received, pipeline.counters.dropped) == (WAITING_IMAGES + 4, 3)
 
 
 def test_a_hiccup_loses_no_image(start, heard):
-    entered, release = threading.Event(), threading.Event()
     pipeline = start(calibration)
-    pipeline._decode = lambda message: (entered.set(), release.wait(PATIENCE_S), message)[2]
-    pipeline.offer(0, PIXELS)
-    assert entered.wait(PATIENCE_S)
-    for number in range(1, WAITING_IMAGES + 1):
-        pipeline.offer(number * FRAME_NS, PIXELS)
-    release.set()
+    offer_while_held_up(pipeline, WAITING_IMAGES + 1)
     wait_for(lambda: pipeline.counters.used == WAITING_IMAGES + 1, 'all images')
     assert pipeline.counters.dropped == 0
 
