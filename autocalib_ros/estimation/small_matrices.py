@@ -1,0 +1,77 @@
+"""Algebra of many small vectors and matrices at once, where NumPy's own works through them one by one."""
+
+from __future__ import annotations
+
+import numpy as np
+
+NEXT, LAST = [1, 2, 0], [2, 0, 1]
+LAGUERRE_STEPS = 3
+"""Each step from 0, which is below all eigenvalues, triples the digits of the least."""
+
+
+def dot(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Scalar products of vectors (..., 3) that broadcast against each other, shape (...)."""
+    if first.ndim == second.ndim > 1 and second.shape[-2] == 1:
+        # one vector for a row of others, which is a product of matrices
+        return (first @ second.swapaxes(-1, -2))[..., 0]
+    return np.einsum('...i,...i->...', first, second)
+
+
+def cross(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Vector products of vectors (..., 3) that broadcast against each other, shape (..., 3)."""
+    (x, y, z), (u, v, w) = ([vectors[..., axis] for axis in range(3)] for vectors in (first, second))
+    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=-1)
+
+
+def cofactors(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the parts of symmetric matrices (n, 3, 3) and of their cofactors: two diagonals and two rests (3, n).
+
+    Entry i of a rest stands in the row and the column that are not i.
+    """
+    flat = matrix.reshape(-1, 9).T
+    diagonal, rest = flat[[0, 4, 8]], flat[[5, 2, 1]]
+    return (diagonal, rest, diagonal[NEXT] * diagonal[LAST] - rest * rest,
+            rest[NEXT] * rest[LAST] - diagonal * rest)
+
+
+def least_axes(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Unit eigenvectors (n, 3) of the least eigenvalues of positive semidefinite matrices (n, 3, 3), and those (n,).
+
+    The cofactors of S - l I, l close to the least eigenvalue, are close to a multiple of e e^T: their largest column
+    is close to e, and they turn it closer.
+    """
+    diagonal, rest, minors, mixed = cofactors(matrix)
+    trace = diagonal.sum(axis=0)
+    shift = _least_roots(trace, minors.sum(axis=0), diagonal[0] * minors[0] + (rest[1:] * mixed[1:]).sum(axis=0))
+    minors = minors + shift * (diagonal - trace + shift)
+    mixed = mixed + shift * rest
+    near = np.stack([minors[0], mixed[2], mixed[1], mixed[2], minors[1], mixed[0], mixed[1], mixed[0], minors[2]],
+                    axis=-1).reshape(-1, 3, 3)
+    columns = near[np.arange(len(near)), np.argmax(minors, axis=0)]
+    axes = np.einsum('nij,nj->ni', near, columns)
+    axes /= np.sqrt(dot(axes, axes))[:, None]
+    return axes, np.einsum('ni,nij,nj->n', axes, matrix, axes)
+
+
+def _least_roots(trace: np.ndarray, minors: np.ndarray, determinant: np.ndarray) -> np.ndarray:
+    """Least roots (n,) of l^3 - trace l^2 + minors l - determinant, all of whose roots are real: Laguerre's method."""
+    root = np.zeros(len(trace))
+    for _ in range(LAGUERRE_STEPS):
+        value = ((root - trace) * root + minors) * root - determinant
+        slope = (3 * root - 2 * trace) * root + minors
+        bend = 6 * root - 2 * trace
+        spread = np.sqrt(np.maximum(4 * slope * slope - 6 * value * bend, 0.0))
+        root = root - 3 * value / np.maximum(slope + spread, 1e-300)
+    return root
+
+
+def inverse_factors(matrix: np.ndarray) -> np.ndarray:
+    """Return the inverses of the lower Cholesky factors of positive definite matrices (size, size, n), same shape."""
+    factor, inverse = np.zeros((2, *matrix.shape))
+    for row in range(len(matrix)):
+        column = matrix[row:, row] - np.einsum('jkn,kn->jn', factor[row:, :row], factor[row, :row])
+        root = np.sqrt(column[0])
+        factor[row:, row] = column / root
+        inverse[row, :row] = np.einsum('kn,kjn->jn', factor[row, :row], inverse[:row, :row]) / -root
+        inverse[row, row] = 1.0 / root
+    return inverse
