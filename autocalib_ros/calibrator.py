@@ -15,9 +15,10 @@ from autocalib_ros.estimation.evidence_gate import shortfall
 from autocalib_ros.estimation.great_circles import TrackSet, select_tracks
 from autocalib_ros.estimation.ground_plane import ground_plane, ground_points, pixels_ahead, tilt_and_roll_deg
 from autocalib_ros.estimation.paper import scale, solve_paper
-from autocalib_ros.estimation.roads import Roads, find_roads
+from autocalib_ros.estimation.solution import Solution, find_solution
 from autocalib_ros.estimation.straightness import paper_intrinsics
 from autocalib_ros.estimation.vanishing_points import segment_orientations
+from autocalib_ros.estimation.windows import find_windows
 from autocalib_ros.evidence import Evidence, EvidenceBuffer
 from autocalib_ros.perception.observer import Observer
 
@@ -135,58 +136,57 @@ def solve(evidence: Evidence, options: Options, *, lens: Camera | None = None) -
         published = solve_paper(evidence, options, intrinsics, figures)
         return refused(published) if isinstance(published, Reason) else published
     tracks = select_tracks(evidence, options.joint.max_tracks)
-    roads = find_roads(tracks, evidence.image_size, options.joint, options.gate,
-                       np.random.default_rng(options.random_seed), height_m=options.camera_height, lens=lens)
-    if isinstance(roads, Reason):
-        return refused(roads)
-    figures = _figures(figures, roads, tracks, evidence, options)
+    solution = find_solution(tracks, find_windows(evidence), evidence.image_size, options.joint, options.gate,
+                             np.random.default_rng(options.random_seed), height_m=options.camera_height, lens=lens)
+    if isinstance(solution, Reason):
+        return refused(solution)
+    figures = _figures(figures, solution, tracks, evidence, options)
     paper = None if intrinsics is None else intrinsics.report
-    return _calibration(evidence, options, roads, tracks, Calibration(
-        method=options.method, grade='lens', assumptions=roads.assumptions, checks=roads.checks,
-        camera=roads.fit.state.camera, ground=None, ground_refusal=roads.no_plane,
-        road_directions=roads.fit.state.directions, stddev=_lens_deviations(roads), paper=paper,
+    return _calibration(evidence, options, solution, tracks, Calibration(
+        method=options.method, grade='lens', assumptions=solution.assumptions, checks=solution.checks,
+        camera=solution.fit.state.camera, ground=None, ground_refusal=solution.no_plane,
+        road_directions=solution.fit.state.directions, stddev=_lens_deviations(solution), paper=paper,
         evidence=evidence.summary(), newest_stamp_ns=evidence.newest_stamp_ns, figures=figures))
 
 
-def _figures(figures: Figures, roads: Roads, tracks: TrackSet, evidence: Evidence, options: Options) -> Figures:
+def _figures(figures: Figures, solution: Solution, tracks: TrackSet, evidence: Evidence, options: Options) -> Figures:
     """Add what became of each track, and the orientations of the segments in the solved lens."""
     labels = figures.track_labels.copy()
-    labels[tracks.indices] = np.where(roads.fit.explained(), roads.fit.labels, -2)
-    found = segment_orientations(roads.fit.state.camera, evidence.segments_px, options.paper)
+    labels[tracks.indices] = np.where(solution.fit.explained(), solution.fit.labels, -2)
+    found = segment_orientations(solution.fit.state.camera, evidence.segments_px, options.paper)
     return replace(figures, track_labels=labels, orientation_histogram=found.histogram,
                    orientation_peaks_deg=found.peaks_deg)
 
 
-def _lens_deviations(roads: Roads) -> StandardDeviations:
-    focal, cx, cy, k1, k2 = roads.fit.sigma(lambda state: np.array(
+def _lens_deviations(solution: Solution) -> StandardDeviations:
+    focal, cx, cy, k1, k2 = solution.fit.sigma(lambda state: np.array(
         [state.camera.focal_px, *state.camera.principal_point_px, *state.camera.k[:2]]))
     return StandardDeviations(focal_px=float(focal), principal_point_px=(float(cx), float(cy)), k1=float(k1),
                               k2=float(k2))
 
 
-def _ground_deviations(roads: Roads, side: float, height: float) -> tuple[float | None, ...]:
+def _ground_deviations(solution: Solution, side: float, height: float) -> tuple[float | None, ...]:
     """Standard deviation in metres of road points ahead, None where they are not in the image."""
-    normal = side * roads.fit.state.rotation[:, 2]
-    pixels = pixels_ahead(roads.fit.state.camera, normal, height, np.array(GROUND_DISTANCES_M))
+    normal = side * solution.fit.state.rotation[:, 2]
+    pixels = pixels_ahead(solution.fit.state.camera, normal, height, np.array(GROUND_DISTANCES_M))
     seen = np.isfinite(pixels).all(axis=1)
-    spread = roads.fit.sigma(lambda state: ground_points(
+    spread = solution.fit.sigma(lambda state: ground_points(
         state.camera, side * state.rotation[:, 2], height, pixels[seen]).ravel()) if seen.any() else np.zeros(0)
     sigmas = iter(np.hypot(*spread.reshape(-1, 2).T))
     return tuple(float(next(sigmas)) if here else None for here in seen)
 
 
-def _calibration(evidence: Evidence, options: Options, roads: Roads, tracks: TrackSet,
+def _calibration(evidence: Evidence, options: Options, solution: Solution, tracks: TrackSet,
                  lens: Calibration) -> Calibration:
     """Add the ground plane to a lens where the roads and the height give one."""
     height, metric, grade, no_height = scale(options)
-    reason = roads.no_plane or no_height
+    reason = solution.no_plane or no_height
     if reason:
         return replace(lens, ground_refusal=reason)
-    normal, _ = normal_of(roads.fit.state, tracks)
-    busiest = max(range(len(roads.support)), key=lambda road: len(np.unique(tracks.vehicles[roads.support[road]])))
-    plane = ground_plane(normal, roads.fit.state.directions[busiest], height, metric=metric)
-    side = np.sign(roads.fit.state.rotation[:, 2] @ normal)
-    tilt, roll = roads.fit.sigma(lambda state: tilt_and_roll_deg(side * state.rotation[:, 2]))
+    normal, _ = normal_of(solution.fit.state, tracks)
+    plane = ground_plane(normal, solution.along, height, metric=metric)
+    side = np.sign(solution.fit.state.rotation[:, 2] @ normal)
+    tilt, roll = solution.fit.sigma(lambda state: tilt_and_roll_deg(side * state.rotation[:, 2]))
     return replace(lens, grade=grade, ground=plane, stddev=replace(
         lens.stddev, tilt_deg=float(tilt), roll_deg=float(roll),
-        ground_point_m=_ground_deviations(roads, float(side), height) if metric else ()))
+        ground_point_m=_ground_deviations(solution, float(side), height) if metric else ()))

@@ -21,6 +21,8 @@ from autocalib_ros.errors import UsageError
 
 NEWTON_STEPS = 20
 """Most: Newton's iteration doubles its digits, so that four or five are the rule."""
+ANGLES_RAD = np.linspace(0.0, np.pi, 721)
+"""Where it is looked for that r(theta) falls."""
 
 
 @dataclass(frozen=True)
@@ -67,24 +69,25 @@ class Camera:
 
     def radius(self, theta_rad: np.ndarray) -> np.ndarray:
         """Return the image radius in pixels of the angles `theta_rad`."""
-        t2 = theta_rad * theta_rad
-        k1, k2, k3, k4 = self.k
-        return self.focal_px * theta_rad * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+        return self.focal_px * theta_rad * _series(self.k, theta_rad * theta_rad)
 
     def radius_slope(self, theta_rad: np.ndarray) -> np.ndarray:
         """Return dr/dtheta in pixels per radian."""
-        t2 = theta_rad * theta_rad
+        return self.focal_px * _series(self._slope_k, theta_rad * theta_rad)
+
+    @property
+    def _slope_k(self) -> tuple[float, float, float, float]:
+        """Coefficients of dr/dtheta."""
         k1, k2, k3, k4 = self.k
-        return self.focal_px * (1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4))))
+        return 3 * k1, 5 * k2, 7 * k3, 9 * k4
 
     @cached_property
     def max_angle_rad(self) -> float:
         """Largest theta up to which r(theta) grows: beyond it the model folds back on itself."""
         if not any(self.k):
             return float(np.pi)
-        theta = np.linspace(0.0, np.pi, 721)
-        falling = np.flatnonzero(self.radius_slope(theta) <= 0)
-        return float(theta[falling[0] - 1]) if len(falling) else float(np.pi)
+        falling = np.flatnonzero(self.radius_slope(ANGLES_RAD) <= 0)
+        return float(ANGLES_RAD[falling[0] - 1]) if len(falling) else float(np.pi)
 
     def project(self, bearings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Project bearings (..., 3), of any length, to pixels (..., 2); and say where that is valid (...)."""
@@ -107,17 +110,19 @@ class Camera:
 
     def angle(self, radius_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Invert r(theta) by Newton's method: angles in radians, and where the inversion holds."""
-        radius_px = np.asarray(radius_px, float)
+        radius = np.asarray(radius_px, float) / self.focal_px
         limit = self.max_angle_rad
-        theta = np.clip(radius_px / self.focal_px, 0.0, limit)
+        theta = np.clip(radius, 0.0, limit)
         if any(self.k):
             for _ in range(NEWTON_STEPS):
-                slope = np.maximum(self.radius_slope(theta), 1e-3 * self.focal_px)
-                error = self.radius(theta) - radius_px
-                theta = np.clip(theta - error / slope, 0.0, limit)
-                if np.abs(error).max(initial=0.0) < 1e-9 * self.focal_px:
+                before, t2 = theta, theta * theta
+                error = theta * _series(self.k, t2) - radius
+                theta = theta - error / np.maximum(_series(self._slope_k, t2), 1e-3)
+                theta = np.minimum(np.maximum(theta, 0.0), limit)
+                # the digits double with a step; where the model does not reach, the angle stays at its limit
+                if np.abs(theta - before).max(initial=0.0) < 1e-8:
                     break
-        return theta, np.abs(self.radius(theta) - radius_px) < 1e-6 * self.focal_px
+        return theta, np.abs(theta * _series(self.k, theta * theta) - radius) < 1e-6
 
     def undistort(self, pixels: np.ndarray, focal_px: float | None = None) -> np.ndarray:
         """Map pixels (..., 2) to those of a distortion-free camera with the same principal point.
@@ -129,6 +134,18 @@ class Camera:
         ahead = valid & (bearings[..., 2] > 1e-6)
         scale = np.where(ahead, (focal_px or self.focal_px) / np.where(ahead, bearings[..., 2], 1.0), np.nan)
         return scale[..., None] * bearings[..., :2] + self.principal_point_px
+
+
+def _series(k: tuple[float, ...], t2: np.ndarray) -> np.ndarray:
+    """Return 1 + k1 t2 + k2 t2^2 + ..., shape of `t2`; coefficients of 0 at the end cost nothing."""
+    order = max((power for power, factor in enumerate(k, 1) if factor), default=0)
+    if not order:
+        return np.ones_like(t2)
+    total = t2 * k[order - 1]
+    for factor in reversed(k[:order - 1]):
+        total += factor
+        total *= t2
+    return total + 1.0
 
 
 def image_centre(width: int, height: int) -> tuple[float, float]:

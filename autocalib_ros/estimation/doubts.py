@@ -10,7 +10,10 @@ from autocalib_ros.calibration import Reason
 from autocalib_ros.config import GateOptions
 from autocalib_ros.estimation.great_circles import TrackSet, rays_of
 from autocalib_ros.estimation.ground_plane import BELOW_HORIZON, tilt_and_roll_deg, upward
-from autocalib_ros.estimation.joint import MIN_TRACKS, JointFit, State, road_support, solve_joint
+from autocalib_ros.estimation.joint import MIN_ROWS, JointFit, road_support, solve_joint
+from autocalib_ros.estimation.state import State
+from autocalib_ros.estimation.uncertainty import told_by_evidence
+from autocalib_ros.estimation.windows import Windows
 
 MIN_VEHICLES = 4
 """Vehicles, distinct, that make a road; fewer may be one driver's whim."""
@@ -23,6 +26,9 @@ MIN_CONTRAST = 1.3
 LONGEST_FOCAL = 1.5
 """Focal length, in image diagonals, beyond which no lens curvature can be seen."""
 PRIOR_SIGMAS = 3.5
+MOTION_TELLS = 0.1
+"""Vehicles that turn vouch for a lens when their motion alone tells the focal length to this share, one sigma: turns
+that were taken for roads are off by more."""
 HALVES_SIGMAS = 3.5
 HALVES_FOCAL = 0.03
 HALVES_DEG = 1.5
@@ -50,23 +56,32 @@ def normal_of(state: State, tracks: TrackSet) -> tuple[np.ndarray, float]:
 def lens_doubt(fit: JointFit, contrast: float, tracks: TrackSet, gate: GateOptions) -> Reason | None:
     """Say why the lens cannot be trusted, if so."""
     prior, roads = fit.problem.setting.prior, len(fit.state.angles_rad)
-    if _straight_share(fit, tracks) < STRAIGHT_SHARE:
+    told = motion_tells(fit)
+    if not told and _straight_share(fit, tracks) < STRAIGHT_SHARE:
         return _turning(fit, tracks, STRAIGHT_SHARE)
-    if contrast < MIN_CONTRAST and not (prior.family == 'distortion_free' and fit.crossing_held):
+    if not told and contrast < MIN_CONTRAST and not (prior.family == 'distortion_free' and fit.crossing_held):
         return Reason(
             'no_agreement', f'the traffic singles out no focal length: the best agrees {contrast:.2f} times as well as '
             f'the middling one, {MIN_CONTRAST:g} is needed',
             'wait for straight traffic, above all near the borders of the image; the traffic may be turning, or the '
             'lens may have no distortion: then give joint.road_angle or joint.focal_prior_px')
     _, below = normal_of(fit.state, tracks)
-    if roads > 1 and below < BELOW_HORIZON:
+    if fit.plane_known and below < BELOW_HORIZON:
         return Reason(
-            'horizon', f'{1 - below:.0%} of the tracked points lie above the horizon that the roads imply',
-            'the directions found do not belong to one plane: wait for more straight traffic on both roads')
+            'horizon', f'{1 - below:.0%} of the tracked points lie above the horizon of the plane found',
+            'the traffic found does not belong to one plane: wait for more of it')
     doubt = _curvature_doubt(fit, gate) or _model_doubt(fit)
-    if doubt is None and roads == 1 and _straight_share(fit, tracks) < ONE_ROAD_SHARE:
+    if doubt is None and not told and roads < 2 and _straight_share(fit, tracks) < ONE_ROAD_SHARE:
         return _turning(fit, tracks, ONE_ROAD_SHARE)
     return doubt
+
+
+def motion_tells(fit: JointFit) -> bool:
+    """Whether the motion of vehicles that turn tells the focal length by itself."""
+    if not len(fit.problem.setting.windows) or fit.problem.setting.prior.free[0] != 0:
+        return False
+    _, known = fit.problem.steps.prior_gradient(fit.state.camera)
+    return bool(told_by_evidence(fit.motion_information, known)[0] < MOTION_TELLS)
 
 
 def _straight_share(fit: JointFit, tracks: TrackSet) -> float:
@@ -129,31 +144,39 @@ def _same_side(normal: np.ndarray, reference: np.ndarray) -> np.ndarray:
 
 def halves_doubt(fit: JointFit, tracks: TrackSet, gate: GateOptions) -> Reason | str:
     """Solve the earlier and the later half of the vehicles; they have to agree within what they know."""
-    halves = [tracks.subset(mask) for mask in _time_halves(tracks)]
-    if min(map(len, halves)) < MIN_TRACKS:
-        return NOT_CROSS_CHECKED
+    windows, early, early_windows = fit.problem.setting.windows, *_first_half(tracks, fit.problem.setting.windows)
     setting = replace(fit.problem.setting, vehicle_correlation=fit.vehicle_correlation)
-    fits = [solve_joint(fit.state, half, setting, refine=True) for half in halves]
-    masks = [road_support(part, half) for part, half in zip(fits, halves, strict=True)]
-    if min(mask.sum() for pair in masks for mask in pair) < gate.min_tracks_per_road // 2:
-        return NOT_CROSS_CHECKED
+    fits = []
+    for half, half_windows in ((early, early_windows), (~early, ~early_windows)):
+        part, seen = tracks.subset(half), windows.subset(half_windows)
+        if half.sum() + half_windows.sum() < MIN_ROWS or (len(windows) and not len(seen)):
+            return NOT_CROSS_CHECKED
+        fits.append(solve_joint(fit.state, part, replace(setting, windows=seen), refine=True))
+        if any(mask.sum() < gate.min_tracks_per_road // 2 for mask in road_support(fits[-1], part)):
+            return NOT_CROSS_CHECKED
     (focal, focal_sigma), (turn, turn_sigma) = _difference(*fits)
-    if len(fit.state.angles_rad) < 2:
+    if not fit.plane_known:
         turn = 0.0  # one road leaves the normal free
     if focal > max(HALVES_SIGMAS * focal_sigma, HALVES_FOCAL) or turn > max(HALVES_SIGMAS * turn_sigma, HALVES_DEG):
         return Reason(
             'halves_disagree', f'the earlier and the later half of the traffic disagree: focal length by {focal:.1%}, '
             f'ground normal by {turn:.1f} degrees', 'record for longer; check that the camera is firmly fixed')
-    normal = f' and {turn:.1f} degrees in the ground normal' if len(fit.state.angles_rad) > 1 else ''
+    normal = f' and {turn:.1f} degrees in the ground normal' if fit.plane_known else ''
     return f'the earlier and the later half of the traffic differ by {focal:.1%} in focal length{normal}'
 
 
-def _time_halves(tracks: TrackSet) -> tuple[np.ndarray, np.ndarray]:
-    """Split the tracks by their vehicles' mean time, so that no vehicle is in both halves."""
-    vehicles, inverse = np.unique(tracks.vehicles, return_inverse=True)
-    mean = np.bincount(inverse, tracks.times_s) / np.bincount(inverse)
-    early = (mean <= np.median(mean))[inverse]
-    return early, ~early
+def _first_half(tracks: TrackSet, windows: Windows) -> tuple[np.ndarray, np.ndarray]:
+    """Masks (tracks,) and (windows,) of the earlier half by the vehicles' mean time: no vehicle is in both halves."""
+    of_tracks, of_windows = _mean_times(tracks.vehicles, tracks.times_s), _mean_times(windows.bodies, windows.times_s)
+    _, first = np.unique(tracks.vehicles, return_index=True)
+    _, first_window = np.unique(windows.bodies, return_index=True)
+    middle = np.median(np.concatenate([of_tracks[first], of_windows[first_window]]))
+    return of_tracks <= middle, of_windows <= middle
+
+
+def _mean_times(owners: np.ndarray, times_s: np.ndarray) -> np.ndarray:
+    _, inverse, counts = np.unique(owners, return_inverse=True, return_counts=True)
+    return (np.bincount(inverse, times_s) / counts)[inverse]
 
 
 def _difference(first: JointFit, second: JointFit) -> tuple[tuple[float, float], tuple[float, float]]:

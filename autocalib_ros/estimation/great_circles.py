@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from autocalib_ros.camera import Camera
+from autocalib_ros.estimation.small_matrices import cross, dot, least_axes
 from autocalib_ros.evidence import Evidence
 
 SAMPLES = 10
@@ -68,43 +69,53 @@ class TrackSet:
 
 def select_tracks(evidence: Evidence, limit: int) -> TrackSet:
     """Choose tracks long enough to matter, at most `limit`, spread over image cells, headings and vehicles."""
-    least = MIN_LENGTH * np.hypot(*evidence.image_size)
-    candidates = []
-    for index, track in enumerate(evidence.tracks()):
-        points = track.points_px
-        displacement = np.hypot(*(points[-1] - points[0]))
-        path = np.hypot(*np.diff(points, axis=0).T).sum()
-        if displacement >= least and path <= MAX_PATH_RATIO * displacement:
-            candidates.append((index, displacement, points))
-    return _track_set(evidence, _spread(candidates, evidence, limit))
+    starts, points = evidence.track_starts, evidence.points_px
+    way = points[starts[1:] - 1] - points[starts[:-1]]
+    displacement = np.hypot(way[:, 0], way[:, 1])
+    long = displacement >= MIN_LENGTH * np.hypot(*evidence.image_size)
+    straight = path_lengths(points, starts) <= MAX_PATH_RATIO * displacement
+    candidates = np.flatnonzero(long & straight)
+    candidates = candidates[np.argsort(-displacement[candidates], kind='stable')]
+    return _track_set(evidence, np.sort(candidates[_spread(evidence, candidates, way[candidates])[:limit]]))
 
 
-def _spread(candidates: list[tuple[int, float, np.ndarray]], evidence: Evidence, limit: int) -> list[int]:
-    """Rank each candidate within its cell and heading, longest first, vehicles in turn; take the best ranks."""
-    seen_in_bucket: dict[tuple[int, int, int], int] = {}
-    seen_of_vehicle: dict[tuple[int, int], int] = {}
-    ranked = []
-    for index, displacement, points in sorted(candidates, key=lambda item: -item[1]):
-        vehicle = int(evidence.track_vehicles[index])
-        column, row = np.floor(points[len(points) // 2] / evidence.image_size * CELLS).astype(int)
-        heading = int(np.arctan2(*(points[-1] - points[0])[::-1]) // (np.pi / 4))
-        bucket, family = (int(column), int(row), heading), (vehicle, int(column) + CELLS[0] * int(row))
-        rank = seen_in_bucket.get(bucket, 0) + 4 * seen_of_vehicle.get(family, 0)
-        seen_in_bucket[bucket] = seen_in_bucket.get(bucket, 0) + 1
-        seen_of_vehicle[family] = seen_of_vehicle.get(family, 0) + 1
-        ranked.append((rank, -displacement, index))
-    return sorted(index for _, _, index in sorted(ranked)[:limit])
+def path_lengths(points: np.ndarray, starts: np.ndarray) -> np.ndarray:
+    """Lengths (paths,) of the paths into which `starts` (paths + 1,), with the end, divide `points` (n, 2)."""
+    steps = np.zeros(len(points) + 1)
+    steps[1:-1] = np.hypot(*np.diff(points, axis=0).T)
+    steps[starts] = 0.0
+    return np.diff(np.cumsum(steps)[starts])
 
 
-def _track_set(evidence: Evidence, indices: list[int]) -> TrackSet:
-    pixels, weights = np.zeros((len(indices), SAMPLES, 2)), np.zeros((len(indices), SAMPLES))
-    times = np.zeros((len(indices), SAMPLES))
-    for row, index in enumerate(indices):
-        track = evidence.track(index)
-        chosen = np.round(np.linspace(0, len(track.times_s) - 1, SAMPLES)).astype(int)
-        first = np.concatenate([[True], np.diff(chosen) > 0])
-        pixels[row], weights[row], times[row] = track.points_px[chosen], first / first.sum(), track.times_s[chosen]
-    return TrackSet(pixels, weights, evidence.track_vehicles[indices].astype(int), times, np.array(indices, int))
+def _spread(evidence: Evidence, candidates: np.ndarray, way: np.ndarray) -> np.ndarray:
+    """Order of choice (n,) of candidates, longest first, that went `way` (n, 2).
+
+    By rank within a cell and heading, vehicles in turn.
+    """
+    starts, vehicles = evidence.track_starts, evidence.track_vehicles[candidates]
+    middle = evidence.points_px[(starts[candidates] + starts[candidates + 1]) // 2]
+    column, row = np.floor(middle / evidence.image_size * CELLS).astype(int).T
+    heading = np.arctan2(way[:, 1], way[:, 0]) // (np.pi / 4)
+    rank = _earlier_ones(column, row, heading) + 4 * _earlier_ones(vehicles, column + CELLS[0] * row)
+    return np.argsort(rank, kind='stable')
+
+
+def _earlier_ones(*keys: np.ndarray) -> np.ndarray:
+    """Count for each element how many before it have the same keys (n,)."""
+    _, group, counts = np.unique(np.column_stack(keys), axis=0, return_inverse=True, return_counts=True)
+    earlier = np.empty(len(group), int)
+    earlier[np.argsort(group, kind='stable', axis=None)] = np.arange(len(group)) - np.repeat(
+        np.cumsum(counts) - counts, counts)
+    return earlier
+
+
+def _track_set(evidence: Evidence, indices: np.ndarray) -> TrackSet:
+    starts, ends = evidence.track_starts[indices], evidence.track_starts[indices + 1]
+    chosen = np.round(np.linspace(0, ends - starts - 1, SAMPLES, axis=1)).astype(int)
+    first = np.diff(chosen, axis=1, prepend=-1) > 0
+    points = starts[:, None] + chosen
+    return TrackSet(evidence.points_px[points], first / first.sum(axis=1, keepdims=True),
+                    evidence.track_vehicles[indices].astype(int), evidence.times_s[points], indices)
 
 
 @dataclass(frozen=True)
@@ -120,26 +131,24 @@ class Rays:
 
     def pixel_scale(self, normals: np.ndarray) -> np.ndarray:
         """Pixels per unit of n.b for circle normals (..., 3) that broadcast against the bearings."""
-        gradient = np.hypot(dot(self.radial, normals), dot(self.tangential, normals))
-        return 1.0 / np.maximum(gradient, 1e-9)
+        outwards, around = dot(self.radial, normals), dot(self.tangential, normals)
+        return 1.0 / np.sqrt(np.maximum(outwards * outwards + around * around, 1e-18))
 
     def distance_px(self, normals: np.ndarray) -> np.ndarray:
         """Signed distance in observed pixels of each bearing from the great circle of its normal."""
         return dot(self.bearings, normals) * self.pixel_scale(normals)
 
 
-def dot(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Scalar products of vectors (..., 3) that broadcast against each other, shape (...)."""
-    return np.einsum('...i,...i->...', first, second)
-
-
 def rays_of(camera: Camera, pixels: np.ndarray) -> Rays:
     """Unproject pixels (..., 2); where the lens model does not reach, the last bearing that it reaches."""
-    offset = pixels - np.asarray(camera.principal_point_px)
-    radius = np.maximum(np.hypot(offset[..., 0], offset[..., 1]), 1e-9)
+    x, y = pixels[..., 0] - camera.principal_point_px[0], pixels[..., 1] - camera.principal_point_px[1]
+    radius = np.maximum(np.sqrt(x * x + y * y), 1e-9)
     theta, _ = camera.angle(radius)
-    sine, cosine = np.sin(theta), np.cos(theta)
-    x, y = offset[..., 0] / radius, offset[..., 1] / radius
+    # one tangent is cheaper than a sine and a cosine
+    half = np.tan(0.5 * theta)
+    share = 1.0 / (1.0 + half * half)
+    sine, cosine = 2.0 * half * share, (1.0 - half * half) * share
+    x, y = x / radius, y / radius
     outward = 1.0 / np.maximum(camera.radius_slope(theta), 1e-3 * camera.focal_px)
     around = sine / radius
     rays = Rays(*(np.empty((*radius.shape, 3)) for _ in range(3)))
@@ -161,22 +170,46 @@ def fit_circles(rays: Rays, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
     Returns the normals (tracks, 3), the mean squared distances in px^2 (tracks,) and the scatter (tracks, 3, 3).
     """
+    matrix = circle_scatter(rays, weights)
+    normals, distance2 = least_axes(matrix)
+    return normals, np.maximum(distance2, 0.0), matrix
+
+
+def circle_scatter(rays: Rays, weights: np.ndarray) -> np.ndarray:
+    """Return each track's scatter (tracks, 3, 3) where its great circle makes a pixel worth what it is."""
     scale = np.ones(weights.shape)
     for _ in range(2):
-        _, vectors = np.linalg.eigh(scatter(rays, weights, scale))
-        normals = vectors[:, :, 0]
+        normals, _ = least_axes(scatter(rays, weights, scale))
         scale = rays.pixel_scale(normals[:, None])
-    matrix = scatter(rays, weights, scale)
-    values, vectors = np.linalg.eigh(matrix)
-    return vectors[:, :, 0], np.maximum(values[:, 0], 0.0), matrix
+    return scatter(rays, weights, scale)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Tracks through one camera: what every question about their circles begins with."""
+
+    rays: Rays
+    matrix: np.ndarray
+    """Scatter of each track, shape (tracks, 3, 3)."""
+
+    @classmethod
+    def through(cls, camera: Camera, tracks: TrackSet) -> Seen:
+        """Unproject tracks and sum up their scatter."""
+        rays = rays_of(camera, tracks.pixels)
+        return cls(rays, circle_scatter(rays, tracks.weights))
+
+    def subset(self, keep: np.ndarray) -> Seen:
+        """Return the tracks that `keep`, a mask or indices, selects."""
+        rays = Rays(self.rays.bearings[keep], self.rays.radial[keep], self.rays.tangential[keep])
+        return Seen(rays, self.matrix[keep])
 
 
 def orthonormal_basis(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return two unit vectors (..., 3) that span the plane perpendicular to unit vectors (..., 3)."""
     helper = np.eye(3)[np.argmin(np.abs(directions), axis=-1)]
-    first = np.cross(directions, helper)
-    first /= np.linalg.norm(first, axis=-1, keepdims=True)
-    return first, np.cross(directions, first)
+    first = cross(directions, helper)
+    first /= np.sqrt(dot(first, first))[..., None]
+    return first, cross(directions, first)
 
 
 def fit_circles_through(matrix: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -185,9 +218,9 @@ def fit_circles_through(matrix: np.ndarray, directions: np.ndarray) -> tuple[np.
     Returns normals (tracks, 3) and mean squared distances in px^2 (tracks,): a 2x2 eigenproblem each.
     """
     first, second = orthonormal_basis(directions)
-    a = np.einsum('ti,tij,tj->t', first, matrix, first)
-    b = np.einsum('ti,tij,tj->t', first, matrix, second)
-    c = np.einsum('ti,tij,tj->t', second, matrix, second)
+    image = np.einsum('tij,tj->ti', matrix, first)
+    a, b = dot(first, image), dot(second, image)
+    c = dot(second, np.einsum('tij,tj->ti', matrix, second))
     angle = 0.5 * np.arctan2(2 * b, a - c) + np.pi / 2
     cosine, sine = np.cos(angle), np.sin(angle)
     normals = first * cosine[:, None] + second * sine[:, None]

@@ -8,6 +8,7 @@ family is a centre with standard deviations; a standard deviation of zero holds 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -41,12 +42,12 @@ class LensPrior:
         """Whether anything is known of the focal length."""
         return bool(np.isfinite(self.sigma[0]))
 
-    @property
+    @cached_property
     def free(self) -> np.ndarray:
         """Indices of the parameters that are not held."""
         return np.flatnonzero(self.sigma > 0)
 
-    @property
+    @cached_property
     def units(self) -> np.ndarray:
         """What a unit step of each free parameter is: its sigma, or one in log f where that is unknown."""
         return np.where(np.isfinite(self.sigma), self.sigma, 1.0)[self.free]
@@ -69,7 +70,7 @@ class LensPrior:
         known = np.isfinite(self.sigma[self.free])
         return np.where(known, change[self.free] / self.units, 0.0)
 
-    @property
+    @cached_property
     def information(self) -> np.ndarray:
         """Diagonal of the prior's information about the free parameters in their units: 1 known, 0 unknown."""
         return np.isfinite(self.sigma[self.free]).astype(float)

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from autocalib_ros.config import JointOptions
-from autocalib_ros.estimation.great_circles import Rays, dot
+from autocalib_ros.estimation.great_circles import Rays
+from autocalib_ros.estimation.small_matrices import cross, dot, inverse_factors
 
 WANDER_LENGTH_M = 10.0
 """Distance over which a driver's sideways wander is forgotten: ways of 25 to 80 m from side to side and back."""
@@ -36,7 +37,7 @@ class OnRoad:
 def on_road(rays: Rays, normals: np.ndarray, directions: np.ndarray, up: np.ndarray, height_m: float) -> OnRoad:
     """Place tracks on the road: circle normals and road directions (tracks, 3), ground normal `up` (3,)."""
     below = np.maximum(-(rays.bearings @ up), SEEN_FROM) / (height_m if height_m > 0 else USUAL_HEIGHT_M)
-    across = np.abs(dot(normals, np.cross(directions, up)))[:, None]
+    across = np.abs(dot(normals, cross(directions, up)))[:, None]
     return OnRoad(across * rays.pixel_scale(normals[:, None]) * below, dot(rays.bearings, directions[:, None]) / below)
 
 
@@ -46,17 +47,21 @@ def whitening(pixels: np.ndarray, mask: np.ndarray, road: OnRoad, options: Joint
 
     W is lower triangular. Samples where `mask` (tracks, samples) is false get zero rows and columns.
     """
-    steps = np.hypot(*np.moveaxis(np.diff(pixels, axis=1), -1, 0)) * (mask[:, 1:] & mask[:, :-1])
-    followed = np.concatenate([np.zeros((len(pixels), 1)), np.cumsum(steps, axis=1)], axis=1)
-    apart = (road.along_m[:, :, None] - road.along_m[:, None, :]) / WANDER_LENGTH_M
-    count = np.maximum(mask.sum(axis=1, keepdims=True), 1)
-    lever = road.along_m - (road.along_m * mask).sum(axis=1, keepdims=True) / count
-    wander, heading = options.wander_m * road.px_per_m, np.radians(options.heading_deg) * lever * road.px_per_m
-    covariance = np.exp(-0.5 * apart * apart) * wander[:, :, None] * wander[:, None, :]
+    mask, along_m, px_per_m = (np.ascontiguousarray(part.T) for part in (mask, road.along_m, road.px_per_m))
+    wander = options.wander_m * px_per_m
+    covariance = np.exp(-0.5 * ((along_m[:, None] - along_m) / WANDER_LENGTH_M) ** 2) * (wander[:, None] * wander)
     if drifting:
-        covariance += heading[:, :, None] * heading[:, None, :]
-        covariance += options.drift_px**2 * np.minimum(followed[:, :, None], followed[:, None, :])
-    covariance *= mask[:, :, None] & mask[:, None, :]
-    diagonal = np.arange(mask.shape[1])
-    covariance[:, diagonal, diagonal] += np.where(mask, options.noise_px**2, 1.0)
-    return np.linalg.inv(np.linalg.cholesky(covariance)) * mask[:, None, :]
+        lever = along_m - (along_m * mask).sum(axis=0) / np.maximum(mask.sum(axis=0), 1)
+        heading = np.radians(options.heading_deg) * lever * px_per_m
+        followed = _followed_px(pixels, mask)
+        covariance += heading[:, None] * heading + options.drift_px**2 * np.minimum(followed[:, None], followed)
+    covariance *= mask[:, None] & mask
+    diagonal = np.arange(len(mask))
+    covariance[diagonal, diagonal] += np.where(mask, options.noise_px**2, 1.0)
+    return np.ascontiguousarray((inverse_factors(covariance) * mask).transpose(2, 0, 1))
+
+
+def _followed_px(pixels: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Way in pixels that tracks (tracks, samples, 2) have been followed up to each sample, shape (samples, tracks)."""
+    steps = np.hypot(*np.diff(pixels, axis=1).T) * (mask[1:] & mask[:-1])
+    return np.concatenate([np.zeros((1, len(pixels))), np.cumsum(steps, axis=0)])

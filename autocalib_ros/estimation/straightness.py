@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,8 +9,8 @@ import numpy as np
 from autocalib_ros.calibration import PaperReport
 from autocalib_ros.camera import Camera, image_centre
 from autocalib_ros.config import PaperOptions
-from autocalib_ros.estimation.great_circles import TrackSet, fit_circles, rays_of
-from autocalib_ros.evidence import Evidence, Track
+from autocalib_ros.estimation.great_circles import TrackSet, fit_circles, path_lengths, rays_of
+from autocalib_ros.evidence import Evidence
 
 RIM = 1.02
 """The shortest trial focal length keeps tracked points this factor inside 90 degrees, where tan flips sign."""
@@ -44,27 +43,29 @@ def paper_intervals(evidence: Evidence, options: PaperOptions) -> list[Interval]
     A track is kept if it lived for `min_lifetime` of the interval and its path is at most `max_path_ratio` its
     displacement. Intervals with fewer tracks than the fullest are left out: all estimates rest on as many.
     """
-    kept: dict[int, list[tuple[float, int, np.ndarray]]] = {}
-    for index, track in enumerate(evidence.tracks()):
-        for window, path in _parts(track, options):
-            displacement = float(np.hypot(*(path[-1] - path[0])))
-            length = np.hypot(*np.diff(path, axis=0).T).sum()
-            if displacement > 0 and length <= options.max_path_ratio * displacement:
-                kept.setdefault(window, []).append((-displacement, index, path))
-    longest = [sorted(kept[window], key=lambda item: item[:2])[:options.longest] for window in sorted(kept)]
+    starts, tracks, windows = _parts(evidence, options.window_s)
+    points, times = evidence.points_px, evidence.times_s
+    first, last = starts[:-1], starts[1:] - 1
+    displacement = np.hypot(*(points[last] - points[first]).T)
+    kept = ((last - first > 1) & (times[last] - times[first] >= options.min_lifetime * options.window_s)
+            & (displacement > 0) & (path_lengths(points, starts) <= options.max_path_ratio * displacement))
+    longest = []
+    for window in np.unique(windows[kept]):
+        inside = np.flatnonzero(kept & (windows == window))
+        longest.append(inside[np.argsort(-displacement[inside], kind='stable')[:options.longest]])
     fullest = max(map(len, longest), default=0)
-    return [Interval([path for _, _, path in items], [index for _, index, _ in items])
-            for items in longest if len(items) == fullest]
+    return [Interval([points[starts[part]:starts[part + 1]] for part in parts], tracks[parts].tolist())
+            for parts in longest if len(parts) == fullest]
 
 
-def _parts(track: Track, options: PaperOptions) -> Iterator[tuple[int, np.ndarray]]:
-    """Yield the parts of a track that live long enough in an interval, with the number of the interval."""
-    windows = np.floor(track.times_s / options.window_s).astype(int)
-    for window in np.unique(windows):
-        inside = windows == window
-        times, path = track.times_s[inside], track.points_px[inside]
-        if len(path) > 2 and times[-1] - times[0] >= options.min_lifetime * options.window_s:
-            yield int(window), path
+def _parts(evidence: Evidence, window_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Divide tracks into parts within an interval: where each begins, with the end (parts + 1,); track and interval."""
+    windows = np.floor(evidence.times_s / window_s).astype(int)
+    begins = np.diff(windows, prepend=0) != 0
+    begins[evidence.track_starts[:-1]] = True
+    starts = np.flatnonzero(begins)
+    tracks = np.searchsorted(evidence.track_starts, starts, side='right') - 1
+    return np.append(starts, len(windows)), tracks, windows[starts]
 
 
 def paper_intrinsics(evidence: Evidence, options: PaperOptions) -> PaperIntrinsics | None:

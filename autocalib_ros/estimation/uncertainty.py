@@ -23,9 +23,9 @@ def cluster_covariance(slopes: np.ndarray, residuals: np.ndarray, weight: np.nda
     for an M-estimate. The prior's own spread is added. Undetermined directions get an infinite variance.
     """
     size = slopes.shape[2]
-    gradients = np.einsum('tmp,tm->tp', slopes, residuals)
+    gradients = (residuals[:, None] @ slopes)[:, 0]
     clusters, inverse = np.unique(vehicles, return_inverse=True)
-    per_track = np.einsum('t,tmp,tmq->tpq', weight, slopes, slopes, optimize=True)
+    per_track = (slopes * weight[:, None, None]).transpose(0, 2, 1) @ slopes
     matrices = np.zeros((len(clusters), size, size))
     np.add.at(matrices, inverse, per_track)
     information = matrices.sum(axis=0) + np.diag(prior)
@@ -33,7 +33,7 @@ def cluster_covariance(slopes: np.ndarray, residuals: np.ndarray, weight: np.nda
     if len(clusters) <= size or values[0] < SINGULAR * values[-1]:
         return np.full((size, size), np.inf)
     whiten = vectors / np.sqrt(values)
-    curved = np.eye(size) + whiten.T @ np.einsum('t,tp,tq->pq', bend, gradients, gradients, optimize=True) @ whiten
+    curved = np.eye(size) + whiten.T @ (gradients.T * bend) @ gradients @ whiten
     shares, axes = np.linalg.eigh(curved)
     shares = np.maximum(shares, LEAST_CURVATURE)
     scores = np.zeros((len(clusters), size))

@@ -9,6 +9,7 @@ import numpy as np
 from autocalib_ros.camera import Camera
 from autocalib_ros.config import PaperOptions
 from autocalib_ros.estimation.great_circles import TrackSet, fit_circles, orthonormal_basis, rays_of
+from autocalib_ros.estimation.small_matrices import LAST, NEXT, cofactors, cross
 
 HYPOTHESES = 400
 PROBES = 200
@@ -17,6 +18,8 @@ INLIER_PX = 2.0
 """A track supports a direction when its great circle through it stays this close, root mean square."""
 MIN_ANGLE_DEG = 30.0
 """Two roads that differ by less are one road seen with errors."""
+COMPASS = np.array([(np.cos(turn), np.sin(turn)) for turn in np.arange(8) * np.pi / 4])
+"""Ways to go from a direction in search of a better one."""
 
 
 @dataclass(frozen=True)
@@ -33,14 +36,25 @@ class Directions:
 
 def distances2_through(matrix: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Mean squared pixel distance of every track (t) from its best circle through every direction (h): (h, t)."""
-    first, second = orthonormal_basis(directions)
-    flat = matrix.reshape(-1, 9).T
+    return _distances2(_forms(matrix), directions)
 
-    def form(left: np.ndarray, right: np.ndarray) -> np.ndarray:
-        return np.einsum('hi,hj->hij', left, right).reshape(-1, 9) @ flat
 
-    a, b, c = form(first, first), form(first, second), form(second, second)
-    return np.maximum(0.5 * (a + c - np.sqrt((a - c) ** 2 + 4 * b * b)), 0.0)
+def _forms(matrix: np.ndarray) -> np.ndarray:
+    """Quadratic forms, shape (2, 6, tracks), of a unit direction in scatter matrices S (tracks, 3, 3).
+
+    Their values are the sum and the product of the eigenvalues that S has in the plane across the direction d:
+    trace S - d^T S d, and d^T C d with the cofactors C of S.
+    """
+    diagonal, rest, minors, mixed = cofactors(matrix)
+    return np.stack([np.concatenate([diagonal.sum(axis=0) - diagonal, -rest]), np.concatenate([minors, mixed])])
+
+
+def _distances2(forms: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Lesser eigenvalue (directions, tracks) across unit directions (directions, 3), from `_forms`."""
+    products = np.concatenate([directions**2, 2.0 * directions[:, NEXT] * directions[:, LAST]], axis=1)
+    total, product = products @ forms
+    root = np.sqrt(np.maximum(total * total - 4.0 * product, 0.0))
+    return np.maximum(2.0 * product / np.maximum(total + root, 1e-300), 0.0)
 
 
 def consensus_directions(camera: Camera, tracks: TrackSet, generator: np.random.Generator,
@@ -54,17 +68,18 @@ def consensus_directions(camera: Camera, tracks: TrackSet, generator: np.random.
     normals, own, matrix = fit_circles(rays, tracks.weights)
     probes = generator.normal(size=(PROBES, 3))
     probes /= np.linalg.norm(probes, axis=1, keepdims=True)
-    chance = _support(distances2_through(matrix, probes), inlier_px).mean(axis=0)
+    forms = _forms(matrix)
+    chance = _support(forms, probes, inlier_px).mean(axis=0)
     surprise = -np.log(np.clip(chance, 1.0 / PROBES, 1.0)) * np.sqrt(tracks.share_of_vehicle) * (own < inlier_px**2)
     found: list[np.ndarray] = []
     labels = np.full(len(tracks), -2)
     score = 0.0
     left = surprise.copy()
     for label in range(count):
-        candidate = _strongest(normals, matrix, left, found, generator, inlier_px)
+        candidate = _strongest(normals, forms, left, found, generator, inlier_px)
         if candidate is None:
             break
-        support = _support(distances2_through(matrix, candidate[None])[0], inlier_px)
+        support = _support(forms, candidate[None], inlier_px)[0]
         score += float((left * support).sum())
         labels[(support > 0) & (left > 0)] = label
         left = np.where(support > 0, 0.0, left)
@@ -72,41 +87,42 @@ def consensus_directions(camera: Camera, tracks: TrackSet, generator: np.random.
     return Directions(np.array(found).reshape(-1, 3), labels, score)
 
 
-def _support(distance2: np.ndarray, inlier_px: float) -> np.ndarray:
-    return np.maximum(0.0, 1.0 - distance2 / inlier_px**2)
+def _support(forms: np.ndarray, directions: np.ndarray, inlier_px: float) -> np.ndarray:
+    """Support of every track for every direction (directions, 3), 0 to 1, shape (directions, tracks)."""
+    return np.maximum(0.0, 1.0 - _distances2(forms, directions) / inlier_px**2)
 
 
-def _strongest(normals: np.ndarray, matrix: np.ndarray, surprise: np.ndarray, found: list[np.ndarray],
+def _strongest(normals: np.ndarray, forms: np.ndarray, surprise: np.ndarray, found: list[np.ndarray],
                generator: np.random.Generator, inlier_px: float) -> np.ndarray | None:
     """Return the direction with the most support among intersections of pairs of great circles."""
     total = surprise.sum()
     if np.count_nonzero(surprise) < 3:
         return None
     pairs = generator.choice(len(normals), size=(HYPOTHESES, 2), p=surprise / total)
-    candidates = np.cross(normals[pairs[:, 0]], normals[pairs[:, 1]])
+    candidates = cross(normals[pairs[:, 0]], normals[pairs[:, 1]])
     size = np.linalg.norm(candidates, axis=1)
     candidates = candidates[size > 1e-3] / size[size > 1e-3, None]
     for other in found:
         candidates = candidates[np.abs(candidates @ other) < np.cos(np.radians(MIN_ANGLE_DEG))]
     if not len(candidates):
         return None
-    support = _support(distances2_through(matrix, candidates), inlier_px) @ surprise
-    best = candidates[np.argmax(support)]
-    return _refined(best, matrix, surprise, inlier_px)
+    forms, surprise = forms[..., surprise > 0], surprise[surprise > 0]
+    best = candidates[np.argmax(_support(forms, candidates, inlier_px) @ surprise)]
+    return _refined(best, forms, surprise, inlier_px)
 
 
-def _refined(direction: np.ndarray, matrix: np.ndarray, surprise: np.ndarray, inlier_px: float) -> np.ndarray:
+def _refined(direction: np.ndarray, forms: np.ndarray, surprise: np.ndarray, inlier_px: float) -> np.ndarray:
     """Climb to the local best by halving steps around the direction."""
     step = np.radians(2.0)
-    best = float(_support(distances2_through(matrix, direction[None])[0], inlier_px) @ surprise)
+    best = (_support(forms, direction[None], inlier_px) @ surprise)[0]
+    ring = COMPASS @ orthonormal_basis(direction)
     while step > np.radians(0.02):
-        first, second = orthonormal_basis(direction)
-        around = np.linspace(0, 2 * np.pi, 8, endpoint=False)[:, None]
-        trials = direction + step * (np.cos(around) * first + np.sin(around) * second)
-        trials /= np.linalg.norm(trials, axis=1, keepdims=True)
-        support = _support(distances2_through(matrix, trials), inlier_px) @ surprise
-        if support.max() > best:
-            best, direction = float(support.max()), trials[np.argmax(support)]
+        trials = (direction + step * ring) / np.sqrt(1.0 + step * step)
+        support = _support(forms, trials, inlier_px) @ surprise
+        strongest = np.argmax(support)
+        if support[strongest] > best:
+            best, direction = support[strongest], trials[strongest]
+            ring = COMPASS @ orthonormal_basis(direction)
         else:
             step /= 2
     return direction

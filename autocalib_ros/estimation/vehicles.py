@@ -6,6 +6,8 @@ together do. What moves together is seen on the ground, where bodies have a size
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
@@ -18,6 +20,8 @@ SAME_MOVE, SAME_MOVE_M = 0.3, 0.2
 """Points of one body move alike to this share and so many metres: points higher up seem to go farther."""
 SHORTEST_S = 0.4
 """Two tracks have to be seen together for this long to tell whether they move alike."""
+BLOCK = 64
+"""So many tracks are compared with all others at once."""
 WITNESSES = 3
 """So many tracks corroborate each other; fewer say little of their vehicle."""
 ALONE = 0.25
@@ -39,33 +43,39 @@ def bodies(tracks: TrackSet, ground_m: np.ndarray) -> np.ndarray:
     other at the first and the last time that both are seen, and went the same way between.
     """
     times = tracks.sample_times_s
-    first, last = times[:, 0], times[:, -1]
-    order = np.argsort(first, kind='stable')
-    pairs: list[np.ndarray] = []
-    for place, one in enumerate(order):
-        end = np.searchsorted(first[order], last[one] - SHORTEST_S, side='right')
-        others = order[place + 1:end]
-        others = others[np.minimum(last[others], last[one]) - first[others] >= SHORTEST_S]
-        if not len(others):
-            continue
-        until = np.minimum(last[others], last[one])
-        begin_one = _at(times[[one]], ground_m[[one]], first[others])
-        end_one = _at(times[[one]], ground_m[[one]], until)
-        begin_other, end_other = ground_m[others, 0], _at(times[others], ground_m[others], until)
+    edges = np.zeros((2, 0), int)
+    for ones, others in _seen_together(times[:, 0], times[:, -1]):
+        until = np.minimum(times[ones, -1], times[others, -1])
+        begin_one, begin_other = _at(times, ground_m, ones, times[others, 0]), ground_m[others, 0]
+        end_one, end_other = (_at(times, ground_m, rows, until) for rows in (ones, others))
         moved_one, moved_other = end_one - begin_one, end_other - begin_other
         far = np.maximum(np.hypot(*moved_one.T), np.hypot(*moved_other.T))
         alike = ((np.hypot(*(begin_other - begin_one).T) < BODY_M) & (np.hypot(*(end_other - end_one).T) < BODY_M)
                  & (np.hypot(*(moved_other - moved_one).T) < SAME_MOVE * far + SAME_MOVE_M))
-        pairs.append(np.column_stack([np.full(alike.sum(), one), others[alike]]))
-    edges = np.concatenate(pairs) if pairs else np.zeros((0, 2), int)
-    graph = coo_matrix((np.ones(len(edges)), edges.T), shape=(len(tracks), len(tracks)))
+        edges = np.hstack([edges, [ones[alike], others[alike]]])
+    graph = coo_matrix((np.ones(edges.shape[1]), edges), shape=(len(tracks), len(tracks)))
     return connected_components(graph, directed=False)[1]
 
 
-def _at(times: np.ndarray, places: np.ndarray, when: np.ndarray) -> np.ndarray:
-    """Interpolate places (n or 1, samples, 2), seen at times (n or 1, samples), at `when` (n,); shape (n, 2)."""
-    after = np.clip((times <= when[:, None]).sum(axis=1), 1, times.shape[1] - 1)
-    rows = np.arange(len(when)) if len(times) > 1 or len(when) == 1 else np.zeros(len(when), int)
+def _seen_together(first: np.ndarray, last: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield all pairs of tracks, seen from `first` to `last` (tracks,), by blocks: one (n,) and one that begins later.
+
+    The pairs of a few tracks at a time: those of all would not fit into memory where traffic is dense.
+    """
+    order = np.argsort(first, kind='stable')
+    places = np.arange(len(order))
+    ends = np.searchsorted(first[order], last[order] - SHORTEST_S, side='right')
+    for begin in range(0, len(order), BLOCK):
+        block = places[begin:begin + BLOCK]
+        ones, others = np.nonzero((places > block[:, None]) & (places < ends[block, None]))
+        ones, others = order[block[ones]], order[others]
+        long = np.minimum(last[ones], last[others]) - first[others] >= SHORTEST_S
+        yield ones[long], others[long]
+
+
+def _at(times: np.ndarray, places: np.ndarray, rows: np.ndarray, when: np.ndarray) -> np.ndarray:
+    """Interpolate rows (n,) of places (tracks, samples, 2), seen at times (tracks, samples), at `when` (n,): (n, 2)."""
+    after = np.clip((times[rows] <= when[:, None]).sum(axis=1), 1, times.shape[1] - 1)
     t0, t1 = times[rows, after - 1], times[rows, after]
     part = np.clip((when - t0) / np.maximum(t1 - t0, 1e-9), 0.0, 1.0)[:, None]
     return places[rows, after - 1] * (1 - part) + places[rows, after] * part
@@ -83,10 +93,10 @@ def heading_off_deg(distance_px: np.ndarray, px_per_m: np.ndarray, along_m: np.n
     length = np.maximum(np.ptp(np.where(mask, centred, 0.0), axis=1), 0.3)
     x = centred / length[:, None]
     basis = np.stack([np.ones_like(x), x, x * x - 1 / 12], axis=-1)
-    matrix = np.einsum('tsi,tsj,ts->tij', basis, basis, weight) + 1e-9 * np.eye(3)
-    inverse = np.linalg.inv(matrix)
+    weighted = (basis * weight[..., None]).transpose(0, 2, 1)
+    inverse = np.linalg.inv(weighted @ basis + 1e-9 * np.eye(3))
     offset_m = distance_px / np.maximum(px_per_m, 1e-3)
-    fitted = np.einsum('tij,tsj,ts->ti', inverse, basis, weight * offset_m)
+    fitted = (inverse @ (weighted @ offset_m[..., None]))[..., 0]
     return np.degrees(fitted[:, 1] / length), np.degrees(np.sqrt(inverse[:, 1, 1]) / length)
 
 

@@ -11,7 +11,7 @@ from autocalib_ros.camera import Camera
 from autocalib_ros.config import BufferOptions
 from autocalib_ros.errors import UsageError
 from autocalib_ros.evidence import Evidence, EvidenceBuffer, Segments, Track
-from autocalib_ros.offline.synthetic_traffic import INTERVAL_S, LANE_M, Drive, drive_across
+from autocalib_ros.offline.synthetic_traffic import INTERVAL_S, LANE_M, Drive, beside, drive_across
 from autocalib_ros.offline.synthetic_trouble import Sway, background_drift_px, spoil
 
 SEGMENT_INTERVAL_S = 0.4
@@ -55,6 +55,8 @@ class Junction:
     points_per_vehicle: int = 4
     turning_share: float = 0.2
     lane_change_share: float = 0.0
+    joined_share: float = 0.0
+    """Share of the vehicles that have another beside them, faster or slower, with which they are taken for one."""
     wander_m: float = 0.1
     noise_px: float = 0.5
     outlier_share: float = 0.0
@@ -83,8 +85,11 @@ def synthetic_evidence(junction: Junction, generator: np.random.Generator) -> Ev
         path, heading = junction.drive(junction, generator)
         times = HEADWAY_S * vehicle + INTERVAL_S * np.arange(len(path))
         newest = max(newest, float(times[-1]))
-        for _ in range(junction.points_per_vehicle):
-            track = _observe(junction, generator, path, heading, times, vehicle)
+        bodies = [(path, heading)]
+        if junction.joined_share and generator.uniform() < junction.joined_share:
+            bodies.append(beside(path, heading, generator))
+        for number in range(junction.points_per_vehicle):
+            track = _observe(junction, generator, *bodies[number % len(bodies)], times, vehicle)
             if track is not None and len(tracks) != junction.tracks:
                 tracks.append(track)
     drift = 0.0 if junction.sway is None else background_drift_px(junction.camera, junction.sway, newest)
@@ -96,7 +101,8 @@ def gathered(tracks: list[Track], image_size: tuple[int, int], newest_s: float, 
     buffer = EvidenceBuffer(BufferOptions())
     for track in tracks:
         buffer.add_track(track)
-        buffer.add_segments(_segments(track))
+    for segments in sorted((part for track in tracks for part in _segments(track)), key=lambda part: part.time_s):
+        buffer.add_segments(segments)
     return buffer.snapshot(
         image_size=image_size, first_stamp_ns=0, newest_stamp_ns=int(newest_s * 1e9),
         frames=int(newest_s / INTERVAL_S), drift_px=drift_px, unfinished=[])
@@ -153,9 +159,10 @@ def _longest_run(seen: np.ndarray) -> tuple[int, int]:
     return int(first), int(last)
 
 
-def _segments(track: Track) -> Segments:
-    """Pairs of positions `SEGMENT_INTERVAL_S` apart, as matches between masked frames would give."""
-    later = np.searchsorted(track.times_s, track.times_s + SEGMENT_INTERVAL_S - 1e-6)
-    paired = later < len(track.times_s)
-    ends = np.hstack([track.points_px[paired], track.points_px[later[paired]]])
-    return Segments(float(track.times_s[-1]), np.full(len(ends), track.vehicle), ends)
+def _segments(track: Track) -> Iterator[Segments]:
+    """Where a point was in consecutive masked frames, as matches between them would give."""
+    first, last = np.ceil(track.times_s[0] / SEGMENT_INTERVAL_S), np.floor(track.times_s[-1] / SEGMENT_INTERVAL_S)
+    frames = np.arange(first, last + 1) * SEGMENT_INTERVAL_S
+    places = np.column_stack([np.interp(frames, track.times_s, track.points_px[:, axis]) for axis in (0, 1)])
+    for time_s, before, after in zip(frames[1:], places[:-1], places[1:], strict=True):
+        yield Segments(float(time_s), np.array([track.vehicle]), np.concatenate([before, after])[None])

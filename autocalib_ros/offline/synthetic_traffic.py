@@ -79,6 +79,22 @@ def stroll(junction: Junction, generator: np.random.Generator) -> Path:
     return start + np.cumsum(speed[:, None] * INTERVAL_S * _unit(heading), axis=0), heading
 
 
+def drive_arc(junction: Junction, generator: np.random.Generator, *, radii_m: tuple[float, float]) -> Path:
+    """Turn on an arc of the vehicle's own through the junction's middle."""
+    return drive_bend(junction, generator, radius_m=generator.uniform(*radii_m),
+                      towards_rad=generator.uniform(0, 2 * np.pi))
+
+
+def beside(path: np.ndarray, heading: np.ndarray, generator: np.random.Generator) -> Path:
+    """Drive in the next lane of a path (n, 2) with headings (n,), faster or slower than who drives there."""
+    steps = np.arange(len(path), dtype=float)
+    middle = 0.5 * (len(path) - 1)
+    at = np.clip(middle + (steps - middle) * generator.uniform(0.8, 1.2), 0, len(path) - 1)
+    shifted = path + generator.choice([-1.0, 1.0]) * LANE_M * _left_of(_unit(heading))
+    return (np.column_stack([np.interp(at, steps, shifted[:, axis]) for axis in (0, 1)]),
+            np.interp(at, steps, np.unwrap(heading)))
+
+
 def _on_circle(junction: Junction, generator: np.random.Generator, along: np.ndarray, centre: np.ndarray,
                radius_m: float, bearing: np.ndarray, way: float) -> Path:
     outward = _unit(bearing)

@@ -13,8 +13,9 @@ from autocalib_ros.camera import Camera
 from autocalib_ros.config import GateOptions, JointOptions, Options
 from autocalib_ros.estimation.doubts import NOT_CROSS_CHECKED, halves_doubt
 from autocalib_ros.estimation.great_circles import select_tracks
-from autocalib_ros.estimation.joint import Setting, State, solve_joint
+from autocalib_ros.estimation.joint import solve_joint
 from autocalib_ros.estimation.lens_prior import lens_priors
+from autocalib_ros.estimation.state import Setting, State
 from autocalib_ros.evidence import Evidence
 from autocalib_ros.offline.synthetic_evidence import Junction, pose, synthetic_evidence
 

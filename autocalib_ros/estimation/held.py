@@ -1,0 +1,69 @@
+"""What the evidence cannot tell is held at what was known before, and said."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from autocalib_ros.camera import Camera
+from autocalib_ros.estimation.great_circles import TrackSet
+from autocalib_ros.estimation.joint import JointFit, judged_with, solve_joint
+from autocalib_ros.estimation.lens_prior import PARAMETERS
+from autocalib_ros.estimation.starts import ASKED_FOR, most_probable
+from autocalib_ros.estimation.uncertainty import told_by_evidence
+
+
+def with_what_can_be_told(fit: JointFit, tracks: TrackSet) -> tuple[JointFit, tuple[str, ...]]:
+    """Measure how a vehicle's tracks correlate, set k2 free if asked for, hold what the evidence cannot tell."""
+    setting = replace(fit.problem.setting, vehicle_correlation=fit.vehicle_correlation)
+    fit = solve_joint(fit.state, tracks, setting, refine=True)
+    if setting.prior.family == 'equidistant' and setting.prior.sigma[3] > 0 and fit.plane_known:
+        bent = solve_joint(fit.state, tracks, replace(setting, prior=setting.prior.with_k2()), refine=True)
+        fit = most_probable([fit, bent], tracks, ASKED_FOR)
+        setting = fit.problem.setting
+    held = _untold(fit)
+    if not held:
+        return fit, ()
+    at_prior = setting.prior.start(fit.state.camera.focal_px)
+    camera = fit.state.camera
+    for name in held:
+        camera = _restored(camera, at_prior, name)
+    solved = solve_joint(replace(fit.state, camera=camera), tracks,
+                         replace(setting, prior=setting.prior.holding(held)), refine=True)
+    return judged_with(solved, tracks, setting), held
+
+
+def _untold(fit: JointFit) -> tuple[str, ...]:
+    """Names of the lens's parameters that the evidence alone leaves wider than their prior."""
+    prior = fit.problem.setting.prior
+    _, known = fit.problem.steps.prior_gradient(fit.state.camera)
+    left = told_by_evidence(fit.information, known)
+    names = [PARAMETERS[parameter] for parameter in prior.free]
+    return tuple(name for name, sigma, is_known in zip(names, left, known, strict=False) if is_known and sigma > 1.0)
+
+
+def _restored(camera: Camera, prior: Camera, name: str) -> Camera:
+    """Return the camera with one parameter at the prior's value."""
+    (cx, cy), (k1, k2, *rest) = camera.principal_point_px, camera.k
+    values = {
+        'focal length': {'focal_px': prior.focal_px},
+        'principal point x': {'principal_point_px': (prior.principal_point_px[0], cy)},
+        'principal point y': {'principal_point_px': (cx, prior.principal_point_px[1])},
+        'k1': {'k': (prior.k[0], k2, *rest)}, 'k2': {'k': (k1, prior.k[1], *rest)}}
+    return replace(camera, **values[name])
+
+
+def lens_assumptions(fit: JointFit, held: tuple[str, ...]) -> tuple[str, ...]:
+    """Say in words what was taken for granted of the lens."""
+    prior = fit.problem.setting.prior
+    if prior.family == 'known':
+        return ('the lens is as given: only the pose was solved',)
+    words = {'equidistant': 'lens near equidistant: k1 = 0', 'distortion_free': 'lens free of distortion: k1 = 1/3',
+             'kannala_brandt': 'lens between equidistant and free of distortion: k1 = 1/6'}
+    told = [f'{words[prior.family]} +- {prior.sigma[3]:.3g}']
+    point = prior.sigma[1]
+    told.append('principal point at the image centre' + (f' +- {point:.0f} px' if point > 0 else ''))
+    if prior.focal_known:
+        sigma = prior.sigma[0] * prior.centre.focal_px
+        spread = f' +- {sigma:g} px' if sigma > 0 else ''
+        told.append(f'focal length {prior.centre.focal_px:g} px{spread} (given)')
+    return (*told, *(f'{name} held there: the traffic cannot determine it' for name in held))

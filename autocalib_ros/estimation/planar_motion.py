@@ -1,0 +1,187 @@
+"""Planar rigid motion: between two instants a vehicle turns about the ground normal and moves along the ground.
+
+Its points obey an essential matrix E = [t]x R(turn) whose t lies in the ground plane: two unknowns for a window, the
+turn and the heading of t, while the lens and the ground normal are shared by all. It takes no straightness, no
+vanishing point and no height of a point above the road. Distances are Sampson's (Sampson 1982), in observed pixels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from autocalib_ros.camera import Camera
+from autocalib_ros.config import JointOptions
+from autocalib_ros.estimation.great_circles import Rays, rays_of
+from autocalib_ros.estimation.small_matrices import dot
+from autocalib_ros.estimation.windows import Windows
+
+TURNS_DEG = (0.0, 2.0, 4.5, 7.5, 11.0, 15.0, 20.0, 26.0, 33.0, 42.0, 52.0, 65.0, 80.0, 100.0)
+"""Turns to start from, to either side: dense where most vehicles are, and never far from any."""
+DOUBTED = 2.0
+"""A point has half its influence when it is so many standard deviations off (Cauchy): groups hold strangers."""
+SETTLING = 5
+"""Rounds in which the motion of each window is solved when lens and plane have moved a little."""
+DIFFERENCE = 1e-6
+STEERED_DEG = 5.0
+"""Least turn in a window of a vehicle that is said to turn."""
+SLIP_DEG, SLIP_SHARE = 4.0, 0.25
+"""A wheeled vehicle turns as its path does, to so many degrees and this share: the rest is a change of curvature."""
+STEERED_S = 1.0
+"""What windows of tracks say of a body's turning holds for segments within so long."""
+LOW = 0.02
+"""Least angle below the horizon at which a point is placed on the road, radians."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Turn about the ground normal and heading of the translation in the plane, of each window (windows,)."""
+
+    turn_rad: np.ndarray
+    heading_rad: np.ndarray
+
+    def moved(self, turn: np.ndarray | float, heading: np.ndarray | float) -> Motion:
+        """Return the motion changed by steps."""
+        return Motion(self.turn_rad + turn, self.heading_rad + heading)
+
+    def subset(self, keep: np.ndarray) -> Motion:
+        """Return the motion of the windows that `keep` selects."""
+        return Motion(self.turn_rad[keep], self.heading_rad[keep])
+
+
+@dataclass(frozen=True)
+class View:
+    """Windows as a camera over a plane sees them: bearings in the frame of the plane, z its normal."""
+
+    first: Rays
+    second: Rays
+    mask: np.ndarray
+    sigma_px: np.ndarray
+    """Standard deviation of a tracked point over the window, shape (windows, points)."""
+
+    @classmethod
+    def of(cls, windows: Windows, camera: Camera, camera_from_plane: np.ndarray, options: JointOptions) -> View:
+        """See windows with a camera over a plane (3, 3)."""
+        rays = rays_of(camera, np.stack([windows.first_px, windows.second_px]))
+        first, second = (Rays(rays.bearings[at], rays.radial[at], rays.tangential[at]) for at in (0, 1))
+        way = np.hypot(*np.moveaxis(windows.second_px - windows.first_px, -1, 0))
+        # a followed point drifts as a random walk; half of its variance falls on either end
+        sigma = np.sqrt(options.noise_px**2 + 0.5 * options.drift_px**2 * way)
+        return cls(first, second, windows.mask, sigma).turned(camera_from_plane)
+
+    def turned(self, rotation: np.ndarray) -> View:
+        """Return the view in a frame that is turned, old_from_new (3, 3)."""
+        first, second = (Rays(rays.bearings @ rotation, rays.radial @ rotation, rays.tangential @ rotation)
+                         for rays in (self.first, self.second))
+        return replace(self, first=first, second=second)
+
+    def distances(self, motion: Motion) -> np.ndarray:
+        """Signed Sampson distance of each point in standard deviations, shape (windows, points); 0 off the mask."""
+        cosine, sine = np.cos(motion.turn_rad)[:, None], np.sin(motion.turn_rad)[:, None]
+        along, across = np.cos(motion.heading_rad)[:, None], np.sin(motion.heading_rad)[:, None]
+        x, y, z = np.moveaxis(self.first.bearings, -1, 0)
+        u, v, w = np.moveaxis(self.second.bearings, -1, 0)
+        turned = (cosine * x - sine * y, sine * x + cosine * y)
+        # the epipolar line of the first point, t x R a, and that of the second, R^T (b x t)
+        line = np.stack([across * z, -along * z, along * turned[1] - across * turned[0]], axis=-1)
+        back = (-w * across, w * along)
+        line_back = np.stack([cosine * back[0] + sine * back[1], cosine * back[1] - sine * back[0],
+                              u * across - v * along], axis=-1)
+        gradient2 = (dot(self.second.radial, line)**2 + dot(self.second.tangential, line)**2
+                     + dot(self.first.radial, line_back)**2 + dot(self.first.tangential, line_back)**2)
+        apart = u * line[..., 0] + v * line[..., 1] + w * line[..., 2]
+        return self.mask * apart / (np.sqrt(np.maximum(gradient2, 1e-18)) * self.sigma_px)
+
+    def slopes(self, motion: Motion, here: np.ndarray) -> np.ndarray:
+        """Derivatives of the distances `here` by turn and heading, shape (windows, points, 2)."""
+        return np.stack([self.distances(motion.moved(DIFFERENCE, 0.0)) - here,
+                         self.distances(motion.moved(0.0, DIFFERENCE)) - here], axis=-1) / DIFFERENCE
+
+
+def steered(windows: Windows, motion: Motion, camera: Camera, camera_from_plane: np.ndarray) -> np.ndarray:
+    """Which windows show a vehicle that turns, shape (windows,): its body turns, and as much as its path does.
+
+    Two vehicles side by side that were taken for one seem to turn when one is faster, on straight paths; only what
+    is steered tells anything of the plane. How far the path of a point turns does not depend on its height.
+    """
+    first, middle, second = (
+        _on_plane(rays_of(camera, np.nan_to_num(pixels)).bearings @ camera_from_plane)
+        for pixels in (windows.first_px, windows.middle_px, windows.second_px))
+    before, after = middle - first, second - middle
+    bend = np.arctan2(before[..., 0] * after[..., 1] - before[..., 1] * after[..., 0], (before * after).sum(axis=-1))
+    # chords from the first instant to the middle and on to the second differ by half of what the path turns
+    path_deg = 2.0 * np.degrees(np.ma.median(np.ma.array(bend, mask=~windows.mask), axis=1).filled(0.0))
+    body_deg = np.degrees(np.angle(np.exp(1j * motion.turn_rad)))
+    alike = np.abs(body_deg - path_deg) < SLIP_DEG + SLIP_SHARE * np.abs(path_deg)
+    turning = alike & (np.minimum(np.abs(body_deg), np.abs(path_deg)) > STEERED_DEG) & ~windows.of_segments
+    for row in np.flatnonzero(windows.of_segments):
+        same = turning & (windows.bodies == windows.bodies[row]) & ~windows.of_segments
+        turning[row] = bool((np.abs(windows.times_s[same] - windows.times_s[row]) < STEERED_S).any())
+    return turning
+
+
+def _on_plane(bearings: np.ndarray) -> np.ndarray:
+    """Where bearings (..., 3) in the frame of the plane meet it, in units of the camera's height, shape (..., 2)."""
+    away = bearings[..., 2:] * (np.sign(np.median(bearings[..., 2])) if bearings.size else 1.0)
+    return bearings[..., :2] / np.maximum(away, LOW)
+
+
+def trust(distances: np.ndarray) -> np.ndarray:
+    """Influence of points by their distances in standard deviations: 1 at 0, a half at `DOUBTED` (Cauchy)."""
+    return 1.0 / (1.0 + (distances / DOUBTED) ** 2)
+
+
+def point_cost(distances: np.ndarray) -> np.ndarray:
+    """Sum over each window of the loss whose derivative is `trust`, shape (windows,)."""
+    return DOUBTED**2 * np.log1p((distances / DOUBTED) ** 2).sum(axis=1)
+
+
+def first_motion(view: View) -> Motion:
+    """Find each window's motion from nothing: the best of many turns, each with its best heading in closed form."""
+    count = len(view.mask)
+    best = np.full(count, np.inf)
+    found = Motion(np.zeros(count), np.zeros(count))
+    for turn in np.radians([*TURNS_DEG, *(-turn for turn in TURNS_DEG[1:])]):
+        rotated = view.first.bearings @ np.array([[np.cos(turn), np.sin(turn), 0.0],
+                                                  [-np.sin(turn), np.cos(turn), 0.0], [0.0, 0.0, 1.0]])
+        # b . (t x R a) = t . (R a x b)
+        a, b = rotated, view.second.bearings
+        x, y = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1], a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
+        size = view.mask / np.maximum(np.sqrt(x * x + y * y + (a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])**2), 1e-3)
+        x, y = x * size, y * size
+        heading = 0.5 * np.arctan2(2 * (x * y).sum(axis=1), (x * x - y * y).sum(axis=1)) + np.pi / 2
+        trial = Motion(np.full(count, turn), heading)
+        cost = point_cost(view.distances(trial))
+        better = cost < best
+        best = np.where(better, cost, best)
+        found = Motion(np.where(better, trial.turn_rad, found.turn_rad),
+                       np.where(better, trial.heading_rad, found.heading_rad))
+    return settled(view, found, 2 * SETTLING)
+
+
+def settled(view: View, motion: Motion, rounds: int = SETTLING) -> Motion:
+    """Improve each window's motion by Levenberg-Marquardt rounds of its own."""
+    damping = np.full(len(view.mask), 1e-4)
+    here = view.distances(motion)
+    cost = point_cost(here)
+    for _ in range(rounds):
+        slopes, weight = view.slopes(motion, here), trust(here)
+        a, b, d = ((weight * slopes[..., i] * slopes[..., j]).sum(axis=1) for i, j in ((0, 0), (0, 1), (1, 1)))
+        p, q = ((weight * slopes[..., i] * here).sum(axis=1) for i in (0, 1))
+        lift = damping * (a + d) + 1e-9
+        a, d = a + lift, d + lift
+        determinant = a * d - b * b
+        trial = motion.moved(np.clip((b * q - d * p) / determinant, -0.2, 0.2),
+                             np.clip((b * p - a * q) / determinant, -0.2, 0.2))
+        there = view.distances(trial)
+        cost_there = point_cost(there)
+        better = cost_there <= cost
+        gain = np.max(cost - cost_there, initial=0.0, where=better)
+        motion = Motion(np.where(better, trial.turn_rad, motion.turn_rad),
+                        np.where(better, trial.heading_rad, motion.heading_rad))
+        here, cost = np.where(better[:, None], there, here), np.where(better, cost_there, cost)
+        damping = np.where(better, np.maximum(damping / 10, 1e-6), np.minimum(damping * 20, 1e3))
+        if better.all() and gain < 1e-4:
+            break
+    return motion

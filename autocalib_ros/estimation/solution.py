@@ -1,0 +1,130 @@
+"""The robust method: from traffic to a lens and a ground plane that have been doubted in every way we know."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from autocalib_ros.calibration import Reason
+from autocalib_ros.camera import Camera
+from autocalib_ros.config import GateOptions, JointOptions
+from autocalib_ros.estimation.doubts import halves_doubt, lens_doubt, plane_doubt
+from autocalib_ros.estimation.great_circles import TrackSet
+from autocalib_ros.estimation.held import lens_assumptions, with_what_can_be_told
+from autocalib_ros.estimation.joint import JointFit, noise_cost, road_support, solve_joint, with_bodies
+from autocalib_ros.estimation.lens_prior import LensPrior, known_lens, lens_priors
+from autocalib_ros.estimation.roads import main_direction, with_further_roads, with_real_roads, with_right_angle
+from autocalib_ros.estimation.starts import agreed, in_likeliest_family
+from autocalib_ros.estimation.state import Setting
+from autocalib_ros.estimation.turning import from_turning, with_steered
+from autocalib_ros.estimation.windows import Windows
+
+VOTERS = 200
+"""Tracks, evenly out of all, from which the starts are made and compared; the solution then uses every track."""
+
+
+@dataclass(frozen=True)
+class Solution:
+    """A lens, the plane and its roads, with the reason why there is no ground plane where there is none."""
+
+    fit: JointFit
+    along: np.ndarray
+    """Unit vector (3,), camera frame, along the road of most vehicles."""
+    assumptions: tuple[str, ...]
+    checks: tuple[str, ...]
+    no_plane: Reason | None
+
+
+@dataclass(frozen=True)
+class _Traffic:
+    """What every stage of a solution is given."""
+
+    tracks: TrackSet
+    windows: Windows
+    priors: list[LensPrior]
+    gate: GateOptions
+
+    @property
+    def voters(self) -> TrackSet:
+        return self.tracks.subset(np.unique(np.linspace(0, len(self.tracks) - 1, VOTERS).astype(int)))
+
+
+def find_solution(tracks: TrackSet, windows: Windows, image_size: tuple[int, int], options: JointOptions,
+                  gate: GateOptions, generator: np.random.Generator, *, height_m: float = 0.0,
+                  lens: Camera | None = None) -> Solution | Reason:
+    """Estimate lens, plane and roads; a reason instead when the lens cannot be trusted.
+
+    Straight traffic is tried first, with what turns to complete it; where that gives no plane, the traffic that
+    turns alone. A known `lens` is kept, and only the pose is found.
+    """
+    if len(tracks) < gate.min_tracks:
+        return Reason('too_few_tracks', f'{len(tracks)} tracks of the {gate.min_tracks} needed are long enough',
+                      'wait for more traffic, or record for longer')
+    priors = [known_lens(lens)] if lens is not None else lens_priors(image_size, options)
+    crossing = None if options.crossing_deg is None else float(np.radians(options.crossing_deg))
+    traffic = _Traffic(tracks, windows, priors, gate)
+    setting = Setting(priors[0], options, height_m, crossing)
+    straight = _from_straight(traffic, setting, generator)
+    if isinstance(straight, Solution) and straight.no_plane is None:
+        return straight
+    turned = from_turning(tracks, windows, setting)
+    if turned is None:
+        return straight
+    turning = _completed(with_further_roads(turned, tracks, gate), np.inf, '', traffic)
+    better = isinstance(turning, Solution) and (turning.no_plane is None or isinstance(straight, Reason))
+    return turning if better else straight
+
+
+def _from_straight(traffic: _Traffic, setting: Setting, generator: np.random.Generator) -> Solution | Reason:
+    """Solve from the directions on which straight tracks agree."""
+    tracks, gate = traffic.tracks, traffic.gate
+    found = agreed(traffic.voters, setting, generator)
+    if found is None:
+        return Reason('no_direction', f'{len(tracks)} tracks agree on no common direction',
+                      'straight traffic is needed: wait for it, or turn the camera towards a straight road')
+    best, contrast = found
+    fit = solve_joint(best.state, tracks, best.problem.setting)
+    support = road_support(fit, tracks)
+    second = sorted(int(mask.sum()) for mask in support)[:-1]
+    across = f'{min([gate.min_tracks_per_road, *(second or [0])])} of {gate.min_tracks_per_road} tracks'
+    return _completed(with_real_roads(fit, support, tracks, gate), contrast, across, traffic)
+
+
+def _completed(fit: JointFit, contrast: float, across: str, traffic: _Traffic) -> Solution | Reason:
+    """Refine a solution with all that the traffic tells, and doubt it.
+
+    `contrast` is how sharply straight tracks agreed on the focal length; `across` counts the tracks on a second road
+    for the one who waits for them.
+    """
+    tracks, gate, options = traffic.tracks, traffic.gate, fit.problem.setting.options
+    fit = in_likeliest_family(fit, traffic.priors[1:], traffic.voters, tracks)
+    if noise_cost(fit, tracks, drifting=True) < noise_cost(fit, tracks, drifting=False):
+        tracks = with_bodies(fit, tracks) if fit.plane_known else tracks
+        fit = solve_joint(fit.state, tracks, replace(fit.problem.setting, drifting=True), refine=True)
+    if fit.plane_known:
+        fit = with_steered(fit, tracks, traffic.windows) or fit
+    fit = with_further_roads(fit, tracks, gate)
+    fit, angle = with_right_angle(fit, tracks, options)
+    fit, held = with_what_can_be_told(fit, tracks)
+    doubt = lens_doubt(fit, contrast, tracks, gate)
+    if doubt:
+        return doubt
+    halves = halves_doubt(fit, tracks, gate)
+    if isinstance(halves, Reason):
+        return halves
+    along = main_direction(fit, tracks, road_support(fit, tracks))
+    assumptions = lens_assumptions(fit, held)
+    if not fit.plane_known:
+        return Solution(fit, along, assumptions, (halves,), Reason(
+            'one_direction', f'too little traffic across the main road yet: {across}; {int(fit.explained().sum())} '
+            'follow one road, and rotation about it is free', 'wait for traffic across the main road, or that turns'))
+    checks = (*_angle_and_turning(fit, angle), halves)
+    return Solution(fit, along, (*assumptions, angle) if fit.crossing_held and angle else assumptions, checks,
+                    plane_doubt(fit, tracks, gate))
+
+
+def _angle_and_turning(fit: JointFit, angle: str | None) -> tuple[str, ...]:
+    bodies = len(np.unique(fit.problem.setting.windows.bodies))
+    turning = (f'{bodies} vehicles that turn move as rigid bodies in the plane',) if bodies else ()
+    return turning if angle is None or fit.crossing_held else (angle, *turning)

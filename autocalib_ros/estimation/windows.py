@@ -1,0 +1,235 @@
+"""Windows: several points of one vehicle seen at the same two instants.
+
+Between the two a vehicle has moved as a rigid body on the road. Points that are near each other and move alike make
+up a body; what is grouped wrongly has to be borne by whoever uses a window.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from autocalib_ros.estimation.great_circles import SAMPLES
+from autocalib_ros.evidence import Evidence
+
+INTERVAL_S = 0.4
+"""Windows begin, end and have their middle at whole multiples of this."""
+LENGTHS = (2, 4)
+"""In intervals, even: long enough that a vehicle turns by degrees, short enough that the same points are still seen."""
+MIN_POINTS = 5
+"""A window's own motion takes two unknowns; fewer points say too little beyond."""
+NEAR = 0.06
+"""Points of one body lie within this of a neighbour, share of the image width."""
+LEAST_MOVE = 0.01
+"""Shortest displacement in a window, share of the image width; below it is more noise than motion."""
+ALIKE, ALIKE_PX = 0.25, 2.0
+"""Displacements of neighbours on one body differ by less than this share and so many pixels: it turns, and what is
+nearer or higher moves farther in the image."""
+SHARED = 3
+"""Two windows with so many tracks in common are of one body."""
+SAME_TIME_S = 0.6
+"""Segments belong to a body of tracks that is seen at their place within so long."""
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Windows in arrays of equal width; a window has a point where `mask` is true."""
+
+    first_px: np.ndarray
+    """Observed pixels at the first instant, shape (windows, SAMPLES, 2)."""
+    second_px: np.ndarray
+    """The same points at the second instant, shape (windows, SAMPLES, 2)."""
+    middle_px: np.ndarray
+    """The same points halfway in time, nan for segments, shape (windows, SAMPLES, 2)."""
+    mask: np.ndarray
+    """Shape (windows, SAMPLES)."""
+    bodies: np.ndarray
+    """Which windows are of one body, shape (windows,)."""
+    times_s: np.ndarray
+    """Time of the middle of each window, shape (windows,)."""
+    tracks: np.ndarray
+    """Index in the evidence of each point's track, -1 for segments, shape (windows, SAMPLES)."""
+
+    def __len__(self) -> int:
+        return len(self.bodies)
+
+    def subset(self, keep: np.ndarray) -> Windows:
+        """Return the windows that `keep`, a mask or indices, selects."""
+        return Windows(self.first_px[keep], self.second_px[keep], self.middle_px[keep], self.mask[keep],
+                       self.bodies[keep], self.times_s[keep], self.tracks[keep])
+
+    @property
+    def of_segments(self) -> np.ndarray:
+        """Which windows are of segments, shape (windows,)."""
+        return ~np.isfinite(self.middle_px[:, 0, 0])
+
+    @property
+    def share_of_body(self) -> np.ndarray:
+        """One over the number of windows of the same body, shape (windows,)."""
+        _, inverse, counts = np.unique(self.bodies, return_inverse=True, return_counts=True)
+        return 1.0 / counts[inverse]
+
+    def spread(self, limit: int) -> Windows:
+        """Return at most `limit` windows, bodies in turn, those of most points and farthest motion first."""
+        way = np.hypot(*np.moveaxis(self.second_px - self.first_px, -1, 0)).mean(axis=1)
+        order = np.lexsort((-way, -self.mask.sum(axis=1)))
+        rank = np.empty(len(self), int)
+        rank[order] = _rank_within(self.bodies[order])
+        return self.subset(np.sort(np.lexsort((np.arange(len(self)), rank))[:limit]))
+
+
+def no_windows() -> Windows:
+    """Return none at all."""
+    return _joined([], 0)
+
+
+def find_windows(evidence: Evidence) -> Windows:
+    """Group the points of tracks, and the segments, into bodies at two instants."""
+    width = evidence.image_size[0]
+    return _joined(_bodies([*_of_tracks(evidence), *_of_segments(evidence)], width), width)
+
+
+@dataclass(frozen=True)
+class _Group:
+    """Points (n, 2) at two instants and halfway, with their tracks (n,), and the middle of the window."""
+
+    first: np.ndarray
+    second: np.ndarray
+    middle: np.ndarray
+    tracks: np.ndarray
+    time_s: float
+
+    def subset(self, keep: np.ndarray) -> _Group:
+        """Return the points with these indices."""
+        return _Group(self.first[keep], self.second[keep], self.middle[keep], self.tracks[keep], self.time_s)
+
+
+def _of_tracks(evidence: Evidence) -> Iterator[_Group]:
+    """Points of what may be one vehicle, by the label that it was seen under."""
+    grid = _OnGrid(evidence)
+    for length in LENGTHS:
+        half = length // 2
+        for begin in range(grid.begin.min(initial=0), grid.end.max(initial=0) - length + 1, half):
+            seen = np.flatnonzero((grid.begin <= begin) & (grid.end >= begin + length))
+            for members in _alike(evidence.track_vehicles[seen]):
+                tracks = seen[members]
+                first, middle, second = (grid.at(tracks, begin + step) for step in (0, half, length))
+                yield _Group(first, second, middle, tracks, (begin + half) * INTERVAL_S)
+
+
+def _of_segments(evidence: Evidence) -> Iterator[_Group]:
+    """Segments of one vehicle between the same two masked frames."""
+    _, instant = np.unique(evidence.segment_times_s, return_inverse=True)
+    for members in _alike(instant.ravel() * (evidence.segment_vehicles.max(initial=0) + 1) + evidence.segment_vehicles):
+        first, second = evidence.segments_px[members, :2], evidence.segments_px[members, 2:]
+        yield _Group(first, second, np.full(first.shape, np.nan), np.full(len(members), -1),
+                     float(evidence.segment_times_s[members[0]]))
+
+
+def _alike(labels: np.ndarray) -> list[np.ndarray]:
+    """Indices of the members of each label that has enough of them."""
+    order = np.argsort(labels, kind='stable')
+    parts = np.split(order, np.flatnonzero(np.diff(labels[order])) + 1)
+    return [part for part in parts if len(part) >= MIN_POINTS]
+
+
+class _OnGrid:
+    """Where tracks were at multiples of the interval."""
+
+    def __init__(self, evidence: Evidence) -> None:
+        starts, ends = evidence.track_starts[:-1], evidence.track_starts[1:]
+        self.begin = np.ceil(evidence.times_s[starts] / INTERVAL_S - 1e-9).astype(int)
+        self.end = np.floor(evidence.times_s[ends - 1] / INTERVAL_S + 1e-9).astype(int)
+        self._offset = np.concatenate([[0], np.cumsum(np.maximum(self.end - self.begin + 1, 0))])
+        self._places = np.zeros((self._offset[-1], 2))
+        for index in np.flatnonzero(self.end >= self.begin):
+            part = slice(starts[index], ends[index])
+            wanted = np.arange(self.begin[index], self.end[index] + 1) * INTERVAL_S
+            for axis in (0, 1):
+                self._places[self._offset[index]:self._offset[index + 1], axis] = np.interp(
+                    wanted, evidence.times_s[part], evidence.points_px[part, axis])
+
+    def at(self, tracks: np.ndarray, instant: int) -> np.ndarray:
+        """Positions (n, 2) of tracks (n,) at a multiple of the interval."""
+        return self._places[self._offset[tracks] + instant - self.begin[tracks]]
+
+
+def _bodies(groups: list[_Group], width: int) -> list[_Group]:
+    """Take groups apart into bodies: points near each other, at both instants, that move alike."""
+    edges, start = [np.zeros((2, 0), int)], 0
+    for group in groups:
+        moves = group.second - group.first
+        far = np.hypot(moves[:, 0], moves[:, 1])
+        moving = far > LEAST_MOVE * width
+        together = ((_apart(group.first) < NEAR * width) & (_apart(group.second) < NEAR * width)
+                    & (_apart(moves) < ALIKE * np.maximum(far[:, None], far) + ALIKE_PX) & moving[:, None] & moving)
+        edges.append(np.array(np.nonzero(together)) + start)
+        start += len(far)
+    pairs = np.concatenate(edges, axis=1)
+    graph = coo_matrix((np.ones(pairs.shape[1], bool), pairs), shape=(start, start))
+    _, labels = connected_components(graph, directed=False)
+    starts = np.cumsum([0, *(len(group.tracks) for group in groups)])
+    return [group.subset(_scattered(body, group.first)) for number, group in enumerate(groups)
+            for body in _alike(labels[starts[number]:starts[number + 1]])]
+
+
+def _apart(places: np.ndarray) -> np.ndarray:
+    """Distances (n, n) between places (n, 2)."""
+    return np.hypot(places[:, None, 0] - places[:, 0], places[:, None, 1] - places[:, 1])
+
+
+def _scattered(body: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Choose at most SAMPLES points of a body, each as far from those before as can be."""
+    if len(body) <= SAMPLES:
+        return body
+    chosen = [0]
+    distance = np.hypot(*(places[body] - places[body[0]]).T)
+    while len(chosen) < SAMPLES:
+        chosen.append(int(np.argmax(distance)))
+        distance = np.minimum(distance, np.hypot(*(places[body] - places[body[chosen[-1]]]).T))
+    return body[np.sort(chosen)]
+
+
+def _joined(groups: list[_Group], width: int) -> Windows:
+    count = len(groups)
+    first, second, middle = (np.zeros((count, SAMPLES, 2)) for _ in range(3))
+    mask, tracks = np.zeros((count, SAMPLES), bool), np.full((count, SAMPLES), -1)
+    for row, group in enumerate(groups):
+        points = len(group.tracks)
+        for array, places in ((first, group.first), (second, group.second), (middle, group.middle)):
+            array[row], array[row, :points] = places[0], places
+        mask[row, :points], tracks[row, :points] = True, group.tracks
+    times = np.array([group.time_s for group in groups])
+    return Windows(first, second, middle, mask, _owners(tracks, times, first[:, 0], NEAR * width), times, tracks)
+
+
+def _owners(tracks: np.ndarray, times: np.ndarray, places: np.ndarray, reach: float) -> np.ndarray:
+    """Number the bodies: windows of tracks by the tracks that they share, those of segments by time and place."""
+    rows, columns = np.nonzero(tracks >= 0)
+    members = coo_matrix((np.ones(len(rows)), (rows, tracks[rows, columns])),
+                         shape=(len(tracks), int(tracks.max(initial=-1)) + 1)).tocsr()
+    common = (members @ members.T).tocoo()
+    same = common.data >= SHARED
+    graph = coo_matrix((np.ones(same.sum()), (common.row[same], common.col[same])), shape=(len(tracks), len(tracks)))
+    _, labels = connected_components(graph, directed=False)
+    of_tracks = np.flatnonzero(tracks[:, 0] >= 0)
+    for row in np.flatnonzero(tracks[:, 0] < 0):
+        near = of_tracks[np.abs(times[of_tracks] - times[row]) <= SAME_TIME_S]
+        distance = np.hypot(*(places[near] - places[row]).T)
+        if distance.min(initial=np.inf) < reach:
+            labels[row] = labels[near[np.argmin(distance)]]
+    return labels
+
+
+def _rank_within(labels: np.ndarray) -> np.ndarray:
+    """Count, for each label (n,), how often it came before."""
+    order = np.argsort(labels, kind='stable')
+    starts = np.flatnonzero(np.diff(labels[order], prepend=labels[order][:1] - 1))
+    lengths = np.diff(np.append(starts, len(labels)))
+    rank = np.empty(len(labels), int)
+    rank[order] = np.arange(len(labels)) - np.repeat(starts, lengths)
+    return rank

@@ -1,0 +1,138 @@
+"""Vehicles as rigid bodies in the plane: what obeys it, what does not, and how residuals change."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from autocalib_ros.camera import Camera
+from autocalib_ros.config import JointOptions
+from autocalib_ros.estimation.lens_prior import lens_priors
+from autocalib_ros.estimation.planar_motion import Motion, View, first_motion, settled, steered
+from autocalib_ros.estimation.rows import MotionRows
+from autocalib_ros.estimation.state import Setting, State, Steps
+from autocalib_ros.estimation.windows import Windows
+from autocalib_ros.offline.synthetic_evidence import pose
+
+CAMERA = Camera(1280, 720, 560.0, (645.0, 352.0), (0.01, 0.0, 0.0, 0.0))
+POSE = pose(30.0, 1.5, 20.0)
+HEIGHT_M = 8.0
+POINTS = 8
+
+
+def window(positions: np.ndarray, headings: np.ndarray, bodies: list[np.ndarray]) -> np.ndarray:
+    """Pixels (3, POINTS, 2) of points on bodies that stand at positions (bodies, 3, 2) with headings (bodies, 3)."""
+    seen = []
+    for where, heading, body in zip(positions, headings, bodies, strict=True):
+        forward = np.column_stack([np.cos(heading), np.sin(heading)])
+        left = np.column_stack([-forward[:, 1], forward[:, 0]])
+        ground = where[:, None] + body[:, 0, None] * forward[:, None] + body[:, 1, None] * left[:, None]
+        up = np.broadcast_to(body[:, 2] - HEIGHT_M, ground.shape[:2])
+        seen.append(CAMERA.project(np.dstack([ground, up]) @ POSE.T)[0])
+    return np.concatenate(seen, axis=1)
+
+
+def windows_of(pixels: np.ndarray) -> Windows:
+    """Windows of pixels (windows, 3, POINTS, 2), each a body of its own."""
+    count = len(pixels)
+    return Windows(first_px=pixels[:, 0], second_px=pixels[:, 2], middle_px=pixels[:, 1],
+                   mask=np.ones((count, pixels.shape[2]), bool), bodies=np.arange(count),
+                   times_s=np.zeros(count), tracks=np.zeros((count, pixels.shape[2]), int))
+
+
+def car(generator: np.random.Generator, points: int = POINTS) -> np.ndarray:
+    return generator.uniform([-2.0, -0.8, 0.2], [2.0, 0.8, 1.6], (points, 3))
+
+
+def turning(generator: np.random.Generator, turn_deg: float, speed_m: float = 8.0) -> np.ndarray:
+    """One car that turns steadily by `turn_deg` on its way."""
+    heading = generator.uniform(0, 2 * np.pi) + np.radians(turn_deg) * np.array([0.0, 0.5, 1.0])
+    chords = 0.5 * speed_m * np.column_stack([np.cos(0.5 * (heading[:-1] + heading[1:])),
+                                              np.sin(0.5 * (heading[:-1] + heading[1:]))])
+    where = generator.uniform([12.0, -6.0], [22.0, 6.0]) + np.concatenate([[[0.0, 0.0]], np.cumsum(chords, axis=0)])
+    return window(where[None], heading[None], [car(generator)])
+
+
+def crossing(generator: np.random.Generator) -> np.ndarray:
+    """Two cars on straight ways of their own that are taken for one."""
+    heading = generator.uniform(0, 2 * np.pi) + np.array([0.0, generator.uniform(0.3, 1.2)])
+    forward = np.column_stack([np.cos(heading), np.sin(heading)])
+    start = generator.uniform([14.0, -5.0], [20.0, 5.0])
+    where = start + np.array([0.0, 4.0, 8.0])[:, None] * forward[:, None]
+    return window(where, np.repeat(heading[:, None], 3, axis=1), [car(generator, POINTS // 2) for _ in range(2)])
+
+
+def view_of(windows: Windows) -> View:
+    return View.of(windows, CAMERA, POSE, JointOptions())
+
+
+@pytest.mark.parametrize('turn_deg', [-70.0, -12.0, 3.0, 25.0, 90.0])
+def test_a_turning_car_obeys_the_motion_that_is_found_from_nothing(turn_deg: float) -> None:
+    generator = np.random.default_rng(3)
+    view = view_of(windows_of(np.stack([turning(generator, turn_deg) for _ in range(5)])))
+    motion = settled(view, first_motion(view), rounds=30)
+    assert np.degrees(motion.turn_rad) == pytest.approx(np.full(5, turn_deg), abs=0.01)
+    assert np.abs(view.distances(motion)).max() < 1e-3
+
+
+def test_the_distance_is_in_observed_pixels_over_their_standard_deviation() -> None:
+    generator = np.random.default_rng(4)
+    windows = windows_of(turning(generator, 20.0)[None])
+    view = view_of(windows)
+    motion = first_motion(view)
+    for step in np.array([[1.0, 0.0], [0.0, 1.0]]):
+        nearer = windows.second_px.copy()
+        nearer[0, 0] += 0.01 * step
+        shifted = View.of(Windows(windows.first_px, nearer, windows.middle_px, windows.mask, windows.bodies,
+                                  windows.times_s, windows.tracks), CAMERA, POSE, JointOptions())
+        off_px = shifted.distances(motion)[0, 0] * view.sigma_px[0, 0]
+        assert abs(off_px) <= 0.01 / np.sqrt(2) * 1.5  # both ends share a displacement
+    assert (view.sigma_px > JointOptions().noise_px).all()
+
+
+def test_settling_comes_back_from_a_motion_nearby_and_ignores_a_stranger() -> None:
+    generator = np.random.default_rng(5)
+    windows = windows_of(turning(generator, 20.0)[None])
+    view = view_of(windows)
+    true = first_motion(view)
+    back = settled(view, true.moved(0.05, -0.1), rounds=20)
+    assert back.turn_rad == pytest.approx(true.turn_rad, abs=1e-4)
+    windows.second_px[0, 0] += [15.0, -20.0]
+    assert settled(view_of(windows), true, 20).turn_rad == pytest.approx(true.turn_rad, abs=np.radians(1.0))
+
+
+def test_only_what_is_steered_counts_as_turning() -> None:
+    generator = np.random.default_rng(6)
+    kinds = {'turning': [turning(generator, sign * turn) for turn in (12.0, 20.0, 35.0, 60.0) for sign in (-1, 1)],
+             'straight': [turning(generator, 0.0) for _ in range(40)],
+             'crossing': [crossing(generator) for _ in range(20)]}
+    shares = {}
+    for kind, pixels in kinds.items():
+        windows = windows_of(np.stack(pixels) + generator.normal(scale=0.3, size=np.shape(pixels)))
+        motion = first_motion(view_of(windows))
+        shares[kind] = steered(windows, motion, CAMERA, POSE).mean()
+        if kind == 'crossing':
+            assert np.median(np.abs(np.degrees(motion.turn_rad))) > 5.0  # by their displacements they do seem to turn
+    assert shares['turning'] > 0.8
+    assert shares['straight'] == 0.0
+    assert shares['crossing'] < 0.1
+
+
+def test_residuals_change_as_their_derivatives_say() -> None:
+    generator = np.random.default_rng(7)
+    pixels = np.stack([turning(generator, turn) for turn in (15.0, -30.0, 40.0)])
+    windows = windows_of(pixels + generator.normal(scale=0.05, size=pixels.shape))
+    prior = lens_priors((1280, 720), JointOptions())[0]
+    steps = Steps(State(CAMERA, POSE, np.zeros(0)), Setting(prior, JointOptions(), windows=windows))
+    rows = MotionRows(steps, None)
+    here = rows.linearised()
+    assert here.slopes.shape == (3, POINTS, steps.size)
+    # log f, the principal point and k1 in their prior's sigmas, two turns of the plane
+    step = np.array([1e-3, 2e-3, -2e-3, 2e-3, 4e-4, -3e-4])
+    _, there = rows.at(steps.state(step))
+    assert there - here.residuals == pytest.approx(here.slopes @ step, abs=0.03 * np.abs(here.slopes @ step).max())
+
+
+def test_motion_keeps_its_place_in_a_selection() -> None:
+    motion = Motion(np.array([0.1, 0.2]), np.array([1.0, 2.0]))
+    assert motion.subset(np.array([1])).heading_rad.tolist() == [2.0]

@@ -1,0 +1,64 @@
+"""Calibration from vehicles that turn, and what only looks like turning."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+
+from autocalib_ros.calibration import Calibration, Refusal
+from autocalib_ros.calibrator import solve
+from autocalib_ros.config import Options
+from autocalib_ros.offline.synthetic_evidence import Junction, pose, synthetic_evidence
+from autocalib_ros.offline.synthetic_traffic import drive_arc
+
+TURNING = Junction(drive=partial(drive_arc, radii_m=(12.0, 60.0)), vehicles=40, points_per_vehicle=8)
+
+
+def solved(junction: Junction, seed: int = 0) -> Calibration | Refusal:
+    return solve(synthetic_evidence(junction, np.random.default_rng(seed)), Options(camera_height=8.0))
+
+
+def normal_error_deg(result: Calibration, junction: Junction) -> float:
+    assert result.ground is not None
+    return float(np.degrees(np.arccos(np.clip(result.ground.normal_in_camera @ junction.normal_in_camera, -1, 1))))
+
+
+def test_perfect_turning_traffic_gives_the_truth() -> None:
+    junction = replace(TURNING, wander_m=0.0, noise_px=0.0)
+    result = solved(junction)
+    assert isinstance(result, Calibration)
+    assert result.camera.focal_px == pytest.approx(560.0, rel=5e-3)
+    assert normal_error_deg(result, junction) < 0.2
+    assert any('rigid bodies' in check for check in result.checks)
+
+
+@pytest.mark.parametrize('joined', [0.0, 0.3])
+def test_turning_traffic_alone_calibrates_even_when_groups_are_wrong(joined: float) -> None:
+    junction = replace(TURNING, joined_share=joined)
+    result = solved(junction, seed=1)
+    assert isinstance(result, Calibration)
+    sigma = result.stddev
+    assert sigma.focal_px is not None and sigma.tilt_deg is not None and sigma.roll_deg is not None
+    assert abs(result.camera.focal_px - 560.0) < max(3.0 * sigma.focal_px, 0.02 * 560.0)
+    assert normal_error_deg(result, junction) < 3.0 * np.hypot(sigma.tilt_deg, sigma.roll_deg)
+    assert sigma.focal_px < 0.05 * 560.0
+
+
+def test_cars_side_by_side_on_one_road_tell_no_plane() -> None:
+    junction = Junction(road_angles_deg=(0.0,), camera_from_ground=pose(30.0, 1.0, 60.0), vehicles=60,
+                        points_per_vehicle=8, turning_share=0.0, joined_share=0.7)
+    result = solved(junction)
+    if isinstance(result, Calibration):
+        assert result.ground is None and result.ground_refusal is not None
+        assert result.ground_refusal.code == 'one_direction'
+
+
+def test_turning_traffic_completes_a_single_road() -> None:
+    junction = Junction(road_angles_deg=(0.0,), camera_from_ground=pose(30.0, 1.0, 50.0), vehicles=80,
+                        points_per_vehicle=8, turning_share=0.5)
+    result = solved(junction)
+    assert isinstance(result, Calibration)
+    assert normal_error_deg(result, junction) < 1.5
