@@ -18,7 +18,6 @@ from autocalib_ros.estimation.paper import scale, solve_paper
 from autocalib_ros.estimation.solution import Solution, find_solution
 from autocalib_ros.estimation.straightness import paper_intrinsics
 from autocalib_ros.estimation.vanishing_points import segment_orientations
-from autocalib_ros.estimation.windows import find_windows
 from autocalib_ros.evidence import Evidence, EvidenceBuffer
 from autocalib_ros.perception.observer import Observer
 
@@ -136,7 +135,7 @@ def solve(evidence: Evidence, options: Options, *, lens: Camera | None = None) -
         published = solve_paper(evidence, options, intrinsics, figures)
         return refused(published) if isinstance(published, Reason) else published
     tracks = select_tracks(evidence, options.joint.max_tracks)
-    solution = find_solution(tracks, find_windows(evidence), evidence.image_size, options.joint, options.gate,
+    solution = find_solution(evidence, tracks, options.joint, options.gate,
                              np.random.default_rng(options.random_seed), height_m=options.camera_height, lens=lens)
     if isinstance(solution, Reason):
         return refused(solution)

@@ -11,9 +11,9 @@ from autocalib_ros.config import GateOptions
 from autocalib_ros.estimation.great_circles import TrackSet, rays_of
 from autocalib_ros.estimation.ground_plane import BELOW_HORIZON, tilt_and_roll_deg, upward
 from autocalib_ros.estimation.joint import MIN_ROWS, JointFit, road_support, solve_joint
+from autocalib_ros.estimation.lives import no_lives
 from autocalib_ros.estimation.state import State
 from autocalib_ros.estimation.uncertainty import told_by_evidence
-from autocalib_ros.estimation.windows import Windows
 
 MIN_VEHICLES = 4
 """Vehicles, distinct, that make a road; fewer may be one driver's whim."""
@@ -53,35 +53,47 @@ def normal_of(state: State, tracks: TrackSet) -> tuple[np.ndarray, float]:
     return upward(state.rotation[:, 2], rays_of(state.camera, seen).bearings)
 
 
-def lens_doubt(fit: JointFit, contrast: float, tracks: TrackSet, gate: GateOptions) -> Reason | None:
-    """Say why the lens cannot be trusted, if so."""
-    prior, roads = fit.problem.setting.prior, len(fit.state.angles_rad)
-    told = motion_tells(fit)
-    if not told and _straight_share(fit, tracks) < STRAIGHT_SHARE:
+def traffic_doubt(fit: JointFit, contrast: float, tracks: TrackSet) -> Reason | None:
+    """Say why the straight traffic that a solution started from tells nothing, if so.
+
+    `contrast` is how sharply it agreed on the focal length.
+    """
+    prior = fit.problem.setting.prior
+    if _straight_share(fit, tracks) < STRAIGHT_SHARE:
         return _turning(fit, tracks, STRAIGHT_SHARE)
-    if not told and contrast < MIN_CONTRAST and not (prior.family == 'distortion_free' and fit.crossing_held):
+    if contrast < MIN_CONTRAST and not (prior.family == 'distortion_free' and len(fit.state.angles_rad) > 1):
         return Reason(
             'no_agreement', f'the traffic singles out no focal length: the best agrees {contrast:.2f} times as well as '
             f'the middling one, {MIN_CONTRAST:g} is needed',
             'wait for straight traffic, above all near the borders of the image; the traffic may be turning, or the '
             'lens may have no distortion: then give joint.road_angle or joint.focal_prior_px')
+    return _horizon_doubt(fit, tracks)
+
+
+def lens_doubt(fit: JointFit, tracks: TrackSet, gate: GateOptions, *, turned: bool) -> Reason | None:
+    """Say why the lens cannot be trusted, if so; `turned` where the solution started from traffic that turns."""
+    doubt = _horizon_doubt(fit, tracks) or _curvature_doubt(fit, gate) or _model_doubt(fit)
+    if doubt or turned and motion_tells(fit):
+        return doubt
+    needed = STRAIGHT_SHARE if len(fit.state.angles_rad) > 1 else ONE_ROAD_SHARE
+    return _turning(fit, tracks, needed) if _straight_share(fit, tracks) < needed else None
+
+
+def _horizon_doubt(fit: JointFit, tracks: TrackSet) -> Reason | None:
     _, below = normal_of(fit.state, tracks)
-    if fit.plane_known and below < BELOW_HORIZON:
-        return Reason(
-            'horizon', f'{1 - below:.0%} of the tracked points lie above the horizon of the plane found',
-            'the traffic found does not belong to one plane: wait for more of it')
-    doubt = _curvature_doubt(fit, gate) or _model_doubt(fit)
-    if doubt is None and not told and roads < 2 and _straight_share(fit, tracks) < ONE_ROAD_SHARE:
-        return _turning(fit, tracks, ONE_ROAD_SHARE)
-    return doubt
+    if not fit.plane_known or below >= BELOW_HORIZON:
+        return None
+    return Reason(
+        'horizon', f'{1 - below:.0%} of the tracked points lie above the horizon of the plane found',
+        'the traffic found does not belong to one plane: wait for more of it')
 
 
 def motion_tells(fit: JointFit) -> bool:
     """Whether the motion of vehicles that turn tells the focal length by itself."""
-    if not len(fit.problem.setting.windows) or fit.problem.setting.prior.free[0] != 0:
+    if not fit.problem.setting.turning or fit.problem.setting.prior.free[0] != 0:
         return False
     _, known = fit.problem.steps.prior_gradient(fit.state.camera)
-    return bool(told_by_evidence(fit.motion_information, known)[0] < MOTION_TELLS)
+    return bool(told_by_evidence(fit.turning_information, known)[0] < MOTION_TELLS)
 
 
 def _straight_share(fit: JointFit, tracks: TrackSet) -> float:
@@ -144,14 +156,19 @@ def _same_side(normal: np.ndarray, reference: np.ndarray) -> np.ndarray:
 
 def halves_doubt(fit: JointFit, tracks: TrackSet, gate: GateOptions) -> Reason | str:
     """Solve the earlier and the later half of the vehicles; they have to agree within what they know."""
-    windows, early, early_windows = fit.problem.setting.windows, *_first_half(tracks, fit.problem.setting.windows)
     setting = replace(fit.problem.setting, vehicle_correlation=fit.vehicle_correlation)
+    lives = no_lives() if setting.bundle is None else setting.bundle.lives
+    early, lived, windows = _earlier((tracks.vehicles, tracks.times_s), (lives.bodies, lives.times_s),
+                                     (setting.windows.bodies, setting.windows.times_s))
     fits = []
-    for half, half_windows in ((early, early_windows), (~early, ~early_windows)):
-        part, seen = tracks.subset(half), windows.subset(half_windows)
-        if half.sum() + half_windows.sum() < MIN_ROWS or (len(windows) and not len(seen)):
+    for half, seen, living in ((early, windows, lived), (~early, ~windows, ~lived)):
+        part, bundle = tracks.subset(half), setting.bundle and setting.bundle.subset(living)
+        part_setting = replace(setting, windows=setting.windows.subset(seen), bundle=bundle)
+        if half.sum() + seen.sum() + living.sum() < MIN_ROWS or setting.turning and not part_setting.turning:
             return NOT_CROSS_CHECKED
-        fits.append(solve_joint(fit.state, part, replace(setting, windows=seen), refine=True))
+        _, motion, shapes = fit.problem.inner
+        inner = None, motion.subset(seen) if motion else None, shapes.subset(living) if bundle and shapes else None
+        fits.append(solve_joint(fit.state, part, part_setting, refine=True, inner=inner))
         if any(mask.sum() < gate.min_tracks_per_road // 2 for mask in road_support(fits[-1], part)):
             return NOT_CROSS_CHECKED
     (focal, focal_sigma), (turn, turn_sigma) = _difference(*fits)
@@ -165,13 +182,15 @@ def halves_doubt(fit: JointFit, tracks: TrackSet, gate: GateOptions) -> Reason |
     return f'the earlier and the later half of the traffic differ by {focal:.1%} in focal length{normal}'
 
 
-def _first_half(tracks: TrackSet, windows: Windows) -> tuple[np.ndarray, np.ndarray]:
-    """Masks (tracks,) and (windows,) of the earlier half by the vehicles' mean time: no vehicle is in both halves."""
-    of_tracks, of_windows = _mean_times(tracks.vehicles, tracks.times_s), _mean_times(windows.bodies, windows.times_s)
-    _, first = np.unique(tracks.vehicles, return_index=True)
-    _, first_window = np.unique(windows.bodies, return_index=True)
-    middle = np.median(np.concatenate([of_tracks[first], of_windows[first_window]]))
-    return of_tracks <= middle, of_windows <= middle
+def _earlier(*seen: tuple[np.ndarray, np.ndarray]) -> list[np.ndarray]:
+    """Masks of the earlier half of owners (n,) and times (n,), by each owner's mean time: no vehicle is in both halves.
+
+    The middle is that of all that are seen, each as often as it has owners.
+    """
+    means = [_mean_times(owners, times_s) for owners, times_s in seen]
+    each = [mean[np.unique(owners, return_index=True)[1]] for mean, (owners, _) in zip(means, seen, strict=True)]
+    middle = np.median(np.concatenate(each))
+    return [mean <= middle for mean in means]
 
 
 def _mean_times(owners: np.ndarray, times_s: np.ndarray) -> np.ndarray:

@@ -12,15 +12,19 @@ from autocalib_ros.estimation.starts import ASKED_FOR, most_probable
 from autocalib_ros.estimation.uncertainty import told_by_evidence
 
 
+def with_k2_if_asked_for(fit: JointFit, tracks: TrackSet) -> JointFit:
+    """Set k2 free where that makes the traffic clearly more probable; one road cannot tell."""
+    setting = fit.problem.setting
+    if setting.prior.family != 'equidistant' or setting.prior.sigma[3] <= 0 or not fit.plane_known:
+        return fit
+    bent = solve_joint(fit.state, tracks, replace(setting, prior=setting.prior.with_k2()), refine=True,
+                       inner=fit.problem.inner)
+    return most_probable([fit, bent], tracks, ASKED_FOR)
+
+
 def with_what_can_be_told(fit: JointFit, tracks: TrackSet) -> tuple[JointFit, tuple[str, ...]]:
-    """Measure how a vehicle's tracks correlate, set k2 free if asked for, hold what the evidence cannot tell."""
-    setting = replace(fit.problem.setting, vehicle_correlation=fit.vehicle_correlation)
-    fit = solve_joint(fit.state, tracks, setting, refine=True)
-    if setting.prior.family == 'equidistant' and setting.prior.sigma[3] > 0 and fit.plane_known:
-        bent = solve_joint(fit.state, tracks, replace(setting, prior=setting.prior.with_k2()), refine=True)
-        fit = most_probable([fit, bent], tracks, ASKED_FOR)
-        setting = fit.problem.setting
-    held = _untold(fit)
+    """Hold what the evidence cannot tell; the names of what is held."""
+    setting, held = fit.problem.setting, _untold(fit)
     if not held:
         return fit, ()
     at_prior = setting.prior.start(fit.state.camera.focal_px)
@@ -28,7 +32,7 @@ def with_what_can_be_told(fit: JointFit, tracks: TrackSet) -> tuple[JointFit, tu
     for name in held:
         camera = _restored(camera, at_prior, name)
     solved = solve_joint(replace(fit.state, camera=camera), tracks,
-                         replace(setting, prior=setting.prior.holding(held)), refine=True)
+                         replace(setting, prior=setting.prior.holding(held)), refine=True, inner=fit.problem.inner)
     return judged_with(solved, tracks, setting), held
 
 

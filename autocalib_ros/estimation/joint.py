@@ -19,7 +19,8 @@ from autocalib_ros.estimation.great_circles import Seen, TrackSet, rays_of
 from autocalib_ros.estimation.lens_prior import LensPrior
 from autocalib_ros.estimation.path_noise import USUAL_HEIGHT_M
 from autocalib_ros.estimation.planar_motion import Motion
-from autocalib_ros.estimation.rows import MotionRows, RoadRows, Rows
+from autocalib_ros.estimation.rigid_bodies import Shapes
+from autocalib_ros.estimation.rows import LifeRows, MotionRows, RoadRows, Rows
 from autocalib_ros.estimation.state import Setting, State, Steps, crossed, ground_up
 from autocalib_ros.estimation.uncertainty import cluster_covariance, correlation_within, propagate
 from autocalib_ros.estimation.vanishing_points import distances2_through
@@ -52,46 +53,64 @@ DISCRIMINATION = 5.0
 """A track tells two roads apart when it is so many times farther from the one than from the other."""
 
 
+Inner = tuple[None, Motion | None, Shapes | None]
+"""What is solved inside the rows of each kind and goes on from step to step: motions of windows, shapes of lives."""
+KINDS = 3
+"""Tracks on roads, windows, lives."""
+
+
 class Problem:
-    """Labelled tracks and windows at a state: whitened residuals, and their derivatives by a step from there."""
+    """Labelled tracks and vehicles that turn, at a state: residuals, and their derivatives by a step from there."""
 
     def __init__(self, base: State, tracks: TrackSet, labels: np.ndarray, setting: Setting,
-                 motion: Motion | None = None, seen: Seen | None = None) -> None:
+                 inner: Inner = (None, None, None), seen: Seen | None = None) -> None:
         self.steps = Steps(base, setting)
         self.used = np.flatnonzero(labels >= 0)
-        """Indices of the tracks that are on a road: the first rows; the windows follow."""
-        on_roads, windows = tracks.subset(self.used), setting.windows
+        """Indices of the tracks that are on a road: the first rows; windows and lives follow."""
         seen = seen or Seen.through(base.camera, tracks)
-        self.roads = RoadRows(self.steps, on_roads, labels[self.used], seen.subset(self.used))
-        self.motions = MotionRows(self.steps, motion)
-        self.of_window = np.repeat([False, True], [len(self.used), len(windows)])
-        self.clusters = np.concatenate([on_roads.vehicles, windows.bodies + on_roads.vehicles.max(initial=-1) + 1])
-        self.share = np.concatenate([tracks.independence(setting.vehicle_correlation)[self.used],
-                                     windows.share_of_body])
+        share = tracks.independence(setting.vehicle_correlation)[self.used]
+        self.kinds: list[RoadRows | MotionRows | LifeRows] = [
+            RoadRows(self.steps, tracks.subset(self.used), labels[self.used], seen.subset(self.used), share),
+            MotionRows(self.steps, inner[1])]
+        if setting.bundle is not None:
+            self.kinds.append(LifeRows(self.steps, setting.bundle, inner[2]))
+        self.kind = np.repeat(np.arange(len(self.kinds)), [len(kind.freedom) for kind in self.kinds])
+        """Index of the kind of each row, shape (rows,)."""
+        self.freedom = np.concatenate([kind.freedom for kind in self.kinds])
+        self.share = np.concatenate([kind.share for kind in self.kinds])
 
     @property
     def setting(self) -> Setting:
         """What the solution was given."""
         return self.steps.setting
 
-    def residuals(self, state: State) -> tuple[np.ndarray, Motion]:
-        """Whitened distances (rows, samples) at a state, and the motions there."""
-        motion, distances = self.motions.at(state)
-        return np.concatenate([self.roads.residuals(state), distances]), motion
+    @property
+    def inner(self) -> Inner:
+        """What was solved inside each kind, to go on from."""
+        return (None, self.kinds[1].inner, self.kinds[2].inner if len(self.kinds) > 2 else None)
+
+    @property
+    def owners(self) -> np.ndarray:
+        """Vehicle of each row, shape (rows,): those on roads and those that turn are told apart."""
+        on_roads, *turning = (kind.owners for kind in self.kinds)
+        return np.concatenate([on_roads, *(owners + on_roads.max(initial=-1) + 1 for owners in turning)])
+
+    def at(self, step: np.ndarray) -> tuple[Inner, np.ndarray]:
+        """What is solved inside at a step, and the mean squared residuals there (rows,)."""
+        parts = [kind.at(step) for kind in self.kinds]
+        inner = [part[0] for part in parts] + [None]
+        return (None, inner[1], inner[2]), np.concatenate([part[1] for part in parts])
 
     def linearised(self) -> Rows:
-        """Residuals at the base and their derivatives by the parameters."""
-        parts = self.roads.linearised(), self.motions.linearised()
+        """Sums over the residuals at the base and their derivatives by the parameters."""
+        parts = [kind.linearised() for kind in self.kinds]
         return Rows(*(np.concatenate([getattr(part, name) for part in parts])
-                      for name in ('residuals', 'slopes', 'freedom', 'influence')))
+                      for name in ('squared', 'gradient', 'curvature', 'influence')))
 
     def scales(self, squared: np.ndarray) -> np.ndarray:
-        """Median of the mean squared distances (rows,) over each kind of row, for each row (rows,)."""
-        result = np.ones(len(squared))
-        for kind in (self.of_window, ~self.of_window):
-            if kind.any():
-                result[kind] = max(float(np.median(squared[kind])), LEAST_SCALE)
-        return result
+        """Median of the mean squared distances (rows,) over each kind of row, 1 where there is none; (kinds,)."""
+        return np.array([max(float(np.median(squared[self.kind == kind])), LEAST_SCALE)
+                         if (self.kind == kind).any() else 1.0 for kind in range(KINDS)])
 
 
 @dataclass(frozen=True)
@@ -105,21 +124,17 @@ class JointFit:
     """Root mean square distance of each track from its nearest road's circle, shape (tracks,)."""
     whitened2: np.ndarray
     """Mean squared whitened distance of each track from its road, inf for none, shape (tracks,)."""
-    scale: float
-    """Median of `whitened2` over the tracks on roads: 1 when noise and wander are as the options say."""
-    motion: Motion
-    """Motion of each window."""
-    windows2: np.ndarray
-    """Mean squared whitened distance of each window's points, shape (windows,)."""
-    window_scale: float
-    """Median of `windows2`."""
+    turning2: np.ndarray
+    """The same of the windows and lives, shape (windows + lives,)."""
+    scales: np.ndarray
+    """Median of them over tracks on roads, windows and lives: 1 when noise and wander are as the options say; (3,)."""
     problem: Problem
     """The problem at the solution: steps from there are the parameters of the covariance."""
     covariance: np.ndarray
     """Of the parameters, shape (parameters, parameters)."""
     information: np.ndarray
     """Of the evidence alone about the parameters, shape (parameters, parameters)."""
-    motion_information: np.ndarray
+    turning_information: np.ndarray
     """The same of the vehicles that turn alone."""
     vehicle_correlation: float
     """How much the pulls of one vehicle's tracks on the solution correlate, 0 to 1."""
@@ -127,7 +142,12 @@ class JointFit:
     @property
     def plane_known(self) -> bool:
         """Whether anything tells how the plane lies about its first road: another road, or vehicles that turn."""
-        return len(self.state.angles_rad) > 1 or len(self.problem.setting.windows) > 0
+        return len(self.state.angles_rad) > 1 or self.problem.setting.turning
+
+    @property
+    def scale(self) -> float:
+        """Median of the mean squared whitened distances of the tracks on roads."""
+        return float(self.scales[0])
 
     @property
     def crossing_held(self) -> bool:
@@ -137,10 +157,6 @@ class JointFit:
     def explained(self) -> np.ndarray:
         """Which tracks follow their road as closely as the bulk does, shape (tracks,)."""
         return (self.labels >= 0) & (self.whitened2 < EXPLAINED * max(self.scale, LEAST_SCALE))
-
-    def explained_windows(self) -> np.ndarray:
-        """Which windows move in the plane as closely as the bulk does, shape (windows,)."""
-        return self.windows2 < EXPLAINED * max(self.window_scale, LEAST_SCALE)
 
     def sigma(self, function: Callable[[State], np.ndarray]) -> np.ndarray:
         """Standard deviation of a function of the state, shape of its result."""
@@ -159,11 +175,11 @@ def assign(state: State, seen: Seen, limit_px: float = OUTLIER_PX) -> tuple[np.n
 
 
 def solve_joint(start: State, tracks: TrackSet, setting: Setting, *, refine: bool = False,
-                motion: Motion | None = None) -> JointFit:
+                inner: Inner = (None, None, None)) -> JointFit:
     """Alternate between assigning tracks to roads and a robust Gauss-Newton step, from a start.
 
-    With `refine` the start is a solution already, and nothing is loosened first. `motion` is that of the windows
-    near the start, where it is known.
+    With `refine` the start is a solution already, and nothing is loosened first; `inner` is what was solved inside
+    there, for the same windows and lives.
     """
     state, problem = crossed(start, setting.crossing_rad), None
     for tightness in (() if refine else TIGHTENING) + ROUNDS * (TIGHTEST,):
@@ -172,49 +188,40 @@ def solve_joint(start: State, tracks: TrackSet, setting: Setting, *, refine: boo
         labels, _ = assign(state, seen, OUTLIER_PX if tightness <= TIGHTEST else np.inf)
         if not _enough(labels, setting):
             break
-        problem = Problem(state, tracks, labels, setting, motion, seen)
-        step, state, motion = _stepped(problem, tightness)
+        problem = Problem(state, tracks, labels, setting, inner, seen)
+        step, state, inner = _stepped(problem, tightness)
         if tightness <= TIGHTEST and _settled(step, setting.prior):
             break
-    return _judged(problem or Problem(state, tracks, np.zeros(len(tracks), int), setting), state, motion, tracks)
+    return _judged(problem or Problem(state, tracks, np.zeros(len(tracks), int), setting), state, inner, tracks)
 
 
 def _enough(labels: np.ndarray, setting: Setting) -> bool:
-    return np.count_nonzero(labels >= 0) + len(setting.windows) >= MIN_ROWS
+    turning = len(setting.windows) + (0 if setting.bundle is None else len(setting.bundle.lives))
+    return np.count_nonzero(labels >= 0) + turning >= MIN_ROWS
 
 
-def _stepped(problem: Problem, tightness: float) -> tuple[np.ndarray, State, Motion]:
+def _stepped(problem: Problem, tightness: float) -> tuple[np.ndarray, State, Inner]:
     """Take one Gauss-Newton step on the robust cost, shortened until the cost does not grow."""
     rows, prior = problem.linearised(), problem.setting.prior
-    squared = (rows.residuals**2).sum(axis=1) / rows.freedom
-    scale = problem.scales(squared)
+    scale = problem.scales(rows.squared)[problem.kind]
     share = problem.share * rows.influence / scale
-    weight = share * influence(squared, tightness * scale)
+    weight = share * influence(rows.squared, tightness * scale)
     gradient, known = problem.steps.prior_gradient(problem.steps.base.camera)
-    matrix = information_of(rows.slopes, weight) + np.diag(known)
-    weighted = (weight[:, None] * rows.residuals).ravel()
-    gradient = gradient + weighted @ rows.slopes.reshape(-1, len(gradient))
-    step = -np.linalg.lstsq(matrix, gradient, rcond=1e-12)[0]
+    matrix = np.tensordot(weight, rows.curvature, 1) + np.diag(known)
+    step = -np.linalg.lstsq(matrix, gradient + weight @ rows.gradient, rcond=1e-12)[0]
 
-    def cost(whitened: np.ndarray, camera: Camera) -> float:
-        apart = (whitened**2).sum(axis=1) / rows.freedom
+    def cost(squared: np.ndarray, camera: Camera) -> float:
         deviations = prior.deviations(camera)
-        return float((share * rows.freedom * loss(apart, tightness * scale)).sum() + deviations @ deviations)
+        return float((share * problem.freedom * loss(squared, tightness * scale)).sum() + deviations @ deviations)
 
-    here = cost(rows.residuals, problem.steps.base.camera)
+    here = cost(rows.squared, problem.steps.base.camera)
     for _ in range(BACKTRACKS):
         state = problem.steps.state(step)
-        residuals, motion = problem.residuals(state)
-        if cost(residuals, state.camera) <= here:
-            return step, state, motion
+        inner, squared = problem.at(step)
+        if cost(squared, state.camera) <= here:
+            return step, state, inner
         step = step / 2
-    return np.zeros_like(step), problem.steps.base, problem.motions.motion
-
-
-def information_of(slopes: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Sum of weight (rows,) times J^T J of slopes (rows, samples, parameters); shape (parameters, parameters)."""
-    weighted = (slopes * weight[:, None, None]).reshape(-1, slopes.shape[2])
-    return weighted.T @ slopes.reshape(-1, slopes.shape[2])
+    return np.zeros_like(step), problem.steps.base, problem.inner
 
 
 def influence(squared: np.ndarray, limit: float) -> np.ndarray:
@@ -239,33 +246,31 @@ def _settled(step: np.ndarray, prior: LensPrior) -> bool:
     return bool((np.abs(step) < limit).all())
 
 
-def _judged(last: Problem, state: State, motion: Motion | None, tracks: TrackSet) -> JointFit:
+def _judged(last: Problem, state: State, inner: Inner, tracks: TrackSet) -> JointFit:
     """Measure a solution: distances, cost, covariance and information."""
     seen = Seen.through(state.camera, tracks)
     labels, distance2 = assign(state, seen)
-    problem = Problem(state, tracks, labels, last.setting, motion, seen) if _enough(labels, last.setting) else last
-    rows = problem.linearised()
-    squared = (rows.residuals**2).sum(axis=1) / rows.freedom
-    scale = problem.scales(squared)
+    problem = Problem(state, tracks, labels, last.setting, inner, seen) if _enough(labels, last.setting) else last
+    rows, freedom = problem.linearised(), problem.freedom
+    scales = problem.scales(rows.squared)
+    scale = scales[problem.kind]
     limit = TIGHTEST * scale
     shared = problem.share * rows.influence / scale
+    weight = shared * influence(rows.squared, limit)
+    bend = -4.0 / limit / freedom * shared / (1.0 + rows.squared / limit) ** 3
     _, prior = problem.steps.prior_gradient(state.camera)
+    covariance = cluster_covariance(rows.gradient, rows.curvature, weight, bend, problem.owners, prior)
+    road = problem.kind == 0
     whitened2 = np.full(len(tracks), np.inf)
-    whitened2[problem.used] = squared[~problem.of_window]
-    weight = shared * influence(squared, limit)
-    information = information_of(rows.slopes, weight)
-    bend = -4.0 / limit / rows.freedom * shared / (1.0 + squared / limit) ** 3
-    covariance = cluster_covariance(rows.slopes, rows.residuals, weight, bend, problem.clusters, prior)
-    road = ~problem.of_window
-    pulls = (rows.slopes[road].transpose(0, 2, 1) @ rows.residuals[road][..., None])[..., 0]
-    pulls = pulls * np.sqrt(influence(squared, limit)[road])[:, None] / np.sqrt(np.maximum(np.diag(information), 1e-12))
+    whitened2[problem.used] = rows.squared[road]
+    information = np.tensordot(weight, rows.curvature, 1)
+    pulls = rows.gradient[road] * np.sqrt(influence(rows.squared, limit)[road])[:, None]
+    pulls = pulls / np.sqrt(np.maximum(np.diag(information), 1e-12))
     return JointFit(
-        state=state, labels=labels, distance_px=np.sqrt(distance2), whitened2=whitened2,
-        scale=float(scale[road][0]) if road.any() else 1.0, motion=problem.motions.motion,
-        windows2=squared[problem.of_window], window_scale=float(scale[~road][0]) if not road.all() else 1.0,
-        problem=problem, covariance=covariance, information=information,
-        motion_information=information_of(rows.slopes[~road], weight[~road]),
-        vehicle_correlation=correlation_within(problem.clusters[road], pulls))
+        state=state, labels=labels, distance_px=np.sqrt(distance2), whitened2=whitened2, turning2=rows.squared[~road],
+        scales=scales, problem=problem, covariance=covariance, information=information,
+        turning_information=np.tensordot(weight[~road], rows.curvature[~road], 1),
+        vehicle_correlation=correlation_within(problem.owners[road], pulls))
 
 
 def noise_cost(fit: JointFit, tracks: TrackSet, *, drifting: bool) -> float:
@@ -279,8 +284,8 @@ def noise_cost(fit: JointFit, tracks: TrackSet, *, drifting: bool) -> float:
     steps = Steps(fit.state, replace(fit.problem.setting, drifting=drifting))
     used = labels >= 0
     on_roads = tracks.subset(used)
-    rows = RoadRows(steps, on_roads, labels[used], Seen.through(fit.state.camera, on_roads))
-    squared = (rows.residuals(fit.state)**2).sum(axis=1) / rows.freedom
+    rows = RoadRows(steps, on_roads, labels[used], Seen.through(fit.state.camera, on_roads), np.ones(len(on_roads)))
+    _, squared = rows.at(np.zeros(steps.size))
     scale = max(float(np.median(squared)), LEAST_SCALE)
     return float((rows.freedom * np.log(scale) - 2.0 * rows.log_density()).sum())
 
@@ -297,24 +302,24 @@ def with_bodies(fit: JointFit, tracks: TrackSet) -> TrackSet:
 
 def judged_with(fit: JointFit, tracks: TrackSet, setting: Setting) -> JointFit:
     """Measure the uncertainty of a solution under another setting, such as one that holds less."""
-    problem = Problem(fit.state, tracks, fit.labels, setting, fit.motion)
-    return _judged(problem, fit.state, fit.motion, tracks)
+    inner = fit.problem.inner
+    return _judged(Problem(fit.state, tracks, fit.labels, setting, inner), fit.state, inner, tracks)
 
 
-def cost_at_scale(fit: JointFit, tracks: TrackSet, scale: float, window_scale: float) -> float:
+def cost_at(fit: JointFit, tracks: TrackSet, scales: np.ndarray) -> float:
     """Twice the negative logarithm of a fit's probability, for comparison between fits of the same evidence.
 
-    All at one scale for tracks and one for windows, with the prior and, by Laplace's approximation, the volume that
+    All at one scale for each kind of row (kinds,), with the prior and, by Laplace's approximation, the volume that
     the evidence leaves of it.
     """
-    freedom = np.maximum((tracks.weights > 0).sum(axis=1) - 1, 1)
-    share = tracks.independence(fit.problem.setting.vehicle_correlation)
-    cost = (share / scale * freedom * bounded_loss(fit.whitened2, TIGHTEST * scale)).sum()
-    windows = fit.problem.setting.windows
-    cost += (windows.share_of_body / window_scale * fit.problem.motions.freedom
-             * bounded_loss(fit.windows2, TIGHTEST * window_scale)).sum()
-    deviations, prior = fit.problem.steps.prior_gradient(fit.state.camera)
+    problem, turning = fit.problem, fit.problem.kind > 0
+    freedom = np.concatenate([np.maximum((tracks.weights > 0).sum(axis=1) - 1, 1), problem.freedom[turning]])
+    share = np.concatenate([tracks.independence(problem.setting.vehicle_correlation), problem.share[turning]])
+    scale = np.concatenate([np.full(len(tracks), scales[0]), scales[problem.kind[turning]]])
+    squared = np.concatenate([fit.whitened2, fit.turning2])
+    deviations, prior = problem.steps.prior_gradient(fit.state.camera)
     volume = np.linalg.slogdet(fit.information + np.diag(prior) + 1e-9 * np.eye(len(prior)))[1]
+    cost = (share / scale * freedom * bounded_loss(squared, TIGHTEST * scale)).sum()
     return float(cost + deviations @ deviations + volume)
 
 

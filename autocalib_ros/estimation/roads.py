@@ -18,9 +18,11 @@ from autocalib_ros.estimation.vanishing_points import Directions
 MOST_ROADS = 4
 ON_ROAD_DEG = 1.0
 """A track whose direction in the plane is within this of a further road follows it."""
-RIGHT_ANGLE_SIGMAS = 2.0
-RIGHT_ANGLE_FLOOR_DEG = 1.0
-"""Junctions are built to about a degree: a difference within it does not speak against 90 degrees."""
+RIGHT_ANGLE_SIGMAS = 2.5
+RIGHT_ANGLE_FLOOR_DEG = 2.0
+"""Junctions are built to about a degree, and followed points drift by another across their vehicles' way: within that,
+or so many standard deviations, 90 degrees stay more probable than any other angle (more than half of all junctions are
+square; the others spread over tens of degrees)."""
 NOISIER = 4.0
 """Tracks on roads may be off by so many times the variance that the vehicles' motion shows; beyond it the roads are
 turns that look alike."""
@@ -46,7 +48,7 @@ def with_further_roads(fit: JointFit, tracks: TrackSet, gate: GateOptions) -> Jo
         if angle is None:
             return fit
         wider = solve_joint(_with_road(fit.state, angle), tracks, fit.problem.setting, refine=True)
-        turns = len(wider.problem.setting.windows) and wider.scale > NOISIER * max(wider.window_scale, 1.0)
+        turns = wider.problem.setting.turning and wider.scale > NOISIER * max(1.0, *wider.scales[1:])
         if turns or not apart(wider) or not all(is_road(mask, tracks, gate) for mask in road_support(wider, tracks)):
             return fit
         fit = wider

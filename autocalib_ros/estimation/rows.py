@@ -1,8 +1,8 @@
-"""The two kinds of residuals of the joint problem, and their derivatives by its parameters.
+"""The kinds of residuals of the joint problem, and their derivatives by its parameters.
 
-A row is one track against its road, or one window against a motion in the plane; both have `SAMPLES` residuals,
-whitened: divided by what they are expected to be. What a row has unknown of its own, the angle of its circle or the
-motion of its window, is solved inside (variable projection, Kaufman 1975), so that the problem stays small.
+A row is one track against its road, one window against a motion in the plane, or one life of a rigid body. Residuals
+are whitened: divided by what they are expected to be. What a row has unknown of its own is solved inside (variable
+projection, Kaufman 1975), so that the problem stays small.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from autocalib_ros.estimation.great_circles import (
 )
 from autocalib_ros.estimation.path_noise import on_road, whitening
 from autocalib_ros.estimation.planar_motion import Motion, View, first_motion, settled, trust
+from autocalib_ros.estimation.rigid_bodies import Bundle, Shapes, lifted
 from autocalib_ros.estimation.small_matrices import cross, dot
 from autocalib_ros.estimation.state import State, Steps, ground_up
 from autocalib_ros.estimation.vehicles import corroborated, heading_off_deg
@@ -30,21 +31,32 @@ DIFFERENCE = 1e-6
 
 @dataclass(frozen=True)
 class Rows:
-    """Residuals (rows, SAMPLES), their derivatives (rows, SAMPLES, parameters) and what tells their weight."""
+    """What each row tells at the base, its own unknowns solved: its residuals r and their derivatives J, in sums."""
 
-    residuals: np.ndarray
-    slopes: np.ndarray
-    freedom: np.ndarray
-    """Residuals of each row beyond the unknowns of its own, shape (rows,)."""
+    squared: np.ndarray
+    """Mean squared residual, r^T r over the freedom, shape (rows,)."""
+    gradient: np.ndarray
+    """J^T r, shape (rows, parameters)."""
+    curvature: np.ndarray
+    """J^T J, shape (rows, parameters, parameters)."""
     influence: np.ndarray
     """Weight by what speaks for a row besides its own residuals, shape (rows,)."""
+
+    @classmethod
+    def of(cls, residuals: np.ndarray, slopes: np.ndarray, freedom: np.ndarray, influence: np.ndarray) -> Rows:
+        """Sum up residuals (rows, samples) and slopes (rows, samples, parameters)."""
+        transposed = slopes.transpose(0, 2, 1)
+        return cls((residuals**2).sum(axis=1) / freedom, (transposed @ residuals[..., None])[..., 0],
+                   transposed @ slopes, influence)
 
 
 class RoadRows:
     """Labelled tracks, each on a great circle through the direction of its road."""
 
-    def __init__(self, steps: Steps, tracks: TrackSet, labels: np.ndarray, seen: Seen) -> None:
+    def __init__(self, steps: Steps, tracks: TrackSet, labels: np.ndarray, seen: Seen,
+                 share: np.ndarray) -> None:
         self._steps, self._tracks, self._labels = steps, tracks, labels
+        self.owners, self.share = tracks.vehicles, share
         self._mask = tracks.weights > 0
         base, setting = steps.base, steps.setting
         self.freedom = np.maximum(self._mask.sum(axis=1) - 1, 1)
@@ -65,11 +77,12 @@ class RoadRows:
         normals, _ = fit_circles_through(whitened.transpose(0, 2, 1) @ whitened, state.directions[self._labels])
         return normals
 
-    def residuals(self, state: State) -> np.ndarray:
-        """Whitened distances from the circles, shape (tracks, samples)."""
+    def at(self, step: np.ndarray) -> tuple[None, np.ndarray]:
+        """Mean squared whitened distance of each track from its circle, shape (tracks,); nothing to go on from."""
+        state = self._steps.state(step)
         rays = rays_of(state.camera, self._tracks.pixels)
         distance = rays.distance_px(self._circles(state, rays)[:, None])
-        return (self.whiten @ distance[..., None])[..., 0]
+        return None, ((self.whiten @ distance[..., None])[..., 0]**2).sum(axis=1) / self.freedom
 
     def log_density(self) -> np.ndarray:
         """Logarithm of the determinant of each track's whitening, shape (tracks,)."""
@@ -98,8 +111,8 @@ class RoadRows:
         slopes = self.whiten @ np.stack([free, *columns], axis=-1)
         free, slopes = slopes[..., :1], slopes[..., 1:]
         along = (free * slopes).sum(axis=1, keepdims=True) / np.maximum((free * free).sum(axis=1, keepdims=True), 1e-12)
-        return Rows((self.whiten @ here[..., None])[..., 0], slopes - free * along, self.freedom,
-                    self._vehicles_influence(here))
+        return Rows.of((self.whiten @ here[..., None])[..., 0], slopes - free * along, self.freedom,
+                       self._vehicles_influence(here))
 
     def _distance(self, unit: np.ndarray, normals: np.ndarray) -> np.ndarray:
         return rays_of(self._steps.camera(DIFFERENCE * unit), self._tracks.pixels).distance_px(normals)
@@ -124,23 +137,23 @@ class MotionRows:
     """Windows, each with the motion in the plane that suits it best; `motion` is one near it, None unknown."""
 
     def __init__(self, steps: Steps, motion: Motion | None) -> None:
-        self._steps = steps
+        self._steps, self._windows = steps, steps.setting.windows
+        self.owners, self.share = self._windows.bodies, self._windows.share_of_body
         self._base = view = self._view(steps.base)
-        self.motion = first_motion(view) if motion is None else settled(view, motion)
-        self._here = view.distances(self.motion)
-        self._slopes = view.slopes(self.motion, self._here)
+        self.inner = first_motion(view) if motion is None else settled(view, motion)
+        self._here = view.distances(self.inner)
+        self._slopes = view.slopes(self.inner, self._here)
         self._root = np.sqrt(trust(self._here))
         self.freedom = np.maximum(view.mask.sum(axis=1) - 2, 1)
 
     def _view(self, state: State) -> View:
-        setting = self._steps.setting
-        return View.of(setting.windows, state.camera, state.rotation, setting.options)
+        return View.of(self._windows, state.camera, state.rotation, self._steps.setting.options)
 
-    def at(self, state: State) -> tuple[Motion, np.ndarray]:
-        """Motion and residuals (windows, samples) at a state."""
-        view = self._view(state)
-        motion = settled(view, self.motion)
-        return motion, self._root * view.distances(motion)
+    def at(self, step: np.ndarray) -> tuple[Motion, np.ndarray]:
+        """Motion at a step and mean squared distances, shape (windows,)."""
+        view = self._view(self._steps.state(step))
+        motion = settled(view, self.inner)
+        return motion, ((self._root * view.distances(motion))**2).sum(axis=1) / self.freedom
 
     def linearised(self) -> Rows:
         """Residuals at the base and their derivatives, by differences; the window's own motion projected out."""
@@ -150,7 +163,7 @@ class MotionRows:
         own = self._root[..., None] * self._slopes
         matrix = own.transpose(0, 2, 1) @ own + 1e-9 * np.eye(2)
         slopes = slopes - own @ np.linalg.solve(matrix, own.transpose(0, 2, 1) @ slopes)
-        return Rows(self._root * self._here, slopes, self.freedom, np.ones(len(self.freedom)))
+        return Rows.of(self._root * self._here, slopes, self.freedom, np.ones(len(self.freedom)))
 
     def _moved(self, unit: np.ndarray) -> np.ndarray:
         """Distances a small step away, the motions as they are."""
@@ -159,4 +172,42 @@ class MotionRows:
             return self._here  # the angle of a road is nothing to a window
         view = self._base.turned(self._steps.turned(DIFFERENCE * unit[lens:turns])) if unit[lens:].any() else (
             self._view(self._steps.state(DIFFERENCE * unit)))
-        return view.distances(self.motion)
+        return view.distances(self.inner)
+
+
+class LifeRows:
+    """Lives of rigid bodies, each with the shape and the way that suit it best; `shapes` are near, None unknown."""
+
+    def __init__(self, steps: Steps, bundle: Bundle, shapes: Shapes | None) -> None:
+        self._steps, self._bundle, base = steps, bundle, steps.base
+        self.owners, self.share, self.freedom = bundle.lives.bodies, bundle.lives.share_of_body, bundle.freedom
+        self.inner = (bundle.begun(base.camera, base.rotation) if shapes is None
+                      else bundle.settled(base.camera, base.rotation, shapes))
+        here = bundle.residuals(base.camera, base.rotation, self.inner)
+        self._root = np.sqrt(bundle.trust(here))[:, :, None, None]
+        self._here = here
+        self._follow: np.ndarray | None = None
+        """How the unknowns of each life change with a step, shape (lives, unknowns, parameters)."""
+
+    def at(self, step: np.ndarray) -> tuple[Shapes, np.ndarray]:
+        """Shapes at a step and mean squared residuals, shape (lives,)."""
+        state = self._steps.state(step)
+        near = self.inner if self._follow is None else self.inner.stepped(-(self._follow @ step))
+        shapes = self._bundle.settled(state.camera, state.rotation, near)
+        residuals = self._root * self._bundle.residuals(state.camera, state.rotation, shapes)
+        return shapes, (residuals**2).sum(axis=(1, 2, 3)) / self.freedom
+
+    def linearised(self) -> Rows:
+        """Residuals at the base and their derivatives; what is unknown of each life projected out."""
+        steps, bundle, base = self._steps, self._bundle, self._steps.base
+        slopes, by_place = bundle.slopes(base.camera, base.rotation, self.inner)
+        lenses = [steps.camera(DIFFERENCE * unit) for unit in np.eye(steps.lens)]
+        columns = [change / DIFFERENCE
+                   for change in bundle.by_lens(lenses, base.camera, base.rotation, self.inner)]
+        columns += [bundle.by_turn(axis, by_place, self.inner) for axis in steps.axes]
+        columns += [np.zeros(self._here.shape)] * len(steps.free_angles)
+        own, here = bundle.flat(slopes, self._here)
+        shared = (self._root[..., None] * np.stack(columns, axis=-1)).reshape(len(own), -1, steps.size)
+        matrix = lifted(own.transpose(0, 2, 1) @ own, np.zeros(len(own)))
+        self._follow = np.linalg.solve(matrix, own.transpose(0, 2, 1) @ shared)
+        return Rows.of(here, shared - own @ self._follow, self.freedom, np.ones(len(own)))

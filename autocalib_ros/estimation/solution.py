@@ -9,16 +9,17 @@ import numpy as np
 from autocalib_ros.calibration import Reason
 from autocalib_ros.camera import Camera
 from autocalib_ros.config import GateOptions, JointOptions
-from autocalib_ros.estimation.doubts import halves_doubt, lens_doubt, plane_doubt
+from autocalib_ros.estimation.doubts import halves_doubt, lens_doubt, plane_doubt, traffic_doubt
 from autocalib_ros.estimation.great_circles import TrackSet
-from autocalib_ros.estimation.held import lens_assumptions, with_what_can_be_told
+from autocalib_ros.estimation.held import lens_assumptions, with_k2_if_asked_for, with_what_can_be_told
 from autocalib_ros.estimation.joint import JointFit, noise_cost, road_support, solve_joint, with_bodies
 from autocalib_ros.estimation.lens_prior import LensPrior, known_lens, lens_priors
 from autocalib_ros.estimation.roads import main_direction, with_further_roads, with_real_roads, with_right_angle
 from autocalib_ros.estimation.starts import agreed, in_likeliest_family
 from autocalib_ros.estimation.state import Setting
-from autocalib_ros.estimation.turning import from_turning, with_steered
-from autocalib_ros.estimation.windows import Windows
+from autocalib_ros.estimation.turning import from_turning, over_lives, with_turning
+from autocalib_ros.estimation.windows import Instants, Windows, find_windows
+from autocalib_ros.evidence import Evidence
 
 VOTERS = 200
 """Tracks, evenly out of all, from which the starts are made and compared; the solution then uses every track."""
@@ -42,6 +43,7 @@ class _Traffic:
 
     tracks: TrackSet
     windows: Windows
+    instants: Instants
     priors: list[LensPrior]
     gate: GateOptions
 
@@ -50,10 +52,10 @@ class _Traffic:
         return self.tracks.subset(np.unique(np.linspace(0, len(self.tracks) - 1, VOTERS).astype(int)))
 
 
-def find_solution(tracks: TrackSet, windows: Windows, image_size: tuple[int, int], options: JointOptions,
-                  gate: GateOptions, generator: np.random.Generator, *, height_m: float = 0.0,
+def find_solution(evidence: Evidence, tracks: TrackSet, options: JointOptions, gate: GateOptions,
+                  generator: np.random.Generator, *, height_m: float = 0.0,
                   lens: Camera | None = None) -> Solution | Reason:
-    """Estimate lens, plane and roads; a reason instead when the lens cannot be trusted.
+    """Estimate lens, plane and roads from evidence and the tracks chosen of it; a reason when they cannot be trusted.
 
     Straight traffic is tried first, with what turns to complete it; where that gives no plane, the traffic that
     turns alone. A known `lens` is kept, and only the pose is found.
@@ -61,17 +63,19 @@ def find_solution(tracks: TrackSet, windows: Windows, image_size: tuple[int, int
     if len(tracks) < gate.min_tracks:
         return Reason('too_few_tracks', f'{len(tracks)} tracks of the {gate.min_tracks} needed are long enough',
                       'wait for more traffic, or record for longer')
-    priors = [known_lens(lens)] if lens is not None else lens_priors(image_size, options)
+    priors = [known_lens(lens)] if lens is not None else lens_priors(evidence.image_size, options)
     crossing = None if options.crossing_deg is None else float(np.radians(options.crossing_deg))
-    traffic = _Traffic(tracks, windows, priors, gate)
+    instants = Instants(evidence)
+    traffic = _Traffic(tracks, find_windows(evidence, instants), instants, priors, gate)
     setting = Setting(priors[0], options, height_m, crossing)
     straight = _from_straight(traffic, setting, generator)
     if isinstance(straight, Solution) and straight.no_plane is None:
         return straight
-    turned = from_turning(tracks, windows, setting)
+    turned = from_turning(tracks, traffic.windows, setting)
     if turned is None:
         return straight
-    turning = _completed(with_further_roads(turned, tracks, gate), np.inf, '', traffic)
+    fit, tracks = _with_noise(with_further_roads(turned, tracks, gate), traffic)
+    turning = _completed(fit, tracks, '', traffic, turned=True)
     better = isinstance(turning, Solution) and (turning.no_plane is None or isinstance(straight, Reason))
     return turning if better else straight
 
@@ -88,26 +92,37 @@ def _from_straight(traffic: _Traffic, setting: Setting, generator: np.random.Gen
     support = road_support(fit, tracks)
     second = sorted(int(mask.sum()) for mask in support)[:-1]
     across = f'{min([gate.min_tracks_per_road, *(second or [0])])} of {gate.min_tracks_per_road} tracks'
-    return _completed(with_real_roads(fit, support, tracks, gate), contrast, across, traffic)
+    fit, tracks = _with_noise(with_real_roads(fit, support, tracks, gate), traffic)
+    fit = with_further_roads(fit, tracks, gate)
+    return traffic_doubt(fit, contrast, tracks) or _completed(fit, tracks, across, traffic)
 
 
-def _completed(fit: JointFit, contrast: float, across: str, traffic: _Traffic) -> Solution | Reason:
-    """Refine a solution with all that the traffic tells, and doubt it.
-
-    `contrast` is how sharply straight tracks agreed on the focal length; `across` counts the tracks on a second road
-    for the one who waits for them.
-    """
-    tracks, gate, options = traffic.tracks, traffic.gate, fit.problem.setting.options
+def _with_noise(fit: JointFit, traffic: _Traffic) -> tuple[JointFit, TrackSet]:
+    """Choose the family of the lens, and whether points drift; then tracks of one body are known as such."""
+    tracks = traffic.tracks
     fit = in_likeliest_family(fit, traffic.priors[1:], traffic.voters, tracks)
     if noise_cost(fit, tracks, drifting=True) < noise_cost(fit, tracks, drifting=False):
         tracks = with_bodies(fit, tracks) if fit.plane_known else tracks
         fit = solve_joint(fit.state, tracks, replace(fit.problem.setting, drifting=True), refine=True)
+    return fit, tracks
+
+
+def _completed(fit: JointFit, tracks: TrackSet, across: str, traffic: _Traffic, *,
+               turned: bool = False) -> Solution | Reason:
+    """Refine a solution with all that the traffic tells, and doubt it.
+
+    `across` counts the tracks on a second road for the one who waits for them; `turned` is a solution that started
+    from traffic that turns.
+    """
+    gate, options = traffic.gate, fit.problem.setting.options
     if fit.plane_known:
-        fit = with_steered(fit, tracks, traffic.windows) or fit
+        fit = with_turning(fit, tracks, traffic.windows) or fit
     fit = with_further_roads(fit, tracks, gate)
     fit, angle = with_right_angle(fit, tracks, options)
+    fit = with_k2_if_asked_for(fit, tracks)
+    fit = over_lives(fit, tracks, traffic.windows, traffic.instants)
     fit, held = with_what_can_be_told(fit, tracks)
-    doubt = lens_doubt(fit, contrast, tracks, gate)
+    doubt = lens_doubt(fit, tracks, gate, turned=turned)
     if doubt:
         return doubt
     halves = halves_doubt(fit, tracks, gate)
@@ -125,6 +140,6 @@ def _completed(fit: JointFit, contrast: float, across: str, traffic: _Traffic) -
 
 
 def _angle_and_turning(fit: JointFit, angle: str | None) -> tuple[str, ...]:
-    bodies = len(np.unique(fit.problem.setting.windows.bodies))
+    bodies = len(np.unique(fit.problem.owners[fit.problem.kind > 0]))
     turning = (f'{bodies} vehicles that turn move as rigid bodies in the plane',) if bodies else ()
     return turning if angle is None or fit.crossing_held else (angle, *turning)

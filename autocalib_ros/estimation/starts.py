@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from autocalib_ros.estimation.great_circles import TrackSet
-from autocalib_ros.estimation.joint import JointFit, cost_at_scale, solve_joint
+from autocalib_ros.estimation.joint import JointFit, cost_at, solve_joint
 from autocalib_ros.estimation.lens_prior import LensPrior
 from autocalib_ros.estimation.state import Setting, initial_state
 from autocalib_ros.estimation.straightness import focal_trials
@@ -90,7 +90,6 @@ def _peaks(found: list[Directions]) -> list[int]:
 
 def most_probable(fits: list[JointFit], tracks: TrackSet, margin: float = 0.0) -> JointFit:
     """Choose the solution that makes the traffic most probable; the first unless it is beaten by a margin."""
-    scale, window_scale = min(fit.scale for fit in fits), min(fit.window_scale for fit in fits)
-    costs = [cost_at_scale(fit, tracks, scale, window_scale) + (margin if index else 0.0)
-             for index, fit in enumerate(fits)]
+    scales = np.min([fit.scales for fit in fits], axis=0)
+    costs = [cost_at(fit, tracks, scales) + (margin if index else 0.0) for index, fit in enumerate(fits)]
     return fits[int(np.argmin(costs))]

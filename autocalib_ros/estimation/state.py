@@ -12,6 +12,7 @@ from autocalib_ros.camera import Camera
 from autocalib_ros.config import JointOptions
 from autocalib_ros.estimation.great_circles import Rays
 from autocalib_ros.estimation.lens_prior import LensPrior
+from autocalib_ros.estimation.rigid_bodies import Bundle
 from autocalib_ros.estimation.vanishing_points import Directions
 from autocalib_ros.estimation.windows import Windows, no_windows
 
@@ -57,6 +58,13 @@ class Setting:
     """How much the errors of one vehicle's tracks correlate, 0 to 1: a guess until a fit has measured it."""
     windows: Windows = field(default_factory=no_windows)
     """Vehicles that turn, each between two instants."""
+    bundle: Bundle | None = None
+    """The same, each over its life."""
+
+    @property
+    def turning(self) -> bool:
+        """Whether vehicles that turn are part of the problem."""
+        return len(self.windows) > 0 or self.bundle is not None
 
 
 @dataclass(frozen=True)
@@ -77,7 +85,7 @@ class Steps:
         roads, every = len(self.base.angles_rad), np.eye(3)
         if roads == 0:
             return every[:2]  # headings in the plane mean nothing
-        return every if roads > 1 or len(self.setting.windows) else every[1:]  # one road turns freely about itself
+        return every if roads > 1 or self.setting.turning else every[1:]  # one road turns freely about itself
 
     @cached_property
     def free_angles(self) -> tuple[int, ...]:
@@ -116,7 +124,7 @@ class Steps:
 def ground_up(state: State, setting: Setting, rays: Rays) -> np.ndarray:
     """Normal (3,) of the plane away from the traffic; where one road is all that is known, of an unrolled camera."""
     normal = state.rotation[:, 2]
-    if len(state.angles_rad) == 1 and not len(setting.windows):
+    if len(state.angles_rad) == 1 and not setting.turning:
         normal = level_normal(state.directions[0])
     above = np.count_nonzero(rays.bearings @ normal > 0)
     return -normal if above > 0.5 * rays.bearings[..., 0].size else normal

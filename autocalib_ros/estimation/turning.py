@@ -7,17 +7,20 @@ from dataclasses import replace
 import numpy as np
 
 from autocalib_ros.estimation.great_circles import TrackSet
-from autocalib_ros.estimation.joint import JointFit, cost_at_scale, solve_joint
+from autocalib_ros.estimation.joint import JointFit, solve_joint
+from autocalib_ros.estimation.lives import find_lives, no_lives
 from autocalib_ros.estimation.planar_motion import View, first_motion, steered
+from autocalib_ros.estimation.rigid_bodies import Bundle
+from autocalib_ros.estimation.starts import most_probable
 from autocalib_ros.estimation.state import Setting, State
-from autocalib_ros.estimation.windows import Windows
+from autocalib_ros.estimation.windows import Instants, Windows
 
 START_DIAGONALS = (0.35, 0.55, 0.85)
 """Focal lengths to start from, in image diagonals: lenses of about 100, 75 and 50 degrees across the diagonal."""
 START_TILTS_DEG = (20.0, 45.0)
 """Tilts of the optical axis below the horizontal to start from, without roll."""
 START_WINDOWS = 60
-MOST_WINDOWS = 300
+MOST_WINDOWS, MOST_LIVES = 300, 100
 MIN_BODIES = 8
 """So many vehicles that turn, distinct, make up evidence; fewer may be one driver's whim or a wrong group each."""
 
@@ -33,23 +36,43 @@ def from_turning(tracks: TrackSet, windows: Windows, setting: Setting) -> JointF
     lenses = [setting.prior.start(diagonal * share) for share in START_DIAGONALS]
     starts = [State(lens, _level_plane(tilt), np.zeros(0))
               for lens in (lenses[:1] if setting.prior.focal_known else lenses) for tilt in START_TILTS_DEG]
-    fits = [solve_joint(start, nothing, few) for start in starts]
-    scale = min(fit.window_scale for fit in fits)
-    best = min(fits, key=lambda fit: cost_at_scale(fit, nothing, 1.0, scale))
-    return with_steered(with_steered(best, nothing, windows), tracks, windows)
+    best = most_probable([solve_joint(start, nothing, few) for start in starts], nothing)
+    turning = with_turning(best, nothing, windows)
+    return with_turning(turning, tracks, windows) if turning else None
 
 
-def with_steered(fit: JointFit | None, tracks: TrackSet, windows: Windows) -> JointFit | None:
+def with_turning(fit: JointFit, tracks: TrackSet, windows: Windows) -> JointFit | None:
     """Solve again with the vehicles that turn in the plane of a solution; None where they are too few."""
-    if fit is None:
+    chosen = _steered(fit, windows)
+    if chosen is None:
         return None
-    state, setting = fit.state, fit.problem.setting
-    motion = first_motion(View.of(windows, state.camera, state.rotation, setting.options))
-    turning = np.flatnonzero(steered(windows, motion, state.camera, state.rotation))
-    chosen = windows.subset(turning).spread(MOST_WINDOWS)
-    if len(np.unique(chosen.bodies)) < MIN_BODIES:
-        return None
-    return solve_joint(state, tracks, replace(setting, windows=chosen), refine=True)
+    return solve_joint(fit.state, tracks, replace(fit.problem.setting, windows=chosen.spread(MOST_WINDOWS)),
+                       refine=True)
+
+
+def over_lives(fit: JointFit, tracks: TrackSet, windows: Windows, instants: Instants) -> JointFit:
+    """Solve a last time with those vehicles over their lives, where they are followed, and how they correlate."""
+    setting = replace(fit.problem.setting, vehicle_correlation=fit.vehicle_correlation)
+    chosen = _steered(fit, windows) if setting.turning else None
+    lives = no_lives() if chosen is None else find_lives(chosen, instants, MOST_LIVES)
+    if chosen is None or not len(lives):
+        return solve_joint(fit.state, tracks, setting, refine=True, inner=fit.problem.inner)
+    drifting = Bundle(lives, setting.options.noise_px, setting.options.drift_px)
+    setting = replace(setting, windows=chosen.subset(chosen.of_segments).spread(MOST_WINDOWS), bundle=drifting)
+    solved = solve_joint(fit.state, tracks, setting, refine=True)
+    steady, (_, _, shapes) = drifting.steady(), solved.problem.inner
+    camera, plane = solved.state.camera, solved.state.rotation
+    if shapes is None or steady.noise_cost(camera, plane, shapes) >= drifting.noise_cost(camera, plane, shapes):
+        return solved
+    return solve_joint(solved.state, tracks, replace(setting, bundle=steady), refine=True, inner=solved.problem.inner)
+
+
+def _steered(fit: JointFit, windows: Windows) -> Windows | None:
+    """Windows of the vehicles that turn in the plane of a solution, None where they are too few."""
+    state = fit.state
+    motion = first_motion(View.of(windows, state.camera, state.rotation, fit.problem.setting.options))
+    chosen = windows.subset(np.flatnonzero(steered(windows, motion, state.camera, state.rotation)))
+    return chosen if len(np.unique(chosen.bodies)) >= MIN_BODIES else None
 
 
 def _level_plane(tilt_deg: float) -> np.ndarray:

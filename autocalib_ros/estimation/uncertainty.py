@@ -12,22 +12,21 @@ LEAST_CURVATURE = 0.5
 """A redescending loss curves less than its weights claim; what is left, as a share, when it would hardly curve."""
 
 
-def cluster_covariance(slopes: np.ndarray, residuals: np.ndarray, weight: np.ndarray, bend: np.ndarray,
-                       vehicles: np.ndarray, prior: np.ndarray) -> np.ndarray:
+def cluster_covariance(gradients: np.ndarray, curvatures: np.ndarray, weight: np.ndarray, bend: np.ndarray,
+                       owners: np.ndarray, prior: np.ndarray) -> np.ndarray:
     """Covariance of a robust estimate by leaving out one vehicle at a time, shape (parameters, parameters).
 
-    `slopes` (tracks, samples, parameters) and `residuals` (tracks, samples) are whitened; `weight` (tracks,) is the
-    derivative of a track's loss by half its squared distance, `bend` (tracks,) the factor of g g^T, g = slopes^T
-    residuals, in the second derivative; `prior` (parameters,) is the prior's information. One Newton step from the
-    solution stands for each vehicle's solution without it: the cluster jackknife, CR3 of Bell & McCaffrey (2002),
-    for an M-estimate. The prior's own spread is added. Undetermined directions get an infinite variance.
+    `gradients` g = J^T r (rows, parameters) and `curvatures` J^T J (rows, parameters, parameters) are of whitened
+    residuals r; `weight` (rows,) is the derivative of a row's loss by half its squared distance, `bend` (rows,) the
+    factor of g g^T in the second derivative; `owners` (rows,) are the vehicles, `prior` (parameters,) is the prior's
+    information. One Newton step from the solution stands for each vehicle's solution without it: the cluster
+    jackknife, CR3 of Bell & McCaffrey (2002), for an M-estimate. The prior's own spread is added. Undetermined
+    directions get an infinite variance.
     """
-    size = slopes.shape[2]
-    gradients = (residuals[:, None] @ slopes)[:, 0]
-    clusters, inverse = np.unique(vehicles, return_inverse=True)
-    per_track = (slopes * weight[:, None, None]).transpose(0, 2, 1) @ slopes
+    size = gradients.shape[1]
+    clusters, inverse = np.unique(owners, return_inverse=True)
     matrices = np.zeros((len(clusters), size, size))
-    np.add.at(matrices, inverse, per_track)
+    np.add.at(matrices, inverse, weight[:, None, None] * curvatures)
     information = matrices.sum(axis=0) + np.diag(prior)
     values, vectors = np.linalg.eigh(information)
     if len(clusters) <= size or values[0] < SINGULAR * values[-1]:

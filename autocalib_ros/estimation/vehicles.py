@@ -32,6 +32,8 @@ HEADING_NOISE_DEG = 0.3
 """What the heading of a single short track is off by at least: its point drifts on the body."""
 SPREADS = 2.0
 """A vehicle has a quarter of its influence left when its heading is so many spreads off."""
+RIDGE = 1e-9
+"""Share of its trace by which a matrix is lifted that points at one place leave singular."""
 GROUPS_TO_TELL = 10
 """So many corroborated vehicles tell the spread of headings; with fewer no vehicle is judged by it."""
 
@@ -94,7 +96,9 @@ def heading_off_deg(distance_px: np.ndarray, px_per_m: np.ndarray, along_m: np.n
     x = centred / length[:, None]
     basis = np.stack([np.ones_like(x), x, x * x - 1 / 12], axis=-1)
     weighted = (basis * weight[..., None]).transpose(0, 2, 1)
-    inverse = np.linalg.inv(weighted @ basis + 1e-9 * np.eye(3))
+    matrix = weighted @ basis
+    ridge = RIDGE * np.maximum(np.trace(matrix, axis1=1, axis2=2), 1.0)
+    inverse = np.linalg.inv(matrix + ridge[:, None, None] * np.eye(3))
     offset_m = distance_px / np.maximum(px_per_m, 1e-3)
     fitted = (inverse @ (weighted @ offset_m[..., None]))[..., 0]
     return np.degrees(fitted[:, 1] / length), np.degrees(np.sqrt(inverse[:, 1, 1]) / length)

@@ -87,10 +87,11 @@ def no_windows() -> Windows:
     return _joined([], 0)
 
 
-def find_windows(evidence: Evidence) -> Windows:
+def find_windows(evidence: Evidence, instants: Instants | None = None) -> Windows:
     """Group the points of tracks, and the segments, into bodies at two instants."""
     width = evidence.image_size[0]
-    return _joined(_bodies([*_of_tracks(evidence), *_of_segments(evidence)], width), width)
+    groups = [*_of_tracks(evidence, instants or Instants(evidence)), *_of_segments(evidence)]
+    return _joined(_bodies(groups, width), width)
 
 
 @dataclass(frozen=True)
@@ -108,9 +109,8 @@ class _Group:
         return _Group(self.first[keep], self.second[keep], self.middle[keep], self.tracks[keep], self.time_s)
 
 
-def _of_tracks(evidence: Evidence) -> Iterator[_Group]:
+def _of_tracks(evidence: Evidence, grid: Instants) -> Iterator[_Group]:
     """Points of what may be one vehicle, by the label that it was seen under."""
-    grid = _OnGrid(evidence)
     for length in LENGTHS:
         half = length // 2
         for begin in range(grid.begin.min(initial=0), grid.end.max(initial=0) - length + 1, half):
@@ -137,7 +137,7 @@ def _alike(labels: np.ndarray) -> list[np.ndarray]:
     return [part for part in parts if len(part) >= MIN_POINTS]
 
 
-class _OnGrid:
+class Instants:
     """Where tracks were at multiples of the interval."""
 
     def __init__(self, evidence: Evidence) -> None:
@@ -173,7 +173,7 @@ def _bodies(groups: list[_Group], width: int) -> list[_Group]:
     graph = coo_matrix((np.ones(pairs.shape[1], bool), pairs), shape=(start, start))
     _, labels = connected_components(graph, directed=False)
     starts = np.cumsum([0, *(len(group.tracks) for group in groups)])
-    return [group.subset(_scattered(body, group.first)) for number, group in enumerate(groups)
+    return [group.subset(scattered(body, group.first)) for number, group in enumerate(groups)
             for body in _alike(labels[starts[number]:starts[number + 1]])]
 
 
@@ -182,7 +182,7 @@ def _apart(places: np.ndarray) -> np.ndarray:
     return np.hypot(places[:, None, 0] - places[:, 0], places[:, None, 1] - places[:, 1])
 
 
-def _scattered(body: np.ndarray, places: np.ndarray) -> np.ndarray:
+def scattered(body: np.ndarray, places: np.ndarray) -> np.ndarray:
     """Choose at most SAMPLES points of a body, each as far from those before as can be."""
     if len(body) <= SAMPLES:
         return body

@@ -118,9 +118,13 @@ def roundabout(generator: np.random.Generator) -> Junction:
 
 
 def turning(generator: np.random.Generator) -> Junction:
-    """Vehicles that turn, each on an arc of its own, a fifth of them taken for one with a neighbour."""
+    """Vehicles that turn, each on an arc of its own, a fifth of them taken for one with a neighbour.
+
+    The principal point is the image centre: turns tell less of it than of all else.
+    """
     junction = viewpoint(generator)
-    camera = replace(junction.camera, k=(float(generator.uniform(-TURNING_K1, TURNING_K1)), 0.0, 0.0, 0.0))
+    camera = replace(Camera.equidistant(WIDTH, HEIGHT, junction.camera.focal_px),
+                     k=(float(generator.uniform(-TURNING_K1, TURNING_K1)), 0.0, 0.0, 0.0))
     return replace(junction, camera=camera, drive=partial(drive_arc, radii_m=(12.0, 60.0)), tracks=None, vehicles=25,
                    points_per_vehicle=8, joined_share=0.2)
 

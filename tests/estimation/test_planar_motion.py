@@ -126,11 +126,13 @@ def test_residuals_change_as_their_derivatives_say() -> None:
     steps = Steps(State(CAMERA, POSE, np.zeros(0)), Setting(prior, JointOptions(), windows=windows))
     rows = MotionRows(steps, None)
     here = rows.linearised()
-    assert here.slopes.shape == (3, POINTS, steps.size)
+    assert here.curvature.shape == (3, steps.size, steps.size)
     # log f, the principal point and k1 in their prior's sigmas, two turns of the plane
     step = np.array([1e-3, 2e-3, -2e-3, 2e-3, 4e-4, -3e-4])
-    _, there = rows.at(steps.state(step))
-    assert there - here.residuals == pytest.approx(here.slopes @ step, abs=0.03 * np.abs(here.slopes @ step).max())
+    _, there = rows.at(step)
+    changed = rows.freedom * (there - here.squared)
+    foretold = 2 * here.gradient @ step + np.einsum('p,rpq,q->r', step, here.curvature, step)
+    assert changed == pytest.approx(foretold, rel=0.03)
 
 
 def test_motion_keeps_its_place_in_a_selection() -> None:

@@ -11,7 +11,8 @@ from autocalib_ros.estimation.uncertainty import cluster_covariance, correlation
 def plain(slopes: np.ndarray, residuals: np.ndarray, vehicles: np.ndarray, prior: np.ndarray) -> np.ndarray:
     """Covariance of ordinary least squares, one sample a track."""
     tracks = len(residuals)
-    return cluster_covariance(slopes[:, None], residuals[:, None], np.ones(tracks), np.zeros(tracks), vehicles, prior)
+    return cluster_covariance(slopes * residuals[:, None], slopes[:, :, None] * slopes[:, None], np.ones(tracks),
+                              np.zeros(tracks), vehicles, prior)
 
 
 def test_covariance_covers_errors_shared_within_a_vehicle() -> None:

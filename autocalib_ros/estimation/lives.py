@@ -1,0 +1,103 @@
+"""Lives: points of one vehicle over several instants, the longer view of what windows show between two."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from autocalib_ros.estimation.great_circles import SAMPLES
+from autocalib_ros.estimation.windows import INTERVAL_S, MIN_POINTS, Instants, Windows, scattered
+
+INSTANTS = 9
+"""Most instants of a life: as long as a turn at a junction takes; a longer one goes on as another."""
+CORRELATION = 0.3
+"""How much the errors of lives of one body correlate, 0 to 1."""
+LEAST_INSTANTS = 3
+"""Instants that a point, and points that an instant, needs to add more than its own unknowns."""
+
+
+@dataclass(frozen=True)
+class Lives:
+    """Points of vehicles at instants, in arrays of equal shape."""
+
+    pixels: np.ndarray
+    """Observed pixels, shape (lives, SAMPLES, INSTANTS, 2); 0 where a point was not seen."""
+    mask: np.ndarray
+    """Where it was, shape (lives, SAMPLES, INSTANTS)."""
+    bodies: np.ndarray
+    """Which lives are of one body, shape (lives,)."""
+    times_s: np.ndarray
+    """Time of the middle of each life, shape (lives,)."""
+
+    def __len__(self) -> int:
+        return len(self.bodies)
+
+    def subset(self, keep: np.ndarray) -> Lives:
+        """Return the lives that `keep`, a mask or indices, selects."""
+        return Lives(self.pixels[keep], self.mask[keep], self.bodies[keep], self.times_s[keep])
+
+    @property
+    def share_of_body(self) -> np.ndarray:
+        """Weight of each life among those of the same body, shape (lives,): Kish's design effect."""
+        _, inverse, counts = np.unique(self.bodies, return_inverse=True, return_counts=True)
+        return 1.0 / (1.0 + (counts[inverse] - 1.0) * CORRELATION)
+
+
+def no_lives() -> Lives:
+    """Return none at all."""
+    return Lives(np.zeros((0, SAMPLES, INSTANTS, 2)), np.zeros((0, SAMPLES, INSTANTS), bool), np.zeros(0, int),
+                 np.zeros(0))
+
+
+def find_lives(windows: Windows, instants: Instants, limit: int) -> Lives:
+    """Follow the bodies of windows of tracks from instant to instant; at most `limit` lives, bodies in turn."""
+    of_tracks = np.flatnonzero(~windows.of_segments)
+    found: list[tuple[int, np.ndarray, np.ndarray, float]] = []
+    order = of_tracks[np.argsort(windows.bodies[of_tracks], kind='stable')]
+    for members in np.split(order, np.flatnonzero(np.diff(windows.bodies[order])) + 1):
+        if not len(members):
+            continue
+        tracks = np.unique(windows.tracks[members][windows.tracks[members] >= 0])
+        middles = np.round(windows.times_s[members] / INTERVAL_S).astype(int)
+        for begin in range(middles.min() - 1, middles.max() + 1, INSTANTS - 1):
+            life = _life(tracks, np.arange(begin, min(begin + INSTANTS, middles.max() + 2)), instants)
+            if life is not None:
+                found.append((int(windows.bodies[members[0]]), *life, (begin + 0.5 * INSTANTS) * INTERVAL_S))
+    if not found:
+        return no_lives()
+    bodies, pixels, mask, times = (np.array(column) for column in zip(*found, strict=True))
+    lives = Lives(pixels, mask, bodies, times)
+    return lives.subset(_in_turn(lives)[:limit])
+
+
+def _life(tracks: np.ndarray, when: np.ndarray, instants: Instants) -> tuple[np.ndarray, np.ndarray] | None:
+    """Pixels and mask of one life, None where too little of it is seen."""
+    seen = (instants.begin[tracks][:, None] <= when) & (instants.end[tracks][:, None] >= when)
+    if len(when) < LEAST_INSTANTS or not seen.any():
+        return None
+    often = np.flatnonzero(seen.sum(axis=1) >= LEAST_INSTANTS)
+    if len(often) < MIN_POINTS:
+        return None
+    middle = int(np.argmax(seen[often].sum(axis=0)))
+    here = often[seen[often, middle]]
+    if len(here) < MIN_POINTS:
+        return None
+    chosen = here[scattered(np.arange(len(here)), instants.at(tracks[here], int(when[middle])))]
+    when_seen = seen[chosen].sum(axis=0) >= LEAST_INSTANTS
+    seen = seen & when_seen
+    if when_seen.sum() < LEAST_INSTANTS or (seen[chosen].sum(axis=1) < LEAST_INSTANTS).any():
+        return None
+    pixels, mask = np.zeros((SAMPLES, INSTANTS, 2)), np.zeros((SAMPLES, INSTANTS), bool)
+    for place in np.flatnonzero(when_seen):
+        points = np.flatnonzero(seen[chosen, place])
+        pixels[points, place] = instants.at(tracks[chosen[points]], int(when[place]))
+        mask[points, place] = True
+    return pixels, mask
+
+
+def _in_turn(lives: Lives) -> np.ndarray:
+    """Indices of the lives, those of each body from the fullest on, bodies in turn."""
+    order = np.lexsort((-lives.mask.sum(axis=(1, 2)), lives.bodies))
+    starts = np.searchsorted(lives.bodies[order], lives.bodies[order])
+    return order[np.argsort(np.arange(len(order)) - starts, kind='stable')]

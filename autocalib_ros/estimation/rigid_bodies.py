@@ -1,0 +1,252 @@
+"""Rigid bodies over their lives: bundle adjustment in which a vehicle moves in the plane, points fixed on it.
+
+Lengths are in units of the camera's height over the points' plane, which nothing here tells: a body has a size of its
+own, and lens and ground normal are the same whatever it is. Unknown of each life are the positions of its points at
+one instant, and where the body stands and how it is turned at the others; they are solved inside. Residuals are in
+observed pixels, whitened by what a followed point drifts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from autocalib_ros.camera import Camera
+from autocalib_ros.estimation.great_circles import rays_of
+from autocalib_ros.estimation.lives import Lives
+
+DIFFERENCE = 1e-6
+DAMPING = 1e-4
+"""Of the first round, share of the diagonal."""
+DOUBTED, CREDULOUS = 2.0, 50.0
+"""A point has half its influence when it is so many standard deviations off (Cauchy): bodies hold strangers. And when a
+life is begun from a guess."""
+LOW = 0.03
+"""Least angle below the horizon at which a point is placed on the road to begin with, radians."""
+UNTOLD = 1e-7
+"""Eigenvalues below this share of the largest are of what a life does not show: unseen points, its size."""
+SETTLING, BEGINNING = 2, 12
+"""Rounds in which lives are solved when lens and plane have moved a little, and from nothing."""
+
+
+@dataclass(frozen=True)
+class Shapes:
+    """What is unknown of each life, in the frame of the plane."""
+
+    points: np.ndarray
+    """Positions of the points at the reference instant, shape (lives, points, 3)."""
+    moves: np.ndarray
+    """Translation to each instant, shape (lives, instants, 2)."""
+    turns_rad: np.ndarray
+    """Turn to each instant, shape (lives, instants)."""
+
+    def stepped(self, step: np.ndarray) -> Shapes:
+        """Return the shapes moved by a step (lives, 3 points + 3 instants)."""
+        lives, points, _ = self.points.shape
+        poses = step[:, 3 * points:].reshape(lives, -1, 3)
+        return Shapes(self.points + step[:, :3 * points].reshape(lives, points, 3), self.moves + poses[..., :2],
+                      self.turns_rad + poses[..., 2])
+
+    def subset(self, keep: np.ndarray) -> Shapes:
+        """Return the shapes of the lives that `keep` selects."""
+        return Shapes(self.points[keep], self.moves[keep], self.turns_rad[keep])
+
+    def where(self, better: np.ndarray, other: Shapes) -> Shapes:
+        """Return these shapes with those lives (lives,) from the other."""
+        return Shapes(np.where(better[:, None, None], other.points, self.points),
+                      np.where(better[:, None, None], other.moves, self.moves),
+                      np.where(better[:, None], other.turns_rad, self.turns_rad))
+
+
+class Bundle:
+    """Lives with what their residuals need, whatever the lens and the plane."""
+
+    def __init__(self, lives: Lives, noise_px: float, drift_px: float) -> None:
+        self.lives, self.mask, self._noise_px, self.drift_px = lives, lives.mask, noise_px, drift_px
+        steps = np.hypot(*np.moveaxis(np.diff(lives.pixels, axis=2), -1, 0))
+        steps = steps * (self.mask[..., 1:] & self.mask[..., :-1])
+        way = np.concatenate([np.zeros((*steps.shape[:2], 1)), np.cumsum(steps, axis=2)], axis=2)
+        covariance = drift_px**2 * np.minimum(way[..., :, None], way[..., None, :])
+        covariance *= self.mask[..., :, None] & self.mask[..., None, :]
+        diagonal = np.arange(self.mask.shape[2])
+        covariance[..., diagonal, diagonal] += np.where(self.mask, noise_px**2, 1.0)
+        size = self.mask.shape[2]
+        factors = np.linalg.inv(np.linalg.cholesky(covariance.reshape(-1, size, size))).reshape(covariance.shape)
+        self.whiten = factors * self.mask[..., None, :] * self.mask[..., :, None]
+        seen_points, seen_instants = self.mask.any(axis=2), self.mask.any(axis=1)
+        unknown = 3 * seen_points.sum(axis=1) + 3 * (seen_instants.sum(axis=1) - 1) - 1  # its size is free
+        self.freedom = np.maximum(2 * self.mask.sum(axis=(1, 2)) - unknown, 1)
+        self.point_freedom = np.maximum(2 * self.mask.sum(axis=2) - 3, 1)
+        self.reference = np.argmax(self.mask.sum(axis=1), axis=1)
+        """The instant of most points, at which the body's frame is the plane's, shape (lives,)."""
+
+    def subset(self, keep: np.ndarray) -> Bundle | None:
+        """Return the lives that `keep` selects, None where it selects none."""
+        lives = self.lives.subset(keep)
+        return Bundle(lives, self._noise_px, self.drift_px) if len(lives) else None
+
+    def steady(self) -> Bundle:
+        """Return the same lives of points that do not drift."""
+        return Bundle(self.lives, self._noise_px, 0.0)
+
+    def noise_cost(self, camera: Camera, camera_from_plane: np.ndarray, shapes: Shapes) -> float:
+        """Twice the negative logarithm of how probable the residuals of shapes near their best are.
+
+        The restricted likelihood (Patterson & Thompson 1971), scale fitted: shapes take up some of the noise, and
+        more of the one that wanders.
+        """
+        shapes = self.settled(camera, camera_from_plane, shapes)
+        residuals = self.residuals(camera, camera_from_plane, shapes)
+        scale = float(np.median((residuals**2).sum(axis=(1, 2, 3)) / self.freedom))
+        diagonal = np.diagonal(self.whiten, axis1=-2, axis2=-1)
+        density = 2.0 * np.log(np.where(self.mask, diagonal, 1.0)).sum(axis=(1, 2))
+        slopes, _ = self.slopes(camera, camera_from_plane, shapes)
+        slopes = slopes.reshape(len(self.lives), -1, slopes.shape[-1])
+        told = np.linalg.eigvalsh(slopes.transpose(0, 2, 1) @ slopes)
+        volume = np.log(np.where(told > UNTOLD * told[:, -1:], told, 1.0)).sum(axis=1)
+        return float((self.freedom * np.log(max(scale, 1e-9)) - 2.0 * density + volume).sum())
+
+    def first_shapes(self, camera: Camera, camera_from_plane: np.ndarray) -> Shapes:
+        """Place points on the road and move them as a body from instant to instant: a guess to start from."""
+        bearings = rays_of(camera, self.lives.pixels).bearings @ camera_from_plane
+        side = float(np.sign(np.median(bearings[..., 2][self.mask]))) if self.mask.any() else 1.0
+        ground = bearings[..., :2] / np.maximum(side * bearings[..., 2:], LOW)
+        count, points, instants = self.mask.shape
+        shapes = Shapes(np.zeros((count, points, 3)), np.zeros((count, instants, 2)), np.zeros((count, instants)))
+        shapes.points[..., 2] = side
+        for life in range(count):
+            placed = np.full((points, 2), np.nan)
+            for instant in sorted(np.flatnonzero(self.mask[life].any(axis=0)),
+                                  key=lambda other, near=self.reference[life]: abs(int(other) - int(near))):
+                here, seen = ground[life, :, instant], self.mask[life, :, instant]
+                known = seen & np.isfinite(placed[:, 0])
+                turn, move = _moved(placed[known], here[known]) if known.sum() >= 2 else (0.0, np.zeros(2))
+                shapes.turns_rad[life, instant], shapes.moves[life, instant] = turn, move
+                new = seen & ~known
+                placed[new] = (here[new] - move) @ _turn(turn)
+            shapes.points[life, :, :2] = np.nan_to_num(placed)
+        return shapes
+
+    def residuals(self, camera: Camera, camera_from_plane: np.ndarray, shapes: Shapes) -> np.ndarray:
+        """Whitened residuals (lives, points, instants, 2)."""
+        pixels, _ = camera.project(self._placed(shapes) @ camera_from_plane.T)
+        return self.whiten @ ((pixels - self.lives.pixels) * self.mask[..., None])
+
+    def _placed(self, shapes: Shapes) -> np.ndarray:
+        """Positions (lives, points, instants, 3) in the frame of the plane."""
+        cosine, sine = np.cos(shapes.turns_rad)[:, None], np.sin(shapes.turns_rad)[:, None]
+        x, y, z = (shapes.points[:, :, None, axis] for axis in range(3))
+        right, ahead = (shapes.moves[:, None, :, axis] for axis in range(2))
+        return np.stack([cosine * x - sine * y + right, sine * x + cosine * y + ahead,
+                         np.broadcast_to(z, self.mask.shape)], axis=-1)
+
+    def trust(self, residuals: np.ndarray, doubted: float = DOUBTED) -> np.ndarray:
+        """Influence (lives, points) of points by their mean squared residuals."""
+        return 1.0 / (1.0 + self._off(residuals, doubted))
+
+    def cost(self, residuals: np.ndarray, doubted: float = DOUBTED) -> np.ndarray:
+        """Cost (lives,) whose influence is `trust`."""
+        return (self.point_freedom * doubted**2 * np.log1p(self._off(residuals, doubted))).sum(axis=1)
+
+    def _off(self, residuals: np.ndarray, doubted: float) -> np.ndarray:
+        return (residuals**2).sum(axis=(2, 3)) / self.point_freedom / doubted**2
+
+    def slopes(self, camera: Camera, camera_from_plane: np.ndarray, shapes: Shapes) -> tuple[np.ndarray, np.ndarray]:
+        """Derivatives of the residuals by the unknowns of each life, and of the pixels by the positions.
+
+        Shapes (lives, points, instants, 2, 3 points + 3 instants) and (lives, points, instants, 2, 3).
+        """
+        placed = self._placed(shapes)
+        in_camera = placed @ camera_from_plane.T
+        here, _ = camera.project(in_camera)
+        # a step of a millionth of the distance, whatever the size of the body
+        by_place = np.stack([camera.project(in_camera + DIFFERENCE * axis)[0] - here for axis in camera_from_plane.T],
+                            axis=-1) / DIFFERENCE * self.mask[..., None, None]
+        cosine, sine = (part[:, None, :, None] for part in (np.cos(shapes.turns_rad), np.sin(shapes.turns_rad)))
+        x, y, z = np.moveaxis(by_place, -1, 0)
+        by_point = self._whitened(np.stack([x * cosine + y * sine, y * cosine - x * sine, z], axis=-1))
+        about = placed[..., :2] - shapes.moves[:, None]
+        by_pose = np.stack([x, y, y * about[..., :1] - x * about[..., 1:]], axis=-1)
+        lives, points, instants = self.mask.shape
+        slopes = np.zeros((lives, points, instants, 2, 3 * points + 3 * instants))
+        for point in range(points):
+            slopes[:, point, ..., 3 * point:3 * point + 3] = by_point[:, point]
+        poses = self.whiten[..., None, None] * by_pose[:, :, None]
+        # the body stands where it is at its reference instant
+        poses[np.arange(lives), :, :, self.reference] = 0.0
+        slopes[..., 3 * points:] = np.moveaxis(poses, 3, 4).reshape(lives, points, instants, 2, -1)
+        return slopes, by_place
+
+    def _whitened(self, slopes: np.ndarray) -> np.ndarray:
+        """Whiten derivatives (lives, points, instants, 2, n) along the instants."""
+        lives, points, instants = self.mask.shape
+        return (self.whiten @ slopes.reshape(lives, points, instants, -1)).reshape(slopes.shape)
+
+    def by_lens(self, cameras: list[Camera], camera: Camera, camera_from_plane: np.ndarray,
+                shapes: Shapes) -> list[np.ndarray]:
+        """Whitened change (lives, points, instants, 2) of the residuals from one camera to each of others."""
+        in_camera = self._placed(shapes) @ camera_from_plane.T
+        here, _ = camera.project(in_camera)
+        return [self.whiten @ ((other.project(in_camera)[0] - here) * self.mask[..., None]) for other in cameras]
+
+    def by_turn(self, axis: np.ndarray, by_place: np.ndarray, shapes: Shapes) -> np.ndarray:
+        """Whitened derivative (lives, points, instants, 2) by a turn of the plane about an axis (3,) of its own."""
+        lever = np.cross(axis, self._placed(shapes))
+        return self.whiten @ (by_place @ lever[..., None])[..., 0]
+
+    def begun(self, camera: Camera, camera_from_plane: np.ndarray) -> Shapes:
+        """Solve the lives from nothing: points are doubted only when heights, guessed at first, are found."""
+        shapes = self.first_shapes(camera, camera_from_plane)
+        for doubted in (CREDULOUS, DOUBTED):
+            shapes = self.settled(camera, camera_from_plane, shapes, BEGINNING, doubted)
+        return shapes
+
+    def settled(self, camera: Camera, camera_from_plane: np.ndarray, shapes: Shapes, rounds: int = SETTLING,
+                doubted: float = DOUBTED) -> Shapes:
+        """Improve the shapes by Levenberg-Marquardt rounds of each life's own."""
+        damping = np.full(len(self.lives), DAMPING)
+        here = self.residuals(camera, camera_from_plane, shapes)
+        cost = self.cost(here, doubted)
+        for _ in range(rounds):
+            slopes, _ = self.slopes(camera, camera_from_plane, shapes)
+            own, flat = self.flat(slopes, here, doubted)
+            matrix, gradient = own.transpose(0, 2, 1) @ own, own.transpose(0, 2, 1) @ flat[..., None]
+            trial = shapes.stepped(-np.linalg.solve(lifted(matrix, damping), gradient)[..., 0])
+            there = self.residuals(camera, camera_from_plane, trial)
+            cost_there = self.cost(there, doubted)
+            better = cost_there <= cost
+            gain = np.max(cost - cost_there, initial=0.0, where=better)
+            shapes = shapes.where(better, trial)
+            here = np.where(better[:, None, None, None], there, here)
+            cost = np.where(better, cost_there, cost)
+            damping = np.where(better, np.maximum(damping / 3, 1e-7), np.minimum(damping * 6, 1e4))
+            if better.all() and gain < 1e-3:
+                break
+        return shapes
+
+    def flat(self, slopes: np.ndarray, residuals: np.ndarray,
+             doubted: float = DOUBTED) -> tuple[np.ndarray, np.ndarray]:
+        """Slopes (lives, residuals, n) and residuals (lives, residuals), each point by the root of its trust."""
+        root = np.sqrt(self.trust(residuals, doubted))[:, :, None, None]
+        count = len(self.lives)
+        return ((slopes * root[..., None]).reshape(count, -1, slopes.shape[-1]), (residuals * root).reshape(count, -1))
+
+
+def lifted(matrix: np.ndarray, damping: np.ndarray) -> np.ndarray:
+    """Matrices (lives, n, n) with a lifted diagonal: what is not seen, and the size of a body, stays as it is."""
+    diagonal = np.einsum('lii->li', matrix)
+    lift = damping[:, None] * diagonal + 1e-9 * diagonal.max(axis=1, keepdims=True, initial=0.0) + 1e-9
+    return matrix + lift[:, :, None] * np.eye(matrix.shape[1])
+
+
+def _turn(angle_rad: float) -> np.ndarray:
+    return np.array([[np.cos(angle_rad), -np.sin(angle_rad)], [np.sin(angle_rad), np.cos(angle_rad)]])
+
+
+def _moved(before: np.ndarray, after: np.ndarray) -> tuple[float, np.ndarray]:
+    """Turn and translation that take points (n, 2) to others best (Kabsch 1976 in the plane)."""
+    middle, other = before.mean(axis=0), after.mean(axis=0)
+    first, second = before - middle, after - other
+    turn = float(np.arctan2((first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]).sum(), (first * second).sum()))
+    return turn, other - _turn(turn) @ middle

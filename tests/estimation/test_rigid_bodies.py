@@ -1,0 +1,116 @@
+"""Bundle adjustment of bodies in the plane: exact on perfect motion, its derivatives, and what drifts."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from autocalib_ros.camera import Camera
+from autocalib_ros.config import JointOptions
+from autocalib_ros.estimation.great_circles import SAMPLES
+from autocalib_ros.estimation.lens_prior import lens_priors
+from autocalib_ros.estimation.lives import INSTANTS, Lives, find_lives, no_lives
+from autocalib_ros.estimation.rigid_bodies import Bundle
+from autocalib_ros.estimation.rows import LifeRows
+from autocalib_ros.estimation.state import Setting, State, Steps
+from autocalib_ros.estimation.windows import Instants, find_windows
+from autocalib_ros.offline.accuracy import evidence_of
+from autocalib_ros.offline.synthetic_evidence import pose
+
+CAMERA = Camera(1280, 720, 560.0, (645.0, 352.0), (0.01, 0.0, 0.0, 0.0))
+POSE = pose(30.0, 1.5, 20.0)
+HEIGHT_M = 8.0
+NOISE_PX = 0.3
+
+
+def life(generator: np.random.Generator, turn_deg: float, points: int = SAMPLES) -> np.ndarray:
+    """Pixels (SAMPLES, INSTANTS, 2) of a car that turns by `turn_deg`."""
+    heading = generator.uniform(0, 2 * np.pi) + np.radians(turn_deg) * np.linspace(0, 1, INSTANTS)
+    steps = 1.5 * np.column_stack([np.cos(heading), np.sin(heading)])
+    where = generator.uniform([14.0, -5.0], [20.0, 5.0]) + np.cumsum(steps, axis=0)
+    body = generator.uniform([-2.0, -0.8, 0.2], [2.0, 0.8, 1.6], (points, 3))
+    forward = np.column_stack([np.cos(heading), np.sin(heading)])
+    left = np.column_stack([-forward[:, 1], forward[:, 0]])
+    ground = where + body[:, 0, None, None] * forward + body[:, 1, None, None] * left
+    up = np.broadcast_to((body[:, 2] - HEIGHT_M)[:, None], ground.shape[:2])
+    return CAMERA.project(np.dstack([ground, up]) @ POSE.T)[0]
+
+
+def lives_of(pixels: np.ndarray) -> Lives:
+    count = len(pixels)
+    return Lives(pixels, np.ones(pixels.shape[:3], bool), np.arange(count), np.zeros(count))
+
+
+def noisy(generator: np.random.Generator, count: int = 12) -> Lives:
+    pixels = np.stack([life(generator, turn) for turn in np.linspace(-70, 70, count)])
+    return lives_of(pixels + generator.normal(scale=NOISE_PX, size=pixels.shape))
+
+
+def test_perfect_motion_leaves_no_residual() -> None:
+    generator = np.random.default_rng(1)
+    bundle = Bundle(lives_of(np.stack([life(generator, turn) for turn in (-60.0, -10.0, 0.0, 25.0, 80.0)])), 0.3, 0.05)
+    shapes = bundle.settled(CAMERA, POSE, bundle.begun(CAMERA, POSE), 60)
+    assert np.abs(bundle.residuals(CAMERA, POSE, shapes)).max() < 0.05
+    reference = bundle.reference[0]
+    assert not shapes.moves[0, reference].any() and shapes.turns_rad[0, reference] == 0.0
+    assert np.degrees(np.ptp(shapes.turns_rad, axis=1)) == pytest.approx([60.0, 10.0, 0.0, 25.0, 80.0], abs=0.5)
+
+
+def test_noise_is_as_large_as_it_is_said_to_be() -> None:
+    bundle = Bundle(noisy(np.random.default_rng(2)), NOISE_PX, 0.0)
+    shapes = bundle.begun(CAMERA, POSE)
+    squared = (bundle.residuals(CAMERA, POSE, shapes)**2).sum(axis=(1, 2, 3)) / bundle.freedom
+    assert squared.mean() == pytest.approx(1.0, abs=0.25)
+
+
+def test_a_stranger_on_the_body_is_not_believed() -> None:
+    generator = np.random.default_rng(3)
+    lives = noisy(generator, 4)
+    lives.pixels[0, 0] += np.linspace(0, 60, INSTANTS)[:, None]
+    bundle = Bundle(lives, NOISE_PX, 0.0)
+    shapes = bundle.begun(CAMERA, POSE)
+    trust = bundle.trust(bundle.residuals(CAMERA, POSE, shapes))
+    assert trust[0, 0] < 0.1 < 0.5 < np.median(trust)
+
+
+def test_residuals_change_as_their_derivatives_say() -> None:
+    prior = lens_priors((1280, 720), JointOptions())[0]
+    bundle = Bundle(noisy(np.random.default_rng(4), 5), NOISE_PX, 0.0)
+    steps = Steps(State(CAMERA, POSE, np.zeros(0)), Setting(prior, JointOptions(), bundle=bundle))
+    shapes = bundle.begun(CAMERA, POSE)
+    rows = LifeRows(steps, bundle, shapes)
+    here = rows.linearised()
+    for index in range(steps.size):
+        step = np.zeros(steps.size)
+        step[index] = 2e-3
+        _, there = rows.at(step)
+        changed = (rows.freedom * (there - here.squared)).sum()
+        foretold = (2 * here.gradient @ step + np.einsum('p,rpq,q->r', step, here.curvature, step)).sum()
+        assert changed == pytest.approx(foretold, rel=0.1, abs=2e-3)
+
+
+def test_the_residuals_tell_whether_points_drift() -> None:
+    generator = np.random.default_rng(5)
+    steady = noisy(generator, 20)
+    walk = np.cumsum(generator.normal(scale=0.5, size=steady.pixels.shape), axis=2)
+    drifting = lives_of(steady.pixels + walk)
+    for lives, drifts in ((steady, False), (drifting, True)):
+        bundle = Bundle(lives, NOISE_PX, 0.05)
+        shapes = bundle.begun(CAMERA, POSE)
+        more_probable = bundle.noise_cost(CAMERA, POSE, shapes) < bundle.steady().noise_cost(CAMERA, POSE, shapes)
+        assert more_probable == drifts
+
+
+def test_lives_follow_the_tracks_of_a_body_and_take_bodies_in_turn() -> None:
+    _, evidence = evidence_of('turning', 0, 0)
+    instants = Instants(evidence)
+    windows = find_windows(evidence, instants)
+    lives = find_lives(windows, instants, 1000)
+    assert len(np.unique(lives.bodies)) > 15
+    assert (lives.mask.sum(axis=(1, 2)) >= 15).all()
+    times = evidence.times_s[evidence.track_starts[0]:evidence.track_starts[1]]
+    assert times.min() - 1 < lives.times_s.min()
+    few = find_lives(windows, instants, 10)
+    assert len(np.unique(few.bodies)) == 10
+    assert not len(find_lives(windows.subset(np.zeros(0, int)), instants, 10))
+    assert not len(no_lives())
