@@ -141,7 +141,8 @@ class Calibration:
 
     method: str
     grade: str
-    """'full': lens and metric ground plane; 'unit_scale': the plane in units of the height; 'lens': no plane."""
+    """'full': lens and metric ground plane; 'assumed': the same, where the plane rests on an assumption that was
+    allowed; 'unit_scale': the plane in units of the height; 'lens': no plane."""
     assumptions: tuple[str, ...]
     """What was taken for granted, in words."""
     checks: tuple[str, ...] = ()

@@ -10,11 +10,11 @@ from autocalib_ros.calibration import GROUND_DISTANCES_M, Calibration, Figures, 
 from autocalib_ros.camera import Camera
 from autocalib_ros.config import Options
 from autocalib_ros.errors import InputError
-from autocalib_ros.estimation.doubts import normal_of
 from autocalib_ros.estimation.evidence_gate import shortfall
 from autocalib_ros.estimation.great_circles import TrackSet, select_tracks
 from autocalib_ros.estimation.ground_plane import ground_plane, ground_points, pixels_ahead, tilt_and_roll_deg
 from autocalib_ros.estimation.paper import scale, solve_paper
+from autocalib_ros.estimation.plane import Plane
 from autocalib_ros.estimation.solution import Solution, find_solution
 from autocalib_ros.estimation.straightness import paper_intrinsics
 from autocalib_ros.estimation.vanishing_points import segment_orientations
@@ -141,7 +141,7 @@ def solve(evidence: Evidence, options: Options, *, lens: Camera | None = None) -
         return refused(solution)
     figures = _figures(figures, solution, tracks, evidence, options)
     paper = None if intrinsics is None else intrinsics.report
-    return _calibration(evidence, options, solution, tracks, Calibration(
+    return _calibration(options, solution, Calibration(
         method=options.method, grade='lens', assumptions=solution.assumptions, checks=solution.checks,
         camera=solution.fit.state.camera, ground=None, ground_refusal=solution.no_plane,
         road_directions=solution.fit.state.directions, stddev=_lens_deviations(solution), paper=paper,
@@ -164,28 +164,27 @@ def _lens_deviations(solution: Solution) -> StandardDeviations:
                               k2=float(k2))
 
 
-def _ground_deviations(solution: Solution, side: float, height: float) -> tuple[float | None, ...]:
+def _ground_deviations(plane: Plane, height: float) -> tuple[float | None, ...]:
     """Standard deviation in metres of road points ahead, None where they are not in the image."""
-    normal = side * solution.fit.state.rotation[:, 2]
-    pixels = pixels_ahead(solution.fit.state.camera, normal, height, np.array(GROUND_DISTANCES_M))
+    state = plane.fit.state
+    pixels = pixels_ahead(state.camera, plane.normal(state), height, np.array(GROUND_DISTANCES_M))
     seen = np.isfinite(pixels).all(axis=1)
-    spread = solution.fit.sigma(lambda state: ground_points(
-        state.camera, side * state.rotation[:, 2], height, pixels[seen]).ravel()) if seen.any() else np.zeros(0)
+    spread = plane.sigma(lambda camera, normal: ground_points(camera, normal, height, pixels[seen]).ravel()
+                         ) if seen.any() else np.zeros(0)
     sigmas = iter(np.hypot(*spread.reshape(-1, 2).T))
     return tuple(float(next(sigmas)) if here else None for here in seen)
 
 
-def _calibration(evidence: Evidence, options: Options, solution: Solution, tracks: TrackSet,
-                 lens: Calibration) -> Calibration:
-    """Add the ground plane to a lens where the roads and the height give one."""
+def _calibration(options: Options, solution: Solution, lens: Calibration) -> Calibration:
+    """Add the ground plane to a lens where the traffic and the height give one."""
     height, metric, grade, no_height = scale(options)
     reason = solution.no_plane or no_height
     if reason:
         return replace(lens, ground_refusal=reason)
-    normal, _ = normal_of(solution.fit.state, tracks)
-    plane = ground_plane(normal, solution.along, height, metric=metric)
-    side = np.sign(solution.fit.state.rotation[:, 2] @ normal)
-    tilt, roll = solution.fit.sigma(lambda state: tilt_and_roll_deg(side * state.rotation[:, 2]))
-    return replace(lens, grade=grade, ground=plane, stddev=replace(
+    plane = solution.plane
+    ground = ground_plane(plane.normal(plane.fit.state), solution.along, height, metric=metric)
+    tilt, roll = plane.sigma(lambda _, normal: tilt_and_roll_deg(normal))
+    grade = 'assumed' if plane.roll_sigma_deg is not None and metric else grade
+    return replace(lens, grade=grade, ground=ground, stddev=replace(
         lens.stddev, tilt_deg=float(tilt), roll_deg=float(roll),
-        ground_point_m=_ground_deviations(solution, float(side), height) if metric else ()))
+        ground_point_m=_ground_deviations(plane, height) if metric else ()))

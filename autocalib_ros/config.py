@@ -114,6 +114,9 @@ class JointOptions(_Checked):
     road_angle: str = option(
         'auto', 'angle between the two busiest roads: auto tests whether it is 90 degrees, free never uses it, a '
         'number of degrees asserts it')
+    roll_prior_deg: float = option(
+        0.0, 'where one road alone is seen: standard deviation of the roll of a camera that is taken for level, in '
+        'degrees; it then gives a ground plane of grade assumed; 0 does not allow that', low=0, high=10)
 
     def __post_init__(self) -> None:
         if isinstance(self.road_angle, (int, float)) and not isinstance(self.road_angle, bool):

@@ -12,6 +12,7 @@ from autocalib_ros.estimation.great_circles import TrackSet, rays_of
 from autocalib_ros.estimation.ground_plane import BELOW_HORIZON, tilt_and_roll_deg, upward
 from autocalib_ros.estimation.joint import MIN_ROWS, JointFit, road_support, solve_joint
 from autocalib_ros.estimation.lives import no_lives
+from autocalib_ros.estimation.plane import Plane
 from autocalib_ros.estimation.state import State
 from autocalib_ros.estimation.uncertainty import told_by_evidence
 
@@ -29,6 +30,8 @@ PRIOR_SIGMAS = 3.5
 MOTION_TELLS = 0.1
 """Vehicles that turn vouch for a lens when their motion alone tells the focal length to this share, one sigma: turns
 that were taken for roads are off by more."""
+ASSUMED = 3.0
+"""A plane that rests on an assumption may be so many times less sure than one that was measured."""
 HALVES_SIGMAS = 3.5
 HALVES_FOCAL = 0.03
 HALVES_DEG = 1.5
@@ -139,19 +142,18 @@ def _model_doubt(fit: JointFit) -> Reason | None:
     return None
 
 
-def plane_doubt(fit: JointFit, tracks: TrackSet, gate: GateOptions) -> Reason | None:
-    """Say why the ground plane cannot be trusted, if so."""
-    normal, _ = normal_of(fit.state, tracks)
-    sigma = fit.sigma(lambda state: tilt_and_roll_deg(_same_side(state.rotation[:, 2], normal)))
-    if not sigma.max() <= gate.max_sigma_tilt_deg:
+def plane_doubt(plane: Plane, gate: GateOptions) -> Reason | None:
+    """Say why the ground plane cannot be trusted, if so; an assumption may be as wrong as it says on top."""
+    sigma = float(plane.sigma(lambda _, normal: tilt_and_roll_deg(normal)).max())
+    if plane.roll_sigma_deg is not None and not plane.told_by_roll:
+        return Reason('plane_uncertain', 'the road leads level across the image, where the roll of the camera tells '
+                      'nothing of the plane', 'wait for traffic across the road, or that turns')
+    needed = gate.max_sigma_tilt_deg * (1.0 if plane.roll_sigma_deg is None else ASSUMED)
+    if not sigma <= needed:
         return Reason(
-            'plane_uncertain', f'the ground normal is known to {min(sigma.max(), 90.0):.1f} degrees, '
-            f'{gate.max_sigma_tilt_deg:g} are needed', 'wait for more traffic on the quieter road')
+            'plane_uncertain', f'the ground normal is known to {min(sigma, 90.0):.1f} degrees, {needed:g} are needed',
+            'wait for more traffic on the quieter road')
     return None
-
-
-def _same_side(normal: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    return normal if normal @ reference > 0 else -normal
 
 
 def halves_doubt(fit: JointFit, tracks: TrackSet, gate: GateOptions) -> Reason | str:

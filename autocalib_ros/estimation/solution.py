@@ -14,6 +14,7 @@ from autocalib_ros.estimation.great_circles import TrackSet
 from autocalib_ros.estimation.held import lens_assumptions, with_k2_if_asked_for, with_what_can_be_told
 from autocalib_ros.estimation.joint import JointFit, noise_cost, road_support, solve_joint, with_bodies
 from autocalib_ros.estimation.lens_prior import LensPrior, known_lens, lens_priors
+from autocalib_ros.estimation.plane import Plane
 from autocalib_ros.estimation.roads import main_direction, with_further_roads, with_real_roads, with_right_angle
 from autocalib_ros.estimation.starts import agreed, in_likeliest_family
 from autocalib_ros.estimation.state import Setting
@@ -30,6 +31,7 @@ class Solution:
     """A lens, the plane and its roads, with the reason why there is no ground plane where there is none."""
 
     fit: JointFit
+    plane: Plane
     along: np.ndarray
     """Unit vector (3,), camera frame, along the road of most vehicles."""
     assumptions: tuple[str, ...]
@@ -130,13 +132,20 @@ def _completed(fit: JointFit, tracks: TrackSet, across: str, traffic: _Traffic, 
         return halves
     along = main_direction(fit, tracks, road_support(fit, tracks))
     assumptions = lens_assumptions(fit, held)
-    if not fit.plane_known:
-        return Solution(fit, along, assumptions, (halves,), Reason(
-            'one_direction', f'too little traffic across the main road yet: {across}; {int(fit.explained().sum())} '
-            'follow one road, and rotation about it is free', 'wait for traffic across the main road, or that turns'))
-    checks = (*_angle_and_turning(fit, angle), halves)
-    return Solution(fit, along, (*assumptions, angle) if fit.crossing_held and angle else assumptions, checks,
-                    plane_doubt(fit, tracks, gate))
+    if fit.plane_known:
+        checks = (*_angle_and_turning(fit, angle), halves)
+        plane = Plane.of(fit, tracks)
+        return Solution(fit, plane, along, (*assumptions, angle) if fit.crossing_held and angle else assumptions,
+                        checks, plane_doubt(plane, gate))
+    if options.roll_prior_deg > 0:
+        plane = Plane.of(fit, tracks, options.roll_prior_deg)
+        return Solution(fit, plane, along, (*assumptions, 'ground plane by one road and a camera that is not rolled: '
+                                            f'roll = 0 +- {options.roll_prior_deg:g} degrees'), (halves,),
+                        plane_doubt(plane, gate))
+    return Solution(fit, Plane.of(fit, tracks), along, assumptions, (halves,), Reason(
+        'one_direction', f'too little traffic across the main road yet: {across}; {int(fit.explained().sum())} '
+        'follow one road, and rotation about it is free',
+        'wait for traffic across the main road, or that turns; or allow joint.roll_prior_deg'))
 
 
 def _angle_and_turning(fit: JointFit, angle: str | None) -> tuple[str, ...]:

@@ -20,6 +20,8 @@ from autocalib_ros.evidence import Evidence
 from autocalib_ros.offline.synthetic_evidence import Junction, pose, synthetic_evidence
 
 OPTIONS = Options(camera_height=8.0)
+ONE_ROAD = Junction(road_angles_deg=(0.0,), turning_share=0.0, vehicles=120,
+                    camera_from_ground=pose(35.0, 1.0, 60.0), centre_m=(6.0, -10.0))
 
 
 def solved(junction: Junction, seed: int = 0, options: Options = OPTIONS,
@@ -142,9 +144,7 @@ def test_a_distortion_free_lens_is_found_when_the_angle_of_the_roads_is_given() 
 
 
 def test_what_one_road_cannot_tell_is_held_and_said() -> None:
-    junction = Junction(road_angles_deg=(0.0,), turning_share=0.0, vehicles=120,
-                        camera_from_ground=pose(35.0, 1.0, 60.0), centre_m=(6.0, -10.0))
-    result = solved(junction)
+    result = solved(ONE_ROAD)
     assert isinstance(result, Calibration)
     assert any('held there: the traffic cannot determine it' in text for text in result.assumptions)
 
@@ -158,12 +158,31 @@ def test_ground_points_are_less_sure_farther_away() -> None:
 
 
 def test_one_road_gives_a_lens_and_says_why_there_is_no_plane() -> None:
-    junction = Junction(road_angles_deg=(0.0,), turning_share=0.0, vehicles=120,
-                        camera_from_ground=pose(35.0, 1.0, 60.0), centre_m=(6.0, -10.0))
-    result = solved(junction)
+    result = solved(ONE_ROAD)
     assert isinstance(result, Calibration)
     assert (result.grade, result.ground) == ('lens', None)
     assert result.ground_refusal is not None and result.ground_refusal.code == 'one_direction'
+
+
+@pytest.mark.parametrize('roll_deg', [-1.5, 0.0, 2.0])
+def test_one_road_and_a_level_camera_give_an_assumed_plane_where_allowed(roll_deg: float) -> None:
+    junction = replace(ONE_ROAD, camera_from_ground=pose(35.0, roll_deg, 60.0))
+    options = replace(OPTIONS, joint=JointOptions(roll_prior_deg=2.0))
+    result = solved(junction, options=options)
+    assert isinstance(result, Calibration)
+    assert result.grade == 'assumed' and result.ground is not None
+    assert any('roll = 0 +- 2 degrees' in text for text in result.assumptions)
+    assert result.stddev.roll_deg == pytest.approx(2.0, rel=0.2)
+    sigma = np.hypot(result.stddev.roll_deg, result.stddev.tilt_deg or 0.0)
+    assert normal_error_deg(result, junction) < 2.0 * sigma
+
+
+def test_a_road_level_across_the_image_gives_no_plane_even_where_a_level_camera_is_assumed() -> None:
+    junction = replace(ONE_ROAD, camera_from_ground=pose(32.0, 0.0, 90.0), centre_m=(16.0, 0.0))
+    result = solved(junction, options=replace(OPTIONS, joint=JointOptions(roll_prior_deg=2.0)))
+    if isinstance(result, Calibration):
+        assert result.ground is None and result.ground_refusal is not None
+        assert result.ground_refusal.code == 'plane_uncertain'
 
 
 def test_traffic_that_only_turns_is_refused() -> None:
