@@ -28,6 +28,11 @@ STEERED_DEG = 5.0
 """Least turn in a window of a vehicle that is said to turn."""
 SLIP_DEG, SLIP_SHARE = 4.0, 0.25
 """A wheeled vehicle turns as its path does, to so many degrees and this share: the rest is a change of curvature."""
+SURE_DEG = 2.0
+"""Largest standard deviation of a window's turn: one that is mostly noise turns and moves as it suits a wrong lens
+(Neyman & Scott 1948). What is sure is told by where its points lie, not by how it seems to turn."""
+WALK_M_S = 2.5
+"""Who is slower may be on foot: no rigid body, and free to turn on the spot."""
 STEERED_S = 1.0
 """What windows of tracks say of a body's turning holds for segments within so long."""
 LOW = 0.02
@@ -99,26 +104,59 @@ class View:
                          self.distances(motion.moved(0.0, DIFFERENCE)) - here], axis=-1) / DIFFERENCE
 
 
-def steered(windows: Windows, motion: Motion, camera: Camera, camera_from_plane: np.ndarray) -> np.ndarray:
+def turn_sigma(view: View, motion: Motion) -> np.ndarray:
+    """Standard deviation of each window's turn in radians, shape (windows,)."""
+    here = view.distances(motion)
+    slopes, weight = view.slopes(motion, here), trust(here)
+    a, b, d = ((weight * slopes[..., i] * slopes[..., j]).sum(axis=1) for i, j in ((0, 0), (0, 1), (1, 1)))
+    return np.sqrt(d / np.maximum(a * d - b * b, 1e-12))
+
+
+def steered(windows: Windows, view: View, motion: Motion, camera: Camera, camera_from_plane: np.ndarray,
+            height_m: float) -> np.ndarray:
     """Which windows show a vehicle that turns, shape (windows,): its body turns, and as much as its path does.
 
     Two vehicles side by side that were taken for one seem to turn when one is faster, on straight paths; only what
     is steered tells anything of the plane. How far the path of a point turns does not depend on its height.
     """
-    first, middle, second = (
-        _on_plane(rays_of(camera, np.nan_to_num(pixels)).bearings @ camera_from_plane)
-        for pixels in (windows.first_px, windows.middle_px, windows.second_px))
+    first, middle, second = paths(windows, camera, camera_from_plane)
     before, after = middle - first, second - middle
     bend = np.arctan2(before[..., 0] * after[..., 1] - before[..., 1] * after[..., 0], (before * after).sum(axis=-1))
     # chords from the first instant to the middle and on to the second differ by half of what the path turns
     path_deg = 2.0 * np.degrees(np.ma.median(np.ma.array(bend, mask=~windows.mask), axis=1).filled(0.0))
     body_deg = np.degrees(np.angle(np.exp(1j * motion.turn_rad)))
-    alike = np.abs(body_deg - path_deg) < SLIP_DEG + SLIP_SHARE * np.abs(path_deg)
-    turning = alike & (np.minimum(np.abs(body_deg), np.abs(path_deg)) > STEERED_DEG) & ~windows.of_segments
+    sigma_deg = np.degrees(turn_sigma(view, motion))
+    alike = np.abs(body_deg - path_deg) < SLIP_DEG + SLIP_SHARE * np.abs(path_deg) + 2.0 * sigma_deg
+    sure = sigma_deg < SURE_DEG
+    way = np.hypot(*np.moveaxis(before, -1, 0)) + np.hypot(*np.moveaxis(after, -1, 0))
+    way_m = height_m * np.ma.median(np.ma.array(way, mask=~windows.mask), axis=1).filled(0.0)
+    driven = way_m > WALK_M_S * np.nan_to_num(windows.seconds)
+    turning = alike & sure & driven & (np.abs(path_deg) > STEERED_DEG) & ~windows.of_segments
     for row in np.flatnonzero(windows.of_segments):
         same = turning & (windows.bodies == windows.bodies[row]) & ~windows.of_segments
-        turning[row] = bool((np.abs(windows.times_s[same] - windows.times_s[row]) < STEERED_S).any())
+        turning[row] = sure[row] and bool((np.abs(windows.times_s[same] - windows.times_s[row]) < STEERED_S).any())
     return turning
+
+
+def paths(windows: Windows, camera: Camera, camera_from_plane: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Where the points of windows are on the plane, at three instants, in heights; shape (windows, points, 2) each."""
+    return tuple(_on_plane(rays_of(camera, np.nan_to_num(pixels)).bearings @ camera_from_plane)
+                 for pixels in (windows.first_px, windows.middle_px, windows.second_px))
+
+
+def turning_centres(windows: Windows, camera: Camera, camera_from_plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Centre (windows, 2) about which each window of tracks turns, in heights, and its distance (windows,)."""
+    seen = windows.subset(np.flatnonzero(~windows.of_segments))
+    share = seen.mask / np.maximum(seen.mask.sum(axis=1, keepdims=True), 1)
+    first, middle, second = ((share[..., None] * places).sum(axis=1)
+                             for places in paths(seen, camera, camera_from_plane))
+    # the centre of the circle through three points
+    a, b = middle - first, second - first
+    across = 2.0 * (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+    across = np.where(np.abs(across) < 1e-9, 1e-9, across)
+    a2, b2 = (a * a).sum(axis=1), (b * b).sum(axis=1)
+    from_first = np.stack([b[:, 1] * a2 - a[:, 1] * b2, a[:, 0] * b2 - b[:, 0] * a2], axis=1) / across[:, None]
+    return first + from_first, np.hypot(*from_first.T)
 
 
 def _on_plane(bearings: np.ndarray) -> np.ndarray:

@@ -18,7 +18,7 @@ from autocalib_ros.estimation.plane import Plane
 from autocalib_ros.estimation.roads import main_direction, with_further_roads, with_real_roads, with_right_angle
 from autocalib_ros.estimation.starts import agreed, in_likeliest_family
 from autocalib_ros.estimation.state import Setting
-from autocalib_ros.estimation.turning import from_turning, over_lives, with_turning
+from autocalib_ros.estimation.turning import from_turning, one_centre_doubt, over_lives, with_turning
 from autocalib_ros.estimation.windows import Instants, Windows, find_windows
 from autocalib_ros.evidence import Evidence
 
@@ -124,7 +124,8 @@ def _completed(fit: JointFit, tracks: TrackSet, across: str, traffic: _Traffic, 
     fit = with_k2_if_asked_for(fit, tracks)
     fit = over_lives(fit, tracks, traffic.windows, traffic.instants)
     fit, held = with_what_can_be_told(fit, tracks)
-    doubt = lens_doubt(fit, tracks, gate, turned=turned)
+    doubt = lens_doubt(fit, tracks, gate, turned=turned) or (
+        one_centre_doubt(fit, traffic.windows) if len(fit.state.angles_rad) < 2 else None)
     if doubt:
         return doubt
     halves = halves_doubt(fit, tracks, gate)

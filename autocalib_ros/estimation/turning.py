@@ -6,10 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from autocalib_ros.calibration import Reason
 from autocalib_ros.estimation.great_circles import TrackSet
 from autocalib_ros.estimation.joint import JointFit, solve_joint
 from autocalib_ros.estimation.lives import find_lives, no_lives
-from autocalib_ros.estimation.planar_motion import View, first_motion, steered
+from autocalib_ros.estimation.path_noise import USUAL_HEIGHT_M
+from autocalib_ros.estimation.planar_motion import View, first_motion, steered, turning_centres
 from autocalib_ros.estimation.rigid_bodies import Bundle
 from autocalib_ros.estimation.starts import most_probable
 from autocalib_ros.estimation.state import Setting, State
@@ -21,6 +23,8 @@ START_TILTS_DEG = (20.0, 45.0)
 """Tilts of the optical axis below the horizontal to start from, without roll."""
 START_WINDOWS = 60
 MOST_WINDOWS, MOST_LIVES = 300, 100
+ONE_CENTRE = 0.5
+"""Vehicles that all turn about one centre show it by half of them lying within this share of their radius of it."""
 MIN_BODIES = 8
 """So many vehicles that turn, distinct, make up evidence; fewer may be one driver's whim or a wrong group each."""
 
@@ -67,11 +71,31 @@ def over_lives(fit: JointFit, tracks: TrackSet, windows: Windows, instants: Inst
     return solve_joint(solved.state, tracks, replace(setting, bundle=steady), refine=True, inner=solved.problem.inner)
 
 
+def one_centre_doubt(fit: JointFit, windows: Windows) -> Reason | None:
+    """Say that all vehicles turn about one point, if so.
+
+    One axis for all motion tells lens and plane so weakly that noise biases them by more than the stated deviations.
+    """
+    chosen = _steered(fit, windows)
+    if chosen is None:
+        return None
+    centres, radii = turning_centres(chosen, fit.state.camera, fit.state.rotation)
+    apart = np.hypot(*(centres - np.median(centres, axis=0)).T)
+    if not len(radii) or np.median(apart) > ONE_CENTRE * np.median(radii):
+        return None
+    return Reason(
+        'one_centre', f'all vehicles turn about one point, as on one ring or bend: half of their centres lie within '
+        f'{np.median(apart) / np.median(radii):.0%} of the radius, {ONE_CENTRE:.0%} is needed',
+        'wait for traffic that turns elsewhere, enters or leaves, or drives straight')
+
+
 def _steered(fit: JointFit, windows: Windows) -> Windows | None:
     """Windows of the vehicles that turn in the plane of a solution, None where they are too few."""
     state = fit.state
-    motion = first_motion(View.of(windows, state.camera, state.rotation, fit.problem.setting.options))
-    chosen = windows.subset(np.flatnonzero(steered(windows, motion, state.camera, state.rotation)))
+    view = View.of(windows, state.camera, state.rotation, fit.problem.setting.options)
+    height_m = fit.problem.setting.height_m or USUAL_HEIGHT_M
+    chosen = windows.subset(np.flatnonzero(
+        steered(windows, view, first_motion(view), state.camera, state.rotation, height_m)))
     return chosen if len(np.unique(chosen.bodies)) >= MIN_BODIES else None
 
 

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
@@ -51,6 +52,8 @@ class Windows:
     """Which windows are of one body, shape (windows,)."""
     times_s: np.ndarray
     """Time of the middle of each window, shape (windows,)."""
+    seconds: np.ndarray
+    """Length of each window, nan for segments, shape (windows,)."""
     tracks: np.ndarray
     """Index in the evidence of each point's track, -1 for segments, shape (windows, SAMPLES)."""
 
@@ -60,7 +63,7 @@ class Windows:
     def subset(self, keep: np.ndarray) -> Windows:
         """Return the windows that `keep`, a mask or indices, selects."""
         return Windows(self.first_px[keep], self.second_px[keep], self.middle_px[keep], self.mask[keep],
-                       self.bodies[keep], self.times_s[keep], self.tracks[keep])
+                       self.bodies[keep], self.times_s[keep], self.seconds[keep], self.tracks[keep])
 
     @property
     def of_segments(self) -> np.ndarray:
@@ -103,10 +106,12 @@ class _Group:
     middle: np.ndarray
     tracks: np.ndarray
     time_s: float
+    seconds: float = np.nan
 
     def subset(self, keep: np.ndarray) -> _Group:
         """Return the points with these indices."""
-        return _Group(self.first[keep], self.second[keep], self.middle[keep], self.tracks[keep], self.time_s)
+        return _Group(self.first[keep], self.second[keep], self.middle[keep], self.tracks[keep], self.time_s,
+                      self.seconds)
 
 
 def _of_tracks(evidence: Evidence, grid: Instants) -> Iterator[_Group]:
@@ -118,7 +123,7 @@ def _of_tracks(evidence: Evidence, grid: Instants) -> Iterator[_Group]:
             for members in _alike(evidence.track_vehicles[seen]):
                 tracks = seen[members]
                 first, middle, second = (grid.at(tracks, begin + step) for step in (0, half, length))
-                yield _Group(first, second, middle, tracks, (begin + half) * INTERVAL_S)
+                yield _Group(first, second, middle, tracks, (begin + half) * INTERVAL_S, length * INTERVAL_S)
 
 
 def _of_segments(evidence: Evidence) -> Iterator[_Group]:
@@ -149,9 +154,9 @@ class Instants:
         for index in np.flatnonzero(self.end >= self.begin):
             part = slice(starts[index], ends[index])
             wanted = np.arange(self.begin[index], self.end[index] + 1) * INTERVAL_S
-            for axis in (0, 1):
-                self._places[self._offset[index]:self._offset[index + 1], axis] = np.interp(
-                    wanted, evidence.times_s[part], evidence.points_px[part, axis])
+            # not along chords: a turning vehicle's lie inside its way by several pixels
+            self._places[self._offset[index]:self._offset[index + 1]] = CubicSpline(
+                evidence.times_s[part], evidence.points_px[part])(wanted)
 
     def at(self, tracks: np.ndarray, instant: int) -> np.ndarray:
         """Positions (n, 2) of tracks (n,) at a multiple of the interval."""
@@ -204,7 +209,8 @@ def _joined(groups: list[_Group], width: int) -> Windows:
             array[row], array[row, :points] = places[0], places
         mask[row, :points], tracks[row, :points] = True, group.tracks
     times = np.array([group.time_s for group in groups])
-    return Windows(first, second, middle, mask, _owners(tracks, times, first[:, 0], NEAR * width), times, tracks)
+    return Windows(first, second, middle, mask, _owners(tracks, times, first[:, 0], NEAR * width), times,
+                   np.array([group.seconds for group in groups]), tracks)
 
 
 def _owners(tracks: np.ndarray, times: np.ndarray, places: np.ndarray, reach: float) -> np.ndarray:

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from autocalib_ros.camera import Camera
 from autocalib_ros.config import BufferOptions
@@ -163,6 +164,6 @@ def _segments(track: Track) -> Iterator[Segments]:
     """Where a point was in consecutive masked frames, as matches between them would give."""
     first, last = np.ceil(track.times_s[0] / SEGMENT_INTERVAL_S), np.floor(track.times_s[-1] / SEGMENT_INTERVAL_S)
     frames = np.arange(first, last + 1) * SEGMENT_INTERVAL_S
-    places = np.column_stack([np.interp(frames, track.times_s, track.points_px[:, axis]) for axis in (0, 1)])
+    places = CubicSpline(track.times_s, track.points_px)(frames)
     for time_s, before, after in zip(frames[1:], places[:-1], places[1:], strict=True):
         yield Segments(float(time_s), np.array([track.vehicle]), np.concatenate([before, after])[None])

@@ -12,7 +12,7 @@ from autocalib_ros.calibration import Calibration, Refusal
 from autocalib_ros.calibrator import solve
 from autocalib_ros.config import Options
 from autocalib_ros.offline.synthetic_evidence import Junction, pose, synthetic_evidence
-from autocalib_ros.offline.synthetic_traffic import drive_arc
+from autocalib_ros.offline.synthetic_traffic import drive_arc, drive_ring, stroll
 
 TURNING = Junction(drive=partial(drive_arc, radii_m=(12.0, 60.0)), vehicles=40, points_per_vehicle=8)
 
@@ -62,3 +62,15 @@ def test_turning_traffic_completes_a_single_road() -> None:
     result = solved(junction)
     assert isinstance(result, Calibration)
     assert normal_error_deg(result, junction) < 1.5
+
+
+def test_a_ring_alone_is_refused_because_all_turn_about_one_centre() -> None:
+    junction = replace(TURNING, drive=partial(drive_ring, radius_m=20.0))
+    result = solved(junction)
+    assert isinstance(result, Refusal)
+    assert result.code in ('one_centre', 'turning_traffic')
+
+
+def test_people_on_foot_are_no_rigid_bodies() -> None:
+    result = solved(Junction(drive=stroll, vehicles=60, points_per_vehicle=8))
+    assert isinstance(result, Refusal)
