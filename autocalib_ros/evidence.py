@@ -161,6 +161,8 @@ def _require_consistent(evidence: Evidence) -> None:
     starts = evidence.track_starts
     if starts[0] != 0 or starts[-1] != points or (np.diff(starts) < 1).any():
         raise ValueError('track_starts does not divide points_px into tracks')
+    if (np.delete(np.diff(evidence.times_s), starts[1:-1] - 1) <= 0).any():
+        raise ValueError('times_s does not increase along each track')
     if min(evidence.image_size) < 1 or evidence.newest_stamp_ns < evidence.first_stamp_ns or evidence.frames < 0:
         raise ValueError(f'an image size of {evidence.image_size}, {evidence.frames} frames in {evidence.seconds} s')
     if not evidence.drift_px >= 0:

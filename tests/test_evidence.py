@@ -109,6 +109,7 @@ def test_a_damaged_byte_is_an_input_error_or_does_no_harm(tmp_path: Path, positi
     ({'track_vehicles': np.zeros(3, int)}, 'track_starts of int64'),
     ({'track_starts': np.array([0, 11])}, 'does not divide'),
     ({'track_starts': np.array([-1, 10])}, 'does not divide'),
+    ({'times_s': np.full(10, 4.0)}, 'times_s does not increase'),
     ({'track_starts': np.array([0.0, 10.0])}, 'track_starts of float64'),
     ({'segments_px': np.zeros((0, 3))}, 'segments_px of float64'),
     ({'segment_times_s': np.zeros(2)}, 'segment_times_s of float64'),

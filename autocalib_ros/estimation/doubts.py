@@ -8,11 +8,11 @@ import numpy as np
 
 from autocalib_ros.calibration import Reason
 from autocalib_ros.config import GateOptions
-from autocalib_ros.estimation.great_circles import TrackSet, rays_of
-from autocalib_ros.estimation.ground_plane import BELOW_HORIZON, tilt_and_roll_deg, upward
+from autocalib_ros.estimation.great_circles import TrackSet
+from autocalib_ros.estimation.ground_plane import BELOW_HORIZON, tilt_and_roll_deg
 from autocalib_ros.estimation.joint import MIN_ROWS, JointFit, road_support, solve_joint
 from autocalib_ros.estimation.lives import no_lives
-from autocalib_ros.estimation.plane import Plane
+from autocalib_ros.estimation.plane import Plane, above_traffic
 from autocalib_ros.estimation.state import State
 from autocalib_ros.estimation.uncertainty import told_by_evidence
 
@@ -50,12 +50,6 @@ def crossing_deg(state: State) -> float:
     return float(np.degrees(np.arccos(np.clip(abs(np.cos(state.angles_rad[1])), 0.0, 1.0))))
 
 
-def normal_of(state: State, tracks: TrackSet) -> tuple[np.ndarray, float]:
-    """Upward ground normal (3,) in the camera frame, and the share of tracked points below the horizon."""
-    seen = tracks.pixels[tracks.weights > 0]
-    return upward(state.rotation[:, 2], rays_of(state.camera, seen).bearings)
-
-
 def traffic_doubt(fit: JointFit, contrast: float, tracks: TrackSet) -> Reason | None:
     """Say why the straight traffic that a solution started from tells nothing, if so.
 
@@ -83,7 +77,7 @@ def lens_doubt(fit: JointFit, tracks: TrackSet, gate: GateOptions, *, turned: bo
 
 
 def _horizon_doubt(fit: JointFit, tracks: TrackSet) -> Reason | None:
-    _, below = normal_of(fit.state, tracks)
+    _, below = above_traffic(fit.state.rotation[:, 2], fit.state.camera, tracks)
     if not fit.plane_known or below >= BELOW_HORIZON:
         return None
     return Reason(
@@ -93,7 +87,7 @@ def _horizon_doubt(fit: JointFit, tracks: TrackSet) -> Reason | None:
 
 def motion_tells(fit: JointFit) -> bool:
     """Whether the motion of vehicles that turn tells the focal length by itself."""
-    if not fit.problem.setting.turning or fit.problem.setting.prior.free[0] != 0:
+    if not fit.problem.setting.turning or 0 not in fit.problem.setting.prior.free:
         return False
     _, known = fit.problem.steps.prior_gradient(fit.state.camera)
     return bool(told_by_evidence(fit.turning_information, known)[0] < MOTION_TELLS)

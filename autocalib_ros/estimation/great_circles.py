@@ -56,15 +56,20 @@ class TrackSet:
     @property
     def share_of_vehicle(self) -> np.ndarray:
         """One over the number of tracks of the same vehicle, shape (tracks,)."""
-        return 1.0 / self._of_same_vehicle()
+        return independence(self.vehicles, 1.0)
 
     def independence(self, correlation: float) -> np.ndarray:
-        """Weight (tracks,) of tracks whose errors correlate so much, 0 to 1, within a vehicle: Kish's design effect."""
-        return 1.0 / (1.0 + (self._of_same_vehicle() - 1.0) * correlation)
+        """Weight (tracks,) of tracks whose errors correlate so much, 0 to 1, within a vehicle."""
+        return independence(self.vehicles, correlation)
 
-    def _of_same_vehicle(self) -> np.ndarray:
-        _, inverse, counts = np.unique(self.vehicles, return_inverse=True, return_counts=True)
-        return counts[inverse].astype(float)
+
+def independence(owners: np.ndarray, correlation: float) -> np.ndarray:
+    """Weight (n,) of what belongs to owners (n,) and whose errors correlate so much, 0 to 1, within one.
+
+    Kish's design effect; with a correlation of 1 all of an owner's together count as one.
+    """
+    _, inverse, counts = np.unique(owners, return_inverse=True, return_counts=True)
+    return 1.0 / (1.0 + (counts[inverse] - 1.0) * correlation)
 
 
 def select_tracks(evidence: Evidence, limit: int) -> TrackSet:
@@ -96,11 +101,11 @@ def _spread(evidence: Evidence, candidates: np.ndarray, way: np.ndarray) -> np.n
     middle = evidence.points_px[(starts[candidates] + starts[candidates + 1]) // 2]
     column, row = np.floor(middle / evidence.image_size * CELLS).astype(int).T
     heading = np.arctan2(way[:, 1], way[:, 0]) // (np.pi / 4)
-    rank = _earlier_ones(column, row, heading) + 4 * _earlier_ones(vehicles, column + CELLS[0] * row)
+    rank = earlier_ones(column, row, heading) + 4 * earlier_ones(vehicles, column + CELLS[0] * row)
     return np.argsort(rank, kind='stable')
 
 
-def _earlier_ones(*keys: np.ndarray) -> np.ndarray:
+def earlier_ones(*keys: np.ndarray) -> np.ndarray:
     """Count for each element how many before it have the same keys (n,)."""
     _, group, counts = np.unique(np.column_stack(keys), axis=0, return_inverse=True, return_counts=True)
     earlier = np.empty(len(group), int)

@@ -48,7 +48,7 @@ OUTLIER_PX = 4.0
 NEAREST_HORIZON = 0.03
 """Least angle below the horizon at which a point is placed on the road, radians."""
 EXPLAINED = 3.0
-"""A track or a window is explained when its mean squared whitened distance is below so many medians."""
+"""A track is explained when its mean squared whitened distance is below so many medians."""
 DISCRIMINATION = 5.0
 """A track tells two roads apart when it is so many times farther from the one than from the other."""
 

@@ -6,8 +6,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from autocalib_ros.estimation.great_circles import SAMPLES
-from autocalib_ros.estimation.windows import INTERVAL_S, MIN_POINTS, Instants, Windows, scattered
+from autocalib_ros.estimation.great_circles import SAMPLES, independence
+from autocalib_ros.estimation.windows import (
+    INTERVAL_S,
+    MIN_POINTS,
+    Instants,
+    Windows,
+    in_turn,
+    members_of,
+    scattered,
+)
 
 INSTANTS = 9
 """Most instants of a life: as long as a turn at a junction takes; a longer one goes on as another."""
@@ -39,9 +47,8 @@ class Lives:
 
     @property
     def share_of_body(self) -> np.ndarray:
-        """Weight of each life among those of the same body, shape (lives,): Kish's design effect."""
-        _, inverse, counts = np.unique(self.bodies, return_inverse=True, return_counts=True)
-        return 1.0 / (1.0 + (counts[inverse] - 1.0) * CORRELATION)
+        """Weight of each life among those of the same body, shape (lives,)."""
+        return independence(self.bodies, CORRELATION)
 
 
 def no_lives() -> Lives:
@@ -54,10 +61,7 @@ def find_lives(windows: Windows, instants: Instants, limit: int) -> Lives:
     """Follow the bodies of windows of tracks from instant to instant; at most `limit` lives, bodies in turn."""
     of_tracks = np.flatnonzero(~windows.of_segments)
     found: list[tuple[int, np.ndarray, np.ndarray, float]] = []
-    order = of_tracks[np.argsort(windows.bodies[of_tracks], kind='stable')]
-    for members in np.split(order, np.flatnonzero(np.diff(windows.bodies[order])) + 1):
-        if not len(members):
-            continue
+    for members in (of_tracks[part] for part in members_of(windows.bodies[of_tracks])):
         tracks = np.unique(windows.tracks[members][windows.tracks[members] >= 0])
         middles = np.round(windows.times_s[members] / INTERVAL_S).astype(int)
         for begin in range(middles.min() - 1, middles.max() + 1, INSTANTS - 1):
@@ -68,7 +72,8 @@ def find_lives(windows: Windows, instants: Instants, limit: int) -> Lives:
         return no_lives()
     bodies, pixels, mask, times = (np.array(column) for column in zip(*found, strict=True))
     lives = Lives(pixels, mask, bodies, times)
-    return lives.subset(_in_turn(lives)[:limit])
+    fullest_first = np.argsort(-mask.sum(axis=(1, 2)), kind='stable')
+    return lives.subset(in_turn(bodies, fullest_first)[:limit])
 
 
 def _life(tracks: np.ndarray, when: np.ndarray, instants: Instants) -> tuple[np.ndarray, np.ndarray] | None:
@@ -94,10 +99,3 @@ def _life(tracks: np.ndarray, when: np.ndarray, instants: Instants) -> tuple[np.
         pixels[points, place] = instants.at(tracks[chosen[points]], int(when[place]))
         mask[points, place] = True
     return pixels, mask
-
-
-def _in_turn(lives: Lives) -> np.ndarray:
-    """Indices of the lives, those of each body from the fullest on, bodies in turn."""
-    order = np.lexsort((-lives.mask.sum(axis=(1, 2)), lives.bodies))
-    starts = np.searchsorted(lives.bodies[order], lives.bodies[order])
-    return order[np.argsort(np.arange(len(order)) - starts, kind='stable')]

@@ -107,9 +107,13 @@ class View:
 def turn_sigma(view: View, motion: Motion) -> np.ndarray:
     """Standard deviation of each window's turn in radians, shape (windows,)."""
     here = view.distances(motion)
-    slopes, weight = view.slopes(motion, here), trust(here)
-    a, b, d = ((weight * slopes[..., i] * slopes[..., j]).sum(axis=1) for i, j in ((0, 0), (0, 1), (1, 1)))
+    a, b, d = _curvature(view.slopes(motion, here), trust(here))
     return np.sqrt(d / np.maximum(a * d - b * b, 1e-12))
+
+
+def _curvature(slopes: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, ...]:
+    """The three entries (windows,) of the weighted J^T J of slopes (windows, points, 2), weights (windows, points)."""
+    return tuple((weight * slopes[..., i] * slopes[..., j]).sum(axis=1) for i, j in ((0, 0), (0, 1), (1, 1)))
 
 
 def steered(windows: Windows, view: View, motion: Motion, camera: Camera, camera_from_plane: np.ndarray,
@@ -205,7 +209,7 @@ def settled(view: View, motion: Motion, rounds: int = SETTLING) -> Motion:
     cost = point_cost(here)
     for _ in range(rounds):
         slopes, weight = view.slopes(motion, here), trust(here)
-        a, b, d = ((weight * slopes[..., i] * slopes[..., j]).sum(axis=1) for i, j in ((0, 0), (0, 1), (1, 1)))
+        a, b, d = _curvature(slopes, weight)
         p, q = ((weight * slopes[..., i] * here).sum(axis=1) for i in (0, 1))
         lift = damping * (a + d) + 1e-9
         a, d = a + lift, d + lift

@@ -16,6 +16,11 @@ from autocalib_ros.estimation.state import ALONG_X, State
 STEP_RAD = 1e-5
 
 
+def above_traffic(normal: np.ndarray, camera: Camera, tracks: TrackSet) -> tuple[np.ndarray, float]:
+    """Turn a plane normal (3,) away from the traffic; and the share of the tracked points below the horizon."""
+    return upward(normal, rays_of(camera, tracks.pixels[tracks.weights > 0]).bearings)
+
+
 @dataclass(frozen=True)
 class Plane:
     """The upward ground normal as a function of a state, and how sure it is."""
@@ -30,9 +35,9 @@ class Plane:
     def of(cls, fit: JointFit, tracks: TrackSet, roll_sigma_deg: float | None = None) -> Plane:
         """Return the plane of a solution, the side of the traffic below."""
         plane = cls(fit, 1.0, roll_sigma_deg)
-        seen = tracks.pixels[tracks.weights > 0]
-        normal, _ = upward(plane.normal(fit.state), rays_of(fit.state.camera, seen).bearings)
-        return cls(fit, float(np.sign(plane.normal(fit.state) @ normal)), roll_sigma_deg)
+        normal = plane.normal(fit.state)
+        up, _ = above_traffic(normal, fit.state.camera, tracks)
+        return cls(fit, float(np.sign(normal @ up)), roll_sigma_deg)
 
     def normal(self, state: State, roll_rad: float = 0.0) -> np.ndarray:
         """Upward normal (3,) in the camera frame at a state; `roll_rad` counts where the roll is assumed."""

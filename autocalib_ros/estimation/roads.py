@@ -68,14 +68,19 @@ def _further_angle(fit: JointFit, tracks: TrackSet) -> float | None:
     rays = rays_of(fit.state.camera, tracks.pixels)
     normals, own, _ = fit_circles(rays, tracks.weights)
     left = (fit.labels < 0) & (own < 1.0)
-    along = np.cross(normals[left], fit.state.rotation[:, 2]) @ fit.state.rotation
-    angles = np.arctan2(along[:, 1], along[:, 0])
+    angles = _angles_in_plane(fit.state, normals[left])
     turned = np.abs(np.sin(angles[:, None] - fit.state.angles_rad)).min(axis=1, initial=1.0)
     away = turned > np.sin(np.radians(APART_DEG))
     angles, vehicles = angles[away], tracks.vehicles[left][away]
     agree = np.abs(np.sin(angles[:, None] - angles)) < np.sin(np.radians(ON_ROAD_DEG))
     counts = np.array([len(np.unique(vehicles[row])) for row in agree])
     return float(angles[np.argmax(counts)]) if counts.max(initial=0) > 1 else None
+
+
+def _angles_in_plane(state: State, normals: np.ndarray) -> np.ndarray:
+    """Angle (n,), in the frame of the plane, of the ways on it whose great circles have these normals (n, 3)."""
+    along = np.cross(normals, state.rotation[:, 2]) @ state.rotation
+    return np.arctan2(along[:, 1], along[:, 0])
 
 
 def with_right_angle(fit: JointFit, tracks: TrackSet, options: JointOptions) -> tuple[JointFit, str | None]:
@@ -100,8 +105,7 @@ def main_direction(fit: JointFit, tracks: TrackSet, support: list[np.ndarray]) -
         return fit.state.directions[busiest]
     rays = rays_of(fit.state.camera, tracks.pixels)
     normals, _, _ = fit_circles(rays, tracks.weights)
-    along = np.cross(normals, fit.state.rotation[:, 2]) @ fit.state.rotation
     # headings to and fro are one: doubled angles make them so
-    twice = np.exp(2j * np.arctan2(along[:, 1], along[:, 0])) * tracks.share_of_vehicle
+    twice = np.exp(2j * _angles_in_plane(fit.state, normals)) * tracks.share_of_vehicle
     angle = 0.5 * np.angle(twice.sum())
     return fit.state.rotation @ np.array([np.cos(angle), np.sin(angle), 0.0])

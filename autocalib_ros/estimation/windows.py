@@ -14,7 +14,7 @@ from scipy.interpolate import CubicSpline
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from autocalib_ros.estimation.great_circles import SAMPLES
+from autocalib_ros.estimation.great_circles import SAMPLES, earlier_ones, independence
 from autocalib_ros.evidence import Evidence
 
 INTERVAL_S = 0.4
@@ -73,16 +73,20 @@ class Windows:
     @property
     def share_of_body(self) -> np.ndarray:
         """One over the number of windows of the same body, shape (windows,)."""
-        _, inverse, counts = np.unique(self.bodies, return_inverse=True, return_counts=True)
-        return 1.0 / counts[inverse]
+        return independence(self.bodies, 1.0)
 
     def spread(self, limit: int) -> Windows:
         """Return at most `limit` windows, bodies in turn, those of most points and farthest motion first."""
         way = np.hypot(*np.moveaxis(self.second_px - self.first_px, -1, 0)).mean(axis=1)
-        order = np.lexsort((-way, -self.mask.sum(axis=1)))
-        rank = np.empty(len(self), int)
-        rank[order] = _rank_within(self.bodies[order])
-        return self.subset(np.sort(np.lexsort((np.arange(len(self)), rank))[:limit]))
+        best_first = np.lexsort((-way, -self.mask.sum(axis=1)))
+        return self.subset(np.sort(in_turn(self.bodies, best_first)[:limit]))
+
+
+def in_turn(owners: np.ndarray, best_first: np.ndarray) -> np.ndarray:
+    """Order (n,) in which owners (n,) take turns, each with its best first; `best_first` is the order of merit (n,)."""
+    rank = np.empty(len(owners), int)
+    rank[best_first] = earlier_ones(owners[best_first])
+    return np.argsort(rank, kind='stable')
 
 
 def no_windows() -> Windows:
@@ -120,7 +124,7 @@ def _of_tracks(evidence: Evidence, grid: Instants) -> Iterator[_Group]:
         half = length // 2
         for begin in range(grid.begin.min(initial=0), grid.end.max(initial=0) - length + 1, half):
             seen = np.flatnonzero((grid.begin <= begin) & (grid.end >= begin + length))
-            for members in _alike(evidence.track_vehicles[seen]):
+            for members in members_of(evidence.track_vehicles[seen], MIN_POINTS):
                 tracks = seen[members]
                 first, middle, second = (grid.at(tracks, begin + step) for step in (0, half, length))
                 yield _Group(first, second, middle, tracks, (begin + half) * INTERVAL_S, length * INTERVAL_S)
@@ -129,17 +133,18 @@ def _of_tracks(evidence: Evidence, grid: Instants) -> Iterator[_Group]:
 def _of_segments(evidence: Evidence) -> Iterator[_Group]:
     """Segments of one vehicle between the same two masked frames."""
     _, instant = np.unique(evidence.segment_times_s, return_inverse=True)
-    for members in _alike(instant.ravel() * (evidence.segment_vehicles.max(initial=0) + 1) + evidence.segment_vehicles):
+    labels = instant.ravel() * (evidence.segment_vehicles.max(initial=0) + 1) + evidence.segment_vehicles
+    for members in members_of(labels, MIN_POINTS):
         first, second = evidence.segments_px[members, :2], evidence.segments_px[members, 2:]
         yield _Group(first, second, np.full(first.shape, np.nan), np.full(len(members), -1),
                      float(evidence.segment_times_s[members[0]]))
 
 
-def _alike(labels: np.ndarray) -> list[np.ndarray]:
-    """Indices of the members of each label that has enough of them."""
+def members_of(labels: np.ndarray, least: int = 1) -> list[np.ndarray]:
+    """Indices of the members of each label (n,) that has at least so many, by rising label."""
     order = np.argsort(labels, kind='stable')
     parts = np.split(order, np.flatnonzero(np.diff(labels[order])) + 1)
-    return [part for part in parts if len(part) >= MIN_POINTS]
+    return [part for part in parts if len(part) >= least]
 
 
 class Instants:
@@ -148,7 +153,8 @@ class Instants:
     def __init__(self, evidence: Evidence) -> None:
         starts, ends = evidence.track_starts[:-1], evidence.track_starts[1:]
         self.begin = np.ceil(evidence.times_s[starts] / INTERVAL_S - 1e-9).astype(int)
-        self.end = np.floor(evidence.times_s[ends - 1] / INTERVAL_S + 1e-9).astype(int)
+        last = np.floor(evidence.times_s[ends - 1] / INTERVAL_S + 1e-9).astype(int)
+        self.end = np.where(ends - starts > 1, last, self.begin - 1)  # a single point is no way
         self._offset = np.concatenate([[0], np.cumsum(np.maximum(self.end - self.begin + 1, 0))])
         self._places = np.zeros((self._offset[-1], 2))
         for index in np.flatnonzero(self.end >= self.begin):
@@ -179,7 +185,7 @@ def _bodies(groups: list[_Group], width: int) -> list[_Group]:
     _, labels = connected_components(graph, directed=False)
     starts = np.cumsum([0, *(len(group.tracks) for group in groups)])
     return [group.subset(scattered(body, group.first)) for number, group in enumerate(groups)
-            for body in _alike(labels[starts[number]:starts[number + 1]])]
+            for body in members_of(labels[starts[number]:starts[number + 1]], MIN_POINTS)]
 
 
 def _apart(places: np.ndarray) -> np.ndarray:
@@ -229,13 +235,3 @@ def _owners(tracks: np.ndarray, times: np.ndarray, places: np.ndarray, reach: fl
         if distance.min(initial=np.inf) < reach:
             labels[row] = labels[near[np.argmin(distance)]]
     return labels
-
-
-def _rank_within(labels: np.ndarray) -> np.ndarray:
-    """Count, for each label (n,), how often it came before."""
-    order = np.argsort(labels, kind='stable')
-    starts = np.flatnonzero(np.diff(labels[order], prepend=labels[order][:1] - 1))
-    lengths = np.diff(np.append(starts, len(labels)))
-    rank = np.empty(len(labels), int)
-    rank[order] = np.arange(len(labels)) - np.repeat(starts, lengths)
-    return rank

@@ -74,3 +74,9 @@ def test_a_ring_alone_is_refused_because_all_turn_about_one_centre() -> None:
 def test_people_on_foot_are_no_rigid_bodies() -> None:
     result = solved(Junction(drive=stroll, vehicles=60, points_per_vehicle=8))
     assert isinstance(result, Refusal)
+
+
+def test_a_known_lens_and_turning_traffic_give_a_calibration_or_a_reason() -> None:
+    evidence = synthetic_evidence(TURNING, np.random.default_rng(2))
+    result = solve(evidence, Options(camera_height=8.0), lens=TURNING.camera)
+    assert isinstance(result, Refusal) or result.camera == TURNING.camera

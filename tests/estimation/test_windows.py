@@ -91,3 +91,9 @@ def test_a_selection_takes_the_bodies_in_turn() -> None:
     assert len(np.unique(few.bodies)) == 6
     assert len(windows.spread(10_000)) == len(windows)
     assert np.isclose(windows.share_of_body.sum(), 6.0)
+
+
+def test_a_track_of_one_point_is_no_body() -> None:
+    lone = [Track(1, np.array([0.8]), np.array([[100.0, 300.0]]))]
+    assert len(find_windows(evidence_of(lone))) == 0
+    assert len(find_windows(evidence_of(driving((100, 300), (120, 0), 1) + lone))) == 4 + 1
