@@ -13,8 +13,9 @@ from autocalib_ros.errors import InputError
 from autocalib_ros.estimation.evidence_gate import shortfall
 from autocalib_ros.estimation.great_circles import TrackSet, select_tracks
 from autocalib_ros.estimation.ground_plane import ground_plane, ground_points, pixels_ahead, tilt_and_roll_deg
-from autocalib_ros.estimation.paper import scale, solve_paper
+from autocalib_ros.estimation.paper import solve_paper
 from autocalib_ros.estimation.plane import Plane
+from autocalib_ros.estimation.scale import Scale, is_unusual, known_scale, scale_doubt
 from autocalib_ros.estimation.solution import Solution, find_solution
 from autocalib_ros.estimation.straightness import paper_intrinsics
 from autocalib_ros.estimation.vanishing_points import segment_orientations
@@ -45,11 +46,12 @@ class AutoCalibrator:
 
         An image whose stamp repeats or steps back by less than `REORDERED_NS` is late and left out; a stamp that
         steps back further (a clock that was set, a recording that begins again) or a new image size starts the
-        evidence anew.
+        evidence anew. UsageError where a pixel of scale.distance_px lies outside the image.
         """
         if image.dtype != np.uint8 or image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
             raise InputError(f'an image is grey (H, W) or BGR (H, W, 3) in 8 bits, got {image.dtype} {image.shape}')
         size = (image.shape[1], image.shape[0])
+        self._options.scale.require_inside(*size)
         if self._observer is None or size != self._size or stamp_ns <= self._newest_stamp_ns - REORDERED_NS:
             self._begin(stamp_ns, size)
         elif stamp_ns <= self._newest_stamp_ns:
@@ -118,7 +120,9 @@ def solve(evidence: Evidence, options: Options, *, lens: Camera | None = None) -
     """Estimate lens and ground plane from a snapshot; a pure function of its arguments.
 
     With a known `lens`, of the size of the images, only the pose is solved; the published method knows no such thing.
+    UsageError where a pixel of scale.distance_px lies outside the image.
     """
+    options.scale.require_inside(*evidence.image_size)
     intrinsics = paper_intrinsics(evidence, options.paper)
     figures = Figures(
         track_labels=np.full(evidence.track_count, -1),
@@ -135,8 +139,7 @@ def solve(evidence: Evidence, options: Options, *, lens: Camera | None = None) -
         published = solve_paper(evidence, options, intrinsics, figures)
         return refused(published) if isinstance(published, Reason) else published
     tracks = select_tracks(evidence, options.joint.max_tracks)
-    solution = find_solution(evidence, tracks, options.joint, options.gate,
-                             np.random.default_rng(options.random_seed), height_m=options.camera_height, lens=lens)
+    solution = _solution(evidence, tracks, options, lens)
     if isinstance(solution, Reason):
         return refused(solution)
     figures = _figures(figures, solution, tracks, evidence, options)
@@ -146,6 +149,25 @@ def solve(evidence: Evidence, options: Options, *, lens: Camera | None = None) -
         camera=solution.fit.state.camera, ground=None, ground_refusal=solution.no_plane,
         road_directions=solution.fit.state.directions, stddev=_lens_deviations(solution), paper=paper,
         evidence=evidence.summary(), newest_stamp_ns=evidence.newest_stamp_ns, figures=figures))
+
+
+def _solution(evidence: Evidence, tracks: TrackSet, options: Options, lens: Camera | None) -> Solution | Reason:
+    """Solve; where the height follows from the solution and is unlike the usual one, solve with it once more."""
+    def with_height(height_m: float) -> Solution | Reason:
+        return find_solution(evidence, tracks, options.joint, options.gate, np.random.default_rng(options.random_seed),
+                             height_m=height_m, lens=lens)
+
+    solution = with_height(options.camera_height)
+    if options.scale_from == 'height' or isinstance(solution, Reason) or solution.no_plane:
+        return solution
+    scale = _scale(options, solution)
+    if isinstance(scale, Reason) or not is_unusual(scale.height(*solution.plane.here)):
+        return solution
+    return with_height(scale.height(*solution.plane.here))
+
+
+def _scale(options: Options, solution: Solution) -> Scale | Reason:
+    return known_scale(options, *solution.plane.here, solution.flow)
 
 
 def _figures(figures: Figures, solution: Solution, tracks: TrackSet, evidence: Evidence, options: Options) -> Figures:
@@ -164,27 +186,44 @@ def _lens_deviations(solution: Solution) -> StandardDeviations:
                               k2=float(k2))
 
 
-def _ground_deviations(plane: Plane, height: float) -> tuple[float | None, ...]:
+def _height_deviation(plane: Plane, scale: Scale) -> float:
+    """Standard deviation of the height: of what is given, and of the lens and plane by which it follows."""
+    told = plane.sigma(lambda camera, normal: np.array([scale.height(camera, normal)]))
+    return float(np.hypot(told[0], scale.sigma))
+
+
+def _ground_deviations(plane: Plane, scale: Scale) -> tuple[float | None, ...]:
     """Standard deviation in metres of road points ahead, None where they are not in the image."""
-    state = plane.fit.state
-    pixels = pixels_ahead(state.camera, plane.normal(state), height, np.array(GROUND_DISTANCES_M))
+    camera, normal = plane.here
+    height = scale.height(camera, normal)
+    pixels = pixels_ahead(camera, normal, height, np.array(GROUND_DISTANCES_M))
     seen = np.isfinite(pixels).all(axis=1)
-    spread = plane.sigma(lambda camera, normal: ground_points(camera, normal, height, pixels[seen]).ravel()
-                         ) if seen.any() else np.zeros(0)
+    if not seen.any():
+        return (None,) * len(seen)
+
+    def points(lens: Camera, up: np.ndarray) -> np.ndarray:
+        return ground_points(lens, up, scale.height(lens, up), pixels[seen]).ravel()
+
+    spread = np.hypot(plane.sigma(points), scale.sigma / height * points(camera, normal))
     sigmas = iter(np.hypot(*spread.reshape(-1, 2).T))
     return tuple(float(next(sigmas)) if here else None for here in seen)
 
 
 def _calibration(options: Options, solution: Solution, lens: Calibration) -> Calibration:
-    """Add the ground plane to a lens where the traffic and the height give one."""
-    height, metric, grade, no_height = scale(options)
-    reason = solution.no_plane or no_height
-    if reason:
-        return replace(lens, ground_refusal=reason)
-    plane = solution.plane
-    ground = ground_plane(plane.normal(plane.fit.state), solution.along, height, metric=metric)
+    """Add the ground plane to a lens where the traffic and what tells the scale give one."""
+    plane, scale = solution.plane, solution.no_plane or _scale(options, solution)
+    if isinstance(scale, Reason):
+        return replace(lens, ground_refusal=scale)
+    height, height_sigma = scale.height(*plane.here), _height_deviation(plane, scale)
+    doubt = scale_doubt(height, height_sigma, options.gate)
+    if doubt:
+        return replace(lens, ground_refusal=doubt)
+    normal = plane.normal(plane.fit.state)
     tilt, roll = plane.sigma(lambda _, normal: tilt_and_roll_deg(normal))
-    grade = 'assumed' if plane.roll_sigma_deg is not None and metric else grade
-    return replace(lens, grade=grade, ground=ground, stddev=replace(
-        lens.stddev, tilt_deg=float(tilt), roll_deg=float(roll),
-        ground_point_m=_ground_deviations(plane, height) if metric else ()))
+    grade = 'unit_scale' if not scale.metric else 'full' if plane.roll_sigma_deg is None else 'assumed'
+    return replace(
+        lens, grade=grade, ground=ground_plane(normal, solution.along, height, metric=scale.metric),
+        assumptions=(*lens.assumptions, *scale.assumption(height, height_sigma)),
+        stddev=replace(lens.stddev, tilt_deg=float(tilt), roll_deg=float(roll),
+                       height_m=height_sigma if scale.metric and height_sigma > 0 else None,
+                       ground_point_m=_ground_deviations(plane, scale) if scale.metric else ()))

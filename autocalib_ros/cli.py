@@ -151,8 +151,14 @@ def _add_evidence(parser: argparse.ArgumentParser) -> None:
 
 def _add_solving(parser: argparse.ArgumentParser) -> None:
     """Add what is told to the solution, whatever it is fed from."""
-    parser.add_argument('--camera-height', type=float, metavar='H',
-                        help='height of the camera above the road in metres; without it only the lens is calibrated')
+    scale = parser.add_mutually_exclusive_group()
+    scale.add_argument('--camera-height', type=float, metavar='H',
+                       help='height of the camera above the road in metres; without any scale only the lens is '
+                            'calibrated')
+    scale.add_argument('--scale-distance', type=float, nargs=5, metavar=('U1', 'V1', 'U2', 'V2', 'METRES'),
+                       help='instead: two pixels on the road, and the metres between them')
+    scale.add_argument('--scale-speed', type=float, metavar='KM_H',
+                       help='instead: the mean speed of the traffic that flows on the busiest road')
     parser.add_argument('--camera-info', type=Path, metavar='FILE',
                         help='file of camera_info_manager with the known lens: only the pose is solved')
     parser.add_argument('--params-file', type=Path, metavar='F', help='ROS 2 parameter file with options')
@@ -187,13 +193,25 @@ def _options(arguments: argparse.Namespace) -> Options:
 
     values: dict[str, Any] = read_params_file(arguments.params_file) if arguments.params_file else {}
     values.update(parse_assignments(arguments.param))
-    if arguments.camera_height is not None:
-        values['camera_height'] = arguments.camera_height
+    values.update(_scale_values(arguments))
     if arguments.method is not None:
         values['method'] = arguments.method
     if arguments.allow_unit_scale:
         values['allow_unit_scale'] = True
     return options_with(Options(), values)
+
+
+def _scale_values(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return the options of the one source of the scale that the command line names, if any."""
+    if arguments.camera_height is not None:
+        return {'camera_height': arguments.camera_height}
+    if arguments.scale_distance is not None:
+        *pixels, metres = arguments.scale_distance
+        return {'scale_from': 'distance', 'scale.distance_px': ' '.join(f'{value:g}' for value in pixels),
+                'scale.distance_m': metres}
+    if arguments.scale_speed is not None:
+        return {'scale_from': 'speed', 'scale.speed_km_h': arguments.scale_speed}
+    return {}
 
 
 def _lens(arguments: argparse.Namespace) -> Camera | None:
@@ -264,10 +282,11 @@ def _replay_and_tell(source: Source, options: Options, out: Path, *, lens: Camer
 
 
 def _tell_missing_height(options: Options, lens: Camera | None) -> None:
-    if options.camera_height == 0:
+    if options.scale_from == 'height' and options.camera_height == 0:
         scale = 'is given in units of that height' if options.allow_unit_scale else 'is left out'
         calibrated = 'the lens is calibrated' if lens is None else 'the lens is known'
-        _tell(f'No camera height given: {calibrated}, the ground plane {scale} (see --camera-height).')
+        _tell(f'No camera height given: {calibrated}, the ground plane {scale} (see --camera-height, --scale-distance'
+              ' and --scale-speed).')
 
 
 def _tell_refusal(replayed: ReplayResult) -> None:

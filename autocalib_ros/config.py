@@ -7,6 +7,7 @@ its path, `tracking.max_points` say; an unknown name is an error.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from difflib import get_close_matches
@@ -136,6 +137,54 @@ class JointOptions(_Checked):
         return angle if 10.0 <= angle <= 170.0 else None
 
 
+PIXEL_SIGMAS_APART = 10.0
+"""Pixels that bound a known length are at least so many of their standard deviations apart."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScaleOptions(_Checked):
+    """What tells the scale of the ground plane when scale_from is not height."""
+
+    distance_px: str = option('', 'two pixels of the full image on the road a known distance apart, as text: '
+                              "'u1 v1 u2 v2'")
+    distance_m: float = option(0.0, 'metres between them, straight over the road; 0 is unknown', low=0, high=1000)
+    distance_sigma_m: float = option(0.05, 'standard deviation of distance_m', low=0, high=100)
+    pixel_sigma_px: float = option(1.0, 'standard deviation of each coordinate of distance_px', low=0, high=100)
+    speed_km_h: float = option(0.0, 'mean speed of the traffic that flows on the busiest road, as a loop or a radar '
+                               'counts it; 0 is unknown', low=0, high=300)
+    speed_sigma_km_h: float = option(5.0, 'standard deviation of speed_km_h, as a mean', low=0, high=100)
+    point_height_m: float = option(0.75, 'mean height above the road of the points tracked on vehicles: half the '
+                                   'height of a car', low=0, high=5)
+    point_height_sigma_m: float = option(0.3, 'standard deviation of point_height_m, as a mean', low=0, high=5)
+
+    def __post_init__(self) -> None:
+        pixels = self.pixels
+        super().__post_init__()
+        apart = math.dist(*pixels) if pixels else math.inf
+        if apart < max(PIXEL_SIGMAS_APART * self.pixel_sigma_px, 1.0):
+            raise UsageError(f"the pixels of 'scale.distance_px' are {apart:.1f} px apart, which tells no scale when "
+                             f'each is known to {self.pixel_sigma_px:g} px: take two that are far from each other')
+
+    @property
+    def pixels(self) -> tuple[tuple[float, float], ...]:
+        """The two pixels (u, v) of `distance_px`; none where it is empty."""
+        try:
+            numbers = [float(word) for word in self.distance_px.replace(',', ' ').split()]
+        except (ValueError, AttributeError):  # words, or what is no text at all
+            numbers = [math.nan]
+        if len(numbers) not in (0, 4) or not all(map(math.isfinite, numbers)):
+            raise UsageError("option 'scale.distance_px' is four numbers in one text, '412 530 888 530' for example; "
+                             f'got {self.distance_px!r}')
+        return tuple(zip(numbers[::2], numbers[1::2], strict=True))
+
+    def require_inside(self, width: int, height: int) -> None:
+        """Raise UsageError when a pixel lies outside images of that size."""
+        for u, v in self.pixels:
+            if not (-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5):
+                raise UsageError(f"pixel ({u:g}, {v:g}) of 'scale.distance_px' lies outside the images, which have "
+                                 f'{width}x{height}: give pixels of the full image as the camera sends it')
+
+
 @dataclass(frozen=True, kw_only=True)
 class GateOptions(_Checked):
     """What has to hold before a calibration is accepted."""
@@ -145,6 +194,8 @@ class GateOptions(_Checked):
     min_coverage: float = option(0.15, 'share of image cells that tracks have crossed', low=0, high=1)
     max_sigma_focal_rel: float = option(0.05, 'largest standard deviation of the focal length, relative', low=0, high=1)
     max_sigma_tilt_deg: float = option(1.5, 'largest standard deviation of the ground normal', low=0, high=45)
+    max_sigma_height_rel: float = option(0.2, "largest standard deviation of the camera's height, relative", low=0,
+                                         high=1)
     max_drift_px: float = option(3.0, 'background drift that a fixed camera stays below, at 1280 px width', low=0.1)
 
 
@@ -153,7 +204,11 @@ class Options(_Checked):
     """All that the core is told from outside."""
 
     method: str = option('joint', "'joint' is the robust method, 'paper' the published one", choices=('joint', 'paper'))
+    scale_from: str = option('height', "what tells the scale: the camera's height, a distance on the road, or the "
+                             'mean speed of the traffic', choices=('height', 'distance', 'speed'))
     camera_height: float = option(0.0, 'height of the camera above the road, metres; 0 is unknown', low=0, high=500)
+    camera_height_sigma: float = option(0.0, 'standard deviation of camera_height, metres; 0 takes it as exact', low=0,
+                                        high=100)
     allow_unit_scale: bool = option(False, 'without a height, give the ground plane in units of the height')
     max_image_width: int = option(1280, 'wider images are reduced to this width for tracking', low=160, high=16384)
     random_seed: int = option(0, 'seed of the consensus searches', low=0)
@@ -165,7 +220,33 @@ class Options(_Checked):
     buffer: BufferOptions = field(default_factory=BufferOptions)
     paper: PaperOptions = field(default_factory=PaperOptions)
     joint: JointOptions = field(default_factory=JointOptions)
+    scale: ScaleOptions = field(default_factory=ScaleOptions)
     gate: GateOptions = field(default_factory=GateOptions)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._require_one_scale()
+
+    def _require_one_scale(self) -> None:
+        """Raise UsageError unless what is given of the scale is what `scale_from` names, whole."""
+        scale = self.scale
+        given = {'height': {'camera_height': self.camera_height > 0},
+                 'distance': {'scale.distance_px': bool(scale.pixels), 'scale.distance_m': scale.distance_m > 0},
+                 'speed': {'scale.speed_km_h': scale.speed_km_h > 0}}
+        for source, parts in given.items():
+            extra = [name for name, there in parts.items() if there]
+            if source != self.scale_from and extra:
+                raise UsageError(f"the scale comes from one source: 'scale_from' is {self.scale_from}, and "
+                                 f"'{extra[0]}' is given too; leave that out, or set 'scale_from' to {source} and give "
+                                 'nothing else')
+        missing = [name for name, there in given[self.scale_from].items() if not there]
+        if self.scale_from != 'height' and missing:
+            raise UsageError(f"'scale_from' is {self.scale_from}, which needs '{missing[0]}': give it")
+        if self.camera_height_sigma > 0 and not self.camera_height > 0:
+            raise UsageError("'camera_height_sigma' is given without 'camera_height': give both or neither")
+        if self.scale_from == 'speed' and self.method == 'paper':
+            raise UsageError("the published method tells no road's traffic apart: with 'method' paper, 'scale_from' is "
+                             'height or distance')
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,6 +16,7 @@ from autocalib_ros.estimation.ground_plane import (
     rotation_from_vanishing_points,
     upward,
 )
+from autocalib_ros.estimation.scale import known_scale
 from autocalib_ros.estimation.straightness import PaperIntrinsics
 from autocalib_ros.estimation.vanishing_points import Orientations, segment_orientations, voted_points
 from autocalib_ros.evidence import Evidence
@@ -59,20 +60,13 @@ def _with_ground(result: Calibration, found: Orientations, evidence: Evidence, o
     rotation = rotation_from_vanishing_points(*points, focal)
     bearings, _ = result.camera.unproject(evidence.points_px)
     normal, _ = upward(rotation[:, 2], bearings)
-    height, metric, grade, reason = scale(options)
-    plane = None if reason else ground_plane(normal, rotation[:, 0], height, metric=metric)
-    report = replace(result.paper, focal_from_vanishing_points_px=focal,
-                     translation_m=paper_translation(rotation, height) if plane else None)
-    return replace(result, grade=grade, ground=plane, ground_refusal=reason, paper=report,
-                   road_directions=rotation[:, :2].T)
-
-
-def scale(options: Options) -> tuple[float, bool, str, Reason | None]:
-    """Return height, whether it is in metres, the grade that it allows, and why there is no plane if so."""
-    if options.camera_height > 0:
-        return options.camera_height, True, 'full', None
-    if options.allow_unit_scale:
-        return 1.0, False, 'unit_scale', None
-    return 0.0, False, 'lens', Reason(
-        'no_height', 'the ground plane needs the height of the camera above the road, which was not given',
-        'give camera_height in metres, or allow_unit_scale for a plane in units of the height')
+    report, roads = replace(result.paper, focal_from_vanishing_points_px=focal), rotation[:, :2].T
+    scale = known_scale(options, result.camera, normal)
+    if isinstance(scale, Reason):
+        return replace(result, ground_refusal=scale, paper=report, road_directions=roads)
+    height = scale.height(result.camera, normal)
+    return replace(
+        result, grade='full' if scale.metric else 'unit_scale',
+        assumptions=(*result.assumptions, *scale.assumption(height)),
+        ground=ground_plane(normal, rotation[:, 0], height, metric=scale.metric), road_directions=roads,
+        paper=replace(report, translation_m=paper_translation(rotation, height)))

@@ -48,6 +48,11 @@ class Plane:
         return self.side * normal / max(float(np.linalg.norm(normal)), 1e-9)
 
     @property
+    def here(self) -> tuple[Camera, np.ndarray]:
+        """Lens and upward normal (3,) of the solution."""
+        return self.fit.state.camera, self.normal(self.fit.state)
+
+    @property
     def told_by_roll(self) -> bool:
         """Whether the road leads across the level, so that the roll tells the plane."""
         along = self.fit.state.directions[0]

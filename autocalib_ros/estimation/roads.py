@@ -98,14 +98,19 @@ def with_right_angle(fit: JointFit, tracks: TrackSet, options: JointOptions) -> 
     return squared, f'roads cross at 90 degrees (tested: {angle:.1f} +- {sigma:.1f})'
 
 
-def main_direction(fit: JointFit, tracks: TrackSet, support: list[np.ndarray]) -> np.ndarray:
-    """Unit vector (3,), camera frame, along which most vehicles drive: the busiest road, or the middling heading."""
+def main_road(fit: JointFit, tracks: TrackSet) -> tuple[np.ndarray, TrackSet]:
+    """Unit vector (3,), camera frame, along which most vehicles drive, and the tracks that follow that road straight.
+
+    The busiest road; where there is none the middling heading, and no tracks.
+    """
+    support = road_support(fit, tracks)
     if support:
         busiest = max(range(len(support)), key=lambda road: len(np.unique(tracks.vehicles[support[road]])))
-        return fit.state.directions[busiest]
+        return fit.state.directions[busiest], tracks.subset(support[busiest])
     rays = rays_of(fit.state.camera, tracks.pixels)
     normals, _, _ = fit_circles(rays, tracks.weights)
     # headings to and fro are one: doubled angles make them so
     twice = np.exp(2j * _angles_in_plane(fit.state, normals)) * tracks.share_of_vehicle
     angle = 0.5 * np.angle(twice.sum())
-    return fit.state.rotation @ np.array([np.cos(angle), np.sin(angle), 0.0])
+    along = fit.state.rotation @ np.array([np.cos(angle), np.sin(angle), 0.0])
+    return along, tracks.subset(np.zeros(0, int))

@@ -15,7 +15,7 @@ from autocalib_ros.estimation.held import lens_assumptions, with_k2_if_asked_for
 from autocalib_ros.estimation.joint import JointFit, noise_cost, road_support, solve_joint, with_bodies
 from autocalib_ros.estimation.lens_prior import LensPrior, known_lens, lens_priors
 from autocalib_ros.estimation.plane import Plane
-from autocalib_ros.estimation.roads import main_direction, with_further_roads, with_real_roads, with_right_angle
+from autocalib_ros.estimation.roads import main_road, with_further_roads, with_real_roads, with_right_angle
 from autocalib_ros.estimation.starts import agreed, in_likeliest_family
 from autocalib_ros.estimation.state import Setting
 from autocalib_ros.estimation.turning import from_turning, one_centre_doubt, over_lives, with_turning
@@ -34,6 +34,8 @@ class Solution:
     plane: Plane
     along: np.ndarray
     """Unit vector (3,), camera frame, along the road of most vehicles."""
+    flow: TrackSet
+    """Tracks that follow that road straight; none where no road is straight."""
     assumptions: tuple[str, ...]
     checks: tuple[str, ...]
     no_plane: Reason | None
@@ -131,19 +133,19 @@ def _completed(fit: JointFit, tracks: TrackSet, across: str, traffic: _Traffic, 
     halves = halves_doubt(fit, tracks, gate)
     if isinstance(halves, Reason):
         return halves
-    along = main_direction(fit, tracks, road_support(fit, tracks))
+    along, flow = main_road(fit, tracks)
     assumptions = lens_assumptions(fit, held)
     if fit.plane_known:
         checks = (*_angle_and_turning(fit, angle), halves)
         plane = Plane.of(fit, tracks)
-        return Solution(fit, plane, along, (*assumptions, angle) if fit.crossing_held and angle else assumptions,
+        return Solution(fit, plane, along, flow, (*assumptions, angle) if fit.crossing_held and angle else assumptions,
                         checks, plane_doubt(plane, gate))
     if options.roll_prior_deg > 0:
         plane = Plane.of(fit, tracks, options.roll_prior_deg)
-        return Solution(fit, plane, along, (*assumptions, 'ground plane by one road and a camera that is not rolled: '
-                                            f'roll = 0 +- {options.roll_prior_deg:g} degrees'), (halves,),
-                        plane_doubt(plane, gate))
-    return Solution(fit, Plane.of(fit, tracks), along, assumptions, (halves,), Reason(
+        level = ('ground plane by one road and a camera that is not rolled: '
+                 f'roll = 0 +- {options.roll_prior_deg:g} degrees')
+        return Solution(fit, plane, along, flow, (*assumptions, level), (halves,), plane_doubt(plane, gate))
+    return Solution(fit, Plane.of(fit, tracks), along, flow, assumptions, (halves,), Reason(
         'one_direction', f'too little traffic across the main road yet: {across}; {int(fit.explained().sum())} '
         'follow one road, and rotation about it is free',
         'wait for traffic across the main road, or that turns; or allow joint.roll_prior_deg'))

@@ -78,7 +78,8 @@ def _ground_rows(result: Calibration) -> list[Row]:
     if result.ground is None:
         return []
     down, roll = tilt_and_roll_deg(result.ground.normal_in_camera)
-    height, note = (f'{result.ground.height_m:.2f} m', 'as given') if result.ground.metric else ('1 (unit)', '')
+    height = f'{result.ground.height_m:.2f} m' if result.ground.metric else '1 (unit)'
+    note = next((text for text in result.assumptions if text.startswith('scale by ')), '')
     return [Row('camera height', height, _number(result.stddev.height_m, 2), note),
             Row('looks down by', f'{down:.2f} degrees', _number(result.stddev.tilt_deg, 2)),
             Row('rolled by', f'{roll:.2f} degrees', _number(result.stddev.roll_deg, 2)),

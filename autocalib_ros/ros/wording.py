@@ -25,7 +25,7 @@ def described_calibration(result: Calibration) -> str:
     if result.ground is not None:
         unit = 'm' if result.ground.metric else '(units of the camera height)'
         parts += [f'tilt {tilt_deg(result.ground):.2f} deg{_sigma(sigma.tilt_deg)}',
-                  f'height {result.ground.height_m:g} {unit}']
+                  f'height {result.ground.height_m:g} {unit}{_sigma(sigma.height_m)}']
     elif result.ground_refusal is not None:
         parts.append(f'no ground plane ({result.ground_refusal.code}): {result.ground_refusal.message}')
     assumptions = '; '.join(result.assumptions) or 'none'

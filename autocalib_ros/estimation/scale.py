@@ -1,0 +1,183 @@
+"""The scale of the ground plane: the camera's height from what is given, as a function of lens and plane.
+
+The traffic tells lens and plane without any metre. A length on the road, or how fast its traffic goes, is a number of
+heights in the solved lens and plane, and so tells the height; it is then as sure as that number, and as what is given.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from autocalib_ros.calibration import Reason
+from autocalib_ros.camera import Camera
+from autocalib_ros.config import GateOptions, Options, ScaleOptions
+from autocalib_ros.estimation.great_circles import TrackSet
+from autocalib_ros.estimation.ground_plane import ground_points
+from autocalib_ros.estimation.path_noise import USUAL_HEIGHT_M
+
+LIKE_USUAL = 1.25
+"""A height within this factor of the usual one weighs near against far as that one did: nothing is solved again."""
+LEAST_BELOW = 0.03
+"""Least sine of the angle below the horizon of a pixel whose place on the road is believed: 33 heights away."""
+LEAST_VEHICLES = 10
+"""Fewer vehicles tell neither how fast the traffic goes nor how much that varies."""
+FLOWING = 0.4
+"""Slower than this share of the median speed is who walks or waits; vehicles that flow vary by a fifth or so."""
+TRIMMED = 0.25
+"""Share of the vehicles, slowest and fastest each, that does not count in the mean speed."""
+STEP_PX = 1e-3
+M_S_PER_KM_H = 1 / 3.6
+
+Height = Callable[[Camera, np.ndarray], float]
+"""The height of the camera as a function of lens and upward normal (3,)."""
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Where the scale comes from, and how sure the height is where lens and plane are exact."""
+
+    height: Height
+    sigma: float
+    """Standard deviation of the height, without that of lens and plane."""
+    metric: bool
+    """Whether the height is in metres."""
+    words: str
+    derived: bool = False
+    """Whether the height follows from lens and plane; otherwise it was given."""
+
+    def assumption(self, height: float, sigma: float | None = None) -> tuple[str, ...]:
+        """Say in words what the scale rests on, and the height with its whole standard deviation that follows."""
+        if not self.metric:
+            return ()
+        spread = '' if sigma is None else f' +- {sigma:.2g}'
+        return (f'scale by {self.words}' + (f': camera height {height:.3f}{spread} m' if self.derived else ''),)
+
+
+def known_scale(options: Options, camera: Camera, normal: np.ndarray, flow: TrackSet | None = None) -> Scale | Reason:
+    """Return the scale that the options ask for, or why there is none.
+
+    `flow` are straight tracks along the busiest road, for the scale by their speed.
+    """
+    if options.scale_from == 'distance':
+        return _by_distance(options.scale, camera, normal)
+    if options.scale_from == 'speed' and flow is not None:
+        return _by_speed(options.scale, camera, normal, flow)
+    height, sigma = options.camera_height, options.camera_height_sigma
+    if height > 0:
+        spread = f' +- {sigma:g}' if sigma > 0 else ''
+        return Scale(lambda *_: height, sigma, True, f'the camera height of {height:g}{spread} m (given)')
+    if options.allow_unit_scale:
+        return Scale(lambda *_: 1.0, 0.0, False, '')
+    return Reason(
+        'no_height', 'the ground plane needs the height of the camera above the road, which was not given',
+        'give camera_height in metres; or a distance on the road or the mean speed of the traffic (scale_from); or '
+        'allow_unit_scale for a plane in units of the height')
+
+
+def scale_doubt(height: float, sigma: float, gate: GateOptions) -> Reason | None:
+    """Say why a height with its whole standard deviation cannot be trusted, if so."""
+    if sigma <= gate.max_sigma_height_rel * height:
+        return None
+    return Reason(
+        'scale_uncertain', f'the scale is too uncertain: camera height {height:.2f} m +- '
+        f'{min(sigma / height, 9.99):.0%}, {gate.max_sigma_height_rel:.0%} is needed',
+        'give it more surely: a longer distance on the road nearer to the camera, the mean speed of more traffic, or '
+        'the camera height')
+
+
+def is_unusual(height_m: float) -> bool:
+    """Whether a height is so far from the one that an unknown height is taken for that solving again is worth it."""
+    return abs(np.log(height_m / USUAL_HEIGHT_M)) > np.log(LIKE_USUAL)
+
+
+def _by_distance(given: ScaleOptions, camera: Camera, normal: np.ndarray) -> Scale | Reason:
+    """Two pixels on the road and the metres between them."""
+    pixels = np.array(given.pixels)
+    bearings, valid = camera.unproject(pixels)
+    below = -(bearings @ normal)
+    for pixel, sine, there in zip(given.pixels, below, valid, strict=True):
+        if not there or sine < LEAST_BELOW:
+            where = f'{np.degrees(np.arcsin(sine)):.1f} degrees below' if there else 'beyond the lens and'
+            return Reason(
+                'scale_off_road', 'pixel ({:g}, {:g}) of scale.distance_px is not on the road: it lies {} the horizon '
+                'of the plane found, {:.1f} degrees below is needed'.format(
+                    *pixel, where, np.degrees(np.arcsin(LEAST_BELOW))),
+                'give two pixels on the surface of the road, near to the camera')
+
+    def length(lens: Camera, up: np.ndarray, at: np.ndarray = pixels) -> float:
+        return float(np.hypot(*np.subtract(*ground_points(lens, up, 1.0, at))))
+
+    heights = length(camera, normal)
+    steps = STEP_PX * np.eye(4).reshape(4, 2, 2)
+    slopes = np.array([length(camera, normal, pixels + step) - length(camera, normal, pixels - step)
+                       for step in steps]) / (2 * STEP_PX)
+    relative = np.hypot(given.distance_sigma_m / given.distance_m,
+                        given.pixel_sigma_px * np.linalg.norm(slopes) / heights)
+    between = ' and '.join(f'({u:g}, {v:g})' for u, v in given.pixels)
+    return Scale(
+        lambda lens, up: given.distance_m / length(lens, up), float(given.distance_m / heights * relative), True,
+        f'{given.distance_m:g} +- {given.distance_sigma_m:g} m on the road between the pixels {between}, each '
+        f'+- {given.pixel_sigma_px:g} px (given)', derived=True)
+
+
+def _by_speed(given: ScaleOptions, camera: Camera, normal: np.ndarray, flow: TrackSet) -> Scale | Reason:
+    """The mean speed of the traffic.
+
+    A point h above the road seems to be where its ray meets the road, H / (H - h) times as far and as fast: v metres a
+    second look like v / (H - h) heights a second. The speed of the evidence is so H - h, and h is added.
+    """
+    tracks = _flowing(camera, normal, flow)
+    vehicles = len(np.unique(tracks.vehicles))
+    if vehicles < LEAST_VEHICLES:
+        return Reason(
+            'too_few_vehicles', f'{vehicles} vehicles drive straight along the busiest road, {LEAST_VEHICLES} are '
+            'needed to compare their speed with the mean that was given', 'wait for more traffic, or record for longer')
+    mean, error = trimmed_mean(_vehicle_speeds(camera, normal, tracks))
+    above = given.speed_km_h * M_S_PER_KM_H / mean
+    relative = np.hypot(given.speed_sigma_km_h / given.speed_km_h, error / mean)
+    return Scale(
+        lambda lens, up: (given.speed_km_h * M_S_PER_KM_H / trimmed_mean(_vehicle_speeds(lens, up, tracks))[0]
+                          + given.point_height_m),
+        float(np.hypot(above * relative, given.point_height_sigma_m)), True,
+        f'a mean speed of {given.speed_km_h:g} +- {given.speed_sigma_km_h:g} km/h (given) of {vehicles} vehicles on '
+        f'the busiest road, seen {given.point_height_m:g} +- {given.point_height_sigma_m:g} m above it', derived=True)
+
+
+def _flowing(camera: Camera, normal: np.ndarray, flow: TrackSet) -> TrackSet:
+    """Tracks of the vehicles that go with the traffic."""
+    if not len(flow):
+        return flow
+    speeds = _vehicle_speeds(camera, normal, flow)
+    slow = np.unique(flow.vehicles)[speeds < FLOWING * np.median(speeds)]
+    return flow.subset(~np.isin(flow.vehicles, slow))
+
+
+def _vehicle_speeds(camera: Camera, normal: np.ndarray, tracks: TrackSet) -> np.ndarray:
+    """Speed of each vehicle as if its points were on the road, heights a second, shape (vehicles,).
+
+    The median of its tracks. Points weigh by how surely a pixel tells their place along the road, and so do not
+    count far away, where the plane tells it least.
+    """
+    places = ground_points(camera, normal, 1.0, tracks.pixels.reshape(-1, 2)).reshape(tracks.pixels.shape)
+    # a pixel covers a way on the road that grows with the square of the distance from the camera
+    weights = (tracks.weights > 0) / (1.0 + (places * places).sum(axis=-1)) ** 2
+    weights /= weights.sum(axis=1, keepdims=True)
+    times = tracks.sample_times_s - (weights * tracks.sample_times_s).sum(axis=1, keepdims=True)
+    seconds2 = np.maximum((weights * times * times).sum(axis=1), 1e-12)  # times of damaged evidence may stand still
+    speeds = np.hypot(*((weights * times)[..., None] * places).sum(axis=1).T) / seconds2
+    order = np.argsort(tracks.vehicles, kind='stable')
+    edges = np.flatnonzero(np.diff(tracks.vehicles[order])) + 1
+    return np.array([np.median(part) for part in np.split(speeds[order], edges)])
+
+
+def trimmed_mean(values: np.ndarray) -> tuple[float, float]:
+    """Mean of the middle of values (n,), and its standard deviation (Tukey & McLaughlin 1963)."""
+    cut = int(TRIMMED * len(values))
+    ordered = np.sort(values)
+    low, high = ordered[cut], ordered[len(values) - 1 - cut]
+    spread = np.clip(ordered, low, high).std(ddof=1)
+    kept = len(values) - 2 * cut
+    return float(ordered[cut:len(values) - cut].mean()), float(spread * np.sqrt(len(values)) / kept)
