@@ -183,6 +183,8 @@ def _add_demo(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--out', type=Path, default=DEFAULT_OUT, metavar='DIR', help='folder for the results '
                         '(default: %(default)s)')
     parser.add_argument('--seed', type=int, default=0, metavar='N', help='seed of the simulated traffic')
+    parser.add_argument('--scale-from', choices=('height', 'distance', 'speed'), default='height',
+                        help='what is given of the truth to tell the scale (default: %(default)s)')
     parser.add_argument('--keep-bag', action='store_true', help='leave the simulated recording in DIR/recording')
     parser.set_defaults(run=_demo)
 
@@ -327,15 +329,14 @@ def _tell(line: str) -> None:
 
 def _demo(arguments: argparse.Namespace) -> int:
     from autocalib_ros.offline import outputs
-    from autocalib_ros.offline.demo import compare, simulate_into
+    from autocalib_ros.offline.demo import compare, options_from, simulate_into
     from autocalib_ros.offline.sources import open_source
 
     bag = arguments.out / 'recording'
     outputs.prepare(arguments.out, bag)
     try:
         truth = simulate_into(bag, arguments.seed)
-        options = Options(camera_height=truth['camera']['height'])
-        replayed = _replay_and_tell(open_source(bag), options, arguments.out)
+        replayed = _replay_and_tell(open_source(bag), options_from(truth, arguments.scale_from), arguments.out)
     finally:
         if not arguments.keep_bag:
             shutil.rmtree(bag, ignore_errors=True)

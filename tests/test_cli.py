@@ -70,6 +70,14 @@ def test_help_imports_nothing_heavy(tmp_path):
     (['replay', 'x', '--camera-height', '-3'], "'camera_height' lies between 0 and 500; got -3.0"),
     (['replay', 'x', '--camera-height', 'nan'], "'camera_height' lies between 0 and 500; got nan"),
     (['replay', 'x', '--camera-height', 'inf'], "'camera_height' lies between 0 and 500; got inf"),
+    (['replay', 'x', '--camera-height', '8', '--scale-speed', '50'], 'not allowed with argument --camera-height'),
+    (['evidence', 'x', '--scale-speed', '50', '-p', 'camera_height=8'], "'camera_height' is given too"),
+    (['replay', 'x', '--scale-distance', '1', '2', '3', '4'], 'expected 5 arguments'),
+    (['replay', 'x', '--scale-distance', '1', '2', '3', '4', '5'], 'px apart'),
+    (['replay', 'x', '--scale-distance', '1', '2', '300', '4', '0'], "needs 'scale.distance_m'"),
+    (['evidence', 'x', '--scale-speed', '0'], "needs 'scale.speed_km_h'"),
+    (['evidence', 'x', '-p', 'scale_from=distance'], "needs 'scale.distance_px'"),
+    (['demo', '--scale-from', 'guess'], "invalid choice: 'guess'"),
     (['replay', 'x', '-p', 'camera_hight=3'], "did you mean 'camera_height'?"),
     (['replay', 'x', '-p', 'camera_height'], 'is not of the form name=value'),
     (['replay', 'x', '-p', 'tracking.max_points=many'], "'max_points' takes a int, got 'many'"),
@@ -133,6 +141,19 @@ def test_a_lens_of_another_shape_is_noticed_at_the_first_image(still_video, tmp_
     command = ['replay', str(still_video), '--quiet', '--out', str(tmp_path / 'out')]
     assert main([*command, '--camera-info', str(tmp_path / 'lens.yaml')]) == 2
     assert 'images of 640x480, and these images have 160x96, another shape' in one_line(capsys.readouterr().err)
+
+
+def test_pixels_outside_the_image_are_noticed_at_the_first_image(still_video, tmp_path, capsys):
+    command = ['replay', str(still_video), '--quiet', '--out', str(tmp_path / 'out')]
+    assert main([*command, '--scale-distance', '10', '80', '400', '80', '12.5']) == 2
+    assert "(400, 80) of 'scale.distance_px' lies outside the images, which have 160x96" in one_line(
+        capsys.readouterr().err)
+
+
+@pytest.mark.parametrize('scale', [['--scale-distance', '10', '80', '150', '80', '12.5'], ['--scale-speed', '50']])
+def test_no_height_is_missed_where_something_else_tells_the_scale(scale, still_video, tmp_path, capsys):
+    assert main(['replay', str(still_video), '--out', str(tmp_path / 'out'), *scale]) == 3
+    assert 'height' not in capsys.readouterr().err
 
 
 def test_no_height_is_said_in_one_line(still_video, tmp_path, capsys):

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from autocalib_ros.calibration import GroundPlane
+from autocalib_ros.config import Options
 from autocalib_ros.errors import InputError
-from autocalib_ros.offline.demo import compare, read_truth
+from autocalib_ros.offline.demo import compare, options_from, read_truth
 from autocalib_ros.offline.projection import ground_to_image
 
 
@@ -38,6 +39,21 @@ def test_a_wrong_scale_shows_in_height_and_distances(full, truth):
     comparison = compare(replace(full.result, ground=ground), truth)
     assert comparison.height_m == pytest.approx(0.8)
     assert comparison.distance_percent == pytest.approx(10)
+
+
+def test_somebody_who_knows_a_distance_or_a_speed_is_given_the_truth(truth):
+    assert options_from(truth, 'height') == Options(camera_height=8.0)
+    by_distance = options_from(truth, 'distance')
+    (u, v), _ = by_distance.scale.pixels
+    assert min(np.hypot(u - row[2], v - row[3]) for row in truth['ground_points']['rows']) < 0.1
+    assert 0 < by_distance.scale.distance_m <= 18 * np.sqrt(2) + 1e-9
+    along = [[0.2 * step, 2.0 * step, 0.1, 0.0, 10.0, 0, 0] for step in range(20)]
+    waiting = [[10 + 0.2 * step, 40.0, 0.1, 0.0, 0.0, 0, 0] for step in range(20)]
+    turning = [[20.0, 12 * np.cos(angle), 12 * np.sin(angle), angle, 5.0, 0, 0] for angle in np.linspace(0, 2, 20)]
+    truth |= {'road_directions': [[1, 0, 0], [0, 1, 0]],
+              'vehicles': {'tracks': [{'rows': along + waiting}, {'rows': turning}, {'rows': along}]}}
+    # waiting takes no way, and a loop on the way does not see it
+    assert options_from(truth, 'speed').scale.speed_km_h == pytest.approx(36.0)
 
 
 def test_a_tilted_ground_is_not_good(full, truth):

@@ -36,12 +36,18 @@ def lens_file(tmp_path) -> Path:
 
 
 @pytest.fixture
-def evidence(saved, capsys):
+def without_height(saved, capsys):
     """Return a function that runs the command: status, stdout and stderr."""
     def run(*arguments: object) -> tuple[int, str, str]:
-        status = main(['evidence', str(saved), '--camera-height', '8', *map(str, arguments)])
+        status = main(['evidence', str(saved), *map(str, arguments)])
         return status, *capsys.readouterr()
     return run
+
+
+@pytest.fixture
+def evidence(without_height):
+    """Return the same with the height of the camera."""
+    return lambda *arguments: without_height('--camera-height', '8', *arguments)
 
 
 def document(stdout: str) -> dict:
@@ -125,6 +131,46 @@ def test_the_lens_of_the_live_node_is_used_and_the_command_line_wins(evidence, l
     write_camera_info_yaml(tmp_path / 'other.yaml', replace(SMALL_LENS, focal_px=282.0), 'north')
     _, stdout, _ = evidence('--json', '--params-file', params, '--camera-info', tmp_path / 'other.yaml')
     assert document(stdout)['camera']['focal_px'] == 564.0
+
+
+def test_a_distance_on_the_road_gives_the_height(without_height):
+    ends_m = np.array([[10.0, -8.0, -JUNCTION.height_m], [18.0, -2.0, -JUNCTION.height_m]])
+    pixels, _ = JUNCTION.camera.project(ends_m @ JUNCTION.camera_from_ground.T)
+    status, stdout, stderr = without_height('--json', '--scale-distance', *np.round(pixels, 2).ravel(), 10.0)
+    found = document(stdout)
+    assert (status, stderr, found['grade']) == (0, '', 'full')
+    sigma = found['stddev']['height_m']
+    assert 0 < sigma < 0.02 * JUNCTION.height_m
+    assert found['ground_from_camera']['translation_m'][2] == pytest.approx(JUNCTION.height_m, abs=3 * sigma)
+    assert any(text.startswith('scale by 10 +- 0.05 m on the road') for text in found['assumptions'])
+    assert found['stddev']['ground_point_m']['20'] > 20 * 0.005  # the share of the tape
+
+
+def test_the_speed_of_the_traffic_gives_the_height(without_height):
+    status, stdout, _ = without_height('--json', '--scale-speed', '34.2', '-p', 'scale.speed_sigma_km_h=2.0')
+    found = document(stdout)
+    assert (status, found['grade']) == (0, 'full')
+    height, sigma = found['ground_from_camera']['translation_m'][2], found['stddev']['height_m']
+    assert height == pytest.approx(JUNCTION.height_m, abs=3 * sigma) and sigma < 0.15 * JUNCTION.height_m
+    assert any(text.startswith('scale by a mean speed of 34.2 +- 2 km/h') for text in found['assumptions'])
+
+
+def test_the_height_and_its_source_are_summed_up(without_height):
+    _, stdout, _ = without_height('--camera-height', '8', '-p', 'camera_height_sigma=0.1')
+    assert 'camera height:            8.00 m  ± 0.10' in stdout
+    assert 'assumed:                  scale by the camera height of 8 +- 0.1 m (given)' in stdout
+
+
+def test_a_distance_above_the_horizon_leaves_the_lens(without_height):
+    status, stdout, _ = without_height('--scale-distance', 600, 20, 600, 500, 10.0)
+    assert status == 0
+    assert 'there is no ground plane. Pixel (600, 20)' in stdout
+
+
+def test_pixels_outside_the_image_are_wrong_usage(without_height):
+    status, stdout, stderr = without_height('--scale-distance', 600, 720, 600, 500, 10.0)
+    assert (status, stdout, stderr.count('\n')) == (2, '', 1)
+    assert "(600, 720) of 'scale.distance_px' lies outside the images, which have 1280x720" in stderr
 
 
 def test_a_lens_of_another_shape_is_wrong_usage(evidence, tmp_path):

@@ -104,3 +104,14 @@ def test_assignments_are_read(text):
 def test_a_malformed_assignment_is_wrong_usage(text):
     with pytest.raises(UsageError, match='-p '):
         parse_assignments([text])
+
+
+def test_a_distance_stands_in_a_file_as_text(tmp_path):
+    options = options_from(tmp_path, "/**: {ros__parameters: {scale_from: distance, "
+                                     "scale: {distance_px: '412 530 888 530', distance_m: 12}}}")
+    assert options.scale.pixels == ((412.0, 530.0), (888.0, 530.0)) and options.scale.distance_m == 12.0
+
+
+def test_a_distance_is_assigned_on_the_command_line():
+    values = parse_assignments(['scale_from=distance', 'scale.distance_px=412 530 888 530', 'scale.distance_m:=12'])
+    assert options_with(Options(), values).scale.pixels == ((412.0, 530.0), (888.0, 530.0))

@@ -47,6 +47,18 @@ def test_given_parameters_become_options(bench: Bench):
     assert node.get_parameter('tracking.max_points').value == 100
 
 
+def test_a_distance_is_a_parameter_of_text(bench: Bench):
+    node = bench.start(scale_from='distance', scale__distance_px='412 530 888 530', scale__distance_m=12.5)
+    assert node.options.scale.pixels == ((412.0, 530.0), (888.0, 530.0))
+    assert node.get_parameter('scale.distance_px').value == '412 530 888 530'
+
+
+def test_a_source_of_the_scale_does_not_change_while_running(bench: Bench):
+    node = bench.start(camera_height=7.5)
+    for name, value in (('scale_from', 'speed'), ('scale.distance_px', '1 2 3 4'), ('scale.speed_km_h', 50.0)):
+        assert not node.set_parameters([Parameter(name, value=value)])[0].successful
+
+
 def test_parameters_do_not_change_while_running(bench: Bench):
     node = bench.start(camera_height=7.5)
     assert not node.set_parameters([Parameter('camera_height', value=9.0)])[0].successful
@@ -61,6 +73,10 @@ def test_parameters_do_not_change_while_running(bench: Bench):
     ({'camera_height': -1.0}, "'camera_height' lies between 0 and 500"),
     ({'tracking.max_points': 3.5}, "'max_points' takes a int"),
     ({'method': 'magic'}, 'one of joint, paper'),
+    ({'scale_from': 'distance'}, "needs 'scale.distance_px'"),
+    ({'scale.speed_km_h': 50.0}, "'scale.speed_km_h' is given too"),
+    ({'scale.distance_px': [412.0, 530.0, 888.0, 530.0]}, 'four numbers in one text'),
+    ({'scale.distance_m': 12}, 'scale.distance_m:=12.0, not 12'),
 ])
 def test_unusable_parameter_is_refused_with_what_would_be_accepted(given, told):
     with pytest.raises(UsageError, match=told):
@@ -71,6 +87,8 @@ def test_unusable_parameter_is_refused_with_what_would_be_accepted(given, told):
     ('camera_height:=8', 'write camera_height:=8.0, not 8'),
     ('camera_height:=501.0', 'lies between 0 and 500'),
     ('camera_hight:=8.0', "did you mean 'camera_height'?"),
+    ('scale.distance_px:=412 530 888 530', "'scale.distance_px' is given too"),
+    ('scale.distance_px:=[412.0, 530.0, 888.0, 530.0]', 'four numbers in one text'),
 ])
 def test_node_ends_with_status_2_and_one_line_at_an_unusable_parameter(argument, told):
     done = run_node('-p', argument)
