@@ -100,14 +100,16 @@ def _by_distance(given: ScaleOptions, camera: Camera, normal: np.ndarray) -> Sca
     pixels = np.array(given.pixels)
     bearings, valid = camera.unproject(pixels)
     below = -(bearings @ normal)
-    for pixel, sine, there in zip(given.pixels, below, valid, strict=True):
+    for (u, v), sine, there in zip(given.pixels, below, valid, strict=True):
         if not there or sine < LEAST_BELOW:
-            where = f'{np.degrees(np.arcsin(sine)):.1f} degrees below' if there else 'beyond the lens and'
+            degrees, needed = np.degrees(np.arcsin([sine, LEAST_BELOW]))
+            side = 'below' if degrees > 0 else 'above'
+            where = f'lies {abs(degrees):.1f} degrees {side} the horizon of the plane found' if there else (
+                'lies where the lens found shows nothing')
             return Reason(
-                'scale_off_road', 'pixel ({:g}, {:g}) of scale.distance_px is not on the road: it lies {} the horizon '
-                'of the plane found, {:.1f} degrees below is needed'.format(
-                    *pixel, where, np.degrees(np.arcsin(LEAST_BELOW))),
-                'give two pixels on the surface of the road, near to the camera')
+                'scale_off_road', f'pixel ({u:g}, {v:g}) of scale.distance_px is not on the road: it {where}, at least '
+                f'{needed:.1f} degrees below is needed', 'give two pixels on the surface of the road, near to the '
+                'camera')
 
     def length(lens: Camera, up: np.ndarray, at: np.ndarray = pixels) -> float:
         return float(np.hypot(*np.subtract(*ground_points(lens, up, 1.0, at))))

@@ -247,7 +247,8 @@ def test_a_pixel_above_the_horizon_leaves_the_lens(evidence: Evidence) -> None:
     assert isinstance(found, Calibration) and found.grade == 'lens' and found.ground is None
     reason = found.ground_refusal
     assert reason is not None and reason.code == 'scale_off_road'
-    assert 'pixel (600, 20)' in reason.message and 'horizon' in reason.message and 'near to the camera' in reason.remedy
+    assert 'pixel (600, 20)' in reason.message and 'degrees above the horizon' in reason.message
+    assert 'near to the camera' in reason.remedy
 
 
 def test_a_pixel_outside_the_image_is_wrong_usage_from_the_first_image_on(evidence: Evidence) -> None:
