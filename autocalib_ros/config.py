@@ -56,7 +56,7 @@ class TrackingOptions(_Checked):
     detect_every: int = option(6, 'frames between two searches for new points and segments', low=1, high=100)
     min_spacing_px: float = option(10.0, 'side of the cells of which each holds one point at the most', low=1, high=100)
     round_trip_px: float = option(0.7, 'a point is lost when following it back misses by more', low=0.05, high=10)
-    max_samples: int = option(32, 'points kept of one track, spread evenly along it', low=8, high=500)
+    max_samples: int = option(100, 'points kept of one track, spread evenly along it', low=8, high=500)
 
 
 @dataclass(frozen=True, kw_only=True)

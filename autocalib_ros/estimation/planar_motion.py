@@ -116,12 +116,12 @@ def _curvature(slopes: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, ...]
     return tuple((weight * slopes[..., i] * slopes[..., j]).sum(axis=1) for i, j in ((0, 0), (0, 1), (1, 1)))
 
 
-def steered(windows: Windows, view: View, motion: Motion, camera: Camera, camera_from_plane: np.ndarray,
-            height_m: float) -> np.ndarray:
-    """Which windows show a vehicle that turns, shape (windows,): its body turns, and as much as its path does.
+def on_course(windows: Windows, view: View, motion: Motion, camera: Camera, camera_from_plane: np.ndarray,
+              height_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Which windows show a vehicle that goes as it points, and which of them that it turns, shape (windows,) each.
 
-    Two vehicles side by side that were taken for one seem to turn when one is faster, on straight paths; only what
-    is steered tells anything of the plane. How far the path of a point turns does not depend on its height.
+    Two vehicles side by side that were taken for one seem to turn when one is faster, on straight paths. How far the
+    path of a point turns does not depend on its height.
     """
     first, middle, second = paths(windows, camera, camera_from_plane)
     before, after = middle - first, second - middle
@@ -135,11 +135,13 @@ def steered(windows: Windows, view: View, motion: Motion, camera: Camera, camera
     way = np.hypot(*np.moveaxis(before, -1, 0)) + np.hypot(*np.moveaxis(after, -1, 0))
     way_m = height_m * np.ma.median(np.ma.array(way, mask=~windows.mask), axis=1).filled(0.0)
     driven = way_m > WALK_M_S * np.nan_to_num(windows.seconds)
-    turning = alike & sure & driven & (np.abs(path_deg) > STEERED_DEG) & ~windows.of_segments
-    for row in np.flatnonzero(windows.of_segments):
-        same = turning & (windows.bodies == windows.bodies[row]) & ~windows.of_segments
-        turning[row] = sure[row] and bool((np.abs(windows.times_s[same] - windows.times_s[row]) < STEERED_S).any())
-    return turning
+    course = alike & sure & driven & ~windows.of_segments
+    turning = course & (np.abs(path_deg) > STEERED_DEG)
+    for row in np.flatnonzero(windows.of_segments & sure):
+        near = (windows.bodies == windows.bodies[row]) & (np.abs(windows.times_s - windows.times_s[row]) < STEERED_S)
+        near &= ~windows.of_segments
+        course[row], turning[row] = (near & course).any(), (near & turning).any()
+    return course, turning
 
 
 def paths(windows: Windows, camera: Camera, camera_from_plane: np.ndarray) -> tuple[np.ndarray, ...]:

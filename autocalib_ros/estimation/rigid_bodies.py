@@ -26,7 +26,7 @@ LOW = 0.03
 """Least angle below the horizon at which a point is placed on the road to begin with, radians."""
 UNTOLD = 1e-7
 """Eigenvalues below this share of the largest are of what a life does not show: unseen points, its size."""
-SETTLING, BEGINNING = 2, 12
+SETTLING, BEGINNING = 1, 12
 """Rounds in which lives are solved when lens and plane have moved a little, and from nothing."""
 
 

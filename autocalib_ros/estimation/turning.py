@@ -11,7 +11,7 @@ from autocalib_ros.estimation.great_circles import TrackSet
 from autocalib_ros.estimation.joint import JointFit, solve_joint
 from autocalib_ros.estimation.lives import find_lives, no_lives
 from autocalib_ros.estimation.path_noise import USUAL_HEIGHT_M
-from autocalib_ros.estimation.planar_motion import View, first_motion, steered, turning_centres
+from autocalib_ros.estimation.planar_motion import View, first_motion, on_course, turning_centres
 from autocalib_ros.estimation.rigid_bodies import Bundle
 from autocalib_ros.estimation.starts import most_probable
 from autocalib_ros.estimation.state import Setting, State
@@ -47,7 +47,7 @@ def from_turning(tracks: TrackSet, windows: Windows, setting: Setting) -> JointF
 
 def with_turning(fit: JointFit, tracks: TrackSet, windows: Windows) -> JointFit | None:
     """Solve again with the vehicles that turn in the plane of a solution; None where they are too few."""
-    chosen = _steered(fit, windows)
+    chosen = _turning(fit, windows)
     if chosen is None:
         return None
     return solve_joint(fit.state, tracks, replace(fit.problem.setting, windows=chosen.spread(MOST_WINDOWS)),
@@ -57,7 +57,7 @@ def with_turning(fit: JointFit, tracks: TrackSet, windows: Windows) -> JointFit 
 def over_lives(fit: JointFit, tracks: TrackSet, windows: Windows, instants: Instants) -> JointFit:
     """Solve a last time with those vehicles over their lives, where they are followed, and how they correlate."""
     setting = replace(fit.problem.setting, vehicle_correlation=fit.vehicle_correlation)
-    chosen = _steered(fit, windows) if setting.turning else None
+    chosen = _turning(fit, windows) if setting.turning else None
     lives = no_lives() if chosen is None else find_lives(chosen, instants, MOST_LIVES)
     if chosen is None or not len(lives):
         return solve_joint(fit.state, tracks, setting, refine=True, inner=fit.problem.inner)
@@ -76,7 +76,7 @@ def one_centre_doubt(fit: JointFit, windows: Windows) -> Reason | None:
 
     One axis for all motion tells lens and plane so weakly that noise biases them by more than the stated deviations.
     """
-    chosen = _steered(fit, windows)
+    chosen = _turning(fit, windows)
     if chosen is None:
         return None
     centres, radii = turning_centres(chosen, fit.state.camera, fit.state.rotation)
@@ -89,14 +89,21 @@ def one_centre_doubt(fit: JointFit, windows: Windows) -> Reason | None:
         'wait for traffic that turns elsewhere, enters or leaves, or drives straight')
 
 
-def _steered(fit: JointFit, windows: Windows) -> Windows | None:
-    """Windows of the vehicles that turn in the plane of a solution, None where they are too few."""
+def _turning(fit: JointFit, windows: Windows) -> Windows | None:
+    """Windows of vehicles that turn in the plane of a solution; None where they are too few.
+
+    Of those that turn, what they show before and after counts too, unless two roads tell more of it: whoever never
+    turns may be two, side by side.
+    """
     state = fit.state
     view = View.of(windows, state.camera, state.rotation, fit.problem.setting.options)
     height_m = fit.problem.setting.height_m or USUAL_HEIGHT_M
-    chosen = windows.subset(np.flatnonzero(
-        steered(windows, view, first_motion(view), state.camera, state.rotation, height_m)))
-    return chosen if len(np.unique(chosen.bodies)) >= MIN_BODIES else None
+    course, turning = on_course(windows, view, first_motion(view), state.camera, state.rotation, height_m)
+    bodies = np.unique(windows.bodies[turning])
+    if len(bodies) < MIN_BODIES:
+        return None
+    chosen = turning if len(state.angles_rad) > 1 else course & np.isin(windows.bodies, bodies)
+    return windows.subset(np.flatnonzero(chosen))
 
 
 def _level_plane(tilt_deg: float) -> np.ndarray:

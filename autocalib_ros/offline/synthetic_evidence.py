@@ -18,7 +18,7 @@ from autocalib_ros.offline.synthetic_trouble import Sway, background_drift_px, s
 SEGMENT_INTERVAL_S = 0.4
 MIN_LENGTH_PX = 25.0
 MIN_POINTS = 8
-MAX_POINTS = 32
+MAX_POINTS = 100
 RANGE_M = 60.0
 """Farther points are too small to be followed."""
 HEADWAY_S = 1.5

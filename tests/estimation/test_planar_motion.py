@@ -8,7 +8,7 @@ import pytest
 from autocalib_ros.camera import Camera
 from autocalib_ros.config import JointOptions
 from autocalib_ros.estimation.lens_prior import lens_priors
-from autocalib_ros.estimation.planar_motion import Motion, View, first_motion, settled, steered
+from autocalib_ros.estimation.planar_motion import Motion, View, first_motion, on_course, settled
 from autocalib_ros.estimation.rows import MotionRows
 from autocalib_ros.estimation.state import Setting, State, Steps
 from autocalib_ros.estimation.windows import Windows
@@ -111,7 +111,7 @@ def test_only_what_is_steered_counts_as_turning() -> None:
         windows = windows_of(np.stack(pixels) + generator.normal(scale=0.3, size=np.shape(pixels)))
         view = view_of(windows)
         motion = first_motion(view)
-        shares[kind] = steered(windows, view, motion, CAMERA, POSE, HEIGHT_M).mean()
+        shares[kind] = on_course(windows, view, motion, CAMERA, POSE, HEIGHT_M)[1].mean()
         if kind == 'crossing':
             assert np.median(np.abs(np.degrees(motion.turn_rad))) > 5.0  # by their displacements they do seem to turn
     assert shares['turning'] > 0.5  # some are too small to tell
