@@ -97,3 +97,14 @@ def test_a_track_of_one_point_is_no_body() -> None:
     lone = [Track(1, np.array([0.8]), np.array([[100.0, 300.0]]))]
     assert len(find_windows(evidence_of(lone))) == 0
     assert len(find_windows(evidence_of(driving((100, 300), (120, 0), 1) + lone))) == 4 + 1
+
+
+def test_hours_without_traffic_change_no_window() -> None:
+    apart_s = 36_000.0  # a whole number of windows, so that both vehicles meet the same instants
+    lone = find_windows(evidence_of(driving((100, 300), (120, 0), 1)))
+    both = find_windows(evidence_of(driving((100, 300), (120, 0), 1)
+                                    + driving((100, 300), (120, 0), 2, begin_s=apart_s)))
+    assert len(both) == 2 * len(lone)
+    later = both.subset(both.times_s > apart_s)
+    assert np.allclose(np.sort(later.times_s) - apart_s, np.sort(lone.times_s))
+    assert np.allclose(later.first_px, lone.first_px, atol=1e-6)
