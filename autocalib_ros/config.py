@@ -70,11 +70,15 @@ class MotionOptions(_Checked):
 
 @dataclass(frozen=True, kw_only=True)
 class BufferOptions(_Checked):
-    """The rolling buffer of evidence."""
+    """The buffer of evidence, bounded in number."""
 
-    seconds: float = option(900.0, 'evidence older than this is forgotten', low=5, high=86400)
-    max_tracks: int = option(8000, 'tracks kept; the oldest go first', low=50, high=100000)
-    max_segments: int = option(20000, 'segments kept; the oldest go first', low=100, high=1000000)
+    seconds: float = option(
+        900.0, 'evidence older than this is forgotten where enough newer vehicles went the same way through the same '
+        'part of the image, and all of it when the camera moved', low=5, high=86400)
+    max_tracks: int = option(8000, 'tracks kept at the most; vehicles that add least to newer ones go first', low=50,
+                             high=100000)
+    max_segments: int = option(20000, 'segments kept at the most; vehicles that add least to newer ones go first',
+                               low=100, high=1000000)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,10 +1,9 @@
-"""What the traffic has shown: a rolling, bounded buffer, and the frozen values that estimators read."""
+"""What the traffic has shown: a bounded buffer of what adds most, and the frozen values that estimators read."""
 
 from __future__ import annotations
 
 import zipfile
 import zlib
-from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,6 +13,7 @@ import numpy as np
 from autocalib_ros.calibration import EvidenceSummary
 from autocalib_ros.config import BufferOptions
 from autocalib_ros.errors import InputError
+from autocalib_ros.redundancy import Holdings
 
 FORMAT = 1
 COVERAGE_CELLS = (16, 9)
@@ -179,48 +179,76 @@ def _track_arrays(tracks: list[Track]) -> dict[str, np.ndarray]:
 
 
 class EvidenceBuffer:
-    """Rolling buffer of finished tracks and segments, bounded in age and number."""
+    """Finished tracks and segments, bounded in number: what adds least goes first, by whole vehicles.
+
+    A track holds at most `tracking.max_samples` points of 24 bytes and 0.4 kB of its own, a segment 80 bytes: with the
+    default options no more than 12 MB are held, however long it runs.
+    """
 
     def __init__(self, options: BufferOptions) -> None:
-        self._options = options
-        self._tracks: deque[Track] = deque(maxlen=options.max_tracks)
-        self._segments: deque[Segments] = deque()
-        self._segment_count = 0
+        self._tracks: list[Track] = []
+        self._of_tracks = Holdings(options.max_tracks)
+        self._max_tracks = options.max_tracks
+        self._ends_px = np.zeros((options.max_segments, 4))
+        self._vehicles = np.zeros(options.max_segments, int)
+        self._of_segments = Holdings(options.max_segments)
 
     def add_track(self, track: Track) -> None:
-        """Take a finished track; the oldest makes room."""
+        """Take a finished track; where there is no room, vehicles that add least make some."""
+        if self._of_tracks.count == self._max_tracks:
+            self._keep_tracks(self._of_tracks.with_room(1))
+        points = track.points_px
+        self._of_tracks.add(np.array([track.vehicle]), points[len(points) // 2], (points[-1] - points[0])[None],
+                            track.times_s[-1])
         self._tracks.append(track)
 
     def add_segments(self, segments: Segments) -> None:
-        """Take the segments of one pair of frames; the oldest pairs make room."""
-        if not len(segments.ends_px):
+        """Take the segments of one pair of frames; where there is no room, vehicles that add least make some."""
+        limit, held = len(self._ends_px), self._of_segments.count
+        ends, vehicles = segments.ends_px[:limit], segments.vehicles[:limit]
+        if not len(ends):
             return
-        self._segments.append(segments)
-        self._segment_count += len(segments.ends_px)
-        while self._segment_count > self._options.max_segments and len(self._segments) > 1:
-            self._segment_count -= len(self._segments.popleft().ends_px)
+        if held + len(ends) > limit:
+            self._keep_segments(self._of_segments.with_room(len(ends)))
+        part = slice(self._of_segments.count, self._of_segments.count + len(ends))
+        self._ends_px[part], self._vehicles[part] = ends, vehicles
+        self._of_segments.add(vehicles, 0.5 * (ends[:, :2] + ends[:, 2:]), ends[:, 2:] - ends[:, :2], segments.time_s)
+
+    def forget_replaced(self, time_s: float) -> None:
+        """Drop the vehicles last seen before `time_s` in whose place there are enough newer ones."""
+        self._keep_tracks(self._of_tracks.not_replaced(time_s))
+        self._keep_segments(self._of_segments.not_replaced(time_s))
 
     def forget_before(self, time_s: float) -> None:
-        """Drop what ended before `time_s`."""
-        while self._tracks and self._tracks[0].times_s[-1] < time_s:
-            self._tracks.popleft()
-        while self._segments and self._segments[0].time_s < time_s:
-            self._segment_count -= len(self._segments.popleft().ends_px)
+        """Drop all that ended before `time_s`: the camera may have stood otherwise then."""
+        self._keep_tracks(self._of_tracks.since(time_s))
+        self._keep_segments(self._of_segments.since(time_s))
+
+    def _keep_tracks(self, rows: np.ndarray) -> None:
+        if len(rows) < len(self._tracks):
+            self._of_tracks.keep(rows)
+            self._tracks = [self._tracks[row] for row in rows]
+
+    def _keep_segments(self, rows: np.ndarray) -> None:
+        if len(rows) < self._of_segments.count:
+            self._of_segments.keep(rows)
+            self._ends_px[:len(rows)], self._vehicles[:len(rows)] = self._ends_px[rows], self._vehicles[rows]
 
     @property
     def track_count(self) -> int:
         """Number of finished tracks held."""
         return len(self._tracks)
 
+    @property
+    def oldest_s(self) -> float:
+        """When the oldest track or segment that is held ended; infinite where there is none."""
+        return min(self._of_tracks.oldest_s, self._of_segments.oldest_s)
+
     def snapshot(self, *, image_size: tuple[int, int], first_stamp_ns: int, newest_stamp_ns: int, frames: int,
                  drift_px: float, unfinished: list[Track]) -> Evidence:
         """Freeze what is held, with the tracks that are still being followed."""
-        parts = list(self._segments)
+        held = self._of_segments.count
         return Evidence(
             image_size=image_size, first_stamp_ns=first_stamp_ns, newest_stamp_ns=newest_stamp_ns, frames=frames,
-            drift_px=drift_px,
-            segments_px=np.concatenate([s.ends_px for s in parts] or [np.zeros((0, 4))]).astype(float),
-            segment_vehicles=np.concatenate([s.vehicles for s in parts] or [np.zeros(0)]).astype(int),
-            segment_times_s=np.concatenate(
-                [np.full(len(s.ends_px), s.time_s) for s in parts] or [np.zeros(0)]).astype(float),
-            **_track_arrays([*self._tracks, *unfinished]))
+            drift_px=drift_px, segments_px=self._ends_px[:held].copy(), segment_vehicles=self._vehicles[:held].copy(),
+            segment_times_s=self._of_segments.times_s.copy(), **_track_arrays([*self._tracks, *unfinished]))

