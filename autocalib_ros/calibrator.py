@@ -10,7 +10,7 @@ from autocalib_ros.calibration import GROUND_DISTANCES_M, Calibration, Figures, 
 from autocalib_ros.camera import Camera
 from autocalib_ros.config import Options
 from autocalib_ros.errors import InputError
-from autocalib_ros.estimation.evidence_gate import shortfall
+from autocalib_ros.estimation.evidence_gate import drift_limit_px, outlook, requirements, shortfall, unsteady
 from autocalib_ros.estimation.great_circles import TrackSet, select_tracks
 from autocalib_ros.estimation.ground_plane import ground_plane, ground_points, pixels_ahead, tilt_and_roll_deg
 from autocalib_ros.estimation.paper import solve_paper
@@ -24,14 +24,22 @@ from autocalib_ros.perception.observer import Observer
 
 REORDERED_NS = 1_000_000_000
 """Images overtake each other by less than this on any transport; a longer step back is another time."""
+FORGET_EVERY_S = 10.0
+"""Seconds of recording between two looks for evidence that is old; each costs milliseconds."""
 
 
 @dataclass(frozen=True)
 class Progress:
-    """How far the evidence has come: 0 to 100, and what is missing in an installer's words."""
+    """How far the evidence has come: 0 to 100, what is missing and how long it will take, in an installer's words."""
 
     percent: float
     missing: tuple[str, ...]
+    outlook: str = ''
+    """'about 6 min more at this rate' say; '' where nothing can be foreseen."""
+
+    def __str__(self) -> str:
+        missing = ', '.join([*filter(None, ['; '.join(self.missing), self.outlook])])
+        return f'{self.percent:.0f} %' + (f': {missing}' if missing else '')
 
 
 class AutoCalibrator:
@@ -63,9 +71,26 @@ class AutoCalibrator:
         self._tracks_seen += len(observed.tracks)
         if observed.segments is not None:
             self._buffer.add_segments(observed.segments)
-        self._buffer.forget_before(time_s - self._options.buffer.seconds)
+        if time_s >= self._forget_s:
+            self._forget(time_s)
         self._newest_stamp_ns = stamp_ns
         self._frames += 1
+
+    def _forget(self, time_s: float) -> None:
+        """Drop old evidence that newer replaces, and all that is old once the camera has, or may have, moved.
+
+        It counts as moved until nothing is held any more from before.
+        """
+        self._forget_s = time_s + FORGET_EVERY_S
+        memory_s = self._options.buffer.seconds
+        if self._observer.drift_px > drift_limit_px(self._size[0], self._options.gate):
+            self._moved_s = time_s
+        self._moved_s = max(self._moved_s, self._observer.lost_s)
+        if time_s - self._moved_s <= memory_s:
+            self._buffer.forget_before(time_s - memory_s)
+        else:
+            self._buffer.forget_replaced(time_s - memory_s)
+        self._observer.compare_since(min(self._buffer.oldest_s, time_s - memory_s))
 
     def _begin(self, stamp_ns: int, size: tuple[int, int]) -> None:
         self._observer = Observer(self._options, size)
@@ -73,6 +98,7 @@ class AutoCalibrator:
         self._size, self._first_stamp_ns, self._newest_stamp_ns = size, stamp_ns, stamp_ns - 1
         self._frames = 0
         self._tracks_seen = 0
+        self._forget_s, self._moved_s = FORGET_EVERY_S, -np.inf
         self._due_s, self._due_tracks = self._options.first_solve_s, float(self._options.gate.min_tracks)
 
     def take_due(self) -> Evidence | None:
@@ -85,7 +111,7 @@ class AutoCalibrator:
         time_s = (self._newest_stamp_ns - self._first_stamp_ns) * 1e-9
         if time_s < self._due_s or self._tracks_seen < self._due_tracks:
             return None
-        held = min(self._tracks_seen, self._options.buffer.max_tracks)
+        held = max(self._buffer.track_count, self._options.gate.min_tracks)
         self._due_tracks = self._tracks_seen + (self._options.solve_growth - 1.0) * held
         self._due_s = time_s + self._options.solve_interval_s
         return self.snapshot()
@@ -103,13 +129,13 @@ class AutoCalibrator:
         evidence, gate = self.snapshot(), self._options.gate
         if evidence is None:
             return Progress(0.0, ('no image yet',))
-        shares = [evidence.track_count / gate.min_tracks, evidence.coverage / max(gate.min_coverage, 1e-9),
-                  evidence.seconds / max(self._options.first_solve_s, 1e-9)]
-        reason = shortfall(evidence, gate)
-        missing = [reason.message] if reason else []
-        if shares[2] < 1:
-            missing.append(f'{evidence.seconds:.0f} s of the first {self._options.first_solve_s:g} s watched')
-        return Progress(100.0 * min(1.0, *shares), tuple(missing))
+        needs = requirements(evidence, gate, self._options.first_solve_s)
+        scarcest = min(need.share for need in needs)
+        missing = [need.words for need in needs if need.share < 1.0]
+        moving = unsteady(evidence, gate)
+        if moving:
+            return Progress(100.0 * scarcest, (moving.message, *missing))
+        return Progress(100.0 * scarcest, tuple(missing), outlook(evidence, scarcest))
 
     def background(self) -> np.ndarray | None:
         """Return the road without its traffic, BGR uint8 of the full size, for people to look at."""

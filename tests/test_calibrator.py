@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
-from autocalib_ros.calibrator import AutoCalibrator
-from autocalib_ros.config import GateOptions, Options
+from autocalib_ros.calibrator import AutoCalibrator, Progress
+from autocalib_ros.config import BufferOptions, GateOptions, Options
 from autocalib_ros.errors import InputError
 
 OPTIONS = Options(first_solve_s=2.0, solve_interval_s=1.0, gate=GateOptions(min_tracks=4))
@@ -107,3 +108,59 @@ def test_a_solution_is_due_when_there_are_time_and_tracks() -> None:
 def test_progress_says_what_is_missing() -> None:
     progress = fed(5).progress()
     assert progress.percent < 100 and progress.missing
+
+
+def watched(seconds: float, moved_at_s: float = np.inf, gone_at_s: float = np.inf) -> AutoCalibrator:
+    """Feed one vehicle in the first minute, and then a road without traffic, at 2 images/s.
+
+    The camera is bumped at one time, or turned to another scene.
+    """
+    calibrator = AutoCalibrator(Options(buffer=BufferOptions(seconds=120.0)))
+    road = cv2.GaussianBlur(np.random.default_rng(1).uniform(0, 255, (180, 320)), (0, 0), 2.0)
+    road = cv2.normalize(road, None, 40, 200, cv2.NORM_MINMAX).astype(np.uint8)
+    block = np.random.default_rng(2).integers(0, 255, (30, 40)).astype(np.uint8)
+    block = cv2.resize(block, (60, 45), interpolation=cv2.INTER_CUBIC)
+    noise = np.random.default_rng(3).integers(0, 9, (2, 180, 320)).astype(np.uint8)  # else pictures are repeated ones
+    for index in range(int(2 * seconds)):
+        picture = road if index < 2 * gone_at_s else road[::-1, ::-1]
+        if index >= 2 * moved_at_s:
+            picture = np.roll(picture, (4, 7), axis=(0, 1))
+        picture = picture.copy()
+        if 60 <= index < 100:
+            picture[60:105, 6 * (index - 60):6 * (index - 60) + 60] = block
+        calibrator.add_image(index * 500_000_000, cv2.add(picture, noise[index % 2]))
+    return calibrator
+
+
+def held(calibrator: AutoCalibrator) -> int:
+    evidence = calibrator.snapshot()
+    assert evidence is not None
+    return evidence.track_count
+
+
+def test_a_lone_vehicle_is_kept_as_long_as_nothing_replaces_it() -> None:
+    calibrator = watched(400.0)
+    assert held(calibrator) > 0
+    assert calibrator.progress().outlook == 'no traffic in the last 6 min'
+
+
+def test_evidence_from_before_a_bump_is_forgotten() -> None:
+    calibrator = watched(400.0, moved_at_s=150.0)
+    assert held(calibrator) == 0
+    evidence = calibrator.snapshot()
+    assert evidence is not None and evidence.drift_px < 0.5  # and with it what it was compared with
+
+
+def test_a_bump_is_told_while_evidence_from_before_is_held() -> None:
+    progress = watched(200.0, moved_at_s=150.0).progress()
+    assert 'the camera moves' in str(progress) and not progress.outlook
+
+
+def test_evidence_is_forgotten_when_the_camera_may_look_elsewhere() -> None:
+    assert held(watched(400.0, gone_at_s=150.0)) == 0
+
+
+def test_progress_reads_as_one_line() -> None:
+    assert str(Progress(42.4, ('17 of 40 tracks',), 'about 6 min more at this rate')) == (
+        '42 %: 17 of 40 tracks, about 6 min more at this rate')
+    assert str(Progress(100.0, ())) == '100 %'

@@ -2,22 +2,52 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from autocalib_ros.calibration import Reason
 from autocalib_ros.config import GateOptions
 from autocalib_ros.evidence import Evidence
 
 REFERENCE_WIDTH_PX = 1280
 """Image width for which `max_drift_px` is given; it scales with the width."""
+EARLY_S = 30.0
+"""What is seen in a shorter time is one vehicle or two, and no rate."""
+NO_TRAFFIC_S = 300.0
+"""After so long without traffic the rate of before says nothing of what comes."""
+
+
+@dataclass(frozen=True)
+class Requirement:
+    """How much there is of what a first solution needs, and how much is needed."""
+
+    have: float
+    need: float
+    words: str
+
+    @property
+    def share(self) -> float:
+        """Part of the need that is there, 1 where it is met."""
+        return min(1.0, self.have / self.need) if self.need > 0 else 1.0
+
+
+def drift_limit_px(image_width: int, gate: GateOptions) -> float:
+    """Return the background's drift up to which a camera stands still."""
+    return gate.max_drift_px * image_width / REFERENCE_WIDTH_PX
+
+
+def unsteady(evidence: Evidence, gate: GateOptions) -> Reason | None:
+    """Say how far the camera moved, where that is too far."""
+    limit = drift_limit_px(evidence.image_size[0], gate)
+    return None if evidence.drift_px <= limit else Reason(
+        'camera_moving', f'the camera moves: the background drifted by {evidence.drift_px:.1f} px, and up to '
+        f'{limit:.1f} px pass for standing still', 'fix the camera to something rigid and record again')
 
 
 def shortfall(evidence: Evidence, gate: GateOptions) -> Reason | None:
     """Return the first reason why nothing can be estimated from the evidence, or None."""
-    width, height = evidence.image_size
-    limit = gate.max_drift_px * width / REFERENCE_WIDTH_PX
-    if evidence.drift_px > limit:
-        return Reason(
-            'camera_moving', f'the camera moves: the background drifted by {evidence.drift_px:.1f} px, and up to '
-            f'{limit:.1f} px pass for standing still', 'fix the camera to something rigid and record again')
+    moving = unsteady(evidence, gate)
+    if moving:
+        return moving
     if not evidence.track_count:
         return Reason(
             'no_motion', f'nothing moved in {evidence.frames} images over {evidence.seconds:.0f} s',
@@ -31,3 +61,36 @@ def shortfall(evidence: Evidence, gate: GateOptions) -> Reason | None:
             'poor_coverage', f'traffic crossed {evidence.coverage:.0%} of the image, {gate.min_coverage:.0%} is needed',
             'turn the camera so that the road fills more of the image, or choose a longer lens')
     return None
+
+
+def requirements(evidence: Evidence, gate: GateOptions, first_solve_s: float) -> list[Requirement]:
+    """Return what a first solution needs."""
+    tracks, coverage, seconds = evidence.track_count, evidence.coverage, evidence.seconds
+    return [Requirement(tracks, gate.min_tracks, f'{tracks} of {gate.min_tracks} tracks'),
+            Requirement(coverage, gate.min_coverage,
+                        f'traffic crossed {coverage:.0%} of the image, {gate.min_coverage:.0%} is needed'),
+            Requirement(seconds, first_solve_s, f'{seconds:.0f} s of the first {first_solve_s:g} s watched')]
+
+
+def outlook(evidence: Evidence, share: float) -> str:
+    """Say how long it takes until `share` of what is needed has become all, at the rate since the start.
+
+    '' in the first moments, before anything is seen, and when nothing is missing; without traffic it says that instead.
+    """
+    if share >= 1.0:
+        return ''
+    idle_s = evidence.seconds - evidence.times_s.max(initial=0.0)
+    if idle_s >= NO_TRAFFIC_S:
+        return f'no traffic in the last {in_words(idle_s)}'
+    if evidence.seconds < EARLY_S or share <= 0.0:
+        return ''
+    return f'about {in_words(evidence.seconds * (1.0 / share - 1.0))} more at this rate'
+
+
+def in_words(seconds: float) -> str:
+    """Return a time as coarsely as an estimate deserves."""
+    for unit, length_s, most_s in (('s', 10.0, 90.0), ('min', 60.0, 5400.0), ('h', 3600.0, 172800.0)):
+        if seconds < most_s:
+            count = max(1, round(seconds / length_s))
+            return f'{10 * count if unit == "s" else count} {unit}'
+    return f'{seconds / 86400.0:.0f} days'

@@ -47,7 +47,7 @@ def replay(source: Source, options: Options, on_progress: Callable[[int, str], N
             accepted_at_s = due.seconds
         if on_progress is not None:
             if count % NOTE_EVERY == 1:
-                note = f'{calibrator.progress().percent:.0f} % of the evidence'
+                note = f'evidence {calibrator.progress()}'
             on_progress(count, note)
     evidence = calibrator.snapshot()
     if evidence is None:

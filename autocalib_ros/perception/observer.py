@@ -122,6 +122,15 @@ class Observer:
         """How far the background has moved, pixels of the full image."""
         return self._stillness.drift_px * self._reduction
 
+    @property
+    def lost_s(self) -> float:
+        """When the background was last lost from sight, minus infinity where never."""
+        return self._stillness.lost_s
+
+    def compare_since(self, time_s: float) -> None:
+        """Let `drift_px` go back to `time_s`, that of the oldest evidence, where that is before `buffer.seconds`."""
+        self._stillness.compare_since(time_s)
+
     def background(self) -> np.ndarray | None:
         """Return the road without its traffic, BGR uint8 (H, W, 3)."""
         return self._background.image()

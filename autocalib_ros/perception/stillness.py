@@ -15,14 +15,29 @@ MIN_POINTS = 8
 ROUND_TRIP_PX = 0.5
 QUANTILES = (0.05, 0.95)
 """Drift is the span between these quantiles of the offsets: one passing lorry is not a moving camera."""
+HIDDEN_S = 10.0
+"""Nothing that passes hides the background for longer."""
+COARSE_S = 300.0
+"""Of what lies farther back than memory one median in so long is kept: slow drift is seen, and the memory is small."""
+MAX_COARSE = 8640
+"""A month of medians."""
 
 
 class Stillness:
-    """Follows strong corners of the background from a reference image into later ones."""
+    """Follows strong corners of the background from a reference image into later ones.
+
+    Remembers `memory_s` closely, and by medians back to the time that `compare_since` names.
+    """
 
     def __init__(self, memory_s: float) -> None:
         self._memory_s = memory_s
+        self._coarse: deque[tuple[float, float, float]] = deque(maxlen=MAX_COARSE)
+        self._coarse_due_s = COARSE_S
         self._reference: np.ndarray | None = None
+        self._recent: np.ndarray | None = None
+        self._found_s = 0.0
+        self.lost_s = -np.inf
+        """When the background was last lost from sight: nothing tells how the camera stood before."""
         self._corners = np.zeros((0, 1, 2), np.float32)
         self._base = np.zeros(2)
         self._offsets: deque[tuple[float, float, float]] = deque(maxlen=4096)
@@ -37,38 +52,69 @@ class Stillness:
         self._factor = max(1.0, grey.shape[1] / WIDTH_PX)
         size = (round(grey.shape[1] / self._factor), round(grey.shape[0] / self._factor))
         reduced = cv2.resize(grey, size, interpolation=cv2.INTER_AREA) if self._factor > 1 else grey
-        offset = self._offset(reduced)
+        offset = self._offset(self._reference, self._corners, reduced)
         if offset is None:
-            self._begin(reduced)
-        else:
-            self._offsets.append((time_s, *(self._base + offset)))
-            while self._offsets[0][0] < time_s - self._memory_s:
-                self._offsets.popleft()
+            self._lose(reduced, time_s)
+            return
+        self._recent, self._found_s = reduced.copy(), time_s
+        self._offsets.append((time_s, *(self._base + offset)))
+        while self._offsets[0][0] < time_s - self._memory_s:
+            self._offsets.popleft()
+        if time_s >= self._coarse_due_s:
+            self._coarse.append((time_s, *self._position(time_s - COARSE_S)))
+            self._coarse_due_s = time_s + COARSE_S
 
-    def _begin(self, reduced: np.ndarray) -> None:
-        """Take a new reference image where the last one is of no more use, and go on from the newest offset."""
+    def _lose(self, reduced: np.ndarray, time_s: float) -> None:
+        """Take a new reference where the last one is of no more use.
+
+        Light and shadow change slowly: the image in which it was last found still leads to the new one. Where that
+        fails for longer than something hides the view, the camera may look elsewhere.
+        """
+        step = self._offset(self._recent, _corners(self._recent), reduced)
+        if step is None and self._reference is not None:
+            if time_s - self._found_s < HIDDEN_S:
+                return
+            self.lost_s = time_s
         if self._offsets:
-            self._base = np.array(self._offsets[-1][1:])
-        corners = cv2.goodFeaturesToTrack(reduced, POINTS, 0.02, max(8, reduced.shape[1] // 20))
-        self._corners = np.zeros((0, 1, 2), np.float32) if corners is None else corners
-        self._reference = reduced.copy()
+            self._base = np.array(self._offsets[-1][1:]) + (0.0 if step is None else step)
+        self._reference = self._recent = reduced.copy()
+        self._corners, self._found_s = _corners(reduced), time_s
 
-    def _offset(self, reduced: np.ndarray) -> np.ndarray | None:
-        """Return the median motion of the background (2,) since the reference; None when it is lost."""
-        if self._reference is None or len(self._corners) < MIN_POINTS or self._reference.shape != reduced.shape:
+    def compare_since(self, time_s: float) -> None:
+        """Forget the medians from before `time_s`: no evidence is left of then."""
+        while self._coarse and self._coarse[0][0] < time_s:
+            self._coarse.popleft()
+
+    def _position(self, since_s: float) -> np.ndarray:
+        """Return the median offset (2,) since then."""
+        offsets = np.array(self._offsets)
+        return np.median(offsets[offsets[:, 0] >= since_s, 1:], axis=0)
+
+    @staticmethod
+    def _offset(before: np.ndarray | None, corners: np.ndarray, after: np.ndarray) -> np.ndarray | None:
+        """Return the median motion of the background (2,) from one image to another; None when it is lost."""
+        if before is None or len(corners) < MIN_POINTS or before.shape != after.shape:
             return None
-        found, forward, _ = cv2.calcOpticalFlowPyrLK(self._reference, reduced, self._corners, None)
-        back, backward, _ = cv2.calcOpticalFlowPyrLK(reduced, self._reference, found, None)
-        miss = np.hypot(*(back - self._corners)[:, 0].T)
+        found, forward, _ = cv2.calcOpticalFlowPyrLK(before, after, corners, None)
+        back, backward, _ = cv2.calcOpticalFlowPyrLK(after, before, found, None)
+        miss = np.hypot(*(back - corners)[:, 0].T)
         good = (forward.ravel() == 1) & (backward.ravel() == 1) & (miss < ROUND_TRIP_PX)
-        if good.sum() < max(MIN_POINTS, len(self._corners) // 3):
+        if good.sum() < max(MIN_POINTS, len(corners) // 3):
             return None
-        return np.median((found - self._corners)[good, 0], axis=0).astype(float)
+        return np.median((found - corners)[good, 0], axis=0).astype(float)
 
     @property
     def drift_px(self) -> float:
         """Largest span of the background's position within memory, pixels of the image as given."""
         if len(self._offsets) < 2:
             return 0.0
-        span = np.diff(np.quantile(np.array(self._offsets)[:, 1:], QUANTILES, axis=0), axis=0)
-        return float(np.hypot(*span[0]) * self._factor)
+        spans = [np.diff(np.quantile(np.array(self._offsets)[:, 1:], QUANTILES, axis=0), axis=0)[0]]
+        if len(self._coarse) > 1:
+            spans.append(np.ptp(np.array(self._coarse)[:, 1:], axis=0))
+        return float(max(np.hypot(*span) for span in spans) * self._factor)
+
+
+def _corners(image: np.ndarray | None) -> np.ndarray:
+    """Return strong corners (n, 1, 2) of a reduced image (H, W)."""
+    found = None if image is None else cv2.goodFeaturesToTrack(image, POINTS, 0.02, max(8, image.shape[1] // 20))
+    return np.zeros((0, 1, 2), np.float32) if found is None else found

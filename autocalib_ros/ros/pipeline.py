@@ -14,7 +14,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Protocol
 
@@ -220,7 +220,8 @@ class Pipeline:
         """Add why the last solution was refused: evidence may be enough to try and not to succeed."""
         if progress is None or not self._refused:
             return progress
-        return Progress(min(progress.percent, TRIED_PERCENT), tuple(dict.fromkeys((*progress.missing, self._refused))))
+        return replace(progress, percent=min(progress.percent, TRIED_PERCENT),
+                       missing=tuple(dict.fromkeys((*progress.missing, self._refused))))
 
     def _fitting(self, image_size: tuple[int, int]) -> Camera | None:
         """Return the known lens for images of that size; UsageError when they have another shape."""

@@ -33,11 +33,8 @@ def described_calibration(result: Calibration) -> str:
 
 
 def described_progress(progress: Progress | None) -> str:
-    """Return how far the evidence has come and what is missing."""
-    if progress is None:
-        return 'collecting'
-    missing = f', missing: {"; ".join(progress.missing)}' if progress.missing else ''
-    return _one_line(f'collecting: {progress.percent:.0f} %{missing}')
+    """Return how far the evidence has come, what is missing and how long that will take."""
+    return 'collecting' if progress is None else _one_line(f'collecting: {progress}')
 
 
 def tilt_deg(ground: GroundPlane) -> float:

@@ -38,7 +38,7 @@ def test_a_replay_counts_its_frames_and_reports_them():
     assert replayed.frames == replayed.evidence.frames == 40
     assert [done for done, _ in told] == [*range(1, 41), 40]
     assert told[-1][1] == 'solving'
-    assert '% of the evidence' in told[0][1]
+    assert told[0][1].startswith('evidence 0 %: 0 of 40 tracks')
     assert replayed.background.shape == (120, 160, 3)
 
 

@@ -113,6 +113,37 @@ def test_stillness_measures_how_far_the_background_moved(shift: tuple[float, flo
     assert stillness.drift_px == pytest.approx(np.hypot(*shift), abs=0.4)
 
 
+def road_moved(shift: tuple[float, float]) -> np.ndarray:
+    moved = cv2.warpAffine(ROAD, np.array([[1.0, 0, shift[0]], [0, 1.0, shift[1]]]), SIZE[::-1],
+                           borderMode=cv2.BORDER_REFLECT)
+    return moved.astype(np.uint8)
+
+
+def test_slow_drift_is_seen_as_far_back_as_evidence_goes() -> None:
+    stillness = Stillness(600.0)
+    for time_s in range(0, 36_000, 30):
+        stillness.update(road_moved((5.0 * time_s / 36_000, 0.0)), float(time_s))
+    assert stillness.drift_px == pytest.approx(5.0, abs=0.5)
+    stillness.compare_since(35_000.0)
+    assert stillness.drift_px < 0.5
+
+
+def test_what_hides_the_view_for_a_moment_is_no_loss() -> None:
+    stillness = Stillness(600.0)
+    for index in range(60):
+        hidden = 20 <= index < 28
+        stillness.update(np.full(SIZE, 80, np.uint8) if hidden else road_moved((0.0, 0.0)), float(index))
+    assert stillness.lost_s == -np.inf and stillness.drift_px < 0.1
+
+
+def test_another_scene_is_a_loss() -> None:
+    stillness = Stillness(600.0)
+    for index in range(60):
+        view = road_moved((0.0, 0.0))
+        stillness.update(view if index < 30 else np.ascontiguousarray(view[::-1, ::-1]), float(index))
+    assert 30.0 <= stillness.lost_s <= 42.0
+
+
 def test_passing_cars_are_not_drift(watched: tuple[list, list, Observer]) -> None:
     assert watched[2].drift_px < 0.5
 
