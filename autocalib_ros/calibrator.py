@@ -71,6 +71,8 @@ class AutoCalibrator:
         self._tracks_seen += len(observed.tracks)
         if observed.segments is not None:
             self._buffer.add_segments(observed.segments)
+        if observed.edges is not None:
+            self._buffer.add_edges(observed.edges)
         if time_s >= self._forget_s:
             self._forget(time_s)
         self._newest_stamp_ns = stamp_ns
@@ -246,7 +248,7 @@ def _calibration(options: Options, solution: Solution, lens: Calibration) -> Cal
         return replace(lens, ground_refusal=doubt)
     normal = plane.normal(plane.fit.state)
     tilt, roll = plane.sigma(lambda _, normal: tilt_and_roll_deg(normal))
-    grade = 'unit_scale' if not scale.metric else 'full' if plane.roll_sigma_deg is None else 'assumed'
+    grade = 'unit_scale' if not scale.metric else 'full' if plane.assumed is None else 'assumed'
     return replace(
         lens, grade=grade, ground=ground_plane(normal, solution.along, height, metric=scale.metric),
         assumptions=(*lens.assumptions, *scale.assumption(height, height_sigma)),

@@ -79,6 +79,8 @@ class BufferOptions(_Checked):
                              high=100000)
     max_segments: int = option(20000, 'segments kept at the most; vehicles that add least to newer ones go first',
                                low=100, high=1000000)
+    max_edges: int = option(10000, 'straight edges on vehicles kept at the most; vehicles that add least to newer ones '
+                            'go first', low=100, high=1000000)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,6 +124,9 @@ class JointOptions(_Checked):
     roll_prior_deg: float = option(
         0.0, 'where one road alone is seen: standard deviation of the roll of a camera that is taken for level, in '
         'degrees; it then gives a ground plane of grade assumed; 0 does not allow that', low=0, high=10)
+    transverse_edges: bool = option(
+        True, 'where one road alone is seen: take bumpers, windscreens and roof lines of vehicles for square to it; '
+        'they then give a ground plane of grade assumed')
 
     def __post_init__(self) -> None:
         if isinstance(self.road_angle, (int, float)) and not isinstance(self.road_angle, bool):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import zipfile
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +42,17 @@ class Segments:
     """x0, y0, x1, y1 in observed pixels, shape (n, 4)."""
 
 
+@dataclass(frozen=True)
+class Edges:
+    """Straight edges seen on vehicles in one image: bumpers, windscreens, pillars."""
+
+    time_s: float
+    vehicles: np.ndarray
+    """Vehicle of each edge, shape (n,)."""
+    ends_px: np.ndarray
+    """x0, y0, x1, y1 in observed pixels, shape (n, 4)."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Evidence:
     """A snapshot of the buffer: every estimator can be run on it again without images."""
@@ -66,6 +77,12 @@ class Evidence:
     """Shape (segments,)."""
     drift_px: float
     """How far the still background has moved at most, pixels of the full image; 0 for a fixed camera."""
+    edges_px: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))
+    """Straight edges on vehicles, x0, y0, x1, y1, shape (edges, 4)."""
+    edge_vehicles: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
+    """Shape (edges,)."""
+    edge_times_s: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    """Shape (edges,)."""
 
     @property
     def track_count(self) -> int:
@@ -102,12 +119,12 @@ class Evidence:
             segments=len(self.segments_px), vehicles=len(np.unique(self.track_vehicles)), coverage=self.coverage)
 
     def selected(self, keep: np.ndarray) -> Evidence:
-        """Return the evidence with only the tracks whose indices are in `keep`, segments unchanged."""
+        """Return the evidence with only the tracks whose indices are in `keep`; segments and edges unchanged."""
         return replace(self, **_track_arrays([self.track(index) for index in keep]))
 
     def save(self, path: Path) -> None:
         """Write the snapshot as .npz."""
-        arrays = {name: getattr(self, name) for name in ARRAYS}
+        arrays = {name: getattr(self, name) for name in (*ARRAYS, *EDGE_ARRAYS)}
         path = Path(path)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -130,7 +147,8 @@ class Evidence:
                 width, height = (int(value) for value in data['image_size'])
                 evidence = cls(image_size=(width, height), first_stamp_ns=first, newest_stamp_ns=newest,
                                frames=int(data['frames']), drift_px=float(data['drift_px']),
-                               **{name: data[name] for name in ARRAYS})
+                               **{name: data[name] for name in ARRAYS},
+                               **{name: data[name] for name in EDGE_ARRAYS if name in data})
             _require_consistent(evidence)
         except UNREADABLE as error:
             reason = ' '.join(str(error).split())
@@ -140,6 +158,8 @@ class Evidence:
 
 ARRAYS = ('track_starts', 'points_px', 'times_s', 'track_vehicles', 'segments_px', 'segment_vehicles',
           'segment_times_s')
+EDGE_ARRAYS = ('edges_px', 'edge_vehicles', 'edge_times_s')
+"""Files written before edges were gathered have none of them."""
 
 
 UNREADABLE = (OSError, LookupError, ValueError, TypeError, AttributeError, EOFError, OverflowError, MemoryError,
@@ -152,7 +172,9 @@ def _require_consistent(evidence: Evidence) -> None:
     points, tracks = len(evidence.points_px), len(evidence.track_vehicles)
     shapes = {'track_starts': (tracks + 1,), 'points_px': (points, 2), 'times_s': (points,),
               'track_vehicles': (tracks,), 'segments_px': (len(evidence.segments_px), 4),
-              'segment_vehicles': (len(evidence.segments_px),), 'segment_times_s': (len(evidence.segments_px),)}
+              'segment_vehicles': (len(evidence.segments_px),), 'segment_times_s': (len(evidence.segments_px),),
+              'edges_px': (len(evidence.edges_px), 4), 'edge_vehicles': (len(evidence.edges_px),),
+              'edge_times_s': (len(evidence.edges_px),)}
     for name, shape in shapes.items():
         array = getattr(evidence, name)
         kinds = 'iu' if name == 'track_starts' or name.endswith('vehicles') else 'f'
@@ -178,20 +200,247 @@ def _track_arrays(tracks: list[Track]) -> dict[str, np.ndarray]:
         'track_vehicles': np.array([track.vehicle for track in tracks], int)}
 
 
-class EvidenceBuffer:
-    """Finished tracks and segments, bounded in number: what adds least goes first, by whole vehicles.
+class _Lines:
+    """Lines of vehicles, in arrays: what adds least goes when there is no room."""
 
-    A track holds at most `tracking.max_samples` points of 24 bytes and 0.4 kB of its own, a segment 80 bytes: with the
-    default options no more than 12 MB are held, however long it runs.
+    def __init__(self, limit: int) -> None:
+        self._ends_px = np.zeros((limit, 4))
+        self._vehicles = np.zeros(limit, int)
+        self.held = Holdings(limit)
+
+    def add(self, lines: Segments | Edges) -> None:
+        """Take the lines of one time; where there is no room, vehicles that add least make some."""
+        limit = len(self._ends_px)
+        ends, vehicles = lines.ends_px[:limit], lines.vehicles[:limit]
+        if not len(ends):
+            return
+        if self.held.count + len(ends) > limit:
+            self.keep(self.held.with_room(len(ends)))
+        part = slice(self.held.count, self.held.count + len(ends))
+        self._ends_px[part], self._vehicles[part] = ends, vehicles
+        self.held.add(vehicles, 0.5 * (ends[:, :2] + ends[:, 2:]), ends[:, 2:] - ends[:, :2], lines.time_s)
+
+    def keep(self, rows: np.ndarray) -> None:
+        """Keep the lines of these rows."""
+        if len(rows) < self.held.count:
+            self.held.keep(rows)
+            self._ends_px[:len(rows)], self._vehicles[:len(rows)] = self._ends_px[rows], self._vehicles[rows]
+
+    def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Ends (lines, 4), vehicles (lines,) and times (lines,) of all that is held."""
+        count = self.held.count
+        return self._ends_px[:count].copy(), self._vehicles[:count].copy(), self.held.times_s.copy()
+
+
+class EvidenceBuffer:
+    """Finished tracks, segments and edges, bounded in number: what adds least goes first, by whole vehicles.
+
+    A track holds at most `tracking.max_samples` points of 24 bytes and 0.4 kB of its own, a segment or an edge 80
+    bytes: with the default options no more than 25 MB are held, however long it runs.
     """
 
     def __init__(self, options: BufferOptions) -> None:
         self._tracks: list[Track] = []
         self._of_tracks = Holdings(options.max_tracks)
         self._max_tracks = options.max_tracks
-        self._ends_px = np.zeros((options.max_segments, 4))
-        self._vehicles = np.zeros(options.max_segments, int)
-        self._of_segments = Holdings(options.max_segments)
+        self._segments = _Lines(options.max_segments)
+        self._edges = _Lines(options.max_edges)
+
+    def add_track(self, track: Track) -> None:
+        """Take a finished track; where there is no room, vehicles that add least make some."""
+        if self._of_tracks.count == self._max_tracks:
+            self._keep_tracks(self._of_tracks.with_room(1))
+        points = track.points_px
+        self._of_tracks.add(np.array([track.vehicle]), points[len(points) // 2], (points[-1] - points[0])[None],
+                            track.times_s[-1])
+        self._tracks.append(track)
+
+    def add_segments(self, segments: Segments) -> None:
+        """Take the segments of one pair of frames."""
+        self._segments.add(segments)
+
+    def add_edges(self, edges: Edges) -> None:
+        """Take the edges of one image."""
+        self._edges.add(edges)
+
+    def forget_replaced(self, time_s: float) -> None:
+        """Drop the vehicles last seen before `time_s` in whose place there are enough newer ones."""
+        self._keep_tracks(self._of_tracks.not_replaced(time_s))
+        for lines in (self._segments, self._edges):
+            lines.keep(lines.held.not_replaced(time_s))
+
+    def forget_before(self, time_s: float) -> None:
+        """Drop all that ended before `time_s`: the camera may have stood otherwise then."""
+        self._keep_tracks(self._of_tracks.since(time_s))
+        for lines in (self._segments, self._edges):
+            lines.keep(lines.held.since(time_s))
+
+    def _keep_tracks(self, rows: np.ndarray) -> None:
+        if len(rows) < len(self._tracks):
+            self._of_tracks.keep(rows)
+            self._tracks = [self._tracks[row] for row in rows]
+
+    @property
+    def track_count(self) -> int:
+        """Number of tracks."""
+        return len(self.track_vehicles)
+
+    @property
+    def seconds(self) -> float:
+        """Recording time covered."""
+        return (self.newest_stamp_ns - self.first_stamp_ns) * 1e-9
+
+    def track(self, index: int) -> Track:
+        """Return one track."""
+        part = slice(self.track_starts[index], self.track_starts[index + 1])
+        return Track(int(self.track_vehicles[index]), self.times_s[part], self.points_px[part])
+
+    def tracks(self) -> Iterator[Track]:
+        """Iterate over all tracks."""
+        return (self.track(index) for index in range(self.track_count))
+
+    @property
+    def coverage(self) -> float:
+        """Share of the image's cells that tracks have crossed, 0 to 1."""
+        if not len(self.points_px):
+            return 0.0
+        cells = np.floor(self.points_px / self.image_size * COVERAGE_CELLS).astype(int)
+        cells = np.clip(cells, 0, np.array(COVERAGE_CELLS) - 1)
+        return len(np.unique(cells @ [1, COVERAGE_CELLS[0]])) / (COVERAGE_CELLS[0] * COVERAGE_CELLS[1])
+
+    def summary(self) -> EvidenceSummary:
+        """Return the counts that a result carries."""
+        return EvidenceSummary(
+            image_size=self.image_size, seconds=self.seconds, frames=self.frames, tracks=self.track_count,
+            segments=len(self.segments_px), vehicles=len(np.unique(self.track_vehicles)), coverage=self.coverage)
+
+    def selected(self, keep: np.ndarray) -> Evidence:
+        """Return the evidence with only the tracks whose indices are in `keep`; segments and edges unchanged."""
+        return replace(self, **_track_arrays([self.track(index) for index in keep]))
+
+    def save(self, path: Path) -> None:
+        """Write the snapshot as .npz."""
+        arrays = {name: getattr(self, name) for name in (*ARRAYS, *EDGE_ARRAYS)}
+        path = Path(path)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with path.open('wb') as stream:
+                np.savez_compressed(
+                    stream, format=FORMAT, image_size=self.image_size, drift_px=self.drift_px, frames=self.frames,
+                    stamps_ns=np.array([self.first_stamp_ns, self.newest_stamp_ns], np.int64), **arrays)
+        except OSError as error:
+            raise InputError(f'cannot write {path}: {error.strerror or error}') from error
+
+    @classmethod
+    def load(cls, path: Path) -> Evidence:
+        """Read what `save` wrote, or raise InputError."""
+        path = Path(path)
+        try:
+            with path.open('rb') as stream, np.load(stream, allow_pickle=False) as data:
+                if int(data['format']) != FORMAT:
+                    raise InputError(f'{path} holds evidence of format {int(data["format"])}, not {FORMAT}')
+                first, newest = (int(stamp) for stamp in data['stamps_ns'])
+                width, height = (int(value) for value in data['image_size'])
+                evidence = cls(image_size=(width, height), first_stamp_ns=first, newest_stamp_ns=newest,
+                               frames=int(data['frames']), drift_px=float(data['drift_px']),
+                               **{name: data[name] for name in ARRAYS},
+                               **{name: data[name] for name in EDGE_ARRAYS if name in data})
+            _require_consistent(evidence)
+        except UNREADABLE as error:
+            reason = ' '.join(str(error).split())
+            raise InputError(f'{path} is not a file of saved evidence (.npz): {reason}') from error
+        return evidence
+
+
+ARRAYS = ('track_starts', 'points_px', 'times_s', 'track_vehicles', 'segments_px', 'segment_vehicles',
+          'segment_times_s')
+EDGE_ARRAYS = ('edges_px', 'edge_vehicles', 'edge_times_s')
+"""Files written before edges were gathered have none of them."""
+
+
+UNREADABLE = (OSError, LookupError, ValueError, TypeError, AttributeError, EOFError, OverflowError, MemoryError,
+              NotImplementedError, RuntimeError, zipfile.BadZipFile, zlib.error)
+"""What NumPy and zipfile raise at files that are damaged, encrypted, or of another kind."""
+
+
+def _require_consistent(evidence: Evidence) -> None:
+    """Raise ValueError unless shapes, kinds and numbers are those that a snapshot has."""
+    points, tracks = len(evidence.points_px), len(evidence.track_vehicles)
+    shapes = {'track_starts': (tracks + 1,), 'points_px': (points, 2), 'times_s': (points,),
+              'track_vehicles': (tracks,), 'segments_px': (len(evidence.segments_px), 4),
+              'segment_vehicles': (len(evidence.segments_px),), 'segment_times_s': (len(evidence.segments_px),),
+              'edges_px': (len(evidence.edges_px), 4), 'edge_vehicles': (len(evidence.edges_px),),
+              'edge_times_s': (len(evidence.edges_px),)}
+    for name, shape in shapes.items():
+        array = getattr(evidence, name)
+        kinds = 'iu' if name == 'track_starts' or name.endswith('vehicles') else 'f'
+        if array.shape != shape or array.dtype.kind not in kinds or not np.isfinite(array).all():
+            raise ValueError(f'{name} of {array.dtype} {array.shape} does not fit the rest')
+    starts = evidence.track_starts
+    if starts[0] != 0 or starts[-1] != points or (np.diff(starts) < 1).any():
+        raise ValueError('track_starts does not divide points_px into tracks')
+    if (np.delete(np.diff(evidence.times_s), starts[1:-1] - 1) <= 0).any():
+        raise ValueError('times_s does not increase along each track')
+    if min(evidence.image_size) < 1 or evidence.newest_stamp_ns < evidence.first_stamp_ns or evidence.frames < 0:
+        raise ValueError(f'an image size of {evidence.image_size}, {evidence.frames} frames in {evidence.seconds} s')
+    if not evidence.drift_px >= 0:
+        raise ValueError(f'a drift of {evidence.drift_px} px')
+
+
+def _track_arrays(tracks: list[Track]) -> dict[str, np.ndarray]:
+    lengths = np.array([len(track.times_s) for track in tracks], int)
+    return {
+        'track_starts': np.concatenate([[0], np.cumsum(lengths)]).astype(int),
+        'points_px': np.concatenate([t.points_px for t in tracks] or [np.zeros((0, 2))]).astype(float),
+        'times_s': np.concatenate([t.times_s for t in tracks] or [np.zeros(0)]).astype(float),
+        'track_vehicles': np.array([track.vehicle for track in tracks], int)}
+
+
+class _Lines:
+    """Lines of vehicles, in arrays: what adds least goes when there is no room."""
+
+    def __init__(self, limit: int) -> None:
+        self._ends_px = np.zeros((limit, 4))
+        self._vehicles = np.zeros(limit, int)
+        self.held = Holdings(limit)
+
+    def add(self, lines: Segments | Edges) -> None:
+        """Take the lines of one time; where there is no room, vehicles that add least make some."""
+        limit = len(self._ends_px)
+        ends, vehicles = lines.ends_px[:limit], lines.vehicles[:limit]
+        if not len(ends):
+            return
+        if self.held.count + len(ends) > limit:
+            self.keep(self.held.with_room(len(ends)))
+        part = slice(self.held.count, self.held.count + len(ends))
+        self._ends_px[part], self._vehicles[part] = ends, vehicles
+        self.held.add(vehicles, 0.5 * (ends[:, :2] + ends[:, 2:]), ends[:, 2:] - ends[:, :2], lines.time_s)
+
+    def keep(self, rows: np.ndarray) -> None:
+        """Keep the lines of these rows."""
+        if len(rows) < self.held.count:
+            self.held.keep(rows)
+            self._ends_px[:len(rows)], self._vehicles[:len(rows)] = self._ends_px[rows], self._vehicles[rows]
+
+    def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Ends (lines, 4), vehicles (lines,) and times (lines,) of all that is held."""
+        count = self.held.count
+        return self._ends_px[:count].copy(), self._vehicles[:count].copy(), self.held.times_s.copy()
+
+
+class EvidenceBuffer:
+    """Finished tracks, segments and edges, bounded in number: what adds least goes first, by whole vehicles.
+
+    A track holds at most `tracking.max_samples` points of 24 bytes and 0.4 kB of its own, a segment or an edge 80
+    bytes: with the default options no more than 25 MB are held, however long it runs.
+    """
+
+    def __init__(self, options: BufferOptions) -> None:
+        self._tracks: list[Track] = []
+        self._of_tracks = Holdings(options.max_tracks)
+        self._max_tracks = options.max_tracks
+        self._segments = _Lines(options.max_segments)
+        self._edges = _Lines(options.max_edges)
 
     def add_track(self, track: Track) -> None:
         """Take a finished track; where there is no room, vehicles that add least make some."""
@@ -218,6 +467,15 @@ class EvidenceBuffer:
         """Drop the vehicles last seen before `time_s` in whose place there are enough newer ones."""
         self._keep_tracks(self._of_tracks.not_replaced(time_s))
         self._keep_segments(self._of_segments.not_replaced(time_s))
+
+    def add_edges(self, edges: Edges) -> None:
+        """Take the edges of one image; the oldest images make room."""
+        if not len(edges.ends_px):
+            return
+        self._edges.append(edges)
+        self._edge_count += len(edges.ends_px)
+        while self._edge_count > self._options.max_edges and len(self._edges) > 1:
+            self._edge_count -= len(self._edges.popleft().ends_px)
 
     def forget_before(self, time_s: float) -> None:
         """Drop all that ended before `time_s`: the camera may have stood otherwise then."""
@@ -247,8 +505,10 @@ class EvidenceBuffer:
     def snapshot(self, *, image_size: tuple[int, int], first_stamp_ns: int, newest_stamp_ns: int, frames: int,
                  drift_px: float, unfinished: list[Track]) -> Evidence:
         """Freeze what is held, with the tracks that are still being followed."""
-        held = self._of_segments.count
+        segments_px, segment_vehicles, segment_times_s = self._segments.arrays()
+        edges_px, edge_vehicles, edge_times_s = self._edges.arrays()
         return Evidence(
             image_size=image_size, first_stamp_ns=first_stamp_ns, newest_stamp_ns=newest_stamp_ns, frames=frames,
-            drift_px=drift_px, segments_px=self._ends_px[:held].copy(), segment_vehicles=self._vehicles[:held].copy(),
-            segment_times_s=self._of_segments.times_s.copy(), **_track_arrays([*self._tracks, *unfinished]))
+            drift_px=drift_px, segments_px=segments_px, segment_vehicles=segment_vehicles,
+            segment_times_s=segment_times_s, edges_px=edges_px, edge_vehicles=edge_vehicles, edge_times_s=edge_times_s,
+            **_track_arrays([*self._tracks, *unfinished]))

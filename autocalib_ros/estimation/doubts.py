@@ -12,7 +12,7 @@ from autocalib_ros.estimation.great_circles import TrackSet
 from autocalib_ros.estimation.ground_plane import BELOW_HORIZON, tilt_and_roll_deg
 from autocalib_ros.estimation.joint import MIN_ROWS, JointFit, road_support, solve_joint
 from autocalib_ros.estimation.lives import no_lives
-from autocalib_ros.estimation.plane import Plane, above_traffic
+from autocalib_ros.estimation.plane import LevelCamera, Plane, above_traffic
 from autocalib_ros.estimation.state import State
 from autocalib_ros.estimation.uncertainty import told_by_evidence
 
@@ -139,10 +139,10 @@ def _model_doubt(fit: JointFit) -> Reason | None:
 def plane_doubt(plane: Plane, gate: GateOptions) -> Reason | None:
     """Say why the ground plane cannot be trusted, if so; an assumption may be as wrong as it says on top."""
     sigma = float(plane.sigma(lambda _, normal: tilt_and_roll_deg(normal)).max())
-    if plane.roll_sigma_deg is not None and not plane.told_by_roll:
+    if isinstance(plane.assumed, LevelCamera) and not plane.assumed.tells(plane.fit.state):
         return Reason('plane_uncertain', 'the road leads level across the image, where the roll of the camera tells '
                       'nothing of the plane', 'wait for traffic across the road, or that turns')
-    needed = gate.max_sigma_tilt_deg * (1.0 if plane.roll_sigma_deg is None else ASSUMED)
+    needed = gate.max_sigma_tilt_deg * (1.0 if plane.assumed is None else ASSUMED)
     if not sigma <= needed:
         return Reason(
             'plane_uncertain', f'the ground normal is known to {min(sigma, 90.0):.1f} degrees, {needed:g} are needed',

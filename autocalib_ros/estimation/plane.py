@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,13 +12,64 @@ from autocalib_ros.estimation.great_circles import TrackSet, rays_of
 from autocalib_ros.estimation.ground_plane import upward
 from autocalib_ros.estimation.joint import JointFit
 from autocalib_ros.estimation.state import ALONG_X, State
+from autocalib_ros.estimation.transverse_edges import SquareVehicles, folded
 
 STEP_RAD = 1e-5
+AGREE_SIGMAS = 3.0
+"""Two assumptions that differ by more contradict each other."""
 
 
 def above_traffic(normal: np.ndarray, camera: Camera, tracks: TrackSet) -> tuple[np.ndarray, float]:
     """Turn a plane normal (3,) away from the traffic; and the share of the tracked points below the horizon."""
     return upward(normal, rays_of(camera, tracks.pixels[tracks.weights > 0]).bearings)
+
+
+@dataclass(frozen=True)
+class LevelCamera:
+    """The direction across the road under a camera whose roll is taken for zero."""
+
+    sigma_deg: float
+
+    @property
+    def step_sigma_rad(self) -> float:
+        """Standard deviation of the roll."""
+        return float(np.radians(self.sigma_deg))
+
+    def across(self, _: State, step_rad: float = 0.0) -> np.ndarray:
+        """Direction (3,) in the plane, at a roll by a step: what is level in the image."""
+        return np.array([np.cos(step_rad), np.sin(step_rad), 0.0])
+
+    def tells(self, state: State) -> bool:
+        """Whether the road leads across the level, so that the roll tells the plane."""
+        along = state.directions[0]
+        return float(np.hypot(along[1], along[2])) > ALONG_X
+
+    @property
+    def words(self) -> str:
+        """What is assumed."""
+        return f'a camera that is not rolled: roll = 0 +- {self.sigma_deg:g} degrees'
+
+
+def agreement(level: LevelCamera, square: SquareVehicles, state: State) -> tuple[SquareVehicles | None, float]:
+    """Join two assumptions by their variances, None where they contradict each other; and their difference in degrees.
+
+    The difference is a rotation about the road, nan where the roll does not tell the plane.
+    """
+    if not level.tells(state):
+        return square, np.nan
+    along = state.directions[0]
+    across = square.across(state)
+    up = np.cross(along, across)
+
+    def turn(roll_rad: float) -> float:
+        in_plane = level.across(state, roll_rad)
+        return float(folded(np.arctan2(in_plane @ up, in_plane @ across)))
+
+    sigma = level.step_sigma_rad * abs(turn(STEP_RAD) - turn(-STEP_RAD)) / (2 * STEP_RAD)
+    both = float(np.hypot(sigma, square.step_sigma_rad))
+    joined = replace(square, turn_rad=turn(0.0) * (square.step_sigma_rad / both) ** 2,
+                     step_sigma_rad=square.step_sigma_rad * sigma / both, besides=f', and {level.words}')
+    return joined if abs(turn(0.0)) <= AGREE_SIGMAS * both else None, float(np.degrees(abs(turn(0.0))))
 
 
 @dataclass(frozen=True)
@@ -28,23 +79,22 @@ class Plane:
     fit: JointFit
     side: float
     """1 or -1: which side of the state's plane is up."""
-    roll_sigma_deg: float | None = None
-    """Where the roll of the camera is assumed to be zero, its standard deviation."""
+    assumed: LevelCamera | SquareVehicles | None = None
+    """What tells the direction across the road where the traffic does not."""
 
     @classmethod
-    def of(cls, fit: JointFit, tracks: TrackSet, roll_sigma_deg: float | None = None) -> Plane:
+    def of(cls, fit: JointFit, tracks: TrackSet, assumed: LevelCamera | SquareVehicles | None = None) -> Plane:
         """Return the plane of a solution, the side of the traffic below."""
-        plane = cls(fit, 1.0, roll_sigma_deg)
+        plane = cls(fit, 1.0, assumed)
         normal = plane.normal(fit.state)
         up, _ = above_traffic(normal, fit.state.camera, tracks)
-        return cls(fit, float(np.sign(normal @ up)), roll_sigma_deg)
+        return replace(plane, side=float(np.sign(normal @ up)))
 
-    def normal(self, state: State, roll_rad: float = 0.0) -> np.ndarray:
-        """Upward normal (3,) in the camera frame at a state; `roll_rad` counts where the roll is assumed."""
-        if self.roll_sigma_deg is None:
+    def normal(self, state: State, step_rad: float = 0.0) -> np.ndarray:
+        """Upward normal (3,) in the camera frame at a state; a step of what is assumed counts where it is."""
+        if self.assumed is None:
             return self.side * state.rotation[:, 2]
-        # the plane holds the road and what is level in the image
-        normal = np.cross(state.directions[0], [np.cos(roll_rad), np.sin(roll_rad), 0.0])
+        normal = np.cross(state.directions[0], self.assumed.across(state, step_rad))
         return self.side * normal / max(float(np.linalg.norm(normal)), 1e-9)
 
     @property
@@ -52,17 +102,11 @@ class Plane:
         """Lens and upward normal (3,) of the solution."""
         return self.fit.state.camera, self.normal(self.fit.state)
 
-    @property
-    def told_by_roll(self) -> bool:
-        """Whether the road leads across the level, so that the roll tells the plane."""
-        along = self.fit.state.directions[0]
-        return float(np.hypot(along[1], along[2])) > ALONG_X
-
     def sigma(self, function: Callable[[Camera, np.ndarray], np.ndarray]) -> np.ndarray:
         """Standard deviations of a function of lens and normal, shape of its result; with those of the assumption."""
         told = self.fit.sigma(lambda state: function(state.camera, self.normal(state)))
-        if self.roll_sigma_deg is None:
+        if self.assumed is None:
             return told
         state = self.fit.state
         ends = [np.atleast_1d(function(state.camera, self.normal(state, step))) for step in (-STEP_RAD, STEP_RAD)]
-        return np.hypot(told, np.radians(self.roll_sigma_deg) * (ends[1] - ends[0]) / (2 * STEP_RAD))
+        return np.hypot(told, self.assumed.step_sigma_rad * (ends[1] - ends[0]) / (2 * STEP_RAD))

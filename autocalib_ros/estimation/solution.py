@@ -14,10 +14,11 @@ from autocalib_ros.estimation.great_circles import TrackSet
 from autocalib_ros.estimation.held import lens_assumptions, with_k2_if_asked_for, with_what_can_be_told
 from autocalib_ros.estimation.joint import JointFit, noise_cost, road_support, solve_joint, with_bodies
 from autocalib_ros.estimation.lens_prior import LensPrior, known_lens, lens_priors
-from autocalib_ros.estimation.plane import Plane
+from autocalib_ros.estimation.plane import LevelCamera, Plane, agreement
 from autocalib_ros.estimation.roads import main_road, with_further_roads, with_real_roads, with_right_angle
 from autocalib_ros.estimation.starts import agreed, in_likeliest_family
 from autocalib_ros.estimation.state import Setting
+from autocalib_ros.estimation.transverse_edges import SquareVehicles, square_vehicles
 from autocalib_ros.estimation.turning import from_turning, one_centre_doubt, over_lives, with_turning
 from autocalib_ros.estimation.windows import Instants, Windows, find_windows
 from autocalib_ros.evidence import Evidence
@@ -50,6 +51,8 @@ class _Traffic:
     instants: Instants
     priors: list[LensPrior]
     gate: GateOptions
+    evidence: Evidence
+    generator: np.random.Generator
 
     @property
     def voters(self) -> TrackSet:
@@ -70,9 +73,9 @@ def find_solution(evidence: Evidence, tracks: TrackSet, options: JointOptions, g
     priors = [known_lens(lens)] if lens is not None else lens_priors(evidence.image_size, options)
     crossing = None if options.crossing_deg is None else float(np.radians(options.crossing_deg))
     instants = Instants(evidence)
-    traffic = _Traffic(tracks, find_windows(evidence, instants), instants, priors, gate)
+    traffic = _Traffic(tracks, find_windows(evidence, instants), instants, priors, gate, evidence, generator)
     setting = Setting(priors[0], options, height_m, crossing)
-    straight = _from_straight(traffic, setting, generator)
+    straight = _from_straight(traffic, setting)
     if isinstance(straight, Solution) and straight.no_plane is None:
         return straight
     turned = from_turning(tracks, traffic.windows, setting)
@@ -84,10 +87,10 @@ def find_solution(evidence: Evidence, tracks: TrackSet, options: JointOptions, g
     return turning if better else straight
 
 
-def _from_straight(traffic: _Traffic, setting: Setting, generator: np.random.Generator) -> Solution | Reason:
+def _from_straight(traffic: _Traffic, setting: Setting) -> Solution | Reason:
     """Solve from the directions on which straight tracks agree."""
     tracks, gate = traffic.tracks, traffic.gate
-    found = agreed(traffic.voters, setting, generator)
+    found = agreed(traffic.voters, setting, traffic.generator)
     if found is None:
         return Reason('no_direction', f'{len(tracks)} tracks agree on no common direction',
                       'straight traffic is needed: wait for it, or turn the camera towards a straight road')
@@ -140,15 +143,32 @@ def _completed(fit: JointFit, tracks: TrackSet, across: str, traffic: _Traffic, 
         plane = Plane.of(fit, tracks)
         return Solution(fit, plane, along, flow, (*assumptions, angle) if fit.crossing_held and angle else assumptions,
                         checks, plane_doubt(plane, gate))
-    if options.roll_prior_deg > 0:
-        plane = Plane.of(fit, tracks, options.roll_prior_deg)
-        level = ('ground plane by one road and a camera that is not rolled: '
-                 f'roll = 0 +- {options.roll_prior_deg:g} degrees')
-        return Solution(fit, plane, along, flow, (*assumptions, level), (halves,), plane_doubt(plane, gate))
-    return Solution(fit, Plane.of(fit, tracks), along, flow, assumptions, (halves,), Reason(
+    assumed, checks = _assumed(fit, tracks, traffic)
+    plane, checks = Plane.of(fit, tracks, None if isinstance(assumed, Reason) else assumed), (halves, *checks)
+    if not isinstance(assumed, Reason | None):
+        return Solution(fit, plane, along, flow,
+                        (*assumptions, f'ground plane by one road and {assumed.words}'), checks, plane_doubt(plane, gate))
+    return Solution(fit, plane, along, flow, assumptions, checks, assumed or Reason(
         'one_direction', f'too little traffic across the main road yet: {across}; {int(fit.explained().sum())} '
         'follow one road, and rotation about it is free',
         'wait for traffic across the main road, or that turns; or allow joint.roll_prior_deg'))
+
+
+def _assumed(fit: JointFit, tracks: TrackSet,
+             traffic: _Traffic) -> tuple[LevelCamera | SquareVehicles | Reason | None, tuple[str, ...]]:
+    """What one may assume of the direction across a lone road, a reason where that contradicts itself; and checks."""
+    options = fit.problem.setting.options
+    level = LevelCamera(options.roll_prior_deg) if options.roll_prior_deg > 0 else None
+    square = square_vehicles(traffic.evidence, fit, tracks, traffic.generator) if options.transverse_edges else None
+    if level is None or square is None:
+        return level or square, ()
+    joined, apart_deg = agreement(level, square, fit.state)
+    if joined is None:
+        return Reason(
+            'plane_uncertain', f'edges of vehicles and a level camera disagree by {apart_deg:.1f} degrees about the '
+            'road', 'set joint.roll_prior_deg to 0 to trust the edges, or to what the camera may be rolled'), ()
+    return joined, ((f'edges of vehicles and a level camera differ by {apart_deg:.1f} degrees about the road',)
+                    if apart_deg >= 0 else ())
 
 
 def _angle_and_turning(fit: JointFit, angle: str | None) -> tuple[str, ...]:

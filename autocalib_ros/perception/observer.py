@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 
 from autocalib_ros.config import Options
-from autocalib_ros.evidence import Segments, Track
+from autocalib_ros.evidence import Edges, Segments, Track
 from autocalib_ros.perception.background import Background
+from autocalib_ros.perception.edges import EdgeFinder
 from autocalib_ros.perception.segments import Keypoints, find_keypoints, match_segments
 from autocalib_ros.perception.stillness import Stillness
 from autocalib_ros.perception.tracks import PointTracker
@@ -19,6 +20,8 @@ MASK_EVERY = 2
 """Images between two updates of the background: traffic needs no finer step in time."""
 
 
+EDGES_EVERY = 2
+"""Searches for points between two for edges: they cost as much, and a vehicle's edges are much the same after."""
 REPEATED_LEVELS = 4
 """A reduced image that differs from the last one used by no more than this anywhere is the same picture again."""
 REPEATED_WIDTH_PX = 320
@@ -30,6 +33,7 @@ class Observations:
 
     tracks: list[Track]
     segments: Segments | None
+    edges: Edges | None
 
 
 class Observer:
@@ -48,21 +52,23 @@ class Observer:
         self._last: np.ndarray | None = None
         self._frames = 0
         self._vehicles = 0
+        self._edge_finder = EdgeFinder()
+        self._detections = 0
 
     def observe(self, image: np.ndarray, time_s: float) -> Observations:
         """Take a grey (H, W) or BGR (H, W, 3) uint8 image."""
         grey = self._tracked_image(image)
         if self._repeats(grey):
-            return Observations([], None)
+            return Observations([], None, None)
         self._background.update(image, time_s)
         tracks = self._tracker.follow(grey, time_s)
         detect = self._frames % self._options.tracking.detect_every == 0
         if detect or self._frames % MASK_EVERY == 0:
             self._motion.update(grey, time_s)
-        segments = self._detect(grey, time_s) if detect else None
+        segments, edges = self._detect(grey, time_s) if detect else (None, None)
         self._stillness.update(grey, time_s)
         self._frames += 1
-        return Observations([self._full_size(track) for track in tracks], segments)
+        return Observations([self._full_size(track) for track in tracks], segments, edges)
 
     def _repeats(self, grey: np.ndarray) -> bool:
         """Say whether nothing has changed since the last image used: cameras and recorders send pictures twice."""
@@ -82,19 +88,28 @@ class Observer:
             grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
         return grey
 
-    def _detect(self, grey: np.ndarray, time_s: float) -> Segments | None:
-        """Look for keypoints in the moving regions: they start tracks, and matched they are segments."""
+    def _detect(self, grey: np.ndarray, time_s: float) -> tuple[Segments | None, Edges | None]:
+        """Look into the moving regions for edges and keypoints, which start tracks, and matched are segments."""
         regions = self._motion.regions()
         vehicles = self._vehicles_of(regions)
         keypoints = find_keypoints(grey, regions, self._sift)
         strongest = np.argsort(-keypoints.responses, kind='stable')
         of_keypoint = vehicles[keypoints.regions]
         self._tracker.add_points(keypoints.points_px[strongest], of_keypoint[strongest])
+        edges = self._edges_of(grey, regions, vehicles, time_s)
         before, self._keypoints = self._keypoints, keypoints
         if before is None:
-            return None
+            return None, edges
         ends, matched = match_segments(before, keypoints, grey.shape[1])
-        return Segments(time_s, of_keypoint[matched], self._full_pixels(ends.reshape(-1, 2)).reshape(-1, 4))
+        return Segments(time_s, of_keypoint[matched], self._full_pixels(ends.reshape(-1, 2)).reshape(-1, 4)), edges
+
+    def _edges_of(self, grey: np.ndarray, regions: list[Region], vehicles: np.ndarray, time_s: float) -> Edges | None:
+        """Look for straight edges in every `EDGES_EVERY`th image with regions."""
+        self._detections += 1
+        if self._detections % EDGES_EVERY:
+            return None
+        ends, of_edge = self._edge_finder.find(grey, regions)
+        return Edges(time_s, vehicles[of_edge], self._full_pixels(ends.reshape(-1, 2)).reshape(-1, 4))
 
     def _vehicles_of(self, regions: list[Region]) -> np.ndarray:
         """Give each region (n,) the vehicle that most points followed inside it belong to, or a new one."""
