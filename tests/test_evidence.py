@@ -9,7 +9,7 @@ import pytest
 
 from autocalib_ros.config import BufferOptions
 from autocalib_ros.errors import InputError
-from autocalib_ros.evidence import Evidence, EvidenceBuffer, Segments, Track
+from autocalib_ros.evidence import EDGE_ARRAYS, Edges, Evidence, EvidenceBuffer, Segments, Track
 
 
 def track(vehicle: int, end_s: float) -> Track:
@@ -30,11 +30,37 @@ def test_a_snapshot_survives_its_file_to_the_last_bit(tmp_path: Path) -> None:
     buffer = EvidenceBuffer(BufferOptions())
     buffer.add_track(track(3, 5.0))
     buffer.add_segments(segments(5.0, 4))
+    buffer.add_edges(Edges(5.0, np.array([3, 3]), np.arange(8.0).reshape(2, 4)))
     before = snapshot(buffer)
+    assert len(before.edges_px) == 2
     before.save(tmp_path / 'evidence.npz')
     after = Evidence.load(tmp_path / 'evidence.npz')
     for name in vars(before):
         np.testing.assert_array_equal(getattr(after, name), getattr(before, name), err_msg=name)
+
+
+def rewritten(tmp_path: Path, keep: tuple[str, ...]) -> Path:
+    """A file of evidence with two edges, of whose arrays of edges only some are kept."""
+    buffer = EvidenceBuffer(BufferOptions())
+    buffer.add_track(track(3, 5.0))
+    buffer.add_edges(Edges(5.0, np.array([3, 3]), np.arange(8.0).reshape(2, 4)))
+    path = tmp_path / 'evidence.npz'
+    snapshot(buffer).save(path)
+    with np.load(path) as data:
+        arrays = {name: data[name] for name in data.files if name not in EDGE_ARRAYS or name in keep}
+    np.savez(path, **arrays)
+    return path
+
+
+def test_a_file_from_before_edges_were_gathered_has_none(tmp_path: Path) -> None:
+    evidence = Evidence.load(rewritten(tmp_path, ()))
+    assert evidence.track_count == 1
+    assert evidence.edges_px.shape == (0, 4) and evidence.edge_vehicles.shape == evidence.edge_times_s.shape == (0,)
+
+
+def test_edges_without_their_vehicles_are_an_input_error(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match='edge'):
+        Evidence.load(rewritten(tmp_path, ('edges_px', 'edge_times_s')))
 
 
 def test_the_buffer_keeps_no_more_tracks_than_allowed() -> None:

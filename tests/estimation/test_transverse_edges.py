@@ -1,0 +1,227 @@
+"""The direction across a road from edges of boxes that drive on it, with clutter."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from autocalib_ros.calibration import Calibration
+from autocalib_ros.calibrator import solve
+from autocalib_ros.camera import Camera
+from autocalib_ros.config import JointOptions, Options
+from autocalib_ros.estimation.edge_mixture import folded
+from autocalib_ros.estimation.plane import LevelCamera, agreement
+from autocalib_ros.estimation.state import State
+from autocalib_ros.estimation.transverse_edges import RoadEdges, SquareVehicles, square_to
+from autocalib_ros.evidence import Evidence
+from autocalib_ros.offline.synthetic_evidence import Junction, pose, synthetic_evidence
+
+CAMERA = Camera(1280, 720, 560.0, (639.5, 359.5))
+HEIGHT_M = 8.0
+ONE_ROAD = Junction(road_angles_deg=(0.0,), turning_share=0.0, vehicles=120,
+                    camera_from_ground=pose(35.0, 1.0, 60.0), centre_m=(6.0, -10.0))
+BOX_M = np.array([[length, width, up] for length in (-2.2, 2.2) for width in (-0.9, 0.9) for up in (0.0, 1.5)])
+"""Corners of a vehicle about its middle on the road, x ahead."""
+SIDES = [(a, b) for a in range(8) for b in range(a + 1, 8) if bin(a ^ b).count('1') == 1]
+
+
+def box_edges(camera: Camera, camera_from_ground: np.ndarray, middle_m: np.ndarray, generator: np.random.Generator, *,
+              yaw_deg: float = 0.0, clutter: float = 0.5, noise_px: float = 0.4) -> np.ndarray:
+    """Edges (n, 4) of a box on the road, the nearer half of them seen, and a share of clutter about it."""
+    cosine, sine = np.cos(np.radians(yaw_deg)), np.sin(np.radians(yaw_deg))
+    turned = BOX_M @ np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]])
+    corners = np.append(middle_m, -HEIGHT_M) + turned
+    pixels, valid = camera.project(corners @ camera_from_ground.T)
+    if not (valid.all() and (pixels >= 0).all() and (pixels < [camera.width, camera.height]).all()):
+        return np.zeros((0, 4))
+    farthest = np.argmax(np.linalg.norm(corners, axis=1))
+    ends = np.array([[*pixels[a], *pixels[b]] for a, b in SIDES if farthest not in (a, b)])
+    count = generator.binomial(len(ends), clutter)
+    starts = pixels[generator.integers(8, size=count)]
+    angle = generator.uniform(0, np.pi, count)
+    length = generator.uniform(15, 60, count)[:, None]
+    ends = np.vstack([ends, np.hstack([starts, starts + length * np.column_stack([np.cos(angle), np.sin(angle)])])])
+    ends = ends + generator.normal(scale=noise_px, size=ends.shape)
+    return ends[np.hypot(*(ends[:, 2:] - ends[:, :2]).T) > 12]
+
+
+def traffic(camera_from_ground: np.ndarray, generator: np.random.Generator, vehicles: int = 40, *,
+            yaw_deg: float = 0.0, clutter: float = 0.5) -> RoadEdges:
+    """Edges of boxes that drive along ground x on three lanes, each seen a few times."""
+    ends, owners = [], []
+    heading = np.linalg.inv(camera_from_ground) @ [0.0, 0.0, 1.0]
+    for vehicle in range(vehicles):
+        lane, askew = generator.choice([-3.5, 0.0, 3.5]), yaw_deg + generator.normal(scale=1.0)
+        for ahead in generator.uniform(-25, 25, 5):
+            middle = 14.0 * heading[:2] / np.linalg.norm(heading[:2]) + [ahead, lane]
+            found = box_edges(CAMERA, camera_from_ground, middle, generator, yaw_deg=askew, clutter=clutter)
+            ends.append(found)
+            owners.append(np.full(len(found), vehicle))
+    return RoadEdges(np.concatenate(ends), np.concatenate(owners))
+
+
+def state_of(camera_from_ground: np.ndarray, camera: Camera = CAMERA) -> State:
+    """The state of one road along ground x, its plane turned about the road as it would be where that is unknown."""
+    along = camera_from_ground[:, 0]
+    helper = np.cross(along, [0.3, 0.5, 0.8])
+    helper /= np.linalg.norm(helper)
+    return State(camera, np.column_stack([along, np.cross(helper, along), helper]), np.zeros(1))
+
+
+def error_deg(found: SquareVehicles, camera_from_ground: np.ndarray) -> float:
+    across = found.across(state_of(camera_from_ground))
+    return float(np.degrees(folded(np.arctan2(across @ camera_from_ground[:, 2], across @ camera_from_ground[:, 1]))))
+
+
+@pytest.mark.parametrize(('tilt', 'roll', 'heading'), [(30.0, 0.0, 10.0), (20.0, 4.0, 40.0), (35.0, -6.0, 75.0),
+                                                       (25.0, 10.0, -30.0)])
+def test_boxes_give_the_direction_across_their_road(tilt: float, roll: float, heading: float) -> None:
+    camera_from_ground = pose(tilt, roll, heading)
+    generator = np.random.default_rng(1)
+    found = square_to(traffic(camera_from_ground, generator), state_of(camera_from_ground), generator)
+    assert found is not None
+    sigma = np.degrees(found.step_sigma_rad)
+    assert sigma < 1.5  # degrees: what bodies have in common, and a little for their number
+    assert abs(error_deg(found, camera_from_ground)) < 2.0 * sigma
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_clutter_alone_tells_nothing(seed: int) -> None:
+    generator = np.random.default_rng(seed)
+    camera_from_ground = pose(30.0, 0.0, 30.0)
+    boxes = traffic(camera_from_ground, generator)
+    angle, middle = generator.uniform(0, np.pi, len(boxes)), boxes.ends_px[:, :2]
+    half = 15.0 * np.column_stack([np.cos(angle), np.sin(angle)])
+    clutter = RoadEdges(np.hstack([middle - half, middle + half]), boxes.vehicles)
+    assert square_to(clutter, state_of(camera_from_ground), generator) is None
+
+
+def test_few_vehicles_tell_nothing() -> None:
+    generator = np.random.default_rng(0)
+    camera_from_ground = pose(30.0, 0.0, 20.0)
+    edges = traffic(camera_from_ground, generator, vehicles=6)
+    assert square_to(edges, state_of(camera_from_ground), generator) is None
+
+
+def test_no_edges_tell_nothing() -> None:
+    edges = RoadEdges(np.zeros((0, 4)), np.zeros(0, int))
+    assert square_to(edges, state_of(pose(30.0, 0.0, 20.0)), np.random.default_rng(0)) is None
+
+
+def test_one_vehicle_seen_very_often_does_not_outweigh_the_others() -> None:
+    camera_from_ground, generator = pose(30.0, 2.0, 25.0), np.random.default_rng(3)
+    many = traffic(camera_from_ground, generator)
+    # a load that leans by 8 degrees about the road, in a jam
+    leaning = camera_from_ground @ np.array([[1, 0, 0], [0, 0.990, -0.139], [0, 0.139, 0.990]])
+    jam = np.concatenate([box_edges(CAMERA, leaning, np.array([14.0, 0.0]), generator, clutter=0.0)
+                          for _ in range(300)])
+    edges = RoadEdges(np.vstack([many.ends_px, jam]), np.append(many.vehicles, np.full(len(jam), 999)))
+    found = square_to(edges, state_of(camera_from_ground), generator)
+    assert found is not None
+    assert abs(error_deg(found, camera_from_ground)) < 1.5
+
+
+def test_the_standard_deviation_covers_what_is_missed() -> None:
+    misses = []
+    for seed in range(12):
+        generator = np.random.default_rng(seed)
+        camera_from_ground = pose(generator.uniform(15, 40), generator.normal(scale=4), generator.uniform(-70, 70))
+        found = square_to(traffic(camera_from_ground, generator, 30), state_of(camera_from_ground), generator)
+        assert found is not None
+        misses.append(error_deg(found, camera_from_ground) / np.degrees(found.step_sigma_rad))
+    assert np.sqrt(np.mean(np.square(misses))) < 1.2
+    assert np.abs(misses).max() < 3.0
+
+
+def test_the_same_edges_and_seed_give_the_same_bits() -> None:
+    camera_from_ground = pose(30.0, 2.0, 25.0)
+    edges = traffic(camera_from_ground, np.random.default_rng(5))
+    first, second = (square_to(edges, state_of(camera_from_ground), np.random.default_rng(0)) for _ in range(2))
+    assert first is not None and second is not None
+    assert first.origin.tobytes() == second.origin.tobytes() and first.step_sigma_rad == second.step_sigma_rad
+
+
+@pytest.mark.parametrize('axis', np.eye(3))
+def test_the_direction_moves_with_the_road_as_the_edges_do(axis: np.ndarray) -> None:
+    camera_from_ground = pose(30.0, 5.0, 40.0)
+    edges = traffic(camera_from_ground, np.random.default_rng(2))
+    state = state_of(camera_from_ground)
+    turned = replace(state, rotation=Rotation.from_rotvec(np.radians(2.0) * axis).as_matrix() @ state.rotation)
+    found, anew = (square_to(edges, at, np.random.default_rng(0)) for at in (state, turned))
+    assert found is not None and anew is not None
+    moved = found.across(turned)
+    assert abs(moved @ turned.directions[0]) < 1e-9
+    # to first order, with the weights kept
+    assert np.degrees(np.arccos(min(abs(moved @ anew.across(turned)), 1.0))) < 0.35
+
+
+def test_a_level_camera_and_edges_are_joined_by_their_variances() -> None:
+    camera_from_ground = pose(30.0, 2.0, 5.0)
+    edges = traffic(camera_from_ground, np.random.default_rng(5))
+    state = state_of(camera_from_ground)
+    square = square_to(edges, state, np.random.default_rng(0))
+    assert square is not None
+    joined, apart_deg = agreement(LevelCamera(1.0), square, state)
+    assert joined is not None
+    # along the road ahead the roll and the turn about it are nearly the same
+    assert apart_deg == pytest.approx(2.0, abs=1.0)
+    assert joined.step_sigma_rad < square.step_sigma_rad
+    before, after = error_deg(square, camera_from_ground), error_deg(joined, camera_from_ground)
+    assert 0.1 < abs(after - before) < apart_deg
+
+
+def test_a_level_camera_that_edges_contradict_is_noticed() -> None:
+    camera_from_ground = pose(30.0, 8.0, 5.0)
+    state = state_of(camera_from_ground)
+    square = square_to(traffic(camera_from_ground, np.random.default_rng(5)), state, np.random.default_rng(0))
+    assert square is not None
+    joined, apart_deg = agreement(LevelCamera(1.0), square, state)
+    assert joined is None and apart_deg > 5.0
+
+
+def with_boxes(junction: Junction, clutter: float = 0.5) -> Evidence:
+    """Evidence of a junction with edges of boxes around its vehicles, at times of their tracks."""
+    evidence, generator = synthetic_evidence(junction, np.random.default_rng(0)), np.random.default_rng(1)
+    ends, owners, times = [], [], []
+    for track in evidence.tracks():
+        sample = len(track.times_s) // 2
+        bearing, _ = junction.camera.unproject(track.points_px[sample])
+        ground = bearing @ junction.camera_from_ground
+        found = box_edges(junction.camera, junction.camera_from_ground, HEIGHT_M * ground[:2] / -ground[2], generator,
+                          clutter=clutter)
+        ends.append(found)
+        owners.append(np.full(len(found), track.vehicle))
+        times.append(np.full(len(found), track.times_s[sample]))
+    return replace(evidence, edges_px=np.concatenate(ends), edge_vehicles=np.concatenate(owners),
+                   edge_times_s=np.concatenate(times))
+
+
+ROLLED = replace(ONE_ROAD, camera_from_ground=pose(35.0, 5.0, 60.0))
+
+
+def test_one_road_and_edges_give_an_assumed_plane_of_a_rolled_camera() -> None:
+    result = solve(with_boxes(ROLLED), Options(camera_height=HEIGHT_M))
+    assert isinstance(result, Calibration) and result.ground is not None
+    assert result.grade == 'assumed'
+    assert any('taken as square to it' in text for text in result.assumptions)
+    error = np.degrees(np.arccos(np.clip(result.ground.normal_in_camera @ ROLLED.normal_in_camera, -1, 1)))
+    assert result.stddev.roll_deg is not None and result.stddev.tilt_deg is not None
+    assert error < 1.5 and error < 2.5 * np.hypot(result.stddev.roll_deg, result.stddev.tilt_deg)
+
+
+def test_edges_are_not_asked_where_that_is_not_wanted() -> None:
+    options = Options(camera_height=HEIGHT_M, joint=JointOptions(transverse_edges=False))
+    result = solve(with_boxes(ROLLED), options)
+    assert isinstance(result, Calibration) and result.ground_refusal is not None
+    assert result.ground_refusal.code == 'one_direction'
+
+
+def test_edges_that_contradict_a_level_camera_leave_no_plane_and_say_so() -> None:
+    junction = replace(ONE_ROAD, camera_from_ground=pose(35.0, 9.0, 60.0))
+    result = solve(with_boxes(junction), Options(camera_height=HEIGHT_M, joint=JointOptions(roll_prior_deg=1.0)))
+    assert isinstance(result, Calibration) and result.ground is None and result.ground_refusal is not None
+    assert result.ground_refusal.code == 'plane_uncertain'
+    assert 'edges of vehicles and a level camera disagree' in result.ground_refusal.message
