@@ -80,6 +80,10 @@ def _horizon_doubt(fit: JointFit, tracks: TrackSet) -> Reason | None:
     _, below = above_traffic(fit.state.rotation[:, 2], fit.state.camera, tracks)
     if not fit.plane_known or below >= BELOW_HORIZON:
         return None
+    return _above_horizon(below)
+
+
+def _above_horizon(below: float) -> Reason:
     return Reason(
         'horizon', f'{1 - below:.0%} of the tracked points lie above the horizon of the plane found',
         'the traffic found does not belong to one plane: wait for more of it')
@@ -142,6 +146,8 @@ def plane_doubt(plane: Plane, gate: GateOptions) -> Reason | None:
     if isinstance(plane.assumed, LevelCamera) and not plane.assumed.tells(plane.fit.state):
         return Reason('plane_uncertain', 'the road leads level across the image, where the roll of the camera tells '
                       'nothing of the plane', 'wait for traffic across the road, or that turns')
+    if plane.assumed is not None and plane.below < BELOW_HORIZON:
+        return _above_horizon(plane.below)
     needed = gate.max_sigma_tilt_deg * (1.0 if plane.assumed is None else ASSUMED)
     if not sigma <= needed:
         return Reason(

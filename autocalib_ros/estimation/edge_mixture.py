@@ -24,8 +24,8 @@ SYSTEMATIC_RAD = np.radians([0.75, 1.5])
 FREEDOM, STUDENT = 4.0, 0.375
 """Of Student's distribution about a peak, and its density in the middle for a scale of one: edges of wheels and lamps
 make long tails."""
-LARGEST_SHARE = 0.45
-"""Of the edges in one peak: some are always of neither."""
+LARGEST_SHARE = 0.95
+"""Of the edges in the peaks: some are always of neither."""
 LARGEST_TURN_RAD = np.pi / 4
 """Beyond it from where turns are counted, across and upright are one another's."""
 STEPS = 180
@@ -150,7 +150,7 @@ class _Mixture:
         lever, sigma = self.bulging(pull)
         off = misses[0, :, 0] + self.bulge_rad * self.told.rounding
         bulge = (pull @ ((self.told.rounding - lever) * off) + ROUNDING_RAD / ROUNDING_SIGMA_RAD**2) * sigma**2
-        shares = np.minimum(sums / weights.sum(), LARGEST_SHARE)
+        shares = sums / max(weights.sum(), sums.sum() / LARGEST_SHARE)
         return _Mixture(self.told, tuple(shares.tolist()), tuple(spreads.tolist()), float(bulge))
 
 

@@ -82,14 +82,16 @@ class Plane:
     """1 or -1: which side of the state's plane is up."""
     assumed: LevelCamera | SquareVehicles | None = None
     """What tells the direction across the road where the traffic does not."""
+    below: float = 1.0
+    """Share of the tracked points below the horizon."""
 
     @classmethod
     def of(cls, fit: JointFit, tracks: TrackSet, assumed: LevelCamera | SquareVehicles | None = None) -> Plane:
         """Return the plane of a solution, the side of the traffic below."""
         plane = cls(fit, 1.0, assumed)
         normal = plane.normal(fit.state)
-        up, _ = above_traffic(normal, fit.state.camera, tracks)
-        return replace(plane, side=float(np.sign(normal @ up)))
+        up, below = above_traffic(normal, fit.state.camera, tracks)
+        return replace(plane, side=float(np.sign(normal @ up)), below=below)
 
     def normal(self, state: State, step_rad: float = 0.0) -> np.ndarray:
         """Upward normal (3,) in the camera frame at a state; a step of what is assumed counts where it is."""

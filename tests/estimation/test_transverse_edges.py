@@ -11,9 +11,12 @@ from scipy.spatial.transform import Rotation
 from autocalib_ros.calibration import Calibration
 from autocalib_ros.calibrator import solve
 from autocalib_ros.camera import Camera
-from autocalib_ros.config import JointOptions, Options
+from autocalib_ros.config import GateOptions, JointOptions, Options
+from autocalib_ros.estimation.doubts import plane_doubt
 from autocalib_ros.estimation.edge_mixture import folded
+from autocalib_ros.estimation.great_circles import select_tracks
 from autocalib_ros.estimation.plane import LevelCamera, agreement
+from autocalib_ros.estimation.solution import Solution, find_solution
 from autocalib_ros.estimation.state import State
 from autocalib_ros.estimation.transverse_edges import RoadEdges, SquareVehicles, square_to
 from autocalib_ros.evidence import Evidence
@@ -225,3 +228,29 @@ def test_edges_that_contradict_a_level_camera_leave_no_plane_and_say_so() -> Non
     assert isinstance(result, Calibration) and result.ground is None and result.ground_refusal is not None
     assert result.ground_refusal.code == 'plane_uncertain'
     assert 'edges of vehicles and a level camera disagree' in result.ground_refusal.message
+
+
+@pytest.fixture(scope='module')
+def assumed() -> Solution:
+    evidence, options = with_boxes(ROLLED), Options(camera_height=HEIGHT_M)
+    solution = find_solution(evidence, select_tracks(evidence, options.joint.max_tracks), options.joint, options.gate,
+                             np.random.default_rng(0), height_m=HEIGHT_M)
+    assert isinstance(solution, Solution) and isinstance(solution.plane.assumed, SquareVehicles)
+    return solution
+
+
+def test_a_plane_through_the_traffic_is_doubted(assumed: Solution) -> None:
+    assert assumed.plane.below > 0.99 and plane_doubt(assumed.plane, GateOptions()) is None
+    doubt = plane_doubt(replace(assumed.plane, below=0.8), GateOptions())
+    assert doubt is not None and doubt.code == 'horizon'
+
+
+def test_the_plane_is_no_surer_about_its_road_than_the_edges_are(assumed: Solution) -> None:
+    plane, along = assumed.plane, assumed.fit.state.directions[0]
+    across = np.cross(along, plane.normal(plane.fit.state))
+    sigma = float(plane.sigma(lambda _, normal: np.atleast_1d(normal @ across))[0])
+    told = float(assumed.fit.sigma(lambda state: np.atleast_1d(plane.normal(state) @ across))[0])
+    assert plane.assumed is not None
+    assert sigma == pytest.approx(np.hypot(plane.assumed.step_sigma_rad, told), rel=1e-3)
+    # and the lens adds something of its own, through the edges' own circles
+    assert told > 1e-4
