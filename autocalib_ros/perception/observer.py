@@ -18,10 +18,10 @@ from autocalib_ros.perception.vehicles import MotionMask, Region
 
 MASK_EVERY = 2
 """Images between two updates of the background: traffic needs no finer step in time."""
-
-
 EDGES_EVERY = 2
 """Searches for points between two for edges: they cost as much, and a vehicle's edges are much the same after."""
+
+
 REPEATED_LEVELS = 4
 """A reduced image that differs from the last one used by no more than this anywhere is the same picture again."""
 REPEATED_WIDTH_PX = 320
