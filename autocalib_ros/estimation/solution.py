@@ -150,7 +150,8 @@ def _completed(fit: JointFit, tracks: TrackSet, across: str, traffic: _Traffic, 
                         (*assumptions, f'ground plane by one road and {assumed.words}'), checks, plane_doubt(plane, gate))
     return Solution(fit, plane, along, flow, assumptions, checks, assumed or Reason(
         'one_direction', f'too little traffic across the main road yet: {across}; {int(fit.explained().sum())} '
-        'follow one road, and rotation about it is free',
+        'follow one road, and rotation about it is free'
+        + (': edges of vehicles do not tell it either' if options.transverse_edges else ''),
         'wait for traffic across the main road, or that turns; or allow joint.roll_prior_deg'))
 
 
