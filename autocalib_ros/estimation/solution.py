@@ -146,8 +146,8 @@ def _completed(fit: JointFit, tracks: TrackSet, across: str, traffic: _Traffic, 
     assumed, checks = _assumed(fit, tracks, traffic)
     plane, checks = Plane.of(fit, tracks, None if isinstance(assumed, Reason) else assumed), (halves, *checks)
     if not isinstance(assumed, Reason | None):
-        return Solution(fit, plane, along, flow,
-                        (*assumptions, f'ground plane by one road and {assumed.words}'), checks, plane_doubt(plane, gate))
+        assumptions = (*assumptions, f'ground plane by one road and {assumed.words}')
+        return Solution(fit, plane, along, flow, assumptions, checks, plane_doubt(plane, gate))
     return Solution(fit, plane, along, flow, assumptions, checks, assumed or Reason(
         'one_direction', f'too little traffic across the main road yet: {across}; {int(fit.explained().sum())} '
         'follow one road, and rotation about it is free'
