@@ -287,8 +287,8 @@ class EvidenceBuffer:
 
     @property
     def oldest_s(self) -> float:
-        """When the oldest track or segment that is held ended; infinite where there is none."""
-        return min(self._of_tracks.oldest_s, self._of_segments.oldest_s)
+        """When the oldest of what is held ended; infinite where there is nothing."""
+        return min(held.oldest_s for held in (self._of_tracks, self._segments.held, self._edges.held))
 
     def snapshot(self, *, image_size: tuple[int, int], first_stamp_ns: int, newest_stamp_ns: int, frames: int,
                  drift_px: float, unfinished: list[Track]) -> Evidence:
