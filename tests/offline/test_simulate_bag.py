@@ -20,6 +20,7 @@ from autocalib_ros.offline.simulate import (
     run,
     write_bag,
 )
+from autocalib_ros.offline.simulate.options import SCENES
 
 # One road is quickest to draw.
 TINY = {'width_px': 160, 'height_px': 90, 'focal_px': 70.0, 'rate_hz': 5.0, 'duration_s': 0.6,
@@ -159,6 +160,8 @@ def test_command_line_without_options_gives_the_defaults():
         ('--size 640x360', 'width_px', 640),
         ('--storage mcap', 'storage', 'mcap'),
         ('--shake 1.5', 'shake_px', 1.5),
+        ('--road-angle 70', 'road_angle_deg', 70.0),
+        *[(f'--scene {scene}', 'scene', scene) for scene in SCENES],
     ],
 )
 def test_command_line_sets_an_option(argv, name, value):

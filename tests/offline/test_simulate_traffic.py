@@ -8,14 +8,10 @@ import numpy as np
 import pytest
 
 from autocalib_ros.offline.simulate import SimulationOptions
-from autocalib_ros.offline.simulate.network import Network, junction, network_of
-from autocalib_ros.offline.simulate.traffic import (
-    STEP_S,
-    Traffic,
-    Vehicle,
-    Wander,
-    simulate_traffic,
-)
+from autocalib_ros.offline.simulate.network import Network
+from autocalib_ros.offline.simulate.scenes import junction, network_of
+from autocalib_ros.offline.simulate.traffic import simulate_traffic
+from autocalib_ros.offline.simulate.vehicles import STEP_S, Traffic, Vehicle, Wander
 
 MINUTE = SimulationOptions()
 
@@ -100,36 +96,6 @@ def test_waiting_vehicles_stand_still(traffic):
     assert (a.x, a.y, a.heading) == (b.x, b.y, b.heading)
 
 
-def _outline(state, vehicle: Vehicle) -> np.ndarray:
-    """Points (n, 2) along the sides of a vehicle."""
-    fractions = np.linspace(-0.5, 0.5, 7)
-    body = np.concatenate([np.stack([fractions, 0 * fractions + side], 1) for side in (-0.5, 0.5)])
-    body = body * (vehicle.shape.length_m, vehicle.shape.width_m)
-    c, s = math.cos(state.heading), math.sin(state.heading)
-    return body @ np.array([[c, s], [-s, c]]) + (state.x, state.y)
-
-
-def _overlap(a, b) -> bool:
-    (first, at), (second, there) = a, b
-    if math.hypot(at.x - there.x, at.y - there.y) > 12.0:
-        return False
-    offset = _outline(there, second) - (at.x, at.y)
-    c, s = math.cos(at.heading), math.sin(at.heading)
-    inside = np.abs(offset @ np.array([[c, -s], [s, c]]))
-    half = np.array([first.shape.length_m, first.shape.width_m]) / 2
-    return bool((inside < half).all(1).any())
-
-
-@pytest.mark.parametrize('time_s', range(0, 60, 4))
-def test_vehicles_do_not_overlap(traffic, time_s):
-    states = [(v, s) for v in traffic.vehicles if (s := v.state(time_s + 0.03)) is not None]
-    pairs = [
-        (a[0].number, b[0].number)
-        for i, a in enumerate(states) for b in states[:i] if _overlap(a, b) or _overlap(b, a)
-    ]
-    assert not pairs
-
-
 def test_no_vehicle_brakes_or_accelerates_beyond_reason(traffic):
     steps = np.concatenate([np.diff(v.speeds_mps) for v in traffic.vehicles]) / STEP_S
     assert steps.max() < 3.0
@@ -138,7 +104,7 @@ def test_no_vehicle_brakes_or_accelerates_beyond_reason(traffic):
 
 def test_turning_vehicles_slow_down_in_the_curve(traffic):
     vehicle = _crossings(traffic, 'right')[0]
-    (start, end, radius), = vehicle.route.path.curves()
+    _, (start, end, radius), _ = vehicle.route.path.curves()  # the arc between its clothoids
     inside = (vehicle.s > start + 1) & (vehicle.s < end)
     assert vehicle.speeds_mps[inside].max() ** 2 / radius < 4.0  # m/s^2
 

@@ -1,4 +1,4 @@
-"""A synthetic junction seen through a known lens, as a recording with its truth beside it."""
+"""Synthetic traffic seen through a known lens, as a recording with its truth beside it."""
 
 from __future__ import annotations
 

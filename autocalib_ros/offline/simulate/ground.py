@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial, reduce
 
 import cv2
 import numpy as np
 
 from . import paint
-from .network import CROSSING_WIDTH_M, Network, Road
+from .network import CROSSING_WIDTH_M, Network, Road, Roundabout
 from .palette import Palette
 
 PAVEMENT_M = 3.2
 KERB_M = 0.25
-CORNER_RADIUS_M = 6.5
+VERGE_M = 0.8
 _COARSE_M = 0.25
+_BEND_STEP_M = 0.7  # strips of bends are drawn as polygons with so long sides
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,7 @@ def paint_ground(
     texel_m = 2 * half_m / size
     rng = np.random.default_rng([seed, 3])
     edge = cv2.resize(_edge_distance(network, half_m), (size, size))
-    picture = _surfaces(edge, palette, texel_m, rng)
+    picture = _surfaces(edge, palette, texel_m, network.rural, rng)
     view = _View(picture, half_m, texel_m)
     _paint_wear(view, network, palette, edge, rng)
     marks = np.zeros((size, size), np.uint8)
@@ -52,16 +54,20 @@ def paint_ground(
 
 def edge_distance(network: Network, xy: np.ndarray) -> np.ndarray:
     """Return how far points (..., 2) lie outside the asphalt, in metres; negative on it."""
-    sides = [
-        np.abs(xy[..., 1] * road.axis[0] - xy[..., 0] * road.axis[1]) - road.half_width_m
-        for road in network.roads
-    ]
-    if len(sides) == 1:
-        return sides[0]
-    # The union of both strips, its corners filled with arcs.
-    radius = CORNER_RADIUS_M
-    corner = np.hypot(*(np.maximum(radius - side, 0.0) for side in sides))
-    return np.maximum(np.minimum(*sides), radius) - corner
+    shapes = [road.edge_distance(xy) for road in network.roads]
+    ring = network.roundabout
+    if ring is None:
+        return reduce(partial(_united, radius_m=network.corner_radius_m), shapes)
+    reach = np.hypot(xy[..., 0], xy[..., 1])
+    shapes.append(reach - ring.outer_m)
+    whole = reduce(partial(_united, radius_m=network.corner_radius_m), shapes)
+    return np.maximum(whole, ring.island_m - reach)
+
+
+def _united(a: np.ndarray, b: np.ndarray, radius_m: float) -> np.ndarray:
+    """Return the edge distance of the union of two shapes, its corners filled with arcs."""
+    corner = np.hypot(np.maximum(radius_m - a, 0.0), np.maximum(radius_m - b, 0.0))
+    return np.maximum(np.minimum(a, b), radius_m) - corner
 
 
 def _edge_distance(network: Network, half_m: float) -> np.ndarray:
@@ -72,20 +78,21 @@ def _edge_distance(network: Network, half_m: float) -> np.ndarray:
 
 
 def _surfaces(
-    edge: np.ndarray, palette: Palette, texel_m: float, rng: np.random.Generator
+    edge: np.ndarray, palette: Palette, texel_m: float, rural: bool, rng: np.random.Generator
 ) -> np.ndarray:
-    """Colour grass, pavement, kerb and asphalt by the distance from the kerb, each with grain."""
+    """Colour grass, pavement, kerb and asphalt by the distance from the edge, each with grain."""
+    pavement_m, kerb_m = (VERGE_M, 0.0) if rural else (PAVEMENT_M, KERB_M)
     size = edge.shape[0]
     picture = np.empty((size, size, 3), np.uint8)
     picture[:] = palette.grass
-    picture[edge < PAVEMENT_M] = palette.pavement
-    picture[edge < KERB_M] = palette.kerb
+    picture[edge < pavement_m] = palette.pavement
+    picture[edge < kerb_m] = palette.kerb
     picture[edge < 0] = palette.asphalt
     slabs = ((np.arange(size) * texel_m) % 1.2) < 0.05
-    joints = (slabs[:, None] | slabs[None, :]) & (edge > KERB_M) & (edge < PAVEMENT_M)
-    picture[joints] = paint.mixed(palette.pavement, palette.asphalt, 0.5)
+    joints = (slabs[:, None] | slabs[None, :]) & (edge > kerb_m) & (edge < pavement_m)
+    picture[joints & (not rural)] = paint.mixed(palette.pavement, palette.asphalt, 0.5)
     cv2.GaussianBlur(picture, (3, 3), 0, dst=picture)  # no steps along slanting edges
-    contrast = palette.texture * np.where(edge < 0, 1.0, np.where(edge < PAVEMENT_M, 0.7, 2.0))
+    contrast = palette.texture * np.where(edge < 0, 1.0, np.where(edge < pavement_m, 0.7, 2.0))
     octaves = [(m / texel_m, s) for m, s in ((0.05, 5.0), (0.25, 3.0), (1.0, 3.0), (6.0, 4.0))]
     noise = paint.grain(size, size, [(max(o, 1.0), s) for o, s in octaves], rng)
     paint.roughen(picture, noise * contrast.astype(np.float32))
@@ -108,16 +115,16 @@ class _View:
 
     def strip(self, road: Road, along: tuple[float, float], aside: tuple[float, float],
               colour: tuple[int, ...]) -> None:
-        """Fill a rectangle given along a road and to the left of its axis."""
-        corners = [(along[0], aside[0]), (along[1], aside[0]), (along[1], aside[1]),
-                   (along[0], aside[1])]
-        self.polygon(np.array([on_road(road, *c) for c in corners]), colour)
+        """Fill a strip given along a road and to the left of its axis."""
+        pieces = 1 if road.straight else max(1, round(abs(along[1] - along[0]) / _BEND_STEP_M))
+        way = np.linspace(*along, pieces + 1)
+        self.polygon(np.concatenate([road.at(way, aside[0]), road.at(way[::-1], aside[1])]), colour)
 
-
-def on_road(road: Road, along: float, aside: float) -> np.ndarray:
-    """Return the ground point (2,) at a distance along a road and to the left of its axis."""
-    axis = road.axis
-    return along * axis + aside * np.array([-axis[1], axis[0]])
+    def ring(self, radii: tuple[float, float], colour: tuple[int, ...]) -> None:
+        """Fill a ring about the origin."""
+        angle = np.linspace(0.0, 2 * np.pi, round(2 * np.pi * radii[1] / _BEND_STEP_M))
+        arc = np.stack([np.cos(angle), np.sin(angle)], 1)
+        self.polygon(np.concatenate([radii[0] * arc, radii[1] * arc[::-1]]), colour)
 
 
 def _paint_wear(
@@ -132,13 +139,20 @@ def _paint_wear(
             aside = rng.uniform(-1, 0.7) * road.half_width_m
             length, width = rng.uniform(1.5, 6.0), rng.uniform(0.5, 1.6)
             colour = paint.mixed(palette.asphalt, dark, rng.uniform(-0.4, 0.7))
-            view.strip(road, (along, along + length), (aside, aside + width), colour)
+            if _on_asphalt(network, road.at(np.linspace(along, along + length, 5), aside)):
+                view.strip(road, (along, along + length), (aside, aside + width), colour)
         for _ in range(8):
-            centre = on_road(road, rng.uniform(-reach, reach), rng.uniform(-1, 1) * 6.0)
+            centre = road.at(rng.uniform(-reach, reach), rng.uniform(-1, 1) * 0.75 * road.half_width_m)
             circle = np.linspace(0, 2 * np.pi, 24)
-            view.polygon(centre + 0.32 * np.stack([np.cos(circle), np.sin(circle)], 1), dark)
+            rim = centre + 0.32 * np.stack([np.cos(circle), np.sin(circle)], 1)
+            if _on_asphalt(network, rim):
+                view.polygon(rim, dark)
     for _ in range(14):
         _crack(view, edge, dark, reach, rng)
+
+
+def _on_asphalt(network: Network, xy: np.ndarray) -> bool:
+    return bool((edge_distance(network, xy) <= 0).all())
 
 
 def _crack(view: _View, edge: np.ndarray, colour: tuple[int, ...], reach: float,
@@ -157,25 +171,40 @@ def _crack(view: _View, edge: np.ndarray, colour: tuple[int, ...], reach: float,
 
 def _paint_markings(view: _View, network: Network) -> None:
     """Draw lane lines, stop lines and zebra crossings as a mask."""
-    white = (255,)
     begin = network.stop_m if network.stop_m is not None else 0.0
     far = min(view.half_m, 300.0)
     for road in network.roads:
         for sign in (1, -1):
+            if not road.reaches(sign * begin):
+                continue
             for aside, kind in road.lane_edges_m:
-                _paint_line(view, road, sign, (begin, far), aside, kind)
-        if network.stop_m is None:
-            continue
-        near = network.stop_m - 2.0 - CROSSING_WIDTH_M
-        half = road.half_width_m
-        for sign in (1, -1):
-            # Traffic drives on the right: the lanes that arrive on this arm are on its left.
-            inner, outer = 0.2 * half, 0.98 * half
-            stop = (sign * network.stop_m, sign * (network.stop_m + 0.45))
-            view.strip(road, stop, (sign * -inner, sign * outer), white)
-            for aside in np.arange(-half + 0.4, half - 0.6, 1.0):
-                span = (sign * near, sign * (near + CROSSING_WIDTH_M))
-                view.strip(road, span, (aside, aside + 0.5), white)
+                start = network.clear_m if kind == 'edge' else begin
+                _paint_line(view, road, sign, (start, far), aside, kind)
+            if network.stop_m is not None:
+                _paint_crossing(view, road, sign, network)
+    if network.roundabout is not None:
+        _paint_ring(view, network.roundabout)
+
+
+def _paint_crossing(view: _View, road: Road, sign: int, network: Network) -> None:
+    """Draw a stop line, or a give-way line of short dashes, and a zebra crossing across one arm."""
+    white = (255,)
+    half, stop_m, near = road.half_width_m, network.stop_m, network.crossing_m
+    # Traffic drives on the right: the lanes that arrive on this arm are on its left.
+    inner, outer = (0.0 if network.roundabout else -0.2 * half), 0.98 * half
+    marks = [(inner, outer)]
+    if network.roundabout:
+        marks = [(aside, aside + 0.5) for aside in np.arange(inner + 0.3, outer - 0.4, 0.9)]
+    for mark in marks:
+        view.strip(road, (sign * stop_m, sign * (stop_m + 0.45)), (sign * mark[0], sign * mark[1]), white)
+    for aside in np.arange(-half + 0.4, half - 0.6, 1.0):
+        span = (sign * near, sign * (near + CROSSING_WIDTH_M))
+        view.strip(road, span, (aside, aside + 0.5), white)
+
+
+def _paint_ring(view: _View, ring: Roundabout) -> None:
+    """Draw the line round the island."""
+    view.ring((ring.island_m + 0.3, ring.island_m + 0.45), (255,))
 
 
 def _paint_line(view: _View, road: Road, sign: int, span: tuple[float, float], aside: float,

@@ -11,7 +11,7 @@ from .lens import CameraPose
 from .paint import mixed
 from .sensor import add_glow
 from .shapes import SHAPES
-from .traffic import Vehicle, VehicleState
+from .vehicles import Vehicle, VehicleState
 
 _HEAD = (215, 240, 255)
 _TAIL = (40, 30, 230)

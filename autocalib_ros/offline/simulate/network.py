@@ -1,7 +1,6 @@
-"""Road networks: lane paths, the routes over them and the signals that guard them.
+"""Road networks: roads, the routes over them and the signals that guard them.
 
-A network knows geometry only.  Traffic knows routes only: another scene is another function here
-that returns a `Network`.
+A network knows geometry only, and traffic knows routes only: `scenes.py` holds the networks.
 """
 
 from __future__ import annotations
@@ -11,76 +10,40 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.spatial import cKDTree
 
-from .options import SimulationOptions
+from .paths import Path, Piece
 
 LANE_WIDTH_M = 3.2
+RURAL_LANE_M = 3.5
 ARM_LENGTH_M = 110.0
 CROSSING_WIDTH_M = 3.5
+CITY_SPEED_MPS = 12.5
+_SAMPLES_M = np.arange(-400.0, 400.0, 0.5)
+"""Where a curved road is looked up; roads are painted no farther."""
+_BESIDE_M = 60.0
+"""Farther from a curved road nobody asks how far exactly."""
 
 
 @dataclass(frozen=True)
-class Piece:
-    """A straight line (curvature 0) or an arc (positive curvature turns left)."""
+class Circulation:
+    """The part of a route that lies on the ring of a roundabout.
 
-    x: float
-    y: float
-    heading: float
-    length: float
-    curvature: float = 0.0
+    joins_s, leaves_s: arc lengths of the route; joins_m: place on the ring where it joins.
+    """
 
-    def at(self, s: np.ndarray | np.float64) -> np.ndarray:
-        """Return (x, y, heading) rows (..., 3) at arc lengths s, extended beyond both ends."""
-        heading = self.heading + self.curvature * s
-        if abs(self.curvature) < 1e-9:
-            dx, dy = s * math.cos(self.heading), s * math.sin(self.heading)
-        else:
-            dx = (np.sin(heading) - math.sin(self.heading)) / self.curvature
-            dy = (math.cos(self.heading) - np.cos(heading)) / self.curvature
-        return np.stack([self.x + dx, self.y + dy, heading], -1)
+    joins_s: float
+    leaves_s: float
+    joins_m: float
+    circumference_m: float
 
-    def end(self) -> tuple[float, float, float]:
-        """Return (x, y, heading) at the end."""
-        x, y, heading = self.at(np.float64(self.length))
-        return float(x), float(y), float(heading)
+    def place_m(self, s: float) -> float:
+        """Return the place on the ring at an arc length of the route; before the ring, ahead of it."""
+        return self.joins_m + s - self.joins_s
 
-
-@dataclass(frozen=True)
-class Path:
-    """Pieces joined end to end, addressed by arc length."""
-
-    pieces: tuple[Piece, ...]
-
-    @cached_property
-    def starts(self) -> np.ndarray:
-        """Arc length at which each piece starts."""
-        return np.concatenate([[0.0], np.cumsum([p.length for p in self.pieces[:-1]])])
-
-    @cached_property
-    def length(self) -> float:
-        """Length in metres."""
-        return float(sum(p.length for p in self.pieces))
-
-    def at(self, s: np.ndarray | float) -> np.ndarray:
-        """Return (x, y, heading) rows (..., 3) at arc lengths s; straight on beyond both ends."""
-        s = np.asarray(s, float)
-        if len(self.pieces) == 1:
-            return self.pieces[0].at(s)
-        starts = self.starts
-        index = np.clip(np.searchsorted(starts, s, side='right') - 1, 0, len(self.pieces) - 1)
-        out = np.empty((*s.shape, 3))
-        for i, piece in enumerate(self.pieces):
-            here = index == i
-            out[here] = piece.at(s[here] - starts[i])
-        return out
-
-    def curves(self) -> list[tuple[float, float, float]]:
-        """Return (start, end, radius) of every arc."""
-        return [
-            (float(start), float(start) + p.length, 1.0 / abs(p.curvature))
-            for start, p in zip(self.starts, self.pieces, strict=True)
-            if p.curvature
-        ]
+    def ahead_m(self, place_m: float, s: float) -> float:
+        """Return the way round the ring from where a route is at s to a place, 0..circumference."""
+        return (place_m - self.place_m(s)) % self.circumference_m
 
 
 @dataclass(frozen=True)
@@ -89,7 +52,9 @@ class Route:
 
     approach and leave name the lanes it shares with other routes; stop_s is the arc length of its
     stop line, split_s the one at which it parts from the other routes of its approach lane.
-    share is its traffic relative to that of one lane.
+    share is its traffic relative to that of one lane.  Where stop_s is 0 there is no stop line, and
+    the route belongs to both its lanes from the start.  ring: who enters it gives way.  narrow: its
+    turns are too tight for long vehicles.
     """
 
     path: Path
@@ -100,28 +65,97 @@ class Route:
     stop_s: float = math.inf
     split_s: float = math.inf
     signal: str | None = None
+    ring: Circulation | None = None
+    narrow: bool = False
+    speed_mps: float = CITY_SPEED_MPS
+
+    @property
+    def entered(self) -> frozenset[str]:
+        """The lanes that it uses from its start."""
+        return frozenset({self.approach, self.leave} if self.stop_s <= 0 else {self.approach})
 
 
 @dataclass(frozen=True)
 class Road:
-    """A straight two-sided strip of asphalt through the origin, for painting.
+    """A strip of asphalt for painting, about the path of its axis.
 
     lane_edges_m: (offset to the left of the axis, kind) with kind 'edge', 'dash' or 'solid'.
+    begin_m: where along the axis it begins; only a straight road may.
     """
 
-    heading: float
+    path: Path
     half_width_m: float
     lane_edges_m: tuple[tuple[float, str], ...]
+    begin_m: float = -math.inf
 
     @property
-    def axis(self) -> np.ndarray:
-        """Unit vector (2,) along the road."""
-        return np.array([math.cos(self.heading), math.sin(self.heading)])
+    def straight(self) -> bool:
+        """Whether it has one heading."""
+        return self.path.straight
+
+    @property
+    def headings(self) -> tuple[float, ...]:
+        """The headings of its straight parts."""
+        return tuple(piece.heading for piece in self.path.pieces if piece.straight)
+
+    def reaches(self, along: float) -> bool:
+        """Tell whether it is there at a distance along its axis."""
+        return along >= self.begin_m
+
+    def at(self, along: np.ndarray | float, aside: np.ndarray | float) -> np.ndarray:
+        """Return ground points (..., 2) at distances along the road and to the left of its axis."""
+        rows = self.path.at(along)
+        left = np.stack([-np.sin(rows[..., 2]), np.cos(rows[..., 2])], -1)
+        return rows[..., :2] + np.asarray(aside, float)[..., None] * left
+
+    def heading(self, along: float) -> float:
+        """Return the heading of the axis at a distance along it."""
+        return float(self.path.at(along)[2])
+
+    def edge_distance(self, xy: np.ndarray) -> np.ndarray:
+        """Return how far points (..., 2) lie outside the strip, in metres; negative on it."""
+        if not self.straight:
+            found, _ = self._axis_tree.query(xy, distance_upper_bound=_BESIDE_M)
+            return np.minimum(found, _BESIDE_M) - self.half_width_m
+        x, y, heading = self.path.at(0.0).tolist()
+        dx, dy = xy[..., 0] - x, xy[..., 1] - y
+        c, s = math.cos(heading), math.sin(heading)
+        beside = np.abs(dy * c - dx * s) - self.half_width_m
+        if math.isinf(self.begin_m):
+            return beside
+        before = self.begin_m - (dx * c + dy * s)
+        return np.hypot(np.maximum(beside, 0.0), np.maximum(before, 0.0)) + np.minimum(
+            np.maximum(beside, before), 0.0)
+
+    @cached_property
+    def _axis_tree(self) -> cKDTree:
+        return cKDTree(self.path.at(_SAMPLES_M)[:, :2])
+
+
+def straight_road(
+    heading: float, half_width_m: float, lane_edges_m: tuple[tuple[float, str], ...],
+    begin_m: float = -math.inf,
+) -> Road:
+    """Return a road through the origin."""
+    return Road(Path((Piece(0.0, 0.0, heading, 0.0),)), half_width_m, lane_edges_m, begin_m)
+
+
+@dataclass(frozen=True)
+class Roundabout:
+    """A ring about the origin: radii of the asphalt's outer edge and of the island."""
+
+    outer_m: float
+    island_m: float
 
 
 @dataclass(frozen=True)
 class Network:
-    """Roads, routes and signals; stop_m is the distance of the stop lines from the origin."""
+    """Roads, routes and signals.
+
+    stop_m is the distance of the stop or give-way lines from the origin, crossing_m that of the
+    nearer edge of the zebra crossings.  Where it is rural there are no pavements, houses or people;
+    barriers_m are offsets from the axis of the first road at which crash barriers stand.
+    """
 
     roads: tuple[Road, ...]
     routes: tuple[Route, ...]
@@ -129,123 +163,20 @@ class Network:
     stop_m: float | None
     viewpoint_m: tuple[float, float]
     view_yaw_deg: float
+    crossing_m: float | None = None
+    corner_radius_m: float = 6.5
+    roundabout: Roundabout | None = None
+    rural: bool = False
+    barriers_m: tuple[float, ...] = ()
 
+    @property
+    def clear_m(self) -> float:
+        """Distance from the origin beyond which an arm is a plain road: past its stop line and crossing."""
+        if self.stop_m is None:
+            return 0.0
+        return max(self.stop_m, self.crossing_m + CROSSING_WIDTH_M)
 
-def network_of(options: SimulationOptions) -> Network:
-    """Return the road network that the options ask for."""
-    if options.one_way or options.scene == 'road':
-        return single_road(one_way=options.one_way)
-    return junction(math.radians(options.road_angle_deg), options.turning_fraction)
-
-
-def single_road(one_way: bool) -> Network:
-    """Return one road along the x axis: three lanes one way, or two lanes each way."""
-    half = (1.5 if one_way else 2.0) * LANE_WIDTH_M
-    offsets, inner = [-1.5, -0.5, 0.5, 1.5], {-1.0: 'dash', 0.0: 'solid', 1.0: 'dash'}
-    if one_way:
-        offsets, inner = [-1.0, 0.0, 1.0], {0.5: 'dash', -0.5: 'dash'}
-    edges = [(-half, 'edge'), (half, 'edge')]
-    edges += [(i * LANE_WIDTH_M, kind) for i, kind in inner.items()]
-    routes = []
-    for i in offsets:
-        heading = 0.0 if one_way or i < 0 else math.pi
-        lane = f'lane{i:+g}'
-        path = Path((_line_at(heading, abs(i) * -LANE_WIDTH_M if heading else i * LANE_WIDTH_M),))
-        routes.append(Route(path, lane, lane, 'straight', 1.0))
-    # Near enough to fill the picture, and looking across the road, not along it.
-    return Network(
-        (Road(0.0, half, tuple(edges)),), tuple(routes), (), None, (-8.0, -half - 5.0), 52.0
-    )
-
-
-def junction(angle: float, turning_fraction: float) -> Network:
-    """Return two roads that cross at an angle (radians), each with two lanes and a left-turn lane.
-
-    Straight and right-turning traffic of one road has green together; left turns have their own
-    phase, which traffic skips when nobody waits.
-    """
-    half = 2.5 * LANE_WIDTH_M
-    reach = half * (1 + abs(math.cos(angle))) / math.sin(angle)
-    stop_m = reach + CROSSING_WIDTH_M + 4.0
-    w = LANE_WIDTH_M
-    edges = [(-half, 'edge'), (half, 'edge'), (-1.5 * w, 'dash'), (1.5 * w, 'dash')]
-    edges += [(-0.5 * w, 'solid'), (0.5 * w, 'solid')]
-    roads = tuple(Road(h, half, tuple(edges)) for h in (0.0, angle))
-    routes: list[Route] = []
-    for road, heading in enumerate((0.0, angle, math.pi, math.pi + angle)):
-        routes += _arm_routes(heading, road % 2, angle, stop_m, turning_fraction)
-    phases = (('main0', 13.0), ('left0', 5.0), ('main1', 13.0), ('left1', 5.0))
-    # In the corner between the two arms behind the origin, unequally far from both roads.
-    along, across = np.array([1.0, 0.0]), np.array([math.cos(angle), math.sin(angle)])
-    foot = -(along * (half + 4.0) + across * (half + 7.5)) / math.sin(angle)
-    yaw = math.degrees(math.atan2(-foot[1], -foot[0])) + 6.0
-    return Network(roads, tuple(routes), phases, stop_m, (float(foot[0]), float(foot[1])), yaw)
-
-
-def _arm_routes(
-    heading: float, road: int, angle: float, stop_m: float, turning_fraction: float
-) -> list[Route]:
-    """Return the routes of the traffic that enters with a heading on road 0 or 1."""
-    w = LANE_WIDTH_M
-    turned = angle if road == 0 else math.pi - angle
-    left, right = heading + turned, heading + turned - math.pi
-    name = f'{math.degrees(heading):.0f}'
-    plans = [
-        ('straight', -w, heading, 1.0 - turning_fraction),
-        ('straight', -2 * w, heading, 1.0 - turning_fraction),
-        ('left', 0.0, left, turning_fraction),
-        ('right', -2 * w, right, turning_fraction),
-    ]
-    routes = []
-    for movement, offset, leave, share in plans:
-        exit_offset = {'straight': offset, 'left': -w, 'right': -2 * w}[movement]
-        path, split = _through(heading, offset, leave, exit_offset, stop_m, movement)
-        routes.append(
-            Route(
-                path=path,
-                approach=f'in {name} {offset:.1f}',
-                leave=f'out {math.degrees(leave) % 360:.0f} {exit_offset:.1f}',
-                movement=movement,
-                share=share,
-                stop_s=ARM_LENGTH_M - stop_m - 0.5,
-                split_s=split,
-                signal=f'{"left" if movement == "left" else "main"}{road}',
-            )
-        )
-    return routes
-
-
-def _line_at(heading: float, offset: float, start_m: float = -ARM_LENGTH_M) -> Piece:
-    """Return a lane: a line parallel to a heading through the origin, offset to its left."""
-    c, s = math.cos(heading), math.sin(heading)
-    x, y = start_m * c - offset * s, start_m * s + offset * c
-    return Piece(x, y, heading, -2 * start_m)
-
-
-def _through(
-    heading: float, offset: float, leave: float, exit_offset: float, stop_m: float, movement: str
-) -> tuple[Path, float]:
-    """Join an approach lane to an exit lane by an arc; return the path and the arc's start."""
-    lane = _line_at(heading, offset)
-    if movement == 'straight':
-        return Path((lane,)), math.inf
-    out = _line_at(leave, exit_offset)
-    deflection = math.remainder(leave - heading, 2 * math.pi)
-    # Where the two lanes meet: distances along each, measured from their starts.
-    d_in, d_out = np.linalg.solve(
-        np.array(
-            [
-                [math.cos(heading), -math.cos(leave)],
-                [math.sin(heading), -math.sin(leave)],
-            ]
-        ),
-        np.array([out.x - lane.x, out.y - lane.y]),
-    )
-    stop_s = ARM_LENGTH_M - stop_m
-    tangent = min(d_in - stop_s, (2 * ARM_LENGTH_M - stop_s) - d_out) - 1.0
-    radius = min(tangent / math.tan(abs(deflection) / 2), 9.0 if movement == 'right' else 16.0)
-    tangent = radius * math.tan(abs(deflection) / 2)
-    first = Piece(lane.x, lane.y, heading, float(d_in - tangent))
-    arc = Piece(*first.end(), radius * abs(deflection), math.copysign(1 / radius, deflection))
-    last = Piece(*arc.end(), float(2 * ARM_LENGTH_M - d_out - tangent))
-    return Path((first, arc, last)), first.length
+    def directions(self) -> np.ndarray:
+        """Return unit vectors (n, 2) along the straight roads."""
+        headings = [heading for road in self.roads for heading in road.headings]
+        return np.array([(math.cos(h), math.sin(h)) for h in headings]).reshape(-1, 2)

@@ -10,7 +10,10 @@ from autocalib_ros.errors import UsageError
 
 from .lens import Lens
 
-SCENES = ('junction', 'road')
+SCENES = ('junction', 'road', 'highway', 'bend', 'roundabout', 'skew', 'tee', 'sparse')
+SQUARE_DEG = 90.0
+SKEW_DEG = 65.0
+ONE_WAY_SCENES = ('junction', 'road', 'highway', 'bend')
 STORAGES = ('sqlite3', 'mcap')
 
 
@@ -51,9 +54,12 @@ class SimulationOptions:
         None, 'foot point of the camera; default: beside the road'
     )
 
-    density: float = _option(9.0, 'vehicles a minute and lane')
-    turning_fraction: float = _option(0.18, 'part of the vehicles that turn')
-    road_angle_deg: float = _option(90.0, 'angle between the two roads of a junction')
+    density: float = _option(9.0, 'vehicles a minute and lane; of scene sparse a fifteenth of them')
+    turning_fraction: float = _option(0.18, 'part of the vehicles that turn, or change lanes')
+    road_angle_deg: float | None = _option(
+        None,
+        f'angle between the two roads of a junction; default {SQUARE_DEG:g}, of scene skew {SKEW_DEG:g}',
+    )
     one_way: bool = _option(False, 'one road only, driven in one direction')
     wander_m: float = _option(0.1, 'standard deviation of the wander within the lane')
     pedestrians: int = _option(10, 'people on the pavements')
@@ -86,6 +92,13 @@ class SimulationOptions:
         return max(1, round(self.duration_s * self.rate_hz))
 
     @property
+    def crossing_deg(self) -> float:
+        """Angle between the two roads of a junction."""
+        if self.road_angle_deg is not None:
+            return self.road_angle_deg
+        return SKEW_DEG if self.scene == 'skew' else SQUARE_DEG
+
+    @property
     def lens(self) -> Lens:
         """The true lens."""
         dx, dy = self.principal_point_offset_px
@@ -109,6 +122,10 @@ class SimulationOptions:
     def _check_combinations(self) -> None:
         if self.night and self.thermal:
             raise UsageError('night and thermal exclude each other: choose one')
+        if self.one_way and self.scene not in ONE_WAY_SCENES:
+            raise UsageError(
+                f'scene {self.scene!r} has no one_way: choose {" or ".join(ONE_WAY_SCENES)}'
+            )
         if self.bump_at_s is not None and not 0.0 < self.bump_at_s < self.duration_s:
             raise UsageError(
                 f'bump_at_s is {self.bump_at_s:g}, outside the recording: '

@@ -10,7 +10,7 @@ import numpy as np
 
 from . import paint
 from .faces import Faces, Texture
-from .network import ARM_LENGTH_M, CROSSING_WIDTH_M, Network
+from .network import CROSSING_WIDTH_M, Network, Road
 from .options import SimulationOptions
 from .palette import palette_of
 
@@ -48,7 +48,7 @@ def people_of(
     network: Network, greens: tuple[tuple[str, float, float], ...], options: SimulationOptions
 ) -> tuple[Person, ...]:
     """Return the people of a recording: walkers on the pavements, and some who cross."""
-    if options.empty or not options.pedestrians:
+    if options.empty or not options.pedestrians or network.rural:
         return ()
     rng = np.random.default_rng([options.seed, 2])
     walkers = [_walker(network, rng) for _ in range(options.pedestrians)]
@@ -117,6 +117,12 @@ def _textures(clothes: int, thermal: bool) -> tuple[Texture, ...]:
     return tuple(Texture(p) for p in pictures)
 
 
+def _arm(road: Road, rng: np.random.Generator) -> float:
+    """Return the sign of an arm of a road that is there."""
+    arm = float(rng.choice([-1.0, 1.0]))
+    return arm if road.reaches(arm * _WALK_RANGE_M) else -arm
+
+
 def _walker(network: Network, rng: np.random.Generator) -> Person:
     """Somebody on a pavement, from one end of the view to the other and back at the start."""
     road = network.roads[int(rng.integers(len(network.roads)))]
@@ -124,16 +130,17 @@ def _walker(network: Network, rng: np.random.Generator) -> Person:
     offset = side * (road.half_width_m + rng.uniform(0.8, 2.6))
     forward = bool(rng.integers(2))
     # Round a junction people stay on one arm: between the crossing and the end of the view.
-    near = network.stop_m + 1.0 if network.stop_m else -_WALK_RANGE_M
-    arm = float(rng.choice([-1.0, 1.0])) if network.stop_m else 1.0
+    near = -_WALK_RANGE_M
+    if network.stop_m:
+        near = network.clear_m + 1.0
+    arm = _arm(road, rng) if network.stop_m else 1.0
     ends = sorted((arm * near, arm * _WALK_RANGE_M))
     begin = ends[0] if forward else ends[1]
     length = ends[1] - ends[0]
-    axis, normal = road.axis, np.array([-road.axis[1], road.axis[0]])
     speed = float(rng.uniform(1.0, 1.6))
     return Person(
-        tuple((begin * axis + offset * normal).tolist()),
-        road.heading + (0 if forward else math.pi), length, speed,
+        tuple(road.at(begin, offset).tolist()),
+        road.heading(begin) + (0 if forward else math.pi), length, speed,
         -float(rng.uniform(0, length / speed)), length / speed,
         float(rng.uniform(1.55, 1.9)), int(rng.integers(15)),
     )
@@ -143,15 +150,14 @@ def _crosser(network: Network, green: str, start_s: float, rng: np.random.Genera
     """Somebody who crosses the road that is not the one with green."""
     other = 1 - int(green[-1])
     road = network.roads[other]
-    arm = float(rng.choice([-1.0, 1.0]))
+    arm = _arm(road, rng)
     side = float(rng.choice([-1.0, 1.0]))
-    centre = (network.stop_m or ARM_LENGTH_M) - 2.0 - CROSSING_WIDTH_M / 2
+    centre = network.crossing_m + CROSSING_WIDTH_M / 2
     along = arm * (centre + rng.uniform(-1.2, 1.2))
     across = side * (road.half_width_m + 0.5)
-    axis, normal = road.axis, np.array([-road.axis[1], road.axis[0]])
-    heading = road.heading + (-side) * math.pi / 2
+    heading = road.heading(along) + (-side) * math.pi / 2
     return Person(
-        tuple((along * axis + across * normal).tolist()), heading, 2 * road.half_width_m + 1.0,
+        tuple(road.at(along, across).tolist()), heading, 2 * road.half_width_m + 1.0,
         float(rng.uniform(1.3, 1.7)), start_s + float(rng.uniform(0.0, 2.0)), None,
         float(rng.uniform(1.55, 1.9)), int(rng.integers(15)),
     )

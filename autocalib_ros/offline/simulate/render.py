@@ -20,7 +20,7 @@ from .options import SimulationOptions
 from .palette import palette_of
 from .people import Person
 from .scenery import lamp_places, scenery_of
-from .traffic import Vehicle, VehicleState
+from .vehicles import Vehicle, VehicleState
 
 _DRAWN_RANGE_M = 130.0
 _REACH_M = 14.0  # a bus and its beam, from its middle

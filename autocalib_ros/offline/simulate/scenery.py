@@ -8,13 +8,16 @@ import numpy as np
 
 from . import paint
 from .faces import Faces, Texture, join
-from .ground import PAVEMENT_M, edge_distance, on_road
+from .ground import PAVEMENT_M, edge_distance
 from .network import Network, Road
 from .palette import Palette
 
 _TEXELS_PER_M = 24
 _PANEL_M = 6.0
 _LAMPS_M = np.arange(-105.0, 106.0, 30.0)
+_BARRIER_M = 0.8
+_BARRIER_REACH_M = 300.0
+_BARRIER_PANEL_M = 6.0
 
 
 def scenery_of(
@@ -26,9 +29,11 @@ def scenery_of(
     crowns = [_crown(palette, rng) for _ in range(6)]
     for road in network.roads:
         for side in (1, -1):
-            parts += _buildings(road, side, network, viewpoint, palette, rng)
+            if not network.rural:
+                parts += _buildings(road, side, network, viewpoint, palette, rng)
             parts += _trees(road, side, network, viewpoint, palette, crowns, rng)
             parts += _poles(road, side, network, viewpoint, palette)
+    parts += _barriers(network, palette)
     return join(parts)
 
 
@@ -53,8 +58,8 @@ def _buildings(road: Road, side: int, network: Network, viewpoint: np.ndarray, p
         height = float(rng.choice([6.4, 9.6, 12.8]))
         wall = palette.walls[int(rng.integers(len(palette.walls)))]
         aside = side * (road.half_width_m + PAVEMENT_M + rng.uniform(3.0, 6.0) + depth / 2)
-        centre = on_road(road, along, aside)
-        box = _ring(centre, road.heading, length, depth)
+        centre = road.at(along, aside)
+        box = _ring(centre, road.heading(along), length, depth)
         if _clear(network, viewpoint, _dense(box), PAVEMENT_M + 1.0, 20.0):
             parts.append(_block(box, height, wall, palette, rng))
     return parts
@@ -125,7 +130,7 @@ def _trees(road: Road, side: int, network: Network, viewpoint: np.ndarray, palet
     parts = []
     for along in np.arange(-100.0, 101.0, 11.0):
         aside = side * (road.half_width_m + PAVEMENT_M + rng.uniform(0.5, 2.0))
-        place = on_road(road, along + rng.uniform(-3, 3), aside)
+        place = road.at(along + rng.uniform(-3, 3), aside)
         height = rng.uniform(4.5, 8.0)
         if not _clear(network, viewpoint, place[None], PAVEMENT_M - 0.2, 14.0):
             continue
@@ -163,11 +168,11 @@ def _poles(road: Road, side: int, network: Network, viewpoint: np.ndarray,
     for i, colour in enumerate(((40, 40, 200), (40, 160, 200), (80, 180, 60))):
         paint.disc(head, (8.0, 8.0 + 16 * i), 5.0, (*paint.mixed(palette.trim, colour, 0.4), 255))
     plans = [(along, 0.6, 0.14, 8.0) for along in _LAMPS_M]
-    if network.stop_m is not None:
+    if network.phases:
         plans += [(side * network.stop_m, 0.5, 0.16, 4.2)]
     parts = []
     for along, kerb, width, height in plans:
-        place = on_road(road, along, side * (road.half_width_m + kerb))
+        place = road.at(along, side * (road.half_width_m + kerb))
         if edge_distance(network, place) < 0.2 or np.hypot(*(place - viewpoint)) < 9.0:
             continue
         corners, textures = [_upright(place, viewpoint, width, 0.0, height)], [metal]
@@ -178,12 +183,27 @@ def _poles(road: Road, side: int, network: Network, viewpoint: np.ndarray,
     return parts
 
 
+def _barriers(network: Network, palette: Palette) -> list[Faces]:
+    """Return concrete crash barriers along the first road."""
+    concrete = Texture(paint.filled(16, 16, palette.kerb))
+    parts = []
+    for aside in network.barriers_m:
+        for along in np.arange(-_BARRIER_REACH_M, _BARRIER_REACH_M, _BARRIER_PANEL_M):
+            a, b = network.roads[0].at(np.array([along, along + _BARRIER_PANEL_M]), aside)
+            left = (b - a)[::-1] * (-1, 1) / _BARRIER_PANEL_M * 0.15
+            step = (*(b - a), 0.0)
+            faces = [[(*(a + side * left), _BARRIER_M), step, (0.0, 0.0, -_BARRIER_M)] for side in (1, -1)]
+            faces.append([(*(a + left), _BARRIER_M), step, (*(-2 * left), 0.0)])
+            parts.append(Faces(np.array(faces), (concrete,) * 3))
+    return parts
+
+
 def lamp_places(network: Network) -> list[tuple[float, float]]:
     """Return the ground points (x, y) under the street lamps."""
     places = []
     for road in network.roads:
         for side in (1, -1):
             for along in _LAMPS_M:
-                x, y = on_road(road, along, side * (road.half_width_m - 1.5)).tolist()
+                x, y = road.at(along, side * (road.half_width_m - 1.5)).tolist()
                 places.append((x, y))
     return places

@@ -43,7 +43,8 @@ class Shape:
     parts: tuple[Part, ...]
     share: float
     acceleration_mps2: float
-    turns_right: bool = True
+    fits_narrow_turns: bool = True
+    top_speed_mps: float = 40.0
 
     @property
     def wheels_x_m(self) -> tuple[float, float]:
@@ -135,7 +136,13 @@ SHAPES = {
         Shape('hatchback', 3.9, 1.72, 2.45, 0.30, (_HATCH,), 0.24, 1.9),
         Shape('wagon', 4.6, 1.88, 2.75, 0.35, (_WAGON,), 0.20, 1.7),
         Shape('van', 5.2, 1.98, 3.20, 0.33, (_VAN,), 0.15, 1.5),
-        Shape('truck', 7.5, 2.40, 4.20, 0.45, (_CAB, _CARGO), 0.09, 1.0, turns_right=False),
-        Shape('bus', 11.4, 2.50, 5.80, 0.46, (_COACH,), 0.05, 1.0, turns_right=False),
+        Shape(
+            'truck', 7.5, 2.40, 4.20, 0.45, (_CAB, _CARGO), 0.09, 1.0, fits_narrow_turns=False,
+            top_speed_mps=24.0,
+        ),
+        Shape(
+            'bus', 11.4, 2.50, 5.80, 0.46, (_COACH,), 0.05, 1.0, fits_narrow_turns=False,
+            top_speed_mps=27.0,
+        ),
     )
 }

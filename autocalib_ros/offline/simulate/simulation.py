@@ -9,11 +9,12 @@ import numpy as np
 
 from . import people
 from .lens import CameraPose, look, rotation
-from .network import network_of
 from .options import SimulationOptions
 from .render import Artist, Scene
-from .traffic import Vehicle, VehicleState, simulate_traffic
+from .scenes import network_of
+from .traffic import simulate_traffic
 from .truth import truth_of
+from .vehicles import Vehicle, VehicleState
 
 _START_NS = 1_700_000_000_000_000_000
 _BUMP_AXIS = np.array([0.80, 0.50, 0.33])

@@ -1,111 +1,29 @@
 """Traffic over the routes of a network, simulated once and before the first frame is drawn.
 
 Drivers follow the intelligent driver model (Treiber et al. 2000), stop at signals, slow down for
-curves and wander within their lanes.
+curves, give way to who circles on a ring and wander within their lanes.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from itertools import permutations
 
 import numpy as np
 
-from .network import Network, Route
+from .network import CITY_SPEED_MPS, Network, Route
 from .options import SimulationOptions
 from .shapes import SHAPES, Shape
 from .signals import Signals
+from .vehicles import STEP_S, Traffic, Vehicle, Wander
 
-STEP_S = 0.1
 WARM_UP_S = 52.0
 STANDSTILL_GAP_M = 2.0
 COLOURS = 10  # how many body colours a palette has
-
-
-@dataclass(frozen=True)
-class Wander:
-    """Lateral offset within the lane as a smooth function of the way gone.
-
-    A function of the way, not of time: a waiting vehicle does not slide sideways.
-    """
-
-    amplitudes_m: np.ndarray
-    wavelengths_m: np.ndarray
-    phases: np.ndarray
-
-    @classmethod
-    def draw(cls, stddev_m: float, rng: np.random.Generator) -> Wander:
-        """Draw a wander of a standard deviation; at city speed it is correlated over seconds."""
-        count = 4
-        return cls(
-            np.full(count, stddev_m * math.sqrt(2.0 / count)),
-            np.exp(rng.uniform(math.log(35.0), math.log(140.0), count)),
-            rng.uniform(0.0, 2 * math.pi, count),
-        )
-
-    def at(self, s: np.ndarray) -> np.ndarray:
-        """Return the offset to the left in metres at arc lengths s (...)."""
-        angle = 2 * math.pi * np.asarray(s, float)[..., None] / self.wavelengths_m + self.phases
-        return (self.amplitudes_m * np.sin(angle)).sum(-1)
-
-
-@dataclass(frozen=True)
-class VehicleState:
-    """Where a vehicle is: centre of its footprint in metres, heading in radians, speed."""
-
-    x: float
-    y: float
-    heading: float
-    speed_mps: float
-
-
-@dataclass(frozen=True)
-class Vehicle:
-    """One vehicle and its whole life: arc length and speed every STEP_S from start_s on."""
-
-    number: int
-    kind: str
-    colour: int
-    route: Route
-    wander: Wander
-    start_s: float
-    s: np.ndarray
-    speeds_mps: np.ndarray
-
-    @property
-    def shape(self) -> Shape:
-        """Its dimensions."""
-        return SHAPES[self.kind]
-
-    def state(self, time_s: float) -> VehicleState | None:
-        """Return where it is at a time, or None before and after its life."""
-        position = (time_s - self.start_s) / STEP_S
-        index = math.floor(position + 1e-9)
-        if index < 0 or index > len(self.s) - 2:
-            return None
-        tau = (position - index) * STEP_S
-        v0, v1 = self.speeds_mps[index], self.speeds_mps[index + 1]
-        s = self.s[index] + v0 * tau + 0.5 * (v1 - v0) / STEP_S * tau * tau
-        x, y, heading = self.pose(s)
-        return VehicleState(x, y, heading, float(v0 + (v1 - v0) * tau / STEP_S))
-
-    def pose(self, s: float) -> tuple[float, float, float]:
-        """Return (x, y, heading) with both axles on the wandering path."""
-        axles = s + np.array([-0.5, 0.5]) * self.shape.wheelbase_m
-        rows = self.route.path.at(axles)
-        aside = self.wander.at(axles)
-        xy = rows[:, :2] + aside[:, None] * np.stack([-np.sin(rows[:, 2]), np.cos(rows[:, 2])], -1)
-        (rear_x, rear_y), (front_x, front_y) = xy.tolist()
-        heading = math.atan2(front_y - rear_y, front_x - rear_x)
-        return (rear_x + front_x) / 2, (rear_y + front_y) / 2, heading
-
-
-@dataclass(frozen=True)
-class Traffic:
-    """All vehicles, and the green times (signal, start, end) that they obeyed."""
-
-    vehicles: tuple[Vehicle, ...]
-    greens: tuple[tuple[str, float, float], ...]
+_BRAKING_MPS2 = 1.5  # for a curve or a ring ahead
+_CRITICAL_GAP_S = 4.0  # drivers enter a ring when nobody will be at their place for so long
+_CLEAR_M = 8.0  # beyond an exit, until a vehicle's tail is clear of the ring
 
 
 @dataclass
@@ -174,28 +92,29 @@ class _Arrivals:
             while self._next[i] <= now:
                 self._waiting.setdefault(route.approach, []).append(route)
                 self._next[i] += self._rng.exponential(1 / rate)
-        for lane, queue in self._waiting.items():
-            if queue and (room := _room(lane, drivers))[0] > 20.0:
+        for queue in self._waiting.values():
+            if queue and (room := _room(queue[0], drivers))[0] > 20.0:
                 drivers.append(self._driver(now, queue.pop(0), *room))
 
     def _driver(self, now: float, route: Route, room_m: float, leader_mps: float) -> _Driver:
         rng = self._rng
-        shapes = [s for s in SHAPES.values() if s.turns_right or route.movement != 'right']
+        shapes = [s for s in SHAPES.values() if s.fits_narrow_turns or not route.narrow]
         shares = np.array([s.share for s in shapes])
         shape = shapes[int(rng.choice(len(shapes), p=shares / shares.sum()))]
-        cruise = float(np.clip(rng.normal(12.5, 1.3), 9.5, 16.0))
+        cruise = float(np.clip(rng.normal(12.5, 1.3), 9.5, 16.0)) * route.speed_mps / CITY_SPEED_MPS
+        cruise = min(cruise, shape.top_speed_mps)
         safe = max(0.0, min(cruise, leader_mps + 0.1 * (room_m - 20.0)))
         self._count += 1
         return _Driver(
             self._count, shape, int(rng.integers(COLOURS)), route,
-            Wander.draw(self._wander_m, rng), cruise, float(rng.uniform(1.0, 1.5)), now,
+            Wander.draw(self._wander_m, rng, route.speed_mps), cruise, float(rng.uniform(1.0, 1.5)), now,
             shape.length_m / 2, safe,
         )
 
 
-def _room(lane: str, drivers: list[_Driver]) -> tuple[float, float]:
-    """Return the free way at the start of a lane and the speed of the last vehicle in it."""
-    inside = [d for d in drivers if d.route.approach == lane]
+def _room(route: Route, drivers: list[_Driver]) -> tuple[float, float]:
+    """Return the free way at the start of a route and the speed of the last vehicle there."""
+    inside = [d for d in drivers if d.route.entered & route.entered]
     if not inside:
         return math.inf, math.inf
     last = min(inside, key=lambda d: d.s)
@@ -214,7 +133,7 @@ def _advance(drivers: list[_Driver], signals: Signals) -> None:
         return
     v = np.array([d.v for d in drivers])
     gap, leader_v = _leaders(drivers)
-    stop = np.array([_stop_gap(d, signals) for d in drivers])
+    stop = np.array([_stop_gap(d, signals, drivers) for d in drivers])
     leader_v = np.where(stop < gap, 0.0, leader_v)
     gap = np.minimum(gap, stop)
     wish = np.array([min(d.cruise_mps, _curve_limit(d)) for d in drivers])
@@ -237,9 +156,10 @@ def _leaders(drivers: list[_Driver]) -> tuple[np.ndarray, np.ndarray]:
     """Return the gap to the vehicle ahead and its speed, (n,) each; no leader: (inf, 0)."""
     s = np.array([d.s for d in drivers])
     half = np.array([d.shape.length_m / 2 for d in drivers])
-    approach = _codes([d.route.approach for d in drivers])
-    leave = _codes([d.route.leave for d in drivers])
-    past_line = s > np.array([min(d.route.stop_s, d.route.path.length) for d in drivers])
+    names = [d.route.approach for d in drivers] + [d.route.leave for d in drivers]
+    approach, leave = np.split(_codes(names), 2)
+    stop = np.array([d.route.stop_s for d in drivers])
+    past_line = s > np.minimum(stop, [d.route.path.length for d in drivers])
     left = np.array([d.route.path.length for d in drivers]) - s
     # On the approach lane until the leader's tail has turned off; then towards a shared exit lane.
     split = np.array([d.route.split_s for d in drivers]) + 2 * half + 1.0
@@ -247,15 +167,64 @@ def _leaders(drivers: list[_Driver]) -> tuple[np.ndarray, np.ndarray]:
     ahead = (approach[:, None] == approach) & (same_route | (s < split)[None, :])
     along = np.where(ahead, s[None, :] - s[:, None], np.inf)
     merging = (leave[:, None] == leave) & past_line[:, None] & past_line[None, :]
+    # Who changes lanes belongs to the new one from the start, and to the old one until it has left.
+    free, stays = stop <= 0, s < split
+    crossing = (approach[:, None] == leave) & stays[:, None]
+    crossing |= crossing.T | ((approach[:, None] == approach) & stays[:, None] & stays)
+    merging |= crossing & free[:, None] & free
     merged = np.where(merging & ~same_route, left[:, None] - left[None, :], np.inf)
     along[along <= 0] = np.inf
     merged[merged <= 0] = np.inf
-    gaps = np.minimum(along, merged) - half[:, None] - half[None, :]
+    ahead_m = np.minimum(np.minimum(along, merged), _ways_round(drivers))
+    gaps = ahead_m - half[:, None] - half[None, :]
     np.fill_diagonal(gaps, np.inf)
     first = gaps.argmin(1)
     rows = np.arange(len(drivers))
     speeds = np.array([d.v for d in drivers])[first]
     return gaps[rows, first], np.where(np.isfinite(gaps[rows, first]), speeds, 0.0)
+
+
+def _ways_round(drivers: list[_Driver]) -> np.ndarray:
+    """Return the way round a ring (n, n) from each vehicle on it to each one ahead; else inf.
+
+    On the ring is who has passed its give-way line and has not left with its tail.
+    """
+    ways = np.full((len(drivers), len(drivers)), np.inf)
+    on_ring = [i for i, d in enumerate(drivers) if _circles(d)]
+    for i, j in permutations(on_ring, 2):
+        ways[i, j] = _way_round(drivers[i], drivers[j])
+    return ways
+
+
+def _way_round(driver: _Driver, other: _Driver) -> float:
+    """Return the way round the ring to another vehicle on it if that is ahead, else inf."""
+    ring, there = driver.route.ring, other.route.ring
+    ahead = ring.ahead_m(there.place_m(other.s), driver.s)
+    stays = ring.leaves_s - driver.s
+    if other.s < there.joins_s:
+        concerned = stays > ring.ahead_m(there.joins_m, driver.s)
+    else:
+        concerned = ahead < stays + (driver.shape.length_m + other.shape.length_m) / 2 + _CLEAR_M
+    return ahead if concerned and ahead < ring.circumference_m / 2 else math.inf
+
+
+def _circles(driver: _Driver) -> bool:
+    ring, half_m = driver.route.ring, driver.shape.length_m / 2
+    return ring is not None and driver.s + half_m > driver.route.stop_s and driver.s < (
+        ring.leaves_s + half_m + _CLEAR_M)
+
+
+def _gives_way(driver: _Driver, drivers: list[_Driver]) -> bool:
+    """Tell whether somebody on the ring will soon pass where a vehicle wants to join it."""
+    ring = driver.route.ring
+    for other in drivers:
+        if other is driver or not _circles(other) or other.route.approach == driver.route.approach:
+            continue
+        round_m = other.route.ring.ahead_m(ring.joins_m, other.s)
+        passes = other.route.ring.leaves_s - other.s > round_m
+        if passes and round_m < _CRITICAL_GAP_S * max(other.v, 3.0) + other.shape.length_m:
+            return True
+    return False
 
 
 def _codes(names: list[str]) -> np.ndarray:
@@ -264,14 +233,19 @@ def _codes(names: list[str]) -> np.ndarray:
     return np.array([numbers.setdefault(name, len(numbers)) for name in names])
 
 
-def _stop_gap(driver: _Driver, signals: Signals) -> float:
+def _stop_gap(driver: _Driver, signals: Signals, drivers: list[_Driver]) -> float:
     """Return the way to the stop line if the driver has to stop there, else inf."""
-    if driver.route.signal is None:
-        return math.inf
     ahead = driver.route.stop_s - driver.s - driver.shape.length_m / 2
-    light = signals.light(driver.route.signal)
+    if ahead < -0.3 or math.isinf(ahead):
+        return math.inf
+    if driver.route.ring is not None:
+        light = 'amber' if _gives_way(driver, drivers) else 'green'
+    elif driver.route.signal is not None:
+        light = signals.light(driver.route.signal)
+    else:
+        return math.inf
     braking = {'green': 0.0, 'amber': 2.0, 'red': 5.0}[light]
-    if light == 'green' or ahead < -0.3 or driver.v**2 > 2 * braking * max(ahead, 0.0) + 0.5:
+    if light == 'green' or driver.v**2 > 2 * braking * max(ahead, 0.0) + 0.5:
         return math.inf
     # The gap of the model is one to a bumper; drivers stop closer to a line.
     return max(ahead, 0.0) + STANDSTILL_GAP_M - 0.6
@@ -284,5 +258,5 @@ def _curve_limit(driver: _Driver) -> float:
         comfortable = 2.0 * radius
         if driver.s < end:
             ahead = max(0.0, start - driver.s)
-            limit = min(limit, math.sqrt(comfortable + 2 * 1.5 * ahead))
+            limit = min(limit, math.sqrt(comfortable + 2 * _BRAKING_MPS2 * ahead))
     return limit

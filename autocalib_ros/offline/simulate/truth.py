@@ -12,7 +12,7 @@ from .lens import CameraPose
 
 if TYPE_CHECKING:
     from .simulation import Simulation
-    from .traffic import Vehicle
+    from .vehicles import Vehicle
 
 TRACK_RATE_HZ = 5
 _RANGE_M = 60.0
@@ -26,7 +26,7 @@ def truth_of(simulation: Simulation) -> dict[str, Any]:
     options = simulation.options
     truth = {
         'case': 'simulated',
-        'scene': 'one_way' if options.one_way else options.scene,
+        'scene': _scene(simulation),
         'width': options.width_px,
         'height': options.height_px,
         'fps': options.rate_hz,
@@ -37,8 +37,8 @@ def truth_of(simulation: Simulation) -> dict[str, Any]:
         'camera': _camera(simulation.pose),
         'world': 'X,Y on the ground (z=0), Z up, metres; '
                  'camera optical frame x right, y down, z forward',
-        'road_directions': [[*road.axis.round(9).tolist(), 0.0]
-                            for road in simulation.network.roads],
+        'road_directions': [[*direction, 0.0]
+                            for direction in simulation.network.directions().round(9).tolist()],
         'ground_points': _ground_points(simulation, bumped=False),
         'vehicles': _vehicles(simulation),
         'options': asdict(options),
@@ -50,6 +50,11 @@ def truth_of(simulation: Simulation) -> dict[str, Any]:
             'ground_points': _ground_points(simulation, bumped=True),
         }
     return truth
+
+
+def _scene(simulation: Simulation) -> str:
+    options = simulation.options
+    return 'one_way' if options.one_way and options.scene in ('junction', 'road') else options.scene
 
 
 def _lens(simulation: Simulation) -> dict[str, Any]:

@@ -1,0 +1,111 @@
+"""A junction of two roads with signals, or one where the second road ends."""
+
+from __future__ import annotations
+
+import math
+
+from .network import (
+    ARM_LENGTH_M,
+    CROSSING_WIDTH_M,
+    LANE_WIDTH_M,
+    Network,
+    Route,
+    straight_road,
+)
+from .paths import Path, corner, joined, line, tangent_per_radius
+
+RIGHT_RADIUS_M = 8.0
+"""About the same point as the kerb of the corner."""
+LEFT_RADIUS_M = 16.0
+
+
+def junction(angle: float, turning_fraction: float, tee: bool = False) -> Network:
+    """Return two roads that cross at an angle (radians), each with two lanes and a left-turn lane.
+
+    Straight and right-turning traffic of one road has green together; left turns have their own
+    phase, which traffic skips when nobody waits.  Of a tee the second road begins at the first one.
+    """
+    half = 2.5 * LANE_WIDTH_M
+    reach = half * (1 + abs(math.cos(angle))) / math.sin(angle)
+    stop_m = reach + CROSSING_WIDTH_M + 4.0
+    w = LANE_WIDTH_M
+    edges = [(-half, 'edge'), (half, 'edge'), (-1.5 * w, 'dash'), (1.5 * w, 'dash')]
+    edges += [(-0.5 * w, 'solid'), (0.5 * w, 'solid')]
+    roads = (
+        straight_road(0.0, half, tuple(edges)),
+        straight_road(angle, half, tuple(edges), 0.0 if tee else -math.inf),
+    )
+    # An arm is named by the heading of the traffic that leaves on it.
+    arms = (0.0, angle, math.pi) if tee else (0.0, angle, math.pi, math.pi + angle)
+    routes: list[Route] = []
+    for road, heading in enumerate((0.0, angle, math.pi, math.pi + angle)):
+        if _is_among(heading + math.pi, arms):
+            routes += _arm_routes(heading, road % 2, angle, stop_m, turning_fraction, arms)
+    phases = (('main0', 13.0), ('left0', 5.0), ('main1', 13.0), ('left1', 5.0))
+    # In the corner between the two arms behind the origin, unequally far from both roads.
+    aside = half + 7.5
+    foot = -(half + 4.0 + aside * math.cos(angle)) / math.sin(angle), -aside
+    yaw = math.degrees(math.atan2(-foot[1], -foot[0])) + 6.0
+    return Network(
+        roads, tuple(routes), phases, stop_m, foot, yaw, crossing_m=stop_m - 2.0 - CROSSING_WIDTH_M
+    )
+
+
+def _is_among(heading: float, headings: tuple[float, ...]) -> bool:
+    return any(abs(math.remainder(heading - h, 2 * math.pi)) < 1e-6 for h in headings)
+
+
+def _arm_routes(
+    heading: float, road: int, angle: float, stop_m: float, turning_fraction: float,
+    arms: tuple[float, ...],
+) -> list[Route]:
+    """Return the routes, to arms that are there, of the traffic that enters with a heading."""
+    w = LANE_WIDTH_M
+    turned = angle if road == 0 else math.pi - angle
+    left, right = heading + turned, heading + turned - math.pi
+    name = f'{math.degrees(heading):.0f}'
+    # Who cannot go straight on turns.
+    turning = turning_fraction if _is_among(heading, arms) else 1.0
+    plans = [
+        ('straight', -w, heading, 1.0 - turning),
+        ('straight', -2 * w, heading, 1.0 - turning),
+        ('left', 0.0, left, turning),
+        ('right', -2 * w, right, turning),
+    ]
+    routes = []
+    for movement, offset, leave, share in plans:
+        if not _is_among(leave, arms):
+            continue
+        exit_offset = {'straight': offset, 'left': -w, 'right': -2 * w}[movement]
+        path, split = _through(heading, offset, leave, exit_offset, stop_m, movement)
+        routes.append(
+            Route(
+                path=path,
+                approach=f'in {name} {offset:.1f}',
+                leave=f'out {math.degrees(leave) % 360:.0f} {exit_offset:.1f}',
+                movement=movement,
+                share=share,
+                stop_s=ARM_LENGTH_M - stop_m - 0.5,
+                split_s=split,
+                narrow=movement == 'right',
+                signal=f'{"left" if movement == "left" else "main"}{road}',
+            )
+        )
+    return routes
+
+
+def _through(
+    heading: float, offset: float, leave: float, exit_offset: float, stop_m: float, movement: str
+) -> tuple[Path, float]:
+    """Join an approach lane to an exit lane by a turn; return the path and the turn's start."""
+    lane = line(heading, offset, ARM_LENGTH_M)
+    if movement == 'straight':
+        return Path((lane,)), math.inf
+    out = line(leave, exit_offset, ARM_LENGTH_M)
+    d_in, d_out = corner(lane, out)
+    stop_s = ARM_LENGTH_M - stop_m
+    # A clothoid hardly leaves the lane at first: it may begin before the stop line.
+    room = min(d_in - stop_s, (2 * ARM_LENGTH_M - stop_s) - d_out) + 2.0
+    per_radius = tangent_per_radius(math.remainder(leave - heading, 2 * math.pi))
+    path = joined(lane, out, min(room / per_radius, RIGHT_RADIUS_M if movement == 'right' else LEFT_RADIUS_M))
+    return path, path.pieces[0].length
