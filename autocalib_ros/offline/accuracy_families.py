@@ -15,8 +15,21 @@ import numpy as np
 
 from autocalib_ros.camera import Camera, image_centre
 from autocalib_ros.evidence import Evidence, Track
+from autocalib_ros.offline.simulate.junctions import junction as crossing
+from autocalib_ros.offline.simulate.motorway import highway
+from autocalib_ros.offline.simulate.network import Network
+from autocalib_ros.offline.simulate.roundabout import RING_RADIUS_M
+from autocalib_ros.offline.simulate.roundabout import roundabout as ring_roads
+from autocalib_ros.offline.simulate.scenes import bend as road_bend
 from autocalib_ros.offline.synthetic_evidence import HEADWAY_S, Junction, gathered, pose, synthetic_evidence
-from autocalib_ros.offline.synthetic_traffic import INTERVAL_S, drive_arc, drive_bend, drive_ring, stroll
+from autocalib_ros.offline.synthetic_traffic import (
+    INTERVAL_S,
+    drive_arc,
+    drive_bend,
+    drive_ring,
+    drive_route,
+    stroll,
+)
 from autocalib_ros.offline.synthetic_trouble import random_walk, straggle, waving
 
 WIDTH, HEIGHT = 1280, 720
@@ -122,11 +135,62 @@ def turning(generator: np.random.Generator) -> Junction:
 
     The principal point is the image centre: turns tell less of it than of all else.
     """
-    junction = viewpoint(generator)
+    junction = _centred(viewpoint(generator), generator)
+    return replace(junction, drive=partial(drive_arc, radii_m=(12.0, 60.0)), tracks=None, vehicles=25,
+                   points_per_vehicle=8, joined_share=0.2)
+
+
+def highway_drive(generator: np.random.Generator) -> Junction:
+    """A motorway of three lanes one way, a third of the vehicles changing lanes: the lens alone can be had."""
+    return _driven_on(viewpoint(generator, (40.0, 75.0)), highway(one_way=True, changing_fraction=0.3))
+
+
+def long_bend(generator: np.random.Generator) -> Junction:
+    """A road with lanes both ways that bends by 80 degrees on 64 to 112 m: in view, mostly about one point."""
+    junction = _centred(viewpoint(generator), generator)
+    return _driven_on(junction, road_bend(one_way=False), turned_rad=generator.uniform(0, 2 * np.pi),
+                      scale=generator.uniform(0.8, 1.4))
+
+
+def roundabout_arms(generator: np.random.Generator) -> Junction:
+    """A roundabout with vehicles that enter, circle and leave, seen from outside."""
+    junction = _centred(viewpoint(generator), generator)
+    scale = generator.uniform(0.8, 1.3)
+    direction = np.array(junction.centre_m) / np.hypot(*junction.centre_m)
+    x, y = (scale * RING_RADIUS_M + generator.uniform(6.0, 14.0)) * direction
+    return _driven_on(replace(junction, centre_m=(float(x), float(y))), ring_roads(turning_fraction=0.5),
+                      turned_rad=generator.uniform(0, 2 * np.pi), scale=scale)
+
+
+def skew_turning(generator: np.random.Generator) -> Junction:
+    """Two roads that cross at 60 to 70 degrees, a third of the vehicles turning."""
+    network = crossing(np.radians(generator.uniform(60.0, 70.0)), turning_fraction=0.35)
+    return _driven_on(viewpoint(generator), network, turned_rad=np.pi * generator.integers(2))
+
+
+def tee(generator: np.random.Generator) -> Junction:
+    """A road on which another one ends: all its vehicles turn, and some of the main road's."""
+    network = crossing(np.pi / 2, turning_fraction=0.35, tee=True)
+    return _driven_on(viewpoint(generator), network, turned_rad=np.pi / 2 * generator.integers(4))
+
+
+def sparse(generator: np.random.Generator) -> Junction:
+    """A junction with a vehicle every twelve seconds, watched for two to four minutes."""
+    junction = _driven_on(viewpoint(generator), crossing(np.pi / 2, turning_fraction=0.3))
+    return replace(junction, vehicles=int(generator.integers(10, 21)), headway_s=12.0)
+
+
+def _driven_on(junction: Junction, network: Network, *, turned_rad: float = 0.0, scale: float = 1.0) -> Junction:
+    """Let 40 vehicles with eight points each drive the routes of a network."""
+    drive = partial(drive_route, network=network, turned_rad=turned_rad, scale=scale)
+    return replace(junction, drive=drive, tracks=None, vehicles=40, points_per_vehicle=8)
+
+
+def _centred(junction: Junction, generator: np.random.Generator) -> Junction:
+    """Give the camera a lens nearer equidistant, with its principal point at the image centre."""
     camera = replace(Camera.equidistant(WIDTH, HEIGHT, junction.camera.focal_px),
                      k=(float(generator.uniform(-TURNING_K1, TURNING_K1)), 0.0, 0.0, 0.0))
-    return replace(junction, camera=camera, drive=partial(drive_arc, radii_m=(12.0, 60.0)), tracks=None, vehicles=25,
-                   points_per_vehicle=8, joined_share=0.2)
+    return replace(junction, camera=camera)
 
 
 def pedestrians(generator: np.random.Generator) -> Junction:
@@ -190,10 +254,16 @@ DETERMINED: dict[str, Family] = {
     'one_road': driven(one_road),
     'distortion_free': driven(distortion_free),
     'turning': driven(turning),
+    'highway': driven(highway_drive),
+    'roundabout_arms': driven(roundabout_arms),
+    'skew_turning': driven(skew_turning),
+    'tee': driven(tee),
+    'sparse': driven(sparse),
 }
 UNDERDETERMINED: dict[str, Family] = {
     'radial': driven(radial),
     'bend': driven(bend),
+    'long_bend': driven(long_bend),
     'roundabout': driven(roundabout),
     'pedestrians': driven(pedestrians),
     'noise': noise,

@@ -17,7 +17,7 @@ FALSE_FOCAL = 0.05
 FALSE_DEG = 1.0
 NAME = '{:<21}{:<6}{:>5}{:>6}'
 ERRORS = NAME + '  {:<21}{:>7}{:>7}{:>7}{:>7}{:>8}{:>7}{:>7}{:>7}'
-SIGMAS = NAME + '{:>7}{:>7}{:>8}{:>7}{:>7}{:>8}{:>7}{:>8}'
+SIGMAS = NAME + '{:>7}{:>8}{:>7}{:>8}{:>7}{:>7}{:>8}{:>7}{:>8}'
 
 
 def tables(runs: Sequence[Run]) -> str:
@@ -36,6 +36,13 @@ def falsely_accepted(run: Run) -> bool:
     focal = abs(run.focal_error)
     tilted = _beyond(run.tilt_error_deg, run.tilt_sigma_deg) or _beyond(run.roll_error_deg, run.roll_sigma_deg)
     return focal > FALSE_FOCAL or focal > FALSE_SIGMAS * run.focal_sigma or tilted
+
+
+def beyond_own_sigmas(run: Run) -> bool:
+    """Whether a published focal length, tilt or roll is wrong by more than three of its own standard deviations."""
+    pairs = ((run.focal_error, run.focal_sigma), (run.tilt_error_deg, run.tilt_sigma_deg),
+             (run.roll_error_deg, run.roll_sigma_deg))
+    return run.accepted and any(abs(error) > FALSE_SIGMAS * sigma for error, sigma in pairs)
 
 
 def _beyond(error_deg: float, sigma_deg: float) -> bool:
@@ -59,8 +66,8 @@ ERROR_HEADS = (
     ERRORS.format('', '', '', 'acc.', 'most common', 'focal', 'length', '%', '', 'normal', 'deg', 'rays', 'dist.'),
     ERRORS.format('family', '', 'runs', '%', 'refusal', 'bias', 'spread', 'mean', 'worst', 'mean', 'worst', 'deg', '%'))
 SIGMA_HEADS = (
-    SIGMAS.format('', '', '', 'acc.', 'false', 'plane', 'in 95 %', 'inter-', 'val, %', 'rms', 'z', 'solve'),
-    SIGMAS.format('family', '', 'runs', '%', 'acc.', '%', 'focal', 'tilt', 'roll', 'focal', 'tilt', 'cpu s'))
+    SIGMAS.format('', '', '', 'acc.', 'false', 'beyond', 'plane', 'in 95 %', 'inter-', 'val, %', 'rms', 'z', 'solve'),
+    SIGMAS.format('family', '', 'runs', '%', 'acc.', '3 sig', '%', 'focal', 'tilt', 'roll', 'focal', 'tilt', 'cpu s'))
 
 
 def _errors(runs: Sequence[Run]) -> str:
@@ -79,7 +86,8 @@ def _sigmas(runs: Sequence[Run]) -> str:
     focal, tilt, roll = (_z(accepted, 'focal_error', 'focal_sigma'), _z(accepted, 'tilt_error_deg', 'tilt_sigma_deg'),
                          _z(accepted, 'roll_error_deg', 'roll_sigma_deg'))
     return SIGMAS.format(
-        *_name(runs), sum(map(falsely_accepted, runs)), _told(100 * planes, np.mean, '.0f'),
+        *_name(runs), sum(map(falsely_accepted, runs)), sum(map(beyond_own_sigmas, runs)),
+        _told(100 * planes, np.mean, '.0f'),
         *(_told(z, _coverage, '.0f') for z in (focal, tilt, roll)), *(_told(z, _rms, '.2f') for z in (focal, tilt)),
         _told(_column(runs, 'cpu_s'), np.mean, '.2f')).rstrip()
 

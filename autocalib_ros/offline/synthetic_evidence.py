@@ -54,6 +54,7 @@ class Junction:
     tracks: int | None = None
     """When set, vehicles drive until exactly so many tracks are recorded, and `vehicles` does not count."""
     points_per_vehicle: int = 4
+    headway_s: float = HEADWAY_S
     turning_share: float = 0.2
     lane_change_share: float = 0.0
     joined_share: float = 0.0
@@ -84,7 +85,7 @@ def synthetic_evidence(junction: Junction, generator: np.random.Generator) -> Ev
     newest = 0.0
     for vehicle in _vehicles(junction, tracks):
         path, heading = junction.drive(junction, generator)
-        times = HEADWAY_S * vehicle + INTERVAL_S * np.arange(len(path))
+        times = junction.headway_s * vehicle + INTERVAL_S * np.arange(len(path))
         newest = max(newest, float(times[-1]))
         bodies = [(path, heading)]
         if junction.joined_share and generator.uniform() < junction.joined_share:

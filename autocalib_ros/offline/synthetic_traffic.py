@@ -1,4 +1,4 @@
-"""How made-up road users move over the ground: across a junction, round a bend, round a roundabout, on foot.
+"""How made-up road users move over the ground: across a junction, round a bend, along a scene's routes, on foot.
 
 Each function returns positions (n, 2) in metres and headings (n,) in radians, every `INTERVAL_S`, ground frame.
 """
@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from autocalib_ros.offline.simulate.network import Network
+
 if TYPE_CHECKING:
     from autocalib_ros.offline.synthetic_evidence import Junction
 
@@ -20,6 +22,14 @@ LANE_M = 3.5
 STEADY_S = 4.0
 """Mean time for which a pedestrian keeps a heading."""
 STROLL_S = 30.0
+ROUTE_REACH_M = 70.0
+"""Routes are driven within so far of the scene's middle: farther than points are followed."""
+ROUTE_STEP_M = 0.25
+SIDEWAYS_MPS2 = 2.0
+BRAKING_MPS2 = 1.5
+"""What drivers bear in curves, and on their way to and from them."""
+CRUISE = (0.8, 1.2)
+"""Speed of a driver relative to that of the route."""
 
 Path = tuple[np.ndarray, np.ndarray]
 Drive = Callable[['Junction', np.random.Generator], Path]
@@ -66,6 +76,29 @@ def drive_ring(junction: Junction, generator: np.random.Generator, *, radius_m: 
     return _on_circle(junction, generator, along, np.array(junction.centre_m), radius_m + lane, bearing, 1.0)
 
 
+def drive_route(junction: Junction, generator: np.random.Generator, *, network: Network, turned_rad: float = 0.0,
+                scale: float = 1.0) -> Path:
+    """Drive a route of a network whose middle lies at the junction's, turned there and scaled."""
+    shares = np.array([route.share for route in network.routes])
+    route = network.routes[generator.choice(len(shares), p=shares / shares.sum())]
+    along = np.arange(0.0, scale * route.path.length, ROUTE_STEP_M)
+    x, y, heading = route.path.at(along / scale).T
+    x, y, heading = scale * x, scale * y, heading + turned_rad
+    cruise = route.speed_mps * generator.uniform(*CRUISE)
+    # At twice the speed drivers wander over twice the way.
+    aside = _wander(junction, generator, along * 10.0 / cruise)
+    c, s = np.cos(turned_rad), np.sin(turned_rad)
+    path = np.column_stack([c * x - s * y, s * x + c * y]) + aside[:, None] * _left_of(_unit(heading))
+    near = np.flatnonzero(np.hypot(*path.T) < ROUTE_REACH_M)
+    part = slice(near[0], near[-1] + 1)
+    path, way = path[part] + np.array(junction.centre_m), along[part]
+    steps = np.gradient(path, axis=0)
+    heading = np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
+    times = _times(way, _speeds(np.gradient(heading, way), cruise))
+    at = np.arange(0.0, times[-1], INTERVAL_S)
+    return (np.column_stack([np.interp(at, times, path[:, axis]) for axis in (0, 1)]), np.interp(at, times, heading))
+
+
 def stroll(junction: Junction, generator: np.random.Generator) -> Path:
     """Walk on a pavement along a road, slowly, with sudden changes of heading."""
     road = np.radians(generator.choice(junction.road_angles_deg))
@@ -100,6 +133,20 @@ def _on_circle(junction: Junction, generator: np.random.Generator, along: np.nda
     outward = _unit(bearing)
     radius = radius_m + _wander(junction, generator, along)
     return centre + radius[:, None] * outward, bearing + way * np.pi / 2
+
+
+def _speeds(curvature: np.ndarray, cruise_mps: float) -> np.ndarray:
+    """Speeds (n,) on a path of curvatures (n,), 1/m: slower in curves, and slowing down ahead of them."""
+    squares = np.minimum(cruise_mps**2, SIDEWAYS_MPS2 / np.maximum(np.abs(curvature), 1e-6))
+    # Against the way and along it: v^2 rises by at most 2 a a metre.
+    rise = 2 * BRAKING_MPS2 * ROUTE_STEP_M * np.arange(len(squares))
+    squares = np.minimum.accumulate(squares - rise) + rise
+    return np.sqrt((np.minimum.accumulate((squares - rise[::-1])[::-1])[::-1]) + rise[::-1])
+
+
+def _times(way: np.ndarray, speeds: np.ndarray) -> np.ndarray:
+    """Times (n,) at which places (n,) along a path are reached with speeds (n,)."""
+    return np.concatenate([[0.0], np.cumsum(2 * np.diff(way) / (speeds[1:] + speeds[:-1]))])
 
 
 def _wander(junction: Junction, generator: np.random.Generator, along: np.ndarray) -> np.ndarray:

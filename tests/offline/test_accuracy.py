@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -35,7 +36,7 @@ from autocalib_ros.offline.accuracy import (
     rays_error_deg,
     run_method,
 )
-from autocalib_ros.offline.accuracy_table import falsely_accepted, tables
+from autocalib_ros.offline.accuracy_table import beyond_own_sigmas, falsely_accepted, tables
 from autocalib_ros.offline.synthetic_evidence import Junction, pose
 
 JUNCTION = Junction()
@@ -147,6 +148,30 @@ def test_false_is_what_its_own_sigmas_or_five_per_cent_forbid(changes: dict[str,
     assert not falsely_accepted(refused('no_motion', **{name: changes[name] for name in changes}))
 
 
+@pytest.mark.parametrize(('changes', 'beyond'), [
+    ({}, False),
+    ({'focal_error': 0.031}, True),
+    ({'focal_error': 0.06, 'focal_sigma': 0.05}, False),  # false all the same: more than five per cent
+    ({'tilt_error_deg': -0.61}, True),  # less than a degree, and three of its own sigmas
+    ({'roll_error_deg': 1.4}, False),
+    ({'roll_error_deg': -1.6}, True),
+    ({'focal_error': 0.4, 'focal_sigma': float('nan')}, False),
+    ({'tilt_error_deg': float('nan'), 'roll_error_deg': float('nan')}, False)])
+def test_beyond_is_what_its_own_sigmas_forbid(changes: dict[str, object], beyond: bool) -> None:
+    assert beyond_own_sigmas(run(**changes)) is beyond
+    assert not beyond_own_sigmas(refused('no_motion', **{name: changes[name] for name in changes}))
+
+
+@pytest.mark.parametrize(('family', 'title'), [('standard', 'determines the calibration: stated'),
+                                               ('roundabout', 'does not, or that misleads: stated')])
+def test_table_flags_what_is_beyond_its_own_sigmas_in_either_list(family: str, title: str) -> None:
+    runs = [run(family=family), run(family=family, tilt_error_deg=0.7), run(family=family, focal_error=0.2),
+            refused('horizon', family=family)]
+    words = cells(tables(runs), title, family)
+    assert words[4:6] == ['1', '2']
+    assert re.search(r'false +beyond', tables(runs))
+
+
 def test_table_counts_acceptance_refusals_and_errors() -> None:
     runs = [run(focal_error=0.03, normal_deg=0.5), run(focal_error=-0.01, normal_deg=1.5), refused('horizon'),
             refused('no_motion'), refused('no_motion')]
@@ -160,12 +185,12 @@ def test_table_holds_errors_against_their_sigmas() -> None:
             refused('horizon')]
     # focal z 1, 7, 1, 1; tilt z 1.5, 1.5, 2.5; roll z 0.8, 0.8, -3
     assert cells(tables(runs), 'determines the calibration: stated', 'standard') == [
-        'standard', 'joint', '5', '80', '1', '75', '75', '67', '67', '3.61', '1.89', '1.40']
+        'standard', 'joint', '5', '80', '1', '1', '75', '75', '67', '67', '3.61', '1.89', '1.40']
 
 
 def test_table_shows_a_dash_where_there_is_nothing() -> None:
     paper = [run(method='paper', focal_sigma=float('nan'), tilt_sigma_deg=float('nan'), roll_sigma_deg=float('nan'))]
-    assert cells(tables(paper), 'stated', 'standard')[6:11] == ['-'] * 5
+    assert cells(tables(paper), 'stated', 'standard')[7:12] == ['-'] * 5
     assert cells(tables([refused('horizon')]), 'errors', 'standard')[5:] == ['-'] * 8
 
 

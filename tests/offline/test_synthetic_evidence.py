@@ -12,13 +12,31 @@ from autocalib_ros.camera import Camera
 from autocalib_ros.errors import UsageError
 from autocalib_ros.evidence import Evidence
 from autocalib_ros.offline.accuracy_families import distortion_free_lens, families, radial, short_piece, viewpoint
+from autocalib_ros.offline.simulate.junctions import junction as crossing
+from autocalib_ros.offline.simulate.motorway import highway
+from autocalib_ros.offline.simulate.network import Network
+from autocalib_ros.offline.simulate.roundabout import RING_RADIUS_M, roundabout
+from autocalib_ros.offline.simulate.scenes import bend
 from autocalib_ros.offline.synthetic_evidence import Junction, pose, synthetic_evidence
-from autocalib_ros.offline.synthetic_traffic import INTERVAL_S, drive_across, drive_bend, drive_ring, stroll
+from autocalib_ros.offline.synthetic_traffic import (
+    INTERVAL_S,
+    ROUTE_REACH_M,
+    Path,
+    drive_across,
+    drive_bend,
+    drive_ring,
+    drive_route,
+    stroll,
+)
 from autocalib_ros.offline.synthetic_trouble import background_drift_px, fold, spoil, waving
 
 FAMILIES = tuple(families())
 TRACKS = {'standard': 60, 'few': 40, 'many': 400}
 CLEAN = Junction(turning_share=0.0, wander_m=0.0, noise_px=0.0)
+NETWORKS = {'highway': highway(one_way=True, changing_fraction=1.0), 'bend': bend(one_way=False),
+            'roundabout': roundabout(turning_fraction=0.5), 'skew': crossing(np.radians(65.0), turning_fraction=1.0),
+            'tee': crossing(np.pi / 2, turning_fraction=0.5, tee=True)}
+each_network = pytest.mark.parametrize('network', NETWORKS.values(), ids=NETWORKS)
 
 
 def rng(seed: int = 0) -> np.random.Generator:
@@ -154,6 +172,62 @@ def test_curved_traffic_keeps_its_radius_and_points_along_it(drive) -> None:
 def _centre_of_circle(path: np.ndarray) -> np.ndarray:
     solution, *_ = np.linalg.lstsq(np.column_stack([2 * path, np.ones(len(path))]), (path**2).sum(axis=1), rcond=None)
     return solution[:2]
+
+
+def routes(network: Network, count: int = 12, wander_m: float = 0.0) -> list[Path]:
+    junction = replace(CLEAN, centre_m=(0.0, 0.0), wander_m=wander_m)
+    return [drive_route(junction, rng(seed), network=network) for seed in range(count)]
+
+
+@each_network
+def test_routes_are_driven_without_slip_and_without_jumps(network: Network) -> None:
+    for path, heading in routes(network, wander_m=0.1):
+        steps = np.diff(path, axis=0)
+        lengths = np.hypot(*steps.T)
+        slip = np.angle(np.exp(1j * (np.arctan2(steps[:, 1], steps[:, 0]) - (heading[1:] + heading[:-1]) / 2)))
+        assert np.abs(slip).max() < 0.02  # radians; the body points where its rear axle goes
+        assert lengths.max() / INTERVAL_S < 40.0 and lengths.min() / INTERVAL_S > 2.0  # metres per second
+        assert np.abs(np.diff(lengths)).max() / INTERVAL_S**2 < 3.0  # metres per second squared
+        assert np.abs(np.diff(heading)).max() < 0.15
+        assert np.hypot(*path.T).max() < ROUTE_REACH_M
+
+
+@each_network
+def test_drivers_slow_down_for_tight_turns(network: Network) -> None:
+    for path, heading in routes(network):
+        speed = np.hypot(*np.diff(path, axis=0).T) / INTERVAL_S
+        assert (speed * np.abs(np.diff(heading)) / INTERVAL_S).max() < 2.5  # m/s^2, of the 2 that they bear
+
+
+def test_a_roundabout_is_entered_circled_and_left() -> None:
+    for path, heading in routes(NETWORKS['roundabout']):
+        radius = np.hypot(*path.T)
+        assert min(radius[0], radius[-1]) > 60.0 and radius.min() == pytest.approx(RING_RADIUS_M, abs=0.05)
+        turned = np.diff(heading)
+        assert turned.min() < -0.01 and turned.max() > 0.01  # right on to the ring, left along it
+
+
+def test_a_network_can_be_turned_scaled_and_placed() -> None:
+    junction = replace(CLEAN, centre_m=(30.0, -7.0))
+    path, heading = drive_route(junction, rng(1), network=NETWORKS['roundabout'], turned_rad=0.5, scale=1.25)
+    radius = np.hypot(*(path - junction.centre_m).T)
+    assert radius.min() == pytest.approx(1.25 * RING_RADIUS_M, abs=0.05)
+    assert abs(np.sin(2 * (heading[0] - 0.5))) < 1e-6  # arms are square to each other, and turned
+
+
+@pytest.mark.parametrize(('name', 'vehicles'), [
+    ('highway', 40), ('long_bend', 40), ('roundabout_arms', 40), ('skew_turning', 40), ('tee', 40)])
+def test_vehicles_of_scenes_have_up_to_eight_points(name: str, vehicles: int) -> None:
+    _, evidence = drawn(name)
+    numbers, counts = np.unique(evidence.track_vehicles, return_counts=True)
+    assert 0.6 * vehicles < len(numbers) <= vehicles and counts.max() == 8 and np.median(counts) >= 6
+
+
+def test_sparse_traffic_is_a_vehicle_every_twelve_seconds() -> None:
+    _, evidence = drawn('sparse')
+    begins = [min(track.times_s[0] for track in evidence.tracks() if track.vehicle == vehicle)
+              for vehicle in np.unique(evidence.track_vehicles)]
+    assert 5 <= len(begins) <= 20 and np.median(np.diff(begins)) > 8.0
 
 
 def test_pedestrians_are_slow_and_change_their_minds() -> None:
