@@ -35,6 +35,7 @@ from autocalib_ros.offline.accuracy import (
     measure,
     rays_error_deg,
     run_method,
+    run_task,
 )
 from autocalib_ros.offline.accuracy_table import beyond_own_sigmas, falsely_accepted, tables
 from autocalib_ros.offline.synthetic_evidence import Junction, pose
@@ -123,6 +124,14 @@ def test_a_plane_tilted_by_a_degree_falsifies_distances_by_some_per_cent() -> No
     assert distance_error(JUNCTION.camera, plane(), JUNCTION) == pytest.approx(0.0, abs=1e-9)
     assert 0.01 < distance_error(JUNCTION.camera, plane(tilt_deg=33.0), JUNCTION) < 0.1
     assert distance_error(JUNCTION.camera, plane(tilt_deg=-80.0), JUNCTION) == np.inf  # the road is above the horizon
+
+
+@pytest.mark.parametrize('family', [
+    'highway', 'long_bend', 'roundabout_arms', 'skew_turning', 'tee', 'sparse'])
+def test_families_of_scenes_are_solved_without_a_crash(family: str) -> None:
+    results = run_task(Task(family, 0, 0, ('paper', *(['joint'] if family == 'sparse' else []))))  # the quickest
+    assert not any(result.code.startswith('crash') for result in results)
+    assert not any(beyond_own_sigmas(result) for result in results)
 
 
 def test_a_run_can_be_drawn_again_alone() -> None:
