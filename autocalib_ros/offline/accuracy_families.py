@@ -140,7 +140,7 @@ def turning(generator: np.random.Generator) -> Junction:
                    points_per_vehicle=8, joined_share=0.2)
 
 
-def highway_drive(generator: np.random.Generator) -> Junction:
+def motorway(generator: np.random.Generator) -> Junction:
     """A motorway of three lanes one way, a third of the vehicles changing lanes: the lens alone can be had."""
     return _driven_on(viewpoint(generator, (40.0, 75.0)), highway(one_way=True, changing_fraction=0.3))
 
@@ -254,7 +254,7 @@ DETERMINED: dict[str, Family] = {
     'one_road': driven(one_road),
     'distortion_free': driven(distortion_free),
     'turning': driven(turning),
-    'highway': driven(highway_drive),
+    'highway': driven(motorway),
     'roundabout_arms': driven(roundabout_arms),
     'skew_turning': driven(skew_turning),
     'tee': driven(tee),

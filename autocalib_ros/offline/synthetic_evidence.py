@@ -55,6 +55,7 @@ class Junction:
     """When set, vehicles drive until exactly so many tracks are recorded, and `vehicles` does not count."""
     points_per_vehicle: int = 4
     headway_s: float = HEADWAY_S
+    """Time between vehicles."""
     turning_share: float = 0.2
     lane_change_share: float = 0.0
     joined_share: float = 0.0

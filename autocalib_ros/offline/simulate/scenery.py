@@ -132,7 +132,7 @@ def _trees(road: Road, side: int, network: Network, viewpoint: np.ndarray, palet
         aside = side * (road.half_width_m + PAVEMENT_M + rng.uniform(0.5, 2.0))
         place = road.at(along + rng.uniform(-3, 3), aside)
         height = rng.uniform(4.5, 8.0)
-        if not _clear(network, viewpoint, place[None], PAVEMENT_M - 0.2, 14.0):
+        if not road.reaches(along) or not _clear(network, viewpoint, place[None], PAVEMENT_M - 0.2, 14.0):
             continue
         width = 0.7 * height
         corners = [_upright(place, viewpoint, 0.25, 0.0, 0.5 * height),
@@ -173,6 +173,8 @@ def _poles(road: Road, side: int, network: Network, viewpoint: np.ndarray,
     parts = []
     for along, kerb, width, height in plans:
         place = road.at(along, side * (road.half_width_m + kerb))
+        if not road.reaches(along):
+            continue
         if edge_distance(network, place) < 0.2 or np.hypot(*(place - viewpoint)) < 9.0:
             continue
         corners, textures = [_upright(place, viewpoint, width, 0.0, height)], [metal]
@@ -203,7 +205,7 @@ def lamp_places(network: Network) -> list[tuple[float, float]]:
     places = []
     for road in network.roads:
         for side in (1, -1):
-            for along in _LAMPS_M:
+            for along in filter(road.reaches, _LAMPS_M):
                 x, y = road.at(along, side * (road.half_width_m - 1.5)).tolist()
                 places.append((x, y))
     return places

@@ -19,7 +19,6 @@ BEND_RADIUS_M = 80.0
 BEND_DEG = 80.0
 
 
-
 def network_of(options: SimulationOptions) -> Network:
     """Return the road network that the options ask for."""
     angle = math.radians(options.crossing_deg)
