@@ -49,6 +49,9 @@ NEAREST_HORIZON = 0.03
 """Least angle below the horizon at which a point is placed on the road, radians."""
 EXPLAINED = 3.0
 """A track is explained when its mean squared whitened distance is below so many medians."""
+UNMODELLED_FOCAL, UNMODELLED_RAD = 0.003, np.radians(0.1)
+"""What no residual shows, as standard deviations of the relative focal length and of the plane: a lens is not quite of
+its family, and a road not quite a plane (its crown falls by a degree to either side)."""
 DISCRIMINATION = 5.0
 """A track tells two roads apart when it is so many times farther from the one than from the other."""
 
@@ -260,6 +263,7 @@ def _judged(last: Problem, state: State, inner: Inner, tracks: TrackSet) -> Join
     bend = -4.0 / limit / freedom * shared / (1.0 + rows.squared / limit) ** 3
     _, prior = problem.steps.prior_gradient(state.camera)
     covariance = cluster_covariance(rows.gradient, rows.curvature, weight, bend, problem.owners, prior)
+    covariance += np.diag(_unmodelled(problem.steps) ** 2)
     road = problem.kind == 0
     whitened2 = np.full(len(tracks), np.inf)
     whitened2[problem.used] = rows.squared[road]
@@ -271,6 +275,14 @@ def _judged(last: Problem, state: State, inner: Inner, tracks: TrackSet) -> Join
         scales=scales, problem=problem, covariance=covariance, information=information,
         turning_information=np.tensordot(weight[~road], rows.curvature[~road], 1),
         vehicle_correlation=correlation_within(problem.owners[road], pulls))
+
+
+def _unmodelled(steps: Steps) -> np.ndarray:
+    """Standard deviation (parameters,) of each parameter that the residuals know nothing of."""
+    sigma = np.zeros(steps.size)
+    sigma[:steps.lens][steps.setting.prior.free == 0] = UNMODELLED_FOCAL
+    sigma[steps.lens:steps.lens + len(steps.axes)] = UNMODELLED_RAD
+    return sigma
 
 
 def noise_cost(fit: JointFit, tracks: TrackSet, *, drifting: bool) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from scipy import stats
 
 SINGULAR = 1e-10
 """Directions of the parameters whose information is below this share of the largest are not determined."""
@@ -20,8 +21,8 @@ def cluster_covariance(gradients: np.ndarray, curvatures: np.ndarray, weight: np
     residuals r; `weight` (rows,) is the derivative of a row's loss by half its squared distance, `bend` (rows,) the
     factor of g g^T in the second derivative; `owners` (rows,) are the vehicles, `prior` (parameters,) is the prior's
     information. One Newton step from the solution stands for each vehicle's solution without it: the cluster
-    jackknife, CR3 of Bell & McCaffrey (2002), for an M-estimate. The prior's own spread is added. Undetermined
-    directions get an infinite variance.
+    jackknife, CR3 of Bell & McCaffrey (2002), for an M-estimate. Few vehicles widen it; the prior's own spread is
+    added. Undetermined directions get an infinite variance.
     """
     size = gradients.shape[1]
     clusters, inverse = np.unique(owners, return_inverse=True)
@@ -43,8 +44,21 @@ def cluster_covariance(gradients: np.ndarray, curvatures: np.ndarray, weight: np
     inverted = np.einsum('vij,vj,vkj->vik', turned, 1.0 / np.maximum(low, 0.5 * LEAST_CURVATURE), turned)
     moves = np.einsum('vij,vj->vi', inverted, scores)
     inverse_curved = (axes / shares) @ axes.T
-    spread = moves.T @ moves + inverse_curved @ whiten.T @ np.diag(prior) @ whiten @ inverse_curved
-    return whiten @ spread @ whiten.T
+    by_prior = whiten @ inverse_curved @ whiten.T
+    moved = moves @ whiten.T
+    moved = moved * few_factor(moved)
+    return moved.T @ moved + by_prior @ np.diag(prior) @ by_prior
+
+
+def few_factor(moves: np.ndarray) -> np.ndarray:
+    """Factor (parameters,) by which deviations widen where few vehicles (vehicles, parameters) move the solution.
+
+    The 95 % interval of Student's distribution over the normal one's, with as many degrees of freedom as the sum of
+    the squared moves has by Satterthwaite (1946): about the number of vehicles that matter.
+    """
+    squares = moves**2
+    freedom = 3.0 * squares.sum(axis=0)**2 / np.maximum((squares**2).sum(axis=0), 1e-300)
+    return stats.t.ppf(0.975, np.maximum(freedom, 1.0)) / stats.norm.ppf(0.975)
 
 
 def correlation_within(groups: np.ndarray, pulls: np.ndarray) -> float:
