@@ -90,9 +90,9 @@ def _above_horizon(below: float) -> Reason:
 
 
 def motion_tells(fit: JointFit) -> bool:
-    """Whether the motion of vehicles that turn tells the focal length by itself."""
+    """Whether the motion of vehicles that turn tells the focal length by itself, or need not."""
     if not fit.problem.setting.turning or 0 not in fit.problem.setting.prior.free:
-        return False
+        return fit.problem.setting.turning
     _, known = fit.problem.steps.prior_gradient(fit.state.camera)
     return bool(told_by_evidence(fit.turning_information, known)[0] < MOTION_TELLS)
 

@@ -12,7 +12,14 @@ from autocalib_ros.camera import Camera
 from autocalib_ros.config import BufferOptions
 from autocalib_ros.errors import UsageError
 from autocalib_ros.evidence import Evidence, EvidenceBuffer, Segments, Track
-from autocalib_ros.offline.synthetic_traffic import INTERVAL_S, LANE_M, Drive, beside, drive_across
+from autocalib_ros.offline.synthetic_traffic import (
+    INTERVAL_S,
+    LANE_M,
+    Company,
+    Drive,
+    beside,
+    drive_across,
+)
 from autocalib_ros.offline.synthetic_trouble import Sway, background_drift_px, spoil
 
 SEGMENT_INTERVAL_S = 0.4
@@ -59,7 +66,9 @@ class Junction:
     turning_share: float = 0.2
     lane_change_share: float = 0.0
     joined_share: float = 0.0
-    """Share of the vehicles that have another beside them, faster or slower, with which they are taken for one."""
+    """Share of the vehicles that have company with which they are taken for one."""
+    company: Company = beside
+    """What moves with them: another vehicle beside them, a trailer, a shadow."""
     wander_m: float = 0.1
     noise_px: float = 0.5
     outlier_share: float = 0.0
@@ -90,7 +99,7 @@ def synthetic_evidence(junction: Junction, generator: np.random.Generator) -> Ev
         newest = max(newest, float(times[-1]))
         bodies = [(path, heading)]
         if junction.joined_share and generator.uniform() < junction.joined_share:
-            bodies.append(beside(path, heading, generator))
+            bodies.append(junction.company(path, heading, generator))
         for number in range(junction.points_per_vehicle):
             track = _observe(junction, generator, *bodies[number % len(bodies)], times, vehicle)
             if track is not None and len(tracks) != junction.tracks:

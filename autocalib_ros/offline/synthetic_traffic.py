@@ -31,7 +31,14 @@ BRAKING_MPS2 = 1.5
 CRUISE = (0.8, 1.2)
 """Speed of a driver relative to that of the route."""
 
+HITCH_M, DRAWBAR_M = 3.0, 6.0
+"""A trailer hangs on so far behind the lorry's middle, and its axle is so far behind that."""
+SHADOW_M = (0.5, 2.0)
+"""How far a vehicle's shadow lies from it."""
+
 Path = tuple[np.ndarray, np.ndarray]
+Company = Callable[[np.ndarray, np.ndarray, np.random.Generator], Path]
+"""What moves with a vehicle and is taken for part of it: from its positions and headings, those of the other."""
 Drive = Callable[['Junction', np.random.Generator], Path]
 
 
@@ -118,14 +125,32 @@ def drive_arc(junction: Junction, generator: np.random.Generator, *, radii_m: tu
                       towards_rad=generator.uniform(0, 2 * np.pi))
 
 
-def beside(path: np.ndarray, heading: np.ndarray, generator: np.random.Generator) -> Path:
+def beside(path: np.ndarray, heading: np.ndarray, generator: np.random.Generator,
+           speeds: tuple[float, float] = (0.8, 1.2)) -> Path:
     """Drive in the next lane of a path (n, 2) with headings (n,), faster or slower than who drives there."""
     steps = np.arange(len(path), dtype=float)
     middle = 0.5 * (len(path) - 1)
-    at = np.clip(middle + (steps - middle) * generator.uniform(0.8, 1.2), 0, len(path) - 1)
+    at = np.clip(middle + (steps - middle) * generator.uniform(*speeds), 0, len(path) - 1)
     shifted = path + generator.choice([-1.0, 1.0]) * LANE_M * _left_of(_unit(heading))
     return (np.column_stack([np.interp(at, steps, shifted[:, axis]) for axis in (0, 1)]),
             np.interp(at, steps, np.unwrap(heading)))
+
+
+def trailer(path: np.ndarray, heading: np.ndarray, _: np.random.Generator) -> Path:
+    """Follow a lorry as its trailer does, whose axle runs after the hitch."""
+    hitch = path - HITCH_M * _unit(heading)
+    axle = hitch[0] - DRAWBAR_M * _unit(heading[0])
+    axles = [axle]
+    for pulled in hitch[1:]:
+        axle = pulled - DRAWBAR_M * (pulled - axle) / np.hypot(*(pulled - axle))
+        axles.append(axle)
+    bars = hitch - np.array(axles)
+    return hitch - 0.5 * bars, np.unwrap(np.arctan2(bars[:, 1], bars[:, 0]))
+
+
+def shadow(path: np.ndarray, heading: np.ndarray, generator: np.random.Generator) -> Path:
+    """Lie on the road to one side of a vehicle, wherever it heads."""
+    return path + generator.uniform(*SHADOW_M) * _unit(generator.uniform(0, 2 * np.pi)), heading
 
 
 def _on_circle(junction: Junction, generator: np.random.Generator, along: np.ndarray, centre: np.ndarray,

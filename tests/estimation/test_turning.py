@@ -12,7 +12,7 @@ from autocalib_ros.calibration import Calibration, Refusal
 from autocalib_ros.calibrator import solve
 from autocalib_ros.config import Options
 from autocalib_ros.offline.synthetic_evidence import Junction, pose, synthetic_evidence
-from autocalib_ros.offline.synthetic_traffic import drive_arc, drive_ring, stroll
+from autocalib_ros.offline.synthetic_traffic import Company, beside, drive_arc, drive_ring, shadow, stroll, trailer
 
 TURNING = Junction(drive=partial(drive_arc, radii_m=(12.0, 60.0)), vehicles=40, points_per_vehicle=8)
 
@@ -35,9 +35,10 @@ def test_perfect_turning_traffic_gives_the_truth() -> None:
     assert any('rigid bodies' in check for check in result.checks)
 
 
-@pytest.mark.parametrize('joined', [0.0, 0.3])
-def test_turning_traffic_alone_calibrates_even_when_groups_are_wrong(joined: float) -> None:
-    junction = replace(TURNING, joined_share=joined)
+@pytest.mark.parametrize(('joined', 'company'), [
+    (0.0, beside), (0.3, beside), (0.5, partial(beside, speeds=(1.0, 1.0))), (0.5, trailer), (0.5, shadow)])
+def test_turning_traffic_alone_calibrates_even_when_groups_are_wrong(joined: float, company: Company) -> None:
+    junction = replace(TURNING, joined_share=joined, company=company)
     result = solved(junction, seed=1)
     assert isinstance(result, Calibration)
     sigma = result.stddev
@@ -76,7 +77,10 @@ def test_people_on_foot_are_no_rigid_bodies() -> None:
     assert isinstance(result, Refusal)
 
 
-def test_a_known_lens_and_turning_traffic_give_a_calibration_or_a_reason() -> None:
+def test_a_known_lens_and_turning_traffic_give_the_plane() -> None:
     evidence = synthetic_evidence(TURNING, np.random.default_rng(2))
     result = solve(evidence, Options(camera_height=8.0), lens=TURNING.camera)
-    assert isinstance(result, Refusal) or result.camera == TURNING.camera
+    assert isinstance(result, Calibration) and result.camera == TURNING.camera
+    sigma = result.stddev
+    assert sigma.tilt_deg is not None and sigma.roll_deg is not None
+    assert normal_error_deg(result, TURNING) < min(3.0 * np.hypot(sigma.tilt_deg, sigma.roll_deg), 0.5)

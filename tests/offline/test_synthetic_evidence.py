@@ -26,7 +26,9 @@ from autocalib_ros.offline.synthetic_traffic import (
     drive_bend,
     drive_ring,
     drive_route,
+    shadow,
     stroll,
+    trailer,
 )
 from autocalib_ros.offline.synthetic_trouble import background_drift_px, fold, spoil, waving
 
@@ -285,3 +287,21 @@ def test_viewpoints_differ_in_lens_and_pose() -> None:
     k1 = np.array([junction.camera.k[0] for junction in junctions])
     assert 26 <= tilt.min() < 29 and 35 < tilt.max() <= 38
     assert -0.05 <= k1.min() < -0.03 and 0.03 < k1.max() <= 0.05
+
+
+def test_the_axle_of_a_trailer_rolls_and_does_not_slip() -> None:
+    generator = np.random.default_rng(0)
+    path, heading = drive_ring(CLEAN, generator, radius_m=15.0)
+    middle, bar = trailer(path, heading, generator)
+    axle = middle - 3.0 * np.column_stack([np.cos(bar), np.sin(bar)])
+    rolled = np.diff(axle, axis=0)
+    aside = np.sin(np.arctan2(rolled[:, 1], rolled[:, 0]) - bar[1:])
+    assert np.abs(aside).max() < 1e-6
+    assert np.degrees(np.abs(np.angle(np.exp(1j * (bar - heading))))[-1]) > 10.0  # it cuts the corner
+
+
+def test_a_shadow_stays_on_one_side_whatever_the_heading() -> None:
+    generator = np.random.default_rng(0)
+    path, heading = drive_ring(CLEAN, generator, radius_m=15.0)
+    offset = shadow(path, heading, generator)[0] - path
+    assert np.ptp(offset, axis=0).max() < 1e-9 and 0.5 <= np.hypot(*offset[0]) <= 2.0
