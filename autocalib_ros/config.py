@@ -201,7 +201,7 @@ class GateOptions(_Checked):
     min_tracks: int = option(40, 'tracks needed', low=4, high=100000)
     min_tracks_per_road: int = option(10, 'tracks needed of each of two roads', low=2, high=100000)
     min_coverage: float = option(0.15, 'share of image cells that tracks have crossed', low=0, high=1)
-    max_sigma_focal_rel: float = option(0.03, 'largest standard deviation of the focal length, relative', low=0, high=1)
+    max_sigma_focal_rel: float = option(0.05, 'largest standard deviation of the focal length, relative', low=0, high=1)
     max_sigma_tilt_deg: float = option(1.5, 'largest standard deviation of the ground normal', low=0, high=45)
     max_sigma_height_rel: float = option(0.2, "largest standard deviation of the camera's height, relative", low=0,
                                          high=1)

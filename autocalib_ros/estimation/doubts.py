@@ -9,7 +9,7 @@ import numpy as np
 from autocalib_ros.calibration import Reason
 from autocalib_ros.config import GateOptions
 from autocalib_ros.estimation.great_circles import TrackSet
-from autocalib_ros.estimation.ground_plane import BELOW_HORIZON, tilt_and_roll_deg
+from autocalib_ros.estimation.ground_plane import BELOW_HORIZON
 from autocalib_ros.estimation.joint import MIN_ROWS, JointFit, road_support, solve_joint
 from autocalib_ros.estimation.lives import no_lives
 from autocalib_ros.estimation.plane import LevelCamera, Plane, above_traffic
@@ -27,6 +27,9 @@ MIN_CONTRAST = 1.3
 LONGEST_FOCAL = 1.5
 """Focal length, in image diagonals, beyond which no lens curvature can be seen."""
 PRIOR_SIGMAS = 3.5
+TURNED_SIGMA = 0.03
+"""Largest relative standard deviation of a focal length that was found by traffic that turns: there noise biases, and
+the bias grows faster than the deviation."""
 MOTION_TELLS = 0.1
 """Vehicles that turn vouch for a lens when their motion alone tells the focal length to this share, one sigma: turns
 that were taken for roads are off by more."""
@@ -69,7 +72,7 @@ def traffic_doubt(fit: JointFit, contrast: float, tracks: TrackSet) -> Reason | 
 
 def lens_doubt(fit: JointFit, tracks: TrackSet, gate: GateOptions, *, turned: bool) -> Reason | None:
     """Say why the lens cannot be trusted, if so; `turned` where the solution started from traffic that turns."""
-    doubt = _horizon_doubt(fit, tracks) or _curvature_doubt(fit, gate) or _model_doubt(fit)
+    doubt = _horizon_doubt(fit, tracks) or _curvature_doubt(fit, gate, turned=turned) or _model_doubt(fit)
     if doubt or turned and motion_tells(fit):
         return doubt
     needed = STRAIGHT_SHARE if len(fit.state.angles_rad) > 1 else ONE_ROAD_SHARE
@@ -110,7 +113,7 @@ def _turning(fit: JointFit, tracks: TrackSet, needed: float) -> Reason:
         'wait for straight traffic, or turn the camera towards a straight road')
 
 
-def _curvature_doubt(fit: JointFit, gate: GateOptions) -> Reason | None:
+def _curvature_doubt(fit: JointFit, gate: GateOptions, *, turned: bool) -> Reason | None:
     camera, prior = fit.state.camera, fit.problem.setting.prior
     sigma = float(fit.sigma(lambda state: np.array([np.log(state.camera.focal_px)]))[0])
     diagonals = camera.focal_px / np.hypot(camera.width, camera.height)
@@ -119,13 +122,17 @@ def _curvature_doubt(fit: JointFit, gate: GateOptions) -> Reason | None:
     # length proves nothing
     circular = prior.family == 'distortion_free' and not (
         prior.focal_known or fit.problem.setting.options.crossing_deg is not None)
-    if too_long or circular or not sigma <= gate.max_sigma_focal_rel:
-        return Reason(
-            'too_little_curvature', f'straight traffic shows too little lens curvature: focal length '
-            f'{camera.focal_px:.0f} px +- {min(sigma, 9.99):.0%}, {gate.max_sigma_focal_rel:.0%} is needed',
-            'wait for traffic nearer the borders of the image; a lens without distortion needs the angle between two '
-            'roads (joint.road_angle) or its focal length (joint.focal_prior_px)')
-    return None
+    needed = min(gate.max_sigma_focal_rel, TURNED_SIGMA) if turned else gate.max_sigma_focal_rel
+    if not (too_long or circular or not sigma <= needed):
+        return None
+    found = f'focal length {camera.focal_px:.0f} px +- {min(sigma, 9.99):.1%}, {needed:.0%} is needed'
+    if turned:
+        return Reason('too_little_turning', f'traffic that turns tells too little of the lens: {found}',
+                      'wait for more vehicles that turn, or for straight traffic')
+    return Reason(
+        'too_little_curvature', f'straight traffic shows too little lens curvature: {found}',
+        'wait for traffic nearer the borders of the image; a lens without distortion needs the angle between two '
+        'roads (joint.road_angle) or its focal length (joint.focal_prior_px)')
 
 
 def _model_doubt(fit: JointFit) -> Reason | None:
@@ -142,7 +149,7 @@ def _model_doubt(fit: JointFit) -> Reason | None:
 
 def plane_doubt(plane: Plane, gate: GateOptions) -> Reason | None:
     """Say why the ground plane cannot be trusted, if so; an assumption may be as wrong as it says on top."""
-    sigma = float(plane.sigma(lambda _, normal: tilt_and_roll_deg(normal)).max())
+    sigma = plane.worst_sigma_deg
     if isinstance(plane.assumed, LevelCamera) and not plane.assumed.tells(plane.fit.state):
         return Reason('plane_uncertain', 'the road leads level across the image, where the roll of the camera tells '
                       'nothing of the plane', 'wait for traffic across the road, or that turns')

@@ -127,7 +127,9 @@ def on_course(windows: Windows, view: View, motion: Motion, camera: Camera, came
     before, after = middle - first, second - middle
     bend = np.arctan2(before[..., 0] * after[..., 1] - before[..., 1] * after[..., 0], (before * after).sum(axis=-1))
     # chords from the first instant to the middle and on to the second differ by half of what the path turns
-    path_deg = 2.0 * np.degrees(np.ma.median(np.ma.array(bend, mask=~windows.mask), axis=1).filled(0.0))
+    bends = 2.0 * np.degrees(np.ma.array(bend, mask=~windows.mask))
+    path_deg = np.ma.median(bends, axis=1).filled(0.0)
+    path_sigma_deg = (bends.std(axis=1) / np.sqrt(np.maximum(windows.mask.sum(axis=1), 1))).filled(0.0)
     body_deg = np.degrees(np.angle(np.exp(1j * motion.turn_rad)))
     sigma_deg = np.degrees(turn_sigma(view, motion))
     alike = np.abs(body_deg - path_deg) < SLIP_DEG + SLIP_SHARE * np.abs(path_deg) + 2.0 * sigma_deg
@@ -136,7 +138,7 @@ def on_course(windows: Windows, view: View, motion: Motion, camera: Camera, came
     way_m = height_m * np.ma.median(np.ma.array(way, mask=~windows.mask), axis=1).filled(0.0)
     driven = way_m > WALK_M_S * np.nan_to_num(windows.seconds)
     course = alike & sure & driven & ~windows.of_segments
-    turning = course & (np.abs(path_deg) > STEERED_DEG)
+    turning = course & (np.abs(path_deg) > STEERED_DEG + 2.0 * path_sigma_deg)
     for row in np.flatnonzero(windows.of_segments & sure):
         near = (windows.bodies == windows.bodies[row]) & (np.abs(windows.times_s - windows.times_s[row]) < STEERED_S)
         near &= ~windows.of_segments

@@ -10,7 +10,7 @@ import numpy as np
 from autocalib_ros.camera import Camera
 from autocalib_ros.estimation.edge_mixture import folded
 from autocalib_ros.estimation.great_circles import TrackSet, rays_of
-from autocalib_ros.estimation.ground_plane import upward
+from autocalib_ros.estimation.ground_plane import tilt_and_roll_deg, upward
 from autocalib_ros.estimation.joint import JointFit
 from autocalib_ros.estimation.state import ALONG_X, State
 from autocalib_ros.estimation.transverse_edges import SquareVehicles
@@ -113,3 +113,8 @@ class Plane:
         state = self.fit.state
         ends = [np.atleast_1d(function(state.camera, self.normal(state, step))) for step in (-STEP_RAD, STEP_RAD)]
         return np.hypot(told, self.assumed.step_sigma_rad * (ends[1] - ends[0]) / (2 * STEP_RAD))
+
+    @property
+    def worst_sigma_deg(self) -> float:
+        """The larger of the standard deviations of tilt and roll, degrees."""
+        return float(self.sigma(lambda _, normal: tilt_and_roll_deg(normal)).max())

@@ -64,8 +64,8 @@ def find_solution(evidence: Evidence, tracks: TrackSet, options: JointOptions, g
                   lens: Camera | None = None) -> Solution | Reason:
     """Estimate lens, plane and roads from evidence and the tracks chosen of it; a reason when they cannot be trusted.
 
-    Straight traffic is tried first, with what turns to complete it; where that gives no plane, the traffic that
-    turns alone. A known `lens` is kept, and only the pose is found.
+    Straight traffic is tried first, with what turns to complete it; where that gives no plane, or one that rests on
+    an assumption, the traffic that turns alone. A known `lens` is kept, and only the pose is found.
     """
     if len(tracks) < gate.min_tracks:
         return Reason('too_few_tracks', f'{len(tracks)} tracks of the {gate.min_tracks} needed are long enough',
@@ -76,15 +76,23 @@ def find_solution(evidence: Evidence, tracks: TrackSet, options: JointOptions, g
     traffic = _Traffic(tracks, find_windows(evidence, instants), instants, priors, gate, evidence, generator)
     setting = Setting(priors[0], options, height_m, crossing)
     straight = _from_straight(traffic, setting)
-    if isinstance(straight, Solution) and straight.no_plane is None:
+    if isinstance(straight, Solution) and straight.no_plane is None and straight.plane.assumed is None:
         return straight
     turned = from_turning(tracks, traffic.windows, setting)
     if turned is None:
         return straight
     fit, tracks = _with_noise(with_further_roads(turned, tracks, gate), traffic)
     turning = _completed(fit, tracks, '', traffic, turned=True)
-    better = isinstance(turning, Solution) and (turning.no_plane is None or isinstance(straight, Reason))
-    return turning if better else straight
+    return turning if _tells_more(turning, straight) else straight
+
+
+def _tells_more(turning: Solution | Reason, straight: Solution | Reason) -> bool:
+    """Whether a solution by traffic that turns says more than what straight traffic does."""
+    if isinstance(turning, Reason) or isinstance(straight, Reason):
+        return isinstance(turning, Solution)
+    if turning.no_plane or straight.no_plane:
+        return turning.no_plane is None
+    return turning.plane.worst_sigma_deg < straight.plane.worst_sigma_deg
 
 
 def _from_straight(traffic: _Traffic, setting: Setting) -> Solution | Reason:

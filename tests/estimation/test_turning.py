@@ -65,11 +65,14 @@ def test_turning_traffic_completes_a_single_road() -> None:
     assert normal_error_deg(result, junction) < 1.5
 
 
-def test_a_ring_alone_is_refused_because_all_turn_about_one_centre() -> None:
-    junction = replace(TURNING, drive=partial(drive_ring, radius_m=20.0))
-    result = solved(junction)
-    assert isinstance(result, Refusal)
-    assert result.code in ('one_centre', 'turning_traffic')
+@pytest.mark.parametrize('seed', [0, 1])
+def test_a_ring_alone_is_refused_unless_it_tells_the_lens(seed: int) -> None:
+    result = solved(replace(TURNING, drive=partial(drive_ring, radius_m=20.0)), seed)
+    if isinstance(result, Refusal):
+        assert result.code in ('one_centre', 'turning_traffic', 'too_little_turning')
+    else:
+        assert result.stddev.focal_px is not None and result.stddev.focal_px < 0.02 * 560.0
+        assert abs(result.camera.focal_px - 560.0) < 3.0 * result.stddev.focal_px
 
 
 def test_people_on_foot_are_no_rigid_bodies() -> None:
