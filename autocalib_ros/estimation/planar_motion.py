@@ -123,11 +123,7 @@ def on_course(windows: Windows, view: View, motion: Motion, camera: Camera, came
     Two vehicles side by side that were taken for one seem to turn when one is faster, on straight paths. How far the
     path of a point turns does not depend on its height.
     """
-    first, middle, second = paths(windows, camera, camera_from_plane)
-    before, after = middle - first, second - middle
-    bend = np.arctan2(before[..., 0] * after[..., 1] - before[..., 1] * after[..., 0], (before * after).sum(axis=-1))
-    # chords from the first instant to the middle and on to the second differ by half of what the path turns
-    bends = 2.0 * np.degrees(np.ma.array(bend, mask=~windows.mask))
+    before, after, bends = _bends(windows, camera, camera_from_plane)
     path_deg = np.ma.median(bends, axis=1).filled(0.0)
     path_sigma_deg = (bends.std(axis=1) / np.sqrt(np.maximum(windows.mask.sum(axis=1), 1))).filled(0.0)
     body_deg = np.degrees(np.angle(np.exp(1j * motion.turn_rad)))
@@ -144,6 +140,32 @@ def on_course(windows: Windows, view: View, motion: Motion, camera: Camera, came
         near &= ~windows.of_segments
         course[row], turning[row] = (near & course).any(), (near & turning).any()
     return course, turning
+
+
+def sliding(windows: Windows, motion: Motion, camera: Camera, camera_from_plane: np.ndarray) -> float:
+    """By what share bodies that turn seem to turn less than their paths do, 0 where they do not.
+
+    Followed points slide on a body that turns: those on its outline do not turn with it.
+    """
+    seen = np.flatnonzero(~windows.of_segments)
+    _, _, bends = _bends(windows.subset(seen), camera, camera_from_plane)
+    path_deg = np.ma.median(bends, axis=1).filled(0.0)
+    turned = np.abs(path_deg) > STEERED_DEG
+    if not turned.any():
+        return 0.0
+    body_deg = np.degrees(np.angle(np.exp(1j * motion.turn_rad[seen][turned])))
+    return max(1.0 - float(np.median(body_deg / path_deg[turned])), 0.0)
+
+
+def _bends(windows: Windows, camera: Camera,
+           camera_from_plane: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ma.MaskedArray]:
+    """Ways (windows, points, 2) on the plane to and from the middle, and how far each point's path turns, degrees."""
+    first, middle, second = paths(windows, camera, camera_from_plane)
+    before, after = middle - first, second - middle
+    across = before[..., 0] * after[..., 1] - before[..., 1] * after[..., 0]
+    # chords from the first instant to the middle and on to the second differ by half of what the path turns
+    turn = 2.0 * np.degrees(np.arctan2(across, (before * after).sum(axis=-1)))
+    return before, after, np.ma.array(turn, mask=~windows.mask)
 
 
 def paths(windows: Windows, camera: Camera, camera_from_plane: np.ndarray) -> tuple[np.ndarray, ...]:

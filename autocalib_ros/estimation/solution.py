@@ -19,7 +19,13 @@ from autocalib_ros.estimation.roads import main_road, with_further_roads, with_r
 from autocalib_ros.estimation.starts import agreed, in_likeliest_family
 from autocalib_ros.estimation.state import Setting
 from autocalib_ros.estimation.transverse_edges import SquareVehicles, square_vehicles
-from autocalib_ros.estimation.turning import from_turning, one_centre_doubt, over_lives, with_turning
+from autocalib_ros.estimation.turning import (
+    from_turning,
+    one_centre_doubt,
+    over_lives,
+    with_sliding,
+    with_turning,
+)
 from autocalib_ros.estimation.windows import Instants, Windows, find_windows
 from autocalib_ros.evidence import Evidence
 
@@ -144,6 +150,7 @@ def _completed(fit: JointFit, tracks: TrackSet, across: str, traffic: _Traffic, 
     halves = halves_doubt(fit, tracks, gate)
     if isinstance(halves, Reason):
         return halves
+    fit = with_sliding(fit, traffic.windows)
     along, flow = main_road(fit, tracks)
     assumptions = lens_assumptions(fit, held)
     if fit.plane_known:
