@@ -18,7 +18,7 @@ from autocalib_ros.estimation.uncertainty import told_by_evidence
 
 MIN_VEHICLES = 4
 """Vehicles, distinct, that make a road; fewer may be one driver's whim."""
-STRAIGHT_SHARE = 0.35
+STRAIGHT_SHARE = 0.25
 """Share of vehicles that follow the roads; below it the traffic turns, and what it agrees on is a turn."""
 ONE_ROAD_SHARE = 0.75
 """The same where one road alone is found: on a ring or a bend some arc always passes for a road, of few vehicles."""

@@ -16,6 +16,8 @@ from autocalib_ros.estimation.state import State, initial_state
 from autocalib_ros.estimation.vanishing_points import Directions
 
 MOST_ROADS = 4
+VOTERS = 40
+"""Tracks, evenly out of those left, each two of which propose a direction."""
 ON_ROAD_DEG = 1.0
 """A track whose direction in the plane is within this of a further road follows it."""
 RIGHT_ANGLE_SIGMAS = 2.5
@@ -39,6 +41,37 @@ def with_real_roads(fit: JointFit, support: list[np.ndarray], tracks: TrackSet, 
     alone = initial_state(setting.prior.start(fit.state.camera.focal_px),
                           Directions(direction[None], np.zeros(0, int), 0.0))
     return solve_joint(alone, tracks, setting)
+
+
+def with_second_road(fit: JointFit, tracks: TrackSet, gate: GateOptions) -> JointFit:
+    """Look for a second road where one alone is known: a direction on which vehicles agree that do not follow it."""
+    if fit.plane_known or len(fit.state.angles_rad) != 1:
+        return fit
+    direction = _second_direction(fit, tracks)
+    if direction is None:
+        return fit
+    first = fit.state.directions[0]
+    both = initial_state(fit.state.camera, Directions(np.stack([first, direction]), np.zeros(0, int), 0.0))
+    wider = solve_joint(both, tracks, fit.problem.setting, refine=True)
+    real = apart(wider) and all(is_road(mask, tracks, gate) for mask in road_support(wider, tracks))
+    return wider if real else fit
+
+
+def _second_direction(fit: JointFit, tracks: TrackSet) -> np.ndarray | None:
+    """Direction (3,) on which most vehicles agree whose straight tracks follow no road, None where three do not."""
+    normals, own, _ = fit_circles(rays_of(fit.state.camera, tracks.pixels), tracks.weights)
+    left = np.flatnonzero((fit.labels < 0) & (own < 1.0))
+    normals, vehicles = normals[left], tracks.vehicles[left]
+    some = np.unique(np.linspace(0, max(len(left) - 1, 0), min(VOTERS, len(left))).astype(int))
+    one, other = (some[index] for index in np.triu_indices(len(some), 1))
+    meeting = np.cross(normals[one], normals[other])
+    size = np.linalg.norm(meeting, axis=1)
+    sure = (size > np.sin(np.radians(ON_ROAD_DEG))) & (vehicles[one] != vehicles[other])
+    directions = meeting[sure] / size[sure, None]
+    directions = directions[np.abs(directions @ fit.state.directions[0]) < np.cos(np.radians(APART_DEG))]
+    agree = np.abs(directions @ normals.T) < np.sin(np.radians(ON_ROAD_DEG))
+    counts = np.array([len(np.unique(vehicles[row])) for row in agree])
+    return directions[int(np.argmax(counts))] if counts.max(initial=0) > 2 else None
 
 
 def with_further_roads(fit: JointFit, tracks: TrackSet, gate: GateOptions) -> JointFit:

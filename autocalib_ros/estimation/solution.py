@@ -15,7 +15,13 @@ from autocalib_ros.estimation.held import lens_assumptions, with_k2_if_asked_for
 from autocalib_ros.estimation.joint import JointFit, noise_cost, road_support, solve_joint, with_bodies
 from autocalib_ros.estimation.lens_prior import LensPrior, known_lens, lens_priors
 from autocalib_ros.estimation.plane import LevelCamera, Plane, agreement
-from autocalib_ros.estimation.roads import main_road, with_further_roads, with_real_roads, with_right_angle
+from autocalib_ros.estimation.roads import (
+    main_road,
+    with_further_roads,
+    with_real_roads,
+    with_right_angle,
+    with_second_road,
+)
 from autocalib_ros.estimation.starts import agreed, in_likeliest_family
 from autocalib_ros.estimation.state import Setting
 from autocalib_ros.estimation.transverse_edges import SquareVehicles, square_vehicles
@@ -114,7 +120,7 @@ def _from_straight(traffic: _Traffic, setting: Setting) -> Solution | Reason:
     second = sorted(int(mask.sum()) for mask in support)[:-1]
     across = f'{min([gate.min_tracks_per_road, *(second or [0])])} of {gate.min_tracks_per_road} tracks'
     fit, tracks = _with_noise(with_real_roads(fit, support, tracks, gate), traffic)
-    fit = with_further_roads(fit, tracks, gate)
+    fit = with_further_roads(with_second_road(fit, tracks, gate), tracks, gate)
     return traffic_doubt(fit, contrast, tracks) or _completed(fit, tracks, across, traffic)
 
 
