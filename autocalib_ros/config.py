@@ -222,7 +222,7 @@ class Options(_Checked):
     max_image_width: int = option(1280, 'wider images are reduced to this width for tracking', low=160, high=16384)
     random_seed: int = option(0, 'seed of the consensus searches', low=0)
     first_solve_s: float = option(10.0, 'seconds of recording before the first solution is tried', low=0)
-    solve_growth: float = option(1.3, 'a new solution is tried when the evidence has grown by this factor', low=1.01)
+    solve_growth: float = option(1.2, 'a new solution is tried when the evidence has grown by this factor', low=1.01)
     solve_interval_s: float = option(5.0, 'least seconds of recording between two solutions', low=0.1)
     tracking: TrackingOptions = field(default_factory=TrackingOptions)
     motion: MotionOptions = field(default_factory=MotionOptions)
