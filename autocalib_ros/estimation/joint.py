@@ -49,7 +49,7 @@ NEAREST_HORIZON = 0.03
 """Least angle below the horizon at which a point is placed on the road, radians."""
 EXPLAINED = 3.0
 """A track is explained when its mean squared whitened distance is below so many medians."""
-UNMODELLED_FOCAL, UNMODELLED_RAD = 0.003, np.radians(0.1)
+UNMODELLED_FOCAL, UNMODELLED_RAD = 0.001, np.radians(0.03)
 """What no residual shows, as standard deviations of the relative focal length and of the plane: a lens is not quite of
 its family, and a road not quite a plane (its crown falls by a degree to either side)."""
 DISCRIMINATION = 5.0

@@ -5,7 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from autocalib_ros.estimation.uncertainty import cluster_covariance, correlation_within, propagate, told_by_evidence
+from autocalib_ros.estimation.uncertainty import (
+    cluster_covariance,
+    correlation_within,
+    few_factor,
+    propagate,
+    told_by_evidence,
+)
 
 
 def plain(slopes: np.ndarray, residuals: np.ndarray, vehicles: np.ndarray, prior: np.ndarray) -> np.ndarray:
@@ -29,7 +35,15 @@ def test_leaving_out_vehicles_gives_the_jackknife_of_a_mean() -> None:
     values = np.array([1.0, 4.0, 2.0, 7.0, 3.0])
     sigma2 = plain(np.ones((5, 1)), values - values.mean(), np.arange(5), np.zeros(1))[0, 0]
     left_out = np.array([np.delete(values, index).mean() for index in range(5)])
-    assert sigma2 == pytest.approx(((left_out - values.mean())**2).sum())
+    moves = (left_out - values.mean())[:, None]
+    assert sigma2 == pytest.approx((moves**2).sum() * few_factor(moves)[0]**2)
+
+
+def test_few_vehicles_widen_deviations_as_student_does() -> None:
+    many, one = np.ones((1000, 1)), np.array([[10.0], *[[0.1]] * 40])
+    assert few_factor(many)[0] == pytest.approx(1.0, abs=0.01)
+    assert few_factor(np.ones((10, 1)))[0] == pytest.approx(2.042 / 1.960, abs=1e-3)  # all alike: 30 degrees of freedom
+    assert few_factor(one)[0] > 1.5
 
 
 def test_what_only_the_prior_knows_has_the_spread_of_the_prior() -> None:
