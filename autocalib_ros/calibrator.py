@@ -59,7 +59,6 @@ class AutoCalibrator:
         if image.dtype != np.uint8 or image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
             raise InputError(f'an image is grey (H, W) or BGR (H, W, 3) in 8 bits, got {image.dtype} {image.shape}')
         size = (image.shape[1], image.shape[0])
-        self._options.scale.require_inside(*size)
         if self._observer is None or size != self._size or stamp_ns <= self._newest_stamp_ns - REORDERED_NS:
             self._begin(stamp_ns, size)
         elif stamp_ns <= self._newest_stamp_ns:
@@ -95,6 +94,7 @@ class AutoCalibrator:
         self._observer.compare_since(min(self._buffer.oldest_s, time_s - memory_s))
 
     def _begin(self, stamp_ns: int, size: tuple[int, int]) -> None:
+        self._options.scale.require_inside(*size)
         self._observer = Observer(self._options, size)
         self._buffer = EvidenceBuffer(self._options.buffer)
         self._size, self._first_stamp_ns, self._newest_stamp_ns = size, stamp_ns, stamp_ns - 1

@@ -115,7 +115,7 @@ def _turning(fit: JointFit, tracks: TrackSet, needed: float) -> Reason:
 
 def _curvature_doubt(fit: JointFit, gate: GateOptions, *, turned: bool) -> Reason | None:
     camera, prior = fit.state.camera, fit.problem.setting.prior
-    sigma = float(fit.sigma(lambda state: np.array([np.log(state.camera.focal_px)]))[0])
+    sigma = fit.focal_sigma
     diagonals = camera.focal_px / np.hypot(camera.width, camera.height)
     too_long = diagonals > LONGEST_FOCAL and not prior.focal_known
     # without distortion only an angle between roads tells the focal length, and one that was found by that focal

@@ -105,6 +105,11 @@ def _spread(evidence: Evidence, candidates: np.ndarray, way: np.ndarray) -> np.n
     return np.argsort(rank, kind='stable')
 
 
+def evenly(count: int, limit: int) -> np.ndarray:
+    """Indices of at most `limit` out of `count`, evenly spread."""
+    return np.linspace(0, max(count - 1, 0), min(limit, count)).astype(int)
+
+
 def earlier_ones(*keys: np.ndarray) -> np.ndarray:
     """Count for each element how many before it have the same keys (n,)."""
     _, group, counts = np.unique(np.column_stack(keys), axis=0, return_inverse=True, return_counts=True)

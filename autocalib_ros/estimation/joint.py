@@ -157,6 +157,11 @@ class JointFit:
         """Whether the angle between the first two roads was held."""
         return self.problem.setting.crossing_rad is not None and len(self.state.angles_rad) > 1
 
+    @property
+    def focal_sigma(self) -> float:
+        """Standard deviation of the focal length, relative."""
+        return float(self.sigma(lambda state: np.array([np.log(state.camera.focal_px)]))[0])
+
     def explained(self) -> np.ndarray:
         """Which tracks follow their road as closely as the bulk does, shape (tracks,)."""
         return (self.labels >= 0) & (self.whitened2 < EXPLAINED * max(self.scale, LEAST_SCALE))

@@ -124,9 +124,8 @@ def on_course(windows: Windows, view: View, motion: Motion, camera: Camera, came
     path of a point turns does not depend on its height.
     """
     before, after, bends = _bends(windows, camera, camera_from_plane)
-    path_deg = np.ma.median(bends, axis=1).filled(0.0)
+    path_deg, body_deg = _turns_deg(bends, motion)
     path_sigma_deg = (bends.std(axis=1) / np.sqrt(np.maximum(windows.mask.sum(axis=1), 1))).filled(0.0)
-    body_deg = np.degrees(np.angle(np.exp(1j * motion.turn_rad)))
     sigma_deg = np.degrees(turn_sigma(view, motion))
     alike = np.abs(body_deg - path_deg) < SLIP_DEG + SLIP_SHARE * np.abs(path_deg) + 2.0 * sigma_deg
     sure = sigma_deg < SURE_DEG
@@ -149,12 +148,14 @@ def sliding(windows: Windows, motion: Motion, camera: Camera, camera_from_plane:
     """
     seen = np.flatnonzero(~windows.of_segments)
     _, _, bends = _bends(windows.subset(seen), camera, camera_from_plane)
-    path_deg = np.ma.median(bends, axis=1).filled(0.0)
+    path_deg, body_deg = _turns_deg(bends, motion.subset(seen))
     turned = np.abs(path_deg) > STEERED_DEG
-    if not turned.any():
-        return 0.0
-    body_deg = np.degrees(np.angle(np.exp(1j * motion.turn_rad[seen][turned])))
-    return max(1.0 - float(np.median(body_deg / path_deg[turned])), 0.0)
+    return max(1.0 - float(np.median(body_deg[turned] / path_deg[turned])), 0.0) if turned.any() else 0.0
+
+
+def _turns_deg(bends: np.ma.MaskedArray, motion: Motion) -> tuple[np.ndarray, np.ndarray]:
+    """How far the paths of windows turn, by the bends of their points (windows, points), and the bodies, degrees."""
+    return np.ma.median(bends, axis=1).filled(0.0), np.degrees(np.angle(np.exp(1j * motion.turn_rad)))
 
 
 def _bends(windows: Windows, camera: Camera,

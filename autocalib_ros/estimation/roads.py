@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from autocalib_ros.config import GateOptions, JointOptions
 from autocalib_ros.estimation.doubts import crossing_deg, is_road
-from autocalib_ros.estimation.great_circles import TrackSet, fit_circles, rays_of
+from autocalib_ros.estimation.great_circles import TrackSet, evenly, fit_circles, rays_of
 from autocalib_ros.estimation.joint import JointFit, road_support, solve_joint
 from autocalib_ros.estimation.starts import APART_DEG, apart
 from autocalib_ros.estimation.state import State, initial_state
@@ -32,7 +32,7 @@ turns that look alike."""
 
 def with_real_roads(fit: JointFit, support: list[np.ndarray], tracks: TrackSet, gate: GateOptions) -> JointFit:
     """Solve again with the one road that explains most vehicles when a second has too little behind it."""
-    if all(is_road(mask, tracks, gate) for mask in support) and apart(fit):
+    if _all_real(fit, support, tracks, gate):
         return fit
     explained = fit.explained()
     counts = [len(np.unique(tracks.vehicles[explained & (fit.labels == road)])) for road in range(len(support))]
@@ -41,6 +41,11 @@ def with_real_roads(fit: JointFit, support: list[np.ndarray], tracks: TrackSet, 
     alone = initial_state(setting.prior.start(fit.state.camera.focal_px),
                           Directions(direction[None], np.zeros(0, int), 0.0))
     return solve_joint(alone, tracks, setting)
+
+
+def _all_real(fit: JointFit, support: list[np.ndarray], tracks: TrackSet, gate: GateOptions) -> bool:
+    """Whether each road of a solution has enough behind it, and none is another's echo."""
+    return apart(fit) and all(is_road(mask, tracks, gate) for mask in support)
 
 
 def with_second_road(fit: JointFit, tracks: TrackSet, gate: GateOptions) -> JointFit:
@@ -53,25 +58,38 @@ def with_second_road(fit: JointFit, tracks: TrackSet, gate: GateOptions) -> Join
     first = fit.state.directions[0]
     both = initial_state(fit.state.camera, Directions(np.stack([first, direction]), np.zeros(0, int), 0.0))
     wider = solve_joint(both, tracks, fit.problem.setting, refine=True)
-    real = apart(wider) and all(is_road(mask, tracks, gate) for mask in road_support(wider, tracks))
-    return wider if real else fit
+    return wider if _all_real(wider, road_support(wider, tracks), tracks, gate) else fit
 
 
 def _second_direction(fit: JointFit, tracks: TrackSet) -> np.ndarray | None:
     """Direction (3,) on which most vehicles agree whose straight tracks follow no road, None where three do not."""
-    normals, own, _ = fit_circles(rays_of(fit.state.camera, tracks.pixels), tracks.weights)
-    left = np.flatnonzero((fit.labels < 0) & (own < 1.0))
-    normals, vehicles = normals[left], tracks.vehicles[left]
-    some = np.unique(np.linspace(0, max(len(left) - 1, 0), min(VOTERS, len(left))).astype(int))
+    normals, vehicles = _left(fit, tracks)
+    some = evenly(len(normals), VOTERS)
     one, other = (some[index] for index in np.triu_indices(len(some), 1))
     meeting = np.cross(normals[one], normals[other])
     size = np.linalg.norm(meeting, axis=1)
     sure = (size > np.sin(np.radians(ON_ROAD_DEG))) & (vehicles[one] != vehicles[other])
     directions = meeting[sure] / size[sure, None]
     directions = directions[np.abs(directions @ fit.state.directions[0]) < np.cos(np.radians(APART_DEG))]
-    agree = np.abs(directions @ normals.T) < np.sin(np.radians(ON_ROAD_DEG))
+    best = _most_agreed(np.abs(directions @ normals.T), vehicles, 3)
+    return None if best is None else directions[best]
+
+
+def _left(fit: JointFit, tracks: TrackSet) -> tuple[np.ndarray, np.ndarray]:
+    """Circles' normals (n, 3) and vehicles (n,) of the straight tracks that follow no road."""
+    normals, own, _ = fit_circles(rays_of(fit.state.camera, tracks.pixels), tracks.weights)
+    left = (fit.labels < 0) & (own < 1.0)
+    return normals[left], tracks.vehicles[left]
+
+
+def _most_agreed(sines: np.ndarray, vehicles: np.ndarray, least: int) -> int | None:
+    """Index of the proposal with which most vehicles (n,) agree, by the sines (proposals, n) that their tracks are off.
+
+    None where fewer than `least` do.
+    """
+    agree = sines < np.sin(np.radians(ON_ROAD_DEG))
     counts = np.array([len(np.unique(vehicles[row])) for row in agree])
-    return directions[int(np.argmax(counts))] if counts.max(initial=0) > 2 else None
+    return int(np.argmax(counts)) if counts.max(initial=0) >= least else None
 
 
 def with_further_roads(fit: JointFit, tracks: TrackSet, gate: GateOptions) -> JointFit:
@@ -82,7 +100,7 @@ def with_further_roads(fit: JointFit, tracks: TrackSet, gate: GateOptions) -> Jo
             return fit
         wider = solve_joint(_with_road(fit.state, angle), tracks, fit.problem.setting, refine=True)
         turns = wider.problem.setting.turning and wider.scale > NOISIER * max(1.0, *wider.scales[1:])
-        if turns or not apart(wider) or not all(is_road(mask, tracks, gate) for mask in road_support(wider, tracks)):
+        if turns or not _all_real(wider, road_support(wider, tracks), tracks, gate):
             return fit
         fit = wider
     return fit
@@ -98,16 +116,13 @@ def _with_road(state: State, angle: float) -> State:
 
 def _further_angle(fit: JointFit, tracks: TrackSet) -> float | None:
     """Angle in the plane on which most vehicles agree whose tracks follow no road yet, None where two do not."""
-    rays = rays_of(fit.state.camera, tracks.pixels)
-    normals, own, _ = fit_circles(rays, tracks.weights)
-    left = (fit.labels < 0) & (own < 1.0)
-    angles = _angles_in_plane(fit.state, normals[left])
+    normals, vehicles = _left(fit, tracks)
+    angles = _angles_in_plane(fit.state, normals)
     turned = np.abs(np.sin(angles[:, None] - fit.state.angles_rad)).min(axis=1, initial=1.0)
     away = turned > np.sin(np.radians(APART_DEG))
-    angles, vehicles = angles[away], tracks.vehicles[left][away]
-    agree = np.abs(np.sin(angles[:, None] - angles)) < np.sin(np.radians(ON_ROAD_DEG))
-    counts = np.array([len(np.unique(vehicles[row])) for row in agree])
-    return float(angles[np.argmax(counts)]) if counts.max(initial=0) > 1 else None
+    angles, vehicles = angles[away], vehicles[away]
+    best = _most_agreed(np.abs(np.sin(angles[:, None] - angles)), vehicles, 2)
+    return None if best is None else float(angles[best])
 
 
 def _angles_in_plane(state: State, normals: np.ndarray) -> np.ndarray:

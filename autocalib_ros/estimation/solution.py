@@ -10,7 +10,7 @@ from autocalib_ros.calibration import Reason
 from autocalib_ros.camera import Camera
 from autocalib_ros.config import GateOptions, JointOptions
 from autocalib_ros.estimation.doubts import halves_doubt, lens_doubt, plane_doubt, traffic_doubt
-from autocalib_ros.estimation.great_circles import TrackSet
+from autocalib_ros.estimation.great_circles import TrackSet, evenly
 from autocalib_ros.estimation.held import lens_assumptions, with_k2_if_asked_for, with_what_can_be_told
 from autocalib_ros.estimation.joint import JointFit, noise_cost, road_support, solve_joint, with_bodies
 from autocalib_ros.estimation.lens_prior import LensPrior, known_lens, lens_priors
@@ -68,7 +68,7 @@ class _Traffic:
 
     @property
     def voters(self) -> TrackSet:
-        return self.tracks.subset(np.unique(np.linspace(0, len(self.tracks) - 1, VOTERS).astype(int)))
+        return self.tracks.subset(evenly(len(self.tracks), VOTERS))
 
 
 def find_solution(evidence: Evidence, tracks: TrackSet, options: JointOptions, gate: GateOptions,

@@ -83,9 +83,9 @@ def one_centre_doubt(fit: JointFit, windows: Windows) -> Reason | None:
     One axis for all motion tells lens and plane so weakly that noise biases them by more than the stated deviations,
     unless these are small.
     """
-    chosen = _turning(fit, windows)
-    sigma = float(fit.sigma(lambda state: np.array([np.log(state.camera.focal_px)]))[0])
-    if chosen is None or sigma < ONE_CENTRE_SIGMA:
+    sigma = fit.focal_sigma
+    chosen = None if sigma < ONE_CENTRE_SIGMA else _turning(fit, windows)
+    if chosen is None:
         return None
     centres, radii = turning_centres(chosen, fit.state.camera, fit.state.rotation)
     apart = np.hypot(*(centres - np.median(centres, axis=0)).T)
@@ -100,13 +100,14 @@ def one_centre_doubt(fit: JointFit, windows: Windows) -> Reason | None:
 
 def with_sliding(fit: JointFit, windows: Windows) -> JointFit:
     """Widen the deviation of a focal length that rests on turning traffic by what sliding points may do to it."""
-    chosen = _turning(fit, windows) if len(fit.state.angles_rad) < 2 and fit.problem.setting.turning else None
-    if chosen is None or 0 not in fit.problem.setting.prior.free:
+    state, prior = fit.state, fit.problem.setting.prior
+    rests = len(state.angles_rad) < 2 and fit.problem.setting.turning and 0 in prior.free
+    chosen = _turning(fit, windows) if rests else None
+    if chosen is None:
         return fit
-    state = fit.state
     view = View.of(chosen, state.camera, state.rotation, fit.problem.setting.options)
     covariance = fit.covariance.copy()
-    focal = int(np.flatnonzero(fit.problem.setting.prior.free == 0)[0])
+    focal = int(np.flatnonzero(prior.free == 0)[0])
     covariance[focal, focal] += (SLIDING_FOCAL * sliding(chosen, first_motion(view), state.camera, state.rotation)) ** 2
     return replace(fit, covariance=covariance)
 
