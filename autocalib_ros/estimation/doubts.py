@@ -8,9 +8,9 @@ import numpy as np
 
 from autocalib_ros.calibration import Reason
 from autocalib_ros.config import GateOptions
-from autocalib_ros.estimation.great_circles import TrackSet
+from autocalib_ros.estimation.great_circles import Seen, TrackSet
 from autocalib_ros.estimation.ground_plane import BELOW_HORIZON
-from autocalib_ros.estimation.joint import MIN_ROWS, JointFit, road_support, solve_joint
+from autocalib_ros.estimation.joint import MIN_ROWS, JointFit, assign, road_support, solve_joint
 from autocalib_ros.estimation.lives import no_lives
 from autocalib_ros.estimation.plane import LevelCamera, Plane, above_traffic
 from autocalib_ros.estimation.state import State
@@ -20,8 +20,13 @@ MIN_VEHICLES = 4
 """Vehicles, distinct, that make a road; fewer may be one driver's whim."""
 STRAIGHT_SHARE = 0.25
 """Share of vehicles that follow the roads; below it the traffic turns, and what it agrees on is a turn."""
-ONE_ROAD_SHARE = 0.75
-"""The same where one road alone is found: on a ring or a bend some arc always passes for a road, of few vehicles."""
+ONE_ROAD_SHARE, KEPT_ROAD_SHARE = 0.75, 0.5
+"""The same where one road alone is found: on a ring or a bend some arc always passes for a road. Half of the vehicles
+are enough when those that follow the road keep to it: on a ring they drive on round it."""
+KEPT = 0.9
+KEEPERS = 0.8
+"""A vehicle keeps to a road that it follows for so much of its way; so many, of all that follow it anywhere, have to.
+"""
 MIN_CONTRAST = 1.3
 """Agreement at the best trial focal length over that at the median one: wrong lenses bend straight paths apart."""
 LONGEST_FOCAL = 1.5
@@ -70,13 +75,20 @@ def traffic_doubt(fit: JointFit, contrast: float, tracks: TrackSet) -> Reason | 
     return _horizon_doubt(fit, tracks)
 
 
-def lens_doubt(fit: JointFit, tracks: TrackSet, gate: GateOptions, *, turned: bool) -> Reason | None:
-    """Say why the lens cannot be trusted, if so; `turned` where the solution started from traffic that turns."""
+def lens_doubt(fit: JointFit, tracks: TrackSet, every: TrackSet, gate: GateOptions, *,
+               turned: bool) -> Reason | None:
+    """Say why the lens cannot be trusted, if so; `turned` where the solution started from traffic that turns.
+
+    `tracks` are those that were chosen out of `every` one.
+    """
     doubt = _horizon_doubt(fit, tracks) or _curvature_doubt(fit, gate, turned=turned) or _model_doubt(fit)
     if doubt or turned and motion_tells(fit):
         return doubt
     needed = STRAIGHT_SHARE if len(fit.state.angles_rad) > 1 else ONE_ROAD_SHARE
-    return _turning(fit, tracks, needed) if _straight_share(fit, tracks) < needed else None
+    share = _straight_share(fit, tracks)
+    if needed == ONE_ROAD_SHARE > share > KEPT_ROAD_SHARE and keepers(fit, every) > KEEPERS:
+        return None
+    return _turning(fit, tracks, needed) if share < needed else None
 
 
 def _horizon_doubt(fit: JointFit, tracks: TrackSet) -> Reason | None:
@@ -103,6 +115,16 @@ def motion_tells(fit: JointFit) -> bool:
 def _straight_share(fit: JointFit, tracks: TrackSet) -> float:
     share = tracks.share_of_vehicle
     return float((share * fit.explained()).sum() / share.sum())
+
+
+def keepers(fit: JointFit, every: TrackSet) -> float:
+    """Share of the vehicles that follow a road anywhere that do so all along, 0 where none does."""
+    labels, _ = assign(fit.state, Seen.through(fit.state.camera, every))
+    lengths = np.hypot(*np.moveaxis(np.diff(every.pixels, axis=1), -1, 0)).sum(axis=1)
+    _, owners = np.unique(every.vehicles, return_inverse=True)
+    share = np.bincount(owners, lengths * (labels >= 0)) / np.maximum(np.bincount(owners, lengths), 1e-9)
+    following = share > 1.0 - KEPT
+    return float((share > KEPT).sum() / max(following.sum(), 1))
 
 
 def _turning(fit: JointFit, tracks: TrackSet, needed: float) -> Reason:

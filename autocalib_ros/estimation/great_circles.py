@@ -75,13 +75,27 @@ def independence(owners: np.ndarray, correlation: float) -> np.ndarray:
 def select_tracks(evidence: Evidence, limit: int) -> TrackSet:
     """Choose tracks long enough to matter, at most `limit`, spread over image cells, headings and vehicles."""
     starts, points = evidence.track_starts, evidence.points_px
-    way = points[starts[1:] - 1] - points[starts[:-1]]
-    displacement = np.hypot(way[:, 0], way[:, 1])
-    long = displacement >= MIN_LENGTH * np.hypot(*evidence.image_size)
+    way, displacement = _ways(evidence)
     straight = path_lengths(points, starts) <= MAX_PATH_RATIO * displacement
-    candidates = np.flatnonzero(long & straight)
+    candidates = np.flatnonzero(_long(evidence, displacement) & straight)
     candidates = candidates[np.argsort(-displacement[candidates], kind='stable')]
     return _track_set(evidence, np.sort(candidates[_spread(evidence, candidates, way[candidates])[:limit]]))
+
+
+def every_track(evidence: Evidence) -> TrackSet:
+    """All tracks that are long enough, straight or not."""
+    _, displacement = _ways(evidence)
+    return _track_set(evidence, np.flatnonzero(_long(evidence, displacement)))
+
+
+def _ways(evidence: Evidence) -> tuple[np.ndarray, np.ndarray]:
+    """How far each track went: as vectors (tracks, 2) and lengths (tracks,) in pixels."""
+    way = evidence.points_px[evidence.track_starts[1:] - 1] - evidence.points_px[evidence.track_starts[:-1]]
+    return way, np.hypot(way[:, 0], way[:, 1])
+
+
+def _long(evidence: Evidence, displacement: np.ndarray) -> np.ndarray:
+    return displacement >= MIN_LENGTH * np.hypot(*evidence.image_size)
 
 
 def path_lengths(points: np.ndarray, starts: np.ndarray) -> np.ndarray:

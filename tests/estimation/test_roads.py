@@ -17,6 +17,7 @@ from autocalib_ros.estimation.joint import solve_joint
 from autocalib_ros.estimation.lens_prior import lens_priors
 from autocalib_ros.estimation.state import Setting, State
 from autocalib_ros.evidence import Evidence
+from autocalib_ros.offline.accuracy_families import families
 from autocalib_ros.offline.synthetic_evidence import Junction, pose, synthetic_evidence
 
 OPTIONS = Options(camera_height=8.0)
@@ -189,6 +190,22 @@ def test_traffic_that_only_turns_is_refused() -> None:
     result = solved(Junction(turning_share=1.0, vehicles=80))
     assert isinstance(result, Refusal)
     assert result.code in ('turning_traffic', 'halves_disagree', 'no_direction')
+
+
+@pytest.mark.parametrize('changing_share', [0.3, 0.4])
+def test_a_road_on_which_many_change_lanes_still_gives_the_lens(changing_share: float) -> None:
+    junction = replace(ONE_ROAD, lane_change_share=changing_share)
+    result = solved(junction)
+    assert isinstance(result, Calibration)
+    assert abs(result.camera.focal_px - 560.0) < 3 * result.stddev.focal_px
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_a_ring_of_which_an_arc_passes_for_a_road_is_refused(seed: int) -> None:
+    generator = np.random.default_rng(seed)
+    ring = replace(families()['roundabout'](generator)[0], tracks=None, vehicles=60, points_per_vehicle=4)
+    result = solved(ring, seed)
+    assert isinstance(result, Refusal)
 
 
 def test_a_lens_without_curvature_is_refused() -> None:
