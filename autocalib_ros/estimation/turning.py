@@ -84,7 +84,8 @@ def one_centre_doubt(fit: JointFit, windows: Windows) -> Reason | None:
     unless these are small.
     """
     sigma = fit.focal_sigma
-    chosen = None if sigma < ONE_CENTRE_SIGMA else _turning(fit, windows)
+    rests = fit.problem.setting.turning and sigma >= ONE_CENTRE_SIGMA
+    chosen = _turning(fit, windows) if rests else None
     if chosen is None:
         return None
     centres, radii = turning_centres(chosen, fit.state.camera, fit.state.rotation)
