@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from autocalib_ros.camera import Camera
-from autocalib_ros.camera_info import camera_info
+from autocalib_ros.camera_info import CameraInfo, camera_info
 from autocalib_ros.files import write_atomically
 
 JSON_VERSION = 1
@@ -30,6 +31,16 @@ class EvidenceSummary:
     segments: int
     vehicles: int
     coverage: float
+
+
+@dataclass(frozen=True)
+class Transform:
+    """Takes coordinates in the frame `child` to coordinates in the frame `parent`; metres, unit quaternion (4,)."""
+
+    parent: str
+    child: str
+    translation_m: np.ndarray
+    rotation_xyzw: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -59,6 +70,13 @@ class GroundPlane:
     def normal_in_camera(self) -> np.ndarray:
         """Unit vector up from the road in the camera optical frame, shape (3,)."""
         return self.rotation[2]
+
+    def transform(self, ground_frame: str, camera_frame: str, tf_parent: str) -> Transform:
+        """Return the pose with the 'ground' or the 'camera' as the parent: the same pose, told from either end."""
+        if tf_parent == 'ground':
+            return Transform(ground_frame, camera_frame, self.translation_m, self.rotation_xyzw)
+        back = self.rotation.T
+        return Transform(camera_frame, ground_frame, -back @ self.translation_m, quaternion_xyzw(back))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,7 +176,15 @@ class Calibration:
     evidence: EvidenceSummary
     newest_stamp_ns: int
     """Stamp of the newest image that the result rests on."""
+    distortion_model: str = 'auto'
+    rectified_balance: float = 0.0
     figures: Figures = field(default_factory=Figures, compare=False, repr=False)
+
+
+    @cached_property
+    def camera_info(self) -> CameraInfo:
+        """The lens as ROS knows it; ModelMisfit where the distortion model cannot say it."""
+        return camera_info(self.camera, self.distortion_model, self.rectified_balance)
 
 
 def quaternion_xyzw(rotation: np.ndarray) -> np.ndarray:
@@ -191,7 +217,7 @@ def _refusal_json(refusal: Refusal | Reason) -> dict[str, str]:
 
 
 def _calibration_json(result: Calibration) -> dict[str, Any]:
-    camera, info, sigma = result.camera, camera_info(result.camera), result.stddev
+    camera, info, sigma = result.camera, result.camera_info, result.stddev
     return {
         'grade': result.grade, 'assumptions': list(result.assumptions), 'checks': list(result.checks),
         'refusal': _refusal_json(result.ground_refusal) if result.ground_refusal else None,

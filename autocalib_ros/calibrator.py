@@ -8,6 +8,7 @@ import numpy as np
 
 from autocalib_ros.calibration import GROUND_DISTANCES_M, Calibration, Figures, Reason, Refusal, StandardDeviations
 from autocalib_ros.camera import Camera
+from autocalib_ros.camera_info import ModelMisfit
 from autocalib_ros.config import Options
 from autocalib_ros.errors import InputError
 from autocalib_ros.estimation.evidence_gate import drift_limit_px, outlook, requirements, shortfall, unsteady
@@ -150,6 +151,28 @@ def solve(evidence: Evidence, options: Options, *, lens: Camera | None = None) -
     With a known `lens`, of the size of the images, only the pose is solved; the published method knows no such thing.
     UsageError where a pixel of scale.distance_px lies outside the image.
     """
+    result = _solved(evidence, options, lens)
+    return in_asked_form(result, options) if isinstance(result, Calibration) else result
+
+
+def in_asked_form(result: Calibration, options: Options) -> Calibration | Refusal:
+    """Have camera_info say the lens as the options ask for; a refusal where that would be too far from it.
+
+    Nothing is published in another model then: who asked for one may read no other, and would not notice.
+    """
+    asked = replace(result, distortion_model=options.distortion_model, rectified_balance=options.rectified_balance)
+    try:
+        info = asked.camera_info
+    except ModelMisfit as misfit:
+        return Refusal.because(Reason('distortion_model', misfit.message, misfit.remedy), result.method,
+                               result.evidence, result.figures)
+    if info.distortion_model == 'equidistant':
+        return asked
+    return replace(asked, checks=(*result.checks, f'camera_info is {info.distortion_model}, off by at most '
+                                                  f'{info.error_px:.2g} px anywhere in the image'))
+
+
+def _solved(evidence: Evidence, options: Options, lens: Camera | None) -> Calibration | Refusal:
     options.scale.require_inside(*evidence.image_size)
     intrinsics = paper_intrinsics(evidence, options.paper)
     figures = Figures(

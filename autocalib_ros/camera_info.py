@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 import reprlib
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +13,22 @@ import numpy as np
 import yaml
 
 from autocalib_ros.camera import Camera
-from autocalib_ros.errors import AutocalibError, InputError
+from autocalib_ros.errors import AutocalibError, InputError, UsageError
 from autocalib_ros.files import write_atomically
-from autocalib_ros.opencv_lens import OpencvLens, nearest_camera
+from autocalib_ros.opencv_lens import (
+    MAX_ERROR_PX,
+    MAX_SLOPE_ANGLE_RAD,
+    OpencvLens,
+    nearest_camera,
+    nearest_coefficients,
+    seen_angle_rad,
+)
 
 EQUIDISTANT_FLOOR = 1e-9
 """image_proc and image_geometry take an all-zero D for "no distortion" whatever the model is called."""
+RECTIFIED_LIMIT_DEG = 80.0
+"""A distortion-free image ends at this angle from the axis at the latest: at 90 it would be infinitely large, and
+already here its border is magnified 33 times as much as its middle."""
 MODELS = {'plumb_bob': (4, 5), 'rational_polynomial': (8,), 'equidistant': (0, 1, 2, 3, 4), 'fisheye': (0, 1, 2, 3, 4)}
 """The distortion models that are read, and how many coefficients each may have."""
 MAX_BYTES = 1_000_000
@@ -39,47 +49,146 @@ class CameraInfo:
     d: list[float]
     r: list[float]
     p: list[float]
+    error_px: float = 0.0
+    """Largest distance in pixels, over the whole image, between this and the lens that it says."""
 
 
-def camera_info(camera: Camera) -> CameraInfo:
-    """Return the CameraInfo of a lens in the 'equidistant' model, P chosen so that no border is empty."""
-    coefficients = [float(value) for value in camera.k]
-    if not any(abs(value) >= EQUIDISTANT_FLOOR for value in coefficients):
-        coefficients[0] = EQUIDISTANT_FLOOR
-    rectified = rectified_matrix(camera)
+@dataclass(frozen=True)
+class Readout:
+    """Which pixels of the sensor an image shows, in pixels of the full resolution (REP-104)."""
+
+    width: int
+    height: int
+    """Full resolution of the sensor."""
+    binning: tuple[int, int] = (1, 1)
+    """Pixels across and down that make one of the image; 0 is 1."""
+    offset: tuple[int, int] = (0, 0)
+    window: tuple[int, int] = (0, 0)
+    """Region of interest: where it begins, and its size before binning; 0 is all."""
+
+
+class ModelMisfit(UsageError):
+    """A distortion model was asked for that cannot say the lens."""
+
+    def __init__(self, message: str, remedy: str) -> None:
+        super().__init__(f'{message} {remedy}')
+        self.message, self.remedy = message, remedy
+
+
+def camera_info(camera: Camera, distortion_model: str = 'auto', rectified_balance: float = 0.0) -> CameraInfo:
+    """Return the CameraInfo of a lens; K is the same in every distortion model, and R identity.
+
+    'auto' is 'equidistant', which says every lens of this program exactly; 'rational_polynomial' and 'plumb_bob' are
+    fitted to what the image shows. Raises ModelMisfit where such a fit misses by more than MAX_ERROR_PX.
+    """
+    model = 'equidistant' if distortion_model == 'auto' else distortion_model
+    coefficients, error_px = _coefficients(camera, model)
+    if not error_px <= MAX_ERROR_PX:
+        raise _misfit(camera, model, error_px)
+    rectified = rectified_matrix(camera, rectified_balance)
     return CameraInfo(
-        width=camera.width, height=camera.height, distortion_model='equidistant',
+        width=camera.width, height=camera.height, distortion_model=model,
         k=[float(value) for value in camera.matrix.ravel()], d=coefficients,
         r=[float(value) for value in np.eye(3).ravel()],
-        p=[float(value) for value in np.hstack([rectified, np.zeros((3, 1))]).ravel()])
+        p=[float(value) for value in np.hstack([rectified, np.zeros((3, 1))]).ravel()], error_px=error_px)
 
 
-def rectified_matrix(camera: Camera) -> np.ndarray:
-    """Return the K, shape (3, 3), of a distortion-free image of equal size that the lens fills wholly.
+def in_full_resolution(info: CameraInfo, readout: Readout) -> CameraInfo:
+    """Return what was calibrated in the pixels of binned or cut-out images in those of the whole sensor.
 
-    The largest axis-parallel rectangle about the axis inside the undistorted border decides. Border
-    points beyond 80 degrees are brought in to 80, where the tangent is still tame.
+    image_geometry goes back by subtracting the offset and dividing by the binning, and so is right in the image to the
+    last digit. InputError where images of such a readout would have another size than those of the calibration.
     """
+    across, down = (max(count, 1) for count in readout.binning)
+    window = readout.window[0] or readout.width, readout.window[1] or readout.height
+    # drivers round half a bin up or down
+    if abs(info.width * across - window[0]) >= across or abs(info.height * down - window[1]) >= down:
+        raise InputError(
+            f"the driver's camera_info is of images of {window[0] // across}x{window[1] // down}, and these have"
+            f' {info.width}x{info.height}: its binning and region of interest are not theirs and are left out')
+    left, top = readout.offset
+    return replace(info, width=readout.width, height=readout.height,
+                   k=_unbinned(info.k, 3, (across, down), (left, top)),
+                   p=_unbinned(info.p, 4, (across, down), (left, top)))
+
+
+def _unbinned(matrix: list[float], columns: int, binning: tuple[int, int], offset: tuple[int, int]) -> list[float]:
+    """Return K or P for the whole sensor."""
+    rows = np.array(matrix).reshape(3, columns) * np.array([[binning[0]], [binning[1]], [1]])
+    rows[:2, 2] += offset
+    return [float(value) for value in rows.ravel()]
+
+
+def _coefficients(camera: Camera, model: str) -> tuple[list[float], float]:
+    """Return D in a model, and by how many pixels it misses the lens at the most."""
+    if model == 'equidistant':
+        coefficients = [float(value) for value in camera.k]
+        if not any(abs(value) >= EQUIDISTANT_FLOOR for value in coefficients):
+            coefficients[0] = EQUIDISTANT_FLOOR
+        return coefficients, 0.0
+    fitted, error_px = nearest_coefficients(camera, rational=model == 'rational_polynomial')
+    return list(fitted[:MODELS[model][-1]]), error_px
+
+
+def _misfit(camera: Camera, model: str, error_px: float) -> ModelMisfit:
+    """Say how far a model is from the lens, and which model to choose."""
+    angle_deg = float(np.degrees(seen_angle_rad(camera)))
+    if np.isfinite(error_px):
+        message = (f'{model} would be off by up to {error_px:.3g} px, as the lens sees {angle_deg:.0f} degrees from its'
+                   f' axis; {MAX_ERROR_PX:g} px is the most that is allowed.')
+    else:
+        message = (f'The lens sees {angle_deg:.1f} degrees from its axis, and {model} ends before'
+                   f' {np.degrees(MAX_SLOPE_ANGLE_RAD):.0f}.')
+    others = 'equidistant, which is exact'
+    if model == 'plumb_bob':
+        rational_px = nearest_coefficients(camera, rational=True)[1]
+        if rational_px <= MAX_ERROR_PX:
+            others = f'rational_polynomial, which is off by {rational_px:.2g} px at the most, or {others}'
+    return ModelMisfit(message, f'Set distortion_model to {others}.')
+
+
+def rectified_matrix(camera: Camera, balance: float = 0.0) -> np.ndarray:
+    """Return the K, shape (3, 3), of a distortion-free image of equal size.
+
+    At `balance` 0 the lens fills it wholly: the largest axis-parallel rectangle about the axis inside the undistorted
+    border decides. At 1 it holds all that the lens shows: the smallest one around that border. Between them the matrix
+    is interpolated, as OpenCV does. Border points beyond RECTIFIED_LIMIT_DEG are brought in to it.
+    """
+    left, right, top, bottom = _undistorted_borders(camera)
+    filled = _view(camera, left.max(), right.min(), top.max(), bottom.min(), max)
+    whole = _view(camera, left.min(), right.max(), top.min(), bottom.max(), min)
+    return (1.0 - balance) * filled + balance * whole
+
+
+def _undistorted_borders(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the slopes x of the left and right border's pixels and y of the upper and lower border's, each (n,)."""
     width, height = camera.width, camera.height
-    across, down = np.linspace(0, width - 1, 65), np.linspace(0, height - 1, 65)
+    across, down = np.linspace(0, width - 1, 257), np.linspace(0, height - 1, 257)
+    limit = np.radians(RECTIFIED_LIMIT_DEG)
 
-    def slopes(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    def slopes(x: np.ndarray | float, y: np.ndarray | float) -> np.ndarray:
         bearings, _ = camera.unproject(np.stack(np.broadcast_arrays(x, y), axis=-1))
-        theta = np.minimum(np.arctan2(np.hypot(bearings[:, 0], bearings[:, 1]), bearings[:, 2]), np.radians(80.0))
-        direction = bearings[:, :2] / np.maximum(np.hypot(bearings[:, 0], bearings[:, 1]), 1e-12)[:, None]
-        return np.tan(theta)[:, None] * direction
+        from_axis = np.hypot(bearings[:, 0], bearings[:, 1])
+        theta = np.minimum(np.arctan2(from_axis, bearings[:, 2]), limit)
+        return np.tan(theta)[:, None] * bearings[:, :2] / np.maximum(from_axis, 1e-12)[:, None]
 
-    left, right = slopes(0.0, down)[:, 0].max(), slopes(width - 1.0, down)[:, 0].min()
-    top, bottom = slopes(across, 0.0)[:, 1].max(), slopes(across, height - 1.0)[:, 1].min()
-    focal = max((width - 1) / max(right - left, 1e-6), (height - 1) / max(bottom - top, 1e-6))
-    centre_x, centre_y = (right + left) / 2, (bottom + top) / 2
-    return np.array([[focal, 0, (width - 1) / 2 - focal * centre_x],
-                     [0, focal, (height - 1) / 2 - focal * centre_y], [0, 0, 1]])
+    return (slopes(0.0, down)[:, 0], slopes(width - 1.0, down)[:, 0],
+            slopes(across, 0.0)[:, 1], slopes(across, height - 1.0)[:, 1])
 
 
-def write_camera_info_yaml(path: Path, camera: Camera, camera_name: str) -> None:
+def _view(camera: Camera, left: float, right: float, top: float, bottom: float,
+          choose: Callable[[float, float], float]) -> np.ndarray:
+    """Return the K with square pixels that shows a rectangle of slopes in its middle, one of its sides exactly."""
+    width, height = camera.width, camera.height
+    focal = choose((width - 1) / max(right - left, 1e-6), (height - 1) / max(bottom - top, 1e-6))
+    return np.array([[focal, 0, (width - 1) / 2 - focal * (right + left) / 2],
+                     [0, focal, (height - 1) / 2 - focal * (bottom + top) / 2], [0, 0, 1]])
+
+
+def write_camera_info_yaml(path: Path, camera: Camera, camera_name: str, distortion_model: str = 'auto',
+                           rectified_balance: float = 0.0) -> None:
     """Write the file of camera_info_manager, atomically; `camera_name` is reduced to letters, digits and _."""
-    info = camera_info(camera)
+    info = camera_info(camera, distortion_model, rectified_balance)
 
     def matrix(rows: int, cols: int, data: list[float]) -> dict[str, Any]:
         return {'rows': rows, 'cols': cols, 'data': data}

@@ -216,8 +216,11 @@ def _scale_values(arguments: argparse.Namespace) -> dict[str, Any]:
     return {}
 
 
-def _lens(arguments: argparse.Namespace) -> Camera | None:
-    """Read the known lens: that of the command line, else the one that the parameter file gives to a live node."""
+def _lens(arguments: argparse.Namespace, options: Options) -> Camera | None:
+    """Read the known lens: that of the command line, else the one that the parameter file gives to a live node.
+
+    UsageError where the results could not say it in the distortion model that is asked for.
+    """
     from autocalib_ros.offline.params import camera_info_file
 
     file = arguments.camera_info
@@ -225,13 +228,16 @@ def _lens(arguments: argparse.Namespace) -> Camera | None:
         file = camera_info_file(arguments.params_file) or None
     if file is None:
         return None
-    from autocalib_ros.camera_info import read_camera_info
+    from autocalib_ros.camera_info import camera_info, read_camera_info
 
-    return read_camera_info(file)
+    lens = read_camera_info(file)
+    camera_info(lens, options.distortion_model)
+    return lens
 
 
 def _replay(arguments: argparse.Namespace) -> int:
-    options, lens = _options(arguments), _lens(arguments)
+    options = _options(arguments)
+    lens = _lens(arguments, options)
     from autocalib_ros.offline.sources import open_source
 
     source = open_source(arguments.source, arguments.topic, arguments.start, arguments.duration)
@@ -240,12 +246,13 @@ def _replay(arguments: argparse.Namespace) -> int:
     outputs.prepare(arguments.out, arguments.write_bag)
     replayed = _replay_and_tell(source, options, arguments.out, lens=lens, quiet=arguments.quiet)
     if arguments.write_bag is not None:
-        _write_bag(arguments.write_bag, replayed, source)
+        _write_bag(arguments.write_bag, replayed, source, options.tf_parent)
     return CALIBRATED if replayed.result else REFUSED
 
 
 def _evidence(arguments: argparse.Namespace) -> int:
-    options, lens = _options(arguments), _lens(arguments)
+    options = _options(arguments)
+    lens = _lens(arguments, options)
     from autocalib_ros.evidence import Evidence
     from autocalib_ros.offline import outputs
     from autocalib_ros.offline.replay import solve_again
@@ -314,13 +321,13 @@ def _print_json(replayed: ReplayResult) -> None:
     print(calibration_json(replayed.result, accepted_at_s=replayed.accepted_at_s))
 
 
-def _write_bag(path: Path, replayed: ReplayResult, source: Source) -> None:
+def _write_bag(path: Path, replayed: ReplayResult, source: Source, tf_parent: str) -> None:
     if not replayed.result:
         _tell(f'{path} is not written: there is no calibration')
         return
     from autocalib_ros.offline.write_bag import write_bag
 
-    write_bag(path, replayed.result, source)
+    write_bag(path, replayed.result, source, tf_parent)
 
 
 def _tell(line: str) -> None:

@@ -219,6 +219,16 @@ class Options(_Checked):
     camera_height_sigma: float = option(0.0, 'standard deviation of camera_height, metres; 0 takes it as exact', low=0,
                                         high=100)
     allow_unit_scale: bool = option(False, 'without a height, give the ground plane in units of the height')
+    distortion_model: str = option(
+        'auto', 'how camera_info says the lens: auto is equidistant, which is exact; the others are fitted to what the '
+        'image shows, and refused where they are off by more than 0.5 px',
+        choices=('auto', 'equidistant', 'rational_polynomial', 'plumb_bob'))
+    rectified_balance: float = option(
+        0.0, 'P of camera_info, the camera of the rectified image: at 0 it holds valid pixels only, at 1 all that the '
+        'lens shows up to 80 degrees from its axis', low=0, high=1)
+    tf_parent: str = option('ground', 'parent frame of the ground transform: with ground, the child is the camera; '
+                            'with camera, for a camera whose frame has a parent already, it is the ground',
+                            choices=('ground', 'camera'))
     max_image_width: int = option(1280, 'wider images are reduced to this width for tracking', low=160, high=16384)
     random_seed: int = option(0, 'seed of the consensus searches', low=0)
     first_solve_s: float = option(10.0, 'seconds of recording before the first solution is tried', low=0)

@@ -1,4 +1,4 @@
-"""The lens models of OpenCV, and the Kannala-Brandt camera that comes nearest to one of them.
+"""The lens models of OpenCV, the Kannala-Brandt camera that comes nearest to one of them, and the way back.
 
 A bearing with the slopes (x, y) = (X / Z, Y / Z) and r^2 = x^2 + y^2 is imaged at K (x', y', 1) with
 
@@ -32,6 +32,10 @@ TANGENTIAL_STEPS = 20
 """Fixed-point steps: the tangential terms are small, and each step is closer by their share."""
 REACHED_PX = 0.05
 """A pixel counts as reached when the bearing found for it is imaged this near to it."""
+FIELD_STEPS = 400
+"""Angles, from the axis to the farthest corner, on which a model is fitted to a lens; four times as many check it."""
+REFITS = 20
+"""Fits, each weighted by the errors of the one before: a dozen bring the largest error near to its least."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,6 +138,66 @@ def _fitted(lens: OpencvLens, bearings: np.ndarray, imaged: np.ndarray) -> Camer
     return _camera(lens, solution[2], solution[:2], solution[3:] / solution[2])
 
 
+def nearest_coefficients(camera: Camera, *, rational: bool) -> tuple[tuple[float, ...], float]:
+    """Return k1, k2, p1, p2, k3 to k6 of the OpenCV lens with the camera's K that comes nearest to it, and its error.
+
+    The error is the largest distance in pixels between the images of one bearing in the two lenses, over the whole
+    image; infinite where the image shows bearings at `MAX_SLOPE_ANGLE_RAD` from the axis or more, which have no slopes
+    to speak of. Without `rational`, k4 to k6 are 0.
+    """
+    field_rad = seen_angle_rad(camera)
+    if not field_rad < MAX_SLOPE_ANGLE_RAD:
+        return (0.0,) * 8, np.inf
+    slopes, radii = _radial_samples(camera, field_rad, FIELD_STEPS)
+    checked = _radial_samples(camera, field_rad, 4 * FIELD_STEPS)
+    weights, denominator = np.ones(FIELD_STEPS), np.ones(FIELD_STEPS)
+    best, least_px = (0.0,) * 8, np.inf
+    for _ in range(REFITS):
+        coefficients = _radial_fit(slopes, radii, np.sqrt(weights) / denominator, rational=rational)
+        error_px = camera.focal_px * _radial_error(*checked, coefficients).max()
+        if error_px < least_px:
+            best, least_px = coefficients, float(error_px)
+        denominator = _denominator(slopes * slopes, coefficients)
+        # Lawson's weights: they turn the least sum of squares into the least largest error
+        weights = weights * _radial_error(slopes, radii, coefficients)
+        if not np.isfinite(weights).all() or not weights.any():
+            break
+        weights = np.maximum(weights / weights.mean(), 1e-12)
+    return best, least_px
+
+
+def seen_angle_rad(camera: Camera) -> float:
+    """Return the largest angle from the axis that the image shows: of a corner, or of the edge of a fisheye's disc."""
+    corners = np.array([(x, y) for x in (0, camera.width - 1) for y in (0, camera.height - 1)], float)
+    return float(camera.angle(np.hypot(*(corners - camera.principal_point_px).T).max())[0])
+
+
+def _radial_samples(camera: Camera, field_rad: float, steps: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return slopes r = tan(theta) from the axis to the end of the field and their image radii in focal lengths."""
+    theta = np.linspace(0.0, field_rad, steps + 1)[1:]
+    return np.tan(theta), camera.radius(theta) / camera.focal_px
+
+
+def _radial_fit(slopes: np.ndarray, radii: np.ndarray, weights: np.ndarray, *, rational: bool) -> tuple[float, ...]:
+    """Fit r (1 + k1 r^2 + ...) = radius (1 + k4 r^2 + ...), which is linear in the coefficients, shape (n,) each."""
+    unit = slopes[-1]  # slopes of a wide lens to the seventh power would leave the digits of a double
+    exponents = np.array([2, 4, 6])
+    powers = (slopes[:, None] / unit) ** exponents
+    columns = np.hstack([slopes[:, None] * powers, *([-radii[:, None] * powers] if rational else [])])
+    solution = np.linalg.lstsq(columns * weights[:, None], (radii - slopes) * weights, rcond=None)[0]
+    scaled = solution.reshape(-1, 3) / unit ** exponents
+    k1, k2, k3, *others = (float(value) for value in scaled.ravel())
+    return (k1, k2, 0.0, 0.0, k3, *(others or (0.0,) * 3))
+
+
+def _radial_error(slopes: np.ndarray, radii: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
+    """Return by how much each radius is missed, in focal lengths; infinite where the model has a pole on the way."""
+    r2 = slopes * slopes
+    if not (_denominator(r2, coefficients) > 0).all():
+        return np.full_like(slopes, np.inf)
+    return np.abs(slopes * _radial(r2, coefficients) - radii)
+
+
 def distorted(slopes: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
     """Return x', y' of slopes x, y, shape (n, 2)."""
     return slopes * _radial(np.sum(slopes * slopes, axis=1), coefficients)[:, None] + _tangential(slopes, coefficients)
@@ -154,9 +218,14 @@ def undistorted(ideal: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarra
 
 
 def _radial(r2: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
-    k1, k2, _, _, k3, k4, k5, k6 = coefficients
+    k1, k2, _, _, k3, *_ = coefficients
     with np.errstate(divide='ignore', invalid='ignore'):
-        return (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+        return (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / _denominator(r2, coefficients)
+
+
+def _denominator(r2: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
+    k4, k5, k6 = coefficients[5:]
+    return 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
 
 
 def _tangential(slopes: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from autocalib_ros.calibration import (
     Calibration,
@@ -60,6 +61,18 @@ def test_the_pose_survives_its_file(tmp_path: Path) -> None:
     pose = json.loads((tmp_path / 'c.json').read_text())['ground_from_camera']
     assert pose['translation_m'] == [0.0, 0.0, 7.5]
     np.testing.assert_allclose(pose['rotation_xyzw'], quaternion_xyzw(rotation), atol=0)
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_both_ends_of_the_transform_tell_the_same_pose(seed: int) -> None:
+    ground = GroundPlane(Rotation.random(random_state=seed).as_matrix(), 7.5)
+    down, up = (ground.transform('ground', 'cam', parent) for parent in ('ground', 'camera'))
+    assert (down.parent, down.child, up.parent, up.child) == ('ground', 'cam', 'cam', 'ground')
+    points = np.random.default_rng(seed).normal(0, 20, (50, 3))
+    in_ground = Rotation.from_quat(down.rotation_xyzw).apply(points) + down.translation_m
+    np.testing.assert_allclose(in_ground, points @ ground.rotation.T + [0, 0, 7.5], atol=1e-12)
+    back = Rotation.from_quat(up.rotation_xyzw).apply(in_ground) + up.translation_m
+    np.testing.assert_allclose(back, points, atol=1e-12)
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:

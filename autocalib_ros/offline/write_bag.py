@@ -13,7 +13,6 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from autocalib_ros.calibration import Calibration, GroundPlane
-from autocalib_ros.camera_info import camera_info
 from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.offline.outputs import camera_name, image_topic
 from autocalib_ros.offline.sources import Source, StoredImage
@@ -27,7 +26,7 @@ LATCHED = Qos(QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TR
               QosLiveliness.AUTOMATIC, FOREVER, False)
 
 
-def write_bag(path: Path, result: Calibration, source: Source) -> None:
+def write_bag(path: Path, result: Calibration, source: Source, tf_parent: str = 'ground') -> None:
     """Write a new bag: the images, a CameraInfo with the header of each, and the ground transform where there is one.
 
     CameraInfo goes to the sibling of the image topic. All but the images are latched, so that a node that
@@ -37,7 +36,7 @@ def write_bag(path: Path, result: Calibration, source: Source) -> None:
         raise UsageError(f'{path} exists already and is not overwritten')
     try:
         with Writer(path, version=BAG_VERSION, storage_plugin=StoragePlugin.MCAP) as writer:
-            _Recording(writer, result, source).write()
+            _Recording(writer, result, source, tf_parent).write()
     except BaseException as error:
         shutil.rmtree(path, ignore_errors=True)  # half a bag is worse than none
         if isinstance(error, OSError):
@@ -54,8 +53,8 @@ def camera_info_topic(source: Source) -> str:
 class _Recording:
     """The connections and messages of one new bag."""
 
-    def __init__(self, writer: Writer, result: Calibration, source: Source) -> None:
-        self._writer, self._result, self._source = writer, result, source
+    def __init__(self, writer: Writer, result: Calibration, source: Source, tf_parent: str) -> None:
+        self._writer, self._result, self._source, self._tf_parent = writer, result, source, tf_parent
         self._store = get_typestore(Stores.ROS2_JAZZY)
         self._ground_frame = f'{camera_name(source)}_ground'
 
@@ -77,7 +76,7 @@ class _Recording:
             self._put(self._connect(topic, message.__msgtype__), first.recorded_ns, message)
 
     def _camera_info(self, stored: StoredImage) -> Any:
-        info = camera_info(self._result.camera)
+        info = self._result.camera_info
         region = self._make('sensor_msgs/msg/RegionOfInterest', x_offset=0, y_offset=0, height=0, width=0,
                             do_rectify=False)
         lists = {name: np.array(getattr(info, name), float) for name in 'dkrp'}
@@ -86,13 +85,14 @@ class _Recording:
                           binning_x=0, binning_y=0, roi=region)
 
     def _transform(self, ground: GroundPlane, camera_frame: str) -> Any:
-        """Return the camera's pose in the ground frame: parent ground, child camera (REP-105)."""
-        vector = self._make('geometry_msgs/msg/Vector3', **dict(zip('xyz', _floats(ground.translation_m), strict=True)))
+        """Return the transform between ground and camera, as the live node publishes it."""
+        pose = ground.transform(self._ground_frame, camera_frame, self._tf_parent)
+        vector = self._make('geometry_msgs/msg/Vector3', **dict(zip('xyz', _floats(pose.translation_m), strict=True)))
         quaternion = self._make('geometry_msgs/msg/Quaternion',
-                                **dict(zip('xyzw', _floats(ground.rotation_xyzw), strict=True)))
+                                **dict(zip('xyzw', _floats(pose.rotation_xyzw), strict=True)))
         return self._make('geometry_msgs/msg/TransformStamped',
-                          header=self._header(self._result.newest_stamp_ns, self._ground_frame),
-                          child_frame_id=camera_frame,
+                          header=self._header(self._result.newest_stamp_ns, pose.parent),
+                          child_frame_id=pose.child,
                           transform=self._make('geometry_msgs/msg/Transform', translation=vector, rotation=quaternion))
 
     def _header(self, stamp_ns: int, frame_id: str) -> Any:

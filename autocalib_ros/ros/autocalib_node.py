@@ -58,6 +58,8 @@ class AutocalibNode(Node):
         self.options, self.node_options = options_of(self)
         lens_file = self.node_options.camera_info_file
         lens = read_camera_info(lens_file) if lens_file else None
+        if lens is not None:
+            camera_info(lens, self.options.distortion_model)  # a model that cannot say it is wrong usage at once
         self._headers = Headers(self.node_options, self.get_namespace(), self.get_logger().warning,
                                 lambda: self.get_clock().now().nanoseconds)
         self._lock = threading.Lock()
@@ -144,7 +146,7 @@ class AutocalibNode(Node):
         if isinstance(result, Refusal):
             self._say_seldom(f'refusal {result.code}', described(result), error=False)
             return
-        fields = camera_info(result.camera)
+        fields = result.camera_info
         transform = self._transform_of(result)
         with self._lock:
             if self._image_size not in (None, result.evidence.image_size):
@@ -164,7 +166,7 @@ class AutocalibNode(Node):
             return None
         return messages.ground_transform_message(
             ground, messages.time_message(result.newest_stamp_ns), self._headers.ground_frame(image_frame),
-            self._headers.camera_frame(image_frame))
+            self._headers.camera_frame(image_frame), self.options.tf_parent)
 
     @staticmethod
     def _publish(publisher: Publisher, message: Any) -> None:

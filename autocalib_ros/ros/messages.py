@@ -12,11 +12,12 @@ from typing import Any, TypeVar
 
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Quaternion, Transform, TransformStamped, Vector3
-from sensor_msgs.msg import CameraInfo
+from sensor_msgs.msg import CameraInfo, RegionOfInterest
 from std_msgs.msg import Header
 
 from autocalib_ros.calibration import GroundPlane
 from autocalib_ros.camera_info import CameraInfo as CameraInfoFields
+from autocalib_ros.camera_info import Readout, in_full_resolution
 from autocalib_ros.errors import AutocalibError
 
 COEFFICIENTS = {'plumb_bob': 5, 'rational_polynomial': 8, 'equidistant': 4}
@@ -47,22 +48,41 @@ def header(stamp: Time, frame_id: str) -> Header:
     return Header(stamp=Time(sec=stamp.sec, nanosec=stamp.nanosec), frame_id=frame_id)
 
 
-def camera_info_message(fields: CameraInfoFields, stamp: Time, frame_id: str) -> CameraInfo:
-    """Return the CameraInfo of an image with that stamp and frame."""
+def camera_info_message(fields: CameraInfoFields, stamp: Time, frame_id: str,
+                        driver: CameraInfo | None = None) -> CameraInfo:
+    """Return the CameraInfo of an image with that stamp and frame.
+
+    With the driver's own message its binning and region of interest are copied, and all else is in the full
+    resolution (REP-104). InputError where that is not of these images.
+    """
+    operation: dict[str, Any] = {}
+    if driver is not None:
+        fields = in_full_resolution(fields, _readout(driver))
+        roi = driver.roi
+        operation = {'binning_x': driver.binning_x, 'binning_y': driver.binning_y, 'roi': RegionOfInterest(
+            x_offset=roi.x_offset, y_offset=roi.y_offset, height=roi.height, width=roi.width,
+            do_rectify=roi.do_rectify)}
     return CameraInfo(
         header=header(stamp, frame_id), width=int(fields.width), height=int(fields.height),
         distortion_model=str(fields.distortion_model), d=[float(value) for value in fields.d],
         k=[float(value) for value in fields.k], r=[float(value) for value in fields.r],
-        p=[float(value) for value in fields.p])
+        p=[float(value) for value in fields.p], **operation)
 
 
-def ground_transform_message(ground: GroundPlane, stamp: Time, ground_frame: str,
-                             camera_frame: str) -> TransformStamped:
-    """Return the pose of the camera in the ground frame: a point in the camera frame goes to the ground frame."""
-    x, y, z = (float(value) for value in ground.translation_m)
-    qx, qy, qz, qw = (float(value) for value in ground.rotation_xyzw)
+def _readout(driver: CameraInfo) -> Readout:
+    """Return what a driver says about the pixels that it sends."""
+    return Readout(driver.width, driver.height, (driver.binning_x, driver.binning_y),
+                   (driver.roi.x_offset, driver.roi.y_offset), (driver.roi.width, driver.roi.height))
+
+
+def ground_transform_message(ground: GroundPlane, stamp: Time, ground_frame: str, camera_frame: str,
+                             tf_parent: str = 'ground') -> TransformStamped:
+    """Return the pose between camera and ground: a point in the child's frame goes to the parent's."""
+    pose = ground.transform(ground_frame, camera_frame, tf_parent)
+    x, y, z = (float(value) for value in pose.translation_m)
+    qx, qy, qz, qw = (float(value) for value in pose.rotation_xyzw)
     return TransformStamped(
-        header=header(stamp, ground_frame), child_frame_id=camera_frame,
+        header=header(stamp, pose.parent), child_frame_id=pose.child,
         transform=Transform(translation=Vector3(x=x, y=y, z=z), rotation=Quaternion(x=qx, y=qy, z=qz, w=qw)))
 
 
@@ -129,6 +149,9 @@ def _check_camera_info(info: CameraInfo) -> None:
     _require(info.distortion_model != 'equidistant' or any(info.d), f'{path}.d', 'is all zero')
     for field, matrix, columns in (('k', info.k, 3), ('p', info.p, 4)):
         _require(matrix[0] > 0 and matrix[columns + 1] > 0, f'{path}.{field}', 'has no positive focal length')
+    roi = info.roi
+    _require(roi.x_offset + roi.width <= info.width and roi.y_offset + roi.height <= info.height, f'{path}.roi',
+             f'reaches beyond the {info.width}x{info.height} pixels of the sensor')
 
 
 def _check_transform(stamped: TransformStamped) -> None:
@@ -141,6 +164,13 @@ def _check_transform(stamped: TransformStamped) -> None:
     _require(abs(norm - 1) < UNIT_TOLERANCE, f'{path}.transform.rotation', f'has the length {norm}')
 
 
+def _check_transforms(message: Any) -> None:
+    for stamped in message.transforms:
+        _check_transform(stamped)
+    children = [stamped.child_frame_id for stamped in message.transforms]
+    _require(len(set(children)) == len(children), 'TFMessage.transforms', 'give a frame two parents')
+
+
 def _check_frame(frame_id: str, path: str) -> None:
     _require(bool(frame_id) and not frame_id.startswith('/'), path, f'is {frame_id!r}')
 
@@ -150,5 +180,6 @@ def _require(holds: bool, path: str, what: str) -> None:
         raise InvalidMessage(f'{path} {what}')
 
 
-MEANING: dict[str, Callable[[Any], None]] = {'CameraInfo': _check_camera_info, 'TransformStamped': _check_transform}
+MEANING: dict[str, Callable[[Any], None]] = {
+    'CameraInfo': _check_camera_info, 'TransformStamped': _check_transform, 'TFMessage': _check_transforms}
 """What a message has to mean beyond the types of its fields."""

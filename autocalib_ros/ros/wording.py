@@ -28,6 +28,9 @@ def described_calibration(result: Calibration) -> str:
                   f'height {result.ground.height_m:g} {unit}{_sigma(sigma.height_m)}']
     elif result.ground_refusal is not None:
         parts.append(f'no ground plane ({result.ground_refusal.code}): {result.ground_refusal.message}')
+    info = result.camera_info
+    if info.distortion_model != 'equidistant':
+        parts.append(f'camera_info {info.distortion_model}, off by at most {info.error_px:.2g} px')
     assumptions = '; '.join(result.assumptions) or 'none'
     return _one_line(f'calibrated, grade {result.grade}: {", ".join(parts)}; assumptions: {assumptions}')
 

@@ -197,3 +197,29 @@ def test_unreadable_evidence_is_one_line_and_status_2(content, told, tmp_path, c
     error = capsys.readouterr().err
     assert error.startswith('autocalib: error: ') and told in error and error.count('\n') == 1
     assert not (tmp_path / 'out').exists()
+
+
+def test_camera_info_is_in_the_distortion_model_that_is_asked_for(evidence):
+    _, plain, _ = evidence('--method', 'paper', '--json')
+    status, stdout, _ = evidence('--method', 'paper', '--json', '-p', 'distortion_model=rational_polynomial',
+                                 '-p', 'rectified_balance=1.0')
+    assert status == 0
+    before, found = document(plain), document(stdout)
+    assert found['camera'] == before['camera']
+    info = found['camera_info']
+    assert (info['distortion_model'], len(info['d'])) == ('rational_polynomial', 8)
+    assert info['k'] == before['camera_info']['k'] and info['p'][0] < before['camera_info']['p'][0]
+    assert found['checks'][-1].startswith('camera_info is rational_polynomial, off by at most 0.0')
+
+
+def test_a_model_that_cannot_say_the_lens_is_a_refusal_that_names_another(evidence):
+    status, stdout, stderr = evidence('--method', 'paper', '--json', '-p', 'distortion_model=plumb_bob')
+    assert (status, document(stdout)['refusal']['code']) == (3, 'distortion_model')
+    assert stderr.startswith('Not calibrated: plumb_bob would be off by up to ')
+    assert 'Set distortion_model to rational_polynomial, which is off by' in stderr
+
+
+def test_a_known_lens_in_a_model_that_cannot_say_it_is_wrong_usage(without_height, lens_file):
+    status, _, stderr = without_height('--camera-info', lens_file, '-p', 'distortion_model=plumb_bob')
+    assert status == 2
+    assert 'plumb_bob would be off' in stderr and 'Set distortion_model' in stderr

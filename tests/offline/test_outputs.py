@@ -34,11 +34,14 @@ def source(tmp_path, write_bag, images):
 
 
 def test_a_calibration_gives_all_files(tmp_path, lens_only, source):
-    lens_only = replace(lens_only, background=None)  # saves the time of some figures
+    result = replace(lens_only.result, distortion_model='rational_polynomial', rectified_balance=1.0)
+    lens_only = replace(lens_only, background=None, result=result)  # no background saves the time of some figures
     names = outputs.write_outputs(tmp_path, lens_only, source)
     assert names == ['camera_info.yaml', 'calibration.json', 'report.html', 'evidence.npz']
     info = yaml.safe_load((tmp_path / 'camera_info.yaml').read_text())
-    assert (info['camera_name'], info['image_width'], info['distortion_model']) == ('cam1', 320, 'equidistant')
+    assert (info['camera_name'], info['image_width'], info['distortion_model']) == ('cam1', 320, 'rational_polynomial')
+    assert info['distortion_coefficients']['data'] == result.camera_info.d
+    assert info['projection_matrix']['data'] == result.camera_info.p
     document = json.loads((tmp_path / 'calibration.json').read_text())
     assert (document['state'], document['grade'], document['evidence']['accepted_at_s']) == ('calibrated', 'lens', 30.0)
     assert Evidence.load(tmp_path / 'evidence.npz').track_count == lens_only.evidence.track_count
@@ -83,6 +86,25 @@ def test_the_transform_leads_from_camera_to_ground(tmp_path, full, source, jazzy
     t, q = transform.transform.translation, transform.transform.rotation
     assert (t.x, t.y, t.z) == (0.0, 0.0, 8.0)
     assert np.array([q.x, q.y, q.z, q.w]) == pytest.approx(full.result.ground.rotation_xyzw)
+
+
+def test_the_ground_hangs_from_the_camera_where_that_is_asked_for(tmp_path, full, source, jazzy):
+    write_bag(tmp_path / 'new', full.result, source, tf_parent='camera')
+    messages = {topic: message for topic, _, message in written(tmp_path / 'new', jazzy)[0]}
+    transform = messages['/autocalib/ground_transform']
+    assert messages['/tf_static'].transforms == [transform]
+    assert (transform.header.frame_id, transform.child_frame_id) == ('cam1_optical', 'cam1_ground')
+    # the foot of the camera is 8 m along the ground's downward direction, seen from the camera
+    t = transform.transform.translation
+    assert [t.x, t.y, t.z] == pytest.approx((-8.0 * full.result.ground.normal_in_camera).tolist())
+
+
+def test_the_camera_info_is_in_the_model_that_is_asked_for(tmp_path, full, source, jazzy):
+    asked = replace(full.result, distortion_model='rational_polynomial', rectified_balance=0.5)
+    write_bag(tmp_path / 'new', asked, source)
+    info = next(message for topic, _, message in written(tmp_path / 'new', jazzy)[0] if topic == '/cam1/camera_info')
+    assert (info.distortion_model, info.d.tolist()) == ('rational_polynomial', asked.camera_info.d)
+    assert info.p.tolist() == asked.camera_info.p != full.result.camera_info.p
 
 
 def test_the_camera_info_is_that_of_the_calibration(tmp_path, full, source, jazzy):

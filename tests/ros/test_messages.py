@@ -4,15 +4,17 @@ import copy
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from rclpy.serialization import deserialize_message, serialize_message
-from sensor_msgs.msg import CameraInfo, Image
+from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import CameraInfo, Image, RegionOfInterest
 from std_msgs.msg import Header
 
 from autocalib_ros.calibration import GroundPlane
 from autocalib_ros.camera import Camera
-from autocalib_ros.camera_info import camera_info
+from autocalib_ros.camera_info import ModelMisfit, camera_info
+from autocalib_ros.errors import InputError
 from autocalib_ros.ros.messages import (
     InvalidMessage,
     camera_info_message,
@@ -41,14 +43,20 @@ def unchecked(message, field: str, value):
     return message
 
 
-@given(st.integers(16, 4096), st.integers(16, 4096), st.floats(50, 5000), st.floats(-0.02, 0.02))
-def test_camera_info_of_any_lens_is_valid_and_survives_the_wire(width, height, focal_px, k1):
+@given(st.integers(16, 4096), st.integers(16, 4096), st.floats(50, 5000), st.floats(-0.02, 0.02), st.floats(0, 1),
+       st.sampled_from(['auto', 'equidistant', 'rational_polynomial', 'plumb_bob']))
+@settings(deadline=None)
+def test_camera_info_of_any_lens_is_valid_and_survives_the_wire(width, height, focal_px, k1, balance, model):
     camera = Camera(width, height, focal_px, ((width - 1) / 2, (height - 1) / 2), (k1, 0.0, 0.0, 0.0))
-    fields = camera_info(camera)
+    try:
+        fields = camera_info(camera, model, balance)
+    except ModelMisfit:
+        assume(False)
     message = validated(camera_info_message(fields, STAMP, 'cam'))
     arrived = deserialize_message(serialize_message(message), CameraInfo)
     assert (list(arrived.k), list(arrived.d), list(arrived.p)) == (fields.k, fields.d, fields.p)
-    assert (arrived.width, arrived.height, arrived.distortion_model) == (width, height, 'equidistant')
+    assert (arrived.width, arrived.height) == (width, height)
+    assert arrived.distortion_model == ('equidistant' if model == 'auto' else model)
 
 
 def test_camera_info_converts_numpy_numbers():
@@ -65,6 +73,43 @@ def test_ground_transform_is_the_pose_of_the_camera_in_the_ground_frame():
     assert (t.x, t.y, t.z) == (0.0, 0.0, 8.0)
     # The optical axis (z) is the ground's x: the field's usual quaternion of an optical frame.
     np.testing.assert_allclose([q.x, q.y, q.z, q.w], [-0.5, 0.5, -0.5, 0.5], atol=1e-12)
+
+
+@pytest.mark.parametrize('tf_parent', ['ground', 'camera'])
+def test_ground_transform_takes_points_of_the_child_to_the_parent(tf_parent):
+    message = validated(ground_transform_message(GroundPlane(ROTATION, 8.0), STAMP, 'cam_ground', 'cam', tf_parent))
+    t, q = message.transform.translation, message.transform.rotation
+    # 20 m ahead in the optical axis, 8 m above the road
+    ends = {'cam': [0.0, 0.0, 20.0], 'cam_ground': [20.0, 0.0, 8.0]}
+    moved = Rotation.from_quat([q.x, q.y, q.z, q.w]).apply(ends[message.child_frame_id]) + [t.x, t.y, t.z]
+    np.testing.assert_allclose(moved, ends[message.header.frame_id], atol=1e-12)
+
+
+def driver_message(width: int, height: int, binning: int, roi: RegionOfInterest | None = None) -> CameraInfo:
+    """Return what a driver publishes that was never calibrated."""
+    return CameraInfo(width=width, height=height, binning_x=binning, binning_y=binning, roi=roi or RegionOfInterest())
+
+
+def test_binning_and_region_of_the_driver_are_copied_and_the_rest_is_in_full_resolution():
+    region = RegionOfInterest(x_offset=100, y_offset=60, width=1280, height=720, do_rectify=True)
+    driver = driver_message(1920, 1080, 2, region)
+    fields = camera_info(Camera.equidistant(640, 360, 300.0))
+    message = validated(camera_info_message(fields, STAMP, 'cam', driver))
+    assert (message.width, message.height, message.binning_x, message.binning_y) == (1920, 1080, 2, 2)
+    assert message.roi == region and message.roi is not region
+    # twice the pixels of the image, the middle of which is at (100, 60) and half of 1280x720 from there
+    assert list(message.k) == [600.0, 0.0, 100 + 2 * 319.5, 0.0, 600.0, 60 + 2 * 179.5, 0.0, 0.0, 1.0]
+    assert message.p[0] == 2 * fields.p[0] and list(message.d) == fields.d
+
+
+def test_without_a_driver_binning_and_region_are_those_of_the_whole_image():
+    message = info_message()
+    assert (message.binning_x, message.binning_y, message.roi) == (0, 0, RegionOfInterest())
+
+
+def test_a_driver_that_speaks_of_other_images_is_told():
+    with pytest.raises(InputError, match='of images of 320x180, and these have 640x360'):
+        camera_info_message(camera_info(Camera.equidistant(640, 360, 300.0)), STAMP, 'cam', driver_message(640, 360, 2))
 
 
 def test_header_is_a_copy():
@@ -97,6 +142,13 @@ def test_stamp_keeps_every_nanosecond():
 def test_broken_camera_info_is_refused_by_name(field, value, told):
     with pytest.raises(InvalidMessage, match=told.replace('.', r'\.')):
         validated(unchecked(info_message(), field, value))
+
+
+def test_a_region_beyond_the_sensor_is_refused():
+    message = info_message()
+    message.roi = RegionOfInterest(x_offset=600, width=41, height=10)
+    with pytest.raises(InvalidMessage, match=r'CameraInfo\.roi reaches beyond the 640x360 pixels'):
+        validated(message)
 
 
 @pytest.mark.parametrize('frame', ['', '/cam'])

@@ -11,8 +11,10 @@ from rcl_interfaces.srv import GetParameters
 from rclpy.qos import ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage
 
+from autocalib_ros.calibrator import in_asked_form
 from autocalib_ros.camera import Camera
 from autocalib_ros.camera_info import camera_info, write_camera_info_yaml
+from autocalib_ros.errors import UsageError
 from autocalib_ros.ros.messages import stamp_ns
 from bench import PATIENCE_S, PIXELS, SIZE, Bench, calibration, image, refusal, wait_for
 
@@ -258,3 +260,35 @@ def test_solver_gets_no_lens_unless_one_is_given(bench):
     told = []
     calibrated(bench, lambda evidence, options, lens: told.append(lens) or calibration(evidence))
     assert told and set(told) == {None}
+
+
+def test_known_lens_in_a_distortion_model_that_cannot_say_it_is_wrong_usage(bench, tmp_path):
+    write_camera_info_yaml(tmp_path / 'lens.yaml', Camera.equidistant(1280, 720, 500.0), 'cam')
+    with pytest.raises(UsageError, match='plumb_bob would be off by up to .* Set distortion_model to rational'):
+        bench.start(instantly, camera_info_file=str(tmp_path / 'lens.yaml'), distortion_model='plumb_bob')
+
+
+def test_answer_of_calibrate_tells_the_error_of_a_fitted_distortion_model(bench):
+    def solve(evidence, options, lens):
+        return in_asked_form(calibration(evidence), options)
+
+    node = bench.start(solve, camera_height=8.0, idle_solve_s=1000.0, distortion_model='rational_polynomial')
+    publish_until(bench.connected(bench.publisher()), lambda: used(node), 'an image')
+    infos = bench.collect(CameraInfo, INFO, latched=True)
+    answer = bench.calibrate()
+    assert answer.success
+    assert 'camera_info rational_polynomial, off by at most' in answer.message
+    info = wait_for(lambda: infos, 'camera_info')[0]
+    assert (info.distortion_model, len(info.d)) == ('rational_polynomial', 8)
+
+
+def test_lens_that_the_asked_model_cannot_say_is_refused_and_nothing_is_published(bench):
+    def solve(evidence, options, lens):
+        return in_asked_form(calibration(evidence, 180.0), options)
+
+    node = bench.start(solve, camera_height=8.0, idle_solve_s=1000.0, distortion_model='plumb_bob')
+    publish_until(bench.connected(bench.publisher()), lambda: used(node), 'an image')
+    answer = bench.calibrate()
+    assert not answer.success
+    assert answer.message.startswith('refused (distortion_model): plumb_bob would be off by up to')
+    assert node._published is None
