@@ -281,6 +281,7 @@ class NodeOptions(_Checked):
     ground_frame: str = option('', "frame of the ground plane; '' is <camera_name>_ground")
     camera_info_file: str = option('', "file with the lens, as camera_info_manager writes it: only the pose is then "
                                    "solved; '' finds the lens too")
+    publish_tf: bool = option(True, 'publish the ground transform on /tf_static too, where tf2_msgs is there')
     camera_info_mode: str = option('per_image', 'publish camera_info with each image or when it changes',
                                    choices=('per_image', 'latched_only'))
     idle_solve_s: float = option(3.0, 'when no image came for this long, what is left is solved', low=0.1)

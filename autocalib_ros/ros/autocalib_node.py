@@ -14,7 +14,6 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
 from sensor_msgs.msg import CameraInfo
 from std_srvs.srv import Trigger
@@ -30,11 +29,10 @@ from autocalib_ros.ros.headers import DEFAULT_FRAME, Headers
 from autocalib_ros.ros.image_input import ImageInput
 from autocalib_ros.ros.parameters import options_of
 from autocalib_ros.ros.pipeline import Pipeline, Result, Solve
+from autocalib_ros.ros.qos import LATCHED
+from autocalib_ros.ros.transforms import Transforms
 from autocalib_ros.ros.wording import described, described_progress
 
-LATCHED = QoSProfile(depth=1, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE,
-                     durability=DurabilityPolicy.TRANSIENT_LOCAL)
-"""One publisher serves late joiners and, image by image, everybody else."""
 TELL_PROGRESS_S = 10.0
 REPEAT_S = 60.0
 """Real seconds between two lines of progress, and before an unchanged complaint is repeated."""
@@ -68,7 +66,7 @@ class AutocalibNode(Node):
         self._image_size: tuple[int, int] | None = None
         self._said: dict[str, float] = {}
         self._camera_info = self.create_publisher(CameraInfo, '~/camera_info', LATCHED)
-        self._ground_transform = self.create_publisher(TransformStamped, '~/ground_transform', LATCHED)
+        self._transforms = Transforms(self, tf_parent=self.options.tf_parent, publish_tf=self.node_options.publish_tf)
         self._pipeline = Pipeline(self.options, idle_solve_s=self.node_options.idle_solve_s,
                                   decode=ImageDecoder().decode, solve=solve, listener=self, lens=lens)
         # While a caller waits for its solution, everything outside this group goes on.
@@ -86,7 +84,9 @@ class AutocalibNode(Node):
     def _on_image(self, message: Any) -> None:
         """Keep the image for the perception thread and give it its camera_info; nothing here takes long."""
         frame_id = self._headers.frame_id(message.header.frame_id)
-        self._frame_id = frame_id
+        if frame_id != self._frame_id:
+            self._frame_id = frame_id
+            self._transforms.expect(self._headers.ground_frame(frame_id), self._headers.camera_frame(frame_id))
         self._pipeline.offer(self._headers.stamp_ns(message.header.stamp), message)
         if self.node_options.camera_info_mode == 'per_image':
             with self._lock:
@@ -154,7 +154,7 @@ class AutocalibNode(Node):
             self._publish(self._camera_info, messages.camera_info_message(
                 fields, messages.time_message(result.newest_stamp_ns), self._frame_id or DEFAULT_FRAME))
             if transform is not None:
-                self._publish(self._ground_transform, transform)
+                self._transforms.publish(transform)
             self._published = Published(result, fields)
         self._said = {}
         self.get_logger().info(described(result))
