@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from geometry_msgs.msg import TransformStamped
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from rclpy.serialization import deserialize_message, serialize_message
 from scipy.spatial.transform import Rotation
@@ -60,6 +60,7 @@ def test_a_tree_of_others_with_a_loop_of_its_own_ends():
 
 
 @with_tf2
+@settings(deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 2 ** 32 - 1), st.floats(0.1, 100), st.sampled_from(['ground', 'camera']),
                           st.integers(0, 2 ** 31 * 10 ** 9 - 1)), max_size=4))
 def test_transforms_of_any_pose_are_valid_and_survive_the_wire(poses):
