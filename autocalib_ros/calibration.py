@@ -18,6 +18,9 @@ from autocalib_ros.files import write_atomically
 JSON_VERSION = 1
 GROUND_DISTANCES_M = (10.0, 20.0, 40.0)
 """Distances from the camera's foot at which the accuracy on the road is told."""
+COVARIANCE_OF = ('focal_px', 'principal_point_x_px', 'principal_point_y_px', 'k1', 'k2', 'k3', 'k4', 'tilt_deg',
+                 'roll_deg', 'height_m')
+"""Rows and columns of the covariance."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,6 +175,8 @@ class Calibration:
     road_directions: np.ndarray
     """Unit vectors in the camera optical frame, shape (n, 3)."""
     stddev: StandardDeviations
+    covariance: np.ndarray | None = field(default=None, compare=False, repr=False)
+    """Of `COVARIANCE_OF`, shape (10, 10), where there is a ground plane in metres and it is estimated."""
     paper: PaperReport | None
     evidence: EvidenceSummary
     newest_stamp_ns: int
@@ -201,7 +206,7 @@ def to_json(result: Calibration | Refusal, *, accepted_at_s: float | None = None
         'method': result.method, 'assumptions': [], 'checks': [], 'refusal': None,
         'image_size': list(evidence.image_size),
         'camera': None, 'camera_info': None, 'ground_from_camera': None, 'road_directions_in_camera': [],
-        'stddev': None, 'paper': None,
+        'stddev': None, 'covariance': None, 'paper': None,
         'evidence': {'seconds': evidence.seconds, 'frames': evidence.frames, 'tracks': evidence.tracks,
                      'segments': evidence.segments, 'vehicles': evidence.vehicles,
                      'coverage': evidence.coverage, 'accepted_at_s': accepted_at_s}}
@@ -235,6 +240,8 @@ def _calibration_json(result: Calibration) -> dict[str, Any]:
                    'height_m': sigma.height_m, 'k2': sigma.k2,
                    'ground_point_m': {f'{distance:g}': value for distance, value in zip(
                        GROUND_DISTANCES_M, sigma.ground_point_m, strict=False)}},
+        'covariance': None if result.covariance is None else {
+            'of': list(COVARIANCE_OF), 'matrix': result.covariance.tolist()},
         'paper': None if result.paper is None else {
             'focal_px': result.paper.focal_px, 'polynomial_k': list(result.paper.polynomial_k),
             'straightness_px2': dict(zip(('before', 'after'), result.paper.straightness_px2, strict=True)),

@@ -260,6 +260,17 @@ def _ground_deviations(plane: Plane, scale: Scale) -> tuple[float | None, ...]:
     return tuple(float(next(sigmas)) if here else None for here in seen)
 
 
+def _covariance(plane: Plane, scale: Scale) -> np.ndarray:
+    """Covariance (10, 10) of lens, tilt, roll and height, in the order of COVARIANCE_OF."""
+    def published(camera: Camera, normal: np.ndarray) -> np.ndarray:
+        return np.array([camera.focal_px, *camera.principal_point_px, *camera.k, *tilt_and_roll_deg(normal),
+                         scale.height(camera, normal)])
+
+    covariance = plane.covariance(published)
+    covariance[-1, -1] += scale.sigma**2
+    return covariance
+
+
 def _calibration(options: Options, solution: Solution, lens: Calibration) -> Calibration:
     """Add the ground plane to a lens where the traffic and what tells the scale give one."""
     plane, scale = solution.plane, solution.no_plane or _scale(options, solution)
@@ -275,6 +286,7 @@ def _calibration(options: Options, solution: Solution, lens: Calibration) -> Cal
     return replace(
         lens, grade=grade, ground=ground_plane(normal, solution.along, height, metric=scale.metric),
         assumptions=(*lens.assumptions, *scale.assumption(height, height_sigma)),
+        covariance=_covariance(plane, scale) if scale.metric else None,
         stddev=replace(lens.stddev, tilt_deg=float(tilt), roll_deg=float(roll),
                        height_m=height_sigma if scale.metric and height_sigma > 0 else None,
                        ground_point_m=_ground_deviations(plane, scale) if scale.metric else ()))

@@ -209,7 +209,7 @@ def read_camera_info(path: Path) -> Camera:
     what is wrong with the file, what was expected and what to do.
     """
     try:
-        return nearest_camera(_lens(_fields(Path(os.path.expanduser(path)))))
+        return nearest_camera(lens_of_fields(_fields(Path(os.path.expanduser(path)))))
     except OSError as error:
         raise InputError(f'cannot read {path}: {error.strerror or error}') from error
     except AutocalibError as error:
@@ -232,7 +232,8 @@ def _fields(path: Path) -> Mapping[str, Any]:
     return {str(key).lower(): value for key, value in document.items() if isinstance(key, str)}
 
 
-def _lens(fields: Mapping[str, Any]) -> OpencvLens:
+def lens_of_fields(fields: Mapping[str, Any]) -> OpencvLens:
+    """Return the lens of a CameraInfo given by the names of its fields, lists as lists; InputError where it is none."""
     width, height = _pixels(fields, 'image_width', 'width'), _pixels(fields, 'image_height', 'height')
     model, sizes = _model(fields)
     matrix = np.array(_numbers(fields, (9,), 'camera_matrix', 'k')).reshape(3, 3)

@@ -205,16 +205,34 @@ def distorted(slopes: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray
 
 def undistorted(ideal: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
     """Invert `distorted` as well as it can be: beyond the radius where the model folds back, nothing is right."""
-    radius = np.tan(np.linspace(0.0, MAX_SLOPE_ANGLE_RAD, RADIUS_STEPS))
-    imaged = radius * _radial(radius * radius, coefficients)
-    folds = np.flatnonzero(~(np.diff(imaged) > 0))
-    last = folds[0] + 1 if len(folds) else RADIUS_STEPS
+    radius, imaged = radii_to_the_fold(coefficients)
     slopes = np.zeros_like(ideal)
     for _ in range(TANGENTIAL_STEPS):
         target = ideal - _tangential(slopes, coefficients)
         length = np.hypot(*target.T)
-        slopes = target * (np.interp(length, imaged[:last], radius[:last]) / np.maximum(length, 1e-12))[:, None]
+        slopes = target * (np.interp(length, imaged, radius) / np.maximum(length, 1e-12))[:, None]
     return slopes
+
+
+def radii_to_the_fold(coefficients: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Return slopes' lengths (n,) and where they are imaged (n,), both growing, as far as the model can be inverted."""
+    radius = np.tan(np.linspace(0.0, MAX_SLOPE_ANGLE_RAD, RADIUS_STEPS))
+    imaged = radius * _radial(radius * radius, coefficients)
+    folds = np.flatnonzero(~(np.diff(imaged) > 0))
+    last = folds[0] + 1 if len(folds) else RADIUS_STEPS
+    return radius[:last], imaged[:last]
+
+
+def distortion_slopes(slopes: np.ndarray, coefficients: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return dx'/dx, dx'/dy = dy'/dx and dy'/dy of `distorted` at slopes (n, 2), each (n,)."""
+    k1, k2, p1, p2, k3, k4, k5, k6 = coefficients
+    x, y = slopes.T
+    r2 = x * x + y * y
+    above, below = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+    radial = above / below
+    growth = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3) - radial * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / below
+    return (radial + growth * x * x + 2 * p1 * y + 6 * p2 * x, growth * x * y + 2 * p1 * x + 2 * p2 * y,
+            radial + growth * y * y + 6 * p1 * y + 2 * p2 * x)
 
 
 def _radial(r2: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:

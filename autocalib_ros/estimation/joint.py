@@ -22,7 +22,7 @@ from autocalib_ros.estimation.planar_motion import Motion
 from autocalib_ros.estimation.rigid_bodies import Shapes
 from autocalib_ros.estimation.rows import LifeRows, MotionRows, RoadRows, Rows
 from autocalib_ros.estimation.state import Setting, State, Steps, crossed, ground_up
-from autocalib_ros.estimation.uncertainty import cluster_covariance, correlation_within, propagate
+from autocalib_ros.estimation.uncertainty import cluster_covariance, correlation_within, propagate, propagated
 from autocalib_ros.estimation.vanishing_points import distances2_through
 from autocalib_ros.estimation.vehicles import bodies
 
@@ -170,6 +170,11 @@ class JointFit:
         """Standard deviation of a function of the state, shape of its result."""
         return propagate(lambda step: function(self.problem.steps.state(step)), self.problem.steps.size,
                          self.covariance)
+
+    def covariance_of(self, function: Callable[[State], np.ndarray]) -> np.ndarray:
+        """Covariance (n, n) of a function of the state with n results."""
+        return propagated(lambda step: function(self.problem.steps.state(step)), self.problem.steps.size,
+                          self.covariance)
 
 
 def assign(state: State, seen: Seen, limit_px: float = OUTLIER_PX) -> tuple[np.ndarray, np.ndarray]:

@@ -108,11 +108,21 @@ class Plane:
     def sigma(self, function: Callable[[Camera, np.ndarray], np.ndarray]) -> np.ndarray:
         """Standard deviations of a function of lens and normal, shape of its result; with those of the assumption."""
         told = self.fit.sigma(lambda state: function(state.camera, self.normal(state)))
+        return told if self.assumed is None else np.hypot(told, self._by_assumption(function))
+
+    def covariance(self, function: Callable[[Camera, np.ndarray], np.ndarray]) -> np.ndarray:
+        """Covariance (n, n) of a function of lens and normal with n results; with that of the assumption."""
+        told = self.fit.covariance_of(lambda state: function(state.camera, self.normal(state)))
         if self.assumed is None:
             return told
-        state = self.fit.state
+        moved = self._by_assumption(function)
+        return told + np.outer(moved, moved)
+
+    def _by_assumption(self, function: Callable[[Camera, np.ndarray], np.ndarray]) -> np.ndarray:
+        """How far a standard deviation of what is assumed moves the results of a function, (n,)."""
+        state, sigma_rad = self.fit.state, self.assumed.step_sigma_rad
         ends = [np.atleast_1d(function(state.camera, self.normal(state, step))) for step in (-STEP_RAD, STEP_RAD)]
-        return np.hypot(told, self.assumed.step_sigma_rad * (ends[1] - ends[0]) / (2 * STEP_RAD))
+        return sigma_rad * (ends[1] - ends[0]) / (2 * STEP_RAD)
 
     @property
     def worst_sigma_deg(self) -> float:

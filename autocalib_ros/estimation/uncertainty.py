@@ -74,12 +74,18 @@ def correlation_within(groups: np.ndarray, pulls: np.ndarray) -> float:
 
 def propagate(function: Callable[[np.ndarray], np.ndarray], size: int, covariance: np.ndarray) -> np.ndarray:
     """Standard deviations of `function` (of a parameter step, at 0) under `covariance`; shape of its result."""
+    return np.sqrt(np.maximum(np.diag(propagated(function, size, covariance)), 0.0))
+
+
+def propagated(function: Callable[[np.ndarray], np.ndarray], size: int, covariance: np.ndarray) -> np.ndarray:
+    """Covariance (n, n) of a `function` with n results (of a parameter step, at 0) under `covariance`."""
     step = 1e-5
-    slopes = np.array([(np.atleast_1d(function(step * unit)) - np.atleast_1d(function(-step * unit))) / (2 * step)
-                       for unit in np.eye(size)])
+    results = len(np.atleast_1d(function(np.zeros(size))))
     if not np.isfinite(covariance).all():
-        return np.full(slopes.shape[1] if slopes.ndim > 1 else np.atleast_1d(function(np.zeros(size))).shape, np.inf)
-    return np.sqrt(np.maximum(np.einsum('pi,pq,qi->i', slopes, covariance, slopes), 0.0))
+        return np.full((results, results), np.inf)
+    slopes = np.array([(np.atleast_1d(function(step * unit)) - np.atleast_1d(function(-step * unit))) / (2 * step)
+                       for unit in np.eye(size)]).reshape(size, results)
+    return slopes.T @ covariance @ slopes
 
 
 def told_by_evidence(information: np.ndarray, prior: np.ndarray) -> np.ndarray:

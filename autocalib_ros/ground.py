@@ -1,0 +1,229 @@
+"""Pixels to points on the road and back, for trackers: from the node's two messages or from calibration.json.
+
+    ground = Ground.from_messages(camera_info, ground_transform)
+    found = ground.points(pixels)       # pixels (n, 2) -> found.points_m (n, 3), found.valid (n,)
+    pixels, valid = ground.pixels(found.points_m)
+
+Pixel (0, 0) is the centre of the top-left pixel of the images as they are delivered, neither rectified nor scaled.
+The ground frame is z up with the road at z = 0, metres. Nothing here needs ROS: a message is any object with the
+attributes of one.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from autocalib_ros.calibration import COVARIANCE_OF, JSON_VERSION
+from autocalib_ros.camera import Camera
+from autocalib_ros.errors import InputError
+from autocalib_ros.info_lens import InfoLens, attribute
+
+HORIZON_PX = 1.0
+"""A pixel nearer than this to the horizon, or to where the plane asked for vanishes, is on it: the next one shows no
+ground at all, so that nothing is known of its distance."""
+SLOPE_STEP_PX = 1e-3
+SHARE_OF_SIGMA = 0.01
+"""How far lens and pose are moved to see what depends on them: where everything is still linear."""
+UNIT_TOLERANCE = 1e-3
+"""A quaternion farther from unit length is not one."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GroundPoints:
+    """Where pixels meet the ground, in the order of the pixels."""
+
+    points_m: np.ndarray
+    """In the ground frame, shape (n, 3); nan where not valid."""
+    valid: np.ndarray
+    """False at and above the horizon, and where the lens images nothing; shape (n,)."""
+    covariance_m2: np.ndarray | None
+    """Of x and y, shape (n, 2, 2); None where the calibration does not tell. Errors of one image's points go
+    together: this is not noise that averages out."""
+
+    @property
+    def sigma_m(self) -> np.ndarray | None:
+        """One sigma of a point's place, metres, shape (n,); None where the calibration does not tell."""
+        return None if self.covariance_m2 is None else np.sqrt(np.trace(self.covariance_m2, axis1=1, axis2=2))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ground:
+    """A lens over a plane."""
+
+    lens: Camera | InfoLens
+    rotation: np.ndarray
+    """ground_from_camera, shape (3, 3)."""
+    camera_m: np.ndarray
+    """The camera in the ground frame, shape (3,)."""
+    ground_frame: str = ''
+    camera_frame: str = ''
+    covariance: np.ndarray | None = None
+    """Of COVARIANCE_OF, shape (10, 10); None where it is not known."""
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.camera_m).all() and np.isfinite(self.rotation).all() and self.camera_m[2] > 0):
+            raise InputError(f'the camera is {self.camera_m[2]:g} m above the plane z = 0 of the ground, expected more'
+                             ' than 0: give the transform to the ground frame, whose z axis points up')
+
+    @classmethod
+    def from_messages(cls, camera_info: Any, ground_transform: Any, *, camera_frame: str = '',
+                      rectified: bool = False) -> Ground:
+        """Build from a CameraInfo and a TransformStamped between its frame and the ground, either of them the parent.
+
+        `camera_frame` is the frame of the pose where that is not the one of the CameraInfo; `rectified` is for
+        pixels of image_proc's image_rect. There is no covariance in messages. Raises InputError.
+        """
+        camera = (camera_frame or camera_info.header.frame_id).lstrip('/')
+        parent, child = ground_transform.header.frame_id.lstrip('/'), ground_transform.child_frame_id.lstrip('/')
+        if (parent == camera) == (child == camera):
+            raise InputError(f"the transform joins '{parent}' and '{child}', and one of the two should be the camera's"
+                             f" frame '{camera}': take the ground transform of this camera, or say camera_frame")
+        rotation, translation = _rigid(ground_transform.transform)
+        if parent == camera:
+            rotation, translation = rotation.T, -rotation.T @ translation
+        try:
+            lens = InfoLens.of(camera_info, rectified=rectified)
+        except InputError as error:
+            raise InputError(f'camera_info: {error}') from error
+        if rectified:
+            rotation = rotation @ np.array([float(value) for value in attribute(camera_info, 'r')]).reshape(3, 3).T
+        return cls(lens=lens, rotation=rotation, camera_m=translation, camera_frame=camera,
+                   ground_frame=child if parent == camera else parent)
+
+    @classmethod
+    def from_file(cls, path: Path | str) -> Ground:
+        """Build from a saved calibration.json, with its covariance; InputError where it holds no ground plane."""
+        try:
+            document = json.loads(Path(path).expanduser().read_text(encoding='utf-8'))
+            return cls.from_document(document)
+        except OSError as error:
+            raise InputError(f'cannot read {path}: {error.strerror or error}') from error
+        except InputError as error:
+            raise InputError(f'{path}: {error}') from error
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise InputError(f'{path} is not a calibration.json ({error!r}): give the file that'
+                             ' `autocalib replay` writes') from error
+
+    @classmethod
+    def from_document(cls, document: Mapping[str, Any]) -> Ground:
+        """Build from the document of calibration.json."""
+        if document['version'] != JSON_VERSION:
+            raise InputError(f'its version is {document["version"]}, and {JSON_VERSION} is read:'
+                             ' calibrate again with this program')
+        pose, refusal = document['ground_from_camera'], document['refusal']
+        if pose is None:
+            raise InputError(f'it holds no ground plane ({refusal["code"]}: {refusal["message"]}); {refusal["remedy"]}')
+        if document['grade'] == 'unit_scale':
+            raise InputError("its plane is in units of the camera's height, not in metres: calibrate with the height")
+        camera, (width, height) = document['camera'], document['image_size']
+        (cx, cy), (k1, k2, k3, k4) = camera['principal_point_px'], camera['k']
+        told = document.get('covariance')
+        covariance = None
+        if told is not None and told['of'] == list(COVARIANCE_OF):
+            covariance = np.array(told['matrix'], float).reshape(2 * (len(COVARIANCE_OF),))
+        return cls(lens=Camera(width, height, camera['focal_px'], (cx, cy), (k1, k2, k3, k4)),
+                   rotation=Rotation.from_quat(pose['rotation_xyzw']).as_matrix(),
+                   camera_m=np.array(pose['translation_m'], float), covariance=covariance)
+
+    def points(self, pixels: np.ndarray, *, height_m: float | np.ndarray = 0.0,
+               pixel_sigma_px: float = 0.0) -> GroundPoints:
+        """Return where pixels (n, 2) meet the road, or the plane `height_m` above it: a number, or one each, (n,).
+
+        `pixel_sigma_px` is one sigma of the pixels themselves in x and in y, for `covariance_m2`.
+        """
+        pixels = np.asarray(pixels, float).reshape(-1, 2)
+        numbers = np.isfinite(pixels).all(axis=1)
+        pixels = np.where(numbers[:, None], pixels, 0.0)
+        near = pixels + SLOPE_STEP_PX * np.array([[[0, 0]], [[1, 0]], [[0, 1]]])  # (3, n, 2): the pixel, right, below
+        bearings, seen = self.lens.unproject(near.reshape(-1, 2))
+        rays = bearings.reshape(3, -1, 3) @ self.rotation.T
+        with np.errstate(all='ignore'):  # what is not valid may be anything, and is left out
+            reach = (height_m - self.camera_m[2]) / rays[..., 2]
+            slope = np.hypot(*(rays[1:, :, 2] - rays[0, :, 2])) / SLOPE_STEP_PX
+            valid = numbers & seen.reshape(3, -1).all(axis=0) & (reach[0] > 0)
+            valid &= np.abs(rays[0, :, 2]) > HORIZON_PX * slope
+            places = np.where(valid[:, None], reach[..., None] * rays + self.camera_m, np.nan)
+        points = np.column_stack([places[0, :, :2], np.where(valid, height_m, np.nan)])
+        spread = self._spread(pixels, height_m)
+        if spread is not None and pixel_sigma_px > 0:
+            by_pixel = (places[1:, :, :2] - places[0, :, :2]) * (pixel_sigma_px / SLOPE_STEP_PX)
+            spread = spread + np.einsum('ani,anj->nij', by_pixel, by_pixel)
+        if spread is not None:
+            spread[~valid] = np.nan
+        return GroundPoints(points_m=points, valid=valid, covariance_m2=spread)
+
+    def pixels(self, points_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return pixels (n, 2), nan where there are none, of points (n, 3) in the ground frame; and where valid (n,).
+
+        Points (n, 2) are on the road. A pixel may lie outside the image.
+        """
+        points = np.asarray(points_m, float)
+        points = np.pad(points, ((0, 0), (0, 3 - points.shape[1])))
+        bearings = (points - self.camera_m) @ self.rotation  # the row form of R^T (X - t)
+        there = np.isfinite(bearings).all(axis=1) & bearings.any(axis=1)
+        pixels, valid = self.lens.project(np.where(there[:, None], bearings, [0.0, 0.0, 1.0]))
+        return np.where((there & valid)[:, None], pixels, np.nan), there & valid
+
+    @cached_property
+    def _moved(self) -> list[tuple[Camera, np.ndarray, np.ndarray]] | None:
+        """Lens, pose and place of the camera on both sides of this one along each axis of the covariance."""
+        if self.covariance is None or not isinstance(self.lens, Camera):
+            return None
+        # each row and column by its own sigma: their units have nothing to do with each other
+        scale = np.sqrt(np.maximum(np.diag(self.covariance), 1e-300))
+        values, vectors = np.linalg.eigh(self.covariance / np.outer(scale, scale))
+        axes = (scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))).T[values > 1e-12]
+        return [self._at(sign * SHARE_OF_SIGMA * axis) for axis in axes for sign in (1.0, -1.0)]
+
+    def _at(self, step: np.ndarray) -> tuple[Camera, np.ndarray, np.ndarray]:
+        """Lens, ground_from_camera and place of the camera at a step (10,) of COVARIANCE_OF.
+
+        The ground frame stays below where the optical axis points to: its heading is chosen, not measured.
+        """
+        (cx, cy), (k1, k2, k3, k4) = self.lens.principal_point_px, self.lens.k
+        lens = replace(self.lens, focal_px=self.lens.focal_px + step[0],
+                       principal_point_px=(cx + step[1], cy + step[2]),
+                       k=(k1 + step[3], k2 + step[4], k3 + step[5], k4 + step[6]))
+        normal = self.rotation[2]
+        tilt, roll = np.arcsin(np.clip(-normal[2], -1, 1)), np.arctan2(-normal[0], -normal[1])
+        tilt, roll = tilt + np.radians(step[7]), roll + np.radians(step[8])
+        up = -np.array([np.cos(tilt) * np.sin(roll), np.cos(tilt) * np.cos(roll), np.sin(tilt)])
+        in_road = self.rotation @ _ahead(normal)
+        return lens, in_road @ _ahead(up).T, self.camera_m + [0.0, 0.0, step[9]]
+
+    def _spread(self, pixels: np.ndarray, height_m: float | np.ndarray) -> np.ndarray | None:
+        """Covariance (n, 2, 2) of the places of pixels that the calibration leaves."""
+        if self._moved is None:
+            return None
+        places = np.empty((len(self._moved), len(pixels), 2))
+        for place, (lens, rotation, camera_m) in zip(places, self._moved, strict=True):
+            rays = lens.unproject(pixels)[0] @ rotation.T
+            with np.errstate(all='ignore'):
+                place[:] = ((height_m - camera_m[2]) / rays[:, 2])[:, None] * rays[:, :2] + camera_m[:2]
+        moves = (places[0::2] - places[1::2]) / (2 * SHARE_OF_SIGMA)
+        return np.einsum('ani,anj->nij', moves, moves)
+
+
+def _ahead(normal: np.ndarray) -> np.ndarray:
+    """Columns (3, 3), camera frame: where the optical axis points to on the ground, to the left of it, and up."""
+    ahead = np.array([0.0, 0.0, 1.0]) - normal[2] * normal
+    ahead /= max(float(np.linalg.norm(ahead)), 1e-9)
+    return np.column_stack([ahead, np.cross(normal, ahead), normal])
+
+
+def _rigid(transform: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation (3, 3) and translation (3,) of an object with the attributes of geometry_msgs/Transform."""
+    turn, shift = transform.rotation, transform.translation
+    quaternion = np.array([float(turn.x), float(turn.y), float(turn.z), float(turn.w)])
+    if not abs(np.linalg.norm(quaternion) - 1.0) < UNIT_TOLERANCE:
+        raise InputError(f'the rotation of the transform has the length {np.linalg.norm(quaternion):.6g}, expected 1:'
+                         ' it is no rotation, so its sender is at fault')
+    return Rotation.from_quat(quaternion).as_matrix(), np.array([float(shift.x), float(shift.y), float(shift.z)])
