@@ -7,6 +7,7 @@ memory out of bounds. So every value is converted here, and `validated` looks at
 from __future__ import annotations
 
 import math
+from array import array
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -102,6 +103,8 @@ def _check_fields(message: Any, path: str) -> None:
 
 
 def _check_value(value: Any, kind: str, path: str) -> None:
+    if kind == 'sequence<uint8>' and isinstance(value, array) and value.typecode == 'B':
+        return  # it cannot hold anything else, and may be long
     if kind.startswith('sequence<'):
         for item in _listed(value, path):
             _check_value(item, kind[len('sequence<'):-1].partition(',')[0], path)
