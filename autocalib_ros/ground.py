@@ -45,13 +45,18 @@ class GroundPoints:
     valid: np.ndarray
     """False at and above the horizon, and where the lens images nothing; shape (n,)."""
     covariance_m2: np.ndarray | None
-    """Of x and y, shape (n, 2, 2); None where the calibration does not tell. Errors of one image's points go
-    together: this is not noise that averages out."""
+    """Of x and y, by the calibration, shape (n, 2, 2); None where it does not tell. It moves all points together, in
+    every image alike, so that no filter averages it out."""
+    noise_m2: np.ndarray | None
+    """Of x and y, by the noise of the pixels, shape (n, 2, 2), for filters; None where that was not given."""
 
     @property
     def sigma_m(self) -> np.ndarray | None:
-        """One sigma of a point's place, metres, shape (n,); None where the calibration does not tell."""
-        return None if self.covariance_m2 is None else np.sqrt(np.trace(self.covariance_m2, axis1=1, axis2=2))
+        """One sigma of a point's place by all that is known, metres, (n,); None where the calibration does not tell."""
+        if self.covariance_m2 is None:
+            return None
+        whole = self.covariance_m2 if self.noise_m2 is None else self.covariance_m2 + self.noise_m2
+        return np.sqrt(np.trace(whole, axis1=1, axis2=2))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,7 +142,7 @@ class Ground:
                pixel_sigma_px: float = 0.0) -> GroundPoints:
         """Return where pixels (n, 2) meet the road, or the plane `height_m` above it: a number, or one each, (n,).
 
-        `pixel_sigma_px` is one sigma of the pixels themselves in x and in y, for `covariance_m2`.
+        `pixel_sigma_px` is one sigma of the pixels themselves in x and in y, for `noise_m2`.
         """
         pixels = np.asarray(pixels, float).reshape(-1, 2)
         numbers = np.isfinite(pixels).all(axis=1)
@@ -152,13 +157,10 @@ class Ground:
             valid &= np.abs(rays[0, :, 2]) > HORIZON_PX * slope
             places = np.where(valid[:, None], reach[..., None] * rays + self.camera_m, np.nan)
         points = np.column_stack([places[0, :, :2], np.where(valid, height_m, np.nan)])
-        spread = self._spread(pixels, height_m)
-        if spread is not None and pixel_sigma_px > 0:
-            by_pixel = (places[1:, :, :2] - places[0, :, :2]) * (pixel_sigma_px / SLOPE_STEP_PX)
-            spread = spread + np.einsum('ani,anj->nij', by_pixel, by_pixel)
-        if spread is not None:
-            spread[~valid] = np.nan
-        return GroundPoints(points_m=points, valid=valid, covariance_m2=spread)
+        by_pixel = (places[1:, :, :2] - places[0, :, :2]) * (pixel_sigma_px / SLOPE_STEP_PX)
+        noise = _squares(by_pixel) if pixel_sigma_px > 0 else None
+        return GroundPoints(points_m=points, valid=valid, covariance_m2=self._spread(pixels, height_m, valid),
+                            noise_m2=noise)
 
     def pixels(self, points_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return pixels (n, 2), nan where there are none, of points (n, 3) in the ground frame; and where valid (n,).
@@ -199,17 +201,23 @@ class Ground:
         in_road = self.rotation @ _ahead(normal)
         return lens, in_road @ _ahead(up).T, self.camera_m + [0.0, 0.0, step[9]]
 
-    def _spread(self, pixels: np.ndarray, height_m: float | np.ndarray) -> np.ndarray | None:
-        """Covariance (n, 2, 2) of the places of pixels that the calibration leaves."""
+    def _spread(self, pixels: np.ndarray, height_m: float | np.ndarray, valid: np.ndarray) -> np.ndarray | None:
+        """Covariance (n, 2, 2) of the places of pixels that the calibration leaves, nan where they are not valid."""
         if self._moved is None:
             return None
         places = np.empty((len(self._moved), len(pixels), 2))
         for place, (lens, rotation, camera_m) in zip(places, self._moved, strict=True):
             rays = lens.unproject(pixels)[0] @ rotation.T
-            with np.errstate(all='ignore'):
+            with np.errstate(all='ignore'):  # what is not valid may be anything, and is left out
                 place[:] = ((height_m - camera_m[2]) / rays[:, 2])[:, None] * rays[:, :2] + camera_m[:2]
-        moves = (places[0::2] - places[1::2]) / (2 * SHARE_OF_SIGMA)
-        return np.einsum('ani,anj->nij', moves, moves)
+            spread = _squares((places[0::2] - places[1::2]) / (2 * SHARE_OF_SIGMA))
+        spread[~valid] = np.nan
+        return spread
+
+
+def _squares(moves: np.ndarray) -> np.ndarray:
+    """Covariance (n, 2, 2) of what independent causes of one sigma each move by `moves` (causes, n, 2)."""
+    return np.einsum('ani,anj->nij', moves, moves)
 
 
 def _ahead(normal: np.ndarray) -> np.ndarray:

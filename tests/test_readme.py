@@ -5,8 +5,15 @@ import re
 import shutil
 import subprocess
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
+
+from autocalib_ros.calibration import write_calibration_json
+from autocalib_ros.calibrator import solve
+from autocalib_ros.config import Options
+from autocalib_ros.offline.synthetic_evidence import Junction, synthetic_evidence
 
 ROOT = Path(__file__).parent.parent
 README = ROOT / 'README.md'
@@ -33,6 +40,19 @@ def test_ci_runs_the_second_command(commands):
     done = subprocess.run(['bash', '-c', extraction.group(1)], capture_output=True, text=True, check=True,
                           env={**os.environ, 'root': str(ROOT)})
     assert done.stdout.strip() == commands[1]
+
+
+def test_the_example_of_a_tracker_runs(tmp_path, monkeypatch):
+    block, = re.findall(r'^```python\n(.*?)^```$', README.read_text(encoding='utf-8'), re.MULTILINE | re.DOTALL)
+    evidence = synthetic_evidence(Junction(), np.random.default_rng(0))
+    (tmp_path / 'results').mkdir()
+    write_calibration_json(tmp_path / 'results' / 'calibration.json', solve(evidence, Options(camera_height=8.0)))
+    monkeypatch.chdir(tmp_path)
+    measured = []
+    names = {'tracker': SimpleNamespace(measure=lambda place, noise: measured.append((place.shape, noise.shape)))}
+    exec(compile(block, str(README), 'exec'), names)
+    assert measured == [((2,), (2, 2))] * 2
+    assert names['seen'].shape == (2,) and (names['found'].sigma_m > 0).all()
 
 
 @pytest.mark.slow
