@@ -1,5 +1,9 @@
 """The example consumer as a real node, over DDS."""
 
+import signal
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from geometry_msgs.msg import Point32, Polygon, PolygonStamped, TransformStamped
@@ -149,3 +153,16 @@ def test_a_transform_of_another_camera_gives_no_points(calibrated, capfd):
 def test_no_pixels_are_answered_by_no_points(calibrated):
     found = calibrated.answer([])
     assert (found.width, len(found.data), found.header.frame_id) == (0, 0, 'cam_ground')
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_the_executable_ends_quietly_when_it_is_asked_to(bench, number):
+    command = [sys.executable, '-m', 'autocalib_ros.ros.ground_points']
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            wait_for(lambda: bench.client.count_subscribers('pixels'), 'the node')
+            process.send_signal(number)
+            _, said = process.communicate(timeout=30)
+        finally:
+            process.kill()
+    assert (process.returncode, said) == (0, '')
