@@ -142,9 +142,13 @@ class AutocalibNode(Node):
         self._say_seldom(f'fault {type(error).__name__}', ''.join(traceback.format_exception(error)).rstrip())
 
     def solved(self, result: Result) -> None:
-        """Publish a calibration; after a refusal the one before stays in force."""
+        """Publish a calibration; after a refusal, or a lens without the plane that is known, the one before stays."""
         if isinstance(result, Refusal):
             self._say_seldom(f'refusal {result.code}', described(result), error=False)
+            return
+        if self._loses_plane(result):
+            self._say_seldom('plane', f'the calibration before stays, as this one has no ground plane:'
+                             f' {described(result)}', error=False)
             return
         fields = result.camera_info
         transform = self._transform_of(result)
@@ -158,6 +162,11 @@ class AutocalibNode(Node):
             self._published = Published(result, fields)
         self._said = {}
         self.get_logger().info(described(result))
+
+    def _loses_plane(self, result: Calibration) -> bool:
+        """Say whether consumers would go on to use a ground plane in force with a lens that it does not belong to."""
+        published = self._published
+        return result.ground is None and published is not None and published.result.ground is not None
 
     def _transform_of(self, result: Calibration) -> TransformStamped | None:
         """Return the message of the ground plane, unless its scale is made up and nobody allowed that."""

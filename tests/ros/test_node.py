@@ -154,6 +154,22 @@ def test_images_services_and_parameters_do_not_wait_for_a_solution(bench):
     assert node._published.result.camera.focal_px == 400.0
 
 
+def test_a_lens_without_plane_does_not_replace_one_with_its_plane(bench):
+    found = [{'height_m': 8.0}, {'height_m': None, 'focal_px': 310.0}, {'height_m': 9.0, 'focal_px': 320.0}]
+
+    def solve(evidence, options, lens):
+        return calibration(evidence, **(found.pop(0) if len(found) > 1 else found[0]))
+
+    node, _ = calibrated(bench, solve)
+    infos, transforms = (bench.collect(kind, topic, latched=True)
+                         for kind, topic in ((CameraInfo, INFO), (TransformStamped, GROUND)))
+    wait_for(lambda: infos and transforms, 'lens and plane')
+    assert 'focal length 310' in bench.calibrate().message  # what was found is told, and not published
+    assert bench.calibrate().success
+    wait_for(lambda: infos[-1].k[0] == 320.0 and transforms[-1].transform.translation.z == 9.0, 'lens and plane anew')
+    assert 310.0 not in [info.k[0] for info in infos]
+
+
 def test_calibrate_answers_with_the_refusal(bench):
     node = bench.start(lambda evidence, options, lens: refusal(evidence))
     publish_until(bench.connected(bench.publisher()), lambda: used(node), 'an image')
