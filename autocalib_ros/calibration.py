@@ -206,7 +206,7 @@ def to_json(result: Calibration | Refusal, *, accepted_at_s: float | None = None
         'method': result.method, 'assumptions': [], 'checks': [], 'refusal': None,
         'image_size': list(evidence.image_size),
         'camera': None, 'camera_info': None, 'ground_from_camera': None, 'road_directions_in_camera': [],
-        'stddev': None, 'covariance': None, 'paper': None,
+        'stddev': None, 'covariance': None, 'paper': None, 'newest_stamp_ns': None,
         'evidence': {'seconds': evidence.seconds, 'frames': evidence.frames, 'tracks': evidence.tracks,
                      'segments': evidence.segments, 'vehicles': evidence.vehicles,
                      'coverage': evidence.coverage, 'accepted_at_s': accepted_at_s}}
@@ -232,7 +232,9 @@ def _calibration_json(result: Calibration) -> dict[str, Any]:
                         'p': info.p},
         'ground_from_camera': None if result.ground is None else {
             'translation_m': result.ground.translation_m.tolist(),
-            'rotation_xyzw': result.ground.rotation_xyzw.tolist()},
+            'rotation_xyzw': result.ground.rotation_xyzw.tolist(),
+            'rotation': np.asarray(result.ground.rotation).tolist()},
+        'newest_stamp_ns': result.newest_stamp_ns,
         'road_directions_in_camera': np.asarray(result.road_directions).tolist(),
         'stddev': {'focal_px': sigma.focal_px,
                    'principal_point_px': None if sigma.principal_point_px is None else list(sigma.principal_point_px),

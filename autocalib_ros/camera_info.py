@@ -188,8 +188,11 @@ def _view(camera: Camera, left: float, right: float, top: float, bottom: float,
 def write_camera_info_yaml(path: Path, camera: Camera, camera_name: str, distortion_model: str = 'auto',
                            rectified_balance: float = 0.0) -> None:
     """Write the file of camera_info_manager, atomically; `camera_name` is reduced to letters, digits and _."""
-    info = camera_info(camera, distortion_model, rectified_balance)
+    write_atomically(path, camera_info_yaml(camera_info(camera, distortion_model, rectified_balance), camera_name))
 
+
+def camera_info_yaml(info: CameraInfo, camera_name: str) -> str:
+    """Return the text of camera_info_manager's file in full precision."""
     def matrix(rows: int, cols: int, data: list[float]) -> dict[str, Any]:
         return {'rows': rows, 'cols': cols, 'data': data}
 
@@ -199,7 +202,23 @@ def write_camera_info_yaml(path: Path, camera: Camera, camera_name: str, distort
         'camera_matrix': matrix(3, 3, info.k), 'distortion_model': info.distortion_model,
         'distortion_coefficients': matrix(1, len(info.d), info.d),
         'rectification_matrix': matrix(3, 3, info.r), 'projection_matrix': matrix(3, 4, info.p)}
-    write_atomically(path, yaml.safe_dump(document, sort_keys=False, default_flow_style=None))
+    return yaml.safe_dump(document, sort_keys=False, default_flow_style=None)
+
+
+def read_camera_info_fields(path: Path) -> CameraInfo:
+    """Read camera_info_manager's file as it stands, whatever lens it tells of; InputError where it is none."""
+    try:
+        fields = _fields(path)
+        model, sizes = _model(fields)
+        return CameraInfo(
+            width=_pixels(fields, 'image_width', 'width'), height=_pixels(fields, 'image_height', 'height'),
+            distortion_model=model, k=_numbers(fields, (9,), 'camera_matrix', 'k'),
+            d=_numbers(fields, sizes, 'distortion_coefficients', 'd'),
+            r=_numbers(fields, (9,), 'rectification_matrix', 'r'), p=_numbers(fields, (12,), 'projection_matrix', 'p'))
+    except OSError as error:
+        raise InputError(f'cannot read {path}: {error.strerror or error}') from error
+    except AutocalibError as error:
+        raise InputError(f'{path}: {error}') from error
 
 
 def read_camera_info(path: Path) -> Camera:

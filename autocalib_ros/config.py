@@ -282,6 +282,13 @@ class NodeOptions(_Checked):
     camera_info_file: str = option('', "file with the lens, as camera_info_manager writes it: only the pose is then "
                                    "solved; '' finds the lens too")
     publish_tf: bool = option(True, 'publish the ground transform on /tf_static too, where tf2_msgs is there')
+    camera_info_url: str = option('', "where the calibration is kept, in camera_info_manager's syntax: file:///..., "
+                                  "package://PACKAGE/..., with ${NAME} and ${ROS_HOME}; '' is "
+                                  'file://${ROS_HOME}/camera_info/${NAME}.yaml')
+    autosave: bool = option(True, 'keep each new calibration at camera_info_url, at most once a minute; off: only '
+                            '~/save writes')
+    upload_to_driver: bool = option(False, "send each new calibration to the driver's set_camera_info, at most once a "
+                                    'minute')
     camera_info_mode: str = option('per_image', 'publish camera_info with each image or when it changes',
                                    choices=('per_image', 'latched_only'))
     idle_solve_s: float = option(3.0, 'when no image came for this long, what is left is solved', low=0.1)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import glob
 import os
 import tempfile
 from pathlib import Path
@@ -10,11 +12,11 @@ from autocalib_ros.errors import InputError
 
 
 def write_atomically(path: Path, text: str) -> None:
-    """Replace the file in one step: a reader sees the old text or the new, never a part."""
+    """Replace the file in one step: a reader sees the old text or the new, never a part, a power cut or not."""
     path = Path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f'.{path.name}.')
+        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=_prefix(path))
         try:
             with os.fdopen(handle, 'w', encoding='utf-8') as stream:
                 stream.write(text)
@@ -25,5 +27,47 @@ def write_atomically(path: Path, text: str) -> None:
         except BaseException:
             os.unlink(temporary)
             raise
+        _sync_folder(path.parent)
     except OSError as error:
         raise InputError(f'cannot write {path}: {error.strerror or error}') from error
+
+
+def keep_as(path: Path, kept: Path) -> None:
+    """Give the file a second name in one step, in place of what had that name; InputError where that fails.
+
+    Replacing one of the two leaves the other as it is.
+    """
+    link = path.with_name(f'{_prefix(kept)}{os.getpid()}')
+    try:
+        link.unlink(missing_ok=True)
+        os.link(path, link)
+        os.replace(link, kept)
+        return
+    except OSError:
+        pass  # the file system of a memory card may know no links
+    try:
+        text = path.read_text(encoding='utf-8')
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f'cannot keep {path} as {kept.name}: {error}') from error
+    write_atomically(kept, text)
+
+
+def remove_unfinished(path: Path) -> None:
+    """Remove what writers of this file left behind that were killed."""
+    for left in path.parent.glob(f'{glob.escape(_prefix(path))}*'):
+        with contextlib.suppress(OSError):
+            left.unlink()
+
+
+def _prefix(path: Path) -> str:
+    return f'.{path.name}~'
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make a renaming last; some network file systems know no such thing, and then it is theirs to keep."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        with contextlib.suppress(OSError):
+            os.fsync(handle)
+    finally:
+        os.close(handle)

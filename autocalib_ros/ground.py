@@ -205,12 +205,11 @@ class Ground:
         """Covariance (n, 2, 2) of the places of pixels that the calibration leaves, nan where they are not valid."""
         if self._moved is None:
             return None
-        places = np.empty((len(self._moved), len(pixels), 2))
-        for place, (lens, rotation, camera_m) in zip(places, self._moved, strict=True):
-            rays = lens.unproject(pixels)[0] @ rotation.T
-            with np.errstate(all='ignore'):  # what is not valid may be anything, and is left out
-                place[:] = ((height_m - camera_m[2]) / rays[:, 2])[:, None] * rays[:, :2] + camera_m[:2]
-            spread = _squares((places[0::2] - places[1::2]) / (2 * SHARE_OF_SIGMA))
+        with np.errstate(all='ignore'):  # what is not valid may be anything, and is left out
+            places = [((height_m - camera_m[2]) / rays[:, 2])[:, None] * rays[:, :2]
+                      for lens, rotation, camera_m in self._moved for rays in [lens.unproject(pixels)[0] @ rotation.T]]
+            sides = np.reshape(places, (len(places) // 2, 2, len(pixels), 2))
+            spread = _squares((sides[:, 0] - sides[:, 1]) / (2 * SHARE_OF_SIGMA))
         spread[~valid] = np.nan
         return spread
 

@@ -1,5 +1,15 @@
 """Tests run as the programs do: with one thread for linear algebra."""
 
+import pytest
+
 from autocalib_ros.threads import use_one_thread_for_linear_algebra
+from stored import quick_folder
 
 use_one_thread_for_linear_algebra()
+
+
+@pytest.fixture
+def quick_path():
+    """Yield a folder for files that are written again and again."""
+    with quick_folder() as folder:
+        yield folder

@@ -3,49 +3,38 @@
 from __future__ import annotations
 
 import concurrent.futures
-import threading
 import time
 import traceback
-from dataclasses import dataclass
 from typing import Any
 
-from geometry_msgs.msg import TransformStamped
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from rclpy.publisher import Publisher
 from rclpy.task import Future
-from sensor_msgs.msg import CameraInfo
 from std_srvs.srv import Trigger
 
 from autocalib_ros.calibration import Calibration, Refusal
 from autocalib_ros.calibrator import solve
-from autocalib_ros.camera_info import CameraInfo as CameraInfoFields
 from autocalib_ros.camera_info import camera_info, read_camera_info
 from autocalib_ros.errors import AutocalibError
 from autocalib_ros.perception.images import ImageDecoder
 from autocalib_ros.ros import messages
-from autocalib_ros.ros.headers import DEFAULT_FRAME, Headers
+from autocalib_ros.ros.driver_upload import DriverUpload
+from autocalib_ros.ros.headers import Headers
 from autocalib_ros.ros.image_input import ImageInput
+from autocalib_ros.ros.in_force import InForce, Published
+from autocalib_ros.ros.keeper import Keeper
 from autocalib_ros.ros.parameters import options_of
 from autocalib_ros.ros.pipeline import Pipeline, Result, Solve
-from autocalib_ros.ros.qos import LATCHED
-from autocalib_ros.ros.transforms import Transforms
 from autocalib_ros.ros.wording import described, described_progress
+from autocalib_ros.standing import CalibrationState, with_what_is_given
+from autocalib_ros.store import Store, Stored, path_of
 
 TELL_PROGRESS_S = 10.0
 REPEAT_S = 60.0
 """Real seconds between two lines of progress, and before an unchanged complaint is repeated."""
 CLOSE_S = 4.0
 """Launch kills a node 5 s after the interrupt: by then it should have ended by itself."""
-
-
-@dataclass(frozen=True)
-class Published:
-    """The calibration in force, with the fields that each image's camera_info repeats."""
-
-    result: Calibration
-    fields: CameraInfoFields
 
 
 class AutocalibNode(Node):
@@ -55,83 +44,150 @@ class AutocalibNode(Node):
         super().__init__('autocalib', automatically_declare_parameters_from_overrides=True, **node_arguments)
         self.options, self.node_options = options_of(self)
         lens_file = self.node_options.camera_info_file
-        lens = read_camera_info(lens_file) if lens_file else None
-        if lens is not None:
-            camera_info(lens, self.options.distortion_model)  # a model that cannot say it is wrong usage at once
+        self._lens = read_camera_info(lens_file) if lens_file else None
+        if self._lens is not None:
+            camera_info(self._lens, self.options.distortion_model)  # a model that cannot say it is wrong usage at once
         self._headers = Headers(self.node_options, self.get_namespace(), self.get_logger().warning,
                                 lambda: self.get_clock().now().nanoseconds)
-        self._lock = threading.Lock()
-        self._published: Published | None = None
-        self._frame_id = ''
-        self._image_size: tuple[int, int] | None = None
         self._said: dict[str, float] = {}
-        self._camera_info = self.create_publisher(CameraInfo, '~/camera_info', LATCHED)
-        self._transforms = Transforms(self, tf_parent=self.options.tf_parent, publish_tf=self.node_options.publish_tf)
+        self._store = self._store_of('')
+        self.keeper = Keeper(lambda fault: self.get_logger().error(f'the calibration was not saved: {fault}'))
+        self._upload = DriverUpload(self, self._say) if self.node_options.upload_to_driver else None
+        self.in_force = InForce(self, self.options, self.node_options, self._headers,
+                                taken=self._hand_on, withdrawn=self._hold_back)
         self._pipeline = Pipeline(self.options, idle_solve_s=self.node_options.idle_solve_s,
-                                  decode=ImageDecoder().decode, solve=solve, listener=self, lens=lens)
-        # While a caller waits for its solution, everything outside this group goes on.
-        self.create_service(Trigger, '~/calibrate', self._on_calibrate, callback_group=MutuallyExclusiveCallbackGroup())
+                                  decode=ImageDecoder().decode, solve=solve, listener=self, lens=self._lens)
+        if self._store is not None:
+            self._restore(self._store)
+        # While a caller waits for a solution or a disk, everything outside its group goes on.
+        for name, answer in (('calibrate', self._on_calibrate), ('save', self._on_save), ('reset', self._on_reset)):
+            self.create_service(Trigger, f'~/{name}', answer, callback_group=MutuallyExclusiveCallbackGroup())
         self._input = ImageInput(self, self.node_options, self._on_image)
         self.create_timer(TELL_PROGRESS_S, self._tell_progress, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self.get_logger().info(f'waiting for images on {self._input.topic}')
 
     def close(self) -> None:
         """Stop the threads; to be called once before the node is destroyed."""
-        if not self._pipeline.close(CLOSE_S):
+        deadline = time.monotonic() + CLOSE_S
+        if not self.keeper.close(CLOSE_S / 2):
+            self.get_logger().warning('a calibration was still being written at shutdown and is abandoned')
+        if not self._pipeline.close(deadline - time.monotonic()):
             self.get_logger().warning('a solution was still running at shutdown and is abandoned')
         self.get_logger().info(f'shut down: {self._pipeline.counters}')
 
     def _on_image(self, message: Any) -> None:
         """Keep the image for the perception thread and give it its camera_info; nothing here takes long."""
         frame_id = self._headers.frame_id(message.header.frame_id)
-        if frame_id != self._frame_id:
-            self._frame_id = frame_id
-            self._transforms.expect(self._headers.ground_frame(frame_id), self._headers.camera_frame(frame_id))
         self._pipeline.offer(self._headers.stamp_ns(message.header.stamp), message)
-        if self.node_options.camera_info_mode == 'per_image':
-            with self._lock:
-                published = self._published
-                if published is not None and _same_size(message, published.fields):
-                    self._publish(self._camera_info, messages.camera_info_message(
-                        published.fields, message.header.stamp, frame_id))
+        foreign = self.in_force.image_came(message, frame_id)
+        if foreign is not None:
+            self.get_logger().warning(f"the restored calibration is of the frame '{foreign.image_frame}', and images "
+                                      f"are of '{frame_id}': it is withdrawn and collecting goes on")
+        if self._store is None:
+            store = self._store = self._store_of(frame_id)
+            self.keeper.run(lambda: self._restore(store))
 
     async def _on_calibrate(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if not self._pipeline.counters.used:
             response.success, response.message = False, f'no image yet on {self._input.topic}'
             return response
-        result = await self._solution()
+        result = await self._awaited(self._pipeline.solve_now())
         response.success = isinstance(result, Calibration)
-        response.message = 'no solution: see the log of the node' if result is None else described(result)
+        response.message = ('no solution: a reset came in between, no image came since it, or see the log of the node'
+                            if result is None else described(result))
         return response
 
-    def _solution(self) -> Future:
-        """Return a solution of what is there now, to be awaited; the solver thread wakes the executor for it."""
-        executor = self.executor
-        solution = Future(executor=executor)
+    async def _on_save(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        published, state, store = self.in_force.published, self.in_force.state, self._store
+        if published is None or store is None:
+            response.success = False
+            response.message = f'nothing to save: no calibration yet; {described_progress(self._pipeline.progress)}'
+            return response
+        stored = self._stored(published)
+        error = await self._awaited(self.keeper.run(lambda: store.save(stored, replace_foreign=True)))
+        if error is None and self.in_force.published is published:
+            self.keeper.withdraw()  # the same would be written once more
+        response.success = error is None
+        response.message = (f'not saved: {error}' if error else
+                            f'saved the {state.value} calibration to {store.path} and {store.beside}')
+        return response
 
-        def hand_over(solved: concurrent.futures.Future) -> None:
-            solution.set_result(solved.result())
+    def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Forget the evidence and withdraw the calibration; what is stored stays until the next is saved."""
+        self._pipeline.reset()
+        was = self.in_force.withdraw()
+        response.success = True
+        response.message = 'the evidence is forgotten' + (
+            '' if was is CalibrationState.NONE else f', the {was.value} calibration is withdrawn') + (
+            '; collecting starts anew')
+        self.get_logger().info(f'reset: {response.message}')
+        return response
+
+    def _awaited(self, running: concurrent.futures.Future) -> Future:
+        """Return what another thread works out, to be awaited; that thread wakes the executor for it."""
+        executor = self.executor
+        awaited = Future(executor=executor)
+
+        def hand_over(done: concurrent.futures.Future) -> None:
+            awaited.set_result(done.result())
             if executor is not None:
                 executor.wake()
 
-        self._pipeline.solve_now().add_done_callback(hand_over)
-        return solution
+        running.add_done_callback(hand_over)
+        return awaited
 
     def _tell_progress(self) -> None:
-        if self._published is None and self._pipeline.counters.used:
+        if (self.in_force.state in (CalibrationState.NONE, CalibrationState.RESTORED)
+                and self._pipeline.counters.used):
             self.get_logger().info(described_progress(self._pipeline.progress))
+
+    def _store_of(self, image_frame: str) -> Store | None:
+        """Return where the calibration is kept; None while that is named after a frame that is not known yet."""
+        url, name = self.node_options.camera_info_url, self._headers.camera_name(image_frame)
+        path = path_of(url, name or 'camera')
+        return Store(path) if name or path == path_of(url, 'another') else None
+
+    def _restore(self, store: Store) -> None:
+        """Publish what an earlier run kept, as not yet verified."""
+        store.tidy()
+        found = store.load()
+        self._say(found.note, good=False)
+        if found.stored is None:
+            self.get_logger().info(f'no stored calibration at {store.path}')
+            return
+        try:
+            restored = with_what_is_given(found.stored.calibration, self.options, self._lens)
+            self.in_force.restore(restored, found.stored.image_frame)
+        except AutocalibError as error:
+            self.get_logger().warning(f'the calibration of {store.path} is not restored: {error}')
+            return
+        self.get_logger().info(f'restored from {store.path}, not yet verified: {described(restored)}')
+
+    def _stored(self, published: Published) -> Stored:
+        return Stored(published.result, published.fields, self._headers.camera_name(published.image_frame),
+                      published.image_frame)
+
+    def _hand_on(self, published: Published, save: bool) -> None:
+        """Give a calibration that this run's traffic vouches for to the store and the driver, where that is wanted."""
+        if save and self.node_options.autosave and self._store is not None:
+            self.keeper.offer(self._store, self._stored(published))
+        if self._upload is not None:
+            self._upload.offer(messages.validated(published.camera_info))
+
+    def _hold_back(self) -> None:
+        """Keep what is withdrawn from the store and the driver, where it has not gone there yet."""
+        self.keeper.withdraw()
+        if self._upload is not None:
+            self._upload.withdraw()
 
     def image_taken(self, width: int, height: int) -> None:
         """Withdraw the calibration of another image size: the lens was calibrated in its pixels."""
-        with self._lock:
-            self._image_size = (width, height)
-            published = self._published
-            if published is None or published.result.evidence.image_size == self._image_size:
-                return
-            self._published = None
-        old_width, old_height = published.result.evidence.image_size
-        self.get_logger().warning(f'the image size changed from {old_width}x{old_height} to {width}x{height}: '
-                                  'the calibration is withdrawn and collecting starts anew')
+        withdrawn = self.in_force.image_decoded(width, height)
+        if withdrawn is not None:
+            state, published = withdrawn
+            old_width, old_height = published.result.evidence.image_size
+            self.get_logger().warning(f'the {state.value} calibration is of images of {old_width}x{old_height}, these '
+                                      f'have {width}x{height}: it is withdrawn and collecting starts anew')
 
     def image_unreadable(self, error: AutocalibError) -> None:
         """Log an image that could not be used."""
@@ -142,44 +198,24 @@ class AutocalibNode(Node):
         self._say_seldom(f'fault {type(error).__name__}', ''.join(traceback.format_exception(error)).rstrip())
 
     def solved(self, result: Result) -> None:
-        """Publish a calibration; after a refusal, or a lens without the plane that is known, the one before stays."""
+        """Publish a calibration, unless what is in force tells more; a refusal changes nothing."""
         if isinstance(result, Refusal):
             self._say_seldom(f'refusal {result.code}', described(result), error=False)
             return
-        if self._loses_plane(result):
-            self._say_seldom('plane', f'the calibration before stays, as this one has no ground plane:'
-                             f' {described(result)}', error=False)
+        decision = self.in_force.solved(result)
+        if decision is None:
             return
-        fields = result.camera_info
-        transform = self._transform_of(result)
-        with self._lock:
-            if self._image_size not in (None, result.evidence.image_size):
-                return
-            self._publish(self._camera_info, messages.camera_info_message(
-                fields, messages.time_message(result.newest_stamp_ns), self._frame_id or DEFAULT_FRAME))
-            if transform is not None:
-                self._transforms.publish(transform)
-            self._published = Published(result, fields)
         self._said = {}
+        self._say(decision.words, good=not decision.contradicted)
         self.get_logger().info(described(result))
 
-    def _loses_plane(self, result: Calibration) -> bool:
-        """Say whether consumers would go on to use a ground plane in force with a lens that it does not belong to."""
-        published = self._published
-        return result.ground is None and published is not None and published.result.ground is not None
-
-    def _transform_of(self, result: Calibration) -> TransformStamped | None:
-        """Return the message of the ground plane, unless its scale is made up and nobody allowed that."""
-        ground, image_frame = result.ground, self._frame_id or DEFAULT_FRAME
-        if ground is None or not (ground.metric or self.options.allow_unit_scale):
-            return None
-        return messages.ground_transform_message(
-            ground, messages.time_message(result.newest_stamp_ns), self._headers.ground_frame(image_frame),
-            self._headers.camera_frame(image_frame), self.options.tf_parent)
-
-    @staticmethod
-    def _publish(publisher: Publisher, message: Any) -> None:
-        publisher.publish(messages.validated(message))
+    def _say(self, text: str, *, good: bool) -> None:
+        """Log a line as information or as a warning; '' is nothing to say."""
+        # rclpy allows one severity for each place in the code.
+        if text and good:
+            self.get_logger().info(text)
+        elif text:
+            self.get_logger().warning(text)
 
     def _say_seldom(self, topic: str, text: str, *, error: bool = True) -> None:
         """Log a line unless the same was said less than REPEAT_S ago."""
@@ -192,8 +228,3 @@ class AutocalibNode(Node):
             self.get_logger().error(text)
         else:
             self.get_logger().warning(text)
-
-
-def _same_size(message: Any, fields: CameraInfoFields) -> bool:
-    """Say whether the calibration is of this image's size; a compressed image does not tell."""
-    return not hasattr(message, 'width') or (message.width, message.height) == (fields.width, fields.height)

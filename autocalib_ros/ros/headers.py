@@ -43,7 +43,10 @@ class Headers:
         return self._options.camera_frame.lstrip('/') or image_frame
 
     def camera_name(self, image_frame: str) -> str:
-        """Return the camera's name in letters, digits and _, as camera_info_manager wants it."""
+        """Return the camera's name in letters, digits and _, as camera_info_manager wants it.
+
+        '' when it is named after a frame that is not known yet.
+        """
         return re.sub(r'[^A-Za-z0-9_]', '_', self._options.camera_name or self._namespace or image_frame)
 
     def ground_frame(self, image_frame: str) -> str:

@@ -76,6 +76,8 @@ class Counters:
 @dataclass
 class _Job:
     evidence: Evidence
+    life: int
+    """Number of resets before the evidence was gathered."""
     waiting: list[Future] = field(default_factory=list)
     """Callers of the service, who get the result of this snapshot or of a newer one that replaced it."""
 
@@ -94,6 +96,8 @@ class Pipeline:
         self._job: _Job | None = None
         self._running: _Job | None = None
         self._closed = False
+        self._life, self._calibrator_life = 0, 0
+        self._telling = threading.Lock()
         self._unsolved = 0
         self._arrived = time.monotonic()
         self._looked = -PROGRESS_PERIOD_S
@@ -125,19 +129,40 @@ class Pipeline:
                 self._changed.notify_all()
         return future
 
+    def reset(self) -> None:
+        """Forget all evidence; once this returns the listener hears of no solution that rests on any of it.
+
+        Not to be called by the listener. A solution that runs cannot be interrupted; its result is dropped, and
+        its callers get None.
+        """
+        with self._telling, self._changed:
+            self._life += 1
+            self._images.clear()
+            self._unsolved = 0
+            waiting = self._take_waiting()
+            self.progress, self._refused = None, ''
+            self._changed.notify_all()
+        self._answer(waiting, None)
+
     def close(self, timeout_s: float) -> bool:
         """Stop both threads and say whether they ended in time: a solution that runs cannot be interrupted."""
         with self._changed:
             self._closed = True
-            for job in (self._job, self._running):
-                self._requests += job.waiting if job else []
-            waiting, self._requests, self._job = self._requests, [], None
+            waiting = self._take_waiting()
             self._changed.notify_all()
         self._answer(waiting, None)
         deadline = time.monotonic() + timeout_s
         for thread in self._threads:
             thread.join(max(0.0, deadline - time.monotonic()))
         return not any(thread.is_alive() for thread in self._threads)
+
+    def _take_waiting(self) -> list[Future]:
+        """Drop what waits to be solved, and return who waits for that or for the solution that runs."""
+        waiting = self._requests
+        for job in (self._job, self._running):
+            waiting += job.waiting if job else []
+        self._requests, self._job = [], None
+        return waiting
 
     def _perceive(self) -> None:
         """Run the perception thread: the only one that touches the calibrator."""
@@ -146,11 +171,14 @@ class Pipeline:
                 self._changed.wait_for(lambda: self._closed or self._images or self._requests, self._until_idle())
                 if self._closed:
                     return
+                life = self._life
                 image = self._images.popleft() if self._images else None
                 requests: list[Future] = []
                 # a caller means all that has come so far, but does not wait for a queue that never empties
                 if len(self._images) in (0, WAITING_IMAGES - 1):
                     requests, self._requests = self._requests, []
+            if life != self._calibrator_life:
+                self._calibrator, self._calibrator_life = AutoCalibrator(self._options), life
             if image is not None:
                 self._use(*image)
             if requests or (image is None and self._until_idle() == 0.0):
@@ -177,22 +205,25 @@ class Pipeline:
             self._listener.failed(error)
             return
         self.counters.used += 1
-        self._unsolved += 1
+        with self._changed:
+            self._unsolved += self._life == self._calibrator_life
         self._listener.image_taken(width, height)
         evidence = self._guarded(self._calibrator.take_due)
         if evidence is not None:
             self._submit(evidence, [])
         if time.monotonic() >= self._looked + PROGRESS_PERIOD_S:
             self._looked = time.monotonic()
-            self.progress = self._with_refusal(self._guarded(self._calibrator.progress))
+            progress = self._with_refusal(self._guarded(self._calibrator.progress))
+            with self._changed:
+                self.progress = progress if self._life == self._calibrator_life else None
 
     def _submit(self, evidence: Evidence | None, requests: list[Future]) -> None:
         """Leave a snapshot for the solver thread; it takes the place, and the callers, of one still waiting."""
-        self._unsolved = 0
         with self._changed:
-            if evidence is not None and not self._closed:
+            self._unsolved = 0
+            if evidence is not None and not self._closed and self._life == self._calibrator_life:
                 waiting = self._job.waiting if self._job else []
-                self._job = _Job(evidence, [*waiting, *requests])
+                self._job = _Job(evidence, self._life, [*waiting, *requests])
                 self._changed.notify_all()
                 return
         self._answer(requests, None)
@@ -208,13 +239,20 @@ class Pipeline:
                 self._job = None
             result = self._guarded(partial(self._solved, job.evidence))
             if result is not None:
-                self._guarded(partial(self._listener.solved, result))
+                result = self._told(result, job.life)
             self._answer(job.waiting, result)
 
     def _solved(self, evidence: Evidence) -> Result:
-        result = self._solve(evidence, self._options, lens=self._fitting(evidence.image_size))
-        self._refused = result.message if isinstance(result, Refusal) else ''
-        return result
+        return self._solve(evidence, self._options, lens=self._fitting(evidence.image_size))
+
+    def _told(self, result: Result, life: int) -> Result | None:
+        """Tell the listener, unless a reset came before."""
+        with self._telling:
+            if life != self._life:
+                return None
+            self._refused = result.message if isinstance(result, Refusal) else ''
+            self._guarded(partial(self._listener.solved, result))
+            return result
 
     def _with_refusal(self, progress: Progress | None) -> Progress | None:
         """Add why the last solution was refused: evidence may be enough to try and not to succeed."""

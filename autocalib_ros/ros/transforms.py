@@ -74,11 +74,16 @@ class Transforms:
             self._join(message.header.frame_id, message.child_frame_id)
             self._broadcast()
 
-    def withdraw(self) -> None:
-        """Leave nothing on /tf_static for those who come late; who has the transform keeps it."""
+    def forget(self) -> None:
+        """Leave nothing for those who come late; who has the transform keeps it. In the executor's thread.
+
+        A latched message goes with its publisher.
+        """
         with self._lock:
             self._latest = None
             self._clear()
+            self._node.destroy_publisher(self._ground_transform)
+            self._ground_transform = self._node.create_publisher(TransformStamped, '~/ground_transform', LATCHED)
 
     def _settle(self) -> None:
         self._timer.cancel()

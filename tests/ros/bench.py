@@ -99,17 +99,32 @@ class Bench:
         """Wait until the client's own subscription has found its publisher."""
         wait_for(lambda: self.client.count_publishers(topic) > 0, f'a publisher of {topic}')
 
-    def ask_calibrate(self):
-        """Call ~/calibrate and return the future of its answer."""
-        trigger = self.client.create_client(Trigger, '/autocalib/calibrate')
+    def asked(self, service: str, node: str = '/autocalib'):
+        """Call a service of a node and return the future of its answer."""
+        trigger = self.client.create_client(Trigger, f'{node}/{service}')
         assert trigger.wait_for_service(PATIENCE_S)
         return trigger.call_async(Trigger.Request())
 
+    def ask(self, service: str, node: str = '/autocalib') -> Trigger.Response:
+        """Call a service of a node and wait for its answer."""
+        answer = self.asked(service, node)
+        wait_for(answer.done, f'the answer of ~/{service}')
+        return answer.result()
+
+    def ask_calibrate(self):
+        """Call ~/calibrate and return the future of its answer."""
+        return self.asked('calibrate')
+
     def calibrate(self) -> Trigger.Response:
         """Call ~/calibrate and wait for its answer."""
-        answer = self.ask_calibrate()
-        wait_for(answer.done, 'the answer of ~/calibrate')
-        return answer.result()
+        return self.ask('calibrate')
+
+    def stop(self, node: AutocalibNode) -> None:
+        """End one node."""
+        self.executor.remove_node(node)
+        self.nodes.remove(node)
+        node.close()
+        node.destroy_node()
 
     def close(self):
         self.executor.shutdown(timeout_sec=5.0)

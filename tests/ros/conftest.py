@@ -24,6 +24,13 @@ def pytest_pycollect_makemodule(module_path, parent):
     return None if HAS_ROS else WithoutRos.from_parent(parent, path=module_path)
 
 
+@pytest.fixture(autouse=True)
+def ros_home(quick_path, monkeypatch):
+    """Keep the calibrations of a test's nodes in a folder of its own."""
+    monkeypatch.setenv('ROS_HOME', str(quick_path))
+    return quick_path
+
+
 @pytest.fixture
 def bench():
     """Yield a running executor to put nodes on, with a client node beside them."""

@@ -97,7 +97,7 @@ def test_camera_info_holds_the_lens(bench):
     node, _ = calibrated(bench)
     infos = bench.collect(CameraInfo, INFO, latched=True)
     info = wait_for(lambda: infos, 'camera_info')[0]
-    fields = camera_info(node._published.result.camera)
+    fields = camera_info(node.in_force.published.result.camera)
     assert (info.width, info.height, info.distortion_model) == (*SIZE, 'equidistant')
     assert [list(info.k), list(info.d), list(info.r), list(info.p)] == [fields.k, fields.d, fields.r, fields.p]
 
@@ -151,7 +151,7 @@ def test_images_services_and_parameters_do_not_wait_for_a_solution(bench):
     assert not answer.done()
     release.set()
     wait_for(answer.done, 'the solution')
-    assert node._published.result.camera.focal_px == 400.0
+    assert node.in_force.published.result.camera.focal_px == 400.0
 
 
 def test_a_lens_without_plane_does_not_replace_one_with_its_plane(bench):
@@ -191,7 +191,7 @@ def test_refusal_keeps_the_calibration_before(bench):
     bench.listening(INFO)
     assert not bench.calibrate().success
     publish_until(publisher, lambda: infos, 'camera_info after a refusal')
-    assert node._published.result.camera.focal_px == 300.0
+    assert node.in_force.published.result.camera.focal_px == 300.0
 
 
 def test_new_calibration_replaces_the_latched_one(bench):
@@ -227,7 +227,7 @@ def test_driver_without_stamp_and_frame_is_served(bench):
     publish_until(publisher, lambda: infos and not stamp_ns(infos[-1].header.stamp), 'camera_info of an image',
                   lambda stamp: image(0, frame_id=''))
     assert infos[-1].header.frame_id == 'camera_optical_frame'
-    assert node._published.result.evidence.frames >= 1
+    assert node.in_force.published.result.evidence.frames >= 1
 
 
 def test_image_that_cannot_be_decoded_does_not_stop_the_stream(bench):
@@ -254,7 +254,7 @@ def test_calibration_of_another_image_size_is_withdrawn(bench):
     node, publisher = calibrated(bench)
     infos = bench.collect(CameraInfo, INFO)
     bench.listening(INFO)
-    publish_until(publisher, lambda: node._published is None, 'the withdrawal',
+    publish_until(publisher, lambda: node.in_force.published is None, 'the withdrawal',
                   lambda stamp: image(stamp, size=(160, 120)))
     assert not infos
 
@@ -262,14 +262,14 @@ def test_calibration_of_another_image_size_is_withdrawn(bench):
 def test_solution_is_tried_when_the_images_end(bench):
     node = bench.start(instantly, camera_height=8.0, idle_solve_s=0.5)
     publish_until(bench.connected(bench.publisher()), lambda: used(node), 'an image')
-    wait_for(lambda: node._published, 'a calibration that nobody asked for')
+    wait_for(lambda: node.in_force.published, 'a calibration that nobody asked for')
 
 
 def test_known_lens_is_read_and_given_to_the_solver_in_the_size_of_the_images(bench, tmp_path):
     write_camera_info_yaml(tmp_path / 'lens.yaml', Camera.equidistant(2 * SIZE[0], 2 * SIZE[1], 512.0), 'cam')
     node, _ = calibrated(bench, lambda evidence, options, lens: replace(calibration(evidence), camera=lens),
                          camera_info_file=str(tmp_path / 'lens.yaml'))
-    assert node._published.result.camera == Camera.equidistant(*SIZE, 256.0)
+    assert node.in_force.published.result.camera == Camera.equidistant(*SIZE, 256.0)
 
 
 def test_solver_gets_no_lens_unless_one_is_given(bench):
@@ -307,4 +307,4 @@ def test_lens_that_the_asked_model_cannot_say_is_refused_and_nothing_is_publishe
     answer = bench.calibrate()
     assert not answer.success
     assert answer.message.startswith('refused (distortion_model): plumb_bob would be off by up to')
-    assert node._published is None
+    assert node.in_force.published is None

@@ -227,3 +227,77 @@ def test_close_sends_callers_away_and_says_that_a_solution_still_runs(start, hea
 
 def test_close_ends_idle_threads(start):
     assert start(calibration).close(PATIENCE_S)
+
+
+def test_reset_starts_the_evidence_anew(start, heard):
+    pipeline = start(calibration)
+    feed(pipeline, heard, 5)
+    pipeline.reset()
+    assert result_of(pipeline.solve_now()) is None
+    feed(pipeline, heard, 2, first=5)
+    assert result_of(pipeline.solve_now()).evidence.frames == 2
+
+
+def test_solution_that_runs_during_a_reset_is_not_told_and_its_callers_do_not_wait(start, heard):
+    running, release = threading.Event(), threading.Event()
+
+    def slow(evidence):
+        running.set()
+        release.wait(PATIENCE_S)
+        return calibration(evidence)
+
+    pipeline = start(slow)
+    feed(pipeline, heard, 3)
+    answer = pipeline.solve_now()
+    assert running.wait(PATIENCE_S)
+    pipeline.reset()
+    assert result_of(answer) is None
+    feed(pipeline, heard, 1, first=3)
+    release.set()
+    assert result_of(pipeline.solve_now()).evidence.frames == 1
+    assert [result.evidence.frames for result in heard.results] == [1]
+
+
+def test_image_that_is_looked_at_during_a_reset_is_no_evidence_after_it(start, heard):
+    pipeline = start(calibration, idle_solve_s=0.1)
+    entered, release = threading.Event(), threading.Event()
+    pipeline._decode = lambda message: (entered.set(), release.wait(PATIENCE_S), message)[2]
+    pipeline.offer(0, PIXELS)
+    assert entered.wait(PATIENCE_S)
+    pipeline.offer(FRAME_NS, PIXELS)
+    pipeline.reset()
+    release.set()
+    wait_for(lambda: heard.sizes, 'the image')
+    assert result_of(pipeline.solve_now()) is None
+    feed(pipeline, heard, 1, first=1)
+    assert result_of(pipeline.solve_now()).evidence.frames == 1
+    assert [result.evidence.frames for result in heard.results] == [1]
+
+
+def test_reset_returns_when_nothing_is_told_any_more(start, heard, monkeypatch):
+    telling, release = threading.Event(), threading.Event()
+    monkeypatch.setattr(heard, 'solved', lambda result: (telling.set(), release.wait(PATIENCE_S),
+                                                         heard.results.append(result)))
+    pipeline = start(calibration)
+    feed(pipeline, heard, 1)
+    pipeline.solve_now()
+    assert telling.wait(PATIENCE_S)
+    resetting = threading.Thread(target=pipeline.reset)
+    resetting.start()
+    assert not threading.Event().wait(0.1) and resetting.is_alive()
+    release.set()
+    resetting.join(PATIENCE_S)
+    assert len(heard.results) == 1
+
+
+def test_progress_of_before_a_reset_is_forgotten(start, heard, monkeypatch):
+    monkeypatch.setattr('autocalib_ros.ros.pipeline.PROGRESS_PERIOD_S', 0.0)
+    pipeline = start(refusal)
+    feed(pipeline, heard, 1)
+    result_of(pipeline.solve_now())
+    wait_for(lambda: pipeline.progress, 'the progress')
+    pipeline.reset()
+    assert pipeline.progress is None
+    feed(pipeline, heard, 1, first=1)
+    wait_for(lambda: pipeline.progress, 'the progress')
+    assert '12 tracks of the 40 needed.' not in pipeline.progress.missing

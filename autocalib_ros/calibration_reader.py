@@ -1,0 +1,128 @@
+"""Reads calibration.json back, to the last bit: what is written again is the same text."""
+
+from __future__ import annotations
+
+import json
+import reprlib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+
+from autocalib_ros.calibration import (
+    COVARIANCE_OF,
+    JSON_VERSION,
+    Calibration,
+    EvidenceSummary,
+    GroundPlane,
+    PaperReport,
+    Reason,
+    StandardDeviations,
+)
+from autocalib_ros.camera import Camera
+from autocalib_ros.errors import AutocalibError, InputError
+
+MAX_BYTES = 1_000_000
+"""A calibration takes a few thousand bytes."""
+ROTATION_TOLERANCE = 1e-6
+"""How far the columns of a rotation may be from unit length and right angles."""
+
+
+def read_json(path: Path) -> Mapping[str, Any]:
+    """Return the document in a file; InputError where it is not there, too long, or no JSON object."""
+    try:
+        with path.open('rb') as stream:
+            text = stream.read(MAX_BYTES + 1)
+    except OSError as error:
+        raise InputError(f'cannot read {path}: {error.strerror or error}') from error
+    if len(text) > MAX_BYTES:
+        raise InputError(f'{path}: it is longer than {MAX_BYTES} bytes, so it is no calibration')
+    try:
+        document = json.loads(text, parse_constant=_no_number)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f'{path}: it is not JSON ({error})') from error
+    if not isinstance(document, Mapping):
+        raise InputError(f'{path}: it holds no names with values')
+    return document
+
+
+def calibration_of(document: Mapping[str, Any]) -> Calibration:
+    """Return the calibration of a document of calibration.json; InputError says what is wrong with it."""
+    if document.get('version') != JSON_VERSION:
+        raise InputError(f'its version is {reprlib.repr(document.get("version"))}, and only {JSON_VERSION} is read')
+    if document.get('state') != 'calibrated':
+        raise InputError(f'its state is {reprlib.repr(document.get("state"))}: it holds no calibration')
+    try:
+        return _calibration(document)
+    except AutocalibError as error:
+        raise InputError(str(error)) from error
+    except (KeyError, TypeError, ValueError, IndexError, OverflowError, AttributeError) as error:
+        raise InputError(f'it is no whole calibration.json ({type(error).__name__}: {error})') from error
+
+
+def _calibration(document: Mapping[str, Any]) -> Calibration:
+    width, height = _numbers(document['image_size'], int, 2)
+    lens, evidence, paper = document['camera'], document['evidence'], document['paper']
+    camera = Camera(width, height, float(lens['focal_px']), _numbers(lens['principal_point_px'], float, 2),
+                    _numbers(lens['k'], float, 4))
+    grade, pose, reason = str(document['grade']), document['ground_from_camera'], document['refusal']
+    return Calibration(
+        method=str(document['method']), grade=grade, assumptions=tuple(map(str, document['assumptions'])),
+        checks=tuple(map(str, document['checks'])), camera=camera,
+        ground=None if pose is None else _ground(pose, metric=grade != 'unit_scale'),
+        ground_refusal=None if reason is None else Reason(*(str(reason[name]) for name in Reason.__dataclass_fields__)),
+        road_directions=np.array(document['road_directions_in_camera'], float).reshape(-1, 3),
+        stddev=_deviations(document['stddev']), paper=None if paper is None else _paper(paper),
+        evidence=EvidenceSummary(
+            image_size=(width, height), seconds=float(evidence['seconds']), frames=int(evidence['frames']),
+            tracks=int(evidence['tracks']), segments=int(evidence['segments']), vehicles=int(evidence['vehicles']),
+            coverage=float(evidence['coverage'])),
+        newest_stamp_ns=int(document['newest_stamp_ns']), covariance=_covariance(document.get('covariance')))
+
+
+def _ground(pose: Mapping[str, Any], *, metric: bool) -> GroundPlane:
+    rotation = np.array(pose['rotation'], float).reshape(3, 3)
+    height = _numbers(pose['translation_m'], float, 3)[2]
+    if not np.abs(rotation @ rotation.T - np.eye(3)).max() <= ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
+        raise InputError('its rotation is none: its rows are not of unit length at right angles')
+    if not 0 < height < np.inf:
+        raise InputError(f'its camera is {height:g} above the road')
+    return GroundPlane(rotation, height, metric)
+
+
+def _deviations(sigma: Mapping[str, Any]) -> StandardDeviations:
+    point = sigma['principal_point_px']
+    return StandardDeviations(
+        **{name: _known(sigma[name]) for name in ('focal_px', 'k1', 'k2', 'tilt_deg', 'roll_deg', 'height_m')},
+        principal_point_px=None if point is None else _numbers(point, float, 2),
+        ground_point_m=tuple(_known(value) for value in sigma['ground_point_m'].values()))
+
+
+def _covariance(told: Mapping[str, Any] | None) -> np.ndarray | None:
+    if told is None or told['of'] != list(COVARIANCE_OF):
+        return None
+    return np.array(told['matrix'], float).reshape(2 * (len(COVARIANCE_OF),))
+
+
+def _paper(paper: Mapping[str, Any]) -> PaperReport:
+    straightness, translation = paper['straightness_px2'], paper['translation_m']
+    return PaperReport(
+        focal_px=float(paper['focal_px']), polynomial_k=_numbers(paper['polynomial_k'], float, 3),
+        straightness_px2=(float(straightness['before']), float(straightness['after'])),
+        focal_from_vanishing_points_px=_known(paper['focal_from_vanishing_points_px']),
+        translation_m=None if translation is None else _numbers(translation, float, 3))
+
+
+def _known(value: Any) -> float | None:
+    return None if value is None else float(value)
+
+
+def _numbers(values: Any, kind: Callable[[Any], Any], count: int) -> tuple[Any, ...]:
+    if not isinstance(values, list) or len(values) != count:
+        raise ValueError(f'{reprlib.repr(values)} are not {count} numbers')
+    return tuple(kind(value) for value in values)
+
+
+def _no_number(name: str) -> NoReturn:
+    raise ValueError(f'{name} is no number')

@@ -1,0 +1,204 @@
+"""What a calibration in force stands on, and what a new solution makes of it.
+
+A calibration that was kept from an earlier run is published at once, but vouched for by nobody until the traffic
+of this run gives a solution of its own. Both are compared in units of their stated standard deviations.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from enum import Enum
+
+import numpy as np
+
+from autocalib_ros.calibration import Calibration, GroundPlane, StandardDeviations
+from autocalib_ros.camera import Camera
+from autocalib_ros.config import Options
+from autocalib_ros.errors import UsageError
+from autocalib_ros.estimation.ground_plane import tilt_and_roll_deg
+from autocalib_ros.estimation.scale import Scale, known_scale
+
+AGREES_SIGMAS = 3.0
+"""Two solutions of one camera are farther apart than this in one number out of 400."""
+SAME_LENS_PX = 0.5
+"""Two lenses that image every direction closer together than this serve every consumer alike."""
+SAME_HEIGHT = 1e-9
+"""Heights relatively closer than this are one number."""
+FIELD_SAMPLES = 17
+"""Rows and columns of pixels at which two lenses are compared."""
+GRADES = ('lens', 'unit_scale', 'assumed', 'full')
+"""From the least that a calibration gives to the most."""
+
+
+class CalibrationState(Enum):
+    """What the published calibration rests on."""
+
+    NONE = 'none'
+    """Nothing is published."""
+    RESTORED = 'restored'
+    """From an earlier run, not yet verified."""
+    VERIFIED = 'verified'
+    """From an earlier run, and the traffic of this one agrees."""
+    CALIBRATED = 'calibrated'
+    """Solved from the traffic of this run."""
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What is in force after a new solution, and why."""
+
+    state: CalibrationState
+    in_force: Calibration
+    words: str = ''
+    """For the log; '' where there is nothing to tell but the solution itself."""
+    contradicted: bool = False
+    """Whether the calibration before was wrong for this camera, all of it."""
+
+
+def decided(state: CalibrationState, before: Calibration | None, fresh: Calibration) -> Decision:
+    """Say what a new solution makes of the calibration in force.
+
+    One of this run is replaced by the newer, unless that has lost the plane. One of an earlier run is confirmed where
+    lens and plane agree; it then stays until a solution is as sure as itself. It is replaced where either does not
+    agree. A solution without a plane confirms the lens alone, which leaves the state as it was.
+    """
+    if before is None or state is CalibrationState.NONE:
+        return Decision(CalibrationState.CALIBRATED, fresh)
+    if state is CalibrationState.CALIBRATED:
+        # consumers would go on to use the plane that is latched, with a lens that it does not belong to
+        loses = before.ground is not None and fresh.ground is None
+        return Decision(state, before, 'the calibration before stays: the new one has no ground plane') if loses else (
+            Decision(state, fresh))
+    unlike = [*_unlike_lens(before, fresh), *_unlike_plane(before, fresh)]
+    if unlike:
+        told = ', '.join(filter(None, unlike))
+        return Decision(CalibrationState.CALIBRATED, fresh, contradicted=True, words=(
+            f'the restored calibration does not hold any more and is replaced: {told}' if told else 'the restored '
+            'calibration is replaced: without standard deviations nothing tells whether it still holds'))
+    if before.ground is not None and fresh.ground is None:
+        why = f': {fresh.ground_refusal.message}' if fresh.ground_refusal else ''
+        return Decision(state, before, f'the traffic confirms the restored lens; its ground plane is not verified{why}')
+    if _as_sure(fresh, before):
+        return Decision(CalibrationState.CALIBRATED, fresh, 'the restored calibration is confirmed, and replaced by '
+                        'one as sure')
+    return Decision(CalibrationState.VERIFIED, before, '' if state is CalibrationState.VERIFIED else
+                    'the traffic confirms the restored calibration, which is surer and stays in force')
+
+
+def _unlike_lens(before: Calibration, fresh: Calibration) -> list[str | None]:
+    """Name what differs beyond its deviations; None stands for what has none."""
+    if _distance_px(before.camera, fresh.camera) <= SAME_LENS_PX:
+        return []
+    return _unlike(_lens_numbers(before), _lens_numbers(fresh))
+
+
+def _unlike_plane(before: Calibration, fresh: Calibration) -> list[str | None]:
+    if before.ground is None or fresh.ground is None:
+        return []
+    if before.ground.metric != fresh.ground.metric:
+        return ['the ground plane is in metres' if fresh.ground.metric else 'the ground plane is not in metres']
+    return _unlike(_plane_numbers(before.ground, before.stddev), _plane_numbers(fresh.ground, fresh.stddev))
+
+
+@dataclass(frozen=True)
+class _Number:
+    name: str
+    value: float
+    sigma: float | None
+    unit: str = ''
+
+
+def _lens_numbers(result: Calibration) -> list[_Number]:
+    camera, sigma = result.camera, result.stddev
+    point = sigma.principal_point_px or (None, None)
+    return [_Number('focal length', camera.focal_px, sigma.focal_px, ' px'),
+            _Number('principal point x', camera.principal_point_px[0], point[0], ' px'),
+            _Number('principal point y', camera.principal_point_px[1], point[1], ' px'),
+            _Number('k1', camera.k[0], sigma.k1), _Number('k2', camera.k[1], sigma.k2)]
+
+
+def _plane_numbers(ground: GroundPlane, sigma: StandardDeviations) -> list[_Number]:
+    tilt, roll = tilt_and_roll_deg(ground.normal_in_camera)
+    # a height that was given has no deviation: it is exact
+    return [_Number('tilt', float(tilt), sigma.tilt_deg, ' deg'), _Number('roll', float(roll), sigma.roll_deg, ' deg'),
+            _Number('height', ground.height_m, sigma.height_m or 0.0, ' m')]
+
+
+def _unlike(before: list[_Number], fresh: list[_Number]) -> list[str | None]:
+    told: list[str | None] = []
+    for old, new in zip(before, fresh, strict=True):
+        apart = abs(new.value - old.value)
+        if apart <= SAME_HEIGHT * abs(old.value):
+            continue
+        if old.sigma is None or new.sigma is None:
+            told.append(None)
+        elif apart > AGREES_SIGMAS * math.hypot(old.sigma, new.sigma):
+            told.append(f'{old.name} {old.value:.4g} +- {old.sigma:.2g}{old.unit} was kept, {new.value:.4g} +- '
+                        f'{new.sigma:.2g}{new.unit} was found')
+    return told
+
+
+def _distance_px(before: Camera, fresh: Camera) -> float:
+    """Return how far apart at the most two lenses of one image size image the same direction, pixels."""
+    pixels = np.stack(np.meshgrid(np.linspace(0, before.width - 1, FIELD_SAMPLES),
+                                  np.linspace(0, before.height - 1, FIELD_SAMPLES)), axis=-1)
+    bearings, reached = before.unproject(pixels)
+    seen, valid = fresh.project(bearings)
+    apart = np.hypot(*np.moveaxis(seen - pixels, -1, 0))
+    return float(apart[reached & valid].max(initial=0.0)) if (reached & valid).any() else math.inf
+
+
+def _as_sure(fresh: Calibration, before: Calibration) -> bool:
+    """Whether a solution gives as much as the other, as surely, or a ground plane where that has none."""
+    if before.ground is None and fresh.ground is not None:
+        return True
+    sigmas = [(fresh.stddev.focal_px, before.stddev.focal_px)]
+    if before.ground is not None:
+        sigmas += [(fresh.stddev.tilt_deg, before.stddev.tilt_deg), (fresh.stddev.roll_deg, before.stddev.roll_deg)]
+    return (_rank(fresh.grade) >= _rank(before.grade)
+            and all(_or_none(new) <= _or_none(old) for new, old in sigmas))
+
+
+def _or_none(sigma: float | None) -> float:
+    return math.inf if sigma is None else sigma
+
+
+def _rank(grade: str) -> int:
+    return GRADES.index(grade) if grade in GRADES else -1
+
+
+def with_what_is_given(kept: Calibration, options: Options, lens: Camera | None) -> Calibration:
+    """Return a kept calibration under the options of today; UsageError where it does not fit them.
+
+    The plane takes the scale that is given now, where that needs no traffic; otherwise it keeps its own. A lens
+    that is given now has to be the kept one.
+    """
+    form = {'distortion_model': options.distortion_model, 'rectified_balance': options.rectified_balance}
+    if any(getattr(kept, name) != value for name, value in form.items()):
+        kept = replace(kept, **form)
+    size = kept.evidence.image_size
+    if lens is not None and _distance_px(lens.scaled_to(*size), kept.camera) > SAME_LENS_PX:
+        raise UsageError("its lens is not that of 'camera_info_file': it is left out")
+    given_now = options.camera_height > 0 or options.scale_from == 'distance'
+    if kept.ground is None or not given_now:
+        return kept
+    options.scale.require_inside(*size)
+    scale = known_scale(options, kept.camera, kept.ground.normal_in_camera)
+    if not isinstance(scale, Scale):
+        return replace(kept, grade='lens', ground=None, ground_refusal=scale, covariance=None,
+                       stddev=replace(kept.stddev, tilt_deg=None, roll_deg=None, height_m=None, ground_point_m=()))
+    return _scaled(kept, kept.ground, scale)
+
+
+def _scaled(kept: Calibration, ground: GroundPlane, scale: Scale) -> Calibration:
+    height = scale.height(kept.camera, ground.normal_in_camera)
+    if ground.metric and abs(height - ground.height_m) <= SAME_HEIGHT * height:
+        return kept
+    words = tuple(text for text in kept.assumptions if not text.startswith('scale by '))
+    return replace(
+        kept, grade=kept.grade if ground.metric else 'assumed', ground=replace(ground, height_m=height, metric=True),
+        assumptions=(*words, *scale.assumption(height)),
+        covariance=None,
+        # road points so many metres away are others now, and nothing is left that tells how sure they are
+        stddev=replace(kept.stddev, height_m=scale.sigma or None, ground_point_m=()))

@@ -1,0 +1,70 @@
+"""Kill a process in the middle of its saves, again and again, and look at what it leaves: FOLDER KILLS [SEED].
+
+Prints how often each kind of leaving was found. Ends with an error as soon as a file cannot be read, a calibration is
+none that was saved, or an older one than was there before comes back.
+"""
+
+import os
+import random
+import signal
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+
+from autocalib_ros.camera_info import read_camera_info
+from autocalib_ros.store import Kind, Store, document
+from stored import calibration, stored
+
+LONGEST_LIFE_S = 0.08
+"""Several saves long."""
+
+
+def numbered(number: int):
+    """Return a calibration that tells its number, with a lens of its own."""
+    return stored(calibration(300.0 + 0.01 * number, number=number))
+
+
+def save_until_killed(store: Store, number: int) -> None:
+    while True:
+        number += 1
+        store.save(numbered(number))
+
+
+def check(store: Store, last: int) -> tuple[Kind, int]:
+    """Return what is there now, after any driver could read the YAML."""
+    read_camera_info(store.path)
+    store.tidy()
+    found = store.load()
+    assert found.stored is not None, found
+    number = found.stored.calibration.evidence.frames
+    assert number >= last, f'{number} after {last}'
+    assert document(found.stored) == document(numbered(number)), 'not what was saved'
+    left = [path.name for path in store.path.parent.iterdir() if path.name.startswith('.')]
+    assert not left, left
+    return found.kind, number
+
+
+def main(folder: Path, kills: int, seed: int) -> None:
+    """Fork, kill, look."""
+    lives, kinds = random.Random(seed), Counter()
+    store, last = Store(folder / 'north.yaml'), 0
+    store.save(numbered(last))
+    for _ in range(kills):
+        child = os.fork()
+        if child == 0:
+            save_until_killed(store, last)
+        time.sleep(lives.uniform(0.0, LONGEST_LIFE_S))
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        kind, last = check(store, last)
+        kinds[kind.value] += 1
+    # one that is cut off is followed by whole ones again
+    store.save(numbered(last + 1))
+    kind, last = check(store, last + 1)
+    assert kind is Kind.WHOLE
+    print(f'{kills} kills, {last} saves: {dict(sorted(kinds.items()))}')
+
+
+if __name__ == '__main__':
+    main(Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]) if len(sys.argv) > 3 else 0)

@@ -1,0 +1,26 @@
+"""The real node with a solver that gives what it is told to, after as long as it is told to: FOCAL_PX SECONDS ..."""
+
+import sys
+import time
+from functools import partial
+
+from autocalib_ros.ros import autocalib_node, node
+from bench import calibration
+
+
+def main() -> int:
+    focal_px, seconds = float(sys.argv.pop(1)), float(sys.argv.pop(1))
+
+    def solve(evidence, options, *, lens):
+        print('solving', file=sys.stderr, flush=True)
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:  # busy, as a solver is
+            sum(range(1000))
+        return calibration(evidence, focal_px, height_m=options.camera_height)
+
+    autocalib_node.AutocalibNode = partial(autocalib_node.AutocalibNode, solve=solve)
+    return node.main()
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,96 @@
+"""The thread that writes."""
+
+import threading
+
+import pytest
+
+from autocalib_ros.ros.keeper import Keeper
+from autocalib_ros.store import Store
+from bench import PATIENCE_S, wait_for
+from stored import calibration, stored
+
+NEVER_S = 1e6
+FIRST, SECOND, THIRD = (stored(calibration(300.0 + number, number=number)) for number in range(3))
+
+
+@pytest.fixture
+def store(quick_path) -> Store:
+    return Store(quick_path / 'camera_info' / 'north.yaml')
+
+
+@pytest.fixture
+def told() -> list[str]:
+    return []
+
+
+@pytest.fixture
+def start(told):
+    started = []
+
+    def make(period_s: float = NEVER_S) -> Keeper:
+        started.append(Keeper(told.append, period_s))
+        return started[-1]
+
+    yield make
+    for keeper in started:
+        keeper.close(PATIENCE_S)
+
+
+def kept(store: Store) -> int | None:
+    found = store.load()
+    return None if found.stored is None else found.stored.calibration.evidence.frames
+
+
+def test_first_offer_is_written_at_once_and_of_later_ones_the_newest_at_the_end(start, store):
+    keeper = start()
+    keeper.offer(store, FIRST)
+    wait_for(lambda: kept(store) == 0, 'the first')
+    keeper.offer(store, SECOND)
+    keeper.offer(store, THIRD)
+    assert not threading.Event().wait(0.2)
+    assert kept(store) == 0
+    assert keeper.close(PATIENCE_S)
+    assert kept(store) == 2
+
+
+def test_offers_are_written_after_a_while(start, store):
+    keeper = start(0.1)
+    for number, offered in enumerate((FIRST, SECOND, THIRD)):
+        keeper.offer(store, offered)
+        wait_for(lambda wanted=number: kept(store) == wanted, f'offer {number}')
+
+
+def test_what_is_withdrawn_is_not_written(start, store):
+    keeper = start()
+    keeper.offer(store, FIRST)
+    wait_for(lambda: kept(store) == 0, 'the first')
+    keeper.offer(store, SECOND)
+    keeper.withdraw()
+    keeper.close(PATIENCE_S)
+    assert kept(store) == 0
+
+
+def test_step_runs_at_once_and_gives_its_result_or_error(start, store):
+    keeper = start()
+    assert keeper.run(lambda: store.save(SECOND)).result(PATIENCE_S) is None
+    assert kept(store) == 1
+    assert 'ZeroDivisionError' in str(keeper.run(lambda: 1 / 0).result(PATIENCE_S))
+    assert keeper.run(lambda: 5).result(PATIENCE_S) == 5
+
+
+def test_fault_is_told_once_and_the_offer_is_tried_again(start, store, told, quick_path):
+    (quick_path / 'camera_info').touch()
+    keeper = start(0.02)
+    keeper.offer(store, FIRST)
+    wait_for(lambda: told, 'the fault')
+    assert not threading.Event().wait(0.2)  # ten more tries
+    assert len(told) == 1 and 'cannot write' in told[0] and keeper.fault == told[0]
+    (quick_path / 'camera_info').unlink()
+    wait_for(lambda: kept(store) == 0, 'the calibration')
+    wait_for(lambda: not keeper.fault, 'the end of the fault')
+
+
+def test_closed_keeper_takes_no_more_steps(start):
+    keeper = start()
+    keeper.close(PATIENCE_S)
+    assert 'shutting down' in str(keeper.run(lambda: 5).result(PATIENCE_S))

@@ -1,0 +1,223 @@
+"""The calibration on disk, what comes between its files, and what others put there."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import yaml
+
+from autocalib_ros.camera_info import camera_info_yaml, read_camera_info
+from autocalib_ros.errors import InputError, UsageError
+from autocalib_ros.store import Kind, Store, document, path_of
+from stored import calibration, lens_only, stored
+
+KILLS = 60
+FIRST, SECOND, THIRD = (stored(calibration(focal, number=number)) for number, focal in enumerate((300.0, 310.0, 320.0)))
+CHECKERBOARD = camera_info_yaml(stored(calibration(444.0)).info, 'north')
+
+
+@pytest.fixture
+def store(quick_path) -> Store:
+    return Store(quick_path / 'camera_info' / 'north.yaml')
+
+
+def number_of(found) -> int:
+    return found.stored.calibration.evidence.frames
+
+
+@pytest.mark.parametrize(('url', 'path'), [
+    ('', '/ros/camera_info/cam_1.yaml'),
+    ('file:///etc/${NAME}/lens.yaml', '/etc/cam_1/lens.yaml'),
+    ('FILE:///lens.yaml', '/lens.yaml'),
+    ('file://${ROS_HOME}/x.yaml', '/ros/x.yaml'),
+    ('package://some_robot/config/${NAME}.yaml', '{share}/config/cam_1.yaml'),
+])
+def test_url_names_a_file_as_camera_info_manager_reads_it(quick_path, url, path):
+    marker = quick_path / 'share' / 'ament_index' / 'resource_index' / 'packages' / 'some_robot'
+    marker.parent.mkdir(parents=True)
+    marker.touch()
+    environment = {'ROS_HOME': '/ros', 'AMENT_PREFIX_PATH': f'/nowhere:{quick_path}'}
+    share = quick_path / 'share' / 'some_robot'
+    assert path_of(url, 'cam_1', environment) == Path(path.format(share=share))
+
+
+def test_default_folder_is_in_the_home_without_ros_home():
+    assert path_of('', 'cam', {'HOME': '/home/ann'}) == Path('/home/ann/.ros/camera_info/cam.yaml')
+
+
+@pytest.mark.parametrize(('url', 'told'), [
+    ('/etc/lens.yaml', 'write file:///FOLDER/FILE.yaml'), ('file://lens.yaml', 'names no file'),
+    ('file:///folder/', 'names no file'), ('http://host/x.yaml', 'names no file'), ('package://x', 'names no file'),
+    ('file:///${CAMERA}.yaml', r'holds \$\{CAMERA\}: only'), ('package://no_such/x.yaml', "package 'no_such'"),
+])
+def test_url_that_names_no_file_is_wrong_usage(url, told):
+    with pytest.raises(UsageError, match=told):
+        path_of(url, 'cam', {'HOME': '/home/ann'})
+
+
+def test_nothing_is_found_where_nothing_was_saved(store):
+    assert (store.load().kind, store.load().note) == (Kind.NOTHING, '')
+
+
+@pytest.mark.parametrize('kept', [FIRST, replace(FIRST, calibration=lens_only(FIRST.calibration))])
+def test_what_was_saved_comes_back_to_the_last_bit(store, kept):
+    store.save(kept)
+    found = store.load()
+    assert (found.kind, found.note) == (Kind.WHOLE, '')
+    assert document(found.stored) == document(kept)
+    assert (found.stored.camera_name, found.stored.image_frame) == ('north', 'cam_optical')
+
+
+def test_yaml_is_the_lens_for_camera_info_manager(store):
+    store.save(FIRST)
+    assert read_camera_info(store.path) == FIRST.calibration.camera
+    assert yaml.safe_load(store.path.read_text())['camera_name'] == 'north'
+
+
+def test_version_before_is_kept(store):
+    for kept in (FIRST, SECOND, THIRD):
+        store.save(kept)
+    for path in (store.path, store.beside):
+        path.write_bytes(path.with_name(path.name + '.bak').read_bytes())
+    assert number_of(store.load()) == 1
+
+
+def test_pair_that_a_kill_tore_gives_the_calibration_before(store):
+    store.save(FIRST)
+    before = store.path.read_bytes()
+    store.save(SECOND)
+    store.path.write_bytes(before)
+    found = store.load()
+    assert (found.kind, number_of(found)) == (Kind.CUT_OFF, 0)
+    assert 'a write was cut off' in found.note
+    store.save(THIRD)
+    assert (store.load().kind, number_of(store.load())) == (Kind.WHOLE, 2)
+
+
+def test_what_killed_writers_left_is_removed(store):
+    store.save(FIRST)
+    left = store.path.with_name(f'.{store.path.name}~abcd1234')
+    left.write_text('half a li')
+    another = store.path.with_name('.another.yaml~abcd1234')
+    another.touch()
+    store.tidy()
+    assert not left.exists() and another.exists()
+
+
+def test_files_are_never_broken_whenever_the_writer_is_killed(quick_path):
+    script = Path(__file__).with_name('kept') / 'kill_saves.py'
+    done = subprocess.run([sys.executable, str(script), str(quick_path), str(KILLS)], capture_output=True, text=True,
+                          timeout=120, check=False, env={**os.environ, 'PYTHONPATH': str(Path(__file__).parents[1])})
+    assert done.returncode == 0, done.stderr
+    kills, saves = map(int, re.findall(r'\d+', done.stdout)[:2])
+    assert kills == KILLS
+    assert saves > 10, 'hardly a save in all those lives: the kills hit nothing'
+
+
+@pytest.mark.parametrize('broken', ['', 'image_width: [', 'image_width: 640\n', '\x00\x01'])
+def test_broken_yaml_gives_the_pair_before_and_is_told(store, broken):
+    store.save(FIRST)
+    store.save(SECOND)
+    store.path.write_text(broken)
+    found = store.load()
+    assert (found.kind, number_of(found)) == (Kind.BROKEN, 0)
+    assert str(store.path) in found.note and 'the pair before' in found.note
+    store.save(THIRD)
+    assert number_of(store.load()) == 2
+
+
+@pytest.mark.parametrize('broken', ['', '{"version": 1', '[]', '{"version": 1, "state": "calibrated"}'])
+def test_broken_json_gives_the_pair_before_and_is_told(store, broken):
+    store.save(FIRST)
+    store.save(SECOND)
+    store.beside.write_text(broken)
+    found = store.load()
+    assert (found.kind, number_of(found)) == (Kind.BROKEN, 0)
+    assert str(store.beside) in found.note
+
+
+def test_broken_file_without_a_pair_before_is_told(store):
+    store.save(FIRST)
+    store.beside.write_text('{')
+    assert store.load().stored is None
+    assert str(store.beside) in store.load().note and 'nothing is restored' in store.load().note
+
+
+def test_removed_yaml_means_that_nothing_is_kept(store):
+    store.save(FIRST)
+    store.save(SECOND)
+    store.path.unlink()
+    assert (store.load().kind, store.load().stored) == (Kind.NOTHING, None)
+    assert 'is missing' in store.load().note
+
+
+def test_yaml_that_a_driver_wrote_of_our_numbers_with_fewer_digits_is_ours(store):
+    store.save(FIRST)
+    rounded = re.sub(r'\d+\.\d+', lambda match: f'{float(match[0]):.10g}' if '.' in f'{float(match[0]):.10g}'
+                     else match[0], store.path.read_text())
+    assert rounded != store.path.read_text()
+    store.path.write_text(rounded)
+    assert store.load().kind is Kind.WHOLE
+
+
+@pytest.mark.parametrize('ours_before', [False, True])
+def test_yaml_of_another_hand_is_not_taken_for_ours_and_left_alone(store, ours_before):
+    store.path.parent.mkdir()
+    if ours_before:
+        store.save(FIRST)
+        store.save(SECOND)
+    store.path.write_text(CHECKERBOARD)
+    found = store.load()
+    assert (found.kind, found.stored) == (Kind.FOREIGN, None)
+    assert 'was not written by this node, or changed since' in found.note
+    with pytest.raises(InputError, match='left alone: call ~/save'):
+        store.save(THIRD)
+    assert store.path.read_text() == CHECKERBOARD
+
+
+def test_yaml_of_another_hand_is_kept_when_it_is_replaced(store):
+    store.path.parent.mkdir()
+    store.path.write_text(CHECKERBOARD)
+    store.save(FIRST, replace_foreign=True)
+    for kept in (SECOND, THIRD):
+        store.save(kept)
+    assert store.path.with_name('north.yaml.orig').read_text() == CHECKERBOARD
+    assert number_of(store.load()) == 2
+
+
+def test_second_yaml_of_another_hand_is_not_lost(store):
+    store.path.parent.mkdir()
+    store.path.write_text(CHECKERBOARD)
+    store.save(FIRST, replace_foreign=True)
+    store.path.write_text(CHECKERBOARD.replace('north', 'south').replace('444', '445'))
+    with pytest.raises(InputError, match='move one of them away'):
+        store.save(SECOND, replace_foreign=True)
+
+
+def test_folder_that_cannot_be_made_is_told(quick_path):
+    (quick_path / 'file').touch()
+    blocked = Store(quick_path / 'file' / 'north.yaml')
+    assert blocked.load().kind is Kind.NOTHING
+    with pytest.raises(InputError, match=f'cannot write {quick_path}/file/north.autocalib.json'):
+        blocked.save(FIRST)
+
+
+def test_full_disk_leaves_what_was_there(store, monkeypatch):
+    store.save(FIRST)
+    store.save(SECOND)
+
+    def full(handle):
+        raise OSError(28, 'No space left on device')
+
+    monkeypatch.setattr('autocalib_ros.files.os.fsync', full)
+    with pytest.raises(InputError, match='No space left on device'):
+        store.save(THIRD)
+    monkeypatch.undo()
+    assert (store.load().kind, number_of(store.load())) == (Kind.WHOLE, 1)
+    assert len(list(store.path.parent.iterdir())) == 4
