@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from enum import Enum
 
 import numpy as np
 
@@ -25,8 +26,20 @@ from autocalib_ros.perception.observer import Observer
 
 REORDERED_NS = 1_000_000_000
 """Images overtake each other by less than this on any transport; a longer step back is another time."""
+LEAP_NS = 24 * 3600 * 1_000_000_000
+"""No camera pauses for longer than a day: a longer step forward is a clock that was set."""
 FORGET_EVERY_S = 10.0
 """Seconds of recording between two looks for evidence that is old; each costs milliseconds."""
+
+
+class Intake(Enum):
+    """What became of an image; all but `USED` and `LATE` begin the evidence anew."""
+
+    FIRST = 'the first image'
+    USED = 'used'
+    LATE = 'late: its time stamp is not newer than that of an image before'
+    STEPPED = 'the time stamps stepped'
+    RESIZED = 'the image size changed'
 
 
 @dataclass(frozen=True)
@@ -50,20 +63,21 @@ class AutoCalibrator:
         self._options = options
         self._observer: Observer | None = None
 
-    def add_image(self, stamp_ns: int, image: np.ndarray) -> None:
+    def add_image(self, stamp_ns: int, image: np.ndarray) -> Intake:
         """Take one image: grey (H, W) or BGR (H, W, 3), uint8; it is not kept nor changed.
 
         An image whose stamp repeats or steps back by less than `REORDERED_NS` is late and left out; a stamp that
-        steps back further (a clock that was set, a recording that begins again) or a new image size starts the
-        evidence anew. UsageError where a pixel of scale.distance_px lies outside the image.
+        steps back further (a clock that was set, a recording that begins again) or forward by `LEAP_NS`, or a new
+        image size starts the evidence anew. UsageError where a pixel of scale.distance_px lies outside the image.
         """
         if image.dtype != np.uint8 or image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
             raise InputError(f'an image is grey (H, W) or BGR (H, W, 3) in 8 bits, got {image.dtype} {image.shape}')
         size = (image.shape[1], image.shape[0])
-        if self._observer is None or size != self._size or stamp_ns <= self._newest_stamp_ns - REORDERED_NS:
+        intake = self._intake(stamp_ns, size)
+        if intake is Intake.LATE:
+            return intake
+        if intake is not Intake.USED:
             self._begin(stamp_ns, size)
-        elif stamp_ns <= self._newest_stamp_ns:
-            return
         time_s = (stamp_ns - self._first_stamp_ns) * 1e-9
         observed = self._observer.observe(image, time_s)
         for track in observed.tracks:
@@ -77,6 +91,23 @@ class AutoCalibrator:
             self._forget(time_s)
         self._newest_stamp_ns = stamp_ns
         self._frames += 1
+        return intake
+
+    def _intake(self, stamp_ns: int, size: tuple[int, int]) -> Intake:
+        if self._observer is None:
+            return Intake.FIRST
+        if size != self._size:
+            return Intake.RESIZED
+        step_ns = stamp_ns - self._newest_stamp_ns
+        if not -REORDERED_NS < step_ns < LEAP_NS:
+            return Intake.STEPPED
+        return Intake.USED if step_ns > 0 else Intake.LATE
+
+    def change(self, options: Options) -> None:
+        """Take other options, which may differ in what `config.may_change` says; a solution is due at once."""
+        self._options = options
+        if self._observer is not None:
+            self._begin_due()
 
     def _forget(self, time_s: float) -> None:
         """Drop old evidence that newer replaces, and all that is old once the camera has, or may have, moved.
@@ -102,6 +133,9 @@ class AutoCalibrator:
         self._frames = 0
         self._tracks_seen = 0
         self._forget_s, self._moved_s = FORGET_EVERY_S, -np.inf
+        self._begin_due()
+
+    def _begin_due(self) -> None:
         self._due_s, self._due_tracks = self._options.first_solve_s, float(self._options.gate.min_tracks)
 
     def take_due(self) -> Evidence | None:

@@ -289,9 +289,24 @@ class NodeOptions(_Checked):
                             '~/save writes')
     upload_to_driver: bool = option(False, "send each new calibration to the driver's set_camera_info, at most once a "
                                     'minute')
+    use_driver_camera_info: bool = option(
+        False, "subscribe the driver's CameraInfo on camera_info_in: its binning and roi are published too, and its "
+        'size is compared with that of the images')
     camera_info_mode: str = option('per_image', 'publish camera_info with each image or when it changes',
                                    choices=('per_image', 'latched_only'))
     idle_solve_s: float = option(3.0, 'when no image came for this long, what is left is solved', low=0.1)
+
+
+MAY_CHANGE = ('method', 'scale_from', 'camera_height', 'camera_height_sigma', 'allow_unit_scale', 'random_seed',
+              'first_solve_s', 'solve_growth', 'solve_interval_s', 'paper', 'joint', 'scale', 'gate',
+              'camera_info_mode', 'idle_solve_s')
+"""Options, and groups of them, that are read anew at each solution or publication, so that they may change while a
+node runs; all others shape the evidence from the first image on, or name what others rely on."""
+
+
+def may_change(name: str) -> bool:
+    """Say whether an option, by its full name, may change while a node runs."""
+    return name in MAY_CHANGE or name.partition('.')[0] in MAY_CHANGE
 
 
 @dataclass(frozen=True)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
-from autocalib_ros.calibrator import AutoCalibrator, Progress
+from autocalib_ros.calibrator import LEAP_NS, AutoCalibrator, Intake, Progress
 from autocalib_ros.config import BufferOptions, GateOptions, Options
 from autocalib_ros.errors import InputError
 
@@ -85,6 +87,39 @@ def test_a_repeated_or_late_stamp_is_left_out(stamp_ns: int) -> None:
     calibrator.add_image(stamp_ns, image(30))
     evidence = calibrator.snapshot()
     assert evidence is not None and evidence.frames == 10
+
+
+@pytest.mark.parametrize(('stamp_ns', 'size', 'expected'), [
+    (1_000_000_000, (180, 320), Intake.USED),
+    (900_000_000, (180, 320), Intake.LATE),  # the stamp of the image before
+    (1, (180, 320), Intake.LATE),
+    (-100_000_000, (180, 320), Intake.STEPPED),
+    (800_000_000 + LEAP_NS, (180, 320), Intake.USED),
+    (900_000_000 + LEAP_NS, (180, 320), Intake.STEPPED),
+    (1_000_000_000, (240, 320), Intake.RESIZED),
+])
+def test_what_became_of_an_image_is_told(stamp_ns: int, size: tuple[int, int], expected: Intake) -> None:
+    assert fed(10).add_image(stamp_ns, image(30, size)) is expected
+
+
+def test_first_image_is_told() -> None:
+    assert AutoCalibrator(OPTIONS).add_image(0, image(0)) is Intake.FIRST
+
+
+def test_clock_that_was_set_does_not_count_as_time_watched() -> None:
+    calibrator = fed(10)
+    for index in range(5):
+        calibrator.add_image(50 * 365 * LEAP_NS + index * 100_000_000, image(index))
+    evidence = calibrator.snapshot()
+    assert evidence is not None and (evidence.frames, round(evidence.seconds, 1)) == (5, 0.4)
+
+
+def test_other_options_make_a_solution_due() -> None:
+    calibrator = fed(150)
+    assert calibrator.take_due() is not None
+    assert calibrator.take_due() is None
+    calibrator.change(replace(OPTIONS, camera_height=9.0))
+    assert calibrator.take_due() is not None
 
 
 @pytest.mark.parametrize('picture', [np.zeros((10, 10), np.uint16), np.zeros((10, 10, 4), np.uint8),

@@ -12,12 +12,15 @@ import pytest
 
 from autocalib_ros.calibration import write_calibration_json
 from autocalib_ros.calibrator import solve
-from autocalib_ros.config import Options
+from autocalib_ros.config import Declared, NodeOptions, Options, declared
 from autocalib_ros.offline.synthetic_evidence import Junction, synthetic_evidence
+from autocalib_ros.ros.status import Counts, Situation, status
 
 ROOT = Path(__file__).parent.parent
 README = ROOT / 'README.md'
 START = 'python3 -m venv'
+MADE = re.compile(r"(?:create_\w+\([^')]*|resolve_topic_name\()'([~/\w]+)'")
+"""A publisher, subscription, service or client that is made, and its name."""
 
 
 @pytest.fixture(scope='module')
@@ -31,6 +34,37 @@ def test_readme_holds_two_commands(commands):
     assert len(commands) == 2
     assert commands[0].endswith('.venv/bin/autocalib demo')
     assert commands[1].endswith('-m pytest')
+
+
+def table_row(name: str) -> str:
+    """Return the row of the table that begins with a name."""
+    rows = re.findall(rf'^\| `{re.escape(name)}`.*$', README.read_text(encoding='utf-8'), re.MULTILINE)
+    assert len(rows) == 1, f'{name}: {rows}'
+    return rows[0]
+
+
+@pytest.mark.parametrize('item', list(declared(NodeOptions())), ids=lambda item: item.name)
+def test_every_option_of_the_node_stands_in_the_table_with_its_default_and_choices(item: Declared):
+    default = str(item.default).lower() if isinstance(item.default, bool) else str(item.default) or "`''`"
+    choices = f'; one of {", ".join(item.choices)}' if item.choices else ''
+    assert table_row(item.name) == f'| `{item.name}` | {default} | {item.doc}{choices} |'
+
+
+def test_every_value_of_diagnostics_is_listed():
+    keys = [key for key, _ in status(Situation(topic='', counts=Counts())).values]
+    prose = ' '.join(README.read_text(encoding='utf-8').split())
+    assert ', '.join(f'`{key}`' for key in keys) + '.' in prose
+
+
+@pytest.mark.parametrize('source', sorted((ROOT / 'autocalib_ros' / 'ros').glob('*.py')), ids=lambda path: path.name)
+def test_every_topic_and_service_of_the_live_shell_stands_in_a_table(source: Path):
+    for name in MADE.findall(source.read_text(encoding='utf-8')):
+        assert table_row(name)
+
+
+def test_topics_and_services_are_found_in_the_code():
+    text = ''.join(path.read_text(encoding='utf-8') for path in (ROOT / 'autocalib_ros' / 'ros').glob('*.py'))
+    assert {'image', 'camera_info_in', '/diagnostics', '~/camera_info', '~/calibrate'} <= set(MADE.findall(text))
 
 
 def test_ci_runs_the_second_command(commands):

@@ -7,25 +7,31 @@ import time
 import traceback
 from typing import Any
 
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
 from autocalib_ros.calibration import Calibration, Refusal
-from autocalib_ros.calibrator import solve
 from autocalib_ros.camera_info import camera_info, read_camera_info
+from autocalib_ros.config import NodeOptions, Options
 from autocalib_ros.errors import AutocalibError
 from autocalib_ros.perception.images import ImageDecoder
-from autocalib_ros.ros import messages
+from autocalib_ros.ros.diagnostics import Diagnostics
+from autocalib_ros.ros.driver_info import DriverInfo
 from autocalib_ros.ros.driver_upload import DriverUpload
-from autocalib_ros.ros.headers import Headers
+from autocalib_ros.ros.headers import DEFAULT_FRAME, Headers
 from autocalib_ros.ros.image_input import ImageInput
 from autocalib_ros.ros.in_force import InForce, Published
 from autocalib_ros.ros.keeper import Keeper
+from autocalib_ros.ros.live_parameters import LiveParameters
 from autocalib_ros.ros.parameters import options_of
 from autocalib_ros.ros.pipeline import Pipeline, Result, Solve
+from autocalib_ros.ros.solver import SolverProcess
+from autocalib_ros.ros.status import Counts, Recent, Situation
 from autocalib_ros.ros.wording import described, described_progress
 from autocalib_ros.standing import CalibrationState, with_what_is_given
 from autocalib_ros.store import Store, Stored, path_of
@@ -38,9 +44,9 @@ CLOSE_S = 4.0
 
 
 class AutocalibNode(Node):
-    """Node `autocalib`; `solve` may be replaced by another solver of the same signature."""
+    """Node `autocalib`; `solve` may be replaced by another solver of the same signature, which runs in a thread."""
 
-    def __init__(self, *, solve: Solve = solve, **node_arguments: Any) -> None:
+    def __init__(self, *, solve: Solve | None = None, **node_arguments: Any) -> None:
         super().__init__('autocalib', automatically_declare_parameters_from_overrides=True, **node_arguments)
         self.options, self.node_options = options_of(self)
         lens_file = self.node_options.camera_info_file
@@ -50,19 +56,29 @@ class AutocalibNode(Node):
         self._headers = Headers(self.node_options, self.get_namespace(), self.get_logger().warning,
                                 lambda: self.get_clock().now().nanoseconds)
         self._said: dict[str, float] = {}
+        self._unreadable = self._withdrawn = ''
+        self._recent = Recent()
+        self._driver = DriverInfo(self, self.node_options)
         self._store = self._store_of('')
         self.keeper = Keeper(lambda fault: self.get_logger().error(f'the calibration was not saved: {fault}'))
         self._upload = DriverUpload(self, self._say) if self.node_options.upload_to_driver else None
-        self.in_force = InForce(self, self.options, self.node_options, self._headers,
+        self.in_force = InForce(self, self.options, self.node_options, self._headers, driver=self._driver,
                                 taken=self._hand_on, withdrawn=self._hold_back)
+        solver = SolverProcess()
         self._pipeline = Pipeline(self.options, idle_solve_s=self.node_options.idle_solve_s,
-                                  decode=ImageDecoder().decode, solve=solve, listener=self, lens=self._lens)
+                                  decode=ImageDecoder().decode, solve=solve or solver, listener=self, lens=self._lens,
+                                  stop_solving=solver.close)
         if self._store is not None:
             self._restore(self._store)
         # While a caller waits for a solution or a disk, everything outside its group goes on.
-        for name, answer in (('calibrate', self._on_calibrate), ('save', self._on_save), ('reset', self._on_reset)):
-            self.create_service(Trigger, f'~/{name}', answer, callback_group=MutuallyExclusiveCallbackGroup())
+        self.create_service(Trigger, '~/calibrate', self._on_calibrate, callback_group=MutuallyExclusiveCallbackGroup())
+        self.create_service(Trigger, '~/save', self._on_save, callback_group=MutuallyExclusiveCallbackGroup())
+        self.create_service(Trigger, '~/reset', self._on_reset, callback_group=MutuallyExclusiveCallbackGroup())
         self._input = ImageInput(self, self.node_options, self._on_image)
+        self._live = LiveParameters(self, self.options, self.node_options, self._change,
+                                    lambda: self.in_force.image_size)
+        self._diagnostics = Diagnostics(self, self._situation, lambda: self._headers.camera_name(
+            self.in_force.image_frame or DEFAULT_FRAME))
         self.create_timer(TELL_PROGRESS_S, self._tell_progress, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self.get_logger().info(f'waiting for images on {self._input.topic}')
 
@@ -74,6 +90,16 @@ class AutocalibNode(Node):
         if not self._pipeline.close(deadline - time.monotonic()):
             self.get_logger().warning('a solution was still running at shutdown and is abandoned')
         self.get_logger().info(f'shut down: {self._pipeline.counters}')
+
+    def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
+        """Refuse in words that help: rclpy turns a wrong type down before it asks any callback."""
+        return self._live.refusal(parameter_list) or super().set_parameters_atomically(parameter_list)
+
+    def _change(self, options: Options, node_options: NodeOptions) -> None:
+        """Take other options: what rests on them is solved anew."""
+        self.options, self.node_options = options, node_options
+        self.in_force.change(options, node_options)
+        self._pipeline.change(options, node_options.idle_solve_s)
 
     def _on_image(self, message: Any) -> None:
         """Keep the image for the perception thread and give it its camera_info; nothing here takes long."""
@@ -136,6 +162,33 @@ class AutocalibNode(Node):
         running.add_done_callback(hand_over)
         return awaited
 
+    def _situation(self) -> Situation:
+        """Return what is known now, for diagnostics."""
+        counters, published = self._pipeline.counters, self.in_force.published
+        counts = Counts(received=counters.received, used=counters.used, dropped=counters.dropped,
+                        unreadable=counters.unreadable, late=counters.late, lost=self._input.lost)
+        unsaved = f'the calibration is not saved: {self.keeper.fault}' if self.keeper.fault else ''
+        return Situation(
+            topic=self._input.topic, counts=counts, rates_hz=self._recent.rates_hz(time.monotonic(), counts),
+            result=None if published is None else published.result,
+            restored=self.in_force.state is CalibrationState.RESTORED, progress=self._pipeline.progress,
+            image_age_s=self._input.age_s, encoding=self._input.encoding, silence=self._input.silence,
+            unreadable=self._unreadable, errors=tuple(filter(None, [self._withdrawn, self.in_force.conflict])),
+            warnings=tuple(filter(None, [self._rivals(), self._driver.doubt(self.in_force.image_size),
+                                         self._input.crowd, unsaved])))
+
+    def _rivals(self) -> str:
+        """Say who else publishes where our camera_info goes: two authorities on one lens."""
+        topic = self.in_force.topic
+        if self.count_publishers(topic) < 2:
+            return ''
+        names = {f'{info.node_namespace.rstrip("/")}/{info.node_name}' for info in
+                 self.get_publishers_info_by_topic(topic)} - {self.get_fully_qualified_name()}
+        words = (f'{", ".join(sorted(names)) or "a node of the same name"} publishes {topic} too: remap one of them, '
+                 '-r ~/camera_info:=... here')
+        self._say_seldom('rivals', words, error=False)
+        return words
+
     def _tell_progress(self) -> None:
         if (self.in_force.state in (CalibrationState.NONE, CalibrationState.RESTORED)
                 and self._pipeline.counters.used):
@@ -172,7 +225,7 @@ class AutocalibNode(Node):
         if save and self.node_options.autosave and self._store is not None:
             self.keeper.offer(self._store, self._stored(published))
         if self._upload is not None:
-            self._upload.offer(messages.validated(published.camera_info))
+            self._upload.offer(self.in_force.camera_info(published))
 
     def _hold_back(self) -> None:
         """Keep what is withdrawn from the store and the driver, where it has not gone there yet."""
@@ -182,15 +235,22 @@ class AutocalibNode(Node):
 
     def image_taken(self, width: int, height: int) -> None:
         """Withdraw the calibration of another image size: the lens was calibrated in its pixels."""
+        self._unreadable = ''
         withdrawn = self.in_force.image_decoded(width, height)
         if withdrawn is not None:
             state, published = withdrawn
             old_width, old_height = published.result.evidence.image_size
-            self.get_logger().warning(f'the {state.value} calibration is of images of {old_width}x{old_height}, these '
-                                      f'have {width}x{height}: it is withdrawn and collecting starts anew')
+            self._withdrawn = (f'the {state.value} calibration is of images of {old_width}x{old_height}, these have '
+                               f'{width}x{height}: it is withdrawn')
+            self.get_logger().warning(f'{self._withdrawn} and collecting starts anew')
+
+    def began_anew(self, why: str) -> None:
+        """Log that the evidence so far was dropped; a calibration from it stays in force."""
+        self._say_seldom(f'anew {why}', f'{why}: the evidence is collected anew', error=False)
 
     def image_unreadable(self, error: AutocalibError) -> None:
         """Log an image that could not be used."""
+        self._unreadable = str(error)
         self._say_seldom('unreadable', f'image left out: {error} ({self._pipeline.counters})')
 
     def failed(self, error: Exception) -> None:
@@ -205,6 +265,7 @@ class AutocalibNode(Node):
         decision = self.in_force.solved(result)
         if decision is None:
             return
+        self._withdrawn = ''
         self._said = {}
         self._say(decision.words, good=not decision.contradicted)
         self.get_logger().info(described(result))

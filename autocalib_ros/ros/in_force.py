@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from builtin_interfaces.msg import Time
 from geometry_msgs.msg import TransformStamped
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo
@@ -16,6 +17,7 @@ from autocalib_ros.camera_info import CameraInfo as CameraInfoFields
 from autocalib_ros.config import NodeOptions, Options
 from autocalib_ros.errors import InputError
 from autocalib_ros.ros import messages
+from autocalib_ros.ros.driver_info import DriverInfo
 from autocalib_ros.ros.headers import DEFAULT_FRAME, Headers
 from autocalib_ros.ros.qos import LATCHED
 from autocalib_ros.ros.transforms import Transforms
@@ -32,13 +34,6 @@ class Published:
     transform: TransformStamped | None
     """The ground plane; None where there is none that may be published."""
 
-    @property
-    def camera_info(self) -> CameraInfo:
-        """The message of the newest image that the calibration rests on."""
-        return messages.camera_info_message(self.fields, messages.time_message(self.result.newest_stamp_ns),
-                                            self.image_frame)
-
-
 class InForce:
     """Publishes one calibration at a time, latched and image by image; safe in any thread.
 
@@ -47,9 +42,9 @@ class InForce:
     """
 
     def __init__(self, node: Node, options: Options, node_options: NodeOptions, headers: Headers, *,
-                 taken: Callable[[Published, bool], None], withdrawn: Callable[[], None]) -> None:
+                 driver: DriverInfo, taken: Callable[[Published, bool], None], withdrawn: Callable[[], None]) -> None:
         self.options, self._headers = options, headers
-        self._node, self._taken, self._withdrawn = node, taken, withdrawn
+        self._node, self._driver, self._taken, self._withdrawn = node, driver, taken, withdrawn
         self._per_image = node_options.camera_info_mode == 'per_image'
         self._lock = threading.RLock()
         self.published: Published | None = None
@@ -60,6 +55,10 @@ class InForce:
         """Of the newest image that was decoded."""
         self._camera_info = node.create_publisher(CameraInfo, '~/camera_info', LATCHED)
         self._transforms = Transforms(node, tf_parent=options.tf_parent, publish_tf=node_options.publish_tf)
+
+    def change(self, options: Options, node_options: NodeOptions) -> None:
+        """Publish by other options from now on."""
+        self.options, self._per_image = options, node_options.camera_info_mode == 'per_image'
 
     @property
     def topic(self) -> str:
@@ -81,8 +80,7 @@ class InForce:
             size = (message.width, message.height) if hasattr(message, 'width') else self.image_size
             published = self.published
             if self._per_image and published is not None and size == (published.fields.width, published.fields.height):
-                self._camera_info.publish(messages.validated(
-                    messages.camera_info_message(published.fields, message.header.stamp, image_frame)))
+                self._camera_info.publish(self.camera_info(published, message.header.stamp, image_frame))
         return foreign
 
     def _take_frame(self, image_frame: str) -> Published | None:
@@ -150,6 +148,19 @@ class InForce:
             self._forget_latched()
         return was
 
+    def camera_info(self, published: Published, stamp: Time | None = None, image_frame: str = '') -> CameraInfo:
+        """Return the message of an image, or of the newest one that a calibration rests on.
+
+        The driver's binning and region of interest are in it where they are of these images; where they are not,
+        diagnostics say so.
+        """
+        fields, frame = published.fields, image_frame or published.image_frame
+        stamp = stamp or messages.time_message(published.result.newest_stamp_ns)
+        try:
+            return messages.validated(messages.camera_info_message(fields, stamp, frame, self._driver.newest))
+        except InputError:
+            return messages.validated(messages.camera_info_message(fields, stamp, frame))
+
     def _made(self, result: Calibration, image_frame: str) -> Published:
         return Published(result, result.camera_info, image_frame, self._transform_of(result, image_frame))
 
@@ -163,7 +174,7 @@ class InForce:
             self._headers.camera_frame(image_frame), self.options.tf_parent)
 
     def _put(self, state: CalibrationState, published: Published) -> None:
-        self._camera_info.publish(messages.validated(published.camera_info))
+        self._camera_info.publish(self.camera_info(published))
         if published.transform is not None:
             self._transforms.publish(published.transform)
         self.published, self.state = published, state

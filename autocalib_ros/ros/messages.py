@@ -131,6 +131,8 @@ def _check_scalar(value: Any, kind: str, path: str) -> None:
         _require(low <= value < high, path, f'is {value}, which is not a {kind}')
     elif kind == 'boolean':
         _require(type(value) is bool, path, f'is a {type(value).__name__}, not a bool')
+    elif kind == 'octet':
+        _require(type(value) is bytes and len(value) == 1, path, f'is {value!r}, not one byte')
     elif kind.startswith('string'):
         _require(type(value) is str, path, f'is a {type(value).__name__}, not a string')
 

@@ -9,7 +9,7 @@ from typing import Any
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
 
-from autocalib_ros.config import Declared, NodeOptions, Options, declared, with_values
+from autocalib_ros.config import Declared, NodeOptions, Options, declared, may_change, with_values
 from autocalib_ros.errors import UsageError
 
 OF_ROS = ('use_sim_time', 'start_type_description_service')
@@ -18,7 +18,7 @@ INT64_MAX = 2 ** 63 - 1
 
 
 def options_of(node: Node) -> tuple[Options, NodeOptions]:
-    """Declare every option as a read-only parameter and return what was given, or raise UsageError.
+    """Declare every option as a parameter and return what was given, or raise UsageError.
 
     The node has to be created with `automatically_declare_parameters_from_overrides=True`: rclpy has no
     other public way to see a parameter that was given but that nobody declares, a misspelt one.
@@ -38,28 +38,30 @@ def read(given: dict[str, Any]) -> tuple[Options, NodeOptions]:
     items = {item.name: item for item in (*declared(Options()), *declared(NodeOptions()))}
     for name, value in given.items():
         if name not in items:
-            raise UsageError(_unknown(name, list(items)))
-        _refuse_int_for_float(items[name], value)
+            raise UsageError(unknown(name))
+        refuse_wrong_type(items[name], value)
     of_node = {item.name for item in declared(NodeOptions())}
     return (with_values(Options(), {name: value for name, value in given.items() if name not in of_node}),
             with_values(NodeOptions(), {name: value for name, value in given.items() if name in of_node}))
 
 
-def _unknown(name: str, names: list[str]) -> str:
+def unknown(name: str) -> str:
+    """Say that there is no such parameter, and which was meant."""
+    names = [item.name for options in (Options(), NodeOptions()) for item in declared(options)]
     near = get_close_matches(name, names, n=1)
     hint = f"did you mean '{near[0]}'?" if near else 'config/autocalib.yaml lists all of them'
     return f"unknown parameter '{name}': {hint}"
 
 
-def _refuse_int_for_float(item: Declared, value: Any) -> None:
-    """ROS keeps the type of a parameter: a float cannot be set to an int, here or by anybody later."""
+def refuse_wrong_type(item: Declared, value: Any) -> None:
+    """Raise UsageError at an int for a float: ROS keeps the type of a parameter, here and for good."""
     if type(item.default) is float and type(value) is int:
         raise UsageError(f"parameter '{item.name}' is a float: write {item.name}:={float(value)}, not {value}")
 
 
 def descriptor(item: Declared) -> ParameterDescriptor:
-    """Describe one option; all of them shape the evidence from the first image on, so none changes while running."""
-    described = ParameterDescriptor(name=item.name, description=item.doc, read_only=True)
+    """Describe one option."""
+    described = ParameterDescriptor(name=item.name, description=item.doc, read_only=not may_change(item.name))
     if item.choices:
         described.additional_constraints = f'one of: {", ".join(repr(choice) for choice in item.choices)}'
     if item.low is None and item.high is None:

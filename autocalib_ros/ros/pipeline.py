@@ -21,7 +21,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from autocalib_ros.calibration import Calibration, Refusal
-from autocalib_ros.calibrator import AutoCalibrator, Progress
+from autocalib_ros.calibrator import AutoCalibrator, Intake, Progress
 from autocalib_ros.camera import Camera
 from autocalib_ros.config import Options
 from autocalib_ros.errors import AutocalibError
@@ -29,6 +29,8 @@ from autocalib_ros.evidence import Evidence
 
 WAITING_IMAGES = 8
 """Images that may wait for the perception thread: half a second of a hiccup at 15 Hz, 22 MB at 1280x720."""
+REST = 3.0
+"""Time without a solution after one, in units of what that took: solutions take a quarter of a core at the most."""
 TRIED_PERCENT = 99.0
 """The most that is told while the last solution was refused."""
 PROGRESS_PERIOD_S = 1.0
@@ -49,6 +51,9 @@ class Listener(Protocol):
     def image_taken(self, width: int, height: int) -> None:
         """An image of this size has been decoded."""
 
+    def began_anew(self, why: str) -> None:
+        """The evidence so far was dropped."""
+
     def image_unreadable(self, error: AutocalibError) -> None:
         """An image could not be used."""
 
@@ -66,11 +71,13 @@ class Counters:
     received: int = 0
     dropped: int = 0
     unreadable: int = 0
+    late: int = 0
+    """Left out, because their time stamps were not newer than those before."""
     used: int = 0
 
     def __str__(self) -> str:
         return (f'images received {self.received}, used {self.used}, dropped {self.dropped}, '
-                f'unreadable {self.unreadable}')
+                f'unreadable {self.unreadable}, late {self.late}')
 
 
 @dataclass
@@ -83,10 +90,15 @@ class _Job:
 
 
 class Pipeline:
-    """Owns the calibrator and the two threads; `offer` and `solve_now` may be called from any thread."""
+    """Owns the calibrator and the two threads; `offer` and `solve_now` may be called from any thread.
+
+    `stop_solving` ends a solution that runs, when the pipeline is closed.
+    """
 
     def __init__(self, options: Options, *, idle_solve_s: float, decode: Callable[[Any], np.ndarray], solve: Solve,
-                 listener: Listener, lens: Camera | None = None) -> None:
+                 listener: Listener, lens: Camera | None = None,
+                 stop_solving: Callable[[], None] = lambda: None) -> None:
+        self._stop_solving = stop_solving
         self._options, self._idle_solve_s, self._lens = options, idle_solve_s, lens
         self._decode, self._solve, self._listener = decode, solve, listener
         self._calibrator = AutoCalibrator(options)
@@ -95,11 +107,11 @@ class Pipeline:
         self._requests: list[Future] = []
         self._job: _Job | None = None
         self._running: _Job | None = None
-        self._closed = False
+        self._closed = self._changing = False
         self._life, self._calibrator_life = 0, 0
         self._telling = threading.Lock()
         self._unsolved = 0
-        self._arrived = time.monotonic()
+        self._arrived = self._rested = time.monotonic()
         self._looked = -PROGRESS_PERIOD_S
         self.counters = Counters()
         self.progress: Progress | None = None
@@ -144,13 +156,20 @@ class Pipeline:
             self._changed.notify_all()
         self._answer(waiting, None)
 
+    def change(self, options: Options, idle_solve_s: float) -> None:
+        """Solve by other options from now on, which may differ in what `config.may_change` says."""
+        with self._changed:
+            self._options, self._idle_solve_s, self._changing = options, idle_solve_s, True
+            self._changed.notify_all()
+
     def close(self, timeout_s: float) -> bool:
-        """Stop both threads and say whether they ended in time: a solution that runs cannot be interrupted."""
+        """Stop both threads and say whether they ended in time: not every solver can be interrupted."""
         with self._changed:
             self._closed = True
             waiting = self._take_waiting()
             self._changed.notify_all()
         self._answer(waiting, None)
+        self._stop_solving()
         deadline = time.monotonic() + timeout_s
         for thread in self._threads:
             thread.join(max(0.0, deadline - time.monotonic()))
@@ -168,10 +187,12 @@ class Pipeline:
         """Run the perception thread: the only one that touches the calibrator."""
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._closed or self._images or self._requests, self._until_idle())
+                self._changed.wait_for(lambda: self._closed or self._images or self._requests or self._changing,
+                                       self._until_idle())
                 if self._closed:
                     return
                 life = self._life
+                changing, self._changing = self._changing, False
                 image = self._images.popleft() if self._images else None
                 requests: list[Future] = []
                 # a caller means all that has come so far, but does not wait for a queue that never empties
@@ -179,6 +200,9 @@ class Pipeline:
                     requests, self._requests = self._requests, []
             if life != self._calibrator_life:
                 self._calibrator, self._calibrator_life = AutoCalibrator(self._options), life
+            if changing:
+                self._calibrator.change(self._options)
+                self._unsolved += 1  # so that it takes effect even when no image comes any more
             if image is not None:
                 self._use(*image)
             if requests or (image is None and self._until_idle() == 0.0):
@@ -196,7 +220,7 @@ class Pipeline:
             image = self._decode(message)
             height, width = image.shape[:2]
             self._fitting((width, height))  # an image of another shape than the lens's is left out
-            self._calibrator.add_image(stamp_ns, image)
+            intake = self._calibrator.add_image(stamp_ns, image)
         except AutocalibError as error:
             self.counters.unreadable += 1
             self._listener.image_unreadable(error)
@@ -204,6 +228,12 @@ class Pipeline:
         except Exception as error:  # an unattended camera must survive one bad frame
             self._listener.failed(error)
             return
+        if intake is Intake.LATE:
+            self.counters.late += 1
+            return
+        if intake in (Intake.STEPPED, Intake.RESIZED):
+            self._refused = ''
+            self._listener.began_anew(intake.value)
         self.counters.used += 1
         with self._changed:
             self._unsolved += self._life == self._calibrator_life
@@ -231,16 +261,27 @@ class Pipeline:
     def _estimate(self) -> None:
         """Run the solver thread."""
         while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._closed or self._job)
-                if self._closed or self._job is None:
-                    return
-                job = self._running = self._job
-                self._job = None
+            job = self._next_job()
+            if job is None:
+                return
+            began = time.monotonic()
             result = self._guarded(partial(self._solved, job.evidence))
             if result is not None:
                 result = self._told(result, job.life)
+            self._rested = time.monotonic() + REST * (time.monotonic() - began)
             self._answer(job.waiting, result)
+
+    def _next_job(self) -> _Job | None:
+        """Wait for a snapshot, and for the end of the rest unless somebody waits for it; None at the end."""
+        with self._changed:
+            while not self._closed:
+                job = self._job
+                rest_s = 0.0 if job is None or job.waiting else self._rested - time.monotonic()
+                if job is not None and rest_s <= 0.0:
+                    self._running, self._job = job, None
+                    return job
+                self._changed.wait(None if job is None else rest_s)
+        return None
 
     def _solved(self, evidence: Evidence) -> Result:
         return self._solve(evidence, self._options, lens=self._fitting(evidence.image_size))
@@ -277,5 +318,6 @@ class Pipeline:
         try:
             return step()
         except Exception as error:  # reported with its traceback by the listener
-            self._listener.failed(error)
+            if not self._closed:  # what is broken off at the end is no fault
+                self._listener.failed(error)
             return None

@@ -1,18 +1,22 @@
 """The options of config.py as ROS parameters."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
 
 import pytest
+import yaml
 from rcl_interfaces.msg import ParameterType
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.parameter import Parameter
 
-from autocalib_ros.config import NodeOptions, Options, declared
+from autocalib_ros.config import NodeOptions, Options, declared, flattened, may_change
 from autocalib_ros.errors import UsageError
+from autocalib_ros.ros.live_parameters import changed_options
 from autocalib_ros.ros.parameters import read
-from bench import Bench, wait_for
+from bench import PATIENCE_S, Bench, wait_for
 
 OPTIONS = [*declared(Options()), *declared(NodeOptions())]
 NODE = [sys.executable, '-m', 'autocalib_ros.ros.node', '--ros-args']
@@ -24,12 +28,13 @@ def run_node(*arguments: str) -> subprocess.CompletedProcess:
     return subprocess.run([*NODE, *arguments], capture_output=True, text=True, timeout=60, check=False)
 
 
-def test_every_option_is_a_described_read_only_parameter(bench: Bench):
+def test_every_option_is_a_described_parameter(bench: Bench):
     node = bench.start()
     for item in OPTIONS:
         descriptor = node.describe_parameter(item.name)
         assert node.get_parameter(item.name).value == item.default
-        assert (descriptor.type, descriptor.read_only) == (PARAMETER_TYPE[type(item.default)], True)
+        assert (descriptor.type, descriptor.read_only) == (PARAMETER_TYPE[type(item.default)],
+                                                           not may_change(item.name))
         assert descriptor.description == item.doc
 
 
@@ -53,16 +58,97 @@ def test_a_distance_is_a_parameter_of_text(bench: Bench):
     assert node.get_parameter('scale.distance_px').value == '412 530 888 530'
 
 
-def test_a_source_of_the_scale_does_not_change_while_running(bench: Bench):
-    node = bench.start(camera_height=7.5)
-    for name, value in (('scale_from', 'speed'), ('scale.distance_px', '1 2 3 4'), ('scale.speed_km_h', 50.0)):
-        assert not node.set_parameters([Parameter(name, value=value)])[0].successful
+@pytest.mark.parametrize(('name', 'expected'), [
+    ('camera_height', True), ('gate.min_tracks', True), ('scale.speed_km_h', True), ('joint.noise_px', True),
+    ('camera_info_mode', True), ('tracking.max_points', False), ('buffer.seconds', False), ('max_image_width', False),
+    ('image_transport', False), ('camera_frame', False), ('camera_info_file', False), ('gate_of_another', False),
+])
+def test_what_is_read_at_each_solution_may_change_and_what_shapes_the_evidence_may_not(name, expected):
+    assert may_change(name) is expected
 
 
-def test_parameters_do_not_change_while_running(bench: Bench):
+@pytest.mark.parametrize(('given', 'told'), [
+    ({'camera_height': 9}, 'write camera_height:=9.0, not 9'),
+    ({'camera_height': -1.0}, "'camera_height' lies between 0 and 500"),
+    ({'camera_height': None}, "'camera_height' takes a float"),
+    ({'gate.min_tracks': 3.5}, "'min_tracks' takes a int"),
+    ({'camera_info_mode': 'never'}, 'one of per_image, latched_only'),
+    ({'scale_from': 'speed'}, "needs 'scale.speed_km_h'"),
+    ({'tracking.max_points': 100}, "'tracking.max_points' cannot change while the node runs"),
+    ({'image_transport': 'compressed'}, 'start the node with -p image_transport:=compressed'),
+])
+def test_change_that_cannot_be_is_refused_with_the_reason(given, told):
+    with pytest.raises(UsageError, match=told):
+        changed_options(Options(), NodeOptions(), given)
+
+
+def test_change_gives_new_options_and_leaves_other_parameters_to_ros():
+    options, node_options = changed_options(
+        Options(camera_height=7.5), NodeOptions(),
+        {'camera_height': 9.0, 'gate.min_tracks': 60, 'camera_info_mode': 'latched_only', 'use_sim_time': True,
+         'tracking.max_points': Options().tracking.max_points})
+    assert (options.camera_height, options.gate.min_tracks, node_options.camera_info_mode) == (9.0, 60, 'latched_only')
+
+
+def set_remotely(bench: Bench, *parameters: Parameter, atomically: bool = False) -> list:
+    """Set parameters by the node's service, as `ros2 param set` does; return the results."""
+    kind = SetParametersAtomically if atomically else SetParameters
+    client = bench.client.create_client(kind, f'/autocalib/set_parameters{"_atomically" if atomically else ""}')
+    assert client.wait_for_service(PATIENCE_S)
+    answer = client.call_async(kind.Request(parameters=[parameter.to_parameter_msg() for parameter in parameters]))
+    wait_for(answer.done, 'the answer')
+    return [answer.result().result] if atomically else list(answer.result().results)
+
+
+@pytest.mark.parametrize(('name', 'value', 'told'), [
+    ('camera_height', 9, 'write camera_height:=9.0, not 9'),
+    ('camera_height', 900.0, 'lies between 0 and 500'),
+    ('buffer.seconds', 60.0, 'cannot change while the node runs'),
+    ('camera_hight', 9.0, "unknown parameter 'camera_hight': did you mean 'camera_height'?"),
+])
+def test_ros_param_set_is_refused_in_words_that_help(bench: Bench, name, value, told):
+    bench.start(camera_height=7.5)
+    result, = set_remotely(bench, Parameter(name, value=value))
+    assert not result.successful
+    assert told in result.reason
+
+
+def test_source_of_the_scale_changes_at_once_or_not_at_all(bench: Bench):
     node = bench.start(camera_height=7.5)
-    assert not node.set_parameters([Parameter('camera_height', value=9.0)])[0].successful
-    assert node.get_parameter('camera_height').value == 7.5
+    changes = [Parameter('scale_from', value='speed'), Parameter('scale.speed_km_h', value=50.0),
+               Parameter('camera_height', value=0.0)]
+    assert not set_remotely(bench, *changes[:2], atomically=True)[0].successful
+    assert (node.options.scale_from, node.get_parameter('scale_from').value) == ('height', 'height')
+    assert set_remotely(bench, *changes, atomically=True)[0].successful
+    assert (node.options.scale_from, node.options.scale.speed_km_h, node.options.camera_height) == ('speed', 50.0, 0.0)
+
+
+def test_parameter_that_shapes_the_evidence_does_not_change(bench: Bench):
+    node = bench.start()
+    assert not node.set_parameters([Parameter('tracking.max_points', value=100)])[0].successful
+    assert node.options.tracking.max_points == node.get_parameter('tracking.max_points').value == 200
+
+
+@pytest.mark.parametrize('name', ['thermal', 'low_power'])
+def test_example_file_holds_only_options_that_differ_and_can_be_used(request, name):
+    file = request.config.rootpath / 'config' / f'{name}.yaml'
+    values = flattened(yaml.safe_load(file.read_text())['/**']['ros__parameters'])
+    read(values)
+    defaults = {item.name: item.default for item in OPTIONS}
+    assert values and not [key for key, value in values.items() if value == defaults[key]]
+
+
+@pytest.mark.parametrize('name', ['thermal', 'low_power'])
+def test_every_line_of_an_example_file_says_why(request, name):
+    lines = (request.config.rootpath / 'config' / f'{name}.yaml').read_text().splitlines()
+    options = [number for number, line in enumerate(lines) if re.match(r' *\w+: \S', line)]
+    assert options and all(lines[number - 1].lstrip().startswith('#') for number in options)
+
+
+@pytest.mark.parametrize('name', ['thermal', 'low_power'])
+def test_node_reads_an_example_file(request, name):
+    file = request.config.rootpath / 'config' / f'{name}.yaml'
+    assert ended_by(signal.SIGINT, '--params-file', str(file)) == 0
 
 
 @pytest.mark.parametrize(('given', 'told'), [

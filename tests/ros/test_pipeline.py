@@ -21,10 +21,13 @@ class Heard:
     """A listener that writes down what it is told."""
 
     def __init__(self):
-        self.sizes, self.unreadable, self.results, self.faults = [], [], [], []
+        self.sizes, self.unreadable, self.results, self.faults, self.anew = [], [], [], [], []
 
     def image_taken(self, width, height):
         self.sizes.append((width, height))
+
+    def began_anew(self, why):
+        self.anew.append(why)
 
     def image_unreadable(self, error):
         self.unreadable.append(str(error))
@@ -156,6 +159,63 @@ def test_unreadable_image_is_told_and_the_stream_goes_on(start, heard):
     wait_for(lambda: heard.unreadable == ['torn image'], 'the complaint')
     feed(pipeline, heard, 1)
     assert (pipeline.counters.unreadable, pipeline.counters.used) == (1, 1)
+
+
+def test_late_images_are_counted_and_not_used(start, heard):
+    pipeline = start(calibration)
+    feed(pipeline, heard, 10)
+    for number in (9, 5):  # a stamp twice, and one out of order
+        pipeline.offer(number * FRAME_NS, PIXELS)
+    feed(pipeline, heard, 1, first=10)
+    assert (pipeline.counters.late, pipeline.counters.used, heard.anew) == (2, 11, [])
+    assert result_of(pipeline.solve_now()).evidence.frames == 11
+
+
+def test_recording_that_begins_again_is_told_and_its_evidence_begins_anew(start, heard):
+    pipeline = start(calibration)
+    feed(pipeline, heard, 20)
+    pipeline.offer(0, PIXELS)
+    wait_for(lambda: heard.anew, 'the news')
+    assert heard.anew == ['the time stamps stepped']
+    assert result_of(pipeline.solve_now()).evidence.frames == 1
+
+
+def test_other_options_are_solved_with_though_no_image_comes(start, heard):
+    told = []
+    pipeline = start(calibration, idle_solve_s=0.1)
+    pipeline._solve = lambda evidence, options, lens: told.append(options.camera_height) or calibration(evidence)
+    feed(pipeline, heard, 1)
+    wait_for(lambda: told == [0.0], 'the first solution')
+    pipeline.change(Options(camera_height=9.0), 0.1)
+    wait_for(lambda: told == [0.0, 9.0], 'a solution by the new options')
+
+
+def test_solver_rests_unless_somebody_waits(start, heard, monkeypatch):
+    monkeypatch.setattr('autocalib_ros.ros.pipeline.REST', 1e6)
+    pipeline = start(lambda evidence: threading.Event().wait(0.01) or calibration(evidence))
+    feed(pipeline, heard, 1)
+    assert result_of(pipeline.solve_now())
+    feed(pipeline, heard, 1, first=1)
+    pipeline._submit(pipeline._calibrator.snapshot(), [])
+    assert not threading.Event().wait(0.3)  # long enough for a solution that does not wait to show
+    assert len(heard.results) == 1
+    assert result_of(pipeline.solve_now()).evidence.frames == 2
+
+
+def test_close_stops_a_solver_that_can_be_stopped_and_reports_no_fault(start, heard):
+    running, stopped = threading.Event(), threading.Event()
+
+    def slow(evidence):
+        running.set()
+        assert stopped.wait(PATIENCE_S)
+        raise RuntimeError('stopped')
+
+    pipeline = start(slow, stop_solving=stopped.set)
+    feed(pipeline, heard, 1)
+    pipeline.solve_now()
+    assert running.wait(PATIENCE_S)
+    assert pipeline.close(PATIENCE_S)
+    assert not heard.faults
 
 
 def test_fault_of_a_solver_is_told_and_the_next_solution_works(start, heard):

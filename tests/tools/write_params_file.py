@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from autocalib_ros.config import NodeOptions, Options
+from autocalib_ros.config import MAY_CHANGE, NodeOptions, Options
 
 HEAD = """\
 # Every option of autocalib_ros with its default: what it does, and what it may be.
@@ -18,9 +18,13 @@ HEAD = """\
 #
 # Copy the file and keep only the lines that you change. An unknown name is an error. A number with a point
 # stays one with a point: ROS refuses 8 where 8.0 is meant. The file has to stand before every -p that is to win.
+#
+{changes}
 
 /**:
   ros__parameters:"""
+CHANGES = 'While a node runs, `ros2 param set` changes these options and groups, and a solution follows at once:'
+FIXED = 'All else shapes the evidence from the first image on, or names what others rely on, and is read-only.'
 WIDTH = 118
 
 
@@ -70,7 +74,9 @@ def first_line(options: Any) -> str:
 def document() -> str:
     """Return the whole file."""
     node = NodeOptions()
-    lines = [HEAD, *lines_of(Options(), '    '), '', f'    # {first_line(node)}', *lines_of(node, '    ')]
+    wrapped = textwrap.wrap(f'{CHANGES} {", ".join(MAY_CHANGE)}. {FIXED}', WIDTH - 2)
+    head = HEAD.format(changes='\n'.join(f'# {line}' for line in wrapped))
+    lines = [head, *lines_of(Options(), '    '), '', f'    # {first_line(node)}', *lines_of(node, '    ')]
     return '\n'.join(lines) + '\n'
 
 

@@ -1,0 +1,139 @@
+"""Many cameras from one file: one node each, and nothing that two of them would share by mistake. Needs no ROS.
+
+config/cameras.yaml is an example. `defaults` holds for every camera; each has a `namespace` of its own, and as it
+needs them the other `KEYS`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from autocalib_ros.config import NodeOptions, Options, declared, flattened
+from autocalib_ros.errors import InputError, UsageError
+
+KEYS = ('namespace', 'image', 'camera_height', 'camera_info', 'params_file', 'parameters')
+"""What may be said of a camera: its image topic is `image_raw` unless told; `camera_info` is where that goes when the
+driver publishes none; `params_file` is relative to the file; `parameters` are options by name."""
+NODE_NAME = 'autocalib'
+NAMESPACE = re.compile(r'/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*', re.ASCII)
+
+
+@dataclass(frozen=True)
+class CameraNode:
+    """How to start the node of one camera: files and values of parameters, later ones win, and remappings."""
+
+    namespace: str
+    parameters: tuple[str | dict[str, Any], ...]
+    remappings: tuple[tuple[str, str], ...]
+
+
+def plain_name(name: str) -> str:
+    """Return a name in letters, digits and _, as camera_info_manager and frames want it."""
+    return re.sub(r'[^A-Za-z0-9_]', '_', name)
+
+
+def read_cameras(path: Path) -> list[CameraNode]:
+    """Return the nodes that a file asks for; UsageError or InputError with the reason."""
+    path = Path(path)
+    try:
+        tree = yaml.safe_load(path.read_text(encoding='utf-8'))
+    except OSError as error:
+        raise InputError(f'cannot read {path}: {error.strerror or error}') from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise InputError(f'{path} is not YAML: {" ".join(str(error).split())}') from error
+    try:
+        return camera_nodes(tree, path.parent)
+    except UsageError as error:
+        raise UsageError(f'{path}: {error}') from error
+
+
+def camera_nodes(tree: Any, folder: Path) -> list[CameraNode]:
+    """Return the nodes for the content of a file that lies in `folder`."""
+    if not isinstance(tree, Mapping) or not isinstance(tree.get('cameras'), list) or not tree['cameras']:
+        raise UsageError("it holds no list 'cameras' with at least one camera, each with its namespace")
+    _require_known(tree, ('defaults', 'cameras'))
+    defaults = _camera(tree.get('defaults') or {}, 'defaults')
+    cameras = [_camera(item, f'camera {number}') for number, item in enumerate(tree['cameras'], 1)]
+    cameras = [{**defaults, **camera, 'parameters': {**defaults['parameters'], **camera['parameters']}}
+               for camera in cameras]
+    for number, camera in enumerate(cameras, 1):
+        name = camera.get('namespace')
+        if not isinstance(name, str) or not NAMESPACE.fullmatch(name):
+            raise UsageError(f"camera {number} has the namespace {name!r}: give it one of its own, 'cam{number}' say")
+    _require_apart(cameras)
+    return [_node(camera, folder) for camera in cameras]
+
+
+def _camera(given: Any, where: str) -> dict[str, Any]:
+    """Return one camera's entries, its parameters by full name."""
+    if not isinstance(given, Mapping):
+        raise UsageError(f'{where} is {given!r}, not names with values such as namespace: cam1')
+    _require_known(given, KEYS)
+    parameters = given.get('parameters') or {}
+    if not isinstance(parameters, Mapping):
+        raise UsageError(f"'parameters' of {where} are {parameters!r}, not names with values")
+    return {**given, 'parameters': flattened(parameters)}
+
+
+def _require_known(given: Mapping[str, Any], known: tuple[str, ...]) -> None:
+    for name in given:
+        if name not in known:
+            near = get_close_matches(str(name), known, n=1)
+            raise UsageError(f"unknown entry '{name}': " + (f"did you mean '{near[0]}'?" if near else
+                                                           f'one of {", ".join(known)}'))
+
+
+def _require_apart(cameras: list[dict[str, Any]]) -> None:
+    """Raise UsageError where two cameras share what tells cameras apart."""
+    for what, of_camera in SEPARATE.items():
+        seen: dict[str, str] = {}
+        for camera in cameras:
+            value = of_camera(camera)
+            if value in seen:
+                raise UsageError(f"cameras '{seen[value]}' and '{camera['namespace']}' share the {what} '{value}': "
+                                 'give each its own')
+            seen[value] = camera['namespace']
+
+
+def _name(camera: dict[str, Any]) -> str:
+    return plain_name(camera['parameters'].get('camera_name') or camera['namespace'].strip('/'))
+
+
+def _resolved(camera: dict[str, Any], topic: str) -> str:
+    return topic if topic.startswith('/') else f"/{camera['namespace'].strip('/')}/{topic}"
+
+
+SEPARATE = {
+    'namespace': lambda camera: camera['namespace'].strip('/'),
+    'name for frames and files': _name,
+    'ground frame': lambda camera: camera['parameters'].get('ground_frame') or f'{_name(camera)}_ground',
+    'image topic': lambda camera: _resolved(camera, camera.get('image', 'image_raw')),
+    'camera_info topic': lambda camera: _resolved(camera, camera.get('camera_info') or f'{NODE_NAME}/camera_info'),
+}
+"""What two cameras must not share, and what it is for each."""
+
+
+def _node(camera: dict[str, Any], folder: Path) -> CameraNode:
+    values = camera['parameters']
+    if 'camera_height' in camera:
+        values = {**values, 'camera_height': camera['camera_height']}
+    floats = {item.name for options in (Options(), NodeOptions()) for item in declared(options)
+              if isinstance(item.default, float)}
+    # ROS refuses 8 where 8.0 is meant; in a file of our own it is plain what is meant.
+    values = {name: float(value) if name in floats and type(value) is int else value for name, value in values.items()}
+    parameters: list[str | dict[str, Any]] = []
+    if camera.get('params_file'):
+        parameters.append(str(folder / camera['params_file']))
+    if values:
+        parameters.append(values)
+    remappings = [('image', camera.get('image', 'image_raw'))]
+    if camera.get('camera_info'):
+        remappings.append(('~/camera_info', camera['camera_info']))
+    return CameraNode(camera['namespace'], tuple(parameters), tuple(remappings))

@@ -1,0 +1,51 @@
+"""What the driver says of its camera: the newest CameraInfo on `camera_info_in`, where that is wanted."""
+
+from __future__ import annotations
+
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import CameraInfo
+
+from autocalib_ros.config import NodeOptions
+
+QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""It hears every publisher, whatever that offers; messages this small are not lost."""
+
+
+class DriverInfo:
+    """Subscribes `camera_info_in` when `use_driver_camera_info` is set."""
+
+    def __init__(self, node: Node, options: NodeOptions) -> None:
+        self.newest: CameraInfo | None = None
+        """The newest message; None before the first, and always where it is not wanted."""
+        self.topic = node.resolve_topic_name('camera_info_in') if options.use_driver_camera_info else ''
+        if self.topic:
+            node.create_subscription(CameraInfo, self.topic, self._take, QOS)
+
+    def _take(self, message: CameraInfo) -> None:
+        self.newest = message
+
+    def doubt(self, image_size: tuple[int, int] | None) -> str:
+        """Say what is wrong with the driver's message, '' where nothing is or none is wanted."""
+        if not self.topic:
+            return ''
+        if self.newest is None:
+            return f'no CameraInfo comes on {self.topic}: remap camera_info_in, or set use_driver_camera_info:=false'
+        return size_doubt(self.newest, image_size) if image_size else ''
+
+
+def size_doubt(info: CameraInfo, image_size: tuple[int, int]) -> str:
+    """Say how the size of the images (width, height) differs from what the driver's binning and roi leave of its own.
+
+    A size of 0 is that of a driver that knows none, binning 0 is 1, and a roi of size 0 is the whole image.
+    """
+    full = (info.roi.width or info.width, info.roi.height or info.height)
+    if not all(full):
+        return ''
+    expected = tuple(pixels // max(1, binning) for pixels, binning in
+                     zip(full, (info.binning_x, info.binning_y), strict=True))
+    # Drivers round half pixels either way.
+    if all(abs(told - seen) <= 1 for told, seen in zip(expected, image_size, strict=True)):
+        return ''
+    return (f"the driver's CameraInfo is of images of {expected[0]}x{expected[1]}, and these have "
+            f'{image_size[0]}x{image_size[1]}: is camera_info_in of this camera?')

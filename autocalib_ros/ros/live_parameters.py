@@ -1,0 +1,74 @@
+"""Parameters that change while the node runs: what is refused, with the reason, and what follows from the rest."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from autocalib_ros.config import NodeOptions, Options, declared, may_change, with_values
+from autocalib_ros.errors import UsageError
+from autocalib_ros.ros.parameters import refuse_wrong_type, unknown
+
+Changed = Callable[[Options, NodeOptions], None]
+
+
+class LiveParameters:
+    """The options in force; `changed` is called with the new ones, `image_size` tells that of the images so far."""
+
+    def __init__(self, node: Node, options: Options, node_options: NodeOptions, changed: Changed,
+                 image_size: Callable[[], tuple[int, int] | None]) -> None:
+        self.options, self.node_options = options, node_options
+        self._node, self._changed, self._image_size = node, changed, image_size
+        node.add_on_set_parameters_callback(self._check)
+        node.add_post_set_parameters_callback(self._take)
+
+    def refusal(self, parameters: list[Parameter]) -> SetParametersResult | None:
+        """Return why these cannot be set, all at once; None where they can."""
+        foreign = [parameter.name for parameter in parameters if not self._node.has_parameter(parameter.name)]
+        if foreign:
+            return SetParametersResult(successful=False, reason=unknown(foreign[0]))
+        result = self._check(parameters)
+        return None if result.successful else result
+
+    def _check(self, parameters: list[Parameter]) -> SetParametersResult:
+        try:
+            options, _ = changed_options(self.options, self.node_options, _values(parameters))
+            size = self._image_size()
+            if size is not None:
+                options.scale.require_inside(*size)
+        except UsageError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _take(self, parameters: list[Parameter]) -> None:
+        options, node_options = changed_options(self.options, self.node_options, _values(parameters))
+        if (options, node_options) != (self.options, self.node_options):
+            self.options, self.node_options = options, node_options
+            self._changed(options, node_options)
+
+
+def changed_options(options: Options, node_options: NodeOptions,
+                    values: Mapping[str, Any]) -> tuple[Options, NodeOptions]:
+    """Return the options with other values by full name; names that are no options are left to ROS.
+
+    UsageError for what cannot change while the node runs, or cannot be used.
+    """
+    core, of_node = ({item.name: item for item in declared(group)} for group in (options, node_options))
+    for name, value in values.items():
+        item = core.get(name) or of_node.get(name)
+        if item is None:
+            continue
+        refuse_wrong_type(item, value)
+        if not may_change(name) and value != item.default:
+            raise UsageError(f"'{name}' cannot change while the node runs, what it holds rests on it: start the node "
+                             f'with -p {name}:={value}')
+    return (with_values(options, {name: value for name, value in values.items() if name in core}),
+            with_values(node_options, {name: value for name, value in values.items() if name in of_node}))
+
+
+def _values(parameters: list[Parameter]) -> dict[str, Any]:
+    return {parameter.name: parameter.value for parameter in parameters}

@@ -1,0 +1,172 @@
+"""What /diagnostics says, as one pure function of what the node knows. Needs no ROS."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import Enum
+
+from autocalib_ros.calibration import Calibration
+from autocalib_ros.calibrator import Progress
+from autocalib_ros.ros.silence import Silence
+from autocalib_ros.ros.wording import tilt_deg
+
+OK, WARN, ERROR = 0, 1, 2
+"""Levels of diagnostic_msgs/DiagnosticStatus; STALE is the aggregator's to say."""
+RATE_WINDOW_S = 5.0
+"""Real seconds over which rates are counted."""
+DROPPED_SHARE = 0.1
+"""Images dropped, as a share of those received, from which the machine is too slow for the camera."""
+
+
+class State(str, Enum):
+    """What the node is doing."""
+
+    WAITING_FOR_IMAGES = 'WAITING_FOR_IMAGES'
+    COLLECTING = 'COLLECTING'
+    RESTORED = 'RESTORED'
+    CALIBRATED = 'CALIBRATED'
+
+
+LEVELS = {State.WAITING_FOR_IMAGES: WARN, State.COLLECTING: WARN, State.RESTORED: WARN, State.CALIBRATED: OK}
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Images so far, or per second: how many came, and what became of them."""
+
+    received: float = 0
+    used: float = 0
+    dropped: float = 0
+    unreadable: float = 0
+    late: float = 0
+    lost: float = 0
+    """Lost by the middleware before they came here."""
+
+
+class Recent:
+    """Counts of the last `RATE_WINDOW_S`."""
+
+    def __init__(self) -> None:
+        self._seen: deque[tuple[float, Counts]] = deque()
+
+    def rates_hz(self, now_s: float, counts: Counts) -> Counts | None:
+        """Take what was counted until now; return it per second, None at the first call."""
+        self._seen.append((now_s, counts))
+        while now_s - self._seen[0][0] > RATE_WINDOW_S and len(self._seen) > 2:
+            self._seen.popleft()
+        since_s, before = self._seen[0]
+        if now_s <= since_s:
+            return None
+        return Counts(*((getattr(counts, name) - getattr(before, name)) / (now_s - since_s)
+                        for name in Counts.__dataclass_fields__))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Situation:
+    """What the node knows at one moment."""
+
+    topic: str
+    counts: Counts
+    rates_hz: Counts | None = None
+    result: Calibration | None = None
+    """The calibration in force."""
+    restored: bool = False
+    """It was stored by an earlier run and is not yet confirmed by traffic."""
+    progress: Progress | None = None
+    image_age_s: float | None = None
+    encoding: str = ''
+    silence: Silence | None = None
+    unreadable: str = ''
+    """Why the newest image could not be used."""
+    errors: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    """What else is wrong, in words: nothing works before errors are mended."""
+
+
+@dataclass(frozen=True)
+class Status:
+    """The content of a diagnostic_msgs/DiagnosticStatus."""
+
+    level: int
+    message: str
+    values: tuple[tuple[str, str], ...]
+
+
+def state_of(situation: Situation) -> State:
+    """Return what the node is doing."""
+    if situation.result is not None:
+        return State.RESTORED if situation.restored else State.CALIBRATED
+    return State.COLLECTING if situation.counts.used else State.WAITING_FOR_IMAGES
+
+
+def status(situation: Situation) -> Status:
+    """Return the level, one line for people, and every number."""
+    state, problems = state_of(situation), sorted(_problems(situation), key=lambda problem: -problem[0])
+    level = max([LEVELS[state], *(level for level, _ in problems)])
+    message = '; '.join([_headline(state, situation), *(words for _, words in problems)])
+    return Status(level, message, tuple(_values(state, situation)))
+
+
+def _headline(state: State, situation: Situation) -> str:
+    result, progress = situation.result, situation.progress
+    if result is not None:
+        note = ', not yet verified by traffic' if state is State.RESTORED else ''
+        return f'{state.value}: grade {result.grade}, focal length {result.camera.focal_px:.1f} px{note}'
+    if state is State.COLLECTING and progress is not None:
+        return f'{state.value}: {progress}'
+    return f'{state.value}: {situation.topic}' if state is State.WAITING_FOR_IMAGES else state.value
+
+
+def _problems(situation: Situation) -> Iterator[tuple[int, str]]:
+    yield from ((ERROR, words) for words in situation.errors)
+    if situation.unreadable:
+        yield ERROR, f'images cannot be used: {situation.unreadable}'
+    if situation.silence is not None:
+        yield ERROR if situation.silence.lasting else WARN, situation.silence.words
+    yield from ((WARN, words) for words in situation.warnings)
+    rates = situation.rates_hz
+    if rates is not None and rates.dropped > DROPPED_SHARE * rates.received:
+        yield WARN, (f'{rates.dropped:.1f} of {rates.received:.1f} images a second are dropped: lower the rate or size '
+                     'of the images, max_image_width or tracking.max_points')
+    if rates is not None and rates.received > 0 and rates.late >= rates.received:
+        yield WARN, 'no image is newer than those before: the time stamps of the images do not advance'
+
+
+def _values(state: State, situation: Situation) -> Iterator[tuple[str, str]]:
+    counts, rates, progress = situation.counts, situation.rates_hz, situation.progress
+    yield 'state', state.value
+    yield 'evidence_percent', '0' if progress is None else f'{progress.percent:.0f}'
+    yield 'missing', '' if progress is None else '; '.join(progress.missing)
+    yield 'outlook', '' if progress is None else progress.outlook
+    yield 'image_topic', situation.topic
+    yield 'encoding', situation.encoding
+    yield 'image_age_s', _number(situation.image_age_s, '.1f')
+    yield 'received_hz', _number(None if rates is None else rates.received, '.1f')
+    yield 'used_hz', _number(None if rates is None else rates.used, '.1f')
+    for name in Counts.__dataclass_fields__:
+        yield name, f'{getattr(counts, name):.0f}'
+    yield from _result_values(situation.result)
+
+
+def _result_values(result: Calibration | None) -> Iterator[tuple[str, str]]:
+    """Yield the numbers of the calibration in force, all of them '' while there is none."""
+    sigma = None if result is None else result.stddev
+    ground = None if result is None else result.ground
+    yield 'grade', '' if result is None else result.grade
+    yield 'focal_px', _number(None if result is None else result.camera.focal_px, '.2f')
+    yield 'focal_sigma_px', _number(sigma and sigma.focal_px, '.3g')
+    yield 'tilt_deg', _number(None if ground is None else tilt_deg(ground), '.2f')
+    yield 'tilt_sigma_deg', _number(sigma and sigma.tilt_deg, '.3g')
+    yield 'roll_sigma_deg', _number(sigma and sigma.roll_deg, '.3g')
+    yield 'height_m', _number(ground.height_m if ground is not None and ground.metric else None, '.3f')
+    yield 'height_sigma_m', _number(sigma and sigma.height_m, '.3g')
+    yield 'assumptions', '' if result is None else '; '.join(result.assumptions)
+    refusal = None if result is None else result.ground_refusal
+    yield 'no_ground_plane', '' if refusal is None else refusal.message
+    yield 'newest_stamp_s', _number(None if result is None else result.newest_stamp_ns * 1e-9, '.3f')
+
+
+def _number(value: float | None, form: str) -> str:
+    return '' if value is None else format(value, form)

@@ -1,0 +1,172 @@
+"""What the node makes of its stream, its driver and its parameters, heard over DDS."""
+
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import CameraInfo, RegionOfInterest
+
+from autocalib_ros.ros.driver_info import size_doubt
+from autocalib_ros.ros.messages import stamp_ns, time_message
+from bench import SIZE, Bench, calibration, image, wait_for
+
+START_NS = 1_700_000_000_000_000_000
+FRAME_NS = 100_000_000
+INFO = '/autocalib/camera_info'
+
+
+@pytest.fixture
+def told(bench: Bench) -> list:
+    return bench.collect(DiagnosticArray, '/diagnostics')
+
+
+def message(told: list) -> str:
+    return told[-1].status[0].message if told else ''
+
+
+def values(told: list) -> dict[str, str]:
+    return {item.key: item.value for item in told[-1].status[0].values} if told else {}
+
+
+def fed(bench: Bench, count: int = 3, **parameters):
+    """Return a node that used `count` images, and the publisher of its images."""
+    heights = parameters.pop('heights', [])
+
+    def solve(evidence, options, lens):
+        heights.append(options.camera_height)
+        return calibration(evidence)
+
+    node = bench.start(solve, idle_solve_s=0.3, **parameters)
+    publisher = bench.connected(bench.publisher())
+    counters = node._pipeline.counters
+    for number in range(count):
+        publisher.publish(image(START_NS + number * FRAME_NS))
+        wait_for(lambda wanted=number + 1: counters.used >= wanted, 'an image')
+    return node, publisher
+
+
+def test_calibrated_node_says_so_in_diagnostics(bench, told):
+    fed(bench, camera_height=8.0)
+    wait_for(lambda: values(told).get('state') == 'CALIBRATED', 'the calibration')
+    assert (told[-1].status[0].level, told[-1].status[0].name) == (b'\x00', 'autocalib: calibration')
+    assert (values(told)['grade'], values(told)['focal_px'], values(told)['focal_sigma_px']) == ('full', '300.00', '1')
+    assert stamp_ns(told[-1].header.stamp) > START_NS
+
+
+def test_image_that_cannot_be_decoded_is_an_error_until_one_can(bench, told):
+    node, publisher = fed(bench)
+    publisher.publish(image(START_NS + 10 * FRAME_NS, encoding='no_such_encoding'))
+    wait_for(lambda: "'no_such_encoding' is not supported" in message(told), 'the complaint')
+    assert (told[-1].status[0].level, values(told)['unreadable']) == (b'\x02', '1')
+    publisher.publish(image(START_NS + 11 * FRAME_NS))
+    wait_for(lambda: 'no_such_encoding' not in message(told), 'the end of the complaint')
+
+
+def test_size_that_changes_is_an_error_until_there_is_a_new_calibration(bench, told):
+    node, publisher = fed(bench, camera_height=8.0)
+    wait_for(lambda: node.in_force.published, 'the calibration')
+    node._pipeline.change(node.options, 1000.0)  # no solution for now
+    publisher.publish(image(START_NS + 10 * FRAME_NS, size=(160, 120)))
+    wait_for(lambda: 'these have 160x120: it is withdrawn' in message(told), 'the error')
+    assert (told[-1].status[0].level, values(told)['state']) == (b'\x02', 'COLLECTING')
+    node._pipeline.change(node.options, 0.1)
+    wait_for(lambda: values(told)['state'] == 'CALIBRATED', 'a calibration of the new size')
+    assert told[-1].status[0].level == b'\x00'
+
+
+def test_second_publisher_of_our_camera_info_is_told(bench, told):
+    bench.client.create_publisher(CameraInfo, INFO, QoSProfile(depth=1))
+    bench.start()
+    wait_for(lambda: f'/client publishes {INFO} too: remap one of them' in message(told), 'the warning')
+    assert told[-1].status[0].level == b'\x01'
+
+
+def test_two_cameras_on_one_topic_are_told(bench, told):
+    bench.publisher(), bench.publisher()
+    bench.start()
+    wait_for(lambda: '2 publishers share /image' in message(told), 'the warning')
+
+
+@pytest.mark.parametrize('wanted', [True, False])
+def test_newest_message_of_the_driver_is_kept_where_that_is_wanted(bench, wanted):
+    driver = bench.client.create_publisher(CameraInfo, 'camera_info_in', QoSProfile(depth=1))
+    node = bench.start(use_driver_camera_info=wanted)
+    if not wanted:
+        assert (node._driver.newest, node._driver.doubt(SIZE), driver.get_subscription_count()) == (None, '', 0)
+        return
+    assert 'no CameraInfo comes on /camera_info_in' in node._driver.doubt(SIZE)
+    bench.connected(driver)
+    driver.publish(CameraInfo(width=2 * SIZE[0], height=2 * SIZE[1], binning_x=2, binning_y=2))
+    wait_for(lambda: node._driver.newest, 'the message')
+    assert (node._driver.newest.binning_x, node._driver.doubt(SIZE)) == (2, '')
+    assert '320x240, and these have 640x480' in node._driver.doubt((640, 480))
+
+
+@pytest.mark.parametrize(('info', 'fits'), [
+    (CameraInfo(width=640, height=480), True),
+    (CameraInfo(width=1280, height=960, binning_x=2, binning_y=2), True),
+    (CameraInfo(width=1281, height=961, binning_x=2, binning_y=2), True),
+    (CameraInfo(width=1920, height=1080, roi=RegionOfInterest(x_offset=9, width=640, height=480)), True),
+    (CameraInfo(), True),  # a driver that knows no size
+    (CameraInfo(width=1280, height=960), False),
+    (CameraInfo(width=640, height=480, binning_x=2, binning_y=2), False),
+])
+def test_size_of_the_drivers_message_is_compared_with_the_images(info, fits):
+    assert (size_doubt(info, (640, 480)) == '') is fits
+
+
+def test_camera_height_that_changes_is_solved_with_at_once(bench):
+    heights = []
+    node, _ = fed(bench, camera_height=8.0, heights=heights)
+    wait_for(lambda: heights == [8.0], 'the first solution')
+    assert node.set_parameters_atomically([Parameter('camera_height', value=9.0)]).successful
+    wait_for(lambda: heights == [8.0, 9.0], 'a solution with the new height')
+
+
+def test_pixel_outside_the_images_is_refused_once_their_size_is_known(bench):
+    node, _ = fed(bench)
+    refused = node.set_parameters_atomically([
+        Parameter('scale_from', value='distance'), Parameter('scale.distance_m', value=5.0),
+        Parameter('scale.distance_px', value='10 10 900 10')])
+    assert not refused.successful and 'lies outside the images' in refused.reason
+
+
+def test_recording_that_loops_begins_the_evidence_anew_and_keeps_the_calibration(bench):
+    infos = bench.collect(CameraInfo, INFO)
+    node, publisher = fed(bench, count=20, camera_height=8.0)
+    wait_for(lambda: (now := node.in_force.published) and now.result.evidence.frames == 20, 'the calibration')
+    bench.listening(INFO)
+    again = image(START_NS)
+    publisher.publish(again)
+    wait_for(lambda: infos and infos[-1].header == again.header, 'camera_info of the first image again')
+    wait_for(lambda: node.in_force.published.result.evidence.frames == 1, 'the evidence of the second time')
+
+
+def test_images_twice_and_out_of_order_are_left_out_of_the_evidence_but_get_camera_info(bench, told):
+    infos = bench.collect(CameraInfo, INFO)
+    node, publisher = fed(bench, count=10, camera_height=8.0)
+    wait_for(lambda: node.in_force.published, 'the calibration')
+    bench.listening(INFO)
+    late = [image(START_NS + number * FRAME_NS) for number in (9, 5)]
+    for sent in late:
+        publisher.publish(sent)
+    wait_for(lambda: [info.header for info in infos[-2:]] == [sent.header for sent in late], 'their camera_info')
+    wait_for(lambda: values(told)['late'] == '2', 'the count')
+    assert values(told)['used'] == '10'
+
+
+def test_images_without_stamps_take_their_time_from_the_clock_of_the_recording(bench):
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    clock = bench.client.create_publisher(Clock, '/clock', latched)
+    node = bench.start(lambda evidence, options, lens: calibration(evidence), use_sim_time=True, idle_solve_s=0.3)
+    publisher = bench.connected(bench.publisher())
+    counters = node._pipeline.counters
+    for second in (5000, 5001, 20):  # the clock steps back, as where a recording is played in a loop
+        clock.publish(Clock(clock=time_message(second * 10 ** 9)))
+        wait_for(lambda now=second: node.get_clock().now().nanoseconds == now * 10 ** 9, 'the clock')
+        before = counters.used
+        publisher.publish(image(0))
+        wait_for(lambda before=before: counters.used == before + 1, 'an image')
+    wait_for(lambda: (now := node.in_force.published) and now.result.newest_stamp_ns == 20 * 10 ** 9, 'the solution')
+    assert node.in_force.published.result.evidence.frames == 1

@@ -1,0 +1,37 @@
+"""Why no image arrives: one line that names the fault and what mends it."""
+
+import pytest
+
+from autocalib_ros.ros.silence import COMPRESSED, IMAGE, Offer, topic_beside, why_silent
+
+RAW = Offer('/cam/driver', IMAGE, True)
+LOSSY = Offer('/cam/driver', IMAGE, False)
+PACKED = Offer('/cam/driver', COMPRESSED, True)
+POINTS = Offer('/lidar', 'sensor_msgs/msg/PointCloud2', True)
+T, C = '/cam/image', '/cam/image/compressed'
+
+
+@pytest.mark.parametrize(('topic', 'kind', 'offers', 'beside', 'reliable', 'told', 'lasting'), [
+    (T, IMAGE, [], [], True, 'nobody publishes /cam/image: start the camera, or remap', False),
+    (T, IMAGE, [], [PACKED], True, '/cam/image/compressed: set image_transport:=compressed', True),
+    (C, COMPRESSED, [], [RAW], True, 'publishes /cam/image: set image_transport:=raw', True),
+    (C + '/compressed', COMPRESSED, [], [PACKED], True, 'remap without it, -r image:=/cam/image', True),
+    (C, IMAGE, [PACKED], [], True, 'set image_transport:=compressed, and remap -r image:=/cam/image', True),
+    (T, IMAGE, [PACKED], [], True, 'republish it on /cam/image/compressed', True),
+    (C, COMPRESSED, [RAW], [], True, 'set image_transport:=raw, and remap -r image:=/cam/image/compressed', True),
+    (T, IMAGE, [POINTS], [], True, 'as sensor_msgs/msg/PointCloud2, and this node takes sensor_msgs/msg/Image', True),
+    (T, IMAGE, [LOSSY], [], True, 'incompatible QoS): set image_reliability:=auto', True),
+    (T, IMAGE, [LOSSY, RAW], [], True, 'nothing arrives: is the camera running?', False),
+    (T, IMAGE, [LOSSY], [], False, 'best effort loses large images', False),
+    (T, IMAGE, [RAW], [], False, 'is the camera running?', False),
+])
+def test_fault_is_named_with_what_mends_it(topic, kind, offers, beside, reliable, told, lasting):
+    silence = why_silent(topic, kind, offers, asks_reliable=reliable, beside=beside)
+    assert told in silence.words
+    assert '\n' not in silence.words
+    assert silence.lasting == lasting
+
+
+@pytest.mark.parametrize(('topic', 'kind', 'beside'), [(T, IMAGE, C), (C, COMPRESSED, T)])
+def test_other_transport_of_a_camera_is_beside_it(topic, kind, beside):
+    assert topic_beside(topic, kind) == beside

@@ -1,0 +1,68 @@
+"""Solutions in a process of their own."""
+
+import os
+import signal
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import pytest
+
+from autocalib_ros.calibration import Refusal
+from autocalib_ros.calibrator import AutoCalibrator, solve
+from autocalib_ros.config import Options, ScaleOptions
+from autocalib_ros.errors import UsageError
+from autocalib_ros.ros.solver import SolverEnded, SolverProcess
+from bench import PATIENCE_S, PIXELS
+
+OPTIONS = Options(camera_height=8.0)
+
+
+def snapshot():
+    calibrator = AutoCalibrator(OPTIONS)
+    calibrator.add_image(0, PIXELS)
+    return calibrator.snapshot()
+
+
+@pytest.fixture(scope='module')
+def solver():
+    """Yield a solver; its process is started by the first problem."""
+    started = SolverProcess()
+    yield started
+    started.close()
+
+
+def test_process_gives_the_result_that_the_solver_gives(solver):
+    evidence = snapshot()
+    result = solver(evidence, OPTIONS, lens=None)
+    assert isinstance(result, Refusal)
+    assert result == solve(evidence, OPTIONS)
+
+
+def test_exception_of_the_solver_is_raised_here_with_its_traceback(solver):
+    outside = replace(OPTIONS, camera_height=0.0, scale_from='distance',
+                      scale=ScaleOptions(distance_px='10 10 9000 10', distance_m=5.0))
+    with pytest.raises(UsageError, match='lies outside the images') as raised:
+        solver(snapshot(), outside, lens=None)
+    assert 'require_inside' in str(raised.value.__cause__)
+
+
+def test_process_that_dies_is_told_and_the_next_solution_starts_another(solver):
+    assert not solver(snapshot(), OPTIONS, lens=None)
+    os.kill(solver._process.pid, signal.SIGKILL)
+    with pytest.raises(SolverEnded, match='ended with status -9'):
+        solver(snapshot(), OPTIONS, lens=None)
+    assert not solver(snapshot(), OPTIONS, lens=None)
+
+
+def test_close_ends_a_solution_that_runs(solver):
+    assert not solver(snapshot(), OPTIONS, lens=None)
+    process = solver._process
+    os.kill(process.pid, signal.SIGSTOP)  # a solution that never ends
+    with ThreadPoolExecutor(max_workers=1) as pool:
+        answer = pool.submit(solver, snapshot(), OPTIONS, lens=None)
+        assert not threading.Event().wait(0.2)
+        assert not answer.done()
+        solver.close()
+        assert isinstance(answer.exception(PATIENCE_S), SolverEnded)
+    assert not process.is_alive()
