@@ -27,6 +27,8 @@ KEPT = 0.9
 KEEPERS = 0.8
 """A vehicle keeps to a road that it follows for so much of its way; so many, of all that follow it anywhere, have to.
 """
+TOLD_BY = 3
+"""Tracks of a vehicle that tell whether it keeps to a road: a single one is on it or not."""
 MIN_CONTRAST = 1.3
 """Agreement at the best trial focal length over that at the median one: wrong lenses bend straight paths apart."""
 LONGEST_FOCAL = 1.5
@@ -118,13 +120,14 @@ def _straight_share(fit: JointFit, tracks: TrackSet) -> float:
 
 
 def keepers(fit: JointFit, every: TrackSet) -> float:
-    """Share of the vehicles that follow a road anywhere that do so all along, 0 where none does."""
+    """Share of the vehicles that follow a road anywhere that do so all along, 0 where too few tell."""
     labels, _ = assign(fit.state, Seen.through(fit.state.camera, every))
     lengths = np.hypot(*np.moveaxis(np.diff(every.pixels, axis=1), -1, 0)).sum(axis=1)
     _, owners = np.unique(every.vehicles, return_inverse=True)
     share = np.bincount(owners, lengths * (labels >= 0)) / np.maximum(np.bincount(owners, lengths), 1e-9)
-    following = share > 1.0 - KEPT
-    return float((share > KEPT).sum() / max(following.sum(), 1))
+    following = (share > 1.0 - KEPT) & (np.bincount(owners) >= TOLD_BY)
+    kept = following & (share > KEPT)
+    return float(kept.sum() / following.sum()) if following.sum() >= MIN_VEHICLES else 0.0
 
 
 def _turning(fit: JointFit, tracks: TrackSet, needed: float) -> Reason:
