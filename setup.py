@@ -30,7 +30,7 @@ setup(
     ],
     extras_require={
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
-        'test': ['pytest>=7', 'hypothesis>=6', 'ruff>=0.4'],
+        'test': ['pytest>=7', 'pytest-xdist>=3', 'hypothesis>=6', 'ruff>=0.4'],
     },
     zip_safe=True,
     maintainer='autocalib_ros developers',

@@ -33,7 +33,7 @@ def commands() -> list[str]:
 def test_readme_holds_two_commands(commands):
     assert len(commands) == 2
     assert commands[0].endswith('.venv/bin/autocalib demo')
-    assert commands[1].endswith('-m pytest')
+    assert commands[1].endswith('-m pytest -n 2')
 
 
 def table_row(name: str) -> str:

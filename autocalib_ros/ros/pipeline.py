@@ -29,8 +29,8 @@ from autocalib_ros.evidence import Evidence
 
 WAITING_IMAGES = 8
 """Images that may wait for the perception thread: half a second of a hiccup at 15 Hz, 22 MB at 1280x720."""
-REST = 3.0
-"""Time without a solution after one, in units of what that took: solutions take a quarter of a core at the most."""
+REST = 4.0
+"""Time without a solution after one, in units of what that took: solutions take a fifth of a core at the most."""
 TRIED_PERCENT = 99.0
 """The most that is told while the last solution was refused."""
 PROGRESS_PERIOD_S = 1.0
