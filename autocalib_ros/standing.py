@@ -39,9 +39,9 @@ class CalibrationState(Enum):
     RESTORED = 'restored'
     """From an earlier run, not yet verified."""
     VERIFIED = 'verified'
-    """From an earlier run, and the traffic of this one agrees."""
+    """From evidence that is gone, of an earlier run or from before time stepped, and the traffic has vouched for it."""
     CALIBRATED = 'calibrated'
-    """Solved from the traffic of this run."""
+    """Solved from the evidence at hand."""
 
 
 @dataclass(frozen=True)
@@ -74,16 +74,16 @@ def decided(state: CalibrationState, before: Calibration | None, fresh: Calibrat
     if unlike:
         told = ', '.join(filter(None, unlike))
         return Decision(CalibrationState.CALIBRATED, fresh, contradicted=True, words=(
-            f'the restored calibration does not hold any more and is replaced: {told}' if told else 'the restored '
+            f'the earlier calibration does not hold any more and is replaced: {told}' if told else 'the earlier '
             'calibration is replaced: without standard deviations nothing tells whether it still holds'))
     if before.ground is not None and fresh.ground is None:
         why = f': {fresh.ground_refusal.message}' if fresh.ground_refusal else ''
-        return Decision(state, before, f'the traffic confirms the restored lens; its ground plane is not verified{why}')
+        return Decision(state, before, f'the traffic confirms the earlier lens; its ground plane is not verified{why}')
     if _as_sure(fresh, before):
-        return Decision(CalibrationState.CALIBRATED, fresh, 'the restored calibration is confirmed, and replaced by '
+        return Decision(CalibrationState.CALIBRATED, fresh, 'the earlier calibration is confirmed, and replaced by '
                         'one as sure')
     return Decision(CalibrationState.VERIFIED, before, '' if state is CalibrationState.VERIFIED else
-                    'the traffic confirms the restored calibration, which is surer and stays in force')
+                    'the traffic confirms the earlier calibration, which is surer and stays in force')
 
 
 def _unlike_lens(before: Calibration, fresh: Calibration) -> list[str | None]:

@@ -70,7 +70,7 @@ def test_lens_alone_confirms_the_lens_and_leaves_the_plane_unverified():
     fresh = replace(lens_only(VAGUE), ground_refusal=Reason('one_direction', 'one road only.', 'wait'))
     decision = decided(RESTORED, KEPT, fresh)
     assert (decision.state, decision.in_force) == (RESTORED, KEPT)
-    assert 'confirms the restored lens' in decision.words and 'one road only.' in decision.words
+    assert 'confirms the earlier lens' in decision.words and 'one road only.' in decision.words
 
 
 def test_other_lens_without_a_plane_replaces_lens_and_plane():

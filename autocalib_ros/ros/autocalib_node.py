@@ -245,7 +245,8 @@ class AutocalibNode(Node):
             self.get_logger().warning(f'{self._withdrawn} and collecting starts anew')
 
     def began_anew(self, why: str) -> None:
-        """Log that the evidence so far was dropped; a calibration from it stays in force."""
+        """Log that the evidence so far was dropped; a calibration from it stays in force until one is as sure."""
+        self.in_force.began_anew()
         self._say_seldom(f'anew {why}', f'{why}: the evidence is collected anew', error=False)
 
     def image_unreadable(self, error: AutocalibError) -> None:

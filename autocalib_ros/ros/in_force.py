@@ -102,6 +102,12 @@ class InForce:
             self.withdraw()
         return state, published
 
+    def began_anew(self) -> None:
+        """Keep what is in force until a solution of the new evidence is as sure, or contradicts it."""
+        with self._lock:
+            if self.state is CalibrationState.CALIBRATED:
+                self.state = CalibrationState.VERIFIED
+
     def solved(self, result: Calibration) -> Decision | None:
         """Let a new solution confirm or replace what is in force; None where images have another size by now."""
         while True:

@@ -120,9 +120,10 @@ class Bench:
         return self.ask('calibrate')
 
     def stop(self, node: AutocalibNode) -> None:
-        """End one node."""
+        """End one node, once the executor is in none of its callbacks."""
         self.executor.remove_node(node)
         self.nodes.remove(node)
+        wait_for(self.executor.create_task(lambda: None).done, 'the executor')
         node.close()
         node.destroy_node()
 

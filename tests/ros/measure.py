@@ -187,8 +187,8 @@ def run_node(options: argparse.Namespace) -> dict:
     child = resource.getrusage(resource.RUSAGE_CHILDREN)
     return {**vars(counters), 'lost_by_dds': nodes[0]._input.lost, 'cores': (cpu_after - cpu_before) / (ended - began),
             'cores_solving': (child.ru_utime + child.ru_stime) / (ended - began),
-            'state': 'calibrated' if nodes[0].in_force.published else 'collecting', 'solutions_s': quantiles(solved_s or [0.0]),
-            'latency_ms': quantiles(latencies_ms), 'ms': timed.summary(),
+            'state': 'calibrated' if nodes[0].in_force.published else 'collecting',
+            'solutions_s': quantiles(solved_s or [0.0]), 'latency_ms': quantiles(latencies_ms), 'ms': timed.summary(),
             'memory_mb': resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024}
 
 

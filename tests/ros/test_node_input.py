@@ -1,5 +1,7 @@
 """What the node makes of its stream, its driver and its parameters, heard over DDS."""
 
+from dataclasses import replace
+
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.parameter import Parameter
@@ -7,6 +9,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, RegionOfInterest
 
+from autocalib_ros.calibration import StandardDeviations
 from autocalib_ros.ros.driver_info import size_doubt
 from autocalib_ros.ros.messages import stamp_ns, time_message
 from bench import SIZE, Bench, calibration, image, wait_for
@@ -141,6 +144,25 @@ def test_recording_that_loops_begins_the_evidence_anew_and_keeps_the_calibration
     publisher.publish(again)
     wait_for(lambda: infos and infos[-1].header == again.header, 'camera_info of the first image again')
     wait_for(lambda: node.in_force.published.result.evidence.frames == 1, 'the evidence of the second time')
+
+
+@pytest.mark.parametrize(('focal_px', 'state', 'in_force_px'),
+                         [(305.0, 'VERIFIED', 300.0), (400.0, 'CALIBRATED', 400.0)])
+def test_after_a_loop_a_surer_calibration_stays_unless_the_traffic_contradicts_it(bench, focal_px, state, in_force_px):
+    def solve(evidence, options, lens):
+        if evidence.frames > 3:
+            return calibration(evidence)
+        return replace(calibration(evidence, focal_px), stddev=StandardDeviations(focal_px=9.0))
+
+    node = bench.start(solve, idle_solve_s=0.3, camera_height=8.0)
+    publisher, counters = bench.connected(bench.publisher()), node._pipeline.counters
+    for number in range(20):
+        publisher.publish(image(START_NS + number * FRAME_NS))
+        wait_for(lambda wanted=number + 1: counters.used >= wanted, 'an image')
+    wait_for(lambda: (now := node.in_force.published) and now.result.evidence.frames == 20, 'the calibration')
+    publisher.publish(image(START_NS))
+    wait_for(lambda: counters.used == 21 and node.in_force.state.name == state, 'the first after the loop')
+    wait_for(lambda: node.in_force.published.result.camera.focal_px == in_force_px, 'what is in force')
 
 
 def test_images_twice_and_out_of_order_are_left_out_of_the_evidence_but_get_camera_info(bench, told):
