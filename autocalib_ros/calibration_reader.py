@@ -52,13 +52,20 @@ def calibration_of(document: Mapping[str, Any]) -> Calibration:
     if document.get('version') != JSON_VERSION:
         raise InputError(f'its version is {reprlib.repr(document.get("version"))}, and only {JSON_VERSION} is read')
     if document.get('state') != 'calibrated':
-        raise InputError(f'its state is {reprlib.repr(document.get("state"))}: it holds no calibration')
+        raise InputError(f'its state is {reprlib.repr(document.get("state"))}: it holds no calibration{_why(document)}')
     try:
         return _calibration(document)
     except AutocalibError as error:
         raise InputError(str(error)) from error
     except (KeyError, TypeError, ValueError, IndexError, OverflowError, AttributeError) as error:
         raise InputError(f'it is no whole calibration.json ({type(error).__name__}: {error})') from error
+
+
+def _why(document: Mapping[str, Any]) -> str:
+    """Return the reason of a refusal in brackets, '' where none is given."""
+    refusal = document.get('refusal')
+    return f' ({refusal["code"]}: {refusal["message"]})' if isinstance(refusal, Mapping) and {
+        'code', 'message'} <= refusal.keys() else ''
 
 
 def _calibration(document: Mapping[str, Any]) -> Calibration:

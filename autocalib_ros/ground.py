@@ -11,7 +11,6 @@ attributes of one.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -21,7 +20,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from autocalib_ros.calibration import COVARIANCE_OF, JSON_VERSION
+from autocalib_ros.calibration import Calibration
+from autocalib_ros.calibration_reader import calibration_of, read_json
 from autocalib_ros.camera import Camera
 from autocalib_ros.errors import InputError
 from autocalib_ros.info_lens import InfoLens, attribute
@@ -71,7 +71,7 @@ class Ground:
     ground_frame: str = ''
     camera_frame: str = ''
     covariance: np.ndarray | None = None
-    """Of COVARIANCE_OF, shape (10, 10); None where it is not known."""
+    """Of `calibration.COVARIANCE_OF`, shape (10, 10); None where it is not known."""
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.camera_m).all() and np.isfinite(self.rotation).all() and self.camera_m[2] > 0):
@@ -106,37 +106,29 @@ class Ground:
     @classmethod
     def from_file(cls, path: Path | str) -> Ground:
         """Build from a saved calibration.json, with its covariance; InputError where it holds no ground plane."""
+        path = Path(path).expanduser()
+        document = read_json(path)
         try:
-            document = json.loads(Path(path).expanduser().read_text(encoding='utf-8'))
             return cls.from_document(document)
-        except OSError as error:
-            raise InputError(f'cannot read {path}: {error.strerror or error}') from error
         except InputError as error:
             raise InputError(f'{path}: {error}') from error
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise InputError(f'{path} is not a calibration.json ({error!r}): give the file that'
-                             ' `autocalib replay` writes') from error
 
     @classmethod
     def from_document(cls, document: Mapping[str, Any]) -> Ground:
         """Build from the document of calibration.json."""
-        if document['version'] != JSON_VERSION:
-            raise InputError(f'its version is {document["version"]}, and {JSON_VERSION} is read:'
-                             ' calibrate again with this program')
-        pose, refusal = document['ground_from_camera'], document['refusal']
-        if pose is None:
-            raise InputError(f'it holds no ground plane ({refusal["code"]}: {refusal["message"]}); {refusal["remedy"]}')
-        if document['grade'] == 'unit_scale':
+        return cls.of(calibration_of(document))
+
+    @classmethod
+    def of(cls, result: Calibration) -> Ground:
+        """Build from a calibration; InputError where it holds no ground plane in metres."""
+        ground, refusal = result.ground, result.ground_refusal
+        if ground is None:
+            why = f' ({refusal.code}: {refusal.message}); {refusal.remedy}' if refusal else ''
+            raise InputError(f'it holds no ground plane{why}')
+        if not ground.metric:
             raise InputError("its plane is in units of the camera's height, not in metres: calibrate with the height")
-        camera, (width, height) = document['camera'], document['image_size']
-        (cx, cy), (k1, k2, k3, k4) = camera['principal_point_px'], camera['k']
-        told = document.get('covariance')
-        covariance = None
-        if told is not None and told['of'] == list(COVARIANCE_OF):
-            covariance = np.array(told['matrix'], float).reshape(2 * (len(COVARIANCE_OF),))
-        return cls(lens=Camera(width, height, camera['focal_px'], (cx, cy), (k1, k2, k3, k4)),
-                   rotation=Rotation.from_quat(pose['rotation_xyzw']).as_matrix(),
-                   camera_m=np.array(pose['translation_m'], float), covariance=covariance)
+        return cls(lens=result.camera, rotation=ground.rotation, camera_m=ground.translation_m,
+                   covariance=result.covariance)
 
     def points(self, pixels: np.ndarray, *, height_m: float | np.ndarray = 0.0,
                pixel_sigma_px: float = 0.0) -> GroundPoints:
@@ -186,7 +178,7 @@ class Ground:
         return [self._at(sign * SHARE_OF_SIGMA * axis) for axis in axes for sign in (1.0, -1.0)]
 
     def _at(self, step: np.ndarray) -> tuple[Camera, np.ndarray, np.ndarray]:
-        """Lens, ground_from_camera and place of the camera at a step (10,) of COVARIANCE_OF.
+        """Lens, ground_from_camera and place of the camera at a step (10,) of `calibration.COVARIANCE_OF`.
 
         The ground frame stays below where the optical axis points to: its heading is chosen, not measured.
         """

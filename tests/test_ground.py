@@ -428,8 +428,10 @@ def test_a_file_is_read(tmp_path, pixels):
 
 
 @pytest.mark.parametrize(('text', 'said'), [
-    ('{', 'is not a calibration.json'), ('[]', 'is not a calibration.json'),
-    (json.dumps(document() | {'version': 2}), 'its version is 2, and 1 is read'),
+    ('{', 'is not JSON'), ('[]', 'holds no names with values'), ('{"version": 1}', 'holds no calibration'),
+    (json.dumps(document() | {'version': 2}), 'its version is 2, and only 1 is read'),
+    (json.dumps(document() | {'state': 'refused', 'refusal': {'code': 'no_motion', 'message': 'nothing moves'}}),
+     'no calibration .no_motion: nothing moves.'),
     (json.dumps(document(grade='unit_scale')), "units of the camera's height"),
     (json.dumps(document(ground=None, ground_refusal=Reason('no_height', 'none given', 'give it'))),
      'no ground plane .no_height: none given.; give it')])
