@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.parameter import Parameter
@@ -104,6 +105,28 @@ def test_newest_message_of_the_driver_is_kept_where_that_is_wanted(bench, wanted
     wait_for(lambda: node._driver.newest, 'the message')
     assert (node._driver.newest.binning_x, node._driver.doubt(SIZE)) == (2, '')
     assert '320x240, and these have 640x480' in node._driver.doubt((640, 480))
+
+
+def test_binning_and_region_of_the_driver_are_published_where_they_are_of_these_images(bench):
+    infos = bench.collect(CameraInfo, INFO)
+    driver = bench.client.create_publisher(CameraInfo, 'camera_info_in', QoSProfile(depth=1))
+    node, publisher = fed(bench, camera_height=8.0, use_driver_camera_info=True)
+    bench.connected(driver)
+    region = RegionOfInterest(x_offset=100, y_offset=50, width=2 * SIZE[0], height=2 * SIZE[1])
+    readouts = (CameraInfo(width=1920, height=1080, binning_x=2, binning_y=2, roi=region),
+                CameraInfo(width=7, height=7))
+    wait_for(lambda: node.in_force.published, 'the calibration')
+    for number, told_by_driver in enumerate(readouts, 10):
+        driver.publish(told_by_driver)
+        wait_for(lambda width=told_by_driver.width: node._driver.newest and node._driver.newest.width == width, 'it')
+        sent = image(START_NS + number * FRAME_NS)
+        publisher.publish(sent)
+        wait_for(lambda sent=sent: infos and infos[-1].header == sent.header, 'camera_info of the image')
+        if told_by_driver.width == 1920:
+            binned = infos[-1]
+    assert (binned.width, binned.height, binned.binning_x, binned.roi) == (1920, 1080, 2, region)
+    assert (infos[-1].width, infos[-1].binning_x) == (SIZE[0], 0)
+    np.testing.assert_allclose((np.array(binned.k[:6:2]) - [0, 100, 0]) / 2, infos[-1].k[:6:2])
 
 
 @pytest.mark.parametrize(('info', 'fits'), [
