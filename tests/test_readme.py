@@ -19,7 +19,7 @@ from autocalib_ros.ros.status import Counts, Situation, status
 ROOT = Path(__file__).parent.parent
 README = ROOT / 'README.md'
 START = 'python3 -m venv'
-MADE = re.compile(r"(?:create_\w+\([^')]*|resolve_topic_name\()'([~/\w]+)'")
+MADE = re.compile(r"(?:create_\w+\([^')]*|latched_publisher\([^')]*|resolve_topic_name\()'([~/\w]+)'")
 """A publisher, subscription, service or client that is made, and its name."""
 
 

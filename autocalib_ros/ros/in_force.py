@@ -19,7 +19,7 @@ from autocalib_ros.errors import InputError
 from autocalib_ros.ros import messages
 from autocalib_ros.ros.driver_info import DriverInfo
 from autocalib_ros.ros.headers import DEFAULT_FRAME, Headers
-from autocalib_ros.ros.qos import LATCHED
+from autocalib_ros.ros.qos import latched_publisher
 from autocalib_ros.ros.transforms import Transforms
 from autocalib_ros.standing import CalibrationState, Decision, decided
 
@@ -53,7 +53,7 @@ class InForce:
         """Of the newest image; '' before the first."""
         self.image_size: tuple[int, int] | None = None
         """Of the newest image that was decoded."""
-        self._camera_info = node.create_publisher(CameraInfo, '~/camera_info', LATCHED)
+        self._camera_info = latched_publisher(node, CameraInfo, '~/camera_info')
         self._transforms = Transforms(node, tf_parent=options.tf_parent, publish_tf=node_options.publish_tf)
 
     def change(self, options: Options, node_options: NodeOptions) -> None:
@@ -197,6 +197,6 @@ class InForce:
         with self._lock:
             if self.published is None:
                 self._node.destroy_publisher(self._camera_info)
-                self._camera_info = self._node.create_publisher(CameraInfo, '~/camera_info', LATCHED)
+                self._camera_info = latched_publisher(self._node, CameraInfo, '~/camera_info')
             if self.published is None or self.published.transform is None:
                 self._transforms.forget()

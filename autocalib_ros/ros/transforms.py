@@ -19,7 +19,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 
 from autocalib_ros.ros.messages import validated
-from autocalib_ros.ros.qos import LATCHED
+from autocalib_ros.ros.qos import LATCHED, latched_publisher
 
 try:
     from tf2_msgs.msg import TFMessage
@@ -42,7 +42,7 @@ class Transforms:
 
     def __init__(self, node: Node, *, tf_parent: str, publish_tf: bool) -> None:
         self._node, self._tf_parent = node, tf_parent
-        self._ground_transform = node.create_publisher(TransformStamped, '~/ground_transform', LATCHED)
+        self._ground_transform = latched_publisher(node, TransformStamped, '~/ground_transform')
         self._lock = threading.Lock()
         self._broadcasts = publish_tf and TFMessage is not None
         self._settled = self._on_air = False
@@ -83,7 +83,7 @@ class Transforms:
             self._latest = None
             self._clear()
             self._node.destroy_publisher(self._ground_transform)
-            self._ground_transform = self._node.create_publisher(TransformStamped, '~/ground_transform', LATCHED)
+            self._ground_transform = latched_publisher(self._node, TransformStamped, '~/ground_transform')
 
     def _settle(self) -> None:
         self._timer.cancel()

@@ -75,7 +75,10 @@ class Bench:
         """Run an AutocalibNode; dots in parameter names are written as double underscores."""
         overrides = [Parameter(name.replace('__', '.'), value=value) for name, value in parameters.items()]
         more = {} if solve is None else {'solve': solve}
-        node = AutocalibNode(context=self.context, parameter_overrides=overrides, **more)
+        return self.adopt(AutocalibNode(context=self.context, parameter_overrides=overrides, **more))
+
+    def adopt(self, node: AutocalibNode) -> AutocalibNode:
+        """Run a node that is there already, and end it with the others."""
         self.nodes.append(node)
         self.executor.add_node(node)
         return node

@@ -8,13 +8,15 @@ import cv2
 import pytest
 from geometry_msgs.msg import TransformStamped
 from rcl_interfaces.srv import GetParameters
-from rclpy.qos import ReliabilityPolicy
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage
 
 from autocalib_ros.calibrator import in_asked_form
 from autocalib_ros.camera import Camera
 from autocalib_ros.camera_info import camera_info, write_camera_info_yaml
 from autocalib_ros.errors import UsageError
+from autocalib_ros.ros.autocalib_node import AutocalibNode
 from autocalib_ros.ros.messages import stamp_ns
 from bench import PATIENCE_S, PIXELS, SIZE, Bench, calibration, image, refusal, wait_for
 
@@ -308,3 +310,13 @@ def test_lens_that_the_asked_model_cannot_say_is_refused_and_nothing_is_publishe
     assert not answer.success
     assert answer.message.startswith('refused (distortion_model): plumb_bob would be off by up to')
     assert node.in_force.published is None
+
+
+def test_reliability_of_a_publisher_is_overridden_by_a_parameter(bench):
+    node = AutocalibNode(context=bench.context, parameter_overrides=[
+        Parameter('qos_overrides./autocalib/camera_info.publisher.reliability', value='best_effort')])
+    bench.adopt(node)
+    offered = [wait_for(lambda topic=topic: bench.client.get_publishers_info_by_topic(topic), topic)[0].qos_profile
+               for topic in (INFO, GROUND)]
+    assert [profile.reliability for profile in offered] == [ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE]
+    assert all(profile.durability is DurabilityPolicy.TRANSIENT_LOCAL for profile in offered)
