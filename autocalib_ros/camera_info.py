@@ -66,6 +66,11 @@ class Readout:
     window: tuple[int, int] = (0, 0)
     """Region of interest: where it begins, and its size before binning; 0 is all."""
 
+    @property
+    def bins(self) -> tuple[int, int]:
+        """The binning, at least 1."""
+        return max(self.binning[0], 1), max(self.binning[1], 1)
+
 
 class ModelMisfit(UsageError):
     """A distortion model was asked for that cannot say the lens."""
@@ -99,17 +104,26 @@ def in_full_resolution(info: CameraInfo, readout: Readout) -> CameraInfo:
     image_geometry goes back by subtracting the offset and dividing by the binning, and so is right in the image to the
     last digit. InputError where images of such a readout would have another size than those of the calibration.
     """
-    across, down = (max(count, 1) for count in readout.binning)
+    doubt = readout_doubt(readout, (info.width, info.height))
+    if doubt:
+        raise InputError(f'{doubt}: its binning and region of interest are not theirs and are left out')
+    return replace(info, width=readout.width, height=readout.height,
+                   k=_unbinned(info.k, 3, readout.bins, readout.offset),
+                   p=_unbinned(info.p, 4, readout.bins, readout.offset))
+
+
+def readout_doubt(readout: Readout, image_size: tuple[int, int]) -> str:
+    """Say why images of a size (width, height) are not of a readout, '' where they may be."""
+    (across, down), (width, height) = readout.bins, image_size
     window = readout.window[0] or readout.width, readout.window[1] or readout.height
     # drivers round half a bin up or down
-    if abs(info.width * across - window[0]) >= across or abs(info.height * down - window[1]) >= down:
-        raise InputError(
-            f"the driver's camera_info is of images of {window[0] // across}x{window[1] // down}, and these have"
-            f' {info.width}x{info.height}: its binning and region of interest are not theirs and are left out')
-    left, top = readout.offset
-    return replace(info, width=readout.width, height=readout.height,
-                   k=_unbinned(info.k, 3, (across, down), (left, top)),
-                   p=_unbinned(info.p, 4, (across, down), (left, top)))
+    if abs(width * across - window[0]) >= across or abs(height * down - window[1]) >= down:
+        return (f"the driver's camera_info is of images of {window[0] // across}x{window[1] // down}, and these have"
+                f' {width}x{height}')
+    if readout.offset[0] + readout.window[0] > readout.width or readout.offset[1] + readout.window[1] > readout.height:
+        return ("the region of interest in the driver's camera_info reaches beyond its"
+                f' {readout.width}x{readout.height} pixels')
+    return ''
 
 
 def _unbinned(matrix: list[float], columns: int, binning: tuple[int, int], offset: tuple[int, int]) -> list[float]:

@@ -221,7 +221,9 @@ def test_a_message_in_full_resolution_is_the_calibration_in_the_image(readout):
 @pytest.mark.parametrize(('readout', 'told'), [
     (Readout(1280, 720, (2, 2)), 'of images of 640x360, and these have 1280x720'),  # both scalings at once
     (Readout(1920, 1080), 'of images of 1920x1080'), (Readout(0, 0), 'of images of 0x0'),
-    (Readout(1920, 1080, (1, 1), (0, 0), (640, 480)), 'of images of 640x480')])
+    (Readout(1920, 1080, (1, 1), (0, 0), (640, 480)), 'of images of 640x480'),
+    (Readout(1920, 1080, (1, 1), (641, 0), (1280, 720)), 'reaches beyond its 1920x1080 pixels'),
+    (Readout(0, 0, (1, 1), (0, 0), (1280, 720)), 'reaches beyond its 0x0 pixels')])
 def test_a_readout_of_other_images_is_told(readout, told):
     with pytest.raises(InputError, match=told):
         in_full_resolution(camera_info(lens(100)), readout)

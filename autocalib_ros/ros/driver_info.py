@@ -6,7 +6,9 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo
 
+from autocalib_ros.camera_info import readout_doubt
 from autocalib_ros.config import NodeOptions
+from autocalib_ros.ros.messages import readout
 
 QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 """It hears every publisher, whatever that offers; messages this small are not lost."""
@@ -35,17 +37,10 @@ class DriverInfo:
 
 
 def size_doubt(info: CameraInfo, image_size: tuple[int, int]) -> str:
-    """Say how the size of the images (width, height) differs from what the driver's binning and roi leave of its own.
+    """Say why images of a size (width, height) are not what the driver's binning and roi leave of its own.
 
-    A size of 0 is that of a driver that knows none, binning 0 is 1, and a roi of size 0 is the whole image.
+    A driver that tells no size is not doubted.
     """
-    full = (info.roi.width or info.width, info.roi.height or info.height)
-    if not all(full):
-        return ''
-    expected = tuple(pixels // max(1, binning) for pixels, binning in
-                     zip(full, (info.binning_x, info.binning_y), strict=True))
-    # Drivers round half pixels either way.
-    if all(abs(told - seen) <= 1 for told, seen in zip(expected, image_size, strict=True)):
-        return ''
-    return (f"the driver's CameraInfo is of images of {expected[0]}x{expected[1]}, and these have "
-            f'{image_size[0]}x{image_size[1]}: is camera_info_in of this camera?')
+    told = (info.roi.width or info.width) and (info.roi.height or info.height)
+    doubt = readout_doubt(readout(info), image_size) if told else ''
+    return f'{doubt}: is camera_info_in of this camera?' if doubt else ''

@@ -58,7 +58,7 @@ def camera_info_message(fields: CameraInfoFields, stamp: Time, frame_id: str,
     """
     operation: dict[str, Any] = {}
     if driver is not None:
-        fields = in_full_resolution(fields, _readout(driver))
+        fields = in_full_resolution(fields, readout(driver))
         roi = driver.roi
         operation = {'binning_x': driver.binning_x, 'binning_y': driver.binning_y, 'roi': RegionOfInterest(
             x_offset=roi.x_offset, y_offset=roi.y_offset, height=roi.height, width=roi.width,
@@ -70,7 +70,7 @@ def camera_info_message(fields: CameraInfoFields, stamp: Time, frame_id: str,
         p=[float(value) for value in fields.p], **operation)
 
 
-def _readout(driver: CameraInfo) -> Readout:
+def readout(driver: CameraInfo) -> Readout:
     """Return what a driver says about the pixels that it sends."""
     return Readout(driver.width, driver.height, (driver.binning_x, driver.binning_y),
                    (driver.roi.x_offset, driver.roi.y_offset), (driver.roi.width, driver.roi.height))

@@ -114,6 +114,7 @@ def test_binning_and_region_of_the_driver_are_published_where_they_are_of_these_
     bench.connected(driver)
     region = RegionOfInterest(x_offset=100, y_offset=50, width=2 * SIZE[0], height=2 * SIZE[1])
     readouts = (CameraInfo(width=1920, height=1080, binning_x=2, binning_y=2, roi=region),
+                CameraInfo(width=700, height=480, roi=RegionOfInterest(x_offset=500, width=SIZE[0], height=SIZE[1])),
                 CameraInfo(width=7, height=7))
     wait_for(lambda: node.in_force.published, 'the calibration')
     for number, told_by_driver in enumerate(readouts, 10):
@@ -124,6 +125,8 @@ def test_binning_and_region_of_the_driver_are_published_where_they_are_of_these_
         wait_for(lambda sent=sent: infos and infos[-1].header == sent.header, 'camera_info of the image')
         if told_by_driver.width == 1920:
             binned = infos[-1]
+        else:
+            assert (infos[-1].width, infos[-1].binning_x) == (SIZE[0], 0)
     assert (binned.width, binned.height, binned.binning_x, binned.roi) == (1920, 1080, 2, region)
     assert (infos[-1].width, infos[-1].binning_x) == (SIZE[0], 0)
     np.testing.assert_allclose((np.array(binned.k[:6:2]) - [0, 100, 0]) / 2, infos[-1].k[:6:2])
@@ -136,6 +139,7 @@ def test_binning_and_region_of_the_driver_are_published_where_they_are_of_these_
     (CameraInfo(width=1920, height=1080, roi=RegionOfInterest(x_offset=9, width=640, height=480)), True),
     (CameraInfo(), True),  # a driver that knows no size
     (CameraInfo(width=1280, height=960), False),
+    (CameraInfo(width=1000, height=720, roi=RegionOfInterest(x_offset=600, width=640, height=480)), False),
     (CameraInfo(width=640, height=480, binning_x=2, binning_y=2), False),
 ])
 def test_size_of_the_drivers_message_is_compared_with_the_images(info, fits):
