@@ -185,7 +185,6 @@ class Calibration:
     rectified_balance: float = 0.0
     figures: Figures = field(default_factory=Figures, compare=False, repr=False)
 
-
     @cached_property
     def camera_info(self) -> CameraInfo:
         """The lens as ROS knows it; ModelMisfit where the distortion model cannot say it."""

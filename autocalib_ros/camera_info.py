@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import reprlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -205,6 +206,11 @@ def write_camera_info_yaml(path: Path, camera: Camera, camera_name: str, distort
     write_atomically(path, camera_info_yaml(camera_info(camera, distortion_model, rectified_balance), camera_name))
 
 
+def plain_name(name: str) -> str:
+    """Return a name in letters, digits and _, as camera_info_manager and frames want it."""
+    return re.sub(r'[^A-Za-z0-9_]', '_', name)
+
+
 def camera_info_yaml(info: CameraInfo, camera_name: str) -> str:
     """Return the text of camera_info_manager's file in full precision."""
     def matrix(rows: int, cols: int, data: list[float]) -> dict[str, Any]:
@@ -212,7 +218,7 @@ def camera_info_yaml(info: CameraInfo, camera_name: str) -> str:
 
     document = {
         'image_width': info.width, 'image_height': info.height,
-        'camera_name': ''.join(c if c.isascii() and c.isalnum() else '_' for c in camera_name) or 'camera',
+        'camera_name': plain_name(camera_name) or 'camera',
         'camera_matrix': matrix(3, 3, info.k), 'distortion_model': info.distortion_model,
         'distortion_coefficients': matrix(1, len(info.d), info.d),
         'rectification_matrix': matrix(3, 3, info.r), 'projection_matrix': matrix(3, 4, info.p)}

@@ -228,8 +228,7 @@ def distortion_slopes(slopes: np.ndarray, coefficients: tuple[float, ...]) -> tu
     k1, k2, p1, p2, k3, k4, k5, k6 = coefficients
     x, y = slopes.T
     r2 = x * x + y * y
-    above, below = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
-    radial = above / below
+    radial, below = _radial(r2, coefficients), _denominator(r2, coefficients)
     growth = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3) - radial * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / below
     return (radial + growth * x * x + 2 * p1 * y + 6 * p2 * x, growth * x * y + 2 * p1 * x + 2 * p2 * y,
             radial + growth * y * y + 6 * p1 * y + 2 * p2 * x)

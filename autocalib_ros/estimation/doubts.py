@@ -8,13 +8,14 @@ import numpy as np
 
 from autocalib_ros.calibration import Reason
 from autocalib_ros.config import GateOptions
-from autocalib_ros.estimation.great_circles import Seen, TrackSet
+from autocalib_ros.estimation.great_circles import Seen, TrackSet, every_track
 from autocalib_ros.estimation.ground_plane import BELOW_HORIZON
 from autocalib_ros.estimation.joint import MIN_ROWS, JointFit, assign, road_support, solve_joint
 from autocalib_ros.estimation.lives import no_lives
 from autocalib_ros.estimation.plane import LevelCamera, Plane, above_traffic
 from autocalib_ros.estimation.state import State
 from autocalib_ros.estimation.uncertainty import told_by_evidence
+from autocalib_ros.evidence import Evidence
 
 MIN_VEHICLES = 4
 """Vehicles, distinct, that make a road; fewer may be one driver's whim."""
@@ -77,18 +78,18 @@ def traffic_doubt(fit: JointFit, contrast: float, tracks: TrackSet) -> Reason | 
     return _horizon_doubt(fit, tracks)
 
 
-def lens_doubt(fit: JointFit, tracks: TrackSet, every: TrackSet, gate: GateOptions, *,
+def lens_doubt(fit: JointFit, tracks: TrackSet, evidence: Evidence, gate: GateOptions, *,
                turned: bool) -> Reason | None:
     """Say why the lens cannot be trusted, if so; `turned` where the solution started from traffic that turns.
 
-    `tracks` are those that were chosen out of `every` one.
+    `tracks` are those that were chosen out of the evidence.
     """
     doubt = _horizon_doubt(fit, tracks) or _curvature_doubt(fit, gate, turned=turned) or _model_doubt(fit)
     if doubt or turned and motion_tells(fit):
         return doubt
     needed = STRAIGHT_SHARE if len(fit.state.angles_rad) > 1 else ONE_ROAD_SHARE
     share = _straight_share(fit, tracks)
-    if needed == ONE_ROAD_SHARE > share > KEPT_ROAD_SHARE and keepers(fit, every) > KEEPERS:
+    if needed == ONE_ROAD_SHARE > share > KEPT_ROAD_SHARE and keepers(fit, evidence) > KEEPERS:
         return None
     return _turning(fit, tracks, needed) if share < needed else None
 
@@ -119,8 +120,9 @@ def _straight_share(fit: JointFit, tracks: TrackSet) -> float:
     return float((share * fit.explained()).sum() / share.sum())
 
 
-def keepers(fit: JointFit, every: TrackSet) -> float:
+def keepers(fit: JointFit, evidence: Evidence) -> float:
     """Share of the vehicles that follow a road anywhere that do so all along, 0 where too few tell."""
+    every = every_track(evidence)
     labels, _ = assign(fit.state, Seen.through(fit.state.camera, every))
     lengths = np.hypot(*np.moveaxis(np.diff(every.pixels, axis=1), -1, 0)).sum(axis=1)
     _, owners = np.unique(every.vehicles, return_inverse=True)

@@ -10,7 +10,7 @@ from autocalib_ros.calibration import Reason
 from autocalib_ros.camera import Camera
 from autocalib_ros.config import GateOptions, JointOptions
 from autocalib_ros.estimation.doubts import halves_doubt, lens_doubt, plane_doubt, traffic_doubt
-from autocalib_ros.estimation.great_circles import TrackSet, evenly, every_track
+from autocalib_ros.estimation.great_circles import TrackSet, evenly
 from autocalib_ros.estimation.held import lens_assumptions, with_k2_if_asked_for, with_what_can_be_told
 from autocalib_ros.estimation.joint import JointFit, noise_cost, road_support, solve_joint, with_bodies
 from autocalib_ros.estimation.lens_prior import LensPrior, known_lens, lens_priors
@@ -149,7 +149,7 @@ def _completed(fit: JointFit, tracks: TrackSet, across: str, traffic: _Traffic, 
     fit = with_k2_if_asked_for(fit, tracks)
     fit = over_lives(fit, tracks, traffic.windows, traffic.instants)
     fit, held = with_what_can_be_told(fit, tracks)
-    doubt = lens_doubt(fit, tracks, every_track(traffic.evidence), gate, turned=turned) or (
+    doubt = lens_doubt(fit, tracks, traffic.evidence, gate, turned=turned) or (
         one_centre_doubt(fit, traffic.windows) if len(fit.state.angles_rad) < 2 else None)
     if doubt:
         return doubt

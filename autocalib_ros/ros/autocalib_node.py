@@ -164,9 +164,8 @@ class AutocalibNode(Node):
 
     def _situation(self) -> Situation:
         """Return what is known now, for diagnostics."""
-        counters, published = self._pipeline.counters, self.in_force.published
-        counts = Counts(received=counters.received, used=counters.used, dropped=counters.dropped,
-                        unreadable=counters.unreadable, late=counters.late, lost=self._input.lost)
+        published = self.in_force.published
+        counts = Counts(**vars(self._pipeline.counters), lost=self._input.lost)
         unsaved = f'the calibration is not saved: {self.keeper.fault}' if self.keeper.fault else ''
         return Situation(
             topic=self._input.topic, counts=counts, rates_hz=self._recent.rates_hz(time.monotonic(), counts),

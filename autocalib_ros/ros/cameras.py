@@ -15,6 +15,7 @@ from typing import Any
 
 import yaml
 
+from autocalib_ros.camera_info import plain_name
 from autocalib_ros.config import NodeOptions, Options, declared, flattened
 from autocalib_ros.errors import InputError, UsageError
 
@@ -32,11 +33,6 @@ class CameraNode:
     namespace: str
     parameters: tuple[str | dict[str, Any], ...]
     remappings: tuple[tuple[str, str], ...]
-
-
-def plain_name(name: str) -> str:
-    """Return a name in letters, digits and _, as camera_info_manager and frames want it."""
-    return re.sub(r'[^A-Za-z0-9_]', '_', name)
 
 
 def read_cameras(path: Path) -> list[CameraNode]:

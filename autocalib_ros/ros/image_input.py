@@ -80,7 +80,7 @@ class ImageInput:
     def _matching(self, offers: list[Offer]) -> ReliabilityPolicy | None:
         """Return what connects to all publishers; None while there is none.
 
-        Best effort connects to everything but loses half of the large images (ROS.md 1a), and
+        Best effort connects to everything but loses half of the large images, and
         BEST_AVAILABLE is decided once, before a camera that starts later is known.
         """
         reliable = {offer.reliable for offer in offers if offer.type_name == self._type_name()}

@@ -39,6 +39,18 @@ class Heard:
         self.faults.append(error)
 
 
+class Slow:
+    """A solver that runs until it is released."""
+
+    def __init__(self):
+        self.running, self.release = threading.Event(), threading.Event()
+
+    def __call__(self, evidence):
+        self.running.set()
+        self.release.wait(PATIENCE_S)
+        return calibration(evidence)
+
+
 def decode(message) -> np.ndarray:
     if message is None:
         raise InputError('torn image')
@@ -101,40 +113,28 @@ def test_what_is_left_is_solved_once_when_no_image_comes(start, heard):
 
 
 def test_images_keep_flowing_while_a_solution_runs(start, heard):
-    running, release = threading.Event(), threading.Event()
-
-    def slow(evidence):
-        running.set()
-        release.wait(PATIENCE_S)
-        return calibration(evidence)
-
+    slow = Slow()
     pipeline = start(slow)
     feed(pipeline, heard, 2)
     answer = pipeline.solve_now()
-    assert running.wait(PATIENCE_S)
+    assert slow.running.wait(PATIENCE_S)
     feed(pipeline, heard, 20, first=2)
     assert not answer.done()
-    release.set()
+    slow.release.set()
     assert result_of(answer).evidence.frames == 2
 
 
 def test_newest_snapshot_takes_the_place_and_the_callers_of_one_that_waits(start, heard):
-    running, release = threading.Event(), threading.Event()
-
-    def slow(evidence):
-        running.set()
-        release.wait(PATIENCE_S)
-        return calibration(evidence)
-
+    slow = Slow()
     pipeline = start(slow)
     feed(pipeline, heard, 1)
     answers = [pipeline.solve_now()]
-    assert running.wait(PATIENCE_S)
+    assert slow.running.wait(PATIENCE_S)
     for number in (1, 2):
         feed(pipeline, heard, 1, first=number)
         answers.append(pipeline.solve_now())
         wait_for(lambda: not pipeline._requests, 'the snapshot')
-    release.set()
+    slow.release.set()
     assert [result_of(answer).evidence.frames for answer in answers] == [1, 3, 3]
     assert [result.evidence.frames for result in heard.results] == [1, 3]
 
@@ -268,20 +268,14 @@ def test_nothing_to_solve_before_the_first_image(start):
 
 
 def test_close_sends_callers_away_and_says_that_a_solution_still_runs(start, heard):
-    running, release = threading.Event(), threading.Event()
-
-    def slow(evidence):
-        running.set()
-        release.wait(PATIENCE_S)
-        return calibration(evidence)
-
+    slow = Slow()
     pipeline = start(slow)
     feed(pipeline, heard, 1)
     answer = pipeline.solve_now()
-    assert running.wait(PATIENCE_S)
+    assert slow.running.wait(PATIENCE_S)
     assert not pipeline.close(timeout_s=0.1)
     assert result_of(answer) is None
-    release.set()
+    slow.release.set()
     assert pipeline.close(PATIENCE_S)
 
 
@@ -299,21 +293,15 @@ def test_reset_starts_the_evidence_anew(start, heard):
 
 
 def test_solution_that_runs_during_a_reset_is_not_told_and_its_callers_do_not_wait(start, heard):
-    running, release = threading.Event(), threading.Event()
-
-    def slow(evidence):
-        running.set()
-        release.wait(PATIENCE_S)
-        return calibration(evidence)
-
+    slow = Slow()
     pipeline = start(slow)
     feed(pipeline, heard, 3)
     answer = pipeline.solve_now()
-    assert running.wait(PATIENCE_S)
+    assert slow.running.wait(PATIENCE_S)
     pipeline.reset()
     assert result_of(answer) is None
     feed(pipeline, heard, 1, first=3)
-    release.set()
+    slow.release.set()
     assert result_of(pipeline.solve_now()).evidence.frames == 1
     assert [result.evidence.frames for result in heard.results] == [1]
 
