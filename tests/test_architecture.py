@@ -14,7 +14,7 @@ PACKAGE = Path(autocalib_ros.__file__).parent
 # From the ground up. A room imports from rooms in lower lines only; rooms of one line do not know each other.
 STOREYS = (('errors', 'threads', 'redundancy'), ('config', 'files'), ('camera',), ('opencv_lens',), ('camera_info',),
            ('calibration', 'info_lens'), ('calibration_reader',), ('evidence', 'ground', 'store'),
-           ('perception', 'estimation'), ('calibrator', 'standing'), ('ros', 'offline'), ('cli',),
+           ('perception', 'estimation', 'pictures'), ('calibrator', 'standing'), ('ros', 'offline'), ('cli',),
            ('__main__', 'benchmark'))
 STOREY = {room: height for height, rooms in enumerate(STOREYS) for room in rooms}
 ROS_PACKAGES = ('rclpy', 'ament_index_python', 'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs',

@@ -27,10 +27,11 @@ from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.estimation.ground_plane import tilt_and_roll_deg
 from autocalib_ros.evidence import Evidence
 from autocalib_ros.offline.accuracy_families import families
+from autocalib_ros.offline.against_truth import angles_deg, distances_error
 from autocalib_ros.offline.demo import NEAR_M
 from autocalib_ros.offline.progress import progress_bar
-from autocalib_ros.offline.projection import angles_deg, distances_error, ground_to_image, image_to_ground
 from autocalib_ros.offline.synthetic_evidence import Junction
+from autocalib_ros.pictures.views import ground_to_image, image_to_ground
 from autocalib_ros.threads import use_one_thread_for_linear_algebra
 
 RAY_GRID = (49, 28)

@@ -13,7 +13,8 @@ import numpy as np
 from autocalib_ros.calibration import Calibration, Refusal
 from autocalib_ros.config import Options, ScaleOptions
 from autocalib_ros.errors import InputError
-from autocalib_ros.offline.projection import angles_deg, distances_error, image_to_ground
+from autocalib_ros.offline.against_truth import angles_deg, distances_error
+from autocalib_ros.pictures.views import image_to_ground
 
 MAX_FOCAL_ERROR_PERCENT = 3.0
 MAX_NORMAL_ERROR_DEG = 1.0

@@ -11,7 +11,7 @@ from autocalib_ros.calibration import GroundPlane
 from autocalib_ros.config import Options
 from autocalib_ros.errors import InputError
 from autocalib_ros.offline.demo import compare, options_from, read_truth
-from autocalib_ros.offline.projection import ground_to_image
+from autocalib_ros.pictures.views import ground_to_image
 
 
 @pytest.fixture

@@ -14,11 +14,10 @@ import pytest
 
 from autocalib_ros.calibration import GroundPlane
 from autocalib_ros.camera_info import rectified_matrix
-from autocalib_ros.offline.projection import ground_to_image, image_to_ground
 from autocalib_ros.offline.report import write_report
 from autocalib_ros.offline.report.lens_figures import in_undistorted, line_error_px
-from autocalib_ros.offline.report.road_figures import nice_length
 from autocalib_ros.offline.summary import number_rows, text_summary, verdict
+from autocalib_ros.pictures.views import ground_to_image, image_to_ground, nice_length
 
 ALL = {'ground_grid', 'top_view', 'all_tracks', 'kept_tracks', 'undistorted', 'straightness', 'focal_sweep',
        'orientation_histogram', 'directions'}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -20,6 +19,7 @@ from autocalib_ros.offline.report.canvas import (
     image_axes,
     road_colour,
 )
+from autocalib_ros.pictures.views import rectified_sources, resample
 
 LEAST_ERROR_PX = 1e-3
 """Below this a track counts as straight; it keeps the logarithmic axes finite."""
@@ -31,20 +31,11 @@ def undistorted(scene: Scene) -> Figure | None:
         return None
     camera = scene.calibration.camera
     matrix = rectified_matrix(camera)
-    figure, axes = image_axes(scene, picture=undistorted_picture(scene.background, camera, matrix))
+    figure, axes = image_axes(scene, picture=resample(scene.background, rectified_sources(camera, matrix)))
     for label in range(int(scene.labels.max(initial=-1)) + 1):
         paths = [in_undistorted(camera, matrix, path) for path in _paths(scene, label)]
         draw_paths(axes, paths, road_colour(label), alpha=0.6, width=0.8)
     return figure
-
-
-def undistorted_picture(picture: np.ndarray, camera: Camera, matrix: np.ndarray) -> np.ndarray:
-    """Resample a picture into the distortion-free camera of a matrix (3, 3)."""
-    pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1)
-    ones = np.ones((*pixels.shape[:2], 1))
-    bearings = np.concatenate([pixels, ones], axis=2) @ np.linalg.inv(matrix).T
-    sources, _ = camera.project(bearings)
-    return cv2.remap(picture, sources.astype(np.float32), None, cv2.INTER_LINEAR)
 
 
 def in_undistorted(camera: Camera, matrix: np.ndarray, pixels: np.ndarray) -> np.ndarray:

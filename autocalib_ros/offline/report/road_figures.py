@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from autocalib_ros.calibration import GroundPlane
 from autocalib_ros.camera import Camera
-from autocalib_ros.offline.projection import ground_to_image, image_to_ground
 from autocalib_ros.offline.report.canvas import (
     DPI,
     INK,
@@ -22,12 +20,18 @@ from autocalib_ros.offline.report.canvas import (
     image_axes,
     road_colour,
 )
+from autocalib_ros.pictures.views import (
+    TopView,
+    great_circle,
+    grid_lines,
+    grid_step,
+    image_to_ground,
+    near_on_road,
+    nice_length,
+    resample,
+    road_lines,
+)
 
-CIRCLE_POINTS = 361
-GRID_CELLS = 8
-"""Cells of the ground grid to each side of its middle."""
-FARTHEST_HEIGHTS = 10.0
-"""The top view ends this many camera heights away: beyond, a pixel covers metres."""
 TOP_VIEW_PX = 900
 WHITE, HORIZON = '#ffffff', '#aa3377'
 
@@ -41,7 +45,7 @@ def directions(scene: Scene) -> Figure | None:
     for index, direction in enumerate(scene.calibration.road_directions):
         _draw_direction(axes, camera, direction, index)
     if ground is not None:
-        draw_paths(axes, _great_circle(camera, ground.normal_in_camera), HORIZON, 'horizon', width=2)
+        draw_paths(axes, great_circle(camera, ground.normal_in_camera), HORIZON, 'horizon', width=2)
     draw_legend(axes)
     return figure
 
@@ -54,28 +58,10 @@ def _draw_direction(axes: Axes, camera: Camera, direction: np.ndarray, index: in
     for bearing in bearings:
         normal = np.cross(direction, bearing)
         if np.linalg.norm(normal) > 0.05:
-            draw_paths(axes, _great_circle(camera, normal), road_colour(index), width=0.7, alpha=0.6)
+            draw_paths(axes, great_circle(camera, normal), road_colour(index), width=0.7, alpha=0.6)
     ends, valid = camera.project(np.array([direction, -np.asarray(direction)]))
     axes.plot(*ends[valid].T, 'o', color=road_colour(index), markersize=9, markeredgecolor=WHITE,
               label=f'vanishing points of road direction {index + 1}', clip_on=True)
-
-
-def _great_circle(camera: Camera, normal: np.ndarray) -> list[np.ndarray]:
-    """Return the visible arcs of the great circle with that normal, as polylines in pixels near the image."""
-    normal = normal / np.linalg.norm(normal)
-    side = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
-    side /= np.linalg.norm(side)
-    angles = np.linspace(0, 2 * np.pi, CIRCLE_POINTS)[:, None]
-    pixels, valid = camera.project(np.cos(angles) * side + np.sin(angles) * np.cross(normal, side))
-    size = np.array([camera.width, camera.height])
-    near = valid & (pixels > -size).all(axis=1) & (pixels < 2 * size).all(axis=1)
-    return _runs(pixels, near)
-
-
-def _runs(points: np.ndarray, keep: np.ndarray) -> list[np.ndarray]:
-    """Split a polyline into the parts that are kept."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], keep, [False]]).astype(int)))
-    return [points[begin:end] for begin, end in zip(edges[::2], edges[1::2], strict=True) if end - begin > 1]
 
 
 def ground_grid(scene: Scene) -> Figure | None:
@@ -87,37 +73,17 @@ def ground_grid(scene: Scene) -> Figure | None:
     middle = _middle(scene)
     if middle is None:
         return None
-    step = nice_length(0.8 * ground.height_m)
+    step = grid_step(ground)
     middle = np.round(middle / step) * step
     figure, axes = image_axes(scene)
-    lines = [path for path in _grid_lines(middle, step) for path in _seen(camera, ground, path)]
+    lines = road_lines(camera, ground, grid_lines(middle, step))
     draw_paths(axes, lines, WHITE, width=2.0, alpha=0.5)
     draw_paths(axes, lines, '#117733', f'squares of {_length(step, ground)}', width=0.9, alpha=0.9)
     for index, name in enumerate(('x, along the main traffic direction', 'y, to its left')):
         arm = np.linspace([*middle, 0], [*(middle + step * np.eye(2)[index]), 0], 20)
-        draw_paths(axes, _seen(camera, ground, arm), ('#cc3311', '#0077bb')[index], name, width=4)
+        draw_paths(axes, road_lines(camera, ground, [arm]), ('#cc3311', '#0077bb')[index], name, width=4)
     draw_legend(axes)
     return figure
-
-
-def _grid_lines(middle: np.ndarray, step: float) -> list[np.ndarray]:
-    """Return the grid's lines as fine polylines (n, 3): they bend in the image."""
-    offsets = step * np.arange(-GRID_CELLS, GRID_CELLS + 1)
-    fine = np.linspace(offsets[0], offsets[-1], 40 * GRID_CELLS + 1)
-    lines = []
-    for offset in offsets:
-        for axis in (0, 1):
-            line = np.zeros((len(fine), 3))
-            line[:, axis], line[:, 1 - axis] = middle[axis] + fine, middle[1 - axis] + offset
-            lines.append(line)
-    return lines
-
-
-def _seen(camera: Camera, ground: GroundPlane, points_m: np.ndarray) -> list[np.ndarray]:
-    pixels = ground_to_image(camera, ground, points_m)
-    size = np.array([camera.width, camera.height])
-    near = np.isfinite(pixels).all(axis=1) & (pixels > -0.2 * size).all(axis=1) & (pixels < 1.2 * size).all(axis=1)
-    return _runs(pixels, near)
 
 
 def _middle(scene: Scene) -> np.ndarray | None:
@@ -128,32 +94,26 @@ def _middle(scene: Scene) -> np.ndarray | None:
 
 def _traffic_on_road(scene: Scene) -> np.ndarray:
     """Return tracked points on the road that are not too far away, shape (n, 2)."""
-    camera, ground = scene.calibration.camera, scene.calibration.ground
-    points = image_to_ground(camera, ground, scene.evidence.points_px)
-    return points[np.hypot(*points.T) < FARTHEST_HEIGHTS * ground.height_m]
+    return near_on_road(scene.calibration.camera, scene.calibration.ground, scene.evidence.points_px)
 
 
 def top_view(scene: Scene) -> Figure | None:
     """Show the road from above, the main traffic direction to the right, with a scale."""
     if scene.calibration is None or scene.calibration.ground is None or scene.background is None:
         return None
-    points = _traffic_on_road(scene)
-    if len(points) < 2:
-        return None
-    ground = scene.calibration.ground
-    low, high = np.percentile(points, [2, 98], axis=0)
-    pad = 0.15 * (high - low).max() + 0.5 * ground.height_m
-    return _top_figure(scene, low - pad, high + pad)
+    view = TopView.around(_traffic_on_road(scene), scene.calibration.ground, TOP_VIEW_PX)
+    return None if view is None else _top_figure(scene, view)
 
 
-def _top_figure(scene: Scene, low: np.ndarray, high: np.ndarray) -> Figure:
+def _top_figure(scene: Scene, view: TopView) -> Figure:
     camera, ground = scene.calibration.camera, scene.calibration.ground
+    low, high = np.array(view.low_m), np.array(view.high_m)
     width, height = high - low
     figure = Figure(figsize=(WIDTH_IN, min(WIDTH_IN * height / width + 0.6, 1.2 * WIDTH_IN)), dpi=DPI,
                     layout='constrained')
     axes = figure.add_subplot()
-    axes.imshow(faded_rgb(_from_above(scene, low, high), 0.1), extent=(low[0], high[0], low[1], high[1]),
-                interpolation='bilinear')
+    axes.imshow(faded_rgb(resample(scene.background, view.sources(camera, ground)), 0.1),
+                extent=(low[0], high[0], low[1], high[1]), interpolation='bilinear')
     for label in range(int(scene.labels.max(initial=-1)) + 1):
         paths = [image_to_ground(camera, ground, scene.evidence.track(index).points_px)
                  for index in np.flatnonzero(scene.labels == label)]
@@ -169,16 +129,6 @@ def _top_figure(scene: Scene, low: np.ndarray, high: np.ndarray) -> Figure:
     return figure
 
 
-def _from_above(scene: Scene, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Resample the background as seen from straight above; grey where the image does not reach."""
-    camera, ground = scene.calibration.camera, scene.calibration.ground
-    columns, rows = np.maximum(np.round((high - low) / (high - low).max() * TOP_VIEW_PX), 2).astype(int)
-    x, y = np.linspace(low[0], high[0], columns), np.linspace(high[1], low[1], rows)
-    points = np.stack([*np.meshgrid(x, y), np.zeros((rows, columns))], axis=-1)
-    pixels = np.nan_to_num(ground_to_image(camera, ground, points), nan=-1e4).astype(np.float32)
-    return cv2.remap(scene.background, pixels, None, cv2.INTER_LINEAR, borderValue=(224, 224, 224))
-
-
 def _draw_scale(axes: Axes, low: np.ndarray, high: np.ndarray, ground: GroundPlane) -> None:
     length = nice_length(0.2 * (high[0] - low[0]))
     begin = low + 0.04 * (high - low)
@@ -187,12 +137,6 @@ def _draw_scale(axes: Axes, low: np.ndarray, high: np.ndarray, ground: GroundPla
     axes.text(begin[0] + length / 2, begin[1] + 0.02 * (high[1] - low[1]), _length(length, ground), ha='center',
               va='bottom', color=INK, fontsize=10,
               bbox={'boxstyle': 'round,pad=0.2', 'facecolor': WHITE, 'edgecolor': 'none', 'alpha': 0.8})
-
-
-def nice_length(length: float) -> float:
-    """Return 1, 2 or 5 times a power of ten, the largest not above `length`."""
-    power = 10.0 ** np.floor(np.log10(length))
-    return float(max(factor * power for factor in (1, 2, 5) if factor * power <= length * (1 + 1e-9)))
 
 
 def _length(length: float, ground: GroundPlane) -> str:

@@ -1,0 +1,169 @@
+"""Between the image, the road and the views that people look at: undistorted, from above, with a grid on the road.
+
+Pixels are of the full image. A view is a table of where each of its pixels lies in the image, shape (rows, columns, 2);
+it is made once per calibration, and `resample` then takes any image of the camera through it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+
+from autocalib_ros.calibration import GroundPlane
+from autocalib_ros.camera import Camera
+
+FARTHEST_HEIGHTS = 10.0
+"""Views of the road end this many camera heights away: beyond, a pixel covers metres."""
+NOWHERE_PX = -1e4
+"""Where a view's pixel lies that the lens does not see."""
+EMPTY_GREY = 224
+CIRCLE_POINTS = 361
+GRID_CELLS = 8
+"""Cells of a grid on the road to each side of its middle."""
+GRID_STEP_HEIGHTS = 0.8
+SEEN_PIXELS = 64
+"""Pixels along each side of the image that tell how much of the road it shows."""
+
+
+def ground_to_image(camera: Camera, ground: GroundPlane, points_m: np.ndarray) -> np.ndarray:
+    """Return pixels (..., 2) of points (..., 3) in the ground frame; nan where the lens does not see them."""
+    bearings = (points_m - ground.translation_m) @ ground.rotation  # the row form of R^T (X - t)
+    pixels, valid = camera.project(bearings)
+    return np.where(valid[..., None], pixels, np.nan)
+
+
+def image_to_ground(camera: Camera, ground: GroundPlane, pixels: np.ndarray) -> np.ndarray:
+    """Return points (..., 2) on the road of pixels (..., 2); nan at and above the horizon."""
+    bearings, valid = camera.unproject(pixels)
+    rays = bearings @ ground.rotation.T
+    down = np.where(valid & (rays[..., 2] < -1e-6), rays[..., 2], np.nan)
+    return rays[..., :2] * (-ground.height_m / down)[..., None]
+
+
+def near_on_road(camera: Camera, ground: GroundPlane, pixels: np.ndarray) -> np.ndarray:
+    """Return the points (m, 2) on the road of those pixels (n, 2) that show it within FARTHEST_HEIGHTS."""
+    points = image_to_ground(camera, ground, pixels)
+    return points[np.hypot(*points.T) < FARTHEST_HEIGHTS * ground.height_m]
+
+
+def resample(picture: np.ndarray, sources: np.ndarray) -> np.ndarray:
+    """Return the view of a picture, grey (H, W) or BGR (H, W, 3) uint8; EMPTY_GREY where it does not reach."""
+    return cv2.remap(picture, sources, None, cv2.INTER_LINEAR, borderValue=(EMPTY_GREY,) * 3)
+
+
+def rectified_sources(camera: Camera, matrix: np.ndarray) -> np.ndarray:
+    """Return the view of a distortion-free camera of a matrix (3, 3) and the size of the image, float32."""
+    pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1)
+    ones = np.ones((*pixels.shape[:2], 1))
+    sources, valid = camera.project(np.concatenate([pixels, ones], axis=2) @ np.linalg.inv(matrix).T)
+    return np.where(valid[..., None], sources, NOWHERE_PX).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class TopView:
+    """The road seen from straight above, x of the ground frame to the right, y up."""
+
+    low_m: tuple[float, float]
+    """Least x and y that it shows, outer edge of the pixels."""
+    px_per_m: float
+    columns: int
+    rows: int
+
+    @classmethod
+    def around(cls, points_m: np.ndarray, ground: GroundPlane, longest_px: int) -> TopView | None:
+        """Show where points (n, 2) on the road lie, with some margin; None for fewer than two."""
+        if len(points_m) < 2:
+            return None
+        low, high = np.percentile(points_m, [2, 98], axis=0)
+        pad = 0.15 * (high - low).max() + 0.5 * ground.height_m
+        return cls.between(low - pad, high + pad, longest_px)
+
+    @classmethod
+    def of_image(cls, camera: Camera, ground: GroundPlane, longest_px: int) -> TopView | None:
+        """Show all of the road that is in the image and near; None where it shows none."""
+        across = np.linspace(0, camera.width - 1, SEEN_PIXELS)
+        down = np.linspace(0, camera.height - 1, SEEN_PIXELS)
+        points = near_on_road(camera, ground, np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2))
+        return cls.between(points.min(axis=0), points.max(axis=0), longest_px) if len(points) > 1 else None
+
+    @classmethod
+    def between(cls, low_m: np.ndarray, high_m: np.ndarray, longest_px: int) -> TopView:
+        """Show a rectangle of the ground frame, corners (2,), its longer side with so many pixels."""
+        px_per_m = longest_px / float(np.max(high_m - low_m))
+        columns, rows = np.maximum(np.round((high_m - low_m) * px_per_m), 2).astype(int)
+        return cls((float(low_m[0]), float(low_m[1])), px_per_m, int(columns), int(rows))
+
+    @property
+    def high_m(self) -> tuple[float, float]:
+        """Largest x and y that it shows."""
+        return (self.low_m[0] + self.columns / self.px_per_m, self.low_m[1] + self.rows / self.px_per_m)
+
+    @cached_property
+    def _points_m(self) -> np.ndarray:
+        """The road under each pixel's centre, (rows, columns, 3)."""
+        x = self.low_m[0] + (np.arange(self.columns) + 0.5) / self.px_per_m
+        y = self.high_m[1] - (np.arange(self.rows) + 0.5) / self.px_per_m
+        return np.stack([*np.meshgrid(x, y), np.zeros((self.rows, self.columns))], axis=-1)
+
+    def sources(self, camera: Camera, ground: GroundPlane) -> np.ndarray:
+        """Return the view as a table, float32."""
+        return np.nan_to_num(ground_to_image(camera, ground, self._points_m), nan=NOWHERE_PX).astype(np.float32)
+
+    def pixels(self, points_m: np.ndarray) -> np.ndarray:
+        """Return where points (..., 2) of the road lie in the view, pixels (..., 2)."""
+        x = (points_m[..., 0] - self.low_m[0]) * self.px_per_m - 0.5
+        return np.stack([x, (self.high_m[1] - points_m[..., 1]) * self.px_per_m - 0.5], axis=-1)
+
+
+def great_circle(camera: Camera, normal: np.ndarray) -> list[np.ndarray]:
+    """Return the visible arcs of the great circle with that normal, as polylines in pixels near the image.
+
+    With the road's normal it is the horizon.
+    """
+    normal = normal / np.linalg.norm(normal)
+    side = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
+    side /= np.linalg.norm(side)
+    angles = np.linspace(0, 2 * np.pi, CIRCLE_POINTS)[:, None]
+    pixels, valid = camera.project(np.cos(angles) * side + np.sin(angles) * np.cross(normal, side))
+    return _near_image(camera, np.where(valid[:, None], pixels, np.nan), beyond=1.0)
+
+
+def road_lines(camera: Camera, ground: GroundPlane, lines_m: list[np.ndarray]) -> list[np.ndarray]:
+    """Return lines (n, 3) in the ground frame as polylines in pixels in or near the image."""
+    return [part for line in lines_m for part in _near_image(camera, ground_to_image(camera, ground, line), beyond=0.2)]
+
+
+def grid_step(ground: GroundPlane) -> float:
+    """Return the side of a grid's squares that suits the camera's height, a round length."""
+    return nice_length(GRID_STEP_HEIGHTS * ground.height_m)
+
+
+def grid_lines(middle_m: np.ndarray, step_m: float) -> list[np.ndarray]:
+    """Return a grid of squares on the road about a middle (2,), as fine lines (n, 3): they bend in the image."""
+    middle = np.round(middle_m / step_m) * step_m
+    offsets = step_m * np.arange(-GRID_CELLS, GRID_CELLS + 1)
+    fine = np.linspace(offsets[0], offsets[-1], 40 * GRID_CELLS + 1)
+    lines = []
+    for offset in offsets:
+        for axis in (0, 1):
+            line = np.zeros((len(fine), 3))
+            line[:, axis], line[:, 1 - axis] = middle[axis] + fine, middle[1 - axis] + offset
+            lines.append(line)
+    return lines
+
+
+def _near_image(camera: Camera, pixels: np.ndarray, *, beyond: float) -> list[np.ndarray]:
+    """Split a polyline (n, 2) into the parts that lie in the image or `beyond` it by that share of its size."""
+    size = np.array([camera.width, camera.height])
+    near = (np.isfinite(pixels) & (pixels > -beyond * size) & (pixels < (1 + beyond) * size)).all(axis=1)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], near, [False]]).astype(int)))
+    return [pixels[begin:end] for begin, end in zip(edges[::2], edges[1::2], strict=True) if end - begin > 1]
+
+
+def nice_length(length: float) -> float:
+    """Return 1, 2 or 5 times a power of ten, the largest not above `length`."""
+    power = 10.0 ** np.floor(np.log10(length))
+    return float(max(factor * power for factor in (1, 2, 5) if factor * power <= length * (1 + 1e-9)))
