@@ -42,6 +42,8 @@ MAX_K1 = 0.05
 TURNING_K1 = 0.03
 MAX_SHIFT_PX = 20.0
 """Of the principal point from the image centre, along each axis."""
+USUAL_SHIFT = 0.01
+"""Standard deviation of the same, share of the image width: what joint.principal_point_sigma_px is by default."""
 
 Family = Callable[[np.random.Generator], tuple[Junction, Evidence]]
 """Draws the truth, and evidence of it."""
@@ -138,6 +140,13 @@ def turning(generator: np.random.Generator) -> Junction:
     junction = _centred(viewpoint(generator), generator)
     return replace(junction, drive=partial(drive_arc, radii_m=(12.0, 60.0)), tracks=None, vehicles=25,
                    points_per_vehicle=8, joined_share=0.2)
+
+
+def turning_off_centre(generator: np.random.Generator) -> Junction:
+    """Vehicles that turn, before a lens whose principal point is off the image centre as the solver expects it."""
+    junction = turning(generator)
+    point = np.array(junction.camera.principal_point_px) + generator.normal(0.0, USUAL_SHIFT * WIDTH, 2)
+    return replace(junction, camera=replace(junction.camera, principal_point_px=(float(point[0]), float(point[1]))))
 
 
 def motorway(generator: np.random.Generator) -> Junction:
@@ -254,6 +263,7 @@ DETERMINED: dict[str, Family] = {
     'one_road': driven(one_road),
     'distortion_free': driven(distortion_free),
     'turning': driven(turning),
+    'turning_off_centre': driven(turning_off_centre),
     'highway': driven(motorway),
     'roundabout_arms': driven(roundabout_arms),
     'skew_turning': driven(skew_turning),
