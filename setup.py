@@ -27,6 +27,7 @@ setup(
         'tqdm>=4.64',
         'jinja2>=3',
         'matplotlib>=3.7',
+        'onnxruntime>=1.17',
     ],
     extras_require={
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],

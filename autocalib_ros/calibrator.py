@@ -20,8 +20,10 @@ from autocalib_ros.estimation.plane import Plane
 from autocalib_ros.estimation.scale import Scale, is_unusual, known_scale, scale_doubt
 from autocalib_ros.estimation.solution import Solution, find_solution
 from autocalib_ros.estimation.straightness import paper_intrinsics
+from autocalib_ros.estimation.traffic import of_vehicles
 from autocalib_ros.estimation.vanishing_points import segment_orientations
 from autocalib_ros.evidence import Evidence, EvidenceBuffer
+from autocalib_ros.perception.detector.detector import VehicleDetector, open_detector
 from autocalib_ros.perception.observer import Observer
 
 REORDERED_NS = 1_000_000_000
@@ -57,10 +59,14 @@ class Progress:
 
 
 class AutoCalibrator:
-    """Gathers evidence frame by frame; bounded in memory on an endless stream; not thread-safe."""
+    """Gathers evidence frame by frame; bounded in memory on an endless stream; not thread-safe.
 
-    def __init__(self, options: Options) -> None:
+    A `detector` that is open already is used; else that of the options is opened, UsageError where that fails.
+    """
+
+    def __init__(self, options: Options, detector: VehicleDetector | None = None) -> None:
         self._options = options
+        self._detector = detector or open_detector(options.detector)
         self._observer: Observer | None = None
 
     def add_image(self, stamp_ns: int, image: np.ndarray) -> Intake:
@@ -127,7 +133,7 @@ class AutoCalibrator:
 
     def _begin(self, stamp_ns: int, size: tuple[int, int]) -> None:
         self._options.scale.require_inside(*size)
-        self._observer = Observer(self._options, size)
+        self._observer = Observer(self._options, size, self._detector)
         self._buffer = EvidenceBuffer(self._options.buffer)
         self._size, self._first_stamp_ns, self._newest_stamp_ns = size, stamp_ns, stamp_ns - 1
         self._frames = 0
@@ -166,6 +172,7 @@ class AutoCalibrator:
         evidence, gate = self.snapshot(), self._options.gate
         if evidence is None:
             return Progress(0.0, ('no image yet',))
+        evidence, _ = of_vehicles(evidence)
         needs = requirements(evidence, gate, self._options.first_solve_s)
         scarcest = min(need.share for need in needs)
         missing = [need.words for need in needs if need.share < 1.0]
@@ -217,17 +224,18 @@ def _solved(evidence: Evidence, options: Options, lens: Camera | None) -> Calibr
     def refused(reason: Reason) -> Refusal:
         return Refusal.because(reason, options.method, evidence.summary(), figures)
 
-    reason = shortfall(evidence, options.gate)
+    traffic, kept = of_vehicles(evidence)
+    reason = shortfall(traffic, options.gate)
     if reason:
         return refused(reason)
     if options.method == 'paper':
         published = solve_paper(evidence, options, intrinsics, figures)
         return refused(published) if isinstance(published, Reason) else published
-    tracks = select_tracks(evidence, options.joint.max_tracks)
-    solution = _solution(evidence, tracks, options, lens)
+    tracks = select_tracks(traffic, options.joint.max_tracks)
+    solution = _solution(traffic, tracks, options, lens)
     if isinstance(solution, Reason):
         return refused(solution)
-    figures = _figures(figures, solution, tracks, evidence, options)
+    figures = _figures(figures, solution, kept[tracks.indices], evidence, options)
     paper = None if intrinsics is None else intrinsics.report
     return _calibration(options, solution, Calibration(
         method=options.method, grade='lens', assumptions=solution.assumptions, checks=solution.checks,
@@ -255,10 +263,11 @@ def _scale(options: Options, solution: Solution) -> Scale | Reason:
     return known_scale(options, *solution.plane.here, solution.flow)
 
 
-def _figures(figures: Figures, solution: Solution, tracks: TrackSet, evidence: Evidence, options: Options) -> Figures:
-    """Add what became of each track, and the orientations of the segments in the solved lens."""
+def _figures(figures: Figures, solution: Solution, indices: np.ndarray, evidence: Evidence,
+             options: Options) -> Figures:
+    """Add what became of each track (n,) by its index, and the orientations of the segments in the solved lens."""
     labels = figures.track_labels.copy()
-    labels[tracks.indices] = np.where(solution.fit.explained(), solution.fit.labels, -2)
+    labels[indices] = np.where(solution.fit.explained(), solution.fit.labels, -2)
     found = segment_orientations(solution.fit.state.camera, evidence.segments_px, options.paper)
     return replace(figures, track_labels=labels, orientation_histogram=found.histogram,
                    orientation_peaks_deg=found.peaks_deg)

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from autocalib_ros.camera import Camera
     from autocalib_ros.offline.replay import ReplayResult
     from autocalib_ros.offline.sources import Source
+    from autocalib_ros.perception.detector.detector import VehicleDetector
 
 # Everything heavy (OpenCV, rosbags, matplotlib) is imported where it is used, so that --help is quick.
 
@@ -239,12 +240,16 @@ def _replay(arguments: argparse.Namespace) -> int:
     options = _options(arguments)
     lens = _lens(arguments, options)
     from autocalib_ros.offline.sources import open_source
+    from autocalib_ros.perception.detector.detector import open_detector
 
+    detector = open_detector(options.detector)
+    if detector is not None and not arguments.quiet:
+        _tell(f'Vehicles by a {detector}')
     source = open_source(arguments.source, arguments.topic, arguments.start, arguments.duration)
     from autocalib_ros.offline import outputs
 
     outputs.prepare(arguments.out, arguments.write_bag)
-    replayed = _replay_and_tell(source, options, arguments.out, lens=lens, quiet=arguments.quiet)
+    replayed = _replay_and_tell(source, options, arguments.out, lens=lens, detector=detector, quiet=arguments.quiet)
     if arguments.write_bag is not None:
         _write_bag(arguments.write_bag, replayed, source, options.tf_parent)
     return CALIBRATED if replayed.result else REFUSED
@@ -273,7 +278,7 @@ def _evidence(arguments: argparse.Namespace) -> int:
 
 
 def _replay_and_tell(source: Source, options: Options, out: Path, *, lens: Camera | None = None,
-                     quiet: bool = False) -> ReplayResult:
+                     detector: VehicleDetector | None = None, quiet: bool = False) -> ReplayResult:
     """Replay, write the results, and say what came out: the summary on stdout, a refusal's reason on stderr."""
     from autocalib_ros.offline.outputs import write_outputs
     from autocalib_ros.offline.progress import progress_bar
@@ -282,7 +287,7 @@ def _replay_and_tell(source: Source, options: Options, out: Path, *, lens: Camer
     if not quiet:
         _tell_missing_height(options, lens)
     with progress_bar(source.total, 'images', 'replay', quiet=quiet) as progress:
-        replayed = replay(source, options, progress.update_to, lens=lens)
+        replayed = replay(source, options, progress.update_to, lens=lens, detector=detector)
     names = write_outputs(out, replayed, source)
     _tell_refusal(replayed)
     if not quiet:

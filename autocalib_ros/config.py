@@ -69,6 +69,57 @@ class MotionOptions(_Checked):
 
 
 @dataclass(frozen=True, kw_only=True)
+class DetectorOptions(_Checked):
+    """Vehicles by a detector in ONNX; auto goes by what the model says of itself, whatever else is set wins."""
+
+    model: str = option('', "ONNX file of the detector; '' is none: vehicles are what moves")
+    layout: str = option(
+        'auto', 'how the model says its boxes: auto tells by the shapes and names of its outputs',
+        choices=('auto', 'yolox', 'yolox_decoded', 'yolov3', 'yolov5', 'yolov7_end2end', 'yolov8', 'end_to_end',
+                 'yolo_nas', 'rtdetr', 'ultralytics_rtdetr', 'detr', 'tf_od', 'detection_output'))
+    input_size: int = option(0, 'longest side of the image for a model that takes any size, pixels; 0 is that of the '
+                             'camera up to 1280; smaller images are never enlarged', low=0, high=8192)
+    confidence: float = option(0.4, 'least score of a detection', low=0.01, high=1)
+    nms_iou: float = option(0.5, 'of two boxes whose overlap is a larger share of their union, one is left, whatever '
+                            'their classes', low=0.05, high=1)
+    class_ids: str = option('', "numbers of the model's classes that are vehicles and, after a slash, people, as text: "
+                            "'2 3 5 7 / 0 1' is COCO; '' goes by the names in the model, else COCO")
+    channel_order: str = option('auto', 'order of the colours that the model takes; auto: bgr for yolox, else rgb',
+                                choices=('auto', 'bgr', 'rgb'))
+    input_scale: float = option(0.0, 'what the model takes for white, 255 or 1; 0 is auto: 255 for yolox, else 1',
+                                low=0, high=65535)
+    mean_std: str = option('auto', "whether colours are normalised by ImageNet's mean and standard deviation; auto: "
+                           'for detr', choices=('auto', 'none', 'imagenet'))
+    resize_mode: str = option(
+        'auto', 'how an image comes to the size of the model: padded at the right and below, padded all around, or '
+        'stretched; auto goes by the layout', choices=('auto', 'top_left', 'centred', 'stretch'))
+    providers: str = option('CPUExecutionProvider', 'execution providers of onnxruntime, the preferred one first, as '
+                            "text: 'TensorrtExecutionProvider CUDAExecutionProvider' say")
+    threads: int = option(1, 'threads of one detection on the processor', low=1, high=256)
+    every_s: float = option(0.2, 'seconds between two detections: every sixth image at 30 Hz; in between boxes follow '
+                            'the points on their vehicles', low=0.01, high=10)
+
+    def __post_init__(self) -> None:
+        if isinstance(self.class_ids, int) and not isinstance(self.class_ids, bool):
+            object.__setattr__(self, 'class_ids', str(self.class_ids))  # YAML reads one class as a number
+        super().__post_init__()
+        _ = self.chosen_classes
+
+    @property
+    def chosen_classes(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """Classes of vehicles and of people in `class_ids`; two empty tuples where it is empty."""
+        vehicles, _, people = self.class_ids.replace(',', ' ').partition('/')
+        try:
+            chosen = tuple(map(int, vehicles.split())), tuple(map(int, people.split()))
+        except ValueError:
+            chosen = (), (-1,)
+        if min(sum(chosen, ()), default=0) < 0 or (self.class_ids.strip() and not chosen[0]):
+            raise UsageError("option 'class_ids' is whole numbers in one text, vehicles first and people after a "
+                             f"slash, '2 3 5 7 / 0 1' for example; got {self.class_ids!r}")
+        return chosen
+
+
+@dataclass(frozen=True, kw_only=True)
 class BufferOptions(_Checked):
     """The buffer of evidence, bounded in number."""
 
@@ -236,6 +287,7 @@ class Options(_Checked):
     solve_interval_s: float = option(5.0, 'least seconds of recording between two solutions', low=0.1)
     tracking: TrackingOptions = field(default_factory=TrackingOptions)
     motion: MotionOptions = field(default_factory=MotionOptions)
+    detector: DetectorOptions = field(default_factory=DetectorOptions)
     buffer: BufferOptions = field(default_factory=BufferOptions)
     paper: PaperOptions = field(default_factory=PaperOptions)
     joint: JointOptions = field(default_factory=JointOptions)

@@ -6,6 +6,7 @@ import zipfile
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from enum import IntEnum
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,15 @@ COVERAGE_CELLS = (16, 9)
 """Columns and rows of the grid in which coverage of the image is counted."""
 
 
+class Kind(IntEnum):
+    """What a track is of, by the class that a detector saw."""
+
+    UNKNOWN = 0
+    VEHICLE = 1
+    PERSON = 2
+    """On foot or on a bicycle."""
+
+
 @dataclass(frozen=True)
 class Track:
     """One point of one vehicle over time, in observed pixels of the full image."""
@@ -29,6 +39,7 @@ class Track:
     """Seconds since the first image, shape (n,), increasing."""
     points_px: np.ndarray
     """Shape (n, 2)."""
+    kind: Kind = Kind.UNKNOWN
 
 
 @dataclass(frozen=True)
@@ -83,6 +94,12 @@ class Evidence:
     """Shape (edges,)."""
     edge_times_s: np.ndarray = field(default_factory=lambda: np.zeros(0))
     """Shape (edges,)."""
+    track_kinds: np.ndarray = field(default_factory=lambda: np.zeros(0, np.uint8))
+    """`Kind` of each track, uint8, shape (tracks,); all unknown where it is not given."""
+
+    def __post_init__(self) -> None:
+        if not len(self.track_kinds):
+            object.__setattr__(self, 'track_kinds', np.zeros(len(self.track_vehicles), np.uint8))
 
     @property
     def track_count(self) -> int:
@@ -97,7 +114,8 @@ class Evidence:
     def track(self, index: int) -> Track:
         """Return one track."""
         part = slice(self.track_starts[index], self.track_starts[index + 1])
-        return Track(int(self.track_vehicles[index]), self.times_s[part], self.points_px[part])
+        return Track(int(self.track_vehicles[index]), self.times_s[part], self.points_px[part],
+                     Kind(self.track_kinds[index]))
 
     def tracks(self) -> Iterator[Track]:
         """Iterate over all tracks."""
@@ -116,7 +134,8 @@ class Evidence:
         """Return the counts that a result carries."""
         return EvidenceSummary(
             image_size=self.image_size, seconds=self.seconds, frames=self.frames, tracks=self.track_count,
-            segments=len(self.segments_px), vehicles=len(np.unique(self.track_vehicles)), coverage=self.coverage)
+            segments=len(self.segments_px), coverage=self.coverage,
+            vehicles=len(np.unique(self.track_vehicles[self.track_kinds != Kind.PERSON])))
 
     def selected(self, keep: np.ndarray) -> Evidence:
         """Return the evidence with only the tracks whose indices are in `keep`; segments and edges unchanged."""
@@ -125,6 +144,8 @@ class Evidence:
     def save(self, path: Path) -> None:
         """Write the snapshot as .npz."""
         arrays = {name: getattr(self, name) for name in (*ARRAYS, *EDGE_ARRAYS)}
+        if self.track_kinds.any():
+            arrays[KINDS] = self.track_kinds
         path = Path(path)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -148,7 +169,7 @@ class Evidence:
                 evidence = cls(image_size=(width, height), first_stamp_ns=first, newest_stamp_ns=newest,
                                frames=int(data['frames']), drift_px=float(data['drift_px']),
                                **{name: data[name] for name in ARRAYS},
-                               **{name: data[name] for name in EDGE_ARRAYS if name in data})
+                               **{name: data[name] for name in (*EDGE_ARRAYS, KINDS) if name in data})
             _require_consistent(evidence)
         except UNREADABLE as error:
             reason = ' '.join(str(error).split())
@@ -160,6 +181,8 @@ ARRAYS = ('track_starts', 'points_px', 'times_s', 'track_vehicles', 'segments_px
           'segment_times_s')
 EDGE_ARRAYS = ('edges_px', 'edge_vehicles', 'edge_times_s')
 """Files written before edges were gathered have none of them."""
+KINDS = 'track_kinds'
+"""Only in files of evidence that was gathered with a detector."""
 
 
 UNREADABLE = (OSError, LookupError, ValueError, TypeError, AttributeError, EOFError, OverflowError, MemoryError,
@@ -174,12 +197,14 @@ def _require_consistent(evidence: Evidence) -> None:
               'track_vehicles': (tracks,), 'segments_px': (len(evidence.segments_px), 4),
               'segment_vehicles': (len(evidence.segments_px),), 'segment_times_s': (len(evidence.segments_px),),
               'edges_px': (len(evidence.edges_px), 4), 'edge_vehicles': (len(evidence.edges_px),),
-              'edge_times_s': (len(evidence.edges_px),)}
+              'edge_times_s': (len(evidence.edges_px),), KINDS: (tracks,)}
     for name, shape in shapes.items():
         array = getattr(evidence, name)
-        kinds = 'iu' if name == 'track_starts' or name.endswith('vehicles') else 'f'
+        kinds = 'iu' if name in ('track_starts', KINDS) or name.endswith('vehicles') else 'f'
         if array.shape != shape or array.dtype.kind not in kinds or not np.isfinite(array).all():
             raise ValueError(f'{name} of {array.dtype} {array.shape} does not fit the rest')
+    if not np.isin(evidence.track_kinds, list(Kind)).all():
+        raise ValueError(f'{KINDS} holds other kinds than {", ".join(f"{kind:d} ({kind.name})" for kind in Kind)}')
     starts = evidence.track_starts
     if starts[0] != 0 or starts[-1] != points or (np.diff(starts) < 1).any():
         raise ValueError('track_starts does not divide points_px into tracks')
@@ -197,7 +222,8 @@ def _track_arrays(tracks: list[Track]) -> dict[str, np.ndarray]:
         'track_starts': np.concatenate([[0], np.cumsum(lengths)]).astype(int),
         'points_px': np.concatenate([t.points_px for t in tracks] or [np.zeros((0, 2))]).astype(float),
         'times_s': np.concatenate([t.times_s for t in tracks] or [np.zeros(0)]).astype(float),
-        'track_vehicles': np.array([track.vehicle for track in tracks], int)}
+        'track_vehicles': np.array([track.vehicle for track in tracks], int),
+        'track_kinds': np.array([track.kind for track in tracks], np.uint8)}
 
 
 class _Lines:

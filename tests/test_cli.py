@@ -84,6 +84,8 @@ def test_help_imports_nothing_heavy(tmp_path):
     (['replay', 'x', '--params-file', 'nowhere.yaml'], 'cannot read nowhere.yaml'),
     (['replay', 'nowhere.mp4'], 'nowhere.mp4 does not exist'),
     (['replay', 'x', '--camera-info', 'nowhere.yaml'], 'cannot read nowhere.yaml'),
+    (['replay', 'x', '-p', 'detector.model=nowhere.onnx'], "'detector.model' is nowhere.onnx, which is not a file"),
+    (['replay', 'x', '-p', 'detector.layout=yolo'], "'layout' is one of auto, yolox"),
     (['evidence'], 'the following arguments are required: FILE.npz'),
     (['evidence', 'nowhere.npz'], 'nowhere.npz'),
     (['evidence', 'nowhere.npz', '-p', 'camera_hight=3'], "did you mean 'camera_height'?"),

@@ -9,7 +9,7 @@ import pytest
 
 from autocalib_ros.config import BufferOptions
 from autocalib_ros.errors import InputError
-from autocalib_ros.evidence import EDGE_ARRAYS, Edges, Evidence, EvidenceBuffer, Segments, Track
+from autocalib_ros.evidence import EDGE_ARRAYS, KINDS, Edges, Evidence, EvidenceBuffer, Kind, Segments, Track
 
 
 def track(vehicle: int, end_s: float) -> Track:
@@ -37,6 +37,40 @@ def test_a_snapshot_survives_its_file_to_the_last_bit(tmp_path: Path) -> None:
     after = Evidence.load(tmp_path / 'evidence.npz')
     for name in vars(before):
         np.testing.assert_array_equal(getattr(after, name), getattr(before, name), err_msg=name)
+
+
+def of_kinds(*kinds: Kind) -> Evidence:
+    buffer = EvidenceBuffer(BufferOptions())
+    for index, kind in enumerate(kinds):
+        one = track(index, 5.0 + index)
+        buffer.add_track(Track(one.vehicle, one.times_s, one.points_px, kind))
+    return snapshot(buffer)
+
+
+def test_kinds_of_tracks_survive_their_file(tmp_path: Path) -> None:
+    of_kinds(Kind.PERSON, Kind.VEHICLE, Kind.UNKNOWN).save(tmp_path / 'evidence.npz')
+    after = Evidence.load(tmp_path / 'evidence.npz')
+    assert [one.kind for one in after.tracks()] == [Kind.PERSON, Kind.VEHICLE, Kind.UNKNOWN]
+    assert after.selected(np.array([1])).track_kinds.tolist() == [Kind.VEHICLE]
+    assert after.summary().vehicles == 2
+
+
+def test_without_a_detector_a_file_is_what_it_was_before_there_were_kinds(tmp_path: Path) -> None:
+    of_kinds(Kind.UNKNOWN, Kind.UNKNOWN).save(tmp_path / 'evidence.npz')
+    with np.load(tmp_path / 'evidence.npz') as data:
+        assert KINDS not in data.files
+    assert Evidence.load(tmp_path / 'evidence.npz').track_kinds.tolist() == [Kind.UNKNOWN] * 2
+
+
+@pytest.mark.parametrize('kinds', [[1], [1, 3], [1.0, 2.0]])
+def test_kinds_that_do_not_fit_are_an_input_error(tmp_path: Path, kinds: list) -> None:
+    path = tmp_path / 'evidence.npz'
+    of_kinds(Kind.PERSON, Kind.VEHICLE).save(path)
+    with np.load(path) as data:
+        arrays = {name: data[name] for name in data.files}
+    np.savez(path, **{**arrays, KINDS: np.array(kinds)})
+    with pytest.raises(InputError, match=KINDS):
+        Evidence.load(path)
 
 
 def rewritten(tmp_path: Path, keep: tuple[str, ...]) -> Path:

@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 
 from autocalib_ros.calibration import Calibration, Refusal
-from autocalib_ros.config import Options
+from autocalib_ros.config import DetectorOptions, Options
+from autocalib_ros.evidence import Kind
 from autocalib_ros.offline.replay import replay
 from autocalib_ros.offline.sources import open_source
+from autocalib_ros.perception.detector.detector import open_detector
 
 DATA = Path(os.environ.get('AUTOCALIB_TEST_DATA', '')) / 'data'
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(
@@ -46,3 +48,44 @@ def test_real_clips_that_say_too_little_are_refused_with_a_remedy(clip: str) -> 
     result = result_of(DATA / 'real' / clip, 8.0)
     assert isinstance(result, Refusal)
     assert result.message and result.remedy
+
+
+@pytest.mark.parametrize(('model', 'least_found'), [('yolox_nano_dyn', 0.4), ('yolox_nano', 0.2)])
+def test_a_real_detector_finds_vehicles_where_they_are(model: str, least_found: float) -> None:
+    pytest.importorskip('onnxruntime', reason='onnxruntime is not installed')
+    detector = open_detector(DetectorOptions(model=str(DATA.parent / 'models' / f'{model}.onnx')))
+    assert detector is not None and detector.layout == 'yolox'
+    true, found, aside = 0, 0, []
+    for frame, places in zip(*frames_and_places('S7', (150, 300, 450, 600, 750, 900)), strict=True):
+        detections = detector.detect(frame)
+        left, top, right, bottom = detections.edges_px[~detections.people].T
+        u, v = places.T[..., None]
+        inside = (u > left) & (u < right) & (v > top) & (v < bottom)
+        true, found = true + len(places), found + int(inside.any(axis=1).sum())
+        aside += (np.abs(u - 0.5 * (left + right)) / (right - left))[inside].tolist()
+    assert found >= least_found * true
+    assert np.median(aside) < 0.12  # of its width, between a vehicle's footprint and the middle of its box
+
+
+def frames_and_places(scene: str, numbers: tuple[int, ...]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Frames of a scene, and the pixels (n, 2) of the vehicles' footprints in each."""
+    truth = json.loads((DATA / 'scenes' / scene / 'truth.json').read_text())
+    wanted = {number: round(number / truth['fps'], 2) for number in numbers}
+    frames = [frame.image for number, frame in enumerate(open_source(DATA / 'scenes' / scene / 'video.mp4',
+                                                                     duration_s=max(wanted.values()) + 0.01).frames())
+              if number in wanted]
+    rows = np.concatenate([np.array(track['rows']) for track in truth['vehicles']['tracks']])
+    return frames, [rows[np.abs(rows[:, 0] - time_s) < 0.01, 5:7] for time_s in wanted.values()]
+
+
+def test_evidence_by_a_real_detector_tells_people_from_vehicles() -> None:
+    pytest.importorskip('onnxruntime', reason='onnxruntime is not installed')
+    options = DetectorOptions(model=str(DATA.parent / 'models' / 'yolox_nano_dyn.onnx'))
+    evidence = replay(open_source(DATA / 'scenes' / 'S1' / 'video.mp4', duration_s=20.0),
+                      Options(camera_height=8.0, first_solve_s=1e5, detector=options)).evidence
+    way = np.array([np.hypot(*(track.points_px[-1] - track.points_px[0])) / np.ptp(track.times_s)
+                    for track in evidence.tracks()])
+    people = evidence.track_kinds == Kind.PERSON
+    assert people.sum() > 5 and (evidence.track_kinds == Kind.VEHICLE).sum() > 50
+    # pixels a second; who walks is slower than who drives, over the same places
+    assert np.median(way[people]) < 0.6 * np.median(way[~people])

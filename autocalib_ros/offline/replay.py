@@ -14,6 +14,7 @@ from autocalib_ros.config import Options
 from autocalib_ros.errors import InputError
 from autocalib_ros.evidence import Evidence
 from autocalib_ros.offline.sources import Source
+from autocalib_ros.perception.detector.detector import VehicleDetector
 
 NOTE_EVERY = 15
 """Frames between two questions for the progress: it is for people, who read slowly."""
@@ -33,12 +34,13 @@ class ReplayResult:
 
 
 def replay(source: Source, options: Options, on_progress: Callable[[int, str], None] | None = None,
-           lens: Camera | None = None) -> ReplayResult:
+           lens: Camera | None = None, detector: VehicleDetector | None = None) -> ReplayResult:
     """Go through a recording and solve at its end; `on_progress` is told the frames done and a short note.
 
-    With a known `lens` only the pose is solved; UsageError at the first image that is not of its shape.
+    With a known `lens` only the pose is solved; UsageError at the first image that is not of its shape. A `detector`
+    that is open already is used, else that of the options is opened.
     """
-    calibrator, accepted_at_s, count, note, fitting = AutoCalibrator(options), None, 0, '', None
+    calibrator, accepted_at_s, count, note, fitting = AutoCalibrator(options, detector), None, 0, '', None
     for count, frame in enumerate(source.frames(), start=1):
         fitting = _fitting(lens, (frame.image.shape[1], frame.image.shape[0]))
         calibrator.add_image(frame.stamp_ns, frame.image)

@@ -8,8 +8,10 @@ import cv2
 import numpy as np
 
 from autocalib_ros.config import Options
-from autocalib_ros.evidence import Edges, Segments, Track
+from autocalib_ros.evidence import Edges, Kind, Segments, Track
 from autocalib_ros.perception.background import Background
+from autocalib_ros.perception.detected import DetectedVehicles
+from autocalib_ros.perception.detector.detector import VehicleDetector
 from autocalib_ros.perception.edges import EdgeFinder
 from autocalib_ros.perception.segments import Keypoints, find_keypoints, match_segments
 from autocalib_ros.perception.stillness import Stillness
@@ -37,13 +39,17 @@ class Observations:
 
 
 class Observer:
-    """Watches one stream of images of one size; times are seconds since its first image."""
+    """Watches one stream of images of one size; times are seconds since its first image.
 
-    def __init__(self, options: Options, image_size: tuple[int, int]) -> None:
+    Vehicles are what moves or, given a detector, what it finds and moves.
+    """
+
+    def __init__(self, options: Options, image_size: tuple[int, int], detector: VehicleDetector | None = None) -> None:
         self._options = options
         self._image_size = image_size
         self._reduction = max(1.0, image_size[0] / options.max_image_width)
         self._motion = MotionMask(options.motion)
+        self._detected = None if detector is None else DetectedVehicles(detector, options.detector)
         self._tracker = PointTracker(options.tracking)
         self._stillness = Stillness(options.buffer.seconds)
         self._background = Background()
@@ -61,14 +67,16 @@ class Observer:
         if self._repeats(grey):
             return Observations([], None, None)
         self._background.update(image, time_s)
-        tracks = self._tracker.follow(grey, time_s)
+        tracks = [self._full_size(track) for track in self._tracker.follow(grey, time_s)]
         detect = self._frames % self._options.tracking.detect_every == 0
         if detect or self._frames % MASK_EVERY == 0:
             self._motion.update(grey, time_s)
+        if self._detected is not None:
+            self._detected.follow(image, time_s, self._tracker, self._reduction)
         segments, edges = self._detect(grey, time_s) if detect else (None, None)
         self._stillness.update(grey, time_s)
         self._frames += 1
-        return Observations([self._full_size(track) for track in tracks], segments, edges)
+        return Observations(tracks, segments, edges)
 
     def _repeats(self, grey: np.ndarray) -> bool:
         """Say whether nothing has changed since the last image used: cameras and recorders send pictures twice."""
@@ -90,18 +98,27 @@ class Observer:
 
     def _detect(self, grey: np.ndarray, time_s: float) -> tuple[Segments | None, Edges | None]:
         """Look into the moving regions for edges and keypoints, which start tracks, and matched are segments."""
-        regions = self._motion.regions()
-        vehicles = self._vehicles_of(regions)
+        regions, vehicles, people = self._moving(grey.shape)
         keypoints = find_keypoints(grey, regions, self._sift)
-        strongest = np.argsort(-keypoints.responses, kind='stable')
-        of_keypoint = vehicles[keypoints.regions]
-        self._tracker.add_points(keypoints.points_px[strongest], of_keypoint[strongest])
-        edges = self._edges_of(grey, regions, vehicles, time_s)
+        of_keypoint, of_person = vehicles[keypoints.regions], people[keypoints.regions]
+        order = np.lexsort((-keypoints.responses, of_person))  # the strongest first, and people last
+        self._tracker.add_points(keypoints.points_px[order], of_keypoint[order])
+        keypoints, of_keypoint = keypoints.subset(~of_person), of_keypoint[~of_person]
+        edges = self._edges_of(grey, [region for region, person in zip(regions, people, strict=True) if not person],
+                               vehicles[~people], time_s)
         before, self._keypoints = self._keypoints, keypoints
         if before is None:
             return None, edges
         ends, matched = match_segments(before, keypoints, grey.shape[1])
         return Segments(time_s, of_keypoint[matched], self._full_pixels(ends.reshape(-1, 2)).reshape(-1, 4)), edges
+
+    def _moving(self, shape: tuple[int, int]) -> tuple[list[Region], np.ndarray, np.ndarray]:
+        """What moves: regions, the vehicle of each (n,), and whether that is known as a person (n,)."""
+        regions = self._motion.regions()
+        if self._detected is None:
+            return regions, self._vehicles_of(regions), np.zeros(len(regions), bool)
+        regions, vehicles = self._detected.regions(regions, shape)
+        return regions, vehicles, np.array([self._detected.kind(one) is Kind.PERSON for one in vehicles], bool)
 
     def _edges_of(self, grey: np.ndarray, regions: list[Region], vehicles: np.ndarray, time_s: float) -> Edges | None:
         """Look for straight edges in every `EDGES_EVERY`th image with regions."""
@@ -151,7 +168,8 @@ class Observer:
         return self._background.image()
 
     def _full_size(self, track: Track) -> Track:
-        return Track(track.vehicle, track.times_s, self._full_pixels(track.points_px))
+        kind = Kind.UNKNOWN if self._detected is None else self._detected.kind(track.vehicle)
+        return Track(track.vehicle, track.times_s, self._full_pixels(track.points_px), kind)
 
     def _full_pixels(self, points_px: np.ndarray) -> np.ndarray:
         """Bring pixels (n, 2) of the tracked image to the full one; pixel centres lie at whole numbers."""

@@ -32,6 +32,10 @@ class Keypoints:
     descriptors: np.ndarray
     """Shape (n, 128), float32."""
 
+    def subset(self, keep: np.ndarray) -> Keypoints:
+        """Return the keypoints that `keep` (n,) selects."""
+        return Keypoints(self.points_px[keep], self.responses[keep], self.regions[keep], self.descriptors[keep])
+
 
 def find_keypoints(grey: np.ndarray, regions: list[Region], sift: cv2.SIFT) -> Keypoints:
     """Find SIFT keypoints inside the moving regions of a grey image (H, W)."""

@@ -104,6 +104,10 @@ class PointTracker:
         active = np.flatnonzero(self._count)
         return self._newest(active), self._vehicle[active]
 
+    def steps(self) -> np.ndarray:
+        """Return how far the followed points came since the image before, (n, 2) as `positions`."""
+        return self._step[np.flatnonzero(self._count)]
+
     def add_points(self, points_px: np.ndarray, vehicles: np.ndarray) -> None:
         """Begin to follow points (n, 2), best first, that keep their distance from those followed already."""
         spacing = self._options.min_spacing_px

@@ -1,6 +1,6 @@
-"""Where the vehicles are: a mask of what moves against a slowly learned background.
+"""Where something moves: a mask of what differs from a slowly learned background.
 
-A detector can stand in this room beside motion: whatever returns `Region`s will do.
+These regions are the vehicles where there is no detector, and tell moving boxes from still ones where there is one.
 """
 
 from __future__ import annotations

@@ -19,6 +19,7 @@ from autocalib_ros.calibration import Calibration, Refusal
 from autocalib_ros.camera_info import camera_info, read_camera_info
 from autocalib_ros.config import NodeOptions, Options
 from autocalib_ros.errors import AutocalibError
+from autocalib_ros.perception.detector.detector import open_detector
 from autocalib_ros.perception.images import ImageDecoder
 from autocalib_ros.ros.diagnostics import Diagnostics
 from autocalib_ros.ros.driver_info import DriverInfo
@@ -53,6 +54,7 @@ class AutocalibNode(Node):
         self._lens = read_camera_info(lens_file) if lens_file else None
         if self._lens is not None:
             camera_info(self._lens, self.options.distortion_model)  # a model that cannot say it is wrong usage at once
+        detector = open_detector(self.options.detector)
         self._headers = Headers(self.node_options, self.get_namespace(), self.get_logger().warning,
                                 lambda: self.get_clock().now().nanoseconds)
         self._said: dict[str, float] = {}
@@ -67,7 +69,7 @@ class AutocalibNode(Node):
         solver = SolverProcess()
         self._pipeline = Pipeline(self.options, idle_solve_s=self.node_options.idle_solve_s,
                                   decode=ImageDecoder().decode, solve=solve or solver, listener=self, lens=self._lens,
-                                  stop_solving=solver.close)
+                                  detector=detector, stop_solving=solver.close)
         if self._store is not None:
             self._restore(self._store)
         # While a caller waits for a solution or a disk, everything outside its group goes on.
@@ -80,6 +82,8 @@ class AutocalibNode(Node):
         self._diagnostics = Diagnostics(self, self._situation, lambda: self._headers.camera_name(
             self.in_force.image_frame or DEFAULT_FRAME))
         self.create_timer(TELL_PROGRESS_S, self._tell_progress, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        if detector is not None:
+            self.get_logger().info(f'vehicles by a {detector}')
         self.get_logger().info(f'waiting for images on {self._input.topic}')
 
     def close(self) -> None:

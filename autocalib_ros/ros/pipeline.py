@@ -26,6 +26,7 @@ from autocalib_ros.camera import Camera
 from autocalib_ros.config import Options
 from autocalib_ros.errors import AutocalibError
 from autocalib_ros.evidence import Evidence
+from autocalib_ros.perception.detector.detector import VehicleDetector
 
 WAITING_IMAGES = 8
 """Images that may wait for the perception thread: half a second of a hiccup at 15 Hz, 22 MB at 1280x720."""
@@ -96,12 +97,13 @@ class Pipeline:
     """
 
     def __init__(self, options: Options, *, idle_solve_s: float, decode: Callable[[Any], np.ndarray], solve: Solve,
-                 listener: Listener, lens: Camera | None = None,
+                 listener: Listener, lens: Camera | None = None, detector: VehicleDetector | None = None,
                  stop_solving: Callable[[], None] = lambda: None) -> None:
         self._stop_solving = stop_solving
         self._options, self._idle_solve_s, self._lens = options, idle_solve_s, lens
         self._decode, self._solve, self._listener = decode, solve, listener
-        self._calibrator = AutoCalibrator(options)
+        self._detector = detector
+        self._calibrator = AutoCalibrator(options, detector)
         self._changed = threading.Condition()
         self._images: deque[tuple[int, Any]] = deque(maxlen=WAITING_IMAGES)
         self._requests: list[Future] = []
@@ -199,7 +201,7 @@ class Pipeline:
                 if len(self._images) in (0, WAITING_IMAGES - 1):
                     requests, self._requests = self._requests, []
             if life != self._calibrator_life:
-                self._calibrator, self._calibrator_life = AutoCalibrator(self._options), life
+                self._calibrator, self._calibrator_life = AutoCalibrator(self._options, self._detector), life
             if changing:
                 self._calibrator.change(self._options)
                 self._unsolved += 1  # so that it takes effect even when no image comes any more

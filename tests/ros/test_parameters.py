@@ -197,6 +197,13 @@ def test_node_ends_with_status_2_and_one_line_at_an_unusable_camera_info_file(tm
     assert len(done.stderr.splitlines()) == 1
 
 
+def test_node_ends_with_status_2_and_one_line_at_a_detector_that_is_not_there():
+    done = run_node('-p', 'detector.model:=/nowhere/model.onnx')
+    assert done.returncode == 2
+    assert "'detector.model' is /nowhere/model.onnx, which is not a file" in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+
+
 def test_node_ends_with_status_2_at_a_missing_parameter_file():
     done = run_node('--params-file', '/nowhere/autocalib.yaml')
     assert done.returncode == 2

@@ -1,0 +1,59 @@
+"""Which of a model's classes are vehicles, and which are people."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from autocalib_ros.config import DetectorOptions
+from autocalib_ros.errors import UsageError
+
+VEHICLE_NAMES = frozenset((
+    'bus', 'car', 'coach', 'lorry', 'minibus', 'motor', 'motorbike', 'motorcycle', 'pickup', 'suv', 'taxi', 'truck',
+    'van', 'vehicle'))
+PEOPLE_NAMES = frozenset((
+    'bicycle', 'bicyclist', 'bike', 'cyclist', 'pedestrian', 'people', 'person', 'rider', 'scooter'))
+
+
+@dataclass(frozen=True)
+class Classes:
+    """Numbers of a model's classes of vehicles and of people, cyclists among them."""
+
+    vehicles: tuple[int, ...]
+    people: tuple[int, ...]
+
+
+COCO_80 = Classes(vehicles=(2, 3, 5, 7), people=(0, 1))
+COCO_91 = Classes(vehicles=(3, 4, 6, 8), people=(1, 2))
+"""COCO's own numbers, with gaps, which TensorFlow's and DETR's models keep."""
+
+
+def chosen_classes(options: DetectorOptions, names: Mapping[int, str], layout: str, count: int | None) -> Classes:
+    """Choose by the options, else by the names in the model, else COCO; UsageError where none of them tells.
+
+    `count` is the number of classes, None where the layout does not tell it.
+    """
+    vehicles, people = options.chosen_classes
+    if vehicles:
+        highest = max(vehicles + people)
+        if count is not None and highest >= count:
+            raise UsageError(f"class {highest} of 'detector.class_ids' is not in the model, whose classes are numbered "
+                             f'0 to {count - 1}')
+        return Classes(vehicles, people)
+    if names:
+        return _by_name(names)
+    if layout == 'tf_od' or (layout == 'detr' and count in (90, 91)):
+        return COCO_91
+    if layout != 'detection_output' and count in (80, None):
+        return COCO_80
+    raise UsageError(f'the model does not name its classes{f", {count} of them" if count else ""}: set '
+                     "'detector.class_ids' to the numbers of those that are vehicles")
+
+
+def _by_name(names: Mapping[int, str]) -> Classes:
+    words = {number: name.strip().lower() for number, name in names.items()}
+    vehicles = tuple(number for number, word in sorted(words.items()) if word in VEHICLE_NAMES)
+    if not vehicles:
+        raise UsageError(f"none of the model's classes is known as a vehicle ({', '.join(words.values())[:300]}): set "
+                         "'detector.class_ids' to the numbers of those that are")
+    return Classes(vehicles, tuple(number for number, word in sorted(words.items()) if word in PEOPLE_NAMES))

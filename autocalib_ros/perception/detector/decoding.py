@@ -1,0 +1,176 @@
+"""What detectors put out, turned into boxes: a function for each layout.
+
+Each takes the outputs by name, the size of the input (width, height), the number of classes and the least score. Boxes
+are left, top, right, bottom in pixels of the input, where (0, 0) is the corner of the image, not a pixel's centre.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+Outputs = Mapping[str, np.ndarray]
+Size = tuple[int, int]
+YOLOX_STRIDES = (8, 16, 32)
+DETR_WITH_NONE = 92
+"""DETR's own models end with a class for nothing and share out probability among classes; its successors do not."""
+
+
+@dataclass(frozen=True)
+class Boxes:
+    """Detections of one image."""
+
+    edges_px: np.ndarray
+    """Left, top, right, bottom, shape (n, 4)."""
+    scores: np.ndarray
+    """0 to 1, shape (n,)."""
+    classes: np.ndarray
+    """Shape (n,)."""
+
+    def __len__(self) -> int:
+        return len(self.scores)
+
+    def subset(self, keep: np.ndarray) -> Boxes:
+        """Return the boxes that `keep`, a mask or indices, selects."""
+        return Boxes(self.edges_px[keep], self.scores[keep], self.classes[keep])
+
+
+Decode = Callable[[Outputs, Size, int | None, float], Boxes]
+
+
+def without_doubles(boxes: Boxes, iou: float) -> Boxes:
+    """Drop boxes that overlap a better one by more than `iou`, whatever their classes: a van is a car or a truck."""
+    left_top, right_bottom = boxes.edges_px[:, :2], boxes.edges_px[:, 2:]
+    kept = cv2.dnn.NMSBoxes(np.hstack([left_top, right_bottom - left_top]).tolist(), boxes.scores.tolist(), 0.0, iou)
+    return boxes.subset(np.array(kept, int).ravel())
+
+
+def yolox_centres(size: Size) -> np.ndarray:
+    """Corner of each cell in cells, and its stride in pixels, shape (cells, 3), in YOLOX's order."""
+    width, height = size
+    levels = []
+    for stride in YOLOX_STRIDES:
+        rows, columns = np.indices((height // stride, width // stride))
+        levels.append(np.column_stack([columns.ravel(), rows.ravel(), np.full(rows.size, stride)]))
+    return np.concatenate(levels).astype(float)
+
+
+def yolox(outputs: Outputs, size: Size, count: int | None, least: float) -> Boxes:
+    """Rows of offsets within cells of a grid, logarithms of sizes, objectness, classes: [1, A, 5 + C]."""
+    rows = _only(outputs, 3)[0]
+    likely = rows[:, 4] >= least
+    rows, cells = rows[likely].astype(float), yolox_centres(size)[likely]
+    stride = cells[:, 2:]
+    return _with_objectness(_from_centres((rows[:, :2] + cells[:, :2]) * stride, np.exp(rows[:, 2:4]) * stride), rows,
+                            count, least)
+
+
+def yolov5(outputs: Outputs, size: Size, count: int | None, least: float) -> Boxes:
+    """Rows of centre, size, objectness, classes: [1, rows, 5 + C]."""
+    rows = _only(outputs, 3)[0]
+    rows = rows[rows[:, 4] >= least].astype(float)
+    return _with_objectness(_from_centres(rows[:, :2], rows[:, 2:4]), rows, count, least)
+
+
+def yolov8(outputs: Outputs, size: Size, count: int | None, least: float) -> Boxes:
+    """Columns of centre, size, classes: [1, 4 + C, A]; masks may follow the classes."""
+    rows = _only(outputs, 3)[0].T
+    return _best(_from_centres(rows[:, :2], rows[:, 2:4]), rows[:, 4:None if count is None else 4 + count], least)
+
+
+def end_to_end(outputs: Outputs, size: Size, count: int | None, least: float) -> Boxes:
+    """Rows of edges, score, class: [1, 300, 6]."""
+    rows = _only(outputs, 3)[0]
+    return _above(Boxes(rows[:, :4], rows[:, 4], rows[:, 5]), least)
+
+
+def yolov7_end2end(outputs: Outputs, size: Size, count: int | None, least: float) -> Boxes:
+    """Rows of image, edges, class, score: [n, 7]."""
+    rows = _only(outputs, 2)
+    return _above(Boxes(rows[:, 1:5], rows[:, 6], rows[:, 5]), least)
+
+
+def yolov3(outputs: Outputs, size: Size, count: int | None, least: float) -> Boxes:
+    """Edges, y first: [1, M, 4]; scores [1, C, M]; and what is left, as image, class, box: [n, 3] or [1, n, 3]."""
+    picked = next(array for array in outputs.values() if array.dtype.kind in 'iu').reshape(-1, 3)
+    edges, scores = boxes_and_classes({name: array for name, array in outputs.items() if array.dtype.kind == 'f'})
+    picked = picked[(picked >= 0).all(axis=1)]
+    return _above(Boxes(edges[picked[:, 2]][:, [1, 0, 3, 2]], scores[picked[:, 1], picked[:, 2]], picked[:, 1]), least)
+
+
+def yolo_nas(outputs: Outputs, size: Size, count: int | None, least: float) -> Boxes:
+    """Edges [1, A, 4] and probabilities [1, A, C]."""
+    edges, scores = boxes_and_classes(outputs)
+    return _best(edges, scores, least)
+
+
+def rtdetr(outputs: Outputs, size: Size, count: int | None, least: float) -> Boxes:
+    """Labels [1, Q], boxes by edges [1, Q, 4] in pixels of the size that is fed in, scores [1, Q]."""
+    return _above(Boxes(outputs['boxes'][0], outputs['scores'][0], outputs['labels'][0]), least)
+
+
+def ultralytics_rtdetr(outputs: Outputs, size: Size, count: int | None, least: float) -> Boxes:
+    """Rows of centre and size as shares of the input, probabilities: [1, 300, 4 + C]."""
+    rows = _only(outputs, 3)[0]
+    return _best(_from_centres(rows[:, :2] * size, rows[:, 2:4] * size), rows[:, 4:], least)
+
+
+def detr(outputs: Outputs, size: Size, count: int | None, least: float) -> Boxes:
+    """Centre and size as shares of the input [1, Q, 4] and logits [1, Q, K]."""
+    centres, logits = boxes_and_classes(outputs)
+    logits = logits.astype(float)
+    if logits.shape[1] == DETR_WITH_NONE:
+        raised = np.exp(logits - logits.max(axis=1, keepdims=True))
+        scores = (raised / raised.sum(axis=1, keepdims=True))[:, :-1]
+    else:
+        scores = 1.0 / (1.0 + np.exp(-logits))
+    return _best(_from_centres(centres[:, :2] * size, centres[:, 2:] * size), scores, least)
+
+
+def tf_od(outputs: Outputs, size: Size, count: int | None, least: float) -> Boxes:
+    """TensorFlow's object detection: edges, y first, as shares of the input."""
+    edges = outputs['detection_boxes'][0][:, [1, 0, 3, 2]]
+    return _above(Boxes(edges * (size + size), outputs['detection_scores'][0], outputs['detection_classes'][0]), least)
+
+
+def detection_output(outputs: Outputs, size: Size, count: int | None, least: float) -> Boxes:
+    """Rows of image, class, score, edges as shares of the input, up to an image below zero: [1, 1, N, 7]."""
+    rows = _only(outputs, 4)[0, 0]
+    rows = rows[:int(np.argmax(rows[:, 0] < 0))] if (rows[:, 0] < 0).any() else rows
+    return _above(Boxes(rows[:, 3:] * (size + size), rows[:, 2], rows[:, 1]), least)
+
+
+def boxes_and_classes(outputs: Outputs) -> tuple[np.ndarray, np.ndarray]:
+    """Return boxes (n, 4) and what stands for the classes (n, C) of the two outputs of one length."""
+    both = [array for array in outputs.values() if array.ndim == 3]
+    first = next(index for index, array in enumerate(both) if array.shape[-1] == 4)
+    return both[first][0], both[1 - first][0]
+
+
+def _only(outputs: Outputs, dimensions: int) -> np.ndarray:
+    """Return the output of so many dimensions; others, masks and heads for training, say no boxes."""
+    return next(array for array in outputs.values() if array.ndim == dimensions)
+
+
+def _from_centres(centres: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    return np.hstack([centres - 0.5 * sizes, centres + 0.5 * sizes])
+
+
+def _with_objectness(edges: np.ndarray, rows: np.ndarray, count: int | None, least: float) -> Boxes:
+    """Boxes whose score is that of an object times that of the best class."""
+    return _best(edges, rows[:, 4:5] * rows[:, 5:None if count is None else 5 + count], least)
+
+
+def _best(edges: np.ndarray, scores: np.ndarray, least: float) -> Boxes:
+    """Boxes of the best class each, of scores (n, C)."""
+    keep = np.flatnonzero(scores.max(axis=1, initial=0.0) >= least)
+    classes = scores[keep].argmax(axis=1) if len(keep) else np.zeros(0, int)
+    return _above(Boxes(edges[keep], scores[keep, classes], classes), least)
+
+
+def _above(boxes: Boxes, least: float) -> Boxes:
+    kept = boxes.subset(boxes.scores >= least)
+    return Boxes(kept.edges_px.astype(float), kept.scores.astype(float), np.round(kept.classes).astype(int))

@@ -1,0 +1,55 @@
+"""People among the traffic: no solution of the robust method rests on them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from autocalib_ros.calibration import Calibration, Refusal
+from autocalib_ros.calibrator import solve
+from autocalib_ros.config import Options
+from autocalib_ros.estimation.traffic import of_vehicles
+from autocalib_ros.evidence import Evidence, Kind
+from autocalib_ros.offline.synthetic_evidence import Junction, synthetic_evidence
+
+
+def with_people(evidence: Evidence, count: int, generator: np.random.Generator) -> Evidence:
+    """Put tracks of people before those of the vehicles: straight, long, and across everything."""
+    samples, (width, height) = 20, evidence.image_size
+    ends = generator.uniform([0, 0.4 * height], [width, height], (count, 2, 2))
+    along = np.linspace(0, 1, samples)[:, None]
+    paths = (ends[:, :1] + along * (ends[:, 1:] - ends[:, :1])).reshape(-1, 2)
+    return replace(
+        evidence, points_px=np.concatenate([paths, evidence.points_px]),
+        times_s=np.concatenate([np.tile(0.4 * np.arange(samples), count), evidence.times_s]),
+        track_starts=np.concatenate([samples * np.arange(count), evidence.track_starts + samples * count]),
+        track_vehicles=np.concatenate([100000 + np.arange(count), evidence.track_vehicles]),
+        track_kinds=np.concatenate([np.full(count, Kind.PERSON), np.full(evidence.track_count, Kind.VEHICLE)]
+                                   ).astype(np.uint8))
+
+
+def test_people_change_nothing_of_the_lens_and_the_plane_nor_of_what_became_of_each_vehicle() -> None:
+    evidence = synthetic_evidence(Junction(), np.random.default_rng(3))
+    crowd = with_people(evidence, 80, np.random.default_rng(4))
+    alone, among = (solve(one, Options(camera_height=8.0)) for one in (evidence, crowd))
+    assert isinstance(alone, Calibration) and isinstance(among, Calibration)
+    assert among.camera == alone.camera
+    np.testing.assert_array_equal(among.ground.normal_in_camera, alone.ground.normal_in_camera)
+    assert (among.figures.track_labels[:80] == -1).all()
+    np.testing.assert_array_equal(among.figures.track_labels[80:], alone.figures.track_labels)
+
+
+def test_tracks_of_vehicles_are_missing_where_most_are_of_people() -> None:
+    evidence = synthetic_evidence(Junction(), np.random.default_rng(3))
+    kinds = np.where(np.arange(evidence.track_count) < 10, Kind.VEHICLE, Kind.PERSON).astype(np.uint8)
+    refused = solve(replace(evidence, track_kinds=kinds), Options(camera_height=8.0))
+    assert isinstance(refused, Refusal) and refused.code == 'too_few_tracks'
+    assert refused.message.startswith('10 tracks of the 40 needed')
+    assert len(refused.figures.paper_tracks)  # the published method takes the lens from everything
+
+
+def test_unknown_tracks_are_taken_for_vehicles() -> None:
+    evidence = synthetic_evidence(Junction(), np.random.default_rng(3))
+    traffic, kept = of_vehicles(evidence)
+    assert traffic is evidence and len(kept) == evidence.track_count
