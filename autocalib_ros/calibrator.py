@@ -32,6 +32,8 @@ LEAP_NS = 24 * 3600 * 1_000_000_000
 """No camera pauses for longer than a day: a longer step forward is a clock that was set."""
 FORGET_EVERY_S = 10.0
 """Seconds of recording between two looks for evidence that is old; each costs milliseconds."""
+TAIL_STEPS = 16
+"""Images through which the way of a point is shown: a second at 15 Hz."""
 
 
 class Intake(Enum):
@@ -180,6 +182,10 @@ class AutoCalibrator:
         if moving:
             return Progress(100.0 * scarcest, (moving.message, *missing))
         return Progress(100.0 * scarcest, tuple(missing), outlook(evidence, scarcest))
+
+    def followed(self, steps: int = TAIL_STEPS) -> np.ndarray:
+        """Return where the points followed now were in the last images, pixels (n, steps, 2), for people to look at."""
+        return np.zeros((0, steps, 2)) if self._observer is None else self._observer.followed(steps)
 
     def background(self) -> np.ndarray | None:
         """Return the road without its traffic, BGR uint8 of the full size, for people to look at."""

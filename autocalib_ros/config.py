@@ -346,12 +346,14 @@ class NodeOptions(_Checked):
         'size is compared with that of the images')
     camera_info_mode: str = option('per_image', 'publish camera_info with each image or when it changes',
                                    choices=('per_image', 'latched_only'))
+    debug_rate_hz: float = option(5.0, 'most pictures a second on each of debug_image, top_view and image_rect, drawn '
+                                  'while somebody subscribes', low=0.1, high=1000)
     idle_solve_s: float = option(3.0, 'when no image came for this long, what is left is solved', low=0.1)
 
 
 MAY_CHANGE = ('method', 'scale_from', 'camera_height', 'camera_height_sigma', 'allow_unit_scale', 'random_seed',
               'first_solve_s', 'solve_growth', 'solve_interval_s', 'paper', 'joint', 'scale', 'gate',
-              'camera_info_mode', 'idle_solve_s')
+              'camera_info_mode', 'debug_rate_hz', 'idle_solve_s')
 """Options, and groups of them, that are read anew at each solution or publication, so that they may change while a
 node runs; all others shape the evidence from the first image on, or name what others rely on."""
 

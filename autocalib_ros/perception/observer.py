@@ -149,6 +149,10 @@ class Observer:
         """Return the tracks so far of what is still followed."""
         return [self._full_size(track) for track in self._tracker.unfinished()]
 
+    def followed(self, steps: int) -> np.ndarray:
+        """Return where what is followed now was in the last images, pixels (n, steps, 2), newest last."""
+        return self._full_pixels(self._tracker.tails(steps))
+
     @property
     def drift_px(self) -> float:
         """How far the background has moved, pixels of the full image."""

@@ -125,6 +125,15 @@ class PointTracker:
             self._history[slot, 0] = (self._time_s, *point)
             self._count[slot], self._vehicle[slot], self._step[slot] = 1, vehicle, 0.0
 
+    def tails(self, steps: int) -> np.ndarray:
+        """Return where the points followed now were in the last images, (n, steps, 2), newest last.
+
+        A point that is followed for fewer images stands still before.
+        """
+        active = np.flatnonzero(self._count)
+        newest = self._count[active, None] - 1
+        return self._history[active[:, None], np.maximum(newest - np.arange(steps)[::-1], 0), 1:]
+
     def unfinished(self) -> list[Track]:
         """Return the tracks so far of the points still followed."""
         return self._tracks(np.flatnonzero(self._count))

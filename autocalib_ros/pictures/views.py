@@ -20,6 +20,8 @@ FARTHEST_HEIGHTS = 10.0
 NOWHERE_PX = -1e4
 """Where a view's pixel lies that the lens does not see."""
 EMPTY_GREY = 224
+BAND_ROWS = 64
+"""Rows of a table that are worked out at a time: a whole one of a large image would take a gigabyte."""
 CIRCLE_POINTS = 361
 GRID_CELLS = 8
 """Cells of a grid on the road to each side of its middle."""
@@ -49,6 +51,13 @@ def near_on_road(camera: Camera, ground: GroundPlane, pixels: np.ndarray) -> np.
     return points[np.hypot(*points.T) < FARTHEST_HEIGHTS * ground.height_m]
 
 
+def road_in_image(camera: Camera, ground: GroundPlane) -> np.ndarray:
+    """Return points (m, 2) of the road that is in the image and near, as dense as the image shows them."""
+    across = np.linspace(0, camera.width - 1, SEEN_PIXELS)
+    down = np.linspace(0, camera.height - 1, SEEN_PIXELS)
+    return near_on_road(camera, ground, np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2))
+
+
 def resample(picture: np.ndarray, sources: np.ndarray) -> np.ndarray:
     """Return the view of a picture, grey (H, W) or BGR (H, W, 3) uint8; EMPTY_GREY where it does not reach."""
     return cv2.remap(picture, sources, None, cv2.INTER_LINEAR, borderValue=(EMPTY_GREY,) * 3)
@@ -56,10 +65,14 @@ def resample(picture: np.ndarray, sources: np.ndarray) -> np.ndarray:
 
 def rectified_sources(camera: Camera, matrix: np.ndarray) -> np.ndarray:
     """Return the view of a distortion-free camera of a matrix (3, 3) and the size of the image, float32."""
-    pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1)
-    ones = np.ones((*pixels.shape[:2], 1))
-    sources, valid = camera.project(np.concatenate([pixels, ones], axis=2) @ np.linalg.inv(matrix).T)
-    return np.where(valid[..., None], sources, NOWHERE_PX).astype(np.float32)
+    view = np.empty((camera.height, camera.width, 2), np.float32)
+    to_bearing = np.linalg.inv(matrix).T
+    for top in range(0, camera.height, BAND_ROWS):
+        band = view[top:top + BAND_ROWS]
+        x, y = np.meshgrid(np.arange(camera.width), np.arange(top, top + len(band)))
+        sources, valid = camera.project(np.stack([x, y, np.ones_like(x)], axis=-1) @ to_bearing)
+        band[:] = np.where(valid[..., None], sources, NOWHERE_PX)
+    return view
 
 
 @dataclass(frozen=True)
@@ -84,9 +97,7 @@ class TopView:
     @classmethod
     def of_image(cls, camera: Camera, ground: GroundPlane, longest_px: int) -> TopView | None:
         """Show all of the road that is in the image and near; None where it shows none."""
-        across = np.linspace(0, camera.width - 1, SEEN_PIXELS)
-        down = np.linspace(0, camera.height - 1, SEEN_PIXELS)
-        points = near_on_road(camera, ground, np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2))
+        points = road_in_image(camera, ground)
         return cls.between(points.min(axis=0), points.max(axis=0), longest_px) if len(points) > 1 else None
 
     @classmethod

@@ -29,6 +29,7 @@ from autocalib_ros.ros.image_input import ImageInput
 from autocalib_ros.ros.in_force import InForce, Published
 from autocalib_ros.ros.keeper import Keeper
 from autocalib_ros.ros.live_parameters import LiveParameters
+from autocalib_ros.ros.live_pictures import LivePictures
 from autocalib_ros.ros.parameters import options_of
 from autocalib_ros.ros.pipeline import Pipeline, Result, Solve
 from autocalib_ros.ros.solver import SolverProcess
@@ -66,10 +67,13 @@ class AutocalibNode(Node):
         self._upload = DriverUpload(self, self._say) if self.node_options.upload_to_driver else None
         self.in_force = InForce(self, self.options, self.node_options, self._headers, driver=self._driver,
                                 taken=self._hand_on, withdrawn=self._hold_back)
+        self._pictures = LivePictures(self, self.node_options.debug_rate_hz, self.in_force, self._headers,
+                                      progress=lambda: self._pipeline.progress, failed=self.failed)
         solver = SolverProcess()
         self._pipeline = Pipeline(self.options, idle_solve_s=self.node_options.idle_solve_s,
-                                  decode=ImageDecoder().decode, solve=solve or solver, listener=self, lens=self._lens,
-                                  detector=detector, stop_solving=solver.close)
+                                  decode=ImageDecoder().decode, solve=solve or solver, listener=self,
+                                  viewer=self._pictures, lens=self._lens, detector=detector,
+                                  stop_solving=solver.close)
         if self._store is not None:
             self._restore(self._store)
         # While a caller waits for a solution or a disk, everything outside its group goes on.
@@ -93,6 +97,7 @@ class AutocalibNode(Node):
             self.get_logger().warning('a calibration was still being written at shutdown and is abandoned')
         if not self._pipeline.close(deadline - time.monotonic()):
             self.get_logger().warning('a solution was still running at shutdown and is abandoned')
+        self._pictures.close(max(0.0, deadline - time.monotonic()))
         self.get_logger().info(f'shut down: {self._pipeline.counters}')
 
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
@@ -103,6 +108,7 @@ class AutocalibNode(Node):
         """Take other options: what rests on them is solved anew."""
         self.options, self.node_options = options, node_options
         self.in_force.change(options, node_options)
+        self._pictures.rate_hz = node_options.debug_rate_hz
         self._pipeline.change(options, node_options.idle_solve_s)
 
     def _on_image(self, message: Any) -> None:
@@ -145,6 +151,7 @@ class AutocalibNode(Node):
     def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Forget the evidence and withdraw the calibration; what is stored stays until the next is saved."""
         self._pipeline.reset()
+        self._pictures.forget()
         was = self.in_force.withdraw()
         response.success = True
         response.message = 'the evidence is forgotten' + (
@@ -249,6 +256,7 @@ class AutocalibNode(Node):
 
     def began_anew(self, why: str) -> None:
         """Log that the evidence so far was dropped; a calibration from it stays in force until one is as sure."""
+        self._pictures.forget()
         self.in_force.began_anew()
         self._say_seldom(f'anew {why}', f'{why}: the evidence is collected anew', error=False)
 

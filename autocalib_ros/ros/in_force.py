@@ -11,6 +11,7 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import TransformStamped
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo
+from visualization_msgs.msg import MarkerArray
 
 from autocalib_ros.calibration import Calibration
 from autocalib_ros.camera_info import CameraInfo as CameraInfoFields
@@ -19,6 +20,7 @@ from autocalib_ros.errors import InputError
 from autocalib_ros.ros import messages
 from autocalib_ros.ros.driver_info import DriverInfo
 from autocalib_ros.ros.headers import DEFAULT_FRAME, Headers
+from autocalib_ros.ros.markers import markers, no_markers
 from autocalib_ros.ros.qos import latched_publisher
 from autocalib_ros.ros.transforms import Transforms
 from autocalib_ros.standing import CalibrationState, Decision, decided
@@ -33,6 +35,9 @@ class Published:
     image_frame: str
     transform: TransformStamped | None
     """The ground plane; None where there is none that may be published."""
+    markers: MarkerArray
+    """The same for people to look at."""
+
 
 class InForce:
     """Publishes one calibration at a time, latched and image by image; safe in any thread.
@@ -54,6 +59,7 @@ class InForce:
         self.image_size: tuple[int, int] | None = None
         """Of the newest image that was decoded."""
         self._camera_info = latched_publisher(node, CameraInfo, '~/camera_info')
+        self._markers = latched_publisher(node, MarkerArray, '~/markers')
         self._transforms = Transforms(node, tf_parent=options.tf_parent, publish_tf=node_options.publish_tf)
 
     def change(self, options: Options, node_options: NodeOptions) -> None:
@@ -150,6 +156,8 @@ class InForce:
         """Publish nothing any more; return what was in force."""
         with self._lock:
             was, self.state, self.published = self.state, CalibrationState.NONE, None
+            if was is not CalibrationState.NONE:
+                self._markers.publish(no_markers())
             self._withdrawn()
             self._forget_latched()
         return was
@@ -168,7 +176,17 @@ class InForce:
             return messages.validated(messages.camera_info_message(fields, stamp, frame))
 
     def _made(self, result: Calibration, image_frame: str) -> Published:
-        return Published(result, result.camera_info, image_frame, self._transform_of(result, image_frame))
+        transform = self._transform_of(result, image_frame)
+        shown = no_markers() if transform is None else self._markers_of(result, image_frame)
+        return Published(result, result.camera_info, image_frame, transform, shown)
+
+    def _markers_of(self, result: Calibration, image_frame: str) -> MarkerArray:
+        """Return the markers of a ground plane; nothing that is only looked at stops a calibration."""
+        try:
+            return messages.validated(markers(result, self._headers.ground_frame(image_frame)))
+        except Exception as error:
+            self._node.get_logger().error(f'no markers: {type(error).__name__}: {error}')
+            return no_markers()
 
     def _transform_of(self, result: Calibration, image_frame: str) -> TransformStamped | None:
         """Return the message of the ground plane, unless its scale is made up and nobody allowed that."""
@@ -183,6 +201,7 @@ class InForce:
         self._camera_info.publish(self.camera_info(published))
         if published.transform is not None:
             self._transforms.publish(published.transform)
+        self._markers.publish(published.markers)
         self.published, self.state = published, state
 
     def _forget_latched(self) -> None:

@@ -46,6 +46,16 @@ class Solve(Protocol):
         """Return a calibration or a refusal."""
 
 
+class Viewer(Protocol):
+    """Who shows what is going on; called from the threads, and takes no time there."""
+
+    def image_used(self, message: Any, image: np.ndarray, followed: Callable[[], np.ndarray]) -> None:
+        """An image has become evidence; `followed` tells at once where points went of late."""
+
+    def solution_found(self, result: Result, evidence: Evidence) -> None:
+        """A snapshot has been solved."""
+
+
 class Listener(Protocol):
     """Who is told what the threads find; called from the threads."""
 
@@ -97,12 +107,11 @@ class Pipeline:
     """
 
     def __init__(self, options: Options, *, idle_solve_s: float, decode: Callable[[Any], np.ndarray], solve: Solve,
-                 listener: Listener, lens: Camera | None = None, detector: VehicleDetector | None = None,
-                 stop_solving: Callable[[], None] = lambda: None) -> None:
+                 listener: Listener, viewer: Viewer | None = None, lens: Camera | None = None,
+                 detector: VehicleDetector | None = None, stop_solving: Callable[[], None] = lambda: None) -> None:
         self._stop_solving = stop_solving
-        self._options, self._idle_solve_s, self._lens = options, idle_solve_s, lens
-        self._decode, self._solve, self._listener = decode, solve, listener
-        self._detector = detector
+        self._options, self._idle_solve_s, self._lens, self._detector = options, idle_solve_s, lens, detector
+        self._decode, self._solve, self._listener, self._viewer = decode, solve, listener, viewer
         self._calibrator = AutoCalibrator(options, detector)
         self._changed = threading.Condition()
         self._images: deque[tuple[int, Any]] = deque(maxlen=WAITING_IMAGES)
@@ -240,6 +249,8 @@ class Pipeline:
         with self._changed:
             self._unsolved += self._life == self._calibrator_life
         self._listener.image_taken(width, height)
+        if self._viewer is not None:
+            self._guarded(partial(self._viewer.image_used, message, image, self._calibrator.followed))
         evidence = self._guarded(self._calibrator.take_due)
         if evidence is not None:
             self._submit(evidence, [])
@@ -269,7 +280,7 @@ class Pipeline:
             began = time.monotonic()
             result = self._guarded(partial(self._solved, job.evidence))
             if result is not None:
-                result = self._told(result, job.life)
+                result = self._told(result, job)
             self._rested = time.monotonic() + REST * (time.monotonic() - began)
             self._answer(job.waiting, result)
 
@@ -288,13 +299,15 @@ class Pipeline:
     def _solved(self, evidence: Evidence) -> Result:
         return self._solve(evidence, self._options, lens=self._fitting(evidence.image_size))
 
-    def _told(self, result: Result, life: int) -> Result | None:
+    def _told(self, result: Result, job: _Job) -> Result | None:
         """Tell the listener, unless a reset came before."""
         with self._telling:
-            if life != self._life:
+            if job.life != self._life:
                 return None
             self._refused = result.message if isinstance(result, Refusal) else ''
             self._guarded(partial(self._listener.solved, result))
+            if self._viewer is not None:
+                self._guarded(partial(self._viewer.solution_found, result, job.evidence))
             return result
 
     def _with_refusal(self, progress: Progress | None) -> Progress | None:

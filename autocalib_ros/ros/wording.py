@@ -20,6 +20,13 @@ def described_refusal(refusal: Refusal) -> str:
 
 def described_calibration(result: Calibration) -> str:
     """Return focal length, tilt and height with their sigma, the grade and what was assumed."""
+    assumptions = '; '.join(result.assumptions) or 'none'
+    numbers = ', '.join(described_numbers(result))
+    return _one_line(f'calibrated, grade {result.grade}: {numbers}; assumptions: {assumptions}')
+
+
+def described_numbers(result: Calibration) -> list[str]:
+    """Return focal length, tilt and height with their sigma, or why there is no plane."""
     sigma = result.stddev
     parts = [f'focal length {result.camera.focal_px:.2f} px{_sigma(sigma.focal_px)}']
     if result.ground is not None:
@@ -31,8 +38,7 @@ def described_calibration(result: Calibration) -> str:
     info = result.camera_info
     if info.distortion_model != 'equidistant':
         parts.append(f'camera_info {info.distortion_model}, off by at most {info.error_px:.2g} px')
-    assumptions = '; '.join(result.assumptions) or 'none'
-    return _one_line(f'calibrated, grade {result.grade}: {", ".join(parts)}; assumptions: {assumptions}')
+    return parts
 
 
 def described_progress(progress: Progress | None) -> str:

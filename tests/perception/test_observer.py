@@ -100,6 +100,9 @@ def test_a_wide_image_is_tracked_reduced_and_reported_in_full_pixels() -> None:
     speeds = [np.diff(track.points_px[[0, -1], 0])[0] / (track.times_s[-1] - track.times_s[0]) for track in tracks
               if track.times_s[-1] - track.times_s[0] > 1.0]
     assert np.median(np.abs(np.abs(speeds) - 42.5)) < 4.0
+    newest = wide.followed(16)[:, -1]
+    ends = np.array([track.points_px[-1] for track in wide.unfinished()])
+    assert len(ends) and (np.abs(newest[:, None] - ends).max(axis=2).min(axis=0) < 1e-9).all()
 
 
 @pytest.mark.parametrize('shift', [(0.0, 0.0), (4.0, -3.0)])

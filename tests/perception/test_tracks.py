@@ -114,3 +114,18 @@ def test_a_point_thrown_off_its_line_is_given_up() -> None:
     before = np.array([[10.0, 0.0]] * 6)
     now = np.array([[12.0, 1.0], [5.0, 0.0], [20.0, 1.0], [0.0, 0.0], [8.0, 9.0], [-8.0, 0.0]])
     assert _jumped(before, now).tolist() == [False, False, False, True, True, True]
+
+
+def test_tails_are_where_points_were_of_late_newest_last() -> None:
+    tracker, _ = follow([(20 + 3.0 * index, 40.0) for index in range(15)])
+    tails = tracker.tails(6)
+    assert tails.shape == (3, 6, 2)
+    np.testing.assert_array_equal(tails[:, -1], tracker.positions()[0])
+    np.testing.assert_allclose(np.diff(tails, axis=1), np.broadcast_to((3.0, 0.0), (3, 5, 2)), atol=0.3)
+
+
+def test_tails_of_points_that_are_new_begin_where_the_points_did() -> None:
+    tracker, _ = follow([(20.0, 40.0), (23.0, 40.0)])
+    tails = tracker.tails(6)
+    np.testing.assert_array_equal(tails[:, :5], np.repeat(tails[:, :1], 5, axis=1))
+    assert PointTracker(TrackingOptions()).tails(6).shape == (0, 6, 2)

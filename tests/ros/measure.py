@@ -2,6 +2,7 @@
 
     python tests/ros/measure.py VIDEO --cameras 4 --rate 10 --seconds 60
     python tests/ros/measure.py VIDEO --rate 30 --always-solve
+    python tests/ros/measure.py VIDEO --rate 15 --watch debug_image,top_view,image_rect
 
 A driver plays the first seconds of the video forwards and backwards, so that the traffic never jumps. Needs ROS.
 """
@@ -39,7 +40,8 @@ def arguments() -> argparse.Namespace:
     parser.add_argument('--bare', action='store_true', help='images are only counted: what transport and machine lose')
     parser.add_argument('--solve-in-thread', action='store_true', help='solve in a thread of the node, to compare')
     parser.add_argument('--params-file', type=Path)
-    parser.add_argument('--role', choices=('driver', 'node'), help=argparse.SUPPRESS)
+    parser.add_argument('--watch', default='', help='pictures that another process subscribes, with commas between')
+    parser.add_argument('--role', choices=('driver', 'node', 'watcher'), help=argparse.SUPPRESS)
     parser.add_argument('--namespace', default='', help=argparse.SUPPRESS)
     return parser.parse_args()
 
@@ -83,6 +85,28 @@ def drive(options: argparse.Namespace) -> dict:
     node.destroy_node()
     rclpy.shutdown()
     return told
+
+
+def watch(options: argparse.Namespace) -> dict:
+    """Subscribe pictures until this is interrupted; tell how many came of each, and how old they were."""
+    import rclpy
+    from rclpy.executors import ExternalShutdownException
+    from rclpy.qos import QoSProfile
+    from sensor_msgs.msg import Image
+    rclpy.init()
+    node = rclpy.create_node('watcher', namespace=options.namespace)
+    ages_ms: dict[str, list[float]] = {topic: [] for topic in options.watch.split(',')}
+    for topic, ages in ages_ms.items():
+        def take(message: Image, ages=ages) -> None:
+            stamp = message.header.stamp
+            ages.append(1e3 * (time.time() - stamp.sec - stamp.nanosec * 1e-9))
+
+        node.create_subscription(Image, f'autocalib/{topic}', take, QoSProfile(depth=1))
+    try:
+        rclpy.spin(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    return {topic: quantiles(ages or [0.0]) for topic, ages in ages_ms.items()}
 
 
 def cpu_s() -> float:
@@ -148,6 +172,12 @@ def run_node(options: argparse.Namespace) -> dict:
     timed.wrap(diagnostics.Diagnostics, '_publish')
     timed.wrap(image_input.ImageInput, '_watch')
     timed.wrap(pipeline.Pipeline, '_use')
+    if options.watch:
+        from autocalib_ros.pictures import live
+        from autocalib_ros.ros.live_pictures import LivePictures
+        for owner, name in ((LivePictures, 'image_used'), (LivePictures, '_show'), (live.DebugPicture, 'draw'),
+                            (live.TopPicture, 'draw'), (live.RectifiedPicture, 'draw')):
+            timed.wrap(owner, name)
     if options.bare:
         pipeline.Pipeline._use = lambda self, stamp_ns, message: None
 
@@ -186,6 +216,7 @@ def run_node(options: argparse.Namespace) -> dict:
     counters = nodes[0]._pipeline.counters
     child = resource.getrusage(resource.RUSAGE_CHILDREN)
     return {**vars(counters), 'lost_by_dds': nodes[0]._input.lost, 'cores': (cpu_after - cpu_before) / (ended - began),
+            'ms_of_processor_for_an_image_used': round(1e3 * (cpu_after - cpu_before) / max(counters.used, 1), 2),
             'cores_solving': (child.ru_utime + child.ru_stime) / (ended - began),
             'state': 'calibrated' if nodes[0].in_force.published else 'collecting',
             'solutions_s': quantiles(solved_s or [0.0]), 'latency_ms': quantiles(latencies_ms), 'ms': timed.summary(),
@@ -208,13 +239,16 @@ def measure(options: argparse.Namespace) -> None:
 
     processor_before = processor_shares()
     nodes = [start('node', number) for number in range(1, options.cameras + 1)]
+    watchers = [start('watcher', number) for number in range(1, options.cameras + 1) if options.watch]
     drivers = [start('driver', number) for number in range(1, options.cameras + 1)]
     outputs = [driver.communicate() for driver in drivers]
     spent = processor_shares() - processor_before
     idle, stolen = 100 * spent[[3, 7]] / spent.sum()
     print(f'the machine while measuring: {idle:.0f} % idle, {stolen:.0f} % stolen by its host')
-    for node in nodes:
-        node.terminate()
+    for process in (*watchers, *nodes):
+        process.terminate()
+    for number, watcher in enumerate(watchers, 1):
+        print(f'cam{number}: pictures that came, and their age in ms: {watcher.communicate()[0].strip()}')
     for number, (node, (sent, complaint)) in enumerate(zip(nodes, outputs, strict=True), 1):
         told, log = node.communicate()
         if node.returncode or not sent or not told:
@@ -235,4 +269,4 @@ if __name__ == '__main__':
     if chosen.role is None:
         measure(chosen)
     else:
-        print(json.dumps(drive(chosen) if chosen.role == 'driver' else run_node(chosen)))
+        print(json.dumps({'driver': drive, 'node': run_node, 'watcher': watch}[chosen.role](chosen)))

@@ -13,13 +13,12 @@ from matplotlib.figure import Figure
 
 from autocalib_ros.calibration import Calibration, Refusal
 from autocalib_ros.evidence import Evidence
+from autocalib_ros.pictures.drawing import ROAD_COLOURS
 
 WIDTH_IN, DPI = 9.0, 110
 PNG_EFFORT = 3
 """More takes three times as long to save a tenth of the size."""
 INK, MUTED, PAPER = '#1c2733', '#8a97a3', '#e9edf0'
-ROAD_COLOURS = ('#0077bb', '#ee7733', '#009988', '#cc3377', '#ddaa33')
-"""One for each road direction; told apart with every common form of colour blindness."""
 OTHER_LABELS = {-1: ('not used', '#8a97a3'), -2: ('rejected', '#222222')}
 MARGIN = 0.35
 """Share of the image shown around it where something lies outside."""

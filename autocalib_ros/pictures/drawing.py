@@ -1,0 +1,199 @@
+"""Lines, text and views laid over images, with OpenCV: what stays is drawn once, and laid over image after image.
+
+Pictures are BGR uint8; colours are given as in HTML. Paths are in pixels, whole numbers at the centres of pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+INK, PAPER, GREY = '#1c2733', '#ffffff', '#9aa5ae'
+ROAD_COLOURS = ('#0077bb', '#ee7733', '#009988', '#cc3377', '#ddaa33')
+"""One for each road direction; told apart with every common form of colour blindness."""
+FONT = cv2.FONT_HERSHEY_SIMPLEX
+LETTER_SHARE = 0.032
+LEAST_LETTER_PX, MOST_LETTER_PX = 13.0, 34.0
+"""Height of a line of text, as a share of the picture's height, and at which it is still read, or large enough."""
+FONT_PX = 30.0
+"""Height of a line of OpenCV's font at the scale 1, from the top of an l to the foot of a g."""
+STROKE_SHARE = 0.055
+"""Width of the strokes of letters, as a share of their line's height."""
+CAPTION_SHARE = 0.4
+"""The most of a picture's height that the caption may take."""
+PANEL_OPACITY = 0.9
+LINE_SHARE = 0.002
+"""Width of a line, as a share of the picture's height."""
+FRACTION_BITS = 4
+"""OpenCV takes points in whole numbers of 1/16 px."""
+FARTHEST_PX = 30000
+"""Beyond this OpenCV's whole numbers would overflow."""
+
+
+def bgr(colour: str) -> tuple[int, int, int]:
+    """Return a colour such as '#0077bb' as OpenCV takes it."""
+    return int(colour[5:7], 16), int(colour[3:5], 16), int(colour[1:3], 16)
+
+
+def in_colour(image: np.ndarray) -> np.ndarray:
+    """Return a grey (H, W) or BGR (H, W, 3) image as a BGR one that may be drawn on."""
+    return cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if image.ndim == 2 else image.copy()
+
+
+def letter_px(height: int) -> float:
+    """Return the height of a line of text in a picture of a height."""
+    return min(max(LETTER_SHARE * height, LEAST_LETTER_PX), MOST_LETTER_PX)
+
+
+def line_px(height: int) -> int:
+    """Return the width of a line that is seen in a picture of a height."""
+    return max(1, round(LINE_SHARE * height))
+
+
+def draw_paths(picture: np.ndarray, paths: Sequence[np.ndarray] | np.ndarray, colour: str | int, width_px: int) -> None:
+    """Draw polylines, each (n, 2), smoothly; in a mask the colour is a number."""
+    if not len(paths):
+        return
+    steps = [_steps(path) for path in paths] if isinstance(paths, (list, tuple)) else list(_steps(paths))
+    cv2.polylines(picture, steps, False, bgr(colour) if isinstance(colour, str) else colour, width_px, cv2.LINE_AA,
+                  FRACTION_BITS)
+
+
+def draw_dots(picture: np.ndarray, points_px: np.ndarray, colour: str, width_px: int) -> None:
+    """Draw a dot at each of the points (n, 2)."""
+    draw_paths(picture, np.repeat(points_px[:, None], 2, axis=1), colour, width_px)
+
+
+def _steps(path: np.ndarray) -> np.ndarray:
+    near = np.clip(path, -FARTHEST_PX, FARTHEST_PX)
+    return np.round(near * (1 << FRACTION_BITS)).astype(np.int32)
+
+
+def text_size(text: str, letter: float) -> tuple[int, int]:
+    """Return the width of a text in pixels, and the height of its line."""
+    (width, _), _ = cv2.getTextSize(text, FONT, letter / FONT_PX, stroke_px(letter))
+    return width, round(letter)
+
+
+def stroke_px(letter: float) -> int:
+    """Return how thick letters are."""
+    return max(1, round(STROKE_SHARE * letter))
+
+
+def draw_text(picture: np.ndarray, text: str, left: float, top: float, letter: float, colour: str) -> None:
+    """Write one line whose upper left corner is given; OpenCV's font knows ASCII alone."""
+    plain = text.encode('ascii', 'replace').decode()
+    cv2.putText(picture, plain, (round(left), round(top + 0.75 * letter)), FONT, letter / FONT_PX, bgr(colour),
+                stroke_px(letter), cv2.LINE_AA)
+
+
+def wrapped(text: str, letter: float, width_px: float, most: int) -> list[str]:
+    """Break a text into at most so many lines that fit into a width; what does not fit is left out, with '...'."""
+    lines: list[str] = []
+    line = ''
+    for word in text.split():
+        longer = f'{line} {word}'.strip()
+        if line and text_size(longer, letter)[0] > width_px:
+            lines.append(line)
+            longer = word
+        line = longer
+    lines.append(line)
+    if len(lines) > most:
+        lines = [*lines[:most - 1], f'{lines[most - 1]} ...']
+    return [shortened(line, letter, width_px) for line in lines]
+
+
+def shortened(line: str, letter: float, width_px: float) -> str:
+    """Return as much of a line as fits into a width."""
+    if text_size(line, letter)[0] <= width_px:
+        return line
+    while line and text_size(f'{line} ...', letter)[0] > width_px:
+        line = line[:-1]
+    return f'{line} ...'
+
+
+class Overlay:
+    """What is laid over every image of a size: drawn once, with any transparency."""
+
+    def __init__(self, height: int, width: int) -> None:
+        self._ink = np.zeros((height, width, 3), np.uint8)
+        self._clear = np.full((height, width, 3), 255, np.uint8)
+        """How much of the image is seen through, 0 to 255 in each channel."""
+
+    def add_paths(self, paths: Sequence[np.ndarray], colour: str, width_px: int, opacity: float = 1.0) -> None:
+        """Add polylines, each (n, 2)."""
+        mask = np.zeros(self._ink.shape[:2], np.uint8)
+        draw_paths(mask, paths, 255, width_px)
+        self._cover(mask, np.array(bgr(colour), np.uint8), opacity)
+
+    def add_box(self, left: int, top: int, right: int, bottom: int, colour: str, opacity: float) -> None:
+        """Add a filled rectangle; its right and bottom ends are left out."""
+        mask = np.zeros(self._ink.shape[:2], np.uint8)
+        mask[max(top, 0):max(bottom, 0), max(left, 0):max(right, 0)] = 255
+        self._cover(mask, np.array(bgr(colour), np.uint8), opacity)
+
+    def add_text(self, text: str, left: float, top: float, letter: float, colour: str) -> None:
+        """Add one line of text."""
+        written = np.zeros_like(self._ink)
+        draw_text(written, text, left, top, letter, PAPER)
+        self._cover(written[..., 0], np.array(bgr(colour), np.uint8), 1.0)
+
+    def _cover(self, mask: np.ndarray, colour: np.ndarray, opacity: float) -> None:
+        rows, columns = np.nonzero(mask)
+        share = (opacity / 255) * mask[rows, columns, None]
+        self._ink[rows, columns] = np.round(self._ink[rows, columns] * (1 - share) + colour * share)
+        self._clear[rows, columns] = np.round(self._clear[rows, columns] * (1 - share))
+
+    def lay_over(self, picture: np.ndarray) -> None:
+        """Lay it over a picture of its size."""
+        cv2.multiply(picture, self._clear, picture, 1 / 255)
+        cv2.add(picture, self._ink, picture)
+
+
+@dataclass(frozen=True)
+class Caption:
+    """What a picture says in words."""
+
+    title: str
+    text: str = ''
+    colour: str = PAPER
+    """Of the title."""
+
+
+def caption_panel(caption: Caption, height: int, width: int) -> np.ndarray:
+    """Return the words for the upper left corner of a picture of a size, no larger than they need, BGR."""
+    letter = letter_px(height)
+    margin, leading = round(0.5 * letter), round(1.15 * letter)
+    room = width - 2 * margin
+    most = max(1, int((CAPTION_SHARE * height - 2 * margin) / leading) - 1)
+    text = wrapped(caption.text, letter, room, most) if caption.text else []
+    lines = [shortened(caption.title, letter, room), *text]
+    widest = max(text_size(line, letter)[0] for line in lines)
+    panel = np.empty((2 * margin + leading * len(lines), min(widest + 2 * margin, width), 3), np.uint8)
+    panel[:] = bgr(INK)
+    for number, line in enumerate(lines):
+        draw_text(panel, line, margin, margin + number * leading, letter, PAPER if number else caption.colour)
+    return panel[:height]
+
+
+def lay_panel(picture: np.ndarray, panel: np.ndarray) -> None:
+    """Lay a panel over the upper left corner of a picture, which shines through a little."""
+    rows, columns = panel.shape[:2]
+    corner = picture[:rows, :columns]
+    cv2.addWeighted(panel, PANEL_OPACITY, corner, 1 - PANEL_OPACITY, 0, corner)
+
+
+class Lookup:
+    """A view of the images of one camera, in the form in which OpenCV makes it fastest."""
+
+    def __init__(self, sources: np.ndarray, empty_grey: int) -> None:
+        """Take where each pixel of the view lies in the image, float32 (rows, columns, 2)."""
+        self._maps = cv2.convertMaps(sources, None, cv2.CV_16SC2)
+        self._empty = (empty_grey,) * 3
+
+    def of(self, image: np.ndarray) -> np.ndarray:
+        """Return the view of an image, grey or BGR like it."""
+        return cv2.remap(image, *self._maps, cv2.INTER_LINEAR, borderValue=self._empty)

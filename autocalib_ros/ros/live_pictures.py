@@ -1,0 +1,208 @@
+"""Pictures for people to look at: `~/debug_image`, `~/top_view` and `~/image_rect`, drawn only while somebody looks.
+
+    perception thread -> the newest image that is due -> drawing thread -> publishers
+
+Without a subscriber nothing is kept nor drawn, and neither perception nor the executor waits for a picture: what
+comes while one is drawn, or sooner than `debug_rate_hz` allows, is not shown.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from array import array
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from sensor_msgs.msg import Image
+from std_msgs.msg import Header
+
+from autocalib_ros.calibration import Calibration, Refusal
+from autocalib_ros.calibrator import Progress
+from autocalib_ros.evidence import Evidence
+from autocalib_ros.pictures.drawing import Caption
+from autocalib_ros.pictures.live import DebugPicture, JudgedTracks, RectifiedPicture, TopPicture
+from autocalib_ros.ros import messages
+from autocalib_ros.ros.headers import Headers
+from autocalib_ros.ros.in_force import InForce, Published
+from autocalib_ros.ros.wording import described_numbers
+from autocalib_ros.standing import CalibrationState
+
+GOOD, WAITING = '#7ee08a', '#ffd166'
+"""Colours of the state, where a calibration is vouched for and where it is not."""
+
+
+@dataclass(frozen=True)
+class _Shot:
+    """An image to be shown, with what was followed in it, if somebody asked for that."""
+
+    header: Header
+    """With the frame that camera_info has."""
+    image: np.ndarray
+    followed_px: np.ndarray | None
+
+
+class LivePictures:
+    """Publishes the pictures; safe in any thread.
+
+    `progress` tells how the evidence comes on; `failed` is told of faults of the program.
+    """
+
+    def __init__(self, node: Node, rate_hz: float, in_force: InForce, headers: Headers, *,
+                 progress: Callable[[], Progress | None], failed: Callable[[Exception], None]) -> None:
+        self.rate_hz = rate_hz
+        self._in_force, self._headers, self._progress, self._failed = in_force, headers, progress, failed
+        self._debug_image = _picture_publisher(node, '~/debug_image')
+        self._top_view = _picture_publisher(node, '~/top_view')
+        self._image_rect = _picture_publisher(node, '~/image_rect')
+        self._changed = threading.Condition()
+        self._shot: _Shot | None = None
+        self._closed = False
+        self._due_s = 0.0
+        self._judged: JudgedTracks | None = None
+        self._debug = _Kept(DebugPicture)
+        self._top = _Kept(TopPicture.of)
+        self._rectified = _Kept(RectifiedPicture)
+        self._thread = threading.Thread(target=self._run, name='pictures', daemon=True)
+        self._thread.start()
+
+    def image_used(self, message: Any, image: np.ndarray, followed: Callable[[], np.ndarray]) -> None:
+        """Take an image, grey or BGR, where somebody looks and it is time; it is not changed, nor copied here."""
+        debug = self._debug_image.get_subscription_count() > 0
+        views = self._in_force.published is not None and (
+            self._top_view.get_subscription_count() > 0 or self._image_rect.get_subscription_count() > 0)
+        now = time.monotonic()
+        if not (debug or views) or now < self._due_s:
+            return
+        # in step with the images, whatever their rate, and at once after a pause
+        self._due_s = max(self._due_s, now - 0.5 / self.rate_hz) + 1 / self.rate_hz
+        image_header = messages.header(message.header.stamp, self._headers.frame_id(message.header.frame_id))
+        shot = _Shot(image_header, image, followed() if debug else None)
+        with self._changed:
+            self._shot = shot
+            self._changed.notify_all()
+
+    def solution_found(self, result: Calibration | Refusal, evidence: Evidence) -> None:
+        """Show from now on what became of the tracks in a solution; a refusal says nothing of them."""
+        if isinstance(result, Calibration):
+            self._judged = JudgedTracks(evidence.image_size, evidence.points_px, evidence.track_starts,
+                                        result.figures.track_labels)
+
+    def forget(self) -> None:
+        """Show nothing of an earlier solution, nor an image from before."""
+        with self._changed:
+            self._judged = self._shot = None
+
+    def close(self, timeout_s: float) -> None:
+        """Stop drawing."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        self._thread.join(timeout_s)
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._closed or self._shot is not None)
+                if self._closed:
+                    return
+                shot, self._shot = self._shot, None
+            try:
+                self._show(shot)
+            except Exception as error:  # pictures are the least of what the node does
+                if not self._closed:
+                    self._failed(error)
+
+    def _show(self, shot: _Shot) -> None:
+        """Draw what somebody looks at."""
+        image = shown(shot.image)
+        height, width = image.shape[:2]
+        published, state = self._in_force.published, self._in_force.state
+        if published is not None and published.result.evidence.image_size != (width, height):
+            published = None
+        result = None if published is None else published.result
+        if shot.followed_px is not None:
+            picture = self._debug.of((width, height), result, self._judged)
+            caption = caption_of(state, result, self._progress())
+            self._publish(self._debug_image, picture.draw(image, shot.followed_px, caption), shot.header)
+        if result is None:
+            return
+        if self._image_rect.get_subscription_count():
+            self._publish(self._image_rect, self._rectified.of(result).draw(image), shot.header)
+        if self._top_view.get_subscription_count() and published.transform is not None:
+            self._show_from_above(published, image, shot.header)
+
+    def _show_from_above(self, published: Published, image: np.ndarray, image_header: Header) -> None:
+        picture = self._top.of(published.result)
+        if picture is not None:
+            ground_frame = self._headers.ground_frame(image_header.frame_id)
+            self._publish(self._top_view, picture.draw(image), messages.header(image_header.stamp, ground_frame))
+
+    def _publish(self, publisher: Publisher, picture: np.ndarray, picture_header: Header) -> None:
+        publisher.publish(messages.validated(image_message(picture, picture_header)))
+
+
+class _Kept:
+    """Makes something of values, and keeps it until they are others; values are told apart by identity."""
+
+    def __init__(self, make: Callable[..., Any]) -> None:
+        self._make = make
+        self._of: tuple[Any, ...] | None = None
+        self._made: Any = None
+
+    def of(self, *values: Any) -> Any:
+        """Return what is made of values."""
+        same = self._of is not None and all(
+            new is old or (isinstance(new, tuple) and new == old) for new, old in zip(values, self._of, strict=True))
+        if not same:
+            self._made, self._of = None, None  # not both at a time: tables are large
+            self._made, self._of = self._make(*values), values
+        return self._made
+
+
+def shown(image: np.ndarray) -> np.ndarray:
+    """Return what may be shown of an image: all pictures begin here, and nowhere else."""
+    return image
+
+
+def caption_of(state: CalibrationState, result: Calibration | None, progress: Progress | None) -> Caption:
+    """Return the state in words: what is in force, or how far the evidence has come and what is missing."""
+    if result is None or state is CalibrationState.NONE:
+        return Caption(*_collecting(progress), WAITING)
+    numbers = ', '.join(described_numbers(result))
+    if state is CalibrationState.RESTORED:
+        title, missing = _collecting(progress)
+        return Caption(f'RESTORED, not yet verified, grade {result.grade}', f'{numbers}; {title}: {missing}', WAITING)
+    return Caption(f'CALIBRATED, grade {result.grade}', numbers, GOOD)
+
+
+def _collecting(progress: Progress | None) -> tuple[str, str]:
+    """Return how far the evidence has come, and what is missing."""
+    if progress is None:
+        return 'COLLECTING', ''
+    return f'COLLECTING {progress.percent:.0f} %', '; '.join([*progress.missing, *filter(None, [progress.outlook])])
+
+
+def image_message(picture: np.ndarray, image_header: Header) -> Image:
+    """Return a picture, grey (H, W) or BGR (H, W, 3) uint8, as a message."""
+    height, width = picture.shape[:2]
+    data = array('B')
+    data.frombytes(memoryview(np.ascontiguousarray(picture)).cast('B'))
+    return Image(header=image_header, height=height, width=width, encoding='mono8' if picture.ndim == 2 else 'bgr8',
+                 is_bigendian=0, step=picture.strides[0], data=data)
+
+
+def _picture_publisher(node: Node, topic: str) -> Publisher:
+    """Publish reliably, as RViz asks by default and best-effort subscribers take too: best effort loses large images.
+
+    A subscriber that is too slow gets the newest only, and nobody waits for it but the drawing thread.
+    """
+    profile = QoSProfile(depth=1, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE)
+    overriding = QoSOverridingOptions.with_default_policies()
+    return node.create_publisher(Image, topic, profile, qos_overriding_options=overriding)

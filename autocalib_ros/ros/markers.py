@@ -1,0 +1,99 @@
+"""A calibration in three dimensions: `~/markers` for RViz and Foxglove, in the ground frame."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from geometry_msgs.msg import Point
+from std_msgs.msg import ColorRGBA, Header
+from visualization_msgs.msg import Marker, MarkerArray
+
+from autocalib_ros.calibration import Calibration
+from autocalib_ros.pictures.road import Ellipse, Grid, ellipses, enlargement, field_of_view
+from autocalib_ros.ros.wording import described_numbers
+
+LINE_SHARE = 0.005
+LETTER_SHARE = 0.06
+"""Width of lines and height of letters, units of the camera's height."""
+ABOVE_ROAD_SHARE = 0.003
+"""Ellipses are drawn so far above the grid, units of the camera's height, or both would flicker."""
+GRID, FIELD, SURE, WORDS = (0.8, 0.8, 0.8, 0.6), (1.0, 0.88, 0.3, 1.0), (1.0, 0.48, 0.84, 1.0), (1.0, 1.0, 1.0, 1.0)
+"""Colours: red, green, blue, opacity."""
+
+
+def no_markers() -> MarkerArray:
+    """Return the message that takes all markers away."""
+    return MarkerArray(markers=[Marker(action=Marker.DELETEALL)])
+
+
+def markers(result: Calibration, ground_frame: str) -> MarkerArray:
+    """Return the markers of a calibration with a plane, in place of all before.
+
+    They carry no stamp, which RViz takes for "now": they hold until they are replaced.
+    """
+    camera, ground = result.camera, result.ground
+    shown, unit_m = ellipses(result), ground.height_m
+    grid = Grid.of(camera, ground)
+    made = [] if grid is None else [
+        _lines('grid', [line[[0, -1]] for line in grid.lines_m], GRID, 0.5 * LINE_SHARE * unit_m)]
+    made.append(_lines('field_of_view', field_of_view(camera, ground), FIELD, LINE_SHARE * unit_m))
+    made += _uncertainty(shown, unit_m)
+    made.append(_text('state', 0, _words(result, grid, shown), ground.translation_m + [0, 0, 0.5 * unit_m], unit_m))
+    for marker in made:
+        marker.header = Header(frame_id=ground_frame)
+        marker.frame_locked = True
+    return MarkerArray(markers=[*no_markers().markers, *made])
+
+
+def _uncertainty(shown: Sequence[Ellipse], unit_m: float) -> Iterator[Marker]:
+    """Yield an ellipse and its words for each distance."""
+    factor = enlargement(list(shown))
+    for number, ellipse in enumerate(shown):
+        outline = np.pad(ellipse.outline(factor), ((0, 0), (0, 1)), constant_values=ABOVE_ROAD_SHARE * unit_m)
+        marker = _marker('uncertainty', number, Marker.LINE_STRIP, SURE)
+        marker.scale.x = 2 * LINE_SHARE * unit_m
+        marker.points = _points(outline)
+        yield marker
+        place = np.array([*ellipse.centre_m, LETTER_SHARE * unit_m])
+        yield _text('uncertainty_text', number, f'{ellipse.distance_m:g} m: sigma {ellipse.sigma_m:.2g} m', place,
+                    unit_m)
+
+
+def _words(result: Calibration, grid: Grid | None, shown: Sequence[Ellipse]) -> str:
+    lines = [f'grade {result.grade}', *described_numbers(result)]
+    if grid is not None:
+        lines.append(f'squares of {grid.step_m:g} {"m" if result.ground.metric else "camera heights"}')
+    factor = enlargement(list(shown))
+    if shown:
+        lines.append('ellipses: one sigma of a road point' + (f', enlarged {factor} times' if factor > 1 else ''))
+    return '\n'.join(lines)
+
+
+def _lines(namespace: str, lines: Sequence[np.ndarray], colour: tuple[float, ...], width_m: float) -> Marker:
+    """Return polylines (n, 3) as one marker."""
+    marker = _marker(namespace, 0, Marker.LINE_LIST, colour)
+    marker.scale.x = float(width_m)
+    pairs = [np.stack([line[:-1], line[1:]], axis=1).reshape(-1, 3) for line in lines]
+    marker.points = _points(np.concatenate(pairs)) if pairs else []
+    return marker
+
+
+def _text(namespace: str, number: int, text: str, place_m: np.ndarray, unit_m: float) -> Marker:
+    marker = _marker(namespace, number, Marker.TEXT_VIEW_FACING, WORDS)
+    marker.scale.z = float(LETTER_SHARE * unit_m)
+    marker.pose.position = _points(place_m[None])[0]
+    marker.text = text
+    return marker
+
+
+def _marker(namespace: str, number: int, kind: int, colour: tuple[float, ...]) -> Marker:
+    red, green, blue, opacity = colour
+    marker = Marker(ns=namespace, id=number, type=kind, action=Marker.ADD,
+                    color=ColorRGBA(r=red, g=green, b=blue, a=opacity))
+    marker.pose.orientation.w = 1.0
+    return marker
+
+
+def _points(points_m: np.ndarray) -> list[Point]:
+    return [Point(x=x, y=y, z=z) for x, y, z in points_m.tolist()]
