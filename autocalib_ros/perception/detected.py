@@ -156,7 +156,7 @@ def _ious(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 def _owner_inside(edges: np.ndarray, points: np.ndarray, owners: np.ndarray, taken: set[int]) -> int:
     """Return the vehicle of most points (n, 2) inside a box, those taken apart; 0 where there is none."""
     inside = ((points >= edges[:2]) & (points < edges[2:])).all(axis=1)
-    votes = np.bincount([owner for owner in owners[inside].tolist() if owner not in taken], minlength=1)
+    votes = np.bincount(np.array([owner for owner in owners[inside].tolist() if owner not in taken], int), minlength=1)
     return int(votes.argmax())
 
 

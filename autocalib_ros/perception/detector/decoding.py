@@ -64,8 +64,9 @@ def yolox(outputs: Outputs, size: Size, count: int | None, least: float) -> Boxe
     likely = rows[:, 4] >= least
     rows, cells = rows[likely].astype(float), yolox_centres(size)[likely]
     stride = cells[:, 2:]
-    return _with_objectness(_from_centres((rows[:, :2] + cells[:, :2]) * stride, np.exp(rows[:, 2:4]) * stride), rows,
-                            count, least)
+    with np.errstate(over='ignore'):  # sizes beyond all bounds are those of another layout
+        sizes = np.exp(rows[:, 2:4]) * stride
+    return _with_objectness(_from_centres((rows[:, :2] + cells[:, :2]) * stride, sizes), rows, count, least)
 
 
 def yolov5(outputs: Outputs, size: Size, count: int | None, least: float) -> Boxes:
