@@ -251,7 +251,7 @@ def _replay(arguments: argparse.Namespace) -> int:
     outputs.prepare(arguments.out, arguments.write_bag)
     replayed = _replay_and_tell(source, options, arguments.out, lens=lens, detector=detector, quiet=arguments.quiet)
     if arguments.write_bag is not None:
-        _write_bag(arguments.write_bag, replayed, source, options.tf_parent)
+        _write_bag(arguments.write_bag, replayed, source, options)
     return CALIBRATED if replayed.result else REFUSED
 
 
@@ -326,13 +326,13 @@ def _print_json(replayed: ReplayResult) -> None:
     print(calibration_json(replayed.result, accepted_at_s=replayed.accepted_at_s))
 
 
-def _write_bag(path: Path, replayed: ReplayResult, source: Source, tf_parent: str) -> None:
+def _write_bag(path: Path, replayed: ReplayResult, source: Source, options: Options) -> None:
     if not replayed.result:
         _tell(f'{path} is not written: there is no calibration')
         return
     from autocalib_ros.offline.write_bag import write_bag
 
-    write_bag(path, replayed.result, source, tf_parent)
+    write_bag(path, replayed.result, source, options.tf_parent, options.ignored_polygons)
 
 
 def _tell(line: str) -> None:

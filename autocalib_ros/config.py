@@ -281,6 +281,9 @@ class Options(_Checked):
                             'with camera, for a camera whose frame has a parent already, it is the ground',
                             choices=('ground', 'camera'))
     max_image_width: int = option(1280, 'wider images are reduced to this width for tracking', low=160, high=16384)
+    ignore_regions: str = option(
+        '', "polygons in pixels of the full image, as text 'u1 v1 u2 v2 u3 v3; ...', that are never tracked, and black "
+        'in every picture that is written')
     random_seed: int = option(0, 'seed of the consensus searches', low=0)
     first_solve_s: float = option(10.0, 'seconds of recording before the first solution is tried', low=0)
     solve_growth: float = option(1.2, 'a new solution is tried when the evidence has grown by this factor', low=1.01)
@@ -297,6 +300,13 @@ class Options(_Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._require_one_scale()
+        _ = self.ignored_polygons
+
+    @property
+    def ignored_polygons(self) -> tuple[tuple[tuple[float, float], ...], ...]:
+        """The polygons of `ignore_regions`, each of three points (u, v) or more; none where it is empty."""
+        return tuple(_polygon(text) for text in self.ignore_regions.strip().rstrip(';').split(';') if
+                     self.ignore_regions.strip())
 
     def _require_one_scale(self) -> None:
         """Raise UsageError unless what is given of the scale is what `scale_from` names, whole."""
@@ -349,6 +359,22 @@ class NodeOptions(_Checked):
     debug_rate_hz: float = option(5.0, 'most pictures a second on each of debug_image, top_view and image_rect, drawn '
                                   'while somebody subscribes', low=0.1, high=1000)
     idle_solve_s: float = option(3.0, 'when no image came for this long, what is left is solved', low=0.1)
+
+
+LARGEST_PIXEL = 1e5
+"""No image has a pixel beyond."""
+
+
+def _polygon(text: str) -> tuple[tuple[float, float], ...]:
+    """Read one polygon of `ignore_regions`, or say what is wrong with it."""
+    try:
+        numbers = [float(word) for word in text.replace(',', ' ').split()]
+    except ValueError:
+        numbers = []
+    if len(numbers) < 6 or len(numbers) % 2 or not all(abs(number) <= LARGEST_PIXEL for number in numbers):
+        raise UsageError("option 'ignore_regions' is polygons of at least three pixels u v each, with ; between them, "
+                         f"'0 0 200 0 0 150; 900 0 1279 0 1279 90' for example; got {text.strip()!r} for a polygon")
+    return tuple(zip(numbers[::2], numbers[1::2], strict=True))
 
 
 MAY_CHANGE = ('method', 'scale_from', 'camera_height', 'camera_height_sigma', 'allow_unit_scale', 'random_seed',

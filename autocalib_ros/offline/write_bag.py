@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +18,10 @@ from autocalib_ros.calibration import Calibration, GroundPlane
 from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.offline.outputs import camera_name, image_topic
 from autocalib_ros.offline.sources import Source, StoredImage
+from autocalib_ros.perception.black_images import blacked_out, require_blackable
+from autocalib_ros.perception.privacy import Polygons
+
+LOG = logging.getLogger(__name__)
 
 BAG_VERSION = 9
 """What Jazzy writes."""
@@ -26,17 +32,19 @@ LATCHED = Qos(QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TR
               QosLiveliness.AUTOMATIC, FOREVER, False)
 
 
-def write_bag(path: Path, result: Calibration, source: Source, tf_parent: str = 'ground') -> None:
+def write_bag(path: Path, result: Calibration, source: Source, tf_parent: str = 'ground',
+              ignored: Polygons = ()) -> None:
     """Write a new bag: the images, a CameraInfo with the header of each, and the ground transform where there is one.
 
     CameraInfo goes to the sibling of the image topic. All but the images are latched, so that a node that
-    starts late during playback gets them too.
+    starts late during playback gets them too. The `ignored` polygons are black in the images; UsageError, and no bag,
+    where images are of a kind in which that cannot be done.
     """
     if path.exists():
         raise UsageError(f'{path} exists already and is not overwritten')
     try:
         with Writer(path, version=BAG_VERSION, storage_plugin=StoragePlugin.MCAP) as writer:
-            _Recording(writer, result, source, tf_parent).write()
+            _Recording(writer, result, source, tf_parent, ignored).write()
     except BaseException as error:
         shutil.rmtree(path, ignore_errors=True)  # half a bag is worse than none
         if isinstance(error, OSError):
@@ -53,7 +61,9 @@ def camera_info_topic(source: Source) -> str:
 class _Recording:
     """The connections and messages of one new bag."""
 
-    def __init__(self, writer: Writer, result: Calibration, source: Source, tf_parent: str) -> None:
+    def __init__(self, writer: Writer, result: Calibration, source: Source, tf_parent: str,
+                 ignored: Polygons) -> None:
+        self._ignored, self._broken = ignored, 0
         self._writer, self._result, self._source, self._tf_parent = writer, result, source, tf_parent
         self._store = get_typestore(Stores.ROS2_JAZZY)
         self._ground_frame = f'{camera_name(source)}_ground'
@@ -66,8 +76,25 @@ class _Recording:
             if index == 0 and self._result.ground is not None:
                 self._write_ground(self._result.ground, stored)
             self._put(info, stored.recorded_ns, self._camera_info(stored))
-            if images is not None:
-                self._writer.write(images, stored.recorded_ns, stored.cdr)
+            if images is not None and (cdr := self._image(stored.cdr)) is not None:
+                self._writer.write(images, stored.recorded_ns, cdr)
+        if self._broken:
+            LOG.warning('%d images cannot be decoded and so not be made black where asked: they are left out of the '
+                        'bag', self._broken)
+
+    def _image(self, cdr: bytes | memoryview) -> bytes | memoryview | None:
+        """Return an image as it is to be written; None where its regions cannot be made black."""
+        if not self._ignored:
+            return cdr
+        kind = self._source.image_type
+        message = self._store.deserialize_cdr(cdr, kind)
+        require_blackable(message)
+        try:
+            black = blacked_out(message, self._ignored)
+        except InputError:
+            self._broken += 1
+            return None
+        return self._store.serialize_cdr(replace(message, data=black), kind)
 
     def _write_ground(self, ground: GroundPlane, first: StoredImage) -> None:
         transform = self._transform(ground, first.frame_id.lstrip('/') or DEFAULT_FRAME)

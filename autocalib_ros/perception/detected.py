@@ -65,13 +65,19 @@ class DetectedVehicles:
             self._forget(owners)
         self._time_s = time_s
 
-    def regions(self, moving: list[Region], shape: tuple[int, int]) -> tuple[list[Region], np.ndarray]:
-        """Return what moves of each box, nearest first, and the vehicles (n,), given what moves in the image (H, W)."""
+    def regions(self, moving: list[Region], shape: tuple[int, int],
+                avoided: np.ndarray | None = None) -> tuple[list[Region], np.ndarray]:
+        """Return what moves of each box, nearest first, and the vehicles (n,), given what moves in the image (H, W).
+
+        No region reaches to where an image (H, W) is `avoided`, not 0.
+        """
         differs = np.zeros(shape, np.uint8)
         for region in moving:
             height, width = region.mask.shape
             differs[region.y:region.y + height, region.x:region.x + width] |= region.mask
         found, free = [], np.full(shape, 255, np.uint8)
+        if avoided is not None:
+            free[avoided > 0] = 0
         # A person stands before the vehicle that its box overlaps; of two vehicles the lower one is nearer.
         for box in sorted(self._boxes, key=lambda box: (self.kind(box.vehicle) is not Kind.PERSON, -box.edges_px[3])):
             left, top, right, bottom = _inside(box.edges_px, shape)

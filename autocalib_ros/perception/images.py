@@ -24,16 +24,25 @@ COLOUR_CODES = {
     'bayer_rggb': cv2.COLOR_BayerBG2BGR, 'bayer_bggr': cv2.COLOR_BayerRG2BGR,
     'bayer_gbrg': cv2.COLOR_BayerGR2BGR, 'bayer_grbg': cv2.COLOR_BayerGB2BGR,
 }
+CHANNELS = {'rgb': 3, 'bgr': 3, 'rgba': 4, 'bgra': 4}
 PACKED = {
     **{f'{order}{bits}': (order, bits) for order in COLOUR_CODES for bits in (8, 16)},
-    '8UC1': ('mono', 8), '16UC1': ('mono', 16), '8UC3': ('bgr', 8),
+    '8UC1': ('mono', 8), '8UC3': ('bgr', 8), '8UC4': ('bgra', 8), '16UC1': ('mono', 16), '16UC3': ('bgr', 16),
+    '16SC1': ('mono', 16), '32FC1': ('mono', 32),
 }
-"""Encoding to the order of its channels and the bits of each."""
+"""Encoding to the order of its channels and the bits of each; what has more than 8 is stretched.
+
+Sensors of 10, 12 or 14 bits come in 16, at either end of them. Allied Vision's driver calls its Bayer images of 10
+and 12 bits 16SC1; thermal drivers send temperatures as 32FC1 or 16SC1, with or without NaN. Formats packed below a byte
+boundary (Mono10p, BayerRG12Packed) are unpacked by their drivers.
+"""
+NUMBERS = {'16SC1': 'i2', '32FC1': 'f4'}
+"""Kinds of number that are not unsigned."""
 YUV422 = {
     'yuv422': cv2.COLOR_YUV2BGR_UYVY, 'uyvy': cv2.COLOR_YUV2BGR_UYVY,
     'yuv422_yuy2': cv2.COLOR_YUV2BGR_YUY2, 'yuyv': cv2.COLOR_YUV2BGR_YUY2,
 }
-ASSUMED = {'8UC1': 'mono8', '8UC3': 'bgr8'}
+ASSUMED = {'8UC1': 'mono8', '8UC3': 'bgr8', '8UC4': 'bgra8', '16UC3': 'bgr16'}
 """Encodings that do not say what they mean, and what they are taken for."""
 BT601 = np.array([[1.164, 2.018, 0.0, -16 * 1.164 - 128 * 2.018],
                   [1.164, -0.391, -0.813, -16 * 1.164 + 128 * (0.391 + 0.813)],
@@ -44,7 +53,7 @@ JPEG_END_WITHIN = 4096
 
 
 class ImageDecoder:
-    """Decodes the images of one stream; remembers only how dark and bright its 16-bit images are."""
+    """Decodes the images of one stream; remembers only how dark and bright its images of more than 8 bits are."""
 
     def __init__(self) -> None:
         self._stretch = Stretch()
@@ -64,26 +73,28 @@ class ImageDecoder:
             raise InputError(f"image of encoding '{what}' cannot be converted: {_first_line(error)}") from error
 
     def _raw(self, message: Any) -> np.ndarray:
-        encoding = message.encoding
+        encoding = known_encoding(message.encoding)
         if message.width < 1 or message.height < 1:
             raise InputError(f"image of encoding '{encoding}' has no pixels: {message.width} x {message.height}")
         if encoding in ASSUMED:
             self._tell_once(encoding)
         if encoding in PACKED:
-            return self._packed(message, *PACKED[encoding])
+            return self._packed(message, encoding)
         if encoding in YUV422:
-            pixels = _rows(message, 2 * message.width, 1).reshape(message.height, message.width, 2)
+            pixels = rows_of(message, 2 * message.width, 1).reshape(message.height, message.width, 2)
             return cv2.cvtColor(np.ascontiguousarray(pixels), YUV422[encoding])
         if encoding in PLANAR:
             return PLANAR[encoding](message)
         raise InputError(f"image encoding '{encoding}' is not supported")
 
-    def _packed(self, message: Any, order: str, bits: int) -> np.ndarray:
-        channels = {'mono': 1, 'rgb': 3, 'bgr': 3, 'rgba': 4, 'bgra': 4}.get(order, 1)
-        rows = _rows(message, message.width * channels * bits // 8, 1)
-        if bits == 16:
-            rows = np.ascontiguousarray(rows).view('>u2' if message.is_bigendian else '<u2')
-            rows = self._stretch.to_8_bit(rows, message.encoding)
+    def _packed(self, message: Any, encoding: str) -> np.ndarray:
+        order, bits = PACKED[encoding]
+        channels = CHANNELS.get(order, 1)
+        rows = rows_of(message, message.width * channels * bits // 8, 1)
+        if bits > 8:
+            numbers = NUMBERS.get(encoding, f'u{bits // 8}')
+            rows = np.ascontiguousarray(rows).view(('>' if message.is_bigendian else '<') + numbers)
+            rows = self._stretch.to_8_bit(rows, message.encoding, _stamp_s(message))
         pixels = rows.reshape(message.height, message.width, channels) if channels > 1 else rows
         code = COLOUR_CODES[order]
         pixels = np.ascontiguousarray(pixels)
@@ -94,13 +105,13 @@ class ImageDecoder:
         if 'compressedDepth' in said:
             raise InputError(f"compressed image of format '{said}' holds depths, not a picture")
         data = np.frombuffer(message.data, np.uint8)
-        _check_container(data, said)
+        check_container(data, said)
         # the pixels as the sensor delivered them: a turn asked for by EXIF would change the camera's geometry
         image = cv2.imdecode(data, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
         if image is None:
             raise InputError(f"compressed image of format '{said}', {len(data)} bytes, cannot be decoded")
         if image.dtype == np.uint16:
-            image = self._stretch.to_8_bit(image, said)
+            image = self._stretch.to_8_bit(image, said, _stamp_s(message))
         # image_transport compresses a raw Bayer mosaic as it is: grey, with its pattern in the format
         pattern = said.split(';')[0].rstrip('168')
         if image.ndim == 2 and pattern.startswith('bayer_') and pattern in COLOUR_CODES:
@@ -113,7 +124,7 @@ class ImageDecoder:
             LOG.warning("image encoding '%s' does not name its colours; taken for %s", encoding, ASSUMED[encoding])
 
 
-def _rows(message: Any, row_bytes: int, planes: float) -> np.ndarray:
+def rows_of(message: Any, row_bytes: int, planes: float) -> np.ndarray:
     """Return the image's rows without their padding, a view of shape (rows, row_bytes), after checking lengths.
 
     `planes` is the number of rows in units of the image's height.
@@ -129,27 +140,56 @@ def _rows(message: Any, row_bytes: int, planes: float) -> np.ndarray:
     return data[:expected].reshape(rows, message.step)[:, :row_bytes]
 
 
+def known_encoding(encoding: str) -> str:
+    """Return the name of an encoding as it stands here: some drivers write NV12 or YUV420 in capitals."""
+    lower = encoding.lower()
+    return lower if encoding not in PACKED and (lower in YUV422 or lower in PLANAR or lower in PACKED) else encoding
+
+
 def _nv21(message: Any) -> np.ndarray:
     """Y at full size, then V and U in turns at half the height and width."""
-    rows = _rows(_LumaStep(message, 1.5), message.width, 1.5)
+    rows = rows_of(LumaStep(message, 1.5), message.width, 1.5)
     return cv2.cvtColor(np.ascontiguousarray(rows), cv2.COLOR_YUV2BGR_NV21)
+
+
+def _nv12(message: Any) -> np.ndarray:
+    """Y at full size, then U and V in turns: Isaac ROS and the drivers of D-Robotics boards publish it."""
+    rows = rows_of(LumaStep(message, 1.5), message.width, 1.5)
+    return cv2.cvtColor(np.ascontiguousarray(rows), cv2.COLOR_YUV2BGR_NV12)
+
+
+def _yuv420(message: Any) -> np.ndarray:
+    """Y at full size, then all of U and all of V at half the height and width, rows of half the step.
+
+    TI's robotics SDK and nodes around libcamera-vid publish it.
+    """
+    message = LumaStep(message, 1.5)
+    height, width, step = message.height, message.width, message.step
+    if height % 2 or width % 2 or step % 2:
+        raise InputError(f"image of encoding '{message.encoding}' needs an even size and step, found {width} x {height}"
+                         f' and {step}')
+    rows = rows_of(message, width, 1.5)
+    chroma = np.frombuffer(message.data, np.uint8)[step * height:step * height * 3 // 2].reshape(height, step // 2)
+    half = np.ascontiguousarray(chroma[:, :width // 2]).reshape(height // 2, width)
+    return cv2.cvtColor(np.concatenate([rows[:height], half]), cv2.COLOR_YUV2BGR_I420)
 
 
 def _nv24(message: Any) -> np.ndarray:
     """Y at full size, then U and V in turns at full size: OpenCV has no conversion of its own."""
-    message = _LumaStep(message, 3)
+    message = LumaStep(message, 3)
     height, width, step = message.height, message.width, message.step
-    _rows(message, width, 3)
+    rows_of(message, width, 3)
     data = np.frombuffer(message.data, np.uint8)
     luma = data[:step * height].reshape(height, step)[:, :width, None]
     chroma = data[step * height:3 * step * height].reshape(height, 2 * step)[:, :2 * width].reshape(height, width, 2)
     return cv2.transform(np.concatenate([luma, chroma], axis=2), BT601)
 
 
-PLANAR: dict[str, Callable[[Any], np.ndarray]] = {'nv21': _nv21, 'nv24': _nv24}
+PLANAR: dict[str, Callable[[Any], np.ndarray]] = {
+    'nv12': _nv12, 'nv21': _nv21, 'nv24': _nv24, 'yuv420': _yuv420}
 
 
-class _LumaStep:
+class LumaStep:
     """A planar message whose step is that of its luma plane.
 
     Drivers disagree: some give the bytes of a luma row, some those of a whole pixel row of all planes; the length
@@ -163,7 +203,7 @@ class _LumaStep:
         self.step = message.width if tight else message.step
 
 
-def _check_container(data: np.ndarray, said: str) -> None:
+def check_container(data: np.ndarray, said: str) -> None:
     """Go by the bytes: `format` is often wrong, and OpenCV fills what a torn JPEG lacks with grey."""
     head = data[:8].tobytes()
     if head.startswith(b'\xff\xd8\xff'):
@@ -172,6 +212,12 @@ def _check_container(data: np.ndarray, said: str) -> None:
     elif head != b'\x89PNG\r\n\x1a\n':
         begin = head.hex(' ') or 'nothing'
         raise InputError(f"compressed image of format '{said}' is neither JPEG nor PNG, it begins with {begin}")
+
+
+def _stamp_s(message: Any) -> float | None:
+    """Return the stamp of a message in seconds, None where it has none."""
+    stamp = getattr(getattr(message, 'header', None), 'stamp', None)
+    return None if stamp is None else stamp.sec + 1e-9 * stamp.nanosec
 
 
 def _first_line(error: Exception) -> str:

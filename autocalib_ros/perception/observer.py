@@ -13,10 +13,12 @@ from autocalib_ros.perception.background import Background
 from autocalib_ros.perception.detected import DetectedVehicles
 from autocalib_ros.perception.detector.detector import VehicleDetector
 from autocalib_ros.perception.edges import EdgeFinder
+from autocalib_ros.perception.privacy import Ignored, black_out, require_seen
 from autocalib_ros.perception.segments import Keypoints, find_keypoints, match_segments
+from autocalib_ros.perception.shutter import LEAP_LEVELS, Seen, View
 from autocalib_ros.perception.stillness import Stillness
 from autocalib_ros.perception.tracks import PointTracker
-from autocalib_ros.perception.vehicles import MotionMask, Region
+from autocalib_ros.perception.vehicles import MotionMask, Region, without
 
 MASK_EVERY = 2
 """Images between two updates of the background: traffic needs no finer step in time."""
@@ -48,14 +50,19 @@ class Observer:
         self._options = options
         self._image_size = image_size
         self._reduction = max(1.0, image_size[0] / options.max_image_width)
+        self._polygons = options.ignored_polygons
+        require_seen(self._polygons, image_size)
+        ignored = Ignored(self._polygons, image_size, self._tracked_size)
+        self._ignored = ignored.near(0)
+        self._avoided = ignored.near(options.tracking.window_px)
         self._motion = MotionMask(options.motion)
         self._detected = None if detector is None else DetectedVehicles(detector, options.detector)
-        self._tracker = PointTracker(options.tracking)
-        self._stillness = Stillness(options.buffer.seconds)
+        self._tracker = PointTracker(options.tracking, self._avoided)
+        self._stillness = Stillness(options.buffer.seconds, self._ignored)
         self._background = Background()
         self._sift = cv2.SIFT_create(contrastThreshold=0.03)
         self._keypoints: Keypoints | None = None
-        self._last: np.ndarray | None = None
+        self._view = View(REPEATED_LEVELS, LEAP_LEVELS)
         self._frames = 0
         self._vehicles = 0
         self._edge_finder = EdgeFinder()
@@ -63,11 +70,14 @@ class Observer:
 
     def observe(self, image: np.ndarray, time_s: float) -> Observations:
         """Take a grey (H, W) or BGR (H, W, 3) uint8 image."""
+        image = black_out(image, self._polygons)
         grey = self._tracked_image(image)
-        if self._repeats(grey):
+        seen = self._view.judge(_reduced(grey, self._ignored), time_s)
+        if seen in (Seen.REPEATED, Seen.HIDDEN):
             return Observations([], None, None)
+        ended = self._look_anew() if seen is Seen.LEAPT else []
         self._background.update(image, time_s)
-        tracks = [self._full_size(track) for track in self._tracker.follow(grey, time_s)]
+        tracks = [self._full_size(track) for track in (*ended, *self._tracker.follow(grey, time_s))]
         detect = self._frames % self._options.tracking.detect_every == 0
         if detect or self._frames % MASK_EVERY == 0:
             self._motion.update(grey, time_s)
@@ -78,23 +88,21 @@ class Observer:
         self._frames += 1
         return Observations(tracks, segments, edges)
 
-    def _repeats(self, grey: np.ndarray) -> bool:
-        """Say whether nothing has changed since the last image used: cameras and recorders send pictures twice."""
-        height, width = grey.shape
-        size = (min(REPEATED_WIDTH_PX, width), max(1, height * min(REPEATED_WIDTH_PX, width) // width))
-        reduced = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
-        if self._last is not None and cv2.absdiff(reduced, self._last).max() <= REPEATED_LEVELS:
-            return True
-        self._last = reduced
-        return False
+    def _look_anew(self) -> list[Track]:
+        """Forget all that rests on earlier grey levels; return the tracks that so end."""
+        self._motion, self._edge_finder, self._keypoints = MotionMask(self._options.motion), EdgeFinder(), None
+        return self._tracker.finish_all()
 
     def _tracked_image(self, image: np.ndarray) -> np.ndarray:
         grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image.copy()
         if self._reduction > 1:
-            width, height = self._image_size
-            size = (round(width / self._reduction), round(height / self._reduction))
-            grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+            grey = cv2.resize(grey, self._tracked_size, interpolation=cv2.INTER_AREA)
         return grey
+
+    @property
+    def _tracked_size(self) -> tuple[int, int]:
+        width, height = self._image_size
+        return round(width / self._reduction), round(height / self._reduction)
 
     def _detect(self, grey: np.ndarray, time_s: float) -> tuple[Segments | None, Edges | None]:
         """Look into the moving regions for edges and keypoints, which start tracks, and matched are segments."""
@@ -114,10 +122,10 @@ class Observer:
 
     def _moving(self, shape: tuple[int, int]) -> tuple[list[Region], np.ndarray, np.ndarray]:
         """What moves: regions, the vehicle of each (n,), and whether that is known as a person (n,)."""
-        regions = self._motion.regions()
+        regions = without(self._motion.regions(), self._avoided)
         if self._detected is None:
             return regions, self._vehicles_of(regions), np.zeros(len(regions), bool)
-        regions, vehicles = self._detected.regions(regions, shape)
+        regions, vehicles = self._detected.regions(regions, shape, self._avoided)
         return regions, vehicles, np.array([self._detected.kind(one) is Kind.PERSON for one in vehicles], bool)
 
     def _edges_of(self, grey: np.ndarray, regions: list[Region], vehicles: np.ndarray, time_s: float) -> Edges | None:
@@ -169,7 +177,8 @@ class Observer:
 
     def background(self) -> np.ndarray | None:
         """Return the road without its traffic, BGR uint8 (H, W, 3)."""
-        return self._background.image()
+        image = self._background.image()
+        return None if image is None else black_out(image, self._polygons)  # JPEG rings at the border
 
     def _full_size(self, track: Track) -> Track:
         kind = Kind.UNKNOWN if self._detected is None else self._detected.kind(track.vehicle)
@@ -178,3 +187,15 @@ class Observer:
     def _full_pixels(self, points_px: np.ndarray) -> np.ndarray:
         """Bring pixels (n, 2) of the tracked image to the full one; pixel centres lie at whole numbers."""
         return (points_px + 0.5) * self._reduction - 0.5 if self._reduction > 1 else points_px
+
+
+def _reduced(grey: np.ndarray, ignored: np.ndarray | None) -> np.ndarray:
+    """Reduce a grey image (H, W) to `REPEATED_WIDTH_PX`: where noise is weak and a moving vehicle is not.
+
+    What is `ignored`, not 0 in (H, W), gets the mean of the rest: it neither repeats nor hides anything.
+    """
+    if ignored is not None and not ignored.all():
+        grey = np.where(ignored > 0, np.uint8(grey[ignored == 0].mean()), grey)
+    height, width = grey.shape
+    columns = min(REPEATED_WIDTH_PX, width)
+    return cv2.resize(grey, (columns, max(1, height * columns // width)), interpolation=cv2.INTER_AREA)

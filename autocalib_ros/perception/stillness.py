@@ -17,6 +17,8 @@ QUANTILES = (0.05, 0.95)
 """Drift is the span between these quantiles of the offsets: one passing lorry is not a moving camera."""
 HIDDEN_S = 10.0
 """Nothing that passes hides the background for longer."""
+AWAY_PX = 12
+"""A corner is so far from what is ignored, whose border stands still however the camera moves: half a window."""
 COARSE_S = 300.0
 """Of what lies farther back than memory one median in so long is kept: slow drift is seen, and the memory is small."""
 MAX_COARSE = 8640
@@ -26,11 +28,12 @@ MAX_COARSE = 8640
 class Stillness:
     """Follows strong corners of the background from a reference image into later ones.
 
-    Remembers `memory_s` closely, and by medians back to the time that `compare_since` names.
+    Remembers `memory_s` closely, and by medians back to the time that `compare_since` names. Corners are taken only
+    where the image (H, W) `ignored` is 0.
     """
 
-    def __init__(self, memory_s: float) -> None:
-        self._memory_s = memory_s
+    def __init__(self, memory_s: float, ignored: np.ndarray | None = None) -> None:
+        self._memory_s, self._ignored = memory_s, ignored
         self._coarse: deque[tuple[float, float, float]] = deque(maxlen=MAX_COARSE)
         self._coarse_due_s = COARSE_S
         self._reference: np.ndarray | None = None
@@ -70,7 +73,7 @@ class Stillness:
         Light and shadow change slowly: the image in which it was last found still leads to the new one. Where that
         fails for longer than something hides the view, the camera may look elsewhere.
         """
-        step = self._offset(self._recent, _corners(self._recent), reduced)
+        step = self._offset(self._recent, self._corners_of(self._recent), reduced)
         if step is None and self._reference is not None:
             if time_s - self._found_s < HIDDEN_S:
                 return
@@ -78,7 +81,15 @@ class Stillness:
         if self._offsets:
             self._base = np.array(self._offsets[-1][1:]) + (0.0 if step is None else step)
         self._reference = self._recent = reduced.copy()
-        self._corners, self._found_s = _corners(reduced), time_s
+        self._corners, self._found_s = self._corners_of(reduced), time_s
+
+    def _corners_of(self, image: np.ndarray | None) -> np.ndarray:
+        """Return strong corners (n, 1, 2) of a reduced image (H, W), away from what is ignored."""
+        if image is None or self._ignored is None:
+            return _corners(image)
+        ignored = cv2.resize(self._ignored, image.shape[::-1], interpolation=cv2.INTER_NEAREST)
+        near = cv2.dilate(ignored, np.ones((2 * AWAY_PX + 1, 2 * AWAY_PX + 1), np.uint8))
+        return _corners(image, (near == 0).astype(np.uint8))
 
     def compare_since(self, time_s: float) -> None:
         """Forget the medians from before `time_s`: no evidence is left of then."""
@@ -114,7 +125,8 @@ class Stillness:
         return float(max(np.hypot(*span) for span in spans) * self._factor)
 
 
-def _corners(image: np.ndarray | None) -> np.ndarray:
-    """Return strong corners (n, 1, 2) of a reduced image (H, W)."""
-    found = None if image is None else cv2.goodFeaturesToTrack(image, POINTS, 0.02, max(8, image.shape[1] // 20))
+def _corners(image: np.ndarray | None, where: np.ndarray | None = None) -> np.ndarray:
+    """Return strong corners (n, 1, 2) of a reduced image (H, W), where the mask (H, W) is not 0."""
+    found = None if image is None else cv2.goodFeaturesToTrack(image, POINTS, 0.02, max(8, image.shape[1] // 20),
+                                                               mask=where)
     return np.zeros((0, 1, 2), np.float32) if found is None else found

@@ -71,3 +71,16 @@ class MotionMask:
         left, top = round(x0 * factor_x), round(y0 * factor_y)
         right, bottom = round(x1 * factor_x), round(y1 * factor_y)
         return Region(left, top, cv2.resize(part, (right - left, bottom - top), interpolation=cv2.INTER_NEAREST))
+
+
+def without(regions: list[Region], avoided: np.ndarray | None) -> list[Region]:
+    """Return what is left of regions where an image (H, W) is `avoided`, not 0; all of them without such an image."""
+    if avoided is None:
+        return regions
+    left = []
+    for region in regions:
+        height, width = region.mask.shape
+        part = avoided[region.y:region.y + height, region.x:region.x + width]
+        mask = np.where(part > 0, np.uint8(0), region.mask)
+        left += [Region(region.x, region.y, mask)] if mask.any() else []
+    return left

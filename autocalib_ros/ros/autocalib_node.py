@@ -68,7 +68,8 @@ class AutocalibNode(Node):
         self.in_force = InForce(self, self.options, self.node_options, self._headers, driver=self._driver,
                                 taken=self._hand_on, withdrawn=self._hold_back)
         self._pictures = LivePictures(self, self.node_options.debug_rate_hz, self.in_force, self._headers,
-                                      progress=lambda: self._pipeline.progress, failed=self.failed)
+                                      ignored=self.options.ignored_polygons, failed=self.failed,
+                                      progress=lambda: self._pipeline.progress)
         solver = SolverProcess()
         self._pipeline = Pipeline(self.options, idle_solve_s=self.node_options.idle_solve_s,
                                   decode=ImageDecoder().decode, solve=solve or solver, listener=self,

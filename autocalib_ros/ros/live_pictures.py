@@ -26,6 +26,7 @@ from std_msgs.msg import Header
 from autocalib_ros.calibration import Calibration, Refusal
 from autocalib_ros.calibrator import Progress
 from autocalib_ros.evidence import Evidence
+from autocalib_ros.perception.privacy import Polygons, black_out
 from autocalib_ros.pictures.drawing import Caption
 from autocalib_ros.pictures.live import DebugPicture, JudgedTracks, RectifiedPicture, TopPicture
 from autocalib_ros.ros import messages
@@ -51,12 +52,13 @@ class _Shot:
 class LivePictures:
     """Publishes the pictures; safe in any thread.
 
-    `progress` tells how the evidence comes on; `failed` is told of faults of the program.
+    What is `ignored` is black in them. `progress` tells how the evidence comes on; `failed` is told of faults of the
+    program.
     """
 
-    def __init__(self, node: Node, rate_hz: float, in_force: InForce, headers: Headers, *,
+    def __init__(self, node: Node, rate_hz: float, in_force: InForce, headers: Headers, *, ignored: Polygons,
                  progress: Callable[[], Progress | None], failed: Callable[[Exception], None]) -> None:
-        self.rate_hz = rate_hz
+        self.rate_hz, self._ignored = rate_hz, ignored
         self._in_force, self._headers, self._progress, self._failed = in_force, headers, progress, failed
         self._debug_image = _picture_publisher(node, '~/debug_image')
         self._top_view = _picture_publisher(node, '~/top_view')
@@ -121,7 +123,7 @@ class LivePictures:
 
     def _show(self, shot: _Shot) -> None:
         """Draw what somebody looks at."""
-        image = shown(shot.image)
+        image = black_out(shot.image, self._ignored)  # all pictures begin here, and nowhere else
         height, width = image.shape[:2]
         published, state = self._in_force.published, self._in_force.state
         if published is not None and published.result.evidence.image_size != (width, height):
@@ -164,11 +166,6 @@ class _Kept:
             self._made, self._of = None, None  # not both at a time: tables are large
             self._made, self._of = self._make(*values), values
         return self._made
-
-
-def shown(image: np.ndarray) -> np.ndarray:
-    """Return what may be shown of an image: all pictures begin here, and nowhere else."""
-    return image
 
 
 def caption_of(state: CalibrationState, result: Calibration | None, progress: Progress | None) -> Caption:

@@ -141,8 +141,8 @@ def test_an_image_that_cannot_be_decoded_is_skipped_and_counted(tmp_path, write_
 
 
 def test_only_images_that_cannot_be_decoded_are_an_error(tmp_path, write_bag, images):
-    path = write_bag(tmp_path / 'bag', images(3, encoding='32FC1'))
-    with pytest.raises(InputError, match="none of the 3 images on /cam1/image_raw.*encoding '32FC1' is not supported"):
+    path = write_bag(tmp_path / 'bag', images(3, encoding='32FC2'))
+    with pytest.raises(InputError, match="none of the 3 images on /cam1/image_raw.*encoding '32FC2' is not supported"):
         list(open_source(path).frames())
 
 

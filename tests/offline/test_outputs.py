@@ -29,6 +29,12 @@ def written(path, store):
 
 
 @pytest.fixture
+def write_bag_of(request):
+    """The fixture that writes recordings; `write_bag` is what is tested here."""
+    return request.getfixturevalue('write_bag')
+
+
+@pytest.fixture
 def source(tmp_path, write_bag, images):
     return open_source(write_bag(tmp_path / 'recording', images(4)))
 
@@ -126,6 +132,42 @@ def test_images_of_ros1_become_images_of_ros2(tmp_path, full, write_bag1, images
     again = open_source(tmp_path / 'new')
     assert [(f.stamp_ns, int(f.image[0, 0])) for f in again.frames()] == [
         (100 * SECOND + index * SECOND // 10, 5 + 10 * index) for index in range(3)]
+
+
+CORNER = (((0.0, 0.0), (15.0, 0.0), (15.0, 7.0), (0.0, 7.0)),)
+
+
+@pytest.mark.parametrize('encoding', ['bgr8', 'bayer_grbg8', 'jpeg'])
+def test_ignored_regions_are_black_in_the_new_bag(tmp_path, full, write_bag_of, images, jpeg, encoding):
+    channels = 3 if encoding == 'bgr8' else 1
+    if encoding == 'jpeg':
+        messages = images(3, '/cam1/image_raw/compressed', jpeg, begin_ns=103 * SECOND)
+    else:
+        messages = images(3, encoding=encoding, step=32 * channels, data=np.full(24 * 32 * channels, 100, np.uint8))
+    old = open_source(write_bag_of(tmp_path / 'old', messages))
+    write_bag(tmp_path / 'new', full.result, old, ignored=CORNER)
+    new = open_source(tmp_path / 'new')
+    pairs = list(zip(old.frames(), new.frames(), strict=True))
+    assert len(pairs) == 3
+    for before, after in pairs:
+        assert after.stamp_ns == before.stamp_ns
+        assert after.image[:7, :15].max() <= 8  # JPEG rings
+        np.testing.assert_allclose(after.image[16:].astype(int), before.image[16:], atol=2)  # another block of the JPEG
+
+
+def test_images_that_cannot_be_made_black_are_not_written(tmp_path, full, write_bag_of, images):
+    old = open_source(write_bag_of(tmp_path / 'old', images(3, encoding='h264')))
+    with pytest.raises(UsageError, match="'ignore_regions' cannot be made black in images of encoding 'h264'"):
+        write_bag(tmp_path / 'new', full.result, old, ignored=CORNER)
+    assert not (tmp_path / 'new').exists()
+
+
+def test_a_broken_image_is_left_out_where_regions_are_ignored(tmp_path, full, write_bag_of, images, caplog):
+    messages = images(3)
+    messages[1][2].data = np.zeros(5, np.uint8)
+    write_bag(tmp_path / 'new', full.result, open_source(write_bag_of(tmp_path / 'old', messages)), ignored=CORNER)
+    assert len(list(open_source(tmp_path / 'new').frames())) == 2
+    assert '1 images cannot be decoded' in caplog.text
 
 
 def test_a_video_gives_a_bag_of_calibrations(tmp_path, full, write_video, jazzy):

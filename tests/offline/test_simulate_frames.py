@@ -76,6 +76,31 @@ def test_thermal_offset_drifts():
     assert change.std() < 20
 
 
+def test_thermal_contrast_is_some_hundred_counts():
+    simulation = _simulation(thermal=True)
+    frame = simulation.frame(3)
+    road = frame[120:]  # below the houses: asphalt, pavement, vehicles
+    assert 30 < road.std() < 300
+    assert np.abs(np.diff(frame[-20:, :60].astype(int), axis=1)).mean() < 12  # noise of three counts, and texture
+
+
+def test_the_shutter_freezes_the_picture_and_leaves_another_offset_and_pattern():
+    simulation = _simulation(thermal=True, empty=True, shutter_every_s=2.0, rate_hz=10.0)
+    before, *shut = (simulation.frame(index) for index in range(19, 25))
+    assert all(np.array_equal(frame, before) for frame in shut)
+    change = simulation.frame(25).astype(int) - before
+    calm = simulation.frame(19).astype(int) - simulation.frame(18)
+    assert abs(np.median(change)) > 10 > abs(np.median(calm))
+    assert change.std() > 1.1 * calm.std()
+
+
+def test_a_shutter_that_is_shown_is_flat():
+    options = {'thermal': True, 'shutter_every_s': 2.0, 'rate_hz': 10.0}
+    simulation = _simulation(**options, shutter_shows='flat')
+    assert simulation.frame(22).std() < 0.2 * simulation.frame(19).std()
+    assert np.array_equal(simulation.frame(26), _simulation(**options).frame(26))
+
+
 def test_night_is_darker_and_has_bright_lamps(day):
     night = _simulation(night=True).frame(4)
     assert night.mean() < 0.5 * day.frame(4).mean()

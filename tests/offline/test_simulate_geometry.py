@@ -149,6 +149,8 @@ def test_bump_turns_the_camera_by_its_angle():
         ({'focal_px': -1.0}, 'focal_px'),
         ({'road_angle_deg': 10.0}, 'road_angle_deg'),
         ({'night': True, 'thermal': True}, 'exclude each other'),
+        ({'shutter_every_s': 60.0}, 'only thermal cameras'),
+        ({'thermal': True, 'shutter_shows': 'open'}, 'unknown shutter_shows'),
         ({'bump_at_s': 500.0}, 'bump_at_s'),
         ({'k': (0.01,)}, 'not four'),
         ({'k': (-0.3, 0.0, 0.0, 0.0)}, 'forms no image beyond'),

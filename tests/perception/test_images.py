@@ -42,7 +42,8 @@ def decoded(msg: SimpleNamespace) -> np.ndarray:
 @pytest.mark.parametrize('as_array', [False, True])
 @pytest.mark.parametrize('padding', [0, 5])
 @pytest.mark.parametrize(('encoding', 'order'), [('bgr8', [0, 1, 2]), ('rgb8', [2, 1, 0]), ('8UC3', [0, 1, 2]),
-                                                 ('bgra8', [0, 1, 2, 0]), ('rgba8', [2, 1, 0, 0])])
+                                                 ('bgra8', [0, 1, 2, 0]), ('rgba8', [2, 1, 0, 0]),
+                                                 ('8UC4', [0, 1, 2, 0]), ('BGR8', [0, 1, 2])])
 def test_colours_are_put_in_order(encoding, order, padding, as_array):
     image = decoded(message(encoding, scene()[:, :, order], padding=padding, as_array=as_array))
     assert np.array_equal(image, scene())
@@ -73,7 +74,8 @@ def test_16_bit_grey_fills_the_range(encoding, padding, is_bigendian):
 
 
 @pytest.mark.parametrize('is_bigendian', [0, 1])
-@pytest.mark.parametrize(('encoding', 'order'), [('bgr16', [0, 1, 2]), ('rgb16', [2, 1, 0])])
+@pytest.mark.parametrize(('encoding', 'order'), [('bgr16', [0, 1, 2]), ('rgb16', [2, 1, 0]), ('16UC3', [0, 1, 2]),
+                                                 ('bgra16', [0, 1, 2, 0]), ('rgba16', [2, 1, 0, 0])])
 def test_16_bit_colours_keep_their_proportion(encoding, order, is_bigendian):
     wide = scene().astype(int) * 257
     low, high = np.percentile(wide, [1, 99])
@@ -82,15 +84,82 @@ def test_16_bit_colours_keep_their_proportion(encoding, order, is_bigendian):
     assert np.abs(image - np.clip((wide - low) / (high - low) * 255, 0, 255)).max() <= 1
 
 
-def test_the_stretch_moves_slowly():
+@pytest.mark.parametrize('is_bigendian', [0, 1])
+@pytest.mark.parametrize('padding', [0, 6])
+def test_signed_counts_fill_the_range(padding, is_bigendian):
+    grey = np.linspace(-300, 900, HEIGHT * WIDTH).reshape(HEIGHT, WIDTH)  # tenths of a degree Celsius
+    image = decoded(message('16SC1', grey.astype('>i2' if is_bigendian else '<i2'), padding=padding,
+                            is_bigendian=is_bigendian))
+    low, high = np.percentile(grey.astype(int), [1, 99])
+    assert np.abs(image - np.clip((grey - low) / (high - low) * 255, 0, 255)).max() <= 1
+
+
+@pytest.mark.parametrize('is_bigendian', [0, 1])
+@pytest.mark.parametrize('padding', [0, 4])
+def test_temperatures_fill_the_range_and_what_is_none_is_black(padding, is_bigendian):
+    kelvin = np.linspace(283.0, 310.0, HEIGHT * WIDTH).reshape(HEIGHT, WIDTH)
+    low, high = np.percentile(kelvin, [1, 99])
+    holes = kelvin.copy()
+    holes[3, 5:8] = np.nan, np.nan, -np.inf
+    image = decoded(message('32FC1', holes.astype('>f4' if is_bigendian else '<f4'), padding=padding,
+                            is_bigendian=is_bigendian))
+    assert (image[3, 5:8] == 0).all()
+    there = np.isfinite(holes)
+    # the holes move the percentiles by a pixel or two
+    assert np.abs(image - np.clip((kelvin - low) / (high - low) * 255, 0, 255))[there].max() <= 4
+
+
+def test_temperatures_that_are_none_at_all_give_a_black_picture():
+    assert not decoded(message('32FC1', np.full((HEIGHT, WIDTH), np.nan, '<f4'))).any()
+
+
+def stamped(msg: SimpleNamespace, time_s: float) -> SimpleNamespace:
+    msg.header = SimpleNamespace(stamp=SimpleNamespace(sec=100 + int(time_s), nanosec=round(time_s % 1 * 1e9)))
+    return msg
+
+
+@pytest.mark.parametrize('interval_s', [0.05, 0.4])
+def test_the_stretch_follows_time_and_not_the_number_of_images(interval_s):
+    decoder, rng = ImageDecoder(), np.random.default_rng(0)
+    grey = rng.integers(1000, 2000, (HEIGHT, WIDTH))
+    hot = grey.copy()
+    hot[:3, :5] = 4000  # a lorry with its exhaust, 8 % of the image
+    before = decoder.decode(stamped(message('mono16', grey.astype('<u2')), 0.0)).astype(int)
+    noise = iter(range(10**6))
+    shift = {}
+    for time_s in np.arange(interval_s, 60.0, interval_s):
+        image = decoder.decode(stamped(message('mono16', (hot + next(noise) % 2).astype('<u2')), time_s))
+        shift[round(time_s, 2)] = np.abs(image[4:].astype(int) - before[4:]).max()
+    # 255 levels held 1000 counts and will hold 3000: two eases of 20 s make 2.6 % of that way in 5 s, 80 % in a minute
+    assert shift[5.2 if interval_s == 0.4 else 5.0] == pytest.approx(13, abs=4)
+    assert 90 < shift[59.6 if interval_s == 0.4 else 59.95] < 170
+
+
+def test_what_all_pixels_gain_moves_no_grey_level():
+    decoder, rng = ImageDecoder(), np.random.default_rng(0)
+    grey = rng.integers(1000, 2000, (HEIGHT, WIDTH))
+    before = decoder.decode(message('mono16', grey.astype('<u2'))).astype(int)
+    for offset in (3, 5, 400, -300):
+        after = decoder.decode(message('mono16', (grey + offset).astype('<u2'))).astype(int)
+        assert np.abs(after - before).max() <= 1
+
+
+def test_one_flash_leaves_the_stretch_as_it_was():
     decoder, rng = ImageDecoder(), np.random.default_rng(0)
     grey = rng.integers(1000, 2000, (HEIGHT, WIDTH)).astype('<u2')
     before = decoder.decode(message('mono16', grey)).astype(int)
-    flash = decoder.decode(message('mono16', grey * 20))
+    decoder.decode(message('mono16', grey * 20))
     after = decoder.decode(message('mono16', grey)).astype(int)
-    assert flash.min() == 255
-    # one flash moves the upper limit by half a per cent of the way: some levels, not the whole range
-    assert 0 < np.abs(after - before).max() < 50
+    assert np.abs(after - before).max() < 8
+
+
+def test_a_scene_that_has_left_the_limits_gets_new_ones():
+    decoder, rng = ImageDecoder(), np.random.default_rng(0)
+    grey = rng.integers(1000, 2000, (HEIGHT, WIDTH))
+    decoder.decode(stamped(message('mono16', grey.astype('<u2')), 0.0))
+    for index in range(30):  # the sun comes out over a 12-bit camera
+        image = decoder.decode(stamped(message('mono16', (3 * grey + index % 2).astype('<u2')), 0.1 + 0.1 * index))
+    assert (image == 255).mean() < 0.03 and (image == 0).mean() < 0.03
 
 
 def test_a_dark_start_does_not_fix_the_stretch():
@@ -150,6 +219,26 @@ def test_nv21(padding):
     assert np.abs(image - bgr_of(y, u, v)).max() <= 2
 
 
+@pytest.mark.parametrize('name', ['nv12', 'NV12'])
+@pytest.mark.parametrize('padding', [0, 4])
+def test_nv12(padding, name):
+    y, u, v = yuv_of_scene()
+    chroma = np.stack([u[::2, ::2], v[::2, ::2]], axis=-1).reshape(HEIGHT // 2, WIDTH)
+    image = decoded(message(name, np.concatenate([y, chroma]), padding=padding))
+    assert np.abs(image - bgr_of(y, u, v)).max() <= 2
+
+
+@pytest.mark.parametrize('padding', [0, 4])
+def test_yuv420(padding):
+    y, u, v = yuv_of_scene()
+    u[:, WIDTH // 2:] += 30  # a mix-up of planes would put the change elsewhere
+    v[HEIGHT // 2:] += 30
+    half = np.pad(np.concatenate([u[::2, ::2], v[::2, ::2]]), ((0, 0), (0, padding // 2)))
+    msg = message('yuv420', np.concatenate([np.pad(y, ((0, 0), (0, padding))).ravel(), half.ravel()])[None])
+    msg.step = WIDTH + padding
+    assert np.abs(decoded(msg) - bgr_of(y, u, v)).max() <= 2
+
+
 def test_nv24():
     y, u, v = yuv_of_scene()
     data = np.concatenate([y.ravel(), np.stack([u, v], axis=-1).ravel()])
@@ -193,7 +282,7 @@ def test_a_compressed_bayer_mosaic_is_coloured():
 
 
 @pytest.mark.parametrize(('change', 'reason'), [
-    ({'encoding': '32FC1'}, "image encoding '32FC1' is not supported"),
+    ({'encoding': '32FC2'}, "image encoding '32FC2' is not supported"),
     ({'encoding': ''}, "image encoding '' is not supported"),
     ({'data': b'\0' * 100}, r"'bgr8' needs 576 bytes \(12 rows of 48\), found 100"),
     ({'data': b''}, r"'bgr8' needs 576 bytes \(12 rows of 48\), found 0"),
@@ -208,7 +297,7 @@ def test_a_broken_image_is_refused_with_the_reason(change, reason):
         ImageDecoder().decode(msg)
 
 
-@pytest.mark.parametrize('encoding', ['nv21', 'nv24', 'yuv422'])
+@pytest.mark.parametrize('encoding', ['nv12', 'nv21', 'nv24', 'yuv420', 'yuv422'])
 def test_a_short_planar_image_is_refused_with_the_lengths(encoding):
     with pytest.raises(InputError, match=f"'{encoding}'.*(needs|step)"):
         ImageDecoder().decode(message(encoding, scene()[:, :, 0]))

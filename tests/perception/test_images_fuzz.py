@@ -15,7 +15,7 @@ from autocalib_ros.perception.images import PACKED, PLANAR, YUV422, ImageDecoder
 ENCODINGS = [*PACKED, *YUV422, *PLANAR]
 NUMBERS = st.one_of(st.integers(0, 40), st.sampled_from([2**16, 2**31, 2**32 - 1]))
 """Sizes and steps as any bits of a uint32 may be."""
-PIXELS = np.random.default_rng(0).integers(0, 256, 8 * 40 * 40, np.uint8)
+PIXELS = np.random.default_rng(0).integers(0, 256, 20 * 40 * 40, np.uint8)
 PIXELS.flags.writeable = False
 FILES = [cv2.imencode(kind, PIXELS[:1200].reshape(20, 20, 3))[1].tobytes() for kind in ('.jpg', '.png')]
 

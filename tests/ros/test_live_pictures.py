@@ -215,6 +215,14 @@ def test_a_fault_in_drawing_is_told_and_the_next_picture_comes(bench, monkeypatc
     assert [str(error) for error in told] == ['torn']
 
 
+def test_an_ignored_region_is_black_in_pictures_of_the_image(bench):
+    half = SIZE[0] // 2
+    stream = Stream(bench, ignore_regions=f'-1 -1 {half} -1 {half} {SIZE[1]} -1 {SIZE[1]}').calibrated()
+    rectified = pixels(stream.seen('image_rect'))
+    assert not rectified[:, :half // 2].any()
+    assert rectified[:, -half // 2:].any()
+
+
 def test_what_became_of_the_tracks_is_shown_until_the_next_solution_or_a_reset(bench):
     found = [calibration, refusal, calibration]
     stream = Stream(bench, lambda evidence, options, lens: found.pop(0)(evidence)).calibrated()

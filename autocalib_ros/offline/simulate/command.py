@@ -9,12 +9,12 @@ from typing import Any
 
 from autocalib_ros.errors import UsageError
 
-from .options import SCENES, STORAGES, SimulationOptions
+from .options import SCENES, SHUTTER_SHOWS, STORAGES, SimulationOptions
 
 _UNIT = re.compile(r'_(px|deg|m|s|hz)$')
 _BY_HAND = ('width_px', 'height_px', 'k')
 _PAIRS = {'principal_point_offset_px': ('DX', 'DY'), 'position_m': ('X', 'Y')}
-_CHOICES = {'scene': SCENES, 'storage': STORAGES}
+_CHOICES = {'scene': SCENES, 'storage': STORAGES, 'shutter_shows': SHUTTER_SHOWS}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -15,6 +15,7 @@ SQUARE_DEG = 90.0
 SKEW_DEG = 65.0
 ONE_WAY_SCENES = ('junction', 'road', 'highway', 'bend')
 STORAGES = ('sqlite3', 'mcap')
+SHUTTER_SHOWS = ('frozen', 'flat')
 
 
 def _option(default: Any, help_text: str) -> Any:
@@ -68,6 +69,13 @@ class SimulationOptions:
     noise_sigma: float = _option(2.0, 'sensor noise in grey levels')
     night: bool = _option(False, 'darkness, head lamps, more noise')
     thermal: bool = _option(False, 'thermal camera: mono16 instead of bgr8')
+    shutter_every_s: float | None = _option(
+        None, 'seconds between two closings of the shutter of a thermal camera, half a second each, after which its '
+        'offset and pattern are others; default: never'
+    )
+    shutter_shows: str = _option(
+        'frozen', 'what a thermal camera sends while its shutter is closed: the last picture, or the shutter'
+    )
     shake_px: float = _option(0.0, 'standard deviation of the camera shake')
     bump_at_s: float | None = _option(None, 'time at which the camera is knocked askew')
     bump_deg: float = _option(2.0, 'angle by which it is knocked askew')
@@ -106,7 +114,7 @@ class SimulationOptions:
         return Lens(self.focal_px, tuple(self.k), centre)
 
     def _check_names(self) -> None:
-        for name, allowed in (('scene', SCENES), ('storage', STORAGES)):
+        for name, allowed in (('scene', SCENES), ('storage', STORAGES), ('shutter_shows', SHUTTER_SHOWS)):
             if getattr(self, name) not in allowed:
                 raise UsageError(
                     f'unknown {name} {getattr(self, name)!r}: choose {" or ".join(allowed)}'
@@ -122,6 +130,8 @@ class SimulationOptions:
     def _check_combinations(self) -> None:
         if self.night and self.thermal:
             raise UsageError('night and thermal exclude each other: choose one')
+        if self.shutter_every_s is not None and not self.thermal:
+            raise UsageError('shutter_every_s is given without thermal: only thermal cameras have such a shutter')
         if self.one_way and self.scene not in ONE_WAY_SCENES:
             raise UsageError(
                 f'scene {self.scene!r} has no one_way: choose {" or ".join(ONE_WAY_SCENES)}'
@@ -166,6 +176,7 @@ _RANGES = {
     'wander_m': (0.0, 1.0),
     'pedestrians': (0, 200),
     'noise_sigma': (0.0, 30.0),
+    'shutter_every_s': (2.0, 3600.0),
     'shake_px': (0.0, 20.0),
     'bump_deg': (-30.0, 30.0),
 }

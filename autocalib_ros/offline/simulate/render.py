@@ -15,6 +15,7 @@ from .bodies import body_of, shadow_of
 from .faces import NO_MAP, SAMPLES, Canvas, Drawing, Faces, Window
 from .ground import paint_ground
 from .lens import CameraPose, Lens
+from .microbolometer import Microbolometer
 from .network import Network
 from .options import SimulationOptions
 from .palette import palette_of
@@ -35,7 +36,7 @@ _NOTHING = Faces(np.zeros((0, 3, 3)), ())
 class Scene:
     """What a frame shows: the camera's state, the vehicles and the people.
 
-    shake: rotation (3, 3) of the camera in its own frame, or None.
+    shake: rotation (3, 3) of the camera in its own frame, or None.  shut: a shutter hides the scene.
     """
 
     index: int
@@ -44,6 +45,7 @@ class Scene:
     shake: np.ndarray | None
     vehicles: list[tuple[Vehicle, VehicleState]]
     people: list[tuple[Person, tuple[float, float, float]]]
+    shut: bool = False
 
 
 @dataclass(frozen=True)
@@ -65,6 +67,7 @@ class Artist:
         self._lens = options.lens
         self._poses = {False: pose, True: bumped}
         self._noise = sensor.Noise(options)
+        self._core = Microbolometer(options)
         self._margin = math.ceil(4 * options.shake_px) + 2 if options.shake_px else 0
         self._canvas = Canvas(self._lens, options.width_px, options.height_px)
         self._texels_per_m = bodies.FINE if options.focal_px > 350 else bodies.COARSE
@@ -78,7 +81,7 @@ class Artist:
         picture = self._picture(scene, pose)
         noise = self._noise.of(scene.index)
         if self._options.thermal:
-            return sensor.thermal_counts(picture, scene.time_s, noise)
+            return self._core.counts(picture, scene.time_s, noise, shut=scene.shut)
         if self._options.night:
             picture = sensor.darken(picture)
             lamps.add_lamps(picture, self._canvas, pose, self._near(scene, pose))

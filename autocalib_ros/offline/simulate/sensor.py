@@ -1,4 +1,4 @@
-"""From the drawn picture to the sensor's: darkness and lamps, heat, noise."""
+"""From the drawn picture to the sensor's: darkness and lamps, noise."""
 
 from __future__ import annotations
 
@@ -7,12 +7,11 @@ import math
 import cv2
 import numpy as np
 
+from .microbolometer import NOISE_COUNTS
 from .options import SimulationOptions
 
 _NOISE_MARGIN_PX = 64
 NIGHT_GAIN = 0.28
-THERMAL_COUNTS = 14.0  # counts of the 14-bit range to one grey level of the palette
-THERMAL_BASE = 6400.0
 
 
 class Noise:
@@ -24,7 +23,7 @@ class Noise:
         sigma = options.noise_sigma * (1.8 if options.night else 1.0)
         channels = 1 if options.thermal else 3
         if options.thermal:
-            sigma *= THERMAL_COUNTS * 0.35
+            sigma *= NOISE_COUNTS
         rng = np.random.default_rng([options.seed, 6])
         shape = (*(n + _NOISE_MARGIN_PX for n in self._size), channels)
         self._bank = np.round(rng.standard_normal(shape, np.float32) * sigma).astype(np.int16)
@@ -60,12 +59,3 @@ def add_glow(
     light = np.clip(core, 0, 1)[..., None] * np.array(colour, float)
     patch = picture[y0:y1, x0:x1]
     patch[:] = np.clip(patch + light, 0, 255).astype(np.uint8)
-
-
-def thermal_counts(picture: np.ndarray, time_s: float, noise: np.ndarray) -> np.ndarray:
-    """Return mono16 counts (h, w) of a drawn heat picture (h, w, 3); offset and gain drift."""
-    heat = cv2.GaussianBlur(np.ascontiguousarray(picture[..., 0]).astype(np.float32), (0, 0), 0.6)
-    gain = THERMAL_COUNTS * (1 + 0.03 * math.sin(2 * math.pi * time_s / 47.0))
-    offset = THERMAL_BASE + 60.0 * math.sin(2 * math.pi * time_s / 31.0 + 1.0) + 0.8 * time_s
-    counts = heat * gain + offset + noise[..., 0]
-    return np.clip(np.round(counts), 0, 16383).astype(np.uint16)

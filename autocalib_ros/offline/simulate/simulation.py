@@ -9,6 +9,7 @@ import numpy as np
 
 from . import people
 from .lens import CameraPose, look, rotation
+from .microbolometer import shut_since
 from .options import SimulationOptions
 from .render import Artist, Scene
 from .scenes import network_of
@@ -41,7 +42,7 @@ class Simulation:
 
     def frame(self, index: int) -> np.ndarray:
         """Return a frame: BGR (h, w, 3) uint8, or for a thermal camera (h, w) uint16."""
-        return self.artist().frame(self.scene(index))
+        return self.artist().frame(self.scene(self._seen(index)))
 
     def artist(self) -> Artist:
         """Return what draws the pictures; made when first needed."""
@@ -60,7 +61,15 @@ class Simulation:
             self.shake(index) if self.options.shake_px else None,
             self.states(time_s),
             [(person, place) for person, place in walking if place is not None],
+            shut_since(self.options, time_s) is not None,
         )
+
+    def _seen(self, index: int) -> int:
+        """Return the frame whose picture is sent: while a shutter freezes the picture, the last before it closed."""
+        closed_s = shut_since(self.options, self.time_s(index))
+        if closed_s is None or self.options.shutter_shows == 'flat':
+            return index
+        return math.ceil(closed_s * self.options.rate_hz - 1e-9) - 1
 
     def stamp_ns(self, index: int) -> int:
         """Return the time stamp of a frame in nanoseconds."""

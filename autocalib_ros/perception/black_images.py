@@ -1,0 +1,130 @@
+"""Image messages with their `ignore_regions` black, for recordings that pass images on; their kind stays."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+
+from autocalib_ros.errors import InputError, UsageError
+from autocalib_ros.perception.images import (
+    CHANNELS,
+    NUMBERS,
+    PACKED,
+    PLANAR,
+    YUV422,
+    LumaStep,
+    check_container,
+    known_encoding,
+    rows_of,
+)
+from autocalib_ros.perception.privacy import Polygons, ignored_mask
+
+BLACK_LUMA, NO_CHROMA = 16, 128
+"""Black in limited-range YUV."""
+JPEG_QUALITY = 95
+
+
+def require_blackable(message: Any) -> None:
+    """Raise UsageError unless `blacked_out` knows the kind of a sensor_msgs Image or CompressedImage."""
+    if hasattr(message, 'encoding'):
+        encoding = known_encoding(message.encoding)
+        known, kind = encoding in PACKED or encoding in YUV422 or encoding in PLANAR, f"encoding '{encoding}'"
+    else:
+        known, kind = 'compressedDepth' not in str(message.format), f"format '{message.format}'"
+    if not known:
+        raise UsageError(f"'ignore_regions' cannot be made black in images of {kind}: write the bag without images, or "
+                         'leave the regions out')
+
+
+def blacked_out(message: Any, polygons: Polygons) -> np.ndarray:
+    """Return the data (n,) uint8 of an Image or CompressedImage with the polygons black; never changes the message.
+
+    InputError where the image is broken. What has more than 8 bits gets the darkest value of the rest: zero among
+    counts of 6000 would take all contrast from whoever stretches them.
+    """
+    if not hasattr(message, 'encoding'):
+        return _compressed(message, polygons)
+    data, pixels = np.frombuffer(message.data, np.uint8).copy(), message.width * message.height
+    if not 0 < pixels <= len(data):
+        raise InputError(f"image of encoding '{message.encoding}' and {message.width} x {message.height} pixels has "
+                         f'{len(data)} bytes')
+    mask, encoding = ignored_mask(polygons, (message.width, message.height)), known_encoding(message.encoding)
+    if encoding in PACKED:
+        _blacken_packed(_Copy(message, data), mask, encoding)
+    elif encoding in YUV422:
+        _blacken_422(rows_of(_Copy(message, data), 2 * message.width, 1), mask,
+                     luma_first=YUV422[encoding] == cv2.COLOR_YUV2BGR_YUY2)
+    else:
+        _blacken_planar(_Copy(message, data), mask, encoding)
+    return data
+
+
+class _Copy:
+    """A message with other data."""
+
+    def __init__(self, message: Any, data: np.ndarray) -> None:
+        self.encoding, self.width, self.height = message.encoding, message.width, message.height
+        self.step, self.is_bigendian, self.data = message.step, message.is_bigendian, data
+
+
+def _blacken_packed(message: Any, mask: np.ndarray, encoding: str) -> None:
+    order, bits = PACKED[encoding]
+    channels = CHANNELS.get(order, 1)
+    rows = rows_of(message, message.width * channels * bits // 8, 1)
+    numbers = NUMBERS.get(encoding, f'u{bits // 8}')
+    values = np.ascontiguousarray(rows).view(('>' if message.is_bigendian else '<') + numbers)
+    rows[:] = _darkened(values.reshape(*mask.shape, channels), mask).reshape(len(rows), -1).view(np.uint8)
+
+
+def _darkened(values: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Return a copy of values (h, w, channels), of which the first three are colours, dark in the mask (h, w)."""
+    dark, rest = values.copy(), values[~mask][:, :3]
+    rest = rest[np.isfinite(rest)] if values.dtype.kind == 'f' else rest
+    dark[mask, :3] = rest.min() if values.dtype.itemsize > 1 and rest.size else 0
+    return dark
+
+
+def _blacken_422(rows: np.ndarray, mask: np.ndarray, *, luma_first: bool) -> None:
+    """Two pixels share a chroma: where one is black, both lose their colour."""
+    pairs = mask.copy()
+    even = mask.shape[1] // 2 * 2
+    pairs[:, :even] = np.repeat(mask[:, :even:2] | mask[:, 1:even:2], 2, axis=1)
+    luma, chroma = (rows[:, 0::2], rows[:, 1::2]) if luma_first else (rows[:, 1::2], rows[:, 0::2])
+    luma[mask], chroma[pairs] = BLACK_LUMA, NO_CHROMA
+
+
+def _blacken_planar(message: Any, mask: np.ndarray, encoding: str) -> None:
+    planes = 3 if encoding == 'nv24' else 1.5
+    message = LumaStep(message, planes)
+    height, width, step = message.height, message.width, message.step
+    rows_of(message, width, planes)[:height][mask] = BLACK_LUMA
+    chroma = message.data[step * height:int(step * height * planes)]
+    if encoding == 'nv24':
+        chroma.reshape(height, 2 * step)[:, :2 * width][np.repeat(mask, 2, axis=1)] = NO_CHROMA
+        return
+    if height % 2 or width % 2 or step % 2:
+        raise InputError(f"image of encoding '{message.encoding}' needs an even size and step, found {width} x {height}"
+                         f' and {step}')
+    half = mask[::2, ::2] | mask[1::2, ::2] | mask[::2, 1::2] | mask[1::2, 1::2]
+    if encoding == 'yuv420':
+        chroma.reshape(height, step // 2)[:, :width // 2][np.concatenate([half, half])] = NO_CHROMA
+    else:
+        chroma.reshape(height // 2, step)[:, :width][np.repeat(half, 2, axis=1)] = NO_CHROMA
+
+
+def _compressed(message: Any, polygons: Polygons) -> np.ndarray:
+    data = np.frombuffer(message.data, np.uint8)
+    check_container(data, str(message.format))
+    try:
+        image = cv2.imdecode(data, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error:  # a size that no memory holds
+        image = None
+    if image is None:
+        raise InputError(f"compressed image of format '{message.format}', {len(data)} bytes, cannot be decoded")
+    mask = ignored_mask(polygons, image.shape[1::-1])
+    dark = _darkened(image.reshape(*mask.shape, -1), mask).reshape(image.shape)
+    if data[0] == 0xff:
+        return cv2.imencode('.jpg', dark, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].ravel()
+    return cv2.imencode('.png', dark, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].ravel()

@@ -1,0 +1,73 @@
+"""Regions that are never tracked and never shown: `ignore_regions`.
+
+Whoever draws on an image of the camera, or sends or stores one, blacks it out first:
+
+    image = black_out(image, options.ignored_polygons)
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import cv2
+import numpy as np
+
+from autocalib_ros.errors import UsageError
+
+SUBPIXEL_BITS = 4
+Polygons = tuple[tuple[tuple[float, float], ...], ...]
+"""Polygons of points (u, v) in pixels of the full image."""
+
+
+def black_out(image: np.ndarray, polygons: Polygons) -> np.ndarray:
+    """Return an image (H, W) or (H, W, 3), of the full size, with the polygons black: a copy, itself without any."""
+    if not polygons:
+        return image
+    return cv2.bitwise_and(image, image, mask=_shown(polygons, image.shape[1::-1]))
+
+
+@lru_cache(maxsize=8)
+def _shown(polygons: Polygons, size: tuple[int, int]) -> np.ndarray:
+    """Return 255 where an image of `size` (width, height) is shown, 0 elsewhere, uint8 (H, W)."""
+    return np.where(ignored_mask(polygons, size), 0, 255).astype(np.uint8)
+
+
+@lru_cache(maxsize=8)
+def ignored_mask(polygons: Polygons, size: tuple[int, int]) -> np.ndarray:
+    """Return which pixels of an image of `size` (width, height) lie in a polygon or on its border, bool (H, W)."""
+    mask = np.zeros(size[::-1], np.uint8)
+    for polygon in polygons:
+        points = np.round(np.array(polygon) * 2**SUBPIXEL_BITS).astype(np.int32)
+        cv2.fillPoly(mask, [points], 1, shift=SUBPIXEL_BITS)
+    inside = mask > 0
+    inside.flags.writeable = False  # it is shared
+    return inside
+
+
+def require_seen(polygons: Polygons, size: tuple[int, int]) -> None:
+    """Raise UsageError when a polygon lies wholly outside images of `size` (width, height)."""
+    for number, polygon in enumerate(polygons, start=1):
+        if not ignored_mask((polygon,), size).any():
+            raise UsageError(f"polygon {number} of 'ignore_regions' lies wholly outside the images, which have "
+                             f'{size[0]}x{size[1]}: give pixels of the full image as the camera sends it')
+
+
+class Ignored:
+    """The regions in pixels of the tracked image, for those who look for points and edges."""
+
+    def __init__(self, polygons: Polygons, full_size: tuple[int, int], tracked_size: tuple[int, int]) -> None:
+        self._black: np.ndarray | None = None
+        if polygons:
+            black = ignored_mask(polygons, full_size).astype(np.uint8)
+            # a tracked pixel that holds any of it counts as it
+            black = cv2.resize(black * 255, tracked_size, interpolation=cv2.INTER_AREA)
+            self._black = (black > 0).astype(np.uint8)
+
+    def near(self, margin_px: int) -> np.ndarray | None:
+        """Return which pixels lie within a margin of a region, uint8 0 or 1 (h, w): their surroundings are black too.
+
+        None where no region is ignored.
+        """
+        if self._black is None:
+            return None
+        return cv2.dilate(self._black, np.ones((2 * margin_px + 1, 2 * margin_px + 1), np.uint8))

@@ -1,0 +1,83 @@
+"""Pictures that show no new view: repeated, frozen or hidden by a shutter; and what has changed behind it.
+
+A thermal core closes a shutter every few minutes to correct its pixels. Meanwhile it repeats the last picture or
+sends that of the shutter, for 0.3 to 1 s; afterwards offset and pattern of its grey levels are others.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+
+import cv2
+import numpy as np
+
+VIEW_WIDTH = 64
+"""Width at which two pictures are compared as views: finer than lorries, coarser than noise."""
+ALIKE = 0.3
+"""Least correlation between two pictures of one view: what drives through leaves much more, another view none."""
+HIDDEN_S = 2.0
+"""A shutter is open again after this; what is seen then is the view."""
+FLAT_LEVELS = 1.0
+"""Standard deviation, in grey levels, below which a picture shows nothing that could be found again."""
+LEAP_LEVELS = 6.0
+"""Half of the picture changed by more than this at once: the light, the gain or the offset leapt, for the motion mask
+calls moving what changes by ten levels, and nothing that drives covers half of the picture from one image to the next.
+"""
+FIELD_MEDIAN = 15
+"""Side of the median, in pixels of the reduced picture, that tells the camera's own change from that of traffic."""
+
+
+class Seen(Enum):
+    """What a picture is beside the last one used."""
+
+    NEW = 'the same view, later'
+    REPEATED = 'the same picture again'
+    HIDDEN = 'another view, for a moment'
+    LEAPT = 'a view whose grey levels have nothing to do with those before'
+
+
+class View:
+    """Compares the pictures of one stream; what is `REPEATED` or `HIDDEN` is not to be used."""
+
+    def __init__(self, repeated_levels: float, leap_levels: float = np.inf, flat_levels: float = FLAT_LEVELS) -> None:
+        self._repeated_levels, self._leap_levels, self._flat_levels = repeated_levels, leap_levels, flat_levels
+        self._last: np.ndarray | None = None
+        self._last_s = 0.0
+
+    def judge(self, picture: np.ndarray, time_s: float) -> Seen:
+        """Compare a reduced grey picture (h, w), of any type, with the last one used."""
+        seen = Seen.NEW if self._last is None else self._compare(self._last, picture, time_s)
+        if seen is not Seen.HIDDEN:
+            self._last_s = time_s
+        if seen in (Seen.NEW, Seen.LEAPT):
+            self._last = picture
+        return seen
+
+    def _compare(self, last: np.ndarray, picture: np.ndarray, time_s: float) -> Seen:
+        if cv2.absdiff(last, picture).max() <= self._repeated_levels:
+            return Seen.REPEATED
+        before, now = _coarse(last), _coarse(picture)
+        if before.std() >= self._flat_levels and _correlation(before, now) < ALIKE:
+            return Seen.HIDDEN if time_s - self._last_s <= HIDDEN_S else Seen.LEAPT
+        return Seen.LEAPT if np.median(np.abs(now - before)) > self._leap_levels else Seen.NEW
+
+
+def levelled(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Give a grey uint8 image (H, W) the offset, slowly varying over the image, of a later one of the same view."""
+    change = np.clip(_coarse(after) - _coarse(before) + 128.0, 0, 255).astype(np.uint8)
+    field = cv2.medianBlur(change, FIELD_MEDIAN).astype(np.float32) - 128.0
+    return np.clip(before + cv2.resize(field, before.shape[::-1]) + 0.5, 0, 255).astype(np.uint8)
+
+
+def _coarse(picture: np.ndarray) -> np.ndarray:
+    """Reduce a picture (h, w) to `VIEW_WIDTH`, float32."""
+    height, width = picture.shape
+    columns = min(VIEW_WIDTH, width)
+    size = (columns, max(1, height * columns // width))
+    return cv2.resize(picture.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+
+
+def _correlation(before: np.ndarray, now: np.ndarray) -> float:
+    """Correlation coefficient of two pictures; 0 where one is flat."""
+    before, now = before - before.mean(), now - now.mean()
+    return float((before * now).sum() / max(np.sqrt((before**2).sum() * (now**2).sum()), 1e-9))
