@@ -38,11 +38,6 @@ def bgr(colour: str) -> tuple[int, int, int]:
     return int(colour[5:7], 16), int(colour[3:5], 16), int(colour[1:3], 16)
 
 
-def in_colour(image: np.ndarray) -> np.ndarray:
-    """Return a grey (H, W) or BGR (H, W, 3) image as a BGR one that may be drawn on."""
-    return cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if image.ndim == 2 else image.copy()
-
-
 def letter_px(height: int) -> float:
     """Return the height of a line of text in a picture of a height."""
     return min(max(LETTER_SHARE * height, LEAST_LETTER_PX), MOST_LETTER_PX)
@@ -147,10 +142,11 @@ class Overlay:
         self._ink[rows, columns] = np.round(self._ink[rows, columns] * (1 - share) + colour * share)
         self._clear[rows, columns] = np.round(self._clear[rows, columns] * (1 - share))
 
-    def lay_over(self, picture: np.ndarray) -> None:
-        """Lay it over a picture of its size."""
-        cv2.multiply(picture, self._clear, picture, 1 / 255)
-        cv2.add(picture, self._ink, picture)
+    def laid_over(self, image: np.ndarray) -> np.ndarray:
+        """Return an image of its size, grey or BGR, with this laid over it."""
+        colour = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if image.ndim == 2 else image
+        picture = cv2.multiply(colour, self._clear, scale=1 / 255)
+        return cv2.add(picture, self._ink, picture)
 
 
 @dataclass(frozen=True)

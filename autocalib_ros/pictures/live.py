@@ -22,7 +22,6 @@ from autocalib_ros.pictures.drawing import (
     caption_panel,
     draw_dots,
     draw_paths,
-    in_colour,
     lay_panel,
     letter_px,
     line_px,
@@ -44,7 +43,7 @@ FOLLOWED, HORIZON, AXES = '#ffe14d', '#ff7bd5', ('#ff5544', '#55cc55')
 """Colours: points followed now, the horizon, x and y of the ground frame."""
 MOST_PATHS = 80
 """Tracks of a road, or rejected, that are drawn: more would hide the road."""
-TOP_VIEW_PX = 720
+TOP_VIEW_PX = 640
 SCALE_SHARE = 0.2
 """Length of the scale bar, share of the picture's width at the most."""
 MARGIN_HEIGHTS = 0.6
@@ -88,8 +87,7 @@ class DebugPicture:
 
     def draw(self, image: np.ndarray, followed_px: np.ndarray, caption: Caption) -> np.ndarray:
         """Return the picture of an image, grey or BGR, with where points went of late (n, steps, 2), newest last."""
-        picture = in_colour(image)
-        self._overlay.lay_over(picture)
+        picture = self._overlay.laid_over(image)
         width_px = line_px(len(picture))
         draw_paths(picture, followed_px, FOLLOWED, width_px)
         if len(followed_px):
@@ -173,9 +171,7 @@ class TopPicture:
 
     def draw(self, image: np.ndarray) -> np.ndarray:
         """Return the picture of an image, grey or BGR."""
-        picture = in_colour(self._lookup.of(image))
-        self._overlay.lay_over(picture)
-        return picture
+        return self._overlay.laid_over(self._lookup.of(image))
 
     def _add_camera(self, ground: GroundPlane, letter: float) -> None:
         """Mark the camera's foot by an arrow to where it looks, and the axes of the ground frame by arms."""

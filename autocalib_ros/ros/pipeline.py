@@ -300,7 +300,7 @@ class Pipeline:
         return self._solve(evidence, self._options, lens=self._fitting(evidence.image_size))
 
     def _told(self, result: Result, job: _Job) -> Result | None:
-        """Tell the listener, unless a reset came before."""
+        """Tell the listener and the viewer, unless a reset came before."""
         with self._telling:
             if job.life != self._life:
                 return None

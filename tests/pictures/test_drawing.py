@@ -78,8 +78,9 @@ def test_an_overlay_covers_as_much_as_it_is_told_to():
     overlay = Overlay(40, 60)
     overlay.add_box(10, 5, 30, 25, PAPER, 0.5)
     overlay.add_box(10, 5, 20, 25, GREY, 1.0)
-    picture = np.full((40, 60, 3), 100, np.uint8)
-    overlay.lay_over(picture)
+    image = np.full((40, 60, 3), 100, np.uint8)
+    picture = overlay.laid_over(image)
+    assert (image == 100).all() and (picture == overlay.laid_over(image[..., 0])).all()
     assert picture[10, 25] == pytest.approx(177.5, abs=1)  # halfway between 100 and 255, rounded twice
     assert tuple(picture[10, 15]) == bgr(GREY)
     assert (picture[30:] == 100).all() and (picture[:, 30:] == 100).all()
