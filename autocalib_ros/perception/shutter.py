@@ -15,10 +15,13 @@ VIEW_WIDTH = 64
 """Width at which two pictures are compared as views: finer than lorries, coarser than noise."""
 ALIKE = 0.3
 """Least correlation between two pictures of one view: what drives through leaves much more, another view none."""
+GONE = 0.5
+"""Another view changes most pixels by as much as they differ among themselves, at least by this share of it. What
+drives changes few, however bright it is: the rest of a dark or foggy road stays, though its correlation is lost."""
 HIDDEN_S = 2.0
 """A shutter is open again after this; what is seen then is the view."""
 FLAT_LEVELS = 1.0
-"""Standard deviation, in grey levels, below which a picture shows nothing that could be found again."""
+"""Spread, in grey levels, below which a picture shows nothing that could be found again."""
 LEAP_LEVELS = 6.0
 """Half of the picture changed by more than this at once: the light, the gain or the offset leapt, for the motion mask
 calls moving what changes by ten levels, and nothing that drives covers half of the picture from one image to the next.
@@ -57,7 +60,9 @@ class View:
         if cv2.absdiff(last, picture).max() <= self._repeated_levels:
             return Seen.REPEATED
         before, now = _coarse(last), _coarse(picture)
-        if before.std() >= self._flat_levels and _correlation(before, now) < ALIKE:
+        spread = _spread(before)
+        hidden = spread >= self._flat_levels and _spread(now - before) > GONE * spread
+        if hidden and _correlation(before, now) < ALIKE:
             return Seen.HIDDEN if time_s - self._last_s <= HIDDEN_S else Seen.LEAPT
         return Seen.LEAPT if np.median(np.abs(now - before)) > self._leap_levels else Seen.NEW
 
@@ -75,6 +80,11 @@ def _coarse(picture: np.ndarray) -> np.ndarray:
     columns = min(VIEW_WIDTH, width)
     size = (columns, max(1, height * columns // width))
     return cv2.resize(picture.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+
+
+def _spread(picture: np.ndarray) -> float:
+    """Standard deviation of most of a picture, by the median of the deviations from its median."""
+    return 1.4826 * float(np.median(np.abs(picture - np.median(picture))))
 
 
 def _correlation(before: np.ndarray, now: np.ndarray) -> float:

@@ -185,3 +185,16 @@ def test_a_point_far_from_where_it_was_foreseen_is_given_up() -> None:
     foreseen = np.array([[40.0, 0.0]] * 4 + [[0.0, 0.0]])
     found = np.array([[42.0, 3.0], [31.0, 0.0], [29.0, 0.0], [40.0, 12.0], [2.0, 0.0]])
     assert _arrived(foreseen, found).tolist() == [True, True, False, False, True]
+
+
+@pytest.mark.parametrize('dark', [0.0, 2.0])
+def test_a_bright_vehicle_on_a_road_that_shows_little_hides_nothing(dark):
+    # all that correlates is the vehicle, which is elsewhere in each picture
+    road = dark + np.random.default_rng(0).normal(0.0, 2.0, (180, 320)).clip(0.0)
+    view = View(repeated_levels=0.0)
+    seen = []
+    for column in range(0, 240, 40):
+        picture = road.copy()
+        picture[80:140, column:column + 60] = 230.0
+        seen.append(view.judge(picture.astype(np.uint8), column / 200.0))
+    assert set(seen) == {Seen.NEW}
