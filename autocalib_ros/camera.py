@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 
@@ -23,6 +24,19 @@ NEWTON_STEPS = 20
 """Most: Newton's iteration doubles its digits, so that four or five are the rule."""
 ANGLES_RAD = np.linspace(0.0, np.pi, 721)
 """Where it is looked for that r(theta) falls."""
+
+
+class Lens(Protocol):
+    """Any lens in images of a size."""
+
+    width: int
+    height: int
+
+    def project(self, bearings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return pixels (..., 2) of bearings (..., 3), and where they are valid (...)."""
+
+    def unproject(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return unit bearings (..., 3) of pixels (..., 2), and where they are valid (...)."""
 
 
 @dataclass(frozen=True)
@@ -52,11 +66,7 @@ class Camera:
         """
         if (width, height) == (self.width, self.height):
             return self
-        across, down = width / self.width, height / self.height
-        # rounding to whole pixels may have changed the shape by half of one
-        if min(abs(self.height * across - height), abs(self.width * down - width)) > 0.5:
-            raise UsageError(f'the lens was calibrated in images of {self.width}x{self.height}, and these images have'
-                             f' {width}x{height}, another shape: give a calibration of their size')
+        across, down = scale_factors((self.width, self.height), (width, height))
         cx, cy = self.principal_point_px
         return replace(self, width=width, height=height, focal_px=self.focal_px * math.sqrt(across * down),
                        principal_point_px=((cx + 0.5) * across - 0.5, (cy + 0.5) * down - 0.5))
@@ -134,6 +144,16 @@ class Camera:
         ahead = valid & (bearings[..., 2] > 1e-6)
         scale = np.where(ahead, (focal_px or self.focal_px) / np.where(ahead, bearings[..., 2], 1.0), np.nan)
         return scale[..., None] * bearings[..., :2] + self.principal_point_px
+
+
+def scale_factors(calibrated: tuple[int, int], images: tuple[int, int]) -> tuple[float, float]:
+    """Return how many times wider and higher images are than those of a calibration; UsageError for another shape."""
+    across, down = images[0] / calibrated[0], images[1] / calibrated[1]
+    # rounding to whole pixels may have changed the shape by half of one
+    if min(abs(calibrated[1] * across - images[1]), abs(calibrated[0] * down - images[0])) > 0.5:
+        raise UsageError(f'the lens was calibrated in images of {calibrated[0]}x{calibrated[1]}, and these images have'
+                         f' {images[0]}x{images[1]}, another shape: give a calibration of their size')
+    return across, down
 
 
 def _series(k: tuple[float, ...], t2: np.ndarray) -> np.ndarray:

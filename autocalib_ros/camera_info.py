@@ -8,12 +8,12 @@ import reprlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import yaml
 
-from autocalib_ros.camera import Camera
+from autocalib_ros.camera import Camera, Lens
 from autocalib_ros.errors import AutocalibError, InputError, UsageError
 from autocalib_ros.files import write_atomically
 from autocalib_ros.opencv_lens import (
@@ -36,6 +36,7 @@ MAX_BYTES = 1_000_000
 """No camera_info is nearly so long."""
 MAX_NUMBER = 1e9
 """Beyond this nothing is meant in earnest, and powers of it would leave the numbers of a computer."""
+Read = TypeVar('Read')
 WHAT_TO_GIVE = 'give the file of camera_info_manager, or what `ros2 topic echo --once` prints of a CameraInfo'
 
 
@@ -162,7 +163,7 @@ def _misfit(camera: Camera, model: str, error_px: float) -> ModelMisfit:
     return ModelMisfit(message, f'Set distortion_model to {others}.')
 
 
-def rectified_matrix(camera: Camera, balance: float = 0.0) -> np.ndarray:
+def rectified_matrix(camera: Lens, balance: float = 0.0) -> np.ndarray:
     """Return the K, shape (3, 3), of a distortion-free image of equal size.
 
     At `balance` 0 the lens fills it wholly: the largest axis-parallel rectangle about the axis inside the undistorted
@@ -175,7 +176,7 @@ def rectified_matrix(camera: Camera, balance: float = 0.0) -> np.ndarray:
     return (1.0 - balance) * filled + balance * whole
 
 
-def _undistorted_borders(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _undistorted_borders(camera: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return the slopes x of the left and right border's pixels and y of the upper and lower border's, each (n,)."""
     width, height = camera.width, camera.height
     across, down = np.linspace(0, width - 1, 257), np.linspace(0, height - 1, 257)
@@ -191,7 +192,7 @@ def _undistorted_borders(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.nda
             slopes(across, 0.0)[:, 1], slopes(across, height - 1.0)[:, 1])
 
 
-def _view(camera: Camera, left: float, right: float, top: float, bottom: float,
+def _view(camera: Lens, left: float, right: float, top: float, bottom: float,
           choose: Callable[[float, float], float]) -> np.ndarray:
     """Return the K with square pixels that shows a rectangle of slopes in its middle, one of its sides exactly."""
     width, height = camera.width, camera.height
@@ -227,18 +228,16 @@ def camera_info_yaml(info: CameraInfo, camera_name: str) -> str:
 
 def read_camera_info_fields(path: Path) -> CameraInfo:
     """Read camera_info_manager's file as it stands, whatever lens it tells of; InputError where it is none."""
-    try:
-        fields = _fields(path)
-        model, sizes = _model(fields)
-        return CameraInfo(
-            width=_pixels(fields, 'image_width', 'width'), height=_pixels(fields, 'image_height', 'height'),
-            distortion_model=model, k=_numbers(fields, (9,), 'camera_matrix', 'k'),
-            d=_numbers(fields, sizes, 'distortion_coefficients', 'd'),
-            r=_numbers(fields, (9,), 'rectification_matrix', 'r'), p=_numbers(fields, (12,), 'projection_matrix', 'p'))
-    except OSError as error:
-        raise InputError(f'cannot read {path}: {error.strerror or error}') from error
-    except AutocalibError as error:
-        raise InputError(f'{path}: {error}') from error
+    return _read(path, _as_it_stands)
+
+
+def _as_it_stands(fields: Mapping[str, Any]) -> CameraInfo:
+    model, sizes = _model(fields)
+    return CameraInfo(
+        width=_pixels(fields, 'image_width', 'width'), height=_pixels(fields, 'image_height', 'height'),
+        distortion_model=model, k=_numbers(fields, (9,), 'camera_matrix', 'k'),
+        d=_numbers(fields, sizes, 'distortion_coefficients', 'd'),
+        r=_numbers(fields, (9,), 'rectification_matrix', 'r'), p=_numbers(fields, (12,), 'projection_matrix', 'p'))
 
 
 def read_camera_info(path: Path) -> Camera:
@@ -247,8 +246,31 @@ def read_camera_info(path: Path) -> Camera:
     'equidistant' is taken as it stands, other models as the nearest Kannala-Brandt lens. Raises InputError that says
     what is wrong with the file, what was expected and what to do.
     """
+    return _read(path, lambda fields: nearest_camera(lens_of_fields(fields)))
+
+
+def read_exact_lens(path: Path) -> tuple[OpencvLens, np.ndarray | None]:
+    """Read from the same files the lens as it stands, and P R, shape (3, 3), which images its rectified picture.
+
+    The latter is None where the file does not tell it. InputError as of `read_camera_info`.
+    """
+    return _read(path, lambda fields: (lens_of_fields(fields), _rectified(fields)))
+
+
+def _rectified(fields: Mapping[str, Any]) -> np.ndarray | None:
+    if not fields.keys() & {'projection_matrix', 'p'}:
+        return None
+    projection = np.array(_numbers(fields, (12,), 'projection_matrix', 'p')).reshape(3, 4)
+    turn = (np.array(_numbers(fields, (9,), 'rectification_matrix', 'r')).reshape(3, 3)
+            if fields.keys() & {'rectification_matrix', 'r'} else np.eye(3))
+    told = projection[0, 0] > 0 and projection[1, 1] > 0 and abs(np.linalg.det(turn)) > 0.5
+    return projection[:, :3] @ turn if told else None
+
+
+def _read(path: Path, make: Callable[[Mapping[str, Any]], Read]) -> Read:
+    """Return what is made of the fields of a file; InputError names the file."""
     try:
-        return nearest_camera(lens_of_fields(_fields(Path(os.path.expanduser(path)))))
+        return make(_fields(Path(os.path.expanduser(path))))
     except OSError as error:
         raise InputError(f'cannot read {path}: {error.strerror or error}') from error
     except AutocalibError as error:

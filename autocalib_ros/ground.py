@@ -167,8 +167,11 @@ class Ground:
         return np.where((there & valid)[:, None], pixels, np.nan), there & valid
 
     @cached_property
-    def _moved(self) -> list[tuple[Camera, np.ndarray, np.ndarray]] | None:
-        """Lens, pose and place of the camera on both sides of this one along each axis of the covariance."""
+    def deviants(self) -> list[tuple[Camera, np.ndarray, np.ndarray]] | None:
+        """Lens, pose and place of the camera on both sides of this one along each axis of the covariance.
+
+        Each is `SHARE_OF_SIGMA` away; None where the covariance is not known.
+        """
         if self.covariance is None or not isinstance(self.lens, Camera):
             return None
         # each row and column by its own sigma: their units have nothing to do with each other
@@ -195,11 +198,12 @@ class Ground:
 
     def _spread(self, pixels: np.ndarray, height_m: float | np.ndarray, valid: np.ndarray) -> np.ndarray | None:
         """Covariance (n, 2, 2) of the places of pixels that the calibration leaves, nan where they are not valid."""
-        if self._moved is None:
+        moved = self.deviants
+        if moved is None:
             return None
         with np.errstate(all='ignore'):  # what is not valid may be anything, and is left out
             places = [((height_m - camera_m[2]) / rays[:, 2])[:, None] * rays[:, :2]
-                      for lens, rotation, camera_m in self._moved for rays in [lens.unproject(pixels)[0] @ rotation.T]]
+                      for lens, rotation, camera_m in moved for rays in [lens.unproject(pixels)[0] @ rotation.T]]
             sides = np.reshape(places, (len(places) // 2, 2, len(pixels), 2))
             spread = _squares((sides[:, 0] - sides[:, 1]) / (2 * SHARE_OF_SIGMA))
         spread[~valid] = np.nan

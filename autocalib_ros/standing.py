@@ -10,23 +10,15 @@ import math
 from dataclasses import dataclass, replace
 from enum import Enum
 
-import numpy as np
-
 from autocalib_ros.calibration import Calibration, GroundPlane, StandardDeviations
 from autocalib_ros.camera import Camera
+from autocalib_ros.compare import lenses_apart_px
+from autocalib_ros.comparison import AGREES_SIGMAS, SAME_LENS_PX, SAME_NUMBER
 from autocalib_ros.config import Options
 from autocalib_ros.errors import UsageError
 from autocalib_ros.estimation.ground_plane import tilt_and_roll_deg
 from autocalib_ros.estimation.scale import Scale, known_scale
 
-AGREES_SIGMAS = 3.0
-"""Two solutions of one camera are farther apart than this in one number out of 400."""
-SAME_LENS_PX = 0.5
-"""Two lenses that image every direction closer together than this serve every consumer alike."""
-SAME_HEIGHT = 1e-9
-"""Heights relatively closer than this are one number."""
-FIELD_SAMPLES = 17
-"""Rows and columns of pixels at which two lenses are compared."""
 GRADES = ('lens', 'unit_scale', 'assumed', 'full')
 """From the least that a calibration gives to the most."""
 
@@ -88,7 +80,7 @@ def decided(state: CalibrationState, before: Calibration | None, fresh: Calibrat
 
 def _unlike_lens(before: Calibration, fresh: Calibration) -> list[str | None]:
     """Name what differs beyond its deviations; None stands for what has none."""
-    if _distance_px(before.camera, fresh.camera) <= SAME_LENS_PX:
+    if lenses_apart_px(before.camera, fresh.camera) <= SAME_LENS_PX:
         return []
     return _unlike(_lens_numbers(before), _lens_numbers(fresh))
 
@@ -129,7 +121,7 @@ def _unlike(before: list[_Number], fresh: list[_Number]) -> list[str | None]:
     told: list[str | None] = []
     for old, new in zip(before, fresh, strict=True):
         apart = abs(new.value - old.value)
-        if apart <= SAME_HEIGHT * abs(old.value):
+        if apart <= SAME_NUMBER * abs(old.value):
             continue
         if old.sigma is None or new.sigma is None:
             told.append(None)
@@ -137,16 +129,6 @@ def _unlike(before: list[_Number], fresh: list[_Number]) -> list[str | None]:
             told.append(f'{old.name} {old.value:.4g} +- {old.sigma:.2g}{old.unit} was kept, {new.value:.4g} +- '
                         f'{new.sigma:.2g}{new.unit} was found')
     return told
-
-
-def _distance_px(before: Camera, fresh: Camera) -> float:
-    """Return how far apart at the most two lenses of one image size image the same direction, pixels."""
-    pixels = np.stack(np.meshgrid(np.linspace(0, before.width - 1, FIELD_SAMPLES),
-                                  np.linspace(0, before.height - 1, FIELD_SAMPLES)), axis=-1)
-    bearings, reached = before.unproject(pixels)
-    seen, valid = fresh.project(bearings)
-    apart = np.hypot(*np.moveaxis(seen - pixels, -1, 0))
-    return float(apart[reached & valid].max(initial=0.0)) if (reached & valid).any() else math.inf
 
 
 def _as_sure(fresh: Calibration, before: Calibration) -> bool:
@@ -178,7 +160,7 @@ def with_what_is_given(kept: Calibration, options: Options, lens: Camera | None)
     if any(getattr(kept, name) != value for name, value in form.items()):
         kept = replace(kept, **form)
     size = kept.evidence.image_size
-    if lens is not None and _distance_px(lens.scaled_to(*size), kept.camera) > SAME_LENS_PX:
+    if lens is not None and lenses_apart_px(lens.scaled_to(*size), kept.camera) > SAME_LENS_PX:
         raise UsageError("its lens is not that of 'camera_info_file': it is left out")
     given_now = options.camera_height > 0 or options.scale_from == 'distance'
     if kept.ground is None or not given_now:
@@ -193,7 +175,7 @@ def with_what_is_given(kept: Calibration, options: Options, lens: Camera | None)
 
 def _scaled(kept: Calibration, ground: GroundPlane, scale: Scale) -> Calibration:
     height = scale.height(kept.camera, ground.normal_in_camera)
-    if ground.metric and abs(height - ground.height_m) <= SAME_HEIGHT * height:
+    if ground.metric and abs(height - ground.height_m) <= SAME_NUMBER * height:
         return kept
     words = tuple(text for text in kept.assumptions if not text.startswith('scale by '))
     return replace(

@@ -13,9 +13,10 @@ import autocalib_ros
 PACKAGE = Path(autocalib_ros.__file__).parent
 # From the ground up. A room imports from rooms in lower lines only; rooms of one line do not know each other.
 STOREYS = (('errors', 'threads', 'redundancy'), ('config', 'files'), ('camera',), ('opencv_lens',), ('camera_info',),
-           ('calibration', 'info_lens'), ('calibration_reader',), ('evidence', 'ground', 'store'),
-           ('perception', 'estimation', 'pictures'), ('calibrator', 'standing'), ('ros', 'offline'), ('cli',),
-           ('__main__', 'benchmark'))
+           ('calibration', 'info_lens'), ('calibration_reader',),
+           ('evidence', 'ground', 'store', 'known_camera', 'comparison'),
+           ('perception', 'estimation', 'pictures'), ('compare',), ('calibrator', 'standing'),
+           ('ros', 'offline'), ('commands',), ('cli',), ('__main__', 'benchmark'))
 STOREY = {room: height for height, rooms in enumerate(STOREYS) for room in rooms}
 ROS_PACKAGES = ('rclpy', 'ament_index_python', 'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs',
                 'rcl_interfaces', 'rosgraph_msgs', 'sensor_msgs', 'std_msgs', 'std_srvs', 'tf2_msgs', 'tf2_ros',

@@ -201,3 +201,24 @@ def test_an_interrupt_ends_quietly(still_video, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr('autocalib_ros.offline.sources.open_source', interrupted)
     assert main(['replay', str(still_video), '--out', str(tmp_path / 'out')]) == 130
     assert 'Traceback' not in capsys.readouterr().err
+
+
+def test_json_is_calibration_json_and_the_rest_goes_to_stderr(still_video, tmp_path, capsys):
+    out = tmp_path / 'out'
+    assert main(['replay', str(still_video), '--json', '--out', str(out)]) == 3
+    captured = capsys.readouterr()
+    assert captured.out == (out / 'calibration.json').read_text()
+    assert 'Not calibrated: ' in captured.err and 'Written to' in captured.err
+    assert main(['replay', str(still_video), '--json', '--quiet', '--out', str(out)]) == 3
+    quiet = capsys.readouterr()
+    assert quiet.out == captured.out
+    assert quiet.err.startswith('Not calibrated: ') and quiet.err.count('\n') == 1
+
+
+def test_colours_are_for_terminals(still_video, tmp_path, capsys, monkeypatch):
+    command = ['replay', str(still_video), '--quiet', '--out', str(tmp_path / 'out')]
+    for force, told in (('', 'Not calibrated: '), ('1', '\033[31mNot calibrated: ')):
+        monkeypatch.setenv('FORCE_COLOR', force)
+        monkeypatch.setenv('NO_COLOR', '')
+        assert main(command) == 3
+        assert capsys.readouterr().err.startswith(told)

@@ -2,16 +2,20 @@
 
 import os
 import re
+import shlex
 import shutil
 import subprocess
 from pathlib import Path
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 
 from autocalib_ros.calibration import write_calibration_json
 from autocalib_ros.calibrator import solve
+from autocalib_ros.cli import main
+from autocalib_ros.commands.replay import DEFAULT_OUT
 from autocalib_ros.config import Declared, NodeOptions, Options, declared
 from autocalib_ros.offline.synthetic_evidence import Junction, synthetic_evidence
 from autocalib_ros.ros.status import Counts, Situation, status
@@ -21,6 +25,8 @@ README = ROOT / 'README.md'
 START = 'python3 -m venv'
 MADE = re.compile(r"(?:create_\w+\([^')]*|\w+_publisher\([^')]*|resolve_topic_name\()'([~/\w]+)'")
 """A publisher, subscription, service or client that is made, and its name."""
+LARGEST_PICTURE = 300_000
+"""Bytes that a page at its top may take to load."""
 
 
 @pytest.fixture(scope='module')
@@ -88,6 +94,26 @@ def test_the_example_of_a_tracker_runs(tmp_path, monkeypatch):
     exec(compile(block, str(README), 'exec'), names)
     assert measured == [((2,), (2, 2))] * 2
     assert names['seen'].shape == (2,) and (names['found'].sigma_m > 0).all()
+
+
+def test_the_picture_at_the_top_is_what_its_command_makes(tmp_path, monkeypatch):
+    (link, title), = re.findall(r'!\[[^\]]+\]\((\S+) "([^"]+)"\)', README.read_text(encoding='utf-8'))
+    demo, picture = (shlex.split(command) for command in title.split(' && '))
+    assert demo == ['autocalib', 'demo', '--keep-bag']
+    assert picture[:2] == ['autocalib', 'picture'] and picture[4] == link
+    assert Path(picture[2]).parent == Path(picture[3]).parent == DEFAULT_OUT
+    assert (ROOT / link).stat().st_size < LARGEST_PICTURE
+    # the same command on images of a moment, in place of the recording that takes minutes to simulate
+    evidence = synthetic_evidence(Junction(), np.random.default_rng(0))
+    monkeypatch.chdir(tmp_path)
+    write_calibration_json(Path(picture[2]), solve(evidence, Options(camera_height=8.0)))
+    still = picture[3] + '.avi'
+    writer = cv2.VideoWriter(still, cv2.VideoWriter_fourcc(*'MJPG'), 0.1, (1280, 720))
+    for _ in range(6):
+        writer.write(np.full((720, 1280, 3), 90, np.uint8))
+    writer.release()
+    assert main([*picture[1:3], still, *picture[4:]]) == 0
+    assert cv2.imread(link).shape == cv2.imread(str(ROOT / link)).shape
 
 
 @pytest.mark.slow

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from autocalib_ros.calibration import Calibration, Refusal
+from autocalib_ros.calibration import Calibration, GroundPlane, Refusal
+from autocalib_ros.camera import Camera
 from autocalib_ros.config import Options, ScaleOptions
 from autocalib_ros.errors import InputError
 from autocalib_ros.offline.against_truth import angles_deg, distances_error
@@ -125,11 +126,12 @@ def compare(result: Calibration | Refusal, truth: dict[str, Any]) -> Comparison 
     angle = angles_deg(result.ground.normal_in_camera, up)
     sigma = result.stddev.height_m
     return Comparison(focal_percent, float(angle), result.ground.height_m - truth['camera']['height'],
-                      _distance_percent(result, truth), 'given' if sigma is None else f'stated +- {sigma:.2g} m')
+                      distance_percent(result.camera, result.ground, truth),
+                      'given' if sigma is None else f'stated +- {sigma:.2g} m')
 
 
-def _distance_percent(result: Calibration, truth: dict[str, Any]) -> float:
+def distance_percent(camera: Camera, ground: GroundPlane, truth: dict[str, Any]) -> float:
     """Return the median error of distances between points of the road that are not too far away."""
     points = _near_points(truth)
     true_m, pixels = points[:, :2], points[:, 2:]
-    return 100 * distances_error(true_m, image_to_ground(result.camera, result.ground, pixels))
+    return 100 * distances_error(true_m, image_to_ground(camera, ground, pixels))

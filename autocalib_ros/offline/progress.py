@@ -8,15 +8,21 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Protocol, TextIO
 
+from autocalib_ros.offline.terminal import columns_of, is_terminal, shortened
+
 LINE_EVERY_S = 5.0
 LINE_EVERY_SHARE = 0.1
+LEAST_BETWEEN_S = 1.0
+"""A short run that goes through its tenths or its states in a moment needs no ten lines."""
+BAR = '{desc} {percentage:3.0f} %|{bar:8}| {remaining} left{postfix}'
+OPEN_BAR = '{desc} {n_fmt}{unit}, {elapsed}{postfix}'
 
 
 class Progress(Protocol):
     """What `progress_bar` hands out."""
 
     def update_to(self, done: float, note: str = '') -> None:
-        """Show that `done` of the total is done, with a short note behind it."""
+        """Show that `done` of the total is done, with a short note behind it whose first word is the state."""
 
 
 @contextmanager
@@ -29,7 +35,7 @@ def progress_bar(total: float | None, unit: str, label: str, *, quiet: bool = Fa
     stream = stream or sys.stderr
     if quiet:
         yield _Silent()
-    elif stream.isatty():
+    elif is_terminal(stream):
         with _Bar(total, unit, label, stream) as bar:
             yield bar
     else:
@@ -44,44 +50,54 @@ class _Silent:
 
 
 class _Bar:
-    """tqdm with rate and time left."""
+    """tqdm's bar, with as much of the note behind it as the terminal has columns for."""
 
     def __init__(self, total: float | None, unit: str, label: str, stream: TextIO) -> None:
         from tqdm import tqdm  # imported late: `autocalib --help` has no use for it
 
-        self._bar = tqdm(total=total, unit=' ' + unit, desc=label, file=stream, dynamic_ncols=True, leave=True)
+        self._stream = stream
+        # a terminal of unknown size has no line for tqdm, which then shows nothing
+        self._bar = tqdm(total=total, unit=' ' + unit, desc=label, file=stream, leave=True, nrows=2,
+                         ncols=columns_of(stream) - 1, bar_format=BAR if total else OPEN_BAR)
+        self._note = ''
 
     def __enter__(self) -> _Bar:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._bar.refresh()
         self._bar.close()
 
     def update_to(self, done: float, note: str = '') -> None:
-        """Move the bar to `done`."""
-        if note:
-            self._bar.set_postfix_str(note, refresh=done == self._bar.n)
+        """Move the bar to `done`; show another state at once, because it may take a while."""
+        changed, self._note = _state(note) != _state(self._note), note
+        self._bar.ncols = columns_of(self._stream) - 1  # the window may have been resized
+        fixed = {**self._bar.format_dict, 'n': done, 'postfix': '', 'ncols': None}
+        room = self._bar.ncols - len(self._bar.format_meter(**fixed)) - len(', ')
+        self._bar.set_postfix_str(shortened(note, room), refresh=False)
         self._bar.update(done - self._bar.n)
+        if changed:
+            self._bar.refresh()
 
 
 class _Lines:
-    """One line every few seconds or per cent: for logs, pipes and files."""
+    """One line every few seconds or per cent, and for another state: for logs, pipes and files."""
 
     def __init__(self, total: float | None, unit: str, label: str, stream: TextIO) -> None:
         self._total, self._unit, self._label, self._stream = total, unit, label, stream
         self._begun = self._said_at = time.monotonic()
         self._said = self._done = 0.0
-        self._note = ''
+        self._note = self._said_note = ''
 
     def update_to(self, done: float, note: str = '') -> None:
         """Remember `done` and say it when it is time."""
         self._done, self._note = done, note
         step = LINE_EVERY_SHARE * self._total if self._total else float('inf')
         now = time.monotonic()
-        # a short run that goes through its tenths in a moment needs no ten lines
-        late, far = now - self._said_at >= LINE_EVERY_S, done - self._said >= step
+        late = now - self._said_at >= LINE_EVERY_S
+        far = done - self._said >= step or _state(note) != _state(self._said_note)
         complete = self._total is not None and self._said < self._total <= done
-        if late or complete or (far and now - self._said_at >= LINE_EVERY_S / 5):
+        if late or complete or (far and now - self._said_at >= LEAST_BETWEEN_S):
             self._say(now)
 
     def finish(self) -> None:
@@ -90,7 +106,7 @@ class _Lines:
             self._say(time.monotonic())
 
     def _say(self, now: float) -> None:
-        self._said, self._said_at = self._done, now
+        self._said, self._said_at, self._said_note = self._done, now, self._note
         elapsed = max(now - self._begun, 1e-6)
         parts = [f'{self._done:g} {self._unit}']
         if self._total:
@@ -99,3 +115,8 @@ class _Lines:
             parts += [f'{left_s:.0f} s left'] if 0 < self._done < self._total else []
         parts += [f'{self._done / elapsed:.1f} {self._unit}/s'] + ([self._note] if self._note else [])
         print(f'{self._label}: ' + ', '.join(parts), file=self._stream, flush=True)
+
+
+def _state(note: str) -> str:
+    """Return the first word of a note."""
+    return note.partition(' ')[0]

@@ -37,30 +37,44 @@ def replay(source: Source, options: Options, on_progress: Callable[[int, str], N
            lens: Camera | None = None, detector: VehicleDetector | None = None) -> ReplayResult:
     """Go through a recording and solve at its end; `on_progress` is told the frames done and a short note.
 
-    With a known `lens` only the pose is solved; UsageError at the first image that is not of its shape. A `detector`
-    that is open already is used, else that of the options is opened.
+    The first word of the note is the state: collecting, solving, calibrated or refused. With a known `lens` only the
+    pose is solved; UsageError at the first image that is not of its shape. A `detector` that is open already is used,
+    else that of the options is opened.
     """
+    tell = on_progress or (lambda done, note: None)
     calibrator, accepted_at_s, count, note, fitting = AutoCalibrator(options, detector), None, 0, '', None
+    latest: Calibration | Refusal | None = None
     for count, frame in enumerate(source.frames(), start=1):
         fitting = _fitting(lens, (frame.image.shape[1], frame.image.shape[0]))
         calibrator.add_image(frame.stamp_ns, frame.image)
         # a live run would have been accepted then; afterwards only the last solution counts
-        if accepted_at_s is None and (due := calibrator.take_due()) is not None and solve(due, options, lens=fitting):
-            accepted_at_s = due.seconds
-        if on_progress is not None:
-            if count % NOTE_EVERY == 1:
-                note = f'evidence {calibrator.progress()}'
-            on_progress(count, note)
+        if accepted_at_s is None and (due := calibrator.take_due()) is not None:
+            tell(count, 'solving')
+            latest = solve(due, options, lens=fitting)
+            accepted_at_s = due.seconds if latest else None
+        if on_progress is not None and (count % NOTE_EVERY == 1):
+            note = _note(calibrator, latest, accepted_at_s)
+        tell(count, note)
     evidence = calibrator.snapshot()
     if evidence is None:
         raise InputError(f'{source.name} gives no image')
-    if on_progress is not None:
-        on_progress(count, 'solving')
+    tell(count, 'solving')
     result = solve(evidence, options, lens=fitting)
+    tell(count, 'calibrated' if result else 'refused')
     if result and accepted_at_s is None:
         accepted_at_s = evidence.seconds
     return ReplayResult(result=result, evidence=evidence, accepted_at_s=accepted_at_s,
                         background=calibrator.background(), frames=count)
+
+
+def _note(calibrator: AutoCalibrator, latest: Calibration | Refusal | None, accepted_at_s: float | None) -> str:
+    """Say the state, how far the evidence has come, and what is missing."""
+    if isinstance(latest, Calibration):
+        return f'calibrated since {accepted_at_s:.0f} s: focal length {latest.camera.focal_px:.0f} px'
+    progress = calibrator.progress()
+    # all that a first solution needs is there, and yet it was refused: then that is what is missing
+    refused = latest is not None and not progress.missing
+    return f'collecting {progress}' + (f': {latest.message}' if refused else '')
 
 
 def solve_again(evidence: Evidence, options: Options, lens: Camera | None = None) -> ReplayResult:

@@ -118,16 +118,3 @@ def field_of_view_deg(camera: Camera) -> tuple[float, float]:
 
 def _number(value: float | None, digits: int) -> str:
     return '' if value is None else f'{value:.{digits}f}'
-
-
-def text_summary(result: Calibration | Refusal, accepted_at_s: float | None = None) -> str:
-    """Return the verdict, the numbers with one sigma and the assumptions as lines for a terminal."""
-    lines = [verdict(result)]
-    for row in number_rows(result, accepted_at_s):
-        sigma = f'  ± {row.sigma}' if row.sigma else ''
-        lines.append(f'  {row.name + ":":<26}{row.value}{sigma}')
-    if isinstance(result, Calibration):
-        lines += [f'  {"assumed:":<26}{assumption}' for assumption in result.assumptions]
-        lines += [f'  {"checked:":<26}{check}' for check in result.checks]
-    lines += [f'  {"what helps:":<26}{remedy(result)}'] if remedy(result) else []
-    return '\n'.join(lines)

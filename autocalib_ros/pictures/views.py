@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from autocalib_ros.calibration import GroundPlane
-from autocalib_ros.camera import Camera
+from autocalib_ros.camera import Camera, Lens
 
 FARTHEST_HEIGHTS = 10.0
 """Views of the road end this many camera heights away: beyond, a pixel covers metres."""
@@ -63,7 +63,7 @@ def resample(picture: np.ndarray, sources: np.ndarray) -> np.ndarray:
     return cv2.remap(picture, sources, None, cv2.INTER_LINEAR, borderValue=(EMPTY_GREY,) * 3)
 
 
-def rectified_sources(camera: Camera, matrix: np.ndarray) -> np.ndarray:
+def rectified_sources(camera: Lens, matrix: np.ndarray) -> np.ndarray:
     """Return the view of a distortion-free camera of a matrix (3, 3) and the size of the image, float32."""
     view = np.empty((camera.height, camera.width, 2), np.float32)
     to_bearing = np.linalg.inv(matrix).T

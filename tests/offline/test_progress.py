@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import io
+import re
+
+import pytest
 
 from autocalib_ros.offline.progress import progress_bar
 
@@ -34,12 +37,35 @@ def test_an_unknown_total_is_no_obstacle():
     assert run(io.StringIO(), total=None).startswith('replay: 10 images, ')
 
 
-def test_a_terminal_gets_a_bar_with_rate_and_note():
+def test_a_terminal_gets_a_bar_with_percentage_and_note():
     text = run(Terminal())
     assert '\r' in text
-    assert '10/10' in text
-    assert 'images/s' in text
+    assert '100 %|' in text
     assert '3 tracks' in text
+
+
+@pytest.mark.parametrize('total', [10, None])
+def test_a_long_note_does_not_wrap_on_a_terminal(total):
+    stream, note = Terminal(), 'collecting 42 %: ' + 'traffic crossed 20 % of the image, 25 % is needed, ' * 3
+    with progress_bar(total, 'images', 'replay', stream=stream) as progress:
+        for done in range(1, 11):
+            progress.update_to(done, note)
+    shown = [line for line in re.split('[\r\n]', stream.getvalue()) if 'collecting' in line]
+    assert shown
+    assert all(len(line) < 80 and line.rstrip().endswith('…') for line in shown)  # 80 where nobody tells
+
+
+def test_another_state_is_shown_at_once_as_it_may_take_long():
+    stream = Terminal()
+    with progress_bar(1000, 'images', 'replay', stream=stream) as progress:
+        progress.update_to(1, 'collecting 0 %')
+        progress.update_to(2, 'solving')
+        assert 'solving' in stream.getvalue()
+
+
+def test_a_dumb_terminal_gets_plain_lines(monkeypatch):
+    monkeypatch.setenv('TERM', 'dumb')
+    assert '\r' not in run(Terminal())
 
 
 def test_quiet_is_quiet():

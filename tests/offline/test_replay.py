@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from autocalib_ros.calibration import Refusal
 from autocalib_ros.calibrator import solve
 from autocalib_ros.camera import Camera
 from autocalib_ros.config import GateOptions, Options
@@ -36,9 +39,9 @@ def test_a_replay_counts_its_frames_and_reports_them():
     told = []
     replayed = replay(Drive(40), Options(), lambda done, note: told.append((done, note)))
     assert replayed.frames == replayed.evidence.frames == 40
-    assert [done for done, _ in told] == [*range(1, 41), 40]
-    assert told[-1][1] == 'solving'
-    assert told[0][1].startswith('evidence 0 %: 0 of 40 tracks')
+    assert [done for done, _ in told] == [*range(1, 41), 40, 40]
+    assert [note for _, note in told[-2:]] == ['solving', 'refused']
+    assert told[0][1].startswith('collecting 0 %: 0 of 40 tracks')
     assert replayed.background.shape == (120, 160, 3)
 
 
@@ -90,3 +93,21 @@ def test_evidence_solved_again_gives_the_same():
 def test_a_tiny_bag_goes_all_the_way(tmp_path, write_bag, images):
     replayed = replay(open_source(write_bag(tmp_path / 'bag', images(8))), Options())
     assert (replayed.frames, bool(replayed.result)) == (8, False)
+
+
+def test_a_refused_solution_is_what_is_missing_and_then_since_when_it_is_calibrated(monkeypatch, full):
+    accepted = replace(full.result, camera=Camera.equidistant(160, 120, 100.0))
+    refusal = Refusal(code='x', message='the halves disagree', remedy='wait', method='joint',
+                      evidence=full.evidence.summary())
+    results = iter([refusal])
+    monkeypatch.setattr('autocalib_ros.offline.replay.solve',
+                        lambda due, options, lens: next(results, accepted))
+    told = []
+    # the box is all that there is to see, so that the background seems to drift by up to 100 px
+    gate = GateOptions(min_tracks=4, min_coverage=0.0, max_drift_px=1000.0)
+    options = Options(first_solve_s=0.0, solve_interval_s=1.0, solve_growth=1.01, gate=gate)
+    replay(Drive(300), options, lambda done, note: told.append(note))
+    assert 'collecting 100 %: the halves disagree' in told
+    assert any(note.startswith('calibrated since ') and note.endswith('focal length 100 px') for note in told)
+    assert told.index('solving') < told.index('collecting 100 %: the halves disagree')
+    assert told[-1] == 'calibrated'

@@ -16,7 +16,7 @@ from autocalib_ros.calibration import GroundPlane
 from autocalib_ros.camera_info import rectified_matrix
 from autocalib_ros.offline.report import write_report
 from autocalib_ros.offline.report.lens_figures import in_undistorted, line_error_px
-from autocalib_ros.offline.summary import number_rows, text_summary, verdict
+from autocalib_ros.offline.summary import number_rows, verdict
 from autocalib_ros.pictures.views import ground_to_image, image_to_ground, nice_length
 
 ALL = {'ground_grid', 'top_view', 'all_tracks', 'kept_tracks', 'undistorted', 'straightness', 'focal_sweep',
@@ -91,15 +91,6 @@ def test_no_traffic_at_all_still_gives_a_page(tmp_path, refused):
     nothing = refused.evidence.selected(np.zeros(0, int))
     assert 'Not calibrated' in page(tmp_path, replace(refused, evidence=nothing, background=None))
     assert figures(tmp_path) == set()
-
-
-def test_the_summary_has_the_numbers_with_their_sigmas(full):
-    text = text_summary(full.result, full.accepted_at_s)
-    assert text.startswith(
-        'Calibrated: focal length 140.0 ± 1.5 px; the camera looks 40.0 ± 0.2 degrees down from 8.00 m above the road.')
-    assert re.search(r'focal length: +140.00 px +± 1.50', text)
-    assert re.search(r'looks down by: +40.00 degrees +± 0.20', text)
-    assert re.search(r'assumed: +the two roads are perpendicular', text)
 
 
 def test_a_plane_without_scale_is_not_given_in_metres(full):

@@ -1,0 +1,42 @@
+"""`autocalib benchmark`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from autocalib_ros.commands import DONE
+
+HELP = 'measure what the program costs on this machine'
+DESCRIPTION = None
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add a parser for each benchmark."""
+    what = parser.add_subparsers(title='benchmarks', metavar='WHAT', dest='what', required=True)
+    cost = what.add_parser('cost', help='processor time of a frame and of a solution, and memory')
+    cost.add_argument('source', metavar='SOURCE', type=Path, help='recording to measure on')
+    cost.add_argument('--duration', type=float, metavar='S', help='seconds of it to use')
+    accuracy = what.add_parser('accuracy', help='errors against the truth of made-up traffic, by Monte Carlo')
+    accuracy.add_argument('--runs', type=int, default=20, metavar='N', help='draws per family (default: %(default)s)')
+    accuracy.add_argument('--family', nargs='+', default=[], metavar='NAME', help='kinds of evidence (default: all)')
+    accuracy.add_argument('--method', nargs='+', choices=('joint', 'paper'), default=['joint', 'paper'],
+                          help='robust method, the published one, or both (default)')
+    accuracy.add_argument('--jobs', type=int, default=1, metavar='J', help='processes (default: %(default)s)')
+    accuracy.add_argument('--seed', type=int, default=0, metavar='S', help='seed of the draws (default: %(default)s)')
+    accuracy.add_argument('--out', type=Path, metavar='FILE', help='CSV to write, one row a run')
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Measure and print."""
+    if arguments.what == 'cost':
+        from autocalib_ros.offline.benchmark import cost
+
+        print(cost(arguments.source, arguments.duration))
+        return DONE
+    from autocalib_ros.offline.accuracy import measure
+    from autocalib_ros.offline.accuracy_table import tables
+
+    print(tables(measure(arguments.family, arguments.method, arguments.runs, seed=arguments.seed, jobs=arguments.jobs,
+                         out=arguments.out)))
+    return DONE

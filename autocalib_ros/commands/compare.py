@@ -1,0 +1,52 @@
+"""`autocalib compare`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from autocalib_ros.commands import DONE, REFUSED
+
+HELP = 'say how two calibrations of one camera differ'
+DESCRIPTION = ('Say how two calibrations of one camera differ: is that of last month still right? Exit status: 0 they '
+               'agree within 3 combined standard deviations, 3 they differ, or nothing tells, 2 wrong input.')
+FILES = 'calibration.json, NAME.autocalib.json of the node, or a camera_info.yaml, of a checkerboard for example'
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the two files and the truth."""
+    parser.add_argument('first', metavar='A', type=Path, help=FILES)
+    parser.add_argument('second', metavar='B', type=Path, help='the same')
+    parser.add_argument('--truth', metavar='T', type=Path, help='truth.json of a simulation, to compare both with')
+    parser.add_argument('--json', action='store_true', help='print a document instead of the table')
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Compare; return the exit status."""
+    import json
+    import sys
+
+    from autocalib_ros.compare import compared
+    from autocalib_ros.known_camera import read_known_camera
+    from autocalib_ros.offline.comparison_text import comparison_document, comparison_lines, truth_lines
+    from autocalib_ros.offline.terminal import painted
+
+    both = [read_known_camera(path) for path in (arguments.first, arguments.second)]
+    result = compared(*both)
+    errors = []
+    if arguments.truth is not None:
+        from autocalib_ros.offline.truth_file import errors_against_truth, read_truth
+
+        truth = read_truth(arguments.truth)
+        errors = [errors_against_truth(known, truth) for known in both]
+    if arguments.json:
+        document = comparison_document(result)
+        print(json.dumps({**document, **({'against_truth': errors} if errors else {})}, indent=1, allow_nan=False))
+    else:
+        colour = {True: 'green', False: 'red', None: 'yellow'}[result.agrees]
+        print(painted(result.verdict(), colour, sys.stdout))
+        print(f'A: {arguments.first}\nB: {arguments.second}')
+        print('\n'.join(comparison_lines(result)))
+        if errors:
+            print('\n'.join(['', *truth_lines(errors)]))
+    return DONE if result.agrees else REFUSED

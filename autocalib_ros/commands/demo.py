@@ -1,0 +1,47 @@
+"""`autocalib demo`."""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+from pathlib import Path
+
+from autocalib_ros.commands import DONE, REFUSED
+from autocalib_ros.commands.replay import DEFAULT_OUT
+from autocalib_ros.commands.telling import replay_and_tell, tell
+
+HELP = 'simulate traffic, calibrate from it, compare with the truth'
+DESCRIPTION = None
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add what can be chosen."""
+    parser.add_argument('--out', type=Path, default=DEFAULT_OUT, metavar='DIR', help='folder for the results '
+                        '(default: %(default)s)')
+    parser.add_argument('--seed', type=int, default=0, metavar='N', help='seed of the simulated traffic')
+    parser.add_argument('--scale-from', choices=('height', 'distance', 'speed'), default='height',
+                        help='what is given of the truth to tell the scale (default: %(default)s)')
+    parser.add_argument('--keep-bag', action='store_true', help='leave the simulated recording in DIR/recording')
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Simulate, replay and compare; return the exit status."""
+    from autocalib_ros.offline import outputs
+    from autocalib_ros.offline.demo import compare, options_from, simulate_into
+    from autocalib_ros.offline.sources import open_source
+
+    bag = arguments.out / 'recording'
+    outputs.prepare(arguments.out, bag)
+    try:
+        truth = simulate_into(bag, arguments.seed)
+        replayed = replay_and_tell(open_source(bag), options_from(truth, arguments.scale_from), arguments.out)
+    finally:
+        if not arguments.keep_bag:
+            shutil.rmtree(bag, ignore_errors=True)
+    comparison = compare(replayed.result, truth)
+    if comparison is None:
+        return REFUSED
+    print(comparison.table())
+    if not comparison.good:
+        tell('The demonstration failed: the result is farther from the truth than promised.')
+    return DONE if comparison.good else REFUSED

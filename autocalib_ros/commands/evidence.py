@@ -1,0 +1,40 @@
+"""`autocalib evidence`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from autocalib_ros.commands import DONE, REFUSED
+from autocalib_ros.commands.solving import add_solving, known_lens, options_of
+from autocalib_ros.commands.telling import tell_missing_height, tell_result
+
+HELP = 'solve saved evidence again with other options'
+DESCRIPTION = ('Solve the evidence.npz of a replay again, without its pictures. Options of tracking, motion and buffer '
+               'shape the gathering and change nothing here. Exit status as of replay.')
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the file and what is told to the solution."""
+    parser.add_argument('file', metavar='FILE.npz', type=Path, help='evidence that a replay has saved')
+    add_solving(parser)
+    parser.add_argument('--out', type=Path, metavar='DIR', help='folder for the results (default: nothing is written)')
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Solve; return the exit status."""
+    options = options_of(arguments)
+    lens = known_lens(arguments, options)
+    from autocalib_ros.evidence import Evidence
+    from autocalib_ros.offline import outputs
+    from autocalib_ros.offline.replay import solve_again
+
+    evidence, out = Evidence.load(arguments.file), arguments.out
+    if out is not None:
+        outputs.prepare(out)
+    if not arguments.quiet:
+        tell_missing_height(options, lens)
+    solved = solve_again(evidence, options, lens)
+    names = [] if out is None else outputs.write_result(out, solved, arguments.file.name)
+    tell_result(solved, out, names, quiet=arguments.quiet, json=arguments.json)
+    return DONE if solved.result else REFUSED

@@ -1,0 +1,64 @@
+"""`autocalib replay`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from autocalib_ros.commands import DONE, REFUSED
+from autocalib_ros.commands.solving import add_solving, known_lens, options_of
+from autocalib_ros.commands.telling import replay_and_tell, tell
+from autocalib_ros.config import Options
+
+if TYPE_CHECKING:
+    from autocalib_ros.offline.replay import ReplayResult
+    from autocalib_ros.offline.sources import Source
+
+HELP = 'calibrate from a recording'
+DESCRIPTION = 'Calibrate from a recording. Exit status: 0 calibrated, 3 refused, 2 wrong usage or unreadable input.'
+DEFAULT_OUT = Path('autocalib_out')
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the recording and what becomes of it."""
+    parser.add_argument('source', metavar='SOURCE', type=Path,
+                        help='rosbag2 folder, .mcap, .db3, ROS 1 .bag or video file')
+    add_solving(parser)
+    parser.add_argument('--topic', metavar='T', help='image topic; needed when there are several')
+    parser.add_argument('--out', type=Path, default=DEFAULT_OUT, metavar='DIR', help='folder for the results '
+                        '(default: %(default)s)')
+    parser.add_argument('--write-bag', type=Path, metavar='BAG',
+                        help='write a new rosbag2 with the images, CameraInfo and the ground transform')
+    parser.add_argument('--start', type=float, default=0.0, metavar='S', help='seconds to skip at the beginning')
+    parser.add_argument('--duration', type=float, metavar='S', help='seconds to use')
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Replay; return the exit status."""
+    options = options_of(arguments)
+    lens = known_lens(arguments, options)
+    from autocalib_ros.offline.sources import open_source
+    from autocalib_ros.perception.detector.detector import open_detector
+
+    detector = open_detector(options.detector)
+    if detector is not None and not arguments.quiet:
+        tell(f'Vehicles by a {detector}')
+    source = open_source(arguments.source, arguments.topic, arguments.start, arguments.duration)
+    from autocalib_ros.offline import outputs
+
+    outputs.prepare(arguments.out, arguments.write_bag)
+    replayed = replay_and_tell(source, options, arguments.out, lens=lens, detector=detector, quiet=arguments.quiet,
+                               json=arguments.json)
+    if arguments.write_bag is not None:
+        _write_bag(arguments.write_bag, replayed, source, options)
+    return DONE if replayed.result else REFUSED
+
+
+def _write_bag(path: Path, replayed: ReplayResult, source: Source, options: Options) -> None:
+    if not replayed.result:
+        tell(f'{path} is not written: there is no calibration')
+        return
+    from autocalib_ros.offline.write_bag import write_bag
+
+    write_bag(path, replayed.result, source, options.tf_parent, options.ignored_polygons)

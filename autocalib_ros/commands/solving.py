@@ -1,0 +1,81 @@
+"""What `replay` and `evidence` share: the options that a solution is told, and the known lens."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from autocalib_ros.config import Options
+
+if TYPE_CHECKING:
+    from autocalib_ros.camera import Camera
+
+
+def add_solving(parser: argparse.ArgumentParser) -> None:
+    """Add what is told to the solution, whatever it is fed from, and how its result is printed."""
+    scale = parser.add_mutually_exclusive_group()
+    scale.add_argument('--camera-height', type=float, metavar='H',
+                       help='height of the camera above the road in metres; without any scale only the lens is '
+                            'calibrated')
+    scale.add_argument('--scale-distance', type=float, nargs=5, metavar=('U1', 'V1', 'U2', 'V2', 'METRES'),
+                       help='instead: two pixels on the road, and the metres between them')
+    scale.add_argument('--scale-speed', type=float, metavar='KM_H',
+                       help='instead: the mean speed of the traffic that flows on the busiest road')
+    parser.add_argument('--camera-info', type=Path, metavar='FILE',
+                        help='file of camera_info_manager with the known lens: only the pose is solved')
+    parser.add_argument('--params-file', type=Path, metavar='F', help='ROS 2 parameter file with options')
+    parser.add_argument('--method', choices=('joint', 'paper'), help='robust method (default) or the published one')
+    parser.add_argument('--allow-unit-scale', action='store_true',
+                        help="without a height, give the ground plane in units of the camera's height")
+    parser.add_argument('-p', '--param', action='append', default=[], metavar='NAME=VALUE',
+                        help='any option by its full name, for example joint.noise_px=0.7; may be repeated')
+    parser.add_argument('--quiet', action='store_true', help='no progress and no summary; refusals stay on stderr')
+    parser.add_argument('--json', action='store_true',
+                        help='print calibration.json on stdout instead of the summary')
+
+
+def options_of(arguments: argparse.Namespace) -> Options:
+    """Put the options together: defaults, then the parameter file, then the command line."""
+    from autocalib_ros.offline.params import options_with, parse_assignments, read_params_file
+
+    values: dict[str, Any] = read_params_file(arguments.params_file) if arguments.params_file else {}
+    values.update(parse_assignments(arguments.param))
+    values.update(_scale_values(arguments))
+    if arguments.method is not None:
+        values['method'] = arguments.method
+    if arguments.allow_unit_scale:
+        values['allow_unit_scale'] = True
+    return options_with(Options(), values)
+
+
+def _scale_values(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return the options of the one source of the scale that the command line names, if any."""
+    if arguments.camera_height is not None:
+        return {'camera_height': arguments.camera_height}
+    if arguments.scale_distance is not None:
+        *pixels, metres = arguments.scale_distance
+        return {'scale_from': 'distance', 'scale.distance_px': ' '.join(f'{value:g}' for value in pixels),
+                'scale.distance_m': metres}
+    if arguments.scale_speed is not None:
+        return {'scale_from': 'speed', 'scale.speed_km_h': arguments.scale_speed}
+    return {}
+
+
+def known_lens(arguments: argparse.Namespace, options: Options) -> Camera | None:
+    """Read the known lens: that of the command line, else the one that the parameter file gives to a live node.
+
+    UsageError where the results could not say it in the distortion model that is asked for.
+    """
+    from autocalib_ros.offline.params import camera_info_file
+
+    file = arguments.camera_info
+    if file is None and arguments.params_file is not None:
+        file = camera_info_file(arguments.params_file) or None
+    if file is None:
+        return None
+    from autocalib_ros.camera_info import camera_info, read_camera_info
+
+    lens = read_camera_info(file)
+    camera_info(lens, options.distortion_model)
+    return lens

@@ -1,0 +1,67 @@
+"""What a solution says on the terminal: results on stdout, all else on stderr."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from autocalib_ros.config import Options
+
+if TYPE_CHECKING:
+    from autocalib_ros.camera import Camera
+    from autocalib_ros.offline.replay import ReplayResult
+    from autocalib_ros.offline.sources import Source
+    from autocalib_ros.perception.detector.detector import VehicleDetector
+
+
+def tell(line: str) -> None:
+    """Print a line on stderr."""
+    print(line, file=sys.stderr)
+
+
+def replay_and_tell(source: Source, options: Options, out: Path, *, lens: Camera | None = None,
+                    detector: VehicleDetector | None = None, quiet: bool = False, json: bool = False) -> ReplayResult:
+    """Replay, write the results and say what came out."""
+    from autocalib_ros.offline.outputs import write_outputs
+    from autocalib_ros.offline.progress import progress_bar
+    from autocalib_ros.offline.replay import replay
+
+    if not quiet:
+        tell_missing_height(options, lens)
+    with progress_bar(source.total, 'images', 'replay', quiet=quiet) as progress:
+        replayed = replay(source, options, progress.update_to, lens=lens, detector=detector)
+    tell_result(replayed, out, write_outputs(out, replayed, source), quiet=quiet, json=json)
+    return replayed
+
+
+def tell_missing_height(options: Options, lens: Camera | None) -> None:
+    """Say on stderr what a solution without any scale leaves out."""
+    if options.scale_from == 'height' and options.camera_height == 0:
+        scale = 'is given in units of that height' if options.allow_unit_scale else 'is left out'
+        calibrated = 'the lens is calibrated' if lens is None else 'the lens is known'
+        tell(f'No camera height given: {calibrated}, the ground plane {scale} (see --camera-height, --scale-distance'
+             ' and --scale-speed).')
+
+
+def tell_result(replayed: ReplayResult, out: Path | None, names: list[str], *, quiet: bool, json: bool) -> None:
+    """Print a refusal's reason on stderr; the summary on stdout, or instead calibration.json."""
+    from autocalib_ros.calibration import calibration_json
+    from autocalib_ros.offline.summary import remedy, verdict
+    from autocalib_ros.offline.terminal import columns_of, is_terminal, painted, state_colour
+    from autocalib_ros.offline.terminal_summary import summary_lines
+
+    result = replayed.result
+    if not result:
+        tell(painted(f'{verdict(result)} {remedy(result)}'.rstrip(), state_colour(result), sys.stderr))
+    if json:
+        print(calibration_json(result, accepted_at_s=replayed.accepted_at_s), flush=True)
+    if quiet:
+        return
+    if not json:
+        columns = columns_of(sys.stdout) if is_terminal(sys.stdout) else None
+        if result:
+            print(painted(verdict(result), state_colour(result), sys.stdout))
+        print('\n'.join(summary_lines(result, replayed.accepted_at_s, columns)))
+    if names:
+        print(f'Written to {out}: {", ".join(names)}', file=sys.stderr if json else sys.stdout)

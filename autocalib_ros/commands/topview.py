@@ -1,0 +1,38 @@
+"""`autocalib topview`."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING
+
+from autocalib_ros.commands import views
+
+if TYPE_CHECKING:
+    from autocalib_ros.known_camera import KnownCamera
+    from autocalib_ros.offline.view_files import View
+
+HELP = 'show the road from above, from an image or video'
+DESCRIPTION = ('Show the road from above, from an image or video, with a saved calibration of the camera; x of the '
+               'ground frame to the right, y up.')
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the files and what is shown."""
+    views.add_files(parser, 'calibration.json, or NAME.autocalib.json of the node')
+    parser.add_argument('--px-per-m', type=float, metavar='P', help='pixels a metre (default: 1000 along the longer '
+                        'side)')
+    for axis in 'xy':
+        parser.add_argument(f'--{axis}', type=float, nargs=2, metavar=('LOW', 'HIGH'),
+                            help=f'range of {axis} in metres (default: the road that the image shows)')
+    parser.add_argument('--grid', action='store_true', help='draw lines at round metres')
+    parser.add_argument('--scale-bar', action=argparse.BooleanOptionalAction, default=True, help='draw a scale bar')
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Write; return the exit status."""
+    from autocalib_ros.pictures.known_views import from_above, top_view_of
+
+    def view_of(known: KnownCamera) -> View:
+        view = top_view_of(known, arguments.px_per_m, arguments.x, arguments.y)
+        return from_above(known, view, grid=arguments.grid, scale_bar=arguments.scale_bar)
+    return views.write(arguments, 'topview', view_of)

@@ -1,0 +1,120 @@
+"""What a saved file tells of a camera: its lens, and where there is one its pose, with how sure both are.
+
+The files are calibration.json, the node's NAME.autocalib.json, and a camera_info.yaml of any hand.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from autocalib_ros.calibration import Calibration, GroundPlane, StandardDeviations
+from autocalib_ros.calibration_reader import calibration_of, read_json
+from autocalib_ros.camera import Camera, scale_factors
+from autocalib_ros.camera_info import read_exact_lens
+from autocalib_ros.errors import InputError
+from autocalib_ros.info_lens import InfoLens
+from autocalib_ros.opencv_lens import OpencvLens, nearest_camera
+
+
+@dataclass(frozen=True, kw_only=True)
+class KnownCamera:
+    """A lens in images of a size, and what else is known; lengths in pixels unless named otherwise."""
+
+    width: int
+    height: int
+    lens: Camera | InfoLens
+    """Exact both ways."""
+    matrix: np.ndarray
+    """K, shape (3, 3)."""
+    k: tuple[float, ...] | None = None
+    """Kannala-Brandt coefficients, of the nearest such lens for another model; None where none comes near."""
+    rectified: np.ndarray | None = None
+    """What images bearings in the rectified picture that the file tells of, P R, shape (3, 3)."""
+    ground: GroundPlane | None = None
+    stddev: StandardDeviations = field(default_factory=StandardDeviations)
+    covariance: np.ndarray | None = None
+    """Of `calibration.COVARIANCE_OF`, shape (10, 10)."""
+
+    @classmethod
+    def of(cls, result: Calibration, rectified: np.ndarray | None = None) -> KnownCamera:
+        """Return what a calibration tells."""
+        camera = result.camera
+        return cls(width=camera.width, height=camera.height, lens=camera, matrix=camera.matrix, k=camera.k,
+                   rectified=rectified, ground=result.ground, stddev=result.stddev, covariance=result.covariance)
+
+    @classmethod
+    def of_lens(cls, lens: OpencvLens, rectified: np.ndarray | None = None) -> KnownCamera:
+        """Return what a camera_info tells: no pose, and no deviations."""
+        try:
+            camera = nearest_camera(lens)
+        except InputError:  # then there is no such lens; it is told by its rays all the same
+            camera = None
+        return cls(width=lens.width, height=lens.height, lens=InfoLens(lens), matrix=lens.matrix,
+                   k=None if camera is None else camera.k, rectified=rectified)
+
+    @property
+    def focal_px(self) -> float:
+        """Focal length, the geometric mean of the two where the pixels are not square."""
+        return float(np.sqrt(self.matrix[0, 0] * self.matrix[1, 1]))
+
+    @property
+    def principal_point_px(self) -> tuple[float, float]:
+        """Principal point."""
+        return float(self.matrix[0, 2]), float(self.matrix[1, 2])
+
+    def project(self, bearings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Project bearings (..., 3) to pixels (..., 2), and say where that is valid (...)."""
+        pixels, valid = self.lens.project(np.reshape(bearings, (-1, 3)))
+        return pixels.reshape(*bearings.shape[:-1], 2), valid.reshape(bearings.shape[:-1])
+
+    def unproject(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return unit bearings (..., 3) of pixels (..., 2), and where the lens reaches them (...)."""
+        bearings, valid = self.lens.unproject(np.reshape(pixels, (-1, 2)))
+        return bearings.reshape(*pixels.shape[:-1], 3), valid.reshape(pixels.shape[:-1])
+
+    def scaled_to(self, width: int, height: int) -> KnownCamera:
+        """Return the same for images of another size; UsageError where these are of another shape."""
+        if (width, height) == (self.width, self.height):
+            return self
+        across, down = scale_factors((self.width, self.height), (width, height))
+        # borders of the image are scaled, half a pixel outside the centres of its outer pixels
+        scale = np.array([[across, 0, (across - 1) / 2], [0, down, (down - 1) / 2], [0, 0, 1]])
+        matrix, focal = scale @ self.matrix, np.sqrt(across * down)
+        lens = (self.lens.scaled_to(width, height) if isinstance(self.lens, Camera) else
+                InfoLens(replace(self.lens.full, width=width, height=height, matrix=matrix)))
+        units = np.array([focal, across, down, *[1.0] * 7])
+        point = self.stddev.principal_point_px
+        stddev = replace(
+            self.stddev, focal_px=None if self.stddev.focal_px is None else focal * self.stddev.focal_px,
+            principal_point_px=None if point is None else (across * point[0], down * point[1]))
+        return replace(
+            self, width=width, height=height, lens=lens, stddev=stddev,
+            matrix=lens.matrix if isinstance(lens, Camera) else matrix,
+            rectified=None if self.rectified is None else scale @ self.rectified,
+            covariance=None if self.covariance is None else self.covariance * np.outer(units, units))
+
+
+def read_known_camera(path: Path) -> KnownCamera:
+    """Read any of the files; InputError says what is wrong with it and what was expected."""
+    if path.suffix.lower() != '.json':
+        return KnownCamera.of_lens(*read_exact_lens(path))
+    document = read_json(path)
+    try:
+        return KnownCamera.of(calibration_of(document), _rectified(document))
+    except InputError as error:
+        raise InputError(f'{path}: {error}; give a calibration.json, NAME.autocalib.json or camera_info.yaml'
+                         ) from error
+
+
+def _rectified(document: Mapping[str, Any]) -> np.ndarray | None:
+    """Return P of the document's camera_info, whose R is identity; None where it does not hold one."""
+    try:
+        projection = np.array(document['camera_info']['p'], float).reshape(3, 4)
+    except (KeyError, TypeError, ValueError):
+        return None
+    return projection[:, :3] if projection[0, 0] > 0 and projection[1, 1] > 0 else None

@@ -1,0 +1,137 @@
+"""One picture of an image, video or bag through a view, or a video of all of them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from autocalib_ros.errors import InputError, UsageError
+from autocalib_ros.offline.progress import progress_bar
+from autocalib_ros.offline.sources import Source, open_source
+from autocalib_ros.offline.videos import FALLBACK_FPS
+
+PICTURES = ('.png', '.jpg', '.jpeg')
+CODECS = {'.mp4': 'mp4v', '.avi': 'MJPG'}
+IMAGES = (*PICTURES, '.bmp', '.tif', '.tiff', '.webp', '.pgm', '.ppm')
+JPEG_QUALITY = 88
+
+View = Callable[[np.ndarray], np.ndarray]
+"""Takes an image, grey (H, W) or BGR (H, W, 3) uint8, to the picture of it, BGR uint8."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """Which images of a recording: a picture takes the first of them."""
+
+    topic: str | None = None
+    start_s: float = 0.0
+    duration_s: float | None = None
+
+
+def write_view(source: Path, out: Path, part: Part, view_for: Callable[[int, int], View], *, label: str,
+               quiet: bool = False) -> tuple[int, int]:
+    """Write what `view_for(width, height)` makes of the images; return the size of the picture or video.
+
+    A file of that name is replaced once the new one is whole. UsageError where the names do not fit each other,
+    InputError where something cannot be read or written.
+    """
+    _check(source, out, part)
+    if source.suffix.lower() in IMAGES:
+        return _write_picture(out, _applied(view_for, read_image(source)))
+    recording = open_source(source, part.topic, part.start_s, part.duration_s)
+    if out.suffix.lower() in PICTURES:
+        return _write_picture(out, _applied(view_for, next(iter(recording.frames())).image))
+    return _write_video(recording, out, view_for, label, quiet)
+
+
+def _check(source: Path, out: Path, part: Part) -> None:
+    kind = out.suffix.lower()
+    if kind not in (*PICTURES, *CODECS):
+        raise UsageError(f'{out} is neither a picture nor a video: name it {", ".join((*PICTURES, *CODECS))}')
+    if out.is_dir():
+        raise UsageError(f'{out} is a folder, not a file to write')
+    if out.exists() and source.exists() and out.samefile(source):
+        raise UsageError(f'{out} is the source itself: choose another name for the result')
+    if source.suffix.lower() in IMAGES and (kind in CODECS or part != Part()):
+        raise UsageError(f'{source} is one image: write one picture ({", ".join(PICTURES)}) of it, without --at,'
+                         ' --duration and --topic')
+    if kind in PICTURES and part.duration_s is not None:
+        raise UsageError(f'{out} is one picture, and --duration is for videos: give --at alone')
+
+
+def read_image(path: Path) -> np.ndarray:
+    """Read an image file as BGR uint8; InputError where that cannot be."""
+    try:
+        data = np.fromfile(path, np.uint8)
+    except OSError as error:
+        raise InputError(f'cannot read {path}: {error.strerror or error}') from error
+    image = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
+    if image is None:
+        raise InputError(f'{path} is not an image that can be read: it is damaged, cut off or of another kind')
+    return image
+
+
+def _applied(view_for: Callable[[int, int], View], image: np.ndarray) -> np.ndarray:
+    return view_for(image.shape[1], image.shape[0])(image)
+
+
+def _write_picture(out: Path, picture: np.ndarray) -> tuple[int, int]:
+    with _whole(out) as unfinished:
+        encoded, data = cv2.imencode(out.suffix.lower(), picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+        if not encoded:
+            raise InputError(f'cannot write {out}: OpenCV has no encoder for {out.suffix}')
+        unfinished.write_bytes(data.tobytes())
+    return picture.shape[1], picture.shape[0]
+
+
+def _write_video(recording: Source, out: Path, view_for: Callable[[int, int], View], label: str,
+                 quiet: bool) -> tuple[int, int]:
+    view = writer = size = None
+    with _whole(out) as unfinished, progress_bar(recording.total, 'images', label, quiet=quiet) as progress:
+        try:
+            for count, frame in enumerate(recording.frames(), start=1):
+                view = view or view_for(frame.image.shape[1], frame.image.shape[0])
+                picture = view(frame.image)
+                if writer is None:
+                    size = (picture.shape[1] // 2 * 2, picture.shape[0] // 2 * 2)  # codecs halve the colours
+                    writer = _opened(out, unfinished, _rate(recording), size)
+                writer.write(np.ascontiguousarray(picture[:size[1], :size[0]]))
+                progress.update_to(count)
+        finally:
+            if writer is not None:
+                writer.release()
+    return size
+
+
+def _opened(out: Path, unfinished: Path, rate: float, size: tuple[int, int]) -> cv2.VideoWriter:
+    codec = CODECS[out.suffix.lower()]
+    writer = cv2.VideoWriter(str(unfinished), cv2.VideoWriter_fourcc(*codec), rate, size)
+    if not writer.isOpened():
+        raise InputError(f'cannot write {out}: this OpenCV cannot encode {codec} of {size[0]}x{size[1]} there; choose'
+                         ' .avi, or another folder')
+    return writer
+
+
+def _rate(recording: Source) -> float:
+    return recording.total / recording.duration_s if recording.total and recording.duration_s else FALLBACK_FPS
+
+
+@contextmanager
+def _whole(out: Path) -> Iterator[Path]:
+    """Yield a name to write to, which takes the place of `out` at the end; nothing of it is left after an error."""
+    unfinished = out.with_name(f'.{out.stem}~{os.getpid()}{out.suffix}')
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        yield unfinished
+        os.replace(unfinished, out)
+    except OSError as error:
+        raise InputError(f'cannot write {out}: {error.strerror or error}') from error
+    finally:
+        with suppress(OSError):
+            unfinished.unlink()
