@@ -34,6 +34,8 @@ class EvidenceSummary:
     segments: int
     vehicles: int
     coverage: float
+    people: int = 0
+    """Of those that moved, who walks, not counted in `vehicles`: as far as a detector, or else lens and plane tell."""
 
 
 @dataclass(frozen=True)
@@ -208,7 +210,7 @@ def to_json(result: Calibration | Refusal, *, accepted_at_s: float | None = None
         'stddev': None, 'covariance': None, 'paper': None, 'newest_stamp_ns': None,
         'evidence': {'seconds': evidence.seconds, 'frames': evidence.frames, 'tracks': evidence.tracks,
                      'segments': evidence.segments, 'vehicles': evidence.vehicles,
-                     'coverage': evidence.coverage, 'accepted_at_s': accepted_at_s}}
+                     'people': evidence.people, 'coverage': evidence.coverage, 'accepted_at_s': accepted_at_s}}
     if isinstance(result, Refusal):
         document['refusal'] = _refusal_json(result)
     else:

@@ -84,7 +84,7 @@ def _calibration(document: Mapping[str, Any]) -> Calibration:
         evidence=EvidenceSummary(
             image_size=(width, height), seconds=float(evidence['seconds']), frames=int(evidence['frames']),
             tracks=int(evidence['tracks']), segments=int(evidence['segments']), vehicles=int(evidence['vehicles']),
-            coverage=float(evidence['coverage'])),
+            coverage=float(evidence['coverage']), people=int(evidence.get('people', 0))),
         newest_stamp_ns=int(document['newest_stamp_ns']), covariance=_covariance(document.get('covariance')))
 
 

@@ -16,13 +16,15 @@ from autocalib_ros.estimation.evidence_gate import drift_limit_px, outlook, requ
 from autocalib_ros.estimation.great_circles import TrackSet, select_tracks
 from autocalib_ros.estimation.ground_plane import ground_plane, ground_points, pixels_ahead, tilt_and_roll_deg
 from autocalib_ros.estimation.paper import solve_paper
+from autocalib_ros.estimation.path_noise import USUAL_HEIGHT_M
+from autocalib_ros.estimation.people import walkers
 from autocalib_ros.estimation.plane import Plane
 from autocalib_ros.estimation.scale import Scale, is_unusual, known_scale, scale_doubt
 from autocalib_ros.estimation.solution import Solution, find_solution
 from autocalib_ros.estimation.straightness import paper_intrinsics
 from autocalib_ros.estimation.traffic import of_vehicles
 from autocalib_ros.estimation.vanishing_points import segment_orientations
-from autocalib_ros.evidence import Evidence, EvidenceBuffer
+from autocalib_ros.evidence import Evidence, EvidenceBuffer, Kind
 from autocalib_ros.perception.detector.detector import VehicleDetector, open_detector
 from autocalib_ros.perception.observer import Observer
 
@@ -243,11 +245,23 @@ def _solved(evidence: Evidence, options: Options, lens: Camera | None) -> Calibr
         return refused(solution)
     figures = _figures(figures, solution, kept[tracks.indices], evidence, options)
     paper = None if intrinsics is None else intrinsics.report
-    return _calibration(options, solution, Calibration(
+    calibration = _calibration(options, solution, Calibration(
         method=options.method, grade='lens', assumptions=solution.assumptions, checks=solution.checks,
         camera=solution.fit.state.camera, ground=None, ground_refusal=solution.no_plane,
         road_directions=solution.fit.state.directions, stddev=_lens_deviations(solution), paper=paper,
         evidence=evidence.summary(), newest_stamp_ns=evidence.newest_stamp_ns, figures=figures))
+    return _with_people_told(calibration, traffic)
+
+
+def _with_people_told(result: Calibration, evidence: Evidence) -> Calibration:
+    """Count who walks apart from the vehicles, where lens and plane tell them and no detector did."""
+    ground = result.ground
+    if ground is None:
+        return result
+    height = ground.height_m if ground.metric else USUAL_HEIGHT_M
+    untold = evidence.selected(np.flatnonzero(evidence.track_kinds == Kind.UNKNOWN))
+    told, seen = len(walkers(untold, result.camera, ground.normal_in_camera, height)), result.evidence
+    return replace(result, evidence=replace(seen, vehicles=seen.vehicles - told, people=seen.people + told))
 
 
 def _solution(evidence: Evidence, tracks: TrackSet, options: Options, lens: Camera | None) -> Solution | Reason:

@@ -132,10 +132,11 @@ class Evidence:
 
     def summary(self) -> EvidenceSummary:
         """Return the counts that a result carries."""
+        people = self.track_kinds == Kind.PERSON
         return EvidenceSummary(
             image_size=self.image_size, seconds=self.seconds, frames=self.frames, tracks=self.track_count,
             segments=len(self.segments_px), coverage=self.coverage,
-            vehicles=len(np.unique(self.track_vehicles[self.track_kinds != Kind.PERSON])))
+            vehicles=len(np.unique(self.track_vehicles[~people])), people=len(np.unique(self.track_vehicles[people])))
 
     def selected(self, keep: np.ndarray) -> Evidence:
         """Return the evidence with only the tracks whose indices are in `keep`; segments and edges unchanged."""

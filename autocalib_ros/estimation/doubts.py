@@ -67,8 +67,9 @@ def traffic_doubt(fit: JointFit, contrast: float, tracks: TrackSet) -> Reason | 
     `contrast` is how sharply it agreed on the focal length.
     """
     prior = fit.problem.setting.prior
-    if _straight_share(fit, tracks) < STRAIGHT_SHARE:
-        return _turning(fit, tracks, STRAIGHT_SHARE)
+    share = _straight_share(fit, tracks)
+    if share < STRAIGHT_SHARE:
+        return _turning(fit, share, STRAIGHT_SHARE)
     if contrast < MIN_CONTRAST and not (prior.family == 'distortion_free' and len(fit.state.angles_rad) > 1):
         return Reason(
             'no_agreement', f'the traffic singles out no focal length: the best agrees {contrast:.2f} times as well as '
@@ -79,19 +80,20 @@ def traffic_doubt(fit: JointFit, contrast: float, tracks: TrackSet) -> Reason | 
 
 
 def lens_doubt(fit: JointFit, tracks: TrackSet, evidence: Evidence, gate: GateOptions, *,
-               turned: bool) -> Reason | None:
+               turned: bool, driving: np.ndarray | None = None) -> Reason | None:
     """Say why the lens cannot be trusted, if so; `turned` where the solution started from traffic that turns.
 
-    `tracks` are those that were chosen out of the evidence.
+    `tracks` are those that were chosen out of the evidence; where `driving`, a mask (tracks,), is given, the others are
+    of people, who need not keep to a road.
     """
     doubt = _horizon_doubt(fit, tracks) or _curvature_doubt(fit, gate, turned=turned) or _model_doubt(fit)
     if doubt or turned and motion_tells(fit):
         return doubt
     needed = STRAIGHT_SHARE if len(fit.state.angles_rad) > 1 else ONE_ROAD_SHARE
-    share = _straight_share(fit, tracks)
+    share = _straight_share(fit, tracks, driving)
     if needed == ONE_ROAD_SHARE > share > KEPT_ROAD_SHARE and keepers(fit, evidence) > KEEPERS:
         return None
-    return _turning(fit, tracks, needed) if share < needed else None
+    return _turning(fit, share, needed) if share < needed else None
 
 
 def _horizon_doubt(fit: JointFit, tracks: TrackSet) -> Reason | None:
@@ -115,9 +117,9 @@ def motion_tells(fit: JointFit) -> bool:
     return bool(told_by_evidence(fit.turning_information, known)[0] < MOTION_TELLS)
 
 
-def _straight_share(fit: JointFit, tracks: TrackSet) -> float:
-    share = tracks.share_of_vehicle
-    return float((share * fit.explained()).sum() / share.sum())
+def _straight_share(fit: JointFit, tracks: TrackSet, driving: np.ndarray | None = None) -> float:
+    share = tracks.share_of_vehicle if driving is None else tracks.share_of_vehicle * driving
+    return float((share * fit.explained()).sum() / max(share.sum(), 1e-9))
 
 
 def keepers(fit: JointFit, evidence: Evidence) -> float:
@@ -132,10 +134,10 @@ def keepers(fit: JointFit, evidence: Evidence) -> float:
     return float(kept.sum() / following.sum()) if following.sum() >= MIN_VEHICLES else 0.0
 
 
-def _turning(fit: JointFit, tracks: TrackSet, needed: float) -> Reason:
+def _turning(fit: JointFit, share: float, needed: float) -> Reason:
     where = 'best straight roads' if len(fit.state.angles_rad) > 1 else 'one straight road that was found'
     return Reason(
-        'turning_traffic', f'only {_straight_share(fit, tracks):.0%} of the vehicles follow the {where}, {needed:.0%} '
+        'turning_traffic', f'only {share:.0%} of the vehicles follow the {where}, {needed:.0%} '
         'are needed: the traffic turns, or the road bends',
         'wait for straight traffic, or turn the camera towards a straight road')
 

@@ -32,7 +32,8 @@ SURE_DEG = 2.0
 """Largest standard deviation of a window's turn: one that is mostly noise turns and moves as it suits a wrong lens
 (Neyman & Scott 1948). What is sure is told by where its points lie, not by how it seems to turn."""
 WALK_M_S = 2.5
-"""Who is slower may be on foot: no rigid body, and free to turn on the spot."""
+"""Who is slower may be on foot: no rigid body, and free to turn on the spot. A head, seen where its ray meets the road,
+seems faster by a quarter at the usual height."""
 STEERED_S = 1.0
 """What windows of tracks say of a body's turning holds for segments within so long."""
 LOW = 0.02

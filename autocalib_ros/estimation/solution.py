@@ -14,6 +14,8 @@ from autocalib_ros.estimation.great_circles import TrackSet, evenly
 from autocalib_ros.estimation.held import lens_assumptions, with_k2_if_asked_for, with_what_can_be_told
 from autocalib_ros.estimation.joint import JointFit, noise_cost, road_support, solve_joint, with_bodies
 from autocalib_ros.estimation.lens_prior import LensPrior, known_lens, lens_priors
+from autocalib_ros.estimation.path_noise import USUAL_HEIGHT_M
+from autocalib_ros.estimation.people import walkers
 from autocalib_ros.estimation.plane import LevelCamera, Plane, agreement
 from autocalib_ros.estimation.roads import (
     main_road,
@@ -35,6 +37,8 @@ from autocalib_ros.estimation.turning import (
 from autocalib_ros.estimation.windows import Instants, Windows, find_windows
 from autocalib_ros.evidence import Evidence
 
+NEARLY_LEVEL_DEG = 5.0
+"""Roll up to which walking can be told from driving as if there were none."""
 VOTERS = 200
 """Tracks, evenly out of all, from which the starts are made and compared; the solution then uses every track."""
 
@@ -149,7 +153,7 @@ def _completed(fit: JointFit, tracks: TrackSet, across: str, traffic: _Traffic, 
     fit = with_k2_if_asked_for(fit, tracks)
     fit = over_lives(fit, tracks, traffic.windows, traffic.instants)
     fit, held = with_what_can_be_told(fit, tracks)
-    doubt = lens_doubt(fit, tracks, traffic.evidence, gate, turned=turned) or (
+    doubt = _lens_doubt(fit, tracks, traffic, turned=turned) or (
         one_centre_doubt(fit, traffic.windows) if len(fit.state.angles_rad) < 2 else None)
     if doubt:
         return doubt
@@ -174,6 +178,25 @@ def _completed(fit: JointFit, tracks: TrackSet, across: str, traffic: _Traffic, 
         'follow one road, and rotation about it is free'
         + (': edges of vehicles do not tell it either' if options.transverse_edges else ''),
         'wait for traffic across the main road, or that turns; or allow joint.roll_prior_deg'))
+
+
+def _lens_doubt(fit: JointFit, tracks: TrackSet, traffic: _Traffic, *, turned: bool) -> Reason | None:
+    """Doubt the lens; where too few seem to keep to the road, without those who walk beside and over it."""
+    evidence, gate = traffic.evidence, traffic.gate
+    doubt = lens_doubt(fit, tracks, evidence, gate, turned=turned)
+    if doubt is None or doubt.code != 'turning_traffic':
+        return doubt
+    return lens_doubt(fit, tracks, evidence, gate, turned=turned, driving=_driving(fit, tracks, evidence))
+
+
+def _driving(fit: JointFit, tracks: TrackSet, evidence: Evidence) -> np.ndarray:
+    """Mask (tracks,) of those not of people; where one road leaves the plane open, a level camera is plane enough."""
+    level = None if fit.plane_known else LevelCamera(NEARLY_LEVEL_DEG)
+    if level is not None and not level.tells(fit.state):
+        return np.ones(len(tracks), bool)
+    camera, normal = Plane.of(fit, tracks, level).here
+    people = walkers(evidence, camera, normal, fit.problem.setting.height_m or USUAL_HEIGHT_M)
+    return ~np.isin(evidence.track_vehicles[tracks.indices], people)
 
 
 def _assumed(fit: JointFit, tracks: TrackSet,

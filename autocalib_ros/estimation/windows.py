@@ -182,6 +182,10 @@ class Instants:
         """Positions (n, 2) of tracks (n,) at a multiple of the interval."""
         return self._places[self._offset[tracks] + instant - self.begin[tracks]]
 
+    def all(self) -> tuple[np.ndarray, np.ndarray]:
+        """All positions (n, 2), track after track, and where each track begins there, with the end, (tracks + 1,)."""
+        return self._places, self._offset
+
 
 def _speeds(times: np.ndarray, places: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
     """Velocity (n, 2) at each place (n, 2) of tracks: of the parabola through it and its neighbours in its track.

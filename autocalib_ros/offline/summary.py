@@ -100,8 +100,10 @@ def _paper_rows(result: Calibration) -> list[Row]:
 
 def _evidence_rows(result: Calibration | Refusal, accepted_at_s: float | None) -> list[Row]:
     evidence = result.evidence
+    people = f' and {evidence.people} people' if evidence.people else ''
     rows = [Row('recording', f'{evidence.seconds:.1f} s, {evidence.frames} images'),
-            Row('traffic', f'{evidence.tracks} tracks of {evidence.vehicles} vehicles, {evidence.segments} segments'),
+            Row('traffic', f'{evidence.tracks} tracks of {evidence.vehicles} vehicles{people}, '
+                           f'{evidence.segments} segments'),
             Row('coverage', f'{100 * evidence.coverage:.0f} % of the image')]
     return rows + ([] if accepted_at_s is None else [Row('accepted after', f'{accepted_at_s:.1f} s')])
 

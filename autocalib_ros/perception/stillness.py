@@ -15,6 +15,8 @@ MIN_POINTS = 8
 ROUND_TRIP_PX = 0.5
 QUANTILES = (0.05, 0.95)
 """Drift is the span between these quantiles of the offsets: one passing lorry is not a moving camera."""
+LAMPS = 0.97
+"""Share of an image at night that is neither a lamp nor its glare."""
 HIDDEN_S = 10.0
 """Nothing that passes hides the background for longer."""
 AWAY_PX = 12
@@ -126,7 +128,13 @@ class Stillness:
 
 
 def _corners(image: np.ndarray | None, where: np.ndarray | None = None) -> np.ndarray:
-    """Return strong corners (n, 1, 2) of a reduced image (H, W), where the mask (H, W) is not 0."""
-    found = None if image is None else cv2.goodFeaturesToTrack(image, POINTS, 0.02, max(8, image.shape[1] // 20),
-                                                               mask=where)
+    """Return strong corners (n, 1, 2) of a reduced image (H, W), where the mask (H, W) is not 0.
+
+    A corner is strong beside others: where lamps shine in the dark nothing else would be, and they belong to vehicles.
+    So what is brighter than almost all of the image counts as no brighter.
+    """
+    found = None
+    if image is not None:
+        dimmed = np.minimum(image, np.uint8(np.quantile(image[::2, ::2], LAMPS)))
+        found = cv2.goodFeaturesToTrack(dimmed, POINTS, 0.02, max(8, image.shape[1] // 20), mask=where)
     return np.zeros((0, 1, 2), np.float32) if found is None else found

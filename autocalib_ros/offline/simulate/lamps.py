@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -16,6 +18,7 @@ from .vehicles import Vehicle, VehicleState
 _HEAD = (215, 240, 255)
 _TAIL = (40, 30, 230)
 _BEAM_M = (16.0, 6.0)
+LAMP_M = 0.7
 
 
 @lru_cache(maxsize=16)
@@ -44,30 +47,42 @@ def _gain_faces(light: np.ndarray, corners: list[tuple[float, float, float]]) ->
     return Faces(np.array([corners], float), (Texture(picture),))
 
 
+@dataclass(frozen=True)
+class Lamp:
+    """A lamp of a vehicle: its place (3,), the heading (2,) in which it shines, its colour and size."""
+
+    place_m: np.ndarray
+    outward: np.ndarray
+    colour: tuple[int, int, int]
+    size_m: float
+
+
+def lamps_of(vehicle: Vehicle, state: VehicleState) -> Iterator[Lamp]:
+    """Yield the head and tail lamps of a vehicle."""
+    shape = vehicle.shape
+    ahead = np.array([np.cos(state.heading), np.sin(state.heading)])
+    left = np.array([-ahead[1], ahead[0]])
+    for end, colour, size in ((1, _HEAD, 0.24), (-1, _TAIL, 0.13)):
+        for side in (0.36, -0.36):
+            xy = np.array([state.x, state.y]) + ahead * end * (shape.length_m / 2 + 0.05)
+            yield Lamp(np.array([*(xy + left * side * shape.width_m), LAMP_M]), ahead * end, colour, size)
+
+
 def add_lamps(
     picture: np.ndarray, canvas: Canvas, pose: CameraPose,
     vehicles: list[tuple[Vehicle, VehicleState]],
 ) -> None:
     """Add the blobs of all lamps that are turned to the camera and not hidden, in place."""
     for vehicle, state in vehicles:
-        shape = vehicle.shape
-        ahead = np.array([np.cos(state.heading), np.sin(state.heading)])
-        left = np.array([-ahead[1], ahead[0]])
-        for end, colour, size in ((1, _HEAD, 0.24), (-1, _TAIL, 0.13)):
-            for side in (0.36, -0.36):
-                xy = np.array([state.x, state.y]) + ahead * end * (shape.length_m / 2 + 0.05)
-                lamp = np.array([*(xy + left * side * shape.width_m), 0.7])
-                _add_lamp(picture, canvas, pose, lamp, ahead * end, colour, size)
+        for lamp in lamps_of(vehicle, state):
+            _add_lamp(picture, canvas, pose, lamp)
 
 
-def _add_lamp(
-    picture: np.ndarray, canvas: Canvas, pose: CameraPose, lamp: np.ndarray, outward: np.ndarray,
-    colour: tuple[int, int, int], size_m: float,
-) -> None:
-    to_camera = pose.position_m - lamp
+def _add_lamp(picture: np.ndarray, canvas: Canvas, pose: CameraPose, lamp: Lamp) -> None:
+    to_camera = pose.position_m - lamp.place_m
     distance = float(np.linalg.norm(to_camera))
-    turned = float(outward @ to_camera[:2]) / distance
-    pixel, valid = canvas.lens.project(pose.to_camera(lamp))
+    turned = float(lamp.outward @ to_camera[:2]) / distance
+    pixel, valid = canvas.lens.project(pose.to_camera(lamp.place_m))
     column, row = (int(round(c)) for c in pixel)
     if turned < 0.05 or not valid:
         return
@@ -76,6 +91,6 @@ def _add_lamp(
     if canvas.distance[row * SAMPLES, column * SAMPLES] < distance - 0.5:
         return
     # A lamp is dazzling along its axis and fades to the side; far ones stay visible.
-    radius = max(1.2, size_m * canvas.lens.focal_px / distance * (0.6 + 1.4 * turned**2))
+    radius = max(1.2, lamp.size_m * canvas.lens.focal_px / distance * (0.6 + 1.4 * turned**2))
     strength = min(1.0, 0.35 + turned)
-    add_glow(picture, pixel, radius, mixed((0, 0, 0), colour, strength))
+    add_glow(picture, pixel, radius, mixed((0, 0, 0), lamp.colour, strength))

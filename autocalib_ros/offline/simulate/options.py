@@ -16,6 +16,7 @@ SKEW_DEG = 65.0
 ONE_WAY_SCENES = ('junction', 'road', 'highway', 'bend')
 STORAGES = ('sqlite3', 'mcap')
 SHUTTER_SHOWS = ('frozen', 'flat')
+TROUBLES = ('trees', 'flags', 'leds', 'drops', 'rain', 'water', 'shadows', 'wet', 'clock')
 
 
 def _option(default: Any, help_text: str) -> Any:
@@ -77,6 +78,7 @@ class SimulationOptions:
         'frozen', 'what a thermal camera sends while its shutter is closed: the last picture, or the shutter'
     )
     shake_px: float = _option(0.0, 'standard deviation of the camera shake')
+    trouble: str = _option('', 'what moves and is no traffic, comma between: ' + ', '.join(TROUBLES))
     bump_at_s: float | None = _option(None, 'time at which the camera is knocked askew')
     bump_deg: float = _option(2.0, 'angle by which it is knocked askew')
 
@@ -100,6 +102,11 @@ class SimulationOptions:
         return max(1, round(self.duration_s * self.rate_hz))
 
     @property
+    def troubles(self) -> frozenset[str]:
+        """What moves and is no traffic."""
+        return frozenset(filter(None, self.trouble.split(',')))
+
+    @property
     def crossing_deg(self) -> float:
         """Angle between the two roads of a junction."""
         if self.road_angle_deg is not None:
@@ -119,6 +126,8 @@ class SimulationOptions:
                 raise UsageError(
                     f'unknown {name} {getattr(self, name)!r}: choose {" or ".join(allowed)}'
                 )
+        for name in sorted(self.troubles - frozenset(TROUBLES)):
+            raise UsageError(f'unknown trouble {name!r}: choose of {", ".join(TROUBLES)}, with commas between')
         for name in ('topic', 'truth_topic'):
             if not getattr(self, name).startswith('/'):
                 raise UsageError(
@@ -132,6 +141,10 @@ class SimulationOptions:
             raise UsageError('night and thermal exclude each other: choose one')
         if self.shutter_every_s is not None and not self.thermal:
             raise UsageError('shutter_every_s is given without thermal: only thermal cameras have such a shutter')
+        if self.troubles and self.thermal:
+            raise UsageError('the troubles are those of daylight and lamps: leave out trouble or thermal')
+        if 'wet' in self.troubles and not self.night:
+            raise UsageError('a wet road mirrors lamps: trouble wet needs night')
         if self.one_way and self.scene not in ONE_WAY_SCENES:
             raise UsageError(
                 f'scene {self.scene!r} has no one_way: choose {" or ".join(ONE_WAY_SCENES)}'

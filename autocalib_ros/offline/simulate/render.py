@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import zip_longest
 
 import cv2
@@ -21,7 +21,9 @@ from .options import SimulationOptions
 from .palette import palette_of
 from .people import Person
 from .scenery import lamp_places, scenery_of
+from .swaying import Roadside
 from .vehicles import Vehicle, VehicleState
+from .weather import View, Weather
 
 _DRAWN_RANGE_M = 130.0
 _REACH_M = 14.0  # a bus and its beam, from its middle
@@ -72,19 +74,31 @@ class Artist:
         self._canvas = Canvas(self._lens, options.width_px, options.height_px)
         self._texels_per_m = bodies.FINE if options.focal_px > 350 else bodies.COARSE
         self._backdrops: dict[bool, _Backdrop] = {}
+        troubles, size = options.troubles, (options.width_px, options.height_px)
+        self._weather = Weather(options, network, self._poses) if troubles else None
+        self._roadside = Roadside(
+            troubles, network, pose, self._lens, size, palette_of(options.thermal), options.seed) if troubles else None
 
     def frame(self, scene: Scene) -> np.ndarray:
         """Return BGR (h, w, 3) uint8, or for a thermal camera counts (h, w) uint16."""
         pose = self._poses[scene.bumped]
         if scene.shake is not None:
             pose = pose.rotated(scene.shake)
-        picture = self._picture(scene, pose)
+        picture, windows = self._picture(scene, pose)
+        view = None
+        if self._weather is not None:
+            view = View(picture, self._depth(scene, windows), pose, self._near(scene, pose), scene.index, scene.time_s)
+            self._weather.on_ground(view, scene.bumped)
         noise = self._noise.of(scene.index)
         if self._options.thermal:
             return self._core.counts(picture, scene.time_s, noise, shut=scene.shut)
         if self._options.night:
             picture = sensor.darken(picture)
             lamps.add_lamps(picture, self._canvas, pose, self._near(scene, pose))
+        if self._weather is not None and view is not None:
+            view = replace(view, picture=picture)
+            self._weather.lights(view, scene.bumped)
+            picture = self._weather.on_lens(view)
         return cv2.add(picture, noise, dtype=cv2.CV_8U)
 
     def prepare(self) -> None:
@@ -97,8 +111,18 @@ class Artist:
         columns, rows = (np.round(pixels).astype(int) + self._margin).T * SAMPLES
         return distance[rows, columns]
 
-    def _picture(self, scene: Scene, pose: CameraPose) -> np.ndarray:
-        """Draw all movers over the backdrop; return pixels (h, w, 3)."""
+    def _depth(self, scene: Scene, windows: list[Window]) -> np.ndarray:
+        """Return the distance (h, w) of what each pixel shows, movers included; shake left out."""
+        size = (self._options.height_px, self._options.width_px)
+        inner = slice(self._margin * SAMPLES, None, SAMPLES)
+        depth = self._backdrop(scene.bumped).canvas.distance[inner, inner][:size[0], :size[1]].copy()
+        for window in windows:
+            rows, columns = (slice(s.start, s.stop, SAMPLES) for s in window.samples())
+            depth[window.pixels()] = self._canvas.distance[rows, columns]
+        return depth
+
+    def _picture(self, scene: Scene, pose: CameraPose) -> tuple[np.ndarray, list[Window]]:
+        """Draw all movers over the backdrop; return pixels (h, w, 3) and the windows with movers."""
         view = _BackdropView(self._backdrop(scene.bumped), self._lens, self._margin, scene.shake)
         picture = view.picture(self._options.width_px, self._options.height_px)
         gains, solids = self._plan(scene, pose)
@@ -111,7 +135,7 @@ class Artist:
         self._canvas.draw(drawing for group in solids for drawing in group)
         for window in windows:
             picture[window.pixels()] = self._canvas.resolved(window)
-        return picture
+        return picture, windows
 
     def _plan(
         self, scene: Scene, pose: CameraPose
@@ -130,6 +154,8 @@ class Artist:
             flats.append(flat.moved(*place) if near or self._options.night else _NOTHING)
         for person, place in scene.people:
             solids.append(people.faces_of(person, place, pose.position_m[:2], thermal))
+        if self._roadside is not None:
+            solids += self._roadside.at(scene.time_s)
         return self._canvas.plan(flats, pose, gain=True), self._canvas.plan(solids, pose)
 
     def _near(

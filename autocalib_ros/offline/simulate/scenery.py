@@ -26,7 +26,7 @@ def scenery_of(
     """Return all standing things; viewpoint (2,) is the foot of the camera, kept in the clear."""
     rng = np.random.default_rng([seed, 4])
     parts: list[Faces] = []
-    crowns = [_crown(palette, rng) for _ in range(6)]
+    crowns = [crown(palette, rng) for _ in range(6)]
     for road in network.roads:
         for side in (1, -1):
             if not network.rural:
@@ -117,7 +117,7 @@ def _wall_texture(height: float, wall: tuple[int, int, int], palette: Palette,
     return Texture(picture)
 
 
-def _upright(place: np.ndarray, viewpoint: np.ndarray, width: float, low: float,
+def upright(place: np.ndarray, viewpoint: np.ndarray, width: float, low: float,
              high: float) -> list[tuple[float, ...]]:
     """Return an upright rectangle that faces the camera."""
     away = place - viewpoint
@@ -135,14 +135,14 @@ def _trees(road: Road, side: int, network: Network, viewpoint: np.ndarray, palet
         if not road.reaches(along) or not _clear(network, viewpoint, place[None], PAVEMENT_M - 0.2, 14.0):
             continue
         width = 0.7 * height
-        corners = [_upright(place, viewpoint, 0.25, 0.0, 0.5 * height),
-                   _upright(place, viewpoint, width, 0.3 * height, height)]
+        corners = [upright(place, viewpoint, 0.25, 0.0, 0.5 * height),
+                   upright(place, viewpoint, width, 0.3 * height, height)]
         trunk = Texture(paint.filled(32, 4, palette.trunk))
         parts.append(Faces(np.array(corners), (trunk, crowns[int(rng.integers(len(crowns)))])))
     return parts
 
 
-def _crown(palette: Palette, rng: np.random.Generator) -> Texture:
+def crown(palette: Palette, rng: np.random.Generator) -> Texture:
     """Paint leaves: overlapping discs, lit from above."""
     size = 128
     picture = paint.filled(size, size, palette.foliage)
@@ -177,9 +177,9 @@ def _poles(road: Road, side: int, network: Network, viewpoint: np.ndarray,
             continue
         if edge_distance(network, place) < 0.2 or np.hypot(*(place - viewpoint)) < 9.0:
             continue
-        corners, textures = [_upright(place, viewpoint, width, 0.0, height)], [metal]
+        corners, textures = [upright(place, viewpoint, width, 0.0, height)], [metal]
         if height < 5.0:
-            corners.append(_upright(place, viewpoint, 0.36, height - 1.0, height + 0.1))
+            corners.append(upright(place, viewpoint, 0.36, height - 1.0, height + 0.1))
             textures.append(Texture(head))
         parts.append(Faces(np.array(corners), tuple(textures)))
     return parts

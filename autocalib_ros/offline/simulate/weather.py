@@ -1,0 +1,331 @@
+"""What light, water and the lens put into the picture that is no traffic, each with its own physics."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+
+from .faces import NO_MAP
+from .ground import edge_distance
+from .lamps import lamps_of
+from .lens import CameraPose, Lens
+from .network import Network
+from .options import SimulationOptions
+from .paint import grain
+from .sensor import add_glow
+from .vehicles import Vehicle, VehicleState
+
+_NEARER_M = 0.4
+"""What is nearer than the ground behind it by more stands before it."""
+_SUN_RAD = math.radians(28.0)
+_SHADE = 0.5
+_CLOUD_MPS, _CLOUD_M, _CLOUD_SHADE = 7.0, 45.0, 0.4
+_CLOUD_TEXELS = 256
+_POND_M = (5.0, 3.5)
+_WAVES = 10
+_GRAVITY = 9.81
+_WET_M = 1.5
+"""Size of the puddles and dry patches of a wet road."""
+_SMEAR_M = (0.25, 0.45, 0.7, 1.0, 1.5)
+"""Depths below the road at which the rough mirror of a wet road shows a lamp of 0.7 m."""
+_DROPS = 9
+_STREAKS = 350
+_RAIN_FALL_MPS, _EXPOSURE_S = 7.0, 1 / 60
+_LED_M = 0.12
+_LED_HEAD_M = 3.6
+_POLE_FREE_M = 9.0
+"""So near the camera stands no signal."""
+_CLOCK_FONT = cv2.FONT_HERSHEY_DUPLEX
+
+
+@dataclass(frozen=True)
+class GroundView:
+    """The ground behind each pixel."""
+
+    xy: np.ndarray
+    """Metres, shape (h, w, 2); far away where there is sky."""
+    distance_m: np.ndarray
+    """From the camera, shape (h, w); infinite where there is sky."""
+    off_road_m: np.ndarray
+    """How far off the asphalt, shape (h, w)."""
+
+    @classmethod
+    def of(cls, options: SimulationOptions, network: Network, pose: CameraPose) -> GroundView:
+        """Meet every pixel's ray with the ground."""
+        grid = np.stack(np.meshgrid(np.arange(options.width_px), np.arange(options.height_px)), -1)
+        rays = options.lens.bearings(grid) @ pose.world_from_camera.T
+        down = rays[..., 2] < -0.01
+        distance = np.where(down, -pose.position_m[2] / np.minimum(rays[..., 2], -0.01), np.inf)
+        reach = np.where(down, distance, 1e4)
+        xy = pose.position_m[:2] + rays[..., :2] * reach[..., None]
+        return cls(xy.astype(np.float32), distance.astype(np.float32), edge_distance(network, xy).astype(np.float32))
+
+    def seen(self, depth_m: np.ndarray) -> np.ndarray:
+        """Where (h, w) the ground is seen, given the distance (h, w) of what is nearest."""
+        return np.isfinite(self.distance_m) & (depth_m > self.distance_m - _NEARER_M)
+
+
+@dataclass(frozen=True)
+class View:
+    """What the effects of one frame are given."""
+
+    picture: np.ndarray
+    depth_m: np.ndarray
+    """Distance (h, w) of what each pixel shows."""
+    pose: CameraPose
+    vehicles: list[tuple[Vehicle, VehicleState]]
+    index: int
+    time_s: float
+
+
+class Weather:
+    """The troubles of one recording that are drawn into finished pictures; each frame depends on its index alone."""
+
+    def __init__(self, options: SimulationOptions, network: Network, poses: dict[bool, CameraPose]) -> None:
+        self._options, self._network, self._troubles = options, network, options.troubles
+        self._lens: Lens = options.lens
+        self._ground = ({bumped: GroundView.of(options, network, pose) for bumped, pose in poses.items()}
+                        if self._troubles & {'shadows', 'water', 'wet'} else {})
+        rng = np.random.default_rng([options.seed, 11])
+        self._sun_rad = float(rng.uniform(0, 2 * np.pi))
+        wind = rng.uniform(0, 2 * np.pi)
+        self._wind = np.array([math.cos(wind), math.sin(wind)])
+        size = _CLOUD_TEXELS
+        self._clouds = np.clip(0.5 + grain(size, size, ((32.0, 0.5),), rng), 0, 1)
+        self._puddles = np.clip(0.55 + grain(size, size, ((2.0, 0.25), (6.0, 0.3)), rng), 0, 1)
+        self._waves = _ripples(wind, rng)
+        self._pond = self._pond_mask(rng) if 'water' in self._troubles else None
+        self._drops = _drops_of(options, rng)
+
+    def on_ground(self, view: View, bumped: bool) -> None:
+        """Change how the ground looks by daylight: shadows, water."""
+        if 'water' in self._troubles:
+            self._shimmer(view, bumped)
+        if 'shadows' in self._troubles:
+            self._shade(view, bumped)
+
+    def lights(self, view: View, bumped: bool) -> None:
+        """Add what shines: mirrored lamps, signals."""
+        if 'wet' in self._troubles:
+            self._mirror_lamps(view, bumped)
+        if 'leds' in self._troubles:
+            self._signals(view)
+
+    def on_lens(self, view: View) -> np.ndarray:
+        """Return the picture through rain and drops, with the clock that the recorder burns in."""
+        picture = view.picture
+        if 'rain' in self._troubles:
+            picture = self._rain(picture, view.index)
+        if 'drops' in self._troubles:
+            picture = _through_drops(picture, self._drops, view.time_s)
+        if 'clock' in self._troubles:
+            _clock(picture, view.time_s)
+        return picture
+
+    def _shade(self, view: View, bumped: bool) -> None:
+        """Darken the ground under clouds that move with the wind, and in the shadows of vehicles."""
+        ground = self._ground[bumped]
+        coarse = (ground.xy[::8, ::8] - self._wind.astype(np.float32) * np.float32(_CLOUD_MPS * view.time_s))
+        texels = np.mod(coarse * (_CLOUD_TEXELS / (8 * _CLOUD_M)), _CLOUD_TEXELS).astype(np.float32)
+        cloud = cv2.remap(self._clouds, texels, NO_MAP, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+        height, width = ground.distance_m.shape
+        light = 1 - _CLOUD_SHADE * cv2.resize(cloud, (width, height), interpolation=cv2.INTER_LINEAR)
+        mask = np.zeros((height, width), np.uint8)
+        for vehicle, state in view.vehicles:
+            outline = self._shadow(vehicle, state, view.pose)
+            if outline is not None:
+                cv2.fillConvexPoly(mask, outline, 255, cv2.LINE_AA, 4)
+        shadow = cv2.GaussianBlur(mask, (0, 0), 1.0).astype(np.float32) / 255
+        light *= 1 - _SHADE * shadow
+        light[~ground.seen(view.depth_m)] = 1.0
+        view.picture[:] = (view.picture * light[..., None]).astype(np.uint8)
+
+    def _shadow(self, vehicle: Vehicle, state: VehicleState, pose: CameraPose) -> np.ndarray | None:
+        """Return the outline (n, 2), in sixteenths of a pixel, of the shadow that the low sun casts, if all is seen."""
+        shape = vehicle.shape
+        base = box_of(vehicle, state)[:4, :2]
+        top = max(part.top_m for part in shape.parts)
+        away = top / math.tan(_SUN_RAD) * np.array([math.cos(self._sun_rad), math.sin(self._sun_rad)])
+        hull = cv2.convexHull(np.concatenate([base, base + away]).astype(np.float32))[:, 0]
+        parts = np.linspace(0, 1, 6)[:-1, None]
+        dense = np.concatenate([a + parts * (b - a) for a, b in zip(hull, np.roll(hull, -1, axis=0), strict=True)])
+        pixels, valid = self._lens.project(pose.to_camera(np.pad(dense, ((0, 0), (0, 1)))))
+        return np.round(pixels * 16).astype(np.int32) if valid.all() else None
+
+    def _pond_mask(self, rng: np.random.Generator) -> dict[bool, tuple[np.ndarray, np.ndarray]]:
+        """Lay a pond beside the road; return its pixels (n,) rows and columns by pose."""
+        ground = self._ground[False]
+        fit = np.argwhere((ground.off_road_m > _POND_M[1] + 2.5) & (ground.off_road_m < _POND_M[1] + 9.0)
+                          & (ground.distance_m < 40.0))
+        if not len(fit):
+            return {}
+        row, column = fit[int(rng.integers(len(fit)))]
+        centre = ground.xy[row, column]
+        return {bumped: np.nonzero((((view.xy - centre) / _POND_M) ** 2).sum(-1) < 1) for bumped, view
+                in self._ground.items()}
+
+    def _shimmer(self, view: View, bumped: bool) -> None:
+        """Draw waves that travel with the wind, with the glitter of the sun on their slopes."""
+        if not self._pond:
+            return
+        rows, columns = self._pond[bumped]
+        ground = self._ground[bumped]
+        seen = ground.seen(view.depth_m)[rows, columns]
+        rows, columns = rows[seen], columns[seen]
+        numbers, rates, phases = self._waves
+        slope = np.sin(ground.xy[rows, columns] @ numbers.T - rates * view.time_s + phases).sum(-1) / math.sqrt(_WAVES)
+        level = 70 + 28 * slope + 130 * (slope > 1.3)
+        view.picture[rows, columns] = np.clip(level[:, None] * (1.0, 0.95, 0.8), 0, 255).astype(np.uint8)
+
+    def _mirror_lamps(self, view: View, bumped: bool) -> None:
+        """Add the lamps that the wet road mirrors: they shine from below it, smeared by its roughness."""
+        ground, camera = self._ground[bumped], view.pose.position_m
+        height, width = ground.distance_m.shape
+        for lamp in (lamp for vehicle, state in view.vehicles for lamp in lamps_of(vehicle, state)):
+            for depth in _SMEAR_M:
+                below = np.array([*lamp.place_m[:2], -depth])
+                to_camera = camera - below
+                distance = float(np.linalg.norm(to_camera))
+                turned = float(lamp.outward @ to_camera[:2]) / distance
+                pixel, valid = self._lens.project(view.pose.to_camera(below))
+                column, row = (round(float(c)) for c in pixel)
+                if turned < 0.05 or not valid or not (0 <= row < height and 0 <= column < width):
+                    continue
+                if view.depth_m[row, column] < ground.distance_m[row, column] - _NEARER_M:
+                    continue
+                texel = (ground.xy[row, column] / _WET_M * 6.0).astype(int) % _CLOUD_TEXELS
+                # A film of water mirrors the more, the flatter one looks at it.
+                mirrored = 0.05 + 0.95 * (1 - float(to_camera[2]) / distance) ** 5
+                share = 1.6 * mirrored * float(self._puddles[texel[1], texel[0]]) * min(1.0, 0.35 + turned)
+                radius = max(1.2, 1.3 * lamp.size_m * self._lens.focal_px / distance)
+                add_glow(view.picture, pixel, radius, _scaled(lamp.colour, min(share, 0.7)))
+
+    def _signals(self, view: View) -> None:
+        """Add the lit lamps of signals, whose pulses beat with the exposures."""
+        if not self._network.phases or self._network.stop_m is None:
+            return
+        for number, road in enumerate(self._network.roads):
+            for side in (1, -1):
+                foot = road.at(side * self._network.stop_m, side * (road.half_width_m + 0.5))
+                red = int(view.time_s / 12 + number) % 2
+                lamp = np.array([*foot, _LED_HEAD_M + 0.35 * red])
+                pixel, valid = self._lens.project(view.pose.to_camera(lamp))
+                column, row = (round(float(c)) for c in pixel)
+                inside = 0 <= row < self._options.height_px and 0 <= column < self._options.width_px
+                distance = float(np.linalg.norm(view.pose.position_m - lamp))
+                if not valid or not inside or distance < _POLE_FREE_M or view.depth_m[row, column] < distance - 1.0:
+                    continue
+                beat = np.clip(0.5 + 0.9 * math.sin(2 * np.pi * (3.1 + 0.7 * number) * view.time_s + side), 0.05, 1.0)
+                colour = (60, 60, 255) if red else (190, 255, 60)
+                add_glow(view.picture, pixel, max(1.5, _LED_M * self._lens.focal_px / distance * 1.5),
+                         _scaled(colour, float(beat)))
+
+    def _rain(self, picture: np.ndarray, index: int) -> np.ndarray:
+        """Draw the streaks that drops near the camera leave in one exposure, under a veil of those farther off."""
+        rng = np.random.default_rng([self._options.seed, 12, index])
+        height, width = picture.shape[:2]
+        distance = 1.0 + 12.0 * rng.uniform(size=_STREAKS) ** 0.5
+        length = _RAIN_FALL_MPS * _EXPOSURE_S * self._lens.focal_px / distance
+        start = rng.uniform((0, 0), (width, height), (_STREAKS, 2))
+        lean = 0.12 + rng.normal(0, 0.03, _STREAKS)
+        veil = np.zeros((height, width), np.uint8)
+        for (x, y), reach, slant, metres in zip(start, length, lean, distance, strict=True):
+            ends = [(round(16 * x), round(16 * y)), (round(16 * (x + slant * reach)), round(16 * (y + reach)))]
+            cv2.line(veil, *ends, int(np.clip(110 / metres + 12, 0, 90)), 1, cv2.LINE_AA, 4)
+        veil = cv2.GaussianBlur(veil, (0, 0), 0.8)
+        hazy = cv2.addWeighted(picture, 0.85, np.full_like(picture, 150), 0.08, 0)
+        return cv2.add(hazy, cv2.cvtColor(veil, cv2.COLOR_GRAY2BGR))
+
+
+def box_of(vehicle: Vehicle, state: VehicleState) -> np.ndarray:
+    """Return the corners (8, 3) of a vehicle's box, the four on the ground first."""
+    shape = vehicle.shape
+    c, s = math.cos(state.heading), math.sin(state.heading)
+    length, width = shape.length_m / 2, shape.width_m / 2
+    base = np.array([(length, width), (length, -width), (-length, -width), (-length, width)])
+    base = base @ np.array([[c, s], [-s, c]]) + (state.x, state.y)
+    top = max(part.top_m for part in shape.parts)
+    return np.concatenate([np.pad(base, ((0, 0), (0, 1)), constant_values=z) for z in (0.0, top)])
+
+
+def _scaled(colour: tuple[int, int, int], share: float) -> Any:
+    return tuple(round(c * share) for c in colour)
+
+
+def _ripples(wind: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Wave vectors (n, 2) in 1/m, rates (n,) in 1/s of waves on deep water, and phases (n,)."""
+    length = np.exp(rng.uniform(math.log(0.4), math.log(2.5), _WAVES))
+    heading = wind + rng.normal(0, 0.5, _WAVES)
+    number = 2 * np.pi / length
+    return (number[:, None] * np.stack([np.cos(heading), np.sin(heading)], 1), np.sqrt(_GRAVITY * number),
+            rng.uniform(0, 2 * np.pi, _WAVES))
+
+
+@dataclass(frozen=True)
+class Drop:
+    """Water on the front glass, far out of focus: it comes, rests, runs down, and comes again."""
+
+    x_px: float
+    y_px: float
+    radius_px: float
+    comes_s: float
+    rests_s: float
+    runs_px_s: float
+    again_s: float
+
+    def place(self, time_s: float, height_px: int) -> tuple[float, float] | None:
+        """Return where it is at a time, None while it is not there."""
+        age = (time_s - self.comes_s) % self.again_s
+        running = max(0.0, age - self.rests_s)
+        # It creeps, then goes faster, held up by the glass now and then.
+        way = self.runs_px_s * (running + 0.25 * math.sin(4 * running)) * min(1.0, running)
+        y = self.y_px + way
+        if y > height_px + self.radius_px:
+            return None
+        return self.x_px + 6 * math.sin(0.02 * way), y
+
+
+def _drops_of(options: SimulationOptions, rng: np.random.Generator) -> list[Drop]:
+    width, height = options.width_px, options.height_px
+    return [Drop(float(rng.uniform(0, width)), float(rng.uniform(0, 0.8 * height)),
+                 float(rng.uniform(0.012, 0.035) * width), float(rng.uniform(0, 30)), float(rng.uniform(3, 20)),
+                 float(rng.uniform(0.1, 0.5) * height), float(rng.uniform(25, 40))) for _ in range(_DROPS)]
+
+
+def _through_drops(picture: np.ndarray, drops: list[Drop], time_s: float) -> np.ndarray:
+    """Blend in, under each drop, what it shows: the surroundings upside down and blurred."""
+    height, width = picture.shape[:2]
+    small = cv2.resize(picture, (width // 8, height // 8), interpolation=cv2.INTER_AREA)
+    blurred = cv2.GaussianBlur(small, (0, 0), 3.0)
+    for drop in drops:
+        place = drop.place(time_s, height)
+        if place is None:
+            continue
+        x, y = place
+        reach = 1.6 * drop.radius_px
+        x0, x1 = (int(np.clip(c, 0, width)) for c in (x - reach, x + reach))
+        y0, y1 = (int(np.clip(c, 0, height)) for c in (y - reach, y + reach))
+        if x1 <= x0 or y1 <= y0:
+            continue
+        dx, dy = np.meshgrid(np.arange(x0, x1) - x, np.arange(y0, y1) - y)
+        radius = np.hypot(dx, dy) / drop.radius_px
+        alpha = 0.85 / (1 + np.exp((radius - 1) * 9))
+        source = np.stack([(x - 4 * dx) / 8, (y - 4 * dy) / 8], -1).astype(np.float32)
+        shown = cv2.remap(blurred, source, NO_MAP, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+        patch = picture[y0:y1, x0:x1]
+        patch[:] = (patch + alpha[..., None] * (shown.astype(float) - patch)).astype(np.uint8)
+    return picture
+
+
+def _clock(picture: np.ndarray, time_s: float) -> None:
+    """Burn date and time into the picture, in place."""
+    text = f'2024-05-17 08:{int(time_s) // 60:02d}:{int(time_s) % 60:02d}:{int(time_s * 100) % 100:02d}'
+    scale = picture.shape[1] / 1280
+    (width, height), base = cv2.getTextSize(text, _CLOCK_FONT, scale, 2)
+    x, y = round(20 * scale), round(20 * scale) + height
+    cv2.rectangle(picture, (x - 4, y - height - 6), (x + width + 4, y + base), (0, 0, 0), -1)
+    cv2.putText(picture, text, (x, y), _CLOCK_FONT, scale, (255, 255, 255), max(1, round(2 * scale)), cv2.LINE_AA)

@@ -1,0 +1,115 @@
+"""Who walks is told from who drives, by speed, width and way in metres."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from autocalib_ros.calibration import Calibration
+from autocalib_ros.calibrator import solve
+from autocalib_ros.config import Options
+from autocalib_ros.estimation.people import walkers
+from autocalib_ros.evidence import Evidence, Track
+from autocalib_ros.offline.synthetic_evidence import Junction, gathered, synthetic_evidence
+
+FIRST_WALKER = 1000
+"""Numbers from here on are people."""
+TIMES_S = np.arange(0.0, 24.0, 0.4)
+
+
+def _body(junction: Junction, number: int, start_s: float, path_m: np.ndarray, half_m: np.ndarray,
+          generator: np.random.Generator) -> list[Track]:
+    """Tracks of six points of a body, `half_m` (3,) large, that goes along a path (n, 2) on the road."""
+    tracks = []
+    for _ in range(6):
+        offset = generator.uniform((-half_m[0], -half_m[1], 0.1), half_m)
+        points = np.column_stack([path_m + offset[:2], np.full(len(path_m), offset[2] - junction.height_m)])
+        pixels, valid = junction.camera.project(points @ junction.camera_from_ground.T)
+        seen = valid & (pixels >= 0).all(axis=1) & (pixels < junction.image_size).all(axis=1)
+        if seen.sum() > 5:
+            noisy = pixels[seen] + generator.normal(scale=0.4, size=(seen.sum(), 2))
+            tracks.append(Track(number, start_s + TIMES_S[:len(path_m)][seen], noisy))
+    return tracks
+
+
+def _walker(junction: Junction, number: int, generator: np.random.Generator) -> list[Track]:
+    """Somebody 0.5 m wide and 1.7 m high who walks 1 to 1.7 m/s, swaying a little."""
+    heading, speed = generator.uniform(0, 2 * np.pi), generator.uniform(1.0, 1.7)
+    start = np.array(junction.centre_m) + generator.uniform(-8.0, 8.0, 2)
+    way = np.array([np.cos(heading), np.sin(heading)])
+    aside = 0.05 * np.sin(2 * np.pi * 0.9 * TIMES_S)
+    path = start + (TIMES_S - 8.0)[:, None] * speed * way + aside[:, None] * np.array([-way[1], way[0]])
+    return _body(junction, number, 2.0 * (number - FIRST_WALKER), path, np.array([0.25, 0.25, 1.7]), generator)
+
+
+def _stroller(junction: Junction, number: int, generator: np.random.Generator) -> list[Track]:
+    """The same on the pavement along the first road, from one side of it to the other and back."""
+    speed = generator.choice([-1.0, 1.0]) * generator.uniform(1.0, 1.7)
+    along = generator.uniform(-8.0, 8.0) + speed * (TIMES_S - 8.0)
+    aside = generator.choice([-7.0, 7.0]) + 0.5 * np.sin(along / 3.0 + generator.uniform(0, 6))
+    path = np.array(junction.centre_m) + np.column_stack([along, aside])
+    return _body(junction, number, 2.0 * (number - FIRST_WALKER), path, np.array([0.25, 0.25, 1.7]), generator)
+
+
+def _crawler(junction: Junction, number: int, generator: np.random.Generator) -> list[Track]:
+    """A car in a jam at walking speed."""
+    start = np.array(junction.centre_m) + (-12.0, generator.uniform(-4, 4))
+    path = start + 1.5 * TIMES_S[:, None] * (1.0, 0.0)
+    return _body(junction, number, 2.0 * number, path, np.array([2.0, 0.8, 1.4]), generator)
+
+
+def _joined(junction: Junction, evidence: Evidence, tracks: list[Track]) -> Evidence:
+    both = [*evidence.tracks(), *tracks]
+    return gathered(both, junction.image_size, max(float(track.times_s[-1]) for track in both))
+
+
+@pytest.fixture(scope='module')
+def street() -> tuple[Junction, Evidence]:
+    """Return forty vehicles and thirty people."""
+    generator = np.random.default_rng(5)
+    junction = Junction(vehicles=40, points_per_vehicle=6)
+    people = [track for number in range(30) for track in _walker(junction, FIRST_WALKER + number, generator)]
+    return junction, _joined(junction, synthetic_evidence(junction, generator), people)
+
+
+def test_who_walks_is_told_from_who_drives(street):
+    junction, evidence = street
+    told = walkers(evidence, junction.camera, junction.normal_in_camera, junction.height_m)
+    people = np.unique(evidence.track_vehicles[evidence.track_vehicles >= FIRST_WALKER])
+    assert len(people) > 20
+    assert np.isin(told, people).mean() > 0.95
+    assert np.isin(people, told).mean() > 0.8
+
+
+def test_cars_in_a_jam_are_no_people():
+    generator = np.random.default_rng(6)
+    junction = Junction()
+    crawling = [track for number in range(20) for track in _crawler(junction, number, generator)]
+    evidence = gathered(crawling, junction.image_size, 80.0)
+    told = walkers(evidence, junction.camera, junction.normal_in_camera, junction.height_m)
+    # Six points fall anywhere over a width of 1.6 m: of one car in twenty or so all fall within half of it.
+    assert len(told) <= 3
+
+
+def test_a_calibration_counts_vehicles_without_people_and_is_no_worse_for_them(street):
+    junction, evidence = street
+    result = solve(evidence, replace(Options(), camera_height=junction.height_m))
+    assert isinstance(result, Calibration)
+    assert result.evidence.people == pytest.approx(30, abs=5)
+    assert result.evidence.vehicles + result.evidence.people == evidence.summary().vehicles
+    off_deg = np.degrees(np.arccos(min(1.0, float(result.ground.normal_in_camera @ junction.normal_in_camera))))
+    assert off_deg < 3.0 * np.hypot(result.stddev.tilt_deg, result.stddev.roll_deg)
+
+
+def test_people_beside_a_lone_road_do_not_pass_for_turning_traffic():
+    generator = np.random.default_rng(7)
+    junction = Junction(road_angles_deg=(0.0,), turning_share=0.0, vehicles=25, points_per_vehicle=6)
+    people = [track for number in range(25) for track in _stroller(junction, FIRST_WALKER + number, generator)]
+    evidence = _joined(junction, synthetic_evidence(junction, generator), people)
+    # A third and more of all that moved follows no road.
+    assert (np.unique(evidence.track_vehicles) >= FIRST_WALKER).mean() > 0.35
+    result = solve(evidence, replace(Options(), camera_height=junction.height_m))
+    assert isinstance(result, Calibration), result
+    assert abs(result.camera.focal_px - junction.camera.focal_px) < 3.0 * result.stddev.focal_px

@@ -1,0 +1,110 @@
+"""Troubles are drawn where their physics puts them, and nowhere else."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import cv2
+import numpy as np
+import pytest
+
+from autocalib_ros.errors import UsageError
+from autocalib_ros.offline.simulate import Simulation, SimulationOptions
+from autocalib_ros.offline.simulate.lamps import lamps_of
+from autocalib_ros.offline.simulate.weather import GroundView, box_of
+
+SMALL = {'width_px': 320, 'height_px': 180, 'focal_px': 140.0, 'rate_hz': 10.0, 'duration_s': 40.0, 'noise_sigma': 0.0,
+         'pedestrians': 0}
+
+
+@cache
+def _simulation(**given) -> Simulation:
+    return Simulation(SimulationOptions(**{**SMALL, **given}))
+
+
+def _changed(trouble: str, first: int, second: int, **given) -> np.ndarray:
+    """Where (h, w) two frames differ by more than rounding does."""
+    simulation = _simulation(trouble=trouble, **given)
+    return np.abs(simulation.frame(first).astype(int) - simulation.frame(second)).max(-1) > 12
+
+
+def _off_road() -> np.ndarray:
+    simulation = _simulation()
+    return GroundView.of(simulation.options, simulation.network, simulation.pose).off_road_m
+
+
+@pytest.mark.parametrize('trouble', ['trees', 'flags', 'leds', 'water', 'shadows', 'rain', 'drops', 'clock'])
+def test_an_empty_road_moves_with_each_trouble(trouble):
+    changed = _changed(trouble, 100, 104, empty=True) | _changed(trouble, 100, 260, empty=True)
+    assert 5e-5 < changed.mean() < 0.5
+
+
+@pytest.mark.parametrize('trouble', ['trees', 'flags', 'water'])
+def test_what_sways_stays_where_it_is(trouble):
+    # Where it moves later is beside where it moved before: nothing travels.
+    early, late = (_changed(trouble, begin, begin + 13, empty=True) for begin in (100, 140))
+    reach = cv2.dilate(early.astype(np.uint8), np.ones((21, 21), np.uint8)) > 0
+    assert (late & reach).sum() > 0.9 * late.sum() > 0
+
+
+def test_water_lies_beside_the_road():
+    assert (_off_road()[_changed('water', 100, 104, empty=True)] > 0).all()
+
+
+def test_a_frame_does_not_depend_on_the_frames_before():
+    simulation = _simulation(trouble='trees,flags,leds,drops,rain,water,shadows,clock')
+    first = simulation.frame(30)
+    simulation.frame(31)
+    assert np.array_equal(simulation.frame(30), first)
+
+
+def test_a_vehicle_shades_the_ground_beside_it_and_not_itself():
+    simulation, plain = _simulation(trouble='shadows'), _simulation()
+    index = 150
+    darker = plain.frame(index).astype(int).max(-1) - simulation.frame(index).max(-1)
+    ground = GroundView.of(plain.options, plain.network, plain.pose)
+    clouds = _simulation(trouble='shadows', empty=True).frame(index).astype(int).max(-1)
+    # Without its vehicles the same place is as bright as the clouds leave it.
+    cast = (clouds - simulation.frame(index).max(-1) > 25) & (darker > 25) & np.isfinite(ground.distance_m)
+    inside = [_inside(plain, *pair) for pair in plain.states(plain.time_s(index))]
+    assert (cast & ~np.logical_or.reduce(inside)).sum() > 80
+
+
+def _inside(simulation: Simulation, vehicle, state) -> np.ndarray:
+    """Where (h, w) the box of a vehicle is seen."""
+    pixels, _ = simulation.lens.project(simulation.pose.to_camera(box_of(vehicle, state)))
+    mask = np.zeros((simulation.options.height_px, simulation.options.width_px), np.uint8)
+    cv2.fillConvexPoly(mask, cv2.convexHull(np.round(pixels).astype(np.int32)), 1)
+    return mask > 0
+
+
+def test_a_wet_road_mirrors_lamps_as_far_below_it_as_they_are_above():
+    wet, dry = _simulation(trouble='wet', night=True), _simulation(night=True)
+    index = 150
+    added = wet.frame(index).astype(int).max(-1) - dry.frame(index).max(-1)
+    near = [pixel for vehicle, state in dry.states(dry.time_s(index)) for lamp in lamps_of(vehicle, state)
+            if (pixel := _mirrored(dry, lamp)) is not None]
+    bright = [added[int(round(y)), int(round(x))] for x, y in near]
+    assert np.quantile(bright, 0.9) > 40
+    # And not above the road: nothing is added over the horizon.
+    ground = GroundView.of(dry.options, dry.network, dry.pose)
+    assert (added[np.isinf(ground.distance_m)] < 20).all()
+
+
+def _mirrored(simulation: Simulation, lamp) -> np.ndarray | None:
+    """Pixel (2,) of a lamp's mirror image where it is in the picture and shines this way."""
+    below = lamp.place_m * (1, 1, -1)
+    to_camera = simulation.pose.position_m - below
+    pixel, valid = simulation.lens.project(simulation.pose.to_camera(below))
+    size = (simulation.options.width_px - 1, simulation.options.height_px - 1)
+    towards = float(lamp.outward @ to_camera[:2]) / float(np.linalg.norm(to_camera))
+    return pixel if valid and (pixel > 1).all() and (pixel < np.array(size) - 1).all() and towards > 0.3 else None
+
+
+@pytest.mark.parametrize(('given', 'words'), [
+    ({'trouble': 'snow'}, "unknown trouble 'snow'"), ({'trouble': 'wet'}, 'needs night'),
+    ({'trouble': 'trees', 'thermal': True}, 'leave out trouble or thermal')])
+def test_what_cannot_be_drawn_is_said(given, words):
+    with pytest.raises(UsageError, match=words):
+        replace(SimulationOptions(), **given)
