@@ -113,6 +113,18 @@ class PaperReport:
     """The paper's t = (0, 0, H / |r33|), whose origin is where the optical axis meets the road."""
 
 
+@dataclass(frozen=True)
+class Residuals:
+    """How far what a solution rests on lies from where the solution has it, in observed pixels."""
+
+    points_px: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), np.float32))
+    """Observed pixels, shape (n, 2)."""
+    distance_px: np.ndarray = field(default_factory=lambda: np.zeros(0, np.float32))
+    """From the path along a road, or from the place on a vehicle that turns, shape (n,)."""
+    roads: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int8))
+    """Index of the road direction, -1 for a vehicle that turns, shape (n,)."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Figures:
     """What a report draws; not part of a result's identity and not written to calibration.json."""
@@ -126,6 +138,8 @@ class Figures:
     orientation_peaks_deg: tuple[float, ...] = ()
     paper_tracks: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
     """Indices of the tracks that the published method keeps."""
+    residuals: Residuals = field(default_factory=Residuals)
+    """Of the robust method; none for the published one."""
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from autocalib_ros.estimation.paper import solve_paper
 from autocalib_ros.estimation.path_noise import USUAL_HEIGHT_M
 from autocalib_ros.estimation.people import walkers
 from autocalib_ros.estimation.plane import Plane
+from autocalib_ros.estimation.residuals import residuals_of
 from autocalib_ros.estimation.scale import Scale, is_unusual, known_scale, scale_doubt
 from autocalib_ros.estimation.solution import Solution, find_solution
 from autocalib_ros.estimation.straightness import paper_intrinsics
@@ -290,7 +291,7 @@ def _figures(figures: Figures, solution: Solution, indices: np.ndarray, evidence
     labels[indices] = np.where(solution.fit.explained(), solution.fit.labels, -2)
     found = segment_orientations(solution.fit.state.camera, evidence.segments_px, options.paper)
     return replace(figures, track_labels=labels, orientation_histogram=found.histogram,
-                   orientation_peaks_deg=found.peaks_deg)
+                   orientation_peaks_deg=found.peaks_deg, residuals=residuals_of(solution.fit))
 
 
 def _lens_deviations(solution: Solution) -> StandardDeviations:

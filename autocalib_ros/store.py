@@ -3,6 +3,7 @@
     NAME.yaml            the lens as camera_info_manager reads it
     NAME.autocalib.json  calibration.json with the pose, the deviations, the evidence, and what NAME.yaml says
     *.bak                the pair before
+    NAME.report.html     for people, with its figures in NAME.figures; nothing reads them
 
 Each file is replaced in one step, the JSON before the YAML. Whoever is killed between the two leaves a YAML that
 says what the JSON before says; so the lens in the YAML tells which of the two JSONs belongs to it, and a YAML that
@@ -105,6 +106,8 @@ class Store:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.beside = path.with_name(f'{path.stem}.autocalib.json')
+        self.report = path.with_name(f'{path.stem}.report.html')
+        self.figures = path.with_name(f'{path.stem}.figures')
 
     def tidy(self) -> None:
         """Remove what a writer left that was killed; not to be called while another writes."""

@@ -15,7 +15,7 @@ PACKAGE = Path(autocalib_ros.__file__).parent
 STOREYS = (('errors', 'threads', 'redundancy'), ('config', 'files'), ('camera',), ('opencv_lens',), ('camera_info',),
            ('calibration', 'info_lens'), ('calibration_reader',),
            ('evidence', 'ground', 'store', 'known_camera', 'comparison'),
-           ('perception', 'estimation', 'pictures'), ('compare',), ('calibrator', 'standing'),
+           ('perception', 'estimation', 'pictures'), ('compare',), ('calibrator', 'standing'), ('report',),
            ('ros', 'offline'), ('commands',), ('cli',), ('__main__', 'benchmark'))
 STOREY = {room: height for height, rooms in enumerate(STOREYS) for room in rooms}
 ROS_PACKAGES = ('rclpy', 'ament_index_python', 'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs',

@@ -130,8 +130,12 @@ class Bundle:
 
     def residuals(self, camera: Camera, camera_from_plane: np.ndarray, shapes: Shapes) -> np.ndarray:
         """Whitened residuals (lives, points, instants, 2)."""
+        return self.whiten @ self.misses_px(camera, camera_from_plane, shapes)
+
+    def misses_px(self, camera: Camera, camera_from_plane: np.ndarray, shapes: Shapes) -> np.ndarray:
+        """From each observed pixel to where its point should be seen, shape (lives, points, instants, 2)."""
         pixels, _ = camera.project(self._placed(shapes) @ camera_from_plane.T)
-        return self.whiten @ ((pixels - self.lives.pixels) * self.mask[..., None])
+        return (pixels - self.lives.pixels) * self.mask[..., None]
 
     def _placed(self, shapes: Shapes) -> np.ndarray:
         """Positions (lives, points, instants, 3) in the frame of the plane."""

@@ -84,6 +84,12 @@ class RoadRows:
         distance = rays.distance_px(self._circles(state, rays)[:, None])
         return None, ((self.whiten @ distance[..., None])[..., 0]**2).sum(axis=1) / self.freedom
 
+    def distances_px(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Observed pixels (n, 2), their distances from the circles (n,), and their tracks (n,), at the base."""
+        track, sample = np.nonzero(self._mask)
+        distance = np.abs(self._rays.distance_px(self._normals[:, None]))
+        return self._tracks.pixels[track, sample], distance[track, sample], track
+
     def log_density(self) -> np.ndarray:
         """Logarithm of the determinant of each track's whitening, shape (tracks,)."""
         diagonal = np.diagonal(self.whiten, axis1=1, axis2=2)
@@ -165,6 +171,12 @@ class MotionRows:
         slopes = slopes - own @ np.linalg.solve(matrix, own.transpose(0, 2, 1) @ slopes)
         return Rows.of(self._root * self._here, slopes, self.freedom, np.ones(len(self.freedom)))
 
+    def distances_px(self) -> tuple[np.ndarray, np.ndarray]:
+        """Observed pixels (n, 2) and how far each misses the motion of its window (n,), at the base."""
+        window, point = np.nonzero(self._base.mask)
+        distance = np.abs(self._here * self._base.sigma_px)
+        return self._windows.second_px[window, point], distance[window, point]
+
     def _moved(self, unit: np.ndarray) -> np.ndarray:
         """Distances a small step away, the motions as they are."""
         lens, turns = self._steps.lens, self._steps.lens + len(self._steps.axes)
@@ -211,3 +223,9 @@ class LifeRows:
         matrix = lifted(own.transpose(0, 2, 1) @ own, np.zeros(len(own)))
         self._follow = np.linalg.solve(matrix, own.transpose(0, 2, 1) @ shared)
         return Rows.of(here, shared - own @ self._follow, self.freedom, np.ones(len(own)))
+
+    def distances_px(self) -> tuple[np.ndarray, np.ndarray]:
+        """Observed pixels (n, 2) and how far each is from its place on the body (n,), at the base."""
+        base, lives = self._steps.base, self._bundle.lives
+        away = self._bundle.misses_px(base.camera, base.rotation, self.inner)
+        return lives.pixels[lives.mask], np.hypot(*away[lives.mask].T)

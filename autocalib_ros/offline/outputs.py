@@ -10,6 +10,7 @@ from autocalib_ros.camera_info import write_camera_info_yaml
 from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.offline.replay import ReplayResult
 from autocalib_ros.offline.sources import Source
+from autocalib_ros.report.scene import Scene
 
 CAMERA_INFO, CALIBRATION, EVIDENCE, REPORT = 'camera_info.yaml', 'calibration.json', 'evidence.npz', 'report.html'
 
@@ -49,7 +50,7 @@ def write_outputs(out_dir: Path, replayed: ReplayResult, source: Source) -> list
 
 def write_result(out_dir: Path, replayed: ReplayResult, source_name: str, name_of_camera: str = 'camera') -> list[str]:
     """Write the results, and remove those of an earlier run that no longer hold; return the names written."""
-    from autocalib_ros.offline.report import write_report  # imported late: it needs matplotlib
+    from autocalib_ros.report.page import write_report  # imported late: it needs matplotlib
 
     result = replayed.result
     if isinstance(result, Calibration):
@@ -58,7 +59,9 @@ def write_result(out_dir: Path, replayed: ReplayResult, source_name: str, name_o
     else:
         _remove(out_dir / CAMERA_INFO)
     write_calibration_json(out_dir / CALIBRATION, result, accepted_at_s=replayed.accepted_at_s)
-    write_report(out_dir / REPORT, replayed, source_name)
+    write_report(out_dir / REPORT, Scene(
+        result=result, evidence=replayed.evidence, background=replayed.background, options=replayed.options,
+        source=source_name, accepted_at_s=replayed.accepted_at_s, moments=replayed.moments))
     return ([CAMERA_INFO] if result else []) + [CALIBRATION, REPORT]
 
 

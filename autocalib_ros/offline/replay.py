@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -15,7 +15,11 @@ from autocalib_ros.errors import InputError
 from autocalib_ros.evidence import Evidence
 from autocalib_ros.offline.sources import Source
 from autocalib_ros.perception.detector.detector import VehicleDetector
+from autocalib_ros.report.scene import Moment, noted
 
+SETTLING = 2.0
+"""Once accepted, a solution on the way is tried again when the recording has grown by this factor: by then a standard
+deviation has fallen by a third. Only the report has use for it."""
 NOTE_EVERY = 15
 """Frames between two questions for the progress: it is for people, who read slowly."""
 
@@ -31,6 +35,9 @@ class ReplayResult:
     background: np.ndarray | None
     """The road without its traffic, BGR uint8."""
     frames: int
+    options: Options = field(default_factory=Options)
+    moments: tuple[Moment, ...] = ()
+    """What the solutions on the way said, and the last."""
 
 
 def replay(source: Source, options: Options, on_progress: Callable[[int, str], None] | None = None,
@@ -44,15 +51,21 @@ def replay(source: Source, options: Options, on_progress: Callable[[int, str], N
     tell = on_progress or (lambda done, note: None)
     calibrator, accepted_at_s, count, note, fitting = AutoCalibrator(options, detector), None, 0, '', None
     latest: Calibration | Refusal | None = None
+    moments: tuple[Moment, ...] = ()
+    again_s = 0.0
     for count, frame in enumerate(source.frames(), start=1):
         fitting = _fitting(lens, (frame.image.shape[1], frame.image.shape[0]))
         calibrator.add_image(frame.stamp_ns, frame.image)
-        # a live run would have been accepted then; afterwards only the last solution counts
-        if accepted_at_s is None and (due := calibrator.take_due()) is not None:
+        due = calibrator.take_due()
+        if due is not None and due.seconds >= again_s:
             tell(count, 'solving')
-            latest = solve(due, options, lens=fitting)
-            accepted_at_s = due.seconds if latest else None
-        if on_progress is not None and (count % NOTE_EVERY == 1):
+            tried = solve(due, options, lens=fitting)
+            moments = noted(moments, tried)
+            if tried and accepted_at_s is None:  # a live run would have been accepted then
+                accepted_at_s = due.seconds
+            latest = tried if tried or accepted_at_s is None else latest
+            again_s = 0.0 if accepted_at_s is None else SETTLING * due.seconds
+        if on_progress is not None and count % NOTE_EVERY == 1:
             note = _note(calibrator, latest, accepted_at_s)
         tell(count, note)
     evidence = calibrator.snapshot()
@@ -64,7 +77,8 @@ def replay(source: Source, options: Options, on_progress: Callable[[int, str], N
     if result and accepted_at_s is None:
         accepted_at_s = evidence.seconds
     return ReplayResult(result=result, evidence=evidence, accepted_at_s=accepted_at_s,
-                        background=calibrator.background(), frames=count)
+                        background=calibrator.background(), frames=count, options=options,
+                        moments=noted(moments, result))
 
 
 def _note(calibrator: AutoCalibrator, latest: Calibration | Refusal | None, accepted_at_s: float | None) -> str:
@@ -80,7 +94,7 @@ def _note(calibrator: AutoCalibrator, latest: Calibration | Refusal | None, acce
 def solve_again(evidence: Evidence, options: Options, lens: Camera | None = None) -> ReplayResult:
     """Solve saved evidence; it does not tell when it would first have been accepted, and has no picture."""
     return ReplayResult(result=solve(evidence, options, lens=_fitting(lens, evidence.image_size)), evidence=evidence,
-                        accepted_at_s=None, background=None, frames=evidence.frames)
+                        accepted_at_s=None, background=None, frames=evidence.frames, options=options)
 
 
 def _fitting(lens: Camera | None, image_size: tuple[int, int]) -> Camera | None:

@@ -6,8 +6,8 @@ import textwrap
 from dataclasses import replace
 
 from autocalib_ros.calibration import Calibration, Refusal
-from autocalib_ros.offline.summary import number_rows, remedy
 from autocalib_ros.offline.terminal import aligned
+from autocalib_ros.report.words import number_rows, remedy
 
 INDENT = '  '
 

@@ -32,6 +32,7 @@ from autocalib_ros.ros.live_parameters import LiveParameters
 from autocalib_ros.ros.live_pictures import LivePictures
 from autocalib_ros.ros.parameters import options_of
 from autocalib_ros.ros.pipeline import Pipeline, Result, Solve
+from autocalib_ros.ros.reports import Place, Reports
 from autocalib_ros.ros.solver import SolverProcess
 from autocalib_ros.ros.status import Counts, Recent, Situation
 from autocalib_ros.ros.wording import described, described_progress
@@ -64,6 +65,7 @@ class AutocalibNode(Node):
         self._driver = DriverInfo(self, self.node_options)
         self._store = self._store_of('')
         self.keeper = Keeper(lambda fault: self.get_logger().error(f'the calibration was not saved: {fault}'))
+        self._reports = Reports(lambda text, good: self._say(text, good=good))
         self._upload = DriverUpload(self, self._say) if self.node_options.upload_to_driver else None
         self.in_force = InForce(self, self.options, self.node_options, self._headers, driver=self._driver,
                                 taken=self._hand_on, withdrawn=self._hold_back)
@@ -96,6 +98,7 @@ class AutocalibNode(Node):
         deadline = time.monotonic() + CLOSE_S
         if not self.keeper.close(CLOSE_S / 2):
             self.get_logger().warning('a calibration was still being written at shutdown and is abandoned')
+        self._reports.close()
         if not self._pipeline.close(deadline - time.monotonic()):
             self.get_logger().warning('a solution was still running at shutdown and is abandoned')
         self._pictures.close(max(0.0, deadline - time.monotonic()))
@@ -146,14 +149,28 @@ class AutocalibNode(Node):
             self.keeper.withdraw()  # the same would be written once more
         response.success = error is None
         response.message = (f'not saved: {error}' if error else
-                            f'saved the {state.value} calibration to {store.path} and {store.beside}')
+                            f'saved the {state.value} calibration to {store.path} and {store.beside}; '
+                            f'the report follows in {store.report}')
+        if error is None:
+            self._report(published, store)
         return response
+
+    def _report(self, published: Published, store: Store) -> None:
+        """Have the report of a calibration written: whoever saves it need not wait, the log says when it is there."""
+        source = f'{self._headers.camera_name(published.image_frame) or "camera"}, live on {self._input.topic}'
+
+        def go_on(looked: concurrent.futures.Future) -> None:
+            scene = self._reports.scene(published.result, looked.result(), self.options, source)
+            self._reports.write(Place(store.report, store.figures), scene)
+
+        self._pipeline.look().add_done_callback(go_on)
 
     def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Forget the evidence and withdraw the calibration; what is stored stays until the next is saved."""
         self._pipeline.reset()
         self._pictures.forget()
         was = self.in_force.withdraw()
+        self._reports.forget()
         response.success = True
         response.message = 'the evidence is forgotten' + (
             '' if was is CalibrationState.NONE else f', the {was.value} calibration is withdrawn') + (
@@ -233,6 +250,8 @@ class AutocalibNode(Node):
 
     def _hand_on(self, published: Published, save: bool) -> None:
         """Give a calibration that this run's traffic vouches for to the store and the driver, where that is wanted."""
+        if save:
+            self._reports.rests_on(published.result, self._pipeline.told_of)
         if save and self.node_options.autosave and self._store is not None:
             self.keeper.offer(self._store, self._stored(published))
         if self._upload is not None:
@@ -272,6 +291,7 @@ class AutocalibNode(Node):
 
     def solved(self, result: Result) -> None:
         """Publish a calibration, unless what is in force tells more; a refusal changes nothing."""
+        self._reports.solved(result)
         if isinstance(result, Refusal):
             self._say_seldom(f'refusal {result.code}', described(result), error=False)
             return

@@ -116,6 +116,7 @@ class Pipeline:
         self._changed = threading.Condition()
         self._images: deque[tuple[int, Any]] = deque(maxlen=WAITING_IMAGES)
         self._requests: list[Future] = []
+        self._looks: list[Future] = []
         self._job: _Job | None = None
         self._running: _Job | None = None
         self._closed = self._changing = False
@@ -126,6 +127,8 @@ class Pipeline:
         self._looked = -PROGRESS_PERIOD_S
         self.counters = Counters()
         self.progress: Progress | None = None
+        self.told_of: Evidence | None = None
+        """What the solution rests on that the listener is told of at the moment."""
         self._refused = ''
         self._threads = [threading.Thread(target=run, name=name, daemon=True)
                          for run, name in ((self._perceive, 'perception'), (self._estimate, 'solver'))]
@@ -149,6 +152,17 @@ class Pipeline:
                 future.set_result(None)
             else:
                 self._requests.append(future)
+                self._changed.notify_all()
+        return future
+
+    def look(self) -> Future:
+        """Ask for what is seen: the future holds the evidence and the road without traffic, None each before that."""
+        future: Future = Future()
+        with self._changed:
+            if self._closed:
+                future.set_result((None, None))
+            else:
+                self._looks.append(future)
                 self._changed.notify_all()
         return future
 
@@ -178,8 +192,10 @@ class Pipeline:
         with self._changed:
             self._closed = True
             waiting = self._take_waiting()
+            looks, self._looks = self._looks, []
             self._changed.notify_all()
         self._answer(waiting, None)
+        self._answer(looks, (None, None))
         self._stop_solving()
         deadline = time.monotonic() + timeout_s
         for thread in self._threads:
@@ -198,12 +214,13 @@ class Pipeline:
         """Run the perception thread: the only one that touches the calibrator."""
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._closed or self._images or self._requests or self._changing,
-                                       self._until_idle())
+                self._changed.wait_for(lambda: (self._closed or self._images or self._requests or self._looks
+                                                or self._changing), self._until_idle())
                 if self._closed:
                     return
                 life = self._life
                 changing, self._changing = self._changing, False
+                looks, self._looks = self._looks, []
                 image = self._images.popleft() if self._images else None
                 requests: list[Future] = []
                 # a caller means all that has come so far, but does not wait for a queue that never empties
@@ -216,6 +233,9 @@ class Pipeline:
                 self._unsolved += 1  # so that it takes effect even when no image comes any more
             if image is not None:
                 self._use(*image)
+            if looks:
+                self._answer(looks, self._guarded(lambda: (self._calibrator.snapshot(), self._calibrator.background()))
+                             or (None, None))
             if requests or (image is None and self._until_idle() == 0.0):
                 self._submit(self._guarded(self._calibrator.snapshot), requests)
 
@@ -280,7 +300,9 @@ class Pipeline:
             began = time.monotonic()
             result = self._guarded(partial(self._solved, job.evidence))
             if result is not None:
+                self.told_of = job.evidence
                 result = self._told(result, job)
+                self.told_of = None
             self._rested = time.monotonic() + REST * (time.monotonic() - began)
             self._answer(job.waiting, result)
 
@@ -321,7 +343,7 @@ class Pipeline:
         """Return the known lens for images of that size; UsageError when they have another shape."""
         return None if self._lens is None else self._lens.scaled_to(*image_size)
 
-    def _answer(self, futures: list[Future], result: Result | None) -> None:
+    def _answer(self, futures: list[Future], result: Any) -> None:
         """Give callers their result; `close` may have sent them away in the meantime."""
         with self._changed:
             for future in futures:

@@ -10,22 +10,11 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from junction import full_result, grey_road, junction_evidence, lens_result, refusal
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from autocalib_ros.calibration import (
-    Calibration,
-    Figures,
-    GroundPlane,
-    PaperReport,
-    Reason,
-    Refusal,
-    StandardDeviations,
-)
-from autocalib_ros.camera import Camera
-from autocalib_ros.config import BufferOptions
-from autocalib_ros.evidence import Evidence, EvidenceBuffer, Track
 from autocalib_ros.offline.replay import ReplayResult
 
 WIDTH, HEIGHT = 32, 24
@@ -136,76 +125,24 @@ def a_header() -> Any:
     return header(SECOND)
 
 
-def look(down_deg: float = 40.0) -> np.ndarray:
-    """Return ground_from_camera of a camera that looks down and along the ground's x and y alike."""
-    down = np.radians(down_deg)
-    forward = np.array([np.cos(down) * np.sqrt(0.5), np.cos(down) * np.sqrt(0.5), -np.sin(down)])
-    right = np.cross(forward, [0, 0, 1])
-    right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(forward, right), forward], axis=1)
-
-
-def street_tracks(camera: Camera, ground: GroundPlane) -> list[Track]:
-    """Return straight tracks along x and along y that the camera sees."""
-    along, tracks = np.linspace(-30, 30, 200), []
-    for vehicle in range(24):
-        points = np.zeros((len(along), 3))
-        points[:, vehicle % 2], points[:, 1 - vehicle % 2] = 8 + along, 3 + vehicle / 2
-        bearings = (points - ground.translation_m) @ ground.rotation
-        pixels, valid = camera.project(bearings)
-        seen = valid & (bearings[:, 2] > 0) & (pixels > 0).all(axis=1) & (pixels < [319, 179]).all(axis=1)
-        if seen.sum() > 5:
-            tracks.append(Track(vehicle, along[seen], pixels[seen]))
-    return tracks
-
-
 @pytest.fixture
-def evidence_of_a_junction() -> Evidence:
-    """Return exact tracks on two roads seen by a small camera."""
-    camera, ground = Camera.equidistant(320, 180, 140.0), GroundPlane(look(), 8.0)
-    buffer = EvidenceBuffer(BufferOptions())
-    for track in street_tracks(camera, ground):
-        buffer.add_track(track)
-    return buffer.snapshot(image_size=(320, 180), first_stamp_ns=0, newest_stamp_ns=60 * SECOND, frames=600,
-                           drift_px=0.0, unfinished=[])
-
-
-@pytest.fixture
-def full(evidence_of_a_junction: Evidence) -> ReplayResult:
+def full() -> ReplayResult:
     """Return a calibrated replay with everything that a report can show."""
-    ground, evidence = GroundPlane(look(), 8.0), evidence_of_a_junction
-    trials = np.linspace(80, 300, 50)
-    labels = evidence.track_vehicles % 2
-    labels[:2] = -1, -2
-    figures = Figures(
-        focal_sweep_px=np.stack([trials, 1 + (trials / 140 - 1)**2], axis=1), track_labels=labels,
-        orientation_histogram=np.stack([np.arange(-89.5, 90), np.arange(180) % 30], axis=1),
-        orientation_peaks_deg=(-30.0, 45.0), paper_tracks=np.arange(3))
-    result = Calibration(
-        method='joint', grade='full', assumptions=('the two roads are perpendicular',),
-        camera=Camera.equidistant(320, 180, 140.0), ground=ground, ground_refusal=None,
-        road_directions=ground.rotation[:2], newest_stamp_ns=evidence.newest_stamp_ns, evidence=evidence.summary(),
-        stddev=StandardDeviations(focal_px=1.5, tilt_deg=0.2), figures=figures,
-        paper=PaperReport(focal_px=150.0, polynomial_k=(0.3, 0.0, 0.0), straightness_px2=(4.0, 0.5)))
-    background = np.random.default_rng(0).integers(90, 160, (180, 320, 3)).astype(np.uint8)
-    return ReplayResult(result=result, evidence=evidence, accepted_at_s=30.0, background=background, frames=600)
+    evidence = junction_evidence()
+    return ReplayResult(result=full_result(evidence), evidence=evidence, accepted_at_s=30.0, background=grey_road(),
+                        frames=600)
 
 
 @pytest.fixture
 def refused(full: ReplayResult) -> ReplayResult:
     """Return a refused replay."""
-    refusal = Refusal(code='too_few_tracks', message='only 12 of 40 tracks were seen', method='joint',
-                      remedy='Record at a busier time.', evidence=full.evidence.summary())
-    return replace(full, result=refusal, accepted_at_s=None)
+    return replace(full, result=refusal(full.evidence), accepted_at_s=None)
 
 
 @pytest.fixture
 def lens_only(full: ReplayResult) -> ReplayResult:
     """Return a replay that gave a lens and no ground plane."""
-    why = Reason(code='one_direction', message='one direction only', remedy='Aim at a crossing.')
-    lens = replace(full.result, grade='lens', ground=None, ground_refusal=why,
-                   road_directions=full.result.road_directions[:1])
-    return replace(full, result=lens)
+    return replace(full, result=lens_result(full.result))
 
 
 @pytest.fixture

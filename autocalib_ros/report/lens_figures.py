@@ -9,17 +9,18 @@ from matplotlib.figure import Figure
 from autocalib_ros.calibration import Calibration
 from autocalib_ros.camera import Camera
 from autocalib_ros.camera_info import rectified_matrix
-from autocalib_ros.offline.report.canvas import (
+from autocalib_ros.pictures.views import rectified_sources, resample
+from autocalib_ros.report.canvas import (
     INK,
     MUTED,
-    Scene,
     chart,
     draw_legend,
     draw_paths,
     image_axes,
+    label_colour,
     road_colour,
 )
-from autocalib_ros.pictures.views import rectified_sources, resample
+from autocalib_ros.report.scene import Scene
 
 LEAST_ERROR_PX = 1e-3
 """Below this a track counts as straight; it keeps the logarithmic axes finite."""
@@ -27,15 +28,24 @@ LEAST_ERROR_PX = 1e-3
 
 def undistorted(scene: Scene) -> Figure | None:
     """Show the road as a distortion-free camera would see it, with the kept tracks, which are straight there."""
-    if scene.calibration is None or scene.background is None:
+    if scene.calibration is None or (scene.background is None and not scene.groups()):
         return None
     camera = scene.calibration.camera
     matrix = rectified_matrix(camera)
-    figure, axes = image_axes(scene, picture=resample(scene.background, rectified_sources(camera, matrix)))
-    for label in range(int(scene.labels.max(initial=-1)) + 1):
-        paths = [in_undistorted(camera, matrix, path) for path in _paths(scene, label)]
-        draw_paths(axes, paths, road_colour(label), alpha=0.6, width=0.8)
+    figure, axes = undistorted_axes(scene)
+    for name, label, tracks in scene.groups():
+        paths = [in_undistorted(camera, matrix, path) for path in tracks]
+        draw_paths(axes, paths, label_colour(label), name, alpha=0.6, width=0.8)
+    draw_legend(axes)
     return figure
+
+
+def undistorted_axes(scene: Scene) -> tuple[Figure, Axes]:
+    """Return a figure that shows the undistorted image, in its pixels."""
+    camera, picture = scene.calibration.camera, scene.background
+    if picture is not None:
+        picture = resample(picture, rectified_sources(camera, rectified_matrix(camera)))
+    return image_axes(scene, picture=picture)
 
 
 def in_undistorted(camera: Camera, matrix: np.ndarray, pixels: np.ndarray) -> np.ndarray:
@@ -48,26 +58,27 @@ def in_undistorted(camera: Camera, matrix: np.ndarray, pixels: np.ndarray) -> np
 
 def straightness(scene: Scene) -> Figure | None:
     """Compare how far each kept track strays from its line before and after undistortion."""
-    if scene.calibration is None or not (scene.labels >= 0).any():
+    if scene.calibration is None or not scene.roads:
         return None
-    figure, axes = chart(4.8)
+    figure, (axes,) = chart(4.4)
     camera, ends = scene.calibration.camera, []
-    for label in range(int(scene.labels.max()) + 1):
+    for label in scene.roads:
         errors = np.array([(line_error_px(path), line_error_px(camera.undistort(path)))
-                           for path in _paths(scene, label)]).reshape(-1, 2)
+                           for path in scene.paths(label)]).reshape(-1, 2)
         errors = np.maximum(errors[np.isfinite(errors).all(axis=1)], LEAST_ERROR_PX)
         if len(errors):
             before, after = np.median(errors, axis=0)
             ends.append(errors)
             axes.loglog(*errors.T, 'o', color=road_colour(label), alpha=0.6, markersize=4,
-                        label=f'road direction {label + 1}: median {before:.2f} px before, {after:.2f} px after')
+                        label=f'{scene.road_name(label)}: median {before:.2f} px before, {after:.2f} px after')
     if not ends:
         return None
     span = [np.concatenate(ends).min(), np.concatenate(ends).max()]
     axes.plot(span, span, color=MUTED, linewidth=1, label='no change')
-    axes.set_xlabel('distance from a straight line before, px (root mean square)', color=INK)
+    axes.set_ylim(top=span[1] * 12)  # room for the legend
+    axes.set_xlabel('distance from a straight line before undistortion, px (root mean square)', color=INK)
     axes.set_ylabel('after undistortion, px', color=INK)
-    axes.legend(fontsize=9, frameon=False, loc='upper left')
+    draw_legend(axes, 'upper left')
     return figure
 
 
@@ -84,28 +95,34 @@ def focal_sweep(scene: Scene) -> Figure | None:
     sweep = sweep[np.isfinite(sweep).all(axis=1)] if len(sweep) else sweep
     if not len(sweep):
         return None
-    figure, axes = chart(3.6)
+    figure, (axes,) = chart(3.6)
     axes.plot(*sweep.T, color=INK, linewidth=1.6)
     if (sweep[:, 1] > 0).all():
         axes.set_yscale('log')
     if scene.calibration is not None:
         _mark_focal(axes, scene.calibration)
+        axes.set_xlim(*_around(scene.calibration, sweep[:, 0]))
     axes.set_xlabel('trial focal length, px', color=INK)
     axes.set_ylabel('error of straightness, px²', color=INK)
     draw_legend(axes, 'upper center')
     return figure
 
 
+def _around(calibration: Calibration, trials: np.ndarray) -> tuple[float, float]:
+    """Return the range of trial focal lengths from half to twice what was found."""
+    found = [calibration.camera.focal_px] + ([calibration.paper.focal_px] if calibration.paper else [])
+    return max(0.5 * min(found), float(trials.min())), min(2.0 * max(found), float(trials.max()))
+
+
 def _mark_focal(axes: Axes, calibration: Calibration) -> None:
-    """Mark the result with its sigma, and what the published method takes."""
+    """Mark the result with its interval of two sigma, and what the published method takes."""
     focal, sigma = calibration.camera.focal_px, calibration.stddev.focal_px
-    axes.axvline(focal, color=road_colour(0), linewidth=2, label=f'result: {focal:.1f} px')
+    published = calibration.paper is not None and calibration.method != 'paper'
+    spread = f' ± {sigma:.1f}' if sigma else ''
+    axes.axvline(focal, color=road_colour(0), linewidth=2, label=f'result: {focal:.1f}{spread} px')
     if sigma:
-        axes.axvspan(focal - sigma, focal + sigma, color=road_colour(0), alpha=0.2, linewidth=0)
-    if calibration.paper is not None:
+        axes.axvspan(focal - 2 * sigma, focal + 2 * sigma, color=road_colour(0), alpha=0.2, linewidth=0,
+                     label=f'95 % interval: {focal - 2 * sigma:.1f} to {focal + 2 * sigma:.1f} px')
+    if published:
         axes.axvline(calibration.paper.focal_px, color=road_colour(1), linestyle='--', linewidth=1.6,
-                     label=f"the paper's: {calibration.paper.focal_px:.1f} px")
-
-
-def _paths(scene: Scene, label: int) -> list[np.ndarray]:
-    return [scene.evidence.track(index).points_px for index in np.flatnonzero(scene.labels == label)]
+                     label=f'by the published method: {calibration.paper.focal_px:.1f} px')

@@ -1,0 +1,150 @@
+"""What all figures share: size, colours, the image underneath, PNG and JPEG."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patheffects import withStroke
+
+from autocalib_ros.pictures.drawing import ROAD_COLOURS
+from autocalib_ros.report.scene import NOT_USED, REJECTED, Scene
+
+WIDTH_IN, DPI = 7.0, 160
+"""Letters stay readable on a telephone that shows a figure a third as wide as it is."""
+STYLE = {'font.size': 11.0, 'axes.labelsize': 11.0, 'legend.fontsize': 10.0, 'xtick.labelsize': 10.0,
+         'ytick.labelsize': 10.0}
+LEFT_IN, BELOW_IN, EDGE_IN = 0.85, 0.6, 0.12
+"""Room for the letters beside and below a diagram, and at its other edges."""
+BAR_IN, BAR_ROOM_IN = 0.16, 0.75
+"""Thickness of a scale of colours, and room for it with its letters."""
+PNG_EFFORT, JPEG_QUALITY = 3, 85
+"""More effort takes three times as long to save a tenth of the size."""
+INK, MUTED, PAPER, WHITE = '#1c2733', '#8a97a3', '#e9edf0', '#ffffff'
+OTHER_COLOURS = {NOT_USED: '#8a97a3', REJECTED: '#222222'}
+LEGEND_LINE = 2.5
+TURNING = '#7733aa'
+"""What is known of vehicles that turn."""
+HALO = [withStroke(linewidth=3, foreground=WHITE)]
+"""Around letters that stand in a picture."""
+
+
+def road_colour(index: int) -> str:
+    """Return the colour of a road direction."""
+    return ROAD_COLOURS[index % len(ROAD_COLOURS)]
+
+
+def label_colour(label: int) -> str:
+    """Return the colour of tracks of a label."""
+    return OTHER_COLOURS[label] if label in OTHER_COLOURS else road_colour(label)
+
+
+def chart(height_in: float = 3.6, rows: int = 1) -> tuple[Figure, list[Axes]]:
+    """Return a figure with axes for diagrams, one below the other, that share their x axis."""
+    figure = Figure(figsize=(WIDTH_IN, height_in), dpi=DPI)
+    panels = list(np.atleast_1d(figure.subplots(rows, 1, sharex=True)))
+    figure.subplots_adjust(left=LEFT_IN / WIDTH_IN, right=1 - EDGE_IN / WIDTH_IN, bottom=BELOW_IN / height_in,
+                           top=1 - EDGE_IN / height_in, hspace=0.12)
+    for axes in panels:
+        axes.spines[['top', 'right']].set_visible(False)
+        axes.grid(color=PAPER)
+        axes.set_axisbelow(True)
+    return figure, panels
+
+
+def image_axes(scene: Scene, *, margin: float = 0.0, picture: np.ndarray | None = None,
+               fade: float = 0.25) -> tuple[Figure, Axes]:
+    """Return a figure that shows the road, lightened by `fade`, in pixel coordinates.
+
+    `margin` is the share of the image that is shown around it.
+    """
+    width, height = scene.evidence.image_size
+    shown_w, shown_h = width * (1 + 2 * margin), height * (1 + 2 * margin)
+    figure = Figure(figsize=(WIDTH_IN, WIDTH_IN * shown_h / shown_w), dpi=DPI, facecolor=PAPER)
+    axes = figure.add_axes((0, 0, 1, 1))
+    picture = scene.background if picture is None else picture
+    axes.set_facecolor(PAPER)
+    if picture is not None:
+        axes.imshow(faded_rgb(picture, fade), interpolation='bilinear')
+    elif margin:
+        axes.plot(*np.array([[0, 0], [width, 0], [width, height], [0, height], [0, 0]]).T - 0.5, color=MUTED)
+    axes.set(xlim=(-0.5 - margin * width, width - 0.5 + margin * width),
+             ylim=(height - 0.5 + margin * height, -0.5 - margin * height), aspect='equal')
+    axes.set_axis_off()
+    return figure, axes
+
+
+def faded_rgb(picture: np.ndarray, fade: float) -> np.ndarray:
+    """Return a BGR or grey picture as RGB, mixed with white so that lines stand out."""
+    rgb = picture[..., ::-1] if picture.ndim == 3 else np.repeat(picture[..., None], 3, axis=2)
+    return (rgb * (1 - fade) + 255 * fade).astype(np.uint8)
+
+
+def draw_paths(axes: Axes, paths: Sequence[np.ndarray], colour: str, label: str | None = None, *,
+               width: float = 1.1, alpha: float = 0.8) -> None:
+    """Draw polylines (n, 2), with one entry in the legend."""
+    if len(paths):
+        axes.add_collection(LineCollection(list(paths), colors=colour, linewidths=width, alpha=alpha, label=label),
+                            autolim=False)
+
+
+def draw_legend(axes: Axes, place: str = 'upper right') -> None:
+    """Add a legend where there is something to explain; its lines are broad whatever theirs are."""
+    if not axes.get_legend_handles_labels()[0]:
+        return
+    legend = axes.legend(loc=place, framealpha=0.9, edgecolor='none')
+    for handle in legend.legend_handles:
+        if isinstance(handle, Line2D):
+            handle.set(linewidth=max(handle.get_linewidth(), LEGEND_LINE), alpha=1)
+
+
+def rendered(figure: Figure) -> np.ndarray:
+    """Return a figure as a BGR picture."""
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., 2::-1]
+
+
+def png(picture: np.ndarray) -> bytes:
+    """Return a picture as PNG."""
+    return cv2.imencode('.png', picture, [cv2.IMWRITE_PNG_COMPRESSION, PNG_EFFORT])[1].tobytes()
+
+
+def jpeg(picture: np.ndarray) -> bytes:
+    """Return a picture as JPEG, a fraction of the size where it is a photograph."""
+    return cv2.imencode('.jpg', picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
+
+
+def cell_map(scene: Scene, values: np.ma.MaskedArray, scale: Normalize, label: str) -> Figure:
+    """Return a figure that shows a number for each cell (rows, columns) of the image, where it is not masked."""
+    width, height = scene.evidence.image_size
+    height_in = WIDTH_IN * height / width + BAR_ROOM_IN
+    figure = Figure(figsize=(WIDTH_IN, height_in), dpi=DPI)
+    axes = figure.add_axes((0, BAR_ROOM_IN / height_in, 1, 1 - BAR_ROOM_IN / height_in))
+    axes.set_facecolor(PAPER)
+    if scene.background is not None:
+        axes.imshow(faded_rgb(scene.background, 0.25), interpolation='bilinear')
+    rows, columns = values.shape
+    cells = axes.pcolormesh(np.linspace(0, width, columns + 1) - 0.5, np.linspace(0, height, rows + 1) - 0.5, values,
+                            norm=scale, cmap='viridis', alpha=0.6, edgecolors='none')
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect='equal', xticks=[], yticks=[])
+    bar = colour_bar(figure, cells, label, exceeded=bool(values.max() > scale.vmax))
+    bar.xaxis.set_major_formatter('{x:g}')
+    return figure
+
+
+def colour_bar(figure: Figure, mapped: ScalarMappable, label: str, *, exceeded: bool) -> Axes:
+    """Add a scale of colours at the bottom of a figure, in the `BAR_ROOM_IN` there; return its axes."""
+    height_in = figure.get_figheight()
+    left, below = LEFT_IN / WIDTH_IN, (BAR_ROOM_IN - BAR_IN - 0.07) / height_in
+    axes = figure.add_axes((left, below, 1 - left - 3 * EDGE_IN / WIDTH_IN, BAR_IN / height_in))
+    figure.colorbar(mapped, cax=axes, orientation='horizontal', label=label, extend='max' if exceeded else 'neither')
+    return axes

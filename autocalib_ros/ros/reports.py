@@ -1,0 +1,148 @@
+"""Reports of a live node, written by a process of their own: drawing takes seconds, and would hold Python's lock."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+
+import numpy as np
+
+from autocalib_ros.calibration import Calibration, Refusal
+from autocalib_ros.config import Options
+from autocalib_ros.evidence import Evidence, EvidenceBuffer
+from autocalib_ros.report.scene import Moment, Scene, noted
+from autocalib_ros.ros.solver import NICENESS
+from autocalib_ros.threads import use_one_thread_for_linear_algebra
+
+END_S = 1.0
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a report goes."""
+
+    page: Path
+    figures: Path
+
+
+class Reports:
+    """Remembers what a report shows of the solutions, and writes one after the other; of those that wait, the newest.
+
+    Callable from any thread. `tell(text, good)` hears from a thread what became of each.
+    """
+
+    def __init__(self, tell: Callable[[str, bool], None]) -> None:
+        self._tell = tell
+        self._changed = threading.Condition()
+        self._moments: tuple[Moment, ...] = ()
+        self._rests: tuple[Calibration, Evidence] | None = None
+        self._next: tuple[Place, Scene] | None = None
+        self._thread: threading.Thread | None = None
+        self._process: BaseProcess | None = None
+        self._closed = False
+
+    def solved(self, result: Calibration | Refusal) -> None:
+        """Take down what a solution says."""
+        with self._changed:
+            self._moments = noted(self._moments, result)
+
+    def rests_on(self, result: Calibration, evidence: Evidence | None) -> None:
+        """Keep the evidence of the calibration that is in force from now on."""
+        with self._changed:
+            self._rests = None if evidence is None else (result, evidence)
+
+    def forget(self) -> None:
+        """Forget what solutions said, and what they rest on."""
+        with self._changed:
+            self._moments, self._rests = (), None
+
+    def scene(self, result: Calibration, seen: tuple[Evidence | None, np.ndarray | None], options: Options,
+              source: str) -> Scene:
+        """Put together what a report of a calibration shows, with what is `seen` now."""
+        evidence, background = seen
+        with self._changed:
+            if self._rests is not None and self._rests[0] is result:
+                evidence = self._rests[1]
+            moments = self._moments
+        if evidence is None or evidence.image_size != result.evidence.image_size:
+            evidence, background = _nothing_seen(result, options), None
+        return Scene(result=result, evidence=evidence, background=background, options=options, source=source,
+                     moments=moments)
+
+    def write(self, place: Place, scene: Scene) -> None:
+        """Write a report soon."""
+        with self._changed:
+            if self._closed:
+                return
+            self._next = (place, scene)
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._run, name='reports', daemon=True)
+                self._thread.start()
+            self._changed.notify_all()
+
+    def close(self) -> None:
+        """Write no more, and give up what is being written; what was there before stays."""
+        with self._changed:
+            self._closed, self._next = True, None
+            process = self._process
+            self._changed.notify_all()
+        if process is not None:
+            process.kill()
+        if self._thread is not None:
+            self._thread.join(END_S)
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._closed or self._next)
+                if self._closed:
+                    return
+                (place, scene), self._next = self._next, None
+                # Not forked: a fork would share the locks of the parent's threads and its middleware.
+                context = multiprocessing.get_context('spawn')
+                ours, theirs = context.Pipe(duplex=False)
+                process = self._process = context.Process(target=_write, args=(theirs, place, scene),
+                                                          name='autocalib report', daemon=True)
+                process.start()
+            theirs.close()
+            fault = self._told_by(process, ours)
+            if not self._closed:
+                self._tell(f'the report was not written: {fault}' if fault else f'the report is written: {place.page}',
+                           not fault)
+
+    @staticmethod
+    def _told_by(process: BaseProcess, ours: Connection) -> str:
+        """Wait for a process that writes a report; return why that failed, '' where it did not."""
+        try:
+            fault = ours.recv()
+        except (EOFError, OSError):
+            fault = 'the process that draws it ended before it was done: is there enough memory?'
+        ours.close()
+        process.join(END_S)
+        return fault
+
+
+def _write(pipe: Connection, place: Place, scene: Scene) -> None:
+    """Draw and write, behind everything else on the machine, and say what failed."""
+    os.nice(NICENESS)
+    use_one_thread_for_linear_algebra()
+    try:
+        from autocalib_ros.report.page import write_report
+
+        write_report(place.page, scene, place.figures)
+        pipe.send('')
+    except Exception as error:  # whatever it is, the node lives on without a report
+        pipe.send(f'{type(error).__name__}: {error}')
+
+
+def _nothing_seen(result: Calibration, options: Options) -> Evidence:
+    """Return evidence without traffic, for a calibration of an earlier run."""
+    return EvidenceBuffer(options.buffer).snapshot(
+        image_size=result.evidence.image_size, first_stamp_ns=result.newest_stamp_ns,
+        newest_stamp_ns=result.newest_stamp_ns, frames=0, drift_px=0.0, unfinished=[])
