@@ -64,8 +64,8 @@ def test_a_calibration_is_summed_up_and_written(evidence, tmp_path):
     assert {path.name for path in (tmp_path / 'out').iterdir()} == {
         'camera_info.yaml', 'calibration.json', 'report.html', 'figures'}
     figures = {path.stem for path in (tmp_path / 'out' / 'figures').iterdir()}
-    assert {'all_tracks', 'kept_tracks', 'ground_grid', 'top_view'} <= figures
-    assert 'undistorted' not in figures  # it needs a picture
+    assert {'all_tracks', 'kept_tracks', 'ground_grid', 'top_view', 'undistorted'} <= figures  # without a picture
+    assert 'settling' not in figures  # saved evidence does not say what was known when
     assert 'evidence.npz' in (tmp_path / 'out' / 'report.html').read_text()
     written = document((tmp_path / 'out' / 'calibration.json').read_text())
     assert written['evidence']['accepted_at_s'] is None
