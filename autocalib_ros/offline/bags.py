@@ -44,7 +44,7 @@ class BagSource:
     def __init__(self, path: Path, topic: str | None, window: Window) -> None:
         self.name = str(path)
         self._path, self._window = path, window
-        self._ros1 = path.suffix.lower() == '.bag'
+        self._ros1 = _is_ros1(path)
         self._types = get_typestore(Stores.ROS1_NOETIC if self._ros1 else Stores.ROS2_JAZZY)
         with _clear_errors(path), _opened(path) as readers:
             topics = _Topics(self.name, readers)
@@ -212,9 +212,14 @@ class _Order:
 def _opened(path: Path) -> Iterator[list[Any]]:
     """Open all files of a recording; a folder without metadata.yaml is what a recorder leaves that was killed."""
     with ExitStack() as stack:
-        readers = [stack.enter_context(Reader1(part) if part.suffix.lower() == '.bag' else Reader2(sealed(part)))
+        readers = [stack.enter_context(Reader1(part) if _is_ros1(part) else Reader2(sealed(part)))
                    for part in _parts(path)]
         yield sorted(readers, key=lambda reader: reader.start_time)
+
+
+def _is_ros1(path: Path) -> bool:
+    """Say whether this is a recording of ROS 1: a file, where a folder of ROS 2 may bear any name."""
+    return path.suffix.lower() == '.bag' and not path.is_dir()
 
 
 def _parts(path: Path) -> list[Path]:

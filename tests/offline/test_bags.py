@@ -30,6 +30,11 @@ def test_every_kind_of_rosbag2_gives_its_images(tmp_path, write_bag, images, mca
     assert [int(frame.image[0, 0]) for frame in frames] == [5, 15, 25, 35]
 
 
+def test_a_folder_may_be_named_like_a_file_of_ros1(tmp_path, write_bag, images):
+    source = open_source(write_bag(tmp_path / 'north.bag', images(3)))
+    assert len(list(source.frames())) == len(list(source.stored())) == 3
+
+
 @pytest.mark.parametrize(('mcap', 'compression'), [kind for kind in KINDS if kind[1] != 'FILE'])
 def test_a_lone_file_without_metadata_is_read(tmp_path, write_bag, images, mcap, compression):
     bag = write_bag(tmp_path / 'bag', images(4), mcap=mcap, compression=compression)
