@@ -45,26 +45,31 @@ class View:
     def __init__(self, repeated_levels: float, leap_levels: float = np.inf, flat_levels: float = FLAT_LEVELS) -> None:
         self._repeated_levels, self._leap_levels, self._flat_levels = repeated_levels, leap_levels, flat_levels
         self._last: np.ndarray | None = None
+        self._before = np.zeros((0, 0), np.float32)
         self._last_s = 0.0
 
     def judge(self, picture: np.ndarray, time_s: float) -> Seen:
         """Compare a reduced grey picture (h, w), of any type, with the last one used."""
-        seen = Seen.NEW if self._last is None else self._compare(self._last, picture, time_s)
+        now = _coarse(picture)
+        seen = Seen.NEW if self._last is None else self._compare(picture, now, time_s)
         if seen is not Seen.HIDDEN:
             self._last_s = time_s
         if seen in (Seen.NEW, Seen.LEAPT):
-            self._last = picture
+            self._last, self._before = picture, now
         return seen
 
-    def _compare(self, last: np.ndarray, picture: np.ndarray, time_s: float) -> Seen:
-        if cv2.absdiff(last, picture).max() <= self._repeated_levels:
+    def _compare(self, picture: np.ndarray, now: np.ndarray, time_s: float) -> Seen:
+        if cv2.absdiff(self._last, picture).max() <= self._repeated_levels:
             return Seen.REPEATED
-        before, now = _coarse(last), _coarse(picture)
+        before, change = self._before, now - self._before
         spread = _spread(before)
-        hidden = spread >= self._flat_levels and _spread(now - before) > GONE * spread
-        if hidden and _correlation(before, now) < ALIKE:
+        gone = GONE * spread if spread >= self._flat_levels else np.inf
+        # a spread is at most three times the median change: where that is small, as mostly, nothing else need be known
+        if 2 * np.count_nonzero(np.abs(change) > min(self._leap_levels, gone / 3)) < change.size:
+            return Seen.NEW
+        if _spread(change) > gone and _correlation(before, now) < ALIKE:
             return Seen.HIDDEN if time_s - self._last_s <= HIDDEN_S else Seen.LEAPT
-        return Seen.LEAPT if np.median(np.abs(now - before)) > self._leap_levels else Seen.NEW
+        return Seen.LEAPT if np.median(np.abs(change)) > self._leap_levels else Seen.NEW
 
 
 def levelled(before: np.ndarray, after: np.ndarray) -> np.ndarray:
@@ -79,7 +84,7 @@ def _coarse(picture: np.ndarray) -> np.ndarray:
     height, width = picture.shape
     columns = min(VIEW_WIDTH, width)
     size = (columns, max(1, height * columns // width))
-    return cv2.resize(picture.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA).astype(np.float32)
 
 
 def _spread(picture: np.ndarray) -> float:
