@@ -9,7 +9,7 @@ import numpy as np
 from autocalib_ros.camera_info import rectified_matrix
 from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.known_camera import KnownCamera
-from autocalib_ros.pictures.overlay import Overlay, draw_metre_grid, draw_scale_bar
+from autocalib_ros.pictures.plotted import Plotted, draw_metre_grid, draw_scale_bar
 from autocalib_ros.pictures.views import FARTHEST_HEIGHTS, TopView, rectified_sources, resample
 
 LONGEST_PX = 1000
@@ -64,5 +64,5 @@ def from_above(known: KnownCamera, view: TopView, *, grid: bool, scale_bar: bool
     unit = 'm' if known.ground.metric else 'camera heights'
     sources = view.sources(known.lens, known.ground)
     drawings = [draw for draw, wanted in ((draw_metre_grid, grid), (draw_scale_bar, scale_bar)) if wanted]
-    overlay = Overlay.drawn(view.columns, view.rows, lambda axes: [draw(axes, view, unit) for draw in drawings])
+    overlay = Plotted.drawn(view.columns, view.rows, lambda axes: [draw(axes, view, unit) for draw in drawings])
     return lambda image: overlay.over(resample(image, sources))

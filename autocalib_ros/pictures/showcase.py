@@ -13,7 +13,7 @@ from autocalib_ros.calibration import GroundPlane
 from autocalib_ros.camera import Camera
 from autocalib_ros.errors import InputError
 from autocalib_ros.known_camera import KnownCamera
-from autocalib_ros.pictures.overlay import INK, POINT, WHITE, Overlay, draw_plate, draw_scale_bar
+from autocalib_ros.pictures.plotted import INK, POINT, WHITE, Plotted, draw_plate, draw_scale_bar
 from autocalib_ros.pictures.views import (
     TopView,
     great_circle,
@@ -64,7 +64,7 @@ def showcase(known: KnownCamera, image: np.ndarray) -> np.ndarray:
         draw_scale_bar(axes, view, 'm' if ground.metric else 'heights', (IMAGE_PX + GAP_PX + 14.0, rows - 14.0),
                        SMALL_PX)
         _captions(axes, small, step, rows)
-    return Overlay.drawn(page.shape[1], page.shape[0], draw).over(page)
+    return Plotted.drawn(page.shape[1], page.shape[0], draw).over(page)
 
 
 def _upright(ground: GroundPlane) -> GroundPlane:

@@ -1,4 +1,7 @@
-"""Lines and words to lay over pictures of one size: drawn once, smooth, and quick to lay over each frame of a video."""
+"""Lines and words plotted once, smooth, and laid over pictures of one size: quick for each frame of a video.
+
+For files; what a live image gets is drawn in `drawing`, which needs no matplotlib.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +31,7 @@ POINT = 72.0 / DPI
 
 
 @dataclass(frozen=True)
-class Overlay:
+class Plotted:
     """A drawing that covers where its alpha says so."""
 
     colour: np.ndarray
@@ -37,7 +40,7 @@ class Overlay:
     """1 - alpha, (rows, columns, 1) uint16, 255 is 1."""
 
     @classmethod
-    def drawn(cls, columns: int, rows: int, draw: Callable[[Axes], None]) -> Overlay:
+    def drawn(cls, columns: int, rows: int, draw: Callable[[Axes], None]) -> Plotted:
         """Draw on axes whose units are pixels, (0, 0) the centre of the top-left one."""
         figure = Figure(figsize=(columns / DPI, rows / DPI), dpi=DPI, facecolor='none')
         canvas = FigureCanvasAgg(figure)
