@@ -189,7 +189,14 @@ class Lookup:
         """Take where each pixel of the view lies in the image, float32 (rows, columns, 2)."""
         self._maps = cv2.convertMaps(sources, None, cv2.CV_16SC2)
         self._empty = (empty_grey,) * 3
+        self._view: np.ndarray | None = None
 
     def of(self, image: np.ndarray) -> np.ndarray:
-        """Return the view of an image, grey or BGR like it."""
-        return cv2.remap(image, *self._maps, cv2.INTER_LINEAR, borderValue=self._empty)
+        """Return the view of an image, grey or BGR like it; the next view is written over it.
+
+        Fresh memory for each would cost as much as a third of the view itself.
+        """
+        shape = (*self._maps[0].shape[:2], *image.shape[2:])
+        if self._view is None or self._view.shape != shape:
+            self._view = np.empty(shape, np.uint8)
+        return cv2.remap(image, *self._maps, cv2.INTER_LINEAR, dst=self._view, borderValue=self._empty)
