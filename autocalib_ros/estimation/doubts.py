@@ -72,8 +72,8 @@ def traffic_doubt(fit: JointFit, contrast: float, tracks: TrackSet) -> Reason | 
         return _turning(fit, share, STRAIGHT_SHARE)
     if contrast < MIN_CONTRAST and not (prior.family == 'distortion_free' and len(fit.state.angles_rad) > 1):
         return Reason(
-            'no_agreement', f'the traffic singles out no focal length: the best agrees {contrast:.2f} times as well as '
-            f'the middling one, {MIN_CONTRAST:g} is needed',
+            'no_agreement', f'no focal length stands out: with the best one {contrast:.2f} times as much traffic '
+            f'follows straight roads as with a middling one, {MIN_CONTRAST:g} times is needed',
             'wait for straight traffic, above all near the borders of the image; the traffic may be turning, or the '
             'lens may have no distortion: then give joint.road_angle or joint.focal_prior_px')
     return _horizon_doubt(fit, tracks)
