@@ -93,13 +93,15 @@ def _spin(node: AutocalibNode, stop: threading.Event) -> None:
     ready callback again and again until a thread takes it up, and stalls for seconds (ros2/rclpy#1452).
     """
     from rclpy.executors import SingleThreadedExecutor
-    executor = SingleThreadedExecutor()
+    from rclpy.task import Future
+    executor, finished = SingleThreadedExecutor(), Future()
     executor.add_node(node)
     with ThreadPoolExecutor(max_workers=1) as pool:
-        spinning = pool.submit(executor.spin)
+        spinning = pool.submit(executor.spin_until_future_complete, finished)
         spinning.add_done_callback(lambda _: stop.set())
         stop.wait()
-        executor.shutdown(timeout_sec=1.0)
+        finished.set_result(None)
+    executor.shutdown()  # only now: it takes away what a thread that still spins waits for
     spinning.result()
 
 

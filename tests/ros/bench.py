@@ -9,6 +9,7 @@ import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.task import Future
 from sensor_msgs.msg import Image
 from std_srvs.srv import Trigger
 
@@ -68,8 +69,9 @@ class Bench:
         self.executor = SingleThreadedExecutor(context=self.context)
         self.executor.add_node(self.client)
         self.nodes: list[AutocalibNode] = []
-        self.thread = threading.Thread(target=self.executor.spin)
-        self.thread.start()
+        self._finished = Future()
+        self._thread = threading.Thread(target=self.executor.spin_until_future_complete, args=(self._finished,))
+        self._thread.start()
 
     def start(self, solve=None, **parameters) -> AutocalibNode:
         """Run an AutocalibNode; dots in parameter names are written as double underscores."""
@@ -130,9 +132,14 @@ class Bench:
         node.close()
         node.destroy_node()
 
+    def halt(self) -> None:
+        """End the executor; nothing is in a callback any more."""
+        self._finished.set_result(None)
+        self._thread.join(PATIENCE_S)
+        self.executor.shutdown()  # only now: it takes away what a thread that still spins waits for
+
     def close(self):
-        self.executor.shutdown(timeout_sec=5.0)
-        self.thread.join(PATIENCE_S)
+        self.halt()
         for node in self.nodes:
             node.close()
             node.destroy_node()

@@ -17,7 +17,7 @@ from autocalib_ros.offline.synthetic_evidence import pose
 from autocalib_ros.ros import messages
 from autocalib_ros.ros.ground_points import GroundPointsNode
 from autocalib_ros.ros.qos import LATCHED
-from bench import PATIENCE_S, wait_for
+from bench import wait_for
 
 CAMERA = Camera(1280, 720, 560.0, (630.0, 371.0), (0.015, 0.0, 0.0, 0.0))
 PIXELS = [(640.0, 500.0, 0.0), (200.0, 10.0, 0.0), (900.0, 400.0, 1.5)]
@@ -78,8 +78,7 @@ class Consumer:
         return wait_for(found, 'points')[-1]
 
     def close(self):
-        self._bench.executor.shutdown(timeout_sec=5.0)  # first: the node may be answering right now
-        self._bench.thread.join(PATIENCE_S)
+        self._bench.halt()  # first: the node may be answering right now
         self.node.destroy_node()
 
 
