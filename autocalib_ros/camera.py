@@ -171,3 +171,16 @@ def _series(k: tuple[float, ...], t2: np.ndarray) -> np.ndarray:
 def image_centre(width: int, height: int) -> tuple[float, float]:
     """Return the centre of an image in pixels, where (0, 0) is the centre of the top-left pixel."""
     return (width - 1) / 2.0, (height - 1) / 2.0
+
+
+def field_of_view_deg(camera: Camera) -> tuple[float, float]:
+    """Return the angles between the middles of the left and right, and of the top and bottom border.
+
+    Of a Camera, or of any other Lens with a principal point.
+    """
+    cx, cy = camera.principal_point_px
+    right, bottom = camera.width - 1, camera.height - 1
+    bearings, _ = camera.unproject(np.array([[0, cy], [right, cy], [cx, 0], [cx, bottom]], float))
+    cosines = np.clip([bearings[0] @ bearings[1], bearings[2] @ bearings[3]], -1, 1)
+    across, down = np.degrees(np.arccos(cosines))
+    return float(across), float(down)

@@ -18,7 +18,7 @@ import numpy as np
 from autocalib_ros.calibration import GROUND_DISTANCES_M, GroundPlane
 from autocalib_ros.camera import Camera
 from autocalib_ros.comparison import Comparison, Difference, RayDifference, RoadDifference
-from autocalib_ros.estimation.ground_plane import pixels_ahead, tilt_and_roll_deg
+from autocalib_ros.estimation.ground_plane import angles_deg, pixels_ahead, tilt_and_roll_deg
 from autocalib_ros.ground import SHARE_OF_SIGMA, Ground
 from autocalib_ros.known_camera import KnownCamera
 
@@ -217,11 +217,6 @@ def _best_turn(ones: np.ndarray, others: np.ndarray) -> np.ndarray:
     return left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
 
 
-def _angles_deg(ones: np.ndarray, others: np.ndarray) -> np.ndarray:
-    across = np.linalg.norm(np.cross(ones, others), axis=-1)
-    return np.degrees(np.arctan2(across, (ones * others).sum(axis=-1)))
-
-
 def _angle_deg(turn: np.ndarray) -> float:
     """Return the angle of a rotation (3, 3)."""
     off = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
@@ -229,4 +224,4 @@ def _angle_deg(turn: np.ndarray) -> float:
 
 
 def _between_deg(first: GroundPlane, second: GroundPlane) -> float:
-    return float(_angles_deg(first.normal_in_camera, second.normal_in_camera))
+    return float(angles_deg(first.normal_in_camera, second.normal_in_camera))

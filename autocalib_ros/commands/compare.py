@@ -35,7 +35,8 @@ def run(arguments: argparse.Namespace) -> int:
     result = compared(*both)
     errors = []
     if arguments.truth is not None:
-        from autocalib_ros.offline.truth_file import errors_against_truth, read_truth
+        from autocalib_ros.offline.against_truth import read_truth
+        from autocalib_ros.offline.truth_file import errors_against_truth
 
         truth = read_truth(arguments.truth)
         errors = [errors_against_truth(known, truth) for known in both]

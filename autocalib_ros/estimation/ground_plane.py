@@ -77,3 +77,9 @@ def pixels_ahead(camera: Camera, normal: np.ndarray, height: float, distances: n
     pixels, valid = camera.project(distances[:, None] * ahead - height * normal)
     inside = valid & (pixels >= 0).all(axis=1) & (pixels <= [camera.width - 1, camera.height - 1]).all(axis=1)
     return np.where(inside[:, None], pixels, np.nan)
+
+
+def angles_deg(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Angles in degrees between vectors (..., 3)."""
+    across = np.linalg.norm(np.cross(first, second), axis=-1)
+    return np.degrees(np.arctan2(across, (first * second).sum(axis=-1)))

@@ -24,11 +24,10 @@ from autocalib_ros.calibrator import solve
 from autocalib_ros.camera import Camera
 from autocalib_ros.config import Options
 from autocalib_ros.errors import InputError, UsageError
-from autocalib_ros.estimation.ground_plane import tilt_and_roll_deg
+from autocalib_ros.estimation.ground_plane import angles_deg, tilt_and_roll_deg
 from autocalib_ros.evidence import Evidence
 from autocalib_ros.offline.accuracy_families import families
-from autocalib_ros.offline.against_truth import angles_deg, distances_error
-from autocalib_ros.offline.demo import NEAR_M
+from autocalib_ros.offline.against_truth import NEAR_M, distances_error
 from autocalib_ros.offline.progress import progress_bar
 from autocalib_ros.offline.synthetic_evidence import Junction
 from autocalib_ros.pictures.views import ground_to_image, image_to_ground

@@ -1,9 +1,20 @@
-"""How far a result is from the truth: distances on the road and angles."""
+"""A truth.json, and how far distances on the road are from it."""
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 
+from autocalib_ros.calibration import GroundPlane
+from autocalib_ros.camera import Camera
+from autocalib_ros.errors import InputError
+from autocalib_ros.pictures.views import image_to_ground
+
+NEAR_M = 40.0
+"""Distances are compared between points of the road this near to the camera."""
 LEAST_DISTANCE_M = 2.0
 """Shorter distances on the road are not compared: their relative error says little."""
 
@@ -21,7 +32,24 @@ def distances_error(true_m: np.ndarray, found_m: np.ndarray) -> float:
     return float(np.median(errors[far_apart]))
 
 
-def angles_deg(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Angles in degrees between vectors (..., 3)."""
-    across = np.linalg.norm(np.cross(first, second), axis=-1)
-    return np.degrees(np.arctan2(across, (first * second).sum(axis=-1)))
+def read_truth(path: Path) -> dict[str, Any]:
+    """Read a truth.json."""
+    try:
+        return json.loads(path.read_text(encoding='utf-8'))
+    except OSError as error:
+        raise InputError(f'cannot read {path}: {error.strerror or error}') from error
+    except ValueError as error:
+        raise InputError(f'{path} is not a truth.json: {error}') from error
+
+
+def near_points(truth: dict[str, Any]) -> np.ndarray:
+    """Return rows X, Y, u, v of points of the road that are not too far away, shape (n, 4)."""
+    points = np.array(truth['ground_points']['rows']).reshape(-1, 4)
+    return points[np.hypot(*(points[:, :2] - truth['camera']['position'][:2]).T) <= NEAR_M]
+
+
+def distance_percent(camera: Camera, ground: GroundPlane, truth: dict[str, Any]) -> float:
+    """Return the median error of distances between points of the road that are not too far away."""
+    points = near_points(truth)
+    true_m, pixels = points[:, :2], points[:, 2:]
+    return 100 * distances_error(true_m, image_to_ground(camera, ground, pixels))

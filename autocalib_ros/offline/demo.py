@@ -3,24 +3,19 @@
 from __future__ import annotations
 
 import argparse
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from autocalib_ros.calibration import Calibration, GroundPlane, Refusal
-from autocalib_ros.camera import Camera
+from autocalib_ros.calibration import Calibration, Refusal
 from autocalib_ros.config import Options, ScaleOptions
-from autocalib_ros.errors import InputError
-from autocalib_ros.offline.against_truth import angles_deg, distances_error
-from autocalib_ros.pictures.views import image_to_ground
+from autocalib_ros.estimation.ground_plane import angles_deg
+from autocalib_ros.offline.against_truth import NEAR_M, distance_percent, near_points, read_truth
 
 MAX_FOCAL_ERROR_PERCENT = 3.0
 MAX_NORMAL_ERROR_DEG = 1.0
-NEAR_M = 40.0
-"""Distances are compared between points of the road this near to the camera."""
 ON_ROAD_DEG, PATH_RATIO = 6.0, 1.05
 """A simulated vehicle follows a road when its way leads along it to this angle and is longer by no more than this."""
 LEAST_WAY_M = 10.0
@@ -66,32 +61,16 @@ def simulate_into(bag: Path, seed: int) -> dict[str, Any]:
     return read_truth(bag / 'truth.json')
 
 
-def read_truth(path: Path) -> dict[str, Any]:
-    """Read a truth.json."""
-    try:
-        return json.loads(path.read_text(encoding='utf-8'))
-    except OSError as error:
-        raise InputError(f'cannot read {path}: {error.strerror or error}') from error
-    except ValueError as error:
-        raise InputError(f'{path} is not a truth.json: {error}') from error
-
-
 def options_from(truth: dict[str, Any], scale_from: str) -> Options:
     """Return the options of somebody who knows the height, a distance on the road, or the mean speed of a road."""
     if scale_from == 'distance':
-        (x1, y1, *first), (x2, y2, *second) = _far_apart(_near_points(truth))
+        (x1, y1, *first), (x2, y2, *second) = _far_apart(near_points(truth))
         return Options(scale_from=scale_from, scale=ScaleOptions(
             distance_px=' '.join(f'{value:.1f}' for value in (*first, *second)),
             distance_m=float(np.hypot(x2 - x1, y2 - y1))))
     if scale_from == 'speed':
         return Options(scale_from=scale_from, scale=ScaleOptions(speed_km_h=3.6 * _mean_speed(truth)))
     return Options(camera_height=truth['camera']['height'])
-
-
-def _near_points(truth: dict[str, Any]) -> np.ndarray:
-    """Rows X, Y, u, v of points of the road that are not too far away, shape (n, 4)."""
-    points = np.array(truth['ground_points']['rows']).reshape(-1, 4)
-    return points[np.hypot(*(points[:, :2] - truth['camera']['position'][:2]).T) <= NEAR_M]
 
 
 def _far_apart(points: np.ndarray) -> np.ndarray:
@@ -128,10 +107,3 @@ def compare(result: Calibration | Refusal, truth: dict[str, Any]) -> Comparison 
     return Comparison(focal_percent, float(angle), result.ground.height_m - truth['camera']['height'],
                       distance_percent(result.camera, result.ground, truth),
                       'given' if sigma is None else f'stated +- {sigma:.2g} m')
-
-
-def distance_percent(camera: Camera, ground: GroundPlane, truth: dict[str, Any]) -> float:
-    """Return the median error of distances between points of the road that are not too far away."""
-    points = _near_points(truth)
-    true_m, pixels = points[:, :2], points[:, 2:]
-    return 100 * distances_error(true_m, image_to_ground(camera, ground, pixels))

@@ -12,9 +12,7 @@ from autocalib_ros.camera import Camera
 from autocalib_ros.compare import compared
 from autocalib_ros.errors import InputError
 from autocalib_ros.known_camera import KnownCamera
-from autocalib_ros.offline.demo import NEAR_M, distance_percent, read_truth
-
-__all__ = ['errors_against_truth', 'read_truth', 'true_camera']
+from autocalib_ros.offline.against_truth import NEAR_M, distance_percent
 
 TRUE_LENSES = ('equidistant', 'kannala_brandt')
 """Models of a truth.json that are read; both are the one of camera.py."""

@@ -15,7 +15,7 @@ from autocalib_ros.perception.images import (
     PLANAR,
     YUV422,
     LumaStep,
-    check_container,
+    decompressed,
     known_encoding,
     rows_of,
 )
@@ -116,13 +116,11 @@ def _blacken_planar(message: Any, mask: np.ndarray, encoding: str) -> None:
 
 def _compressed(message: Any, polygons: Polygons) -> np.ndarray:
     data = np.frombuffer(message.data, np.uint8)
-    check_container(data, str(message.format))
     try:
-        image = cv2.imdecode(data, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
-    except cv2.error:  # a size that no memory holds
-        image = None
-    if image is None:
-        raise InputError(f"compressed image of format '{message.format}', {len(data)} bytes, cannot be decoded")
+        image = decompressed(data, str(message.format))
+    except cv2.error as error:  # a size that no memory holds
+        raise InputError(f"compressed image of format '{message.format}', {len(data)} bytes, cannot be decoded"
+                         ) from error
     mask = ignored_mask(polygons, image.shape[1::-1])
     dark = _darkened(image.reshape(*mask.shape, -1), mask).reshape(image.shape)
     if data[0] == 0xff:

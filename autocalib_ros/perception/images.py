@@ -104,12 +104,7 @@ class ImageDecoder:
         said = str(message.format)
         if 'compressedDepth' in said:
             raise InputError(f"compressed image of format '{said}' holds depths, not a picture")
-        data = np.frombuffer(message.data, np.uint8)
-        check_container(data, said)
-        # the pixels as the sensor delivered them: a turn asked for by EXIF would change the camera's geometry
-        image = cv2.imdecode(data, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
-        if image is None:
-            raise InputError(f"compressed image of format '{said}', {len(data)} bytes, cannot be decoded")
+        image = decompressed(np.frombuffer(message.data, np.uint8), said)
         if image.dtype == np.uint16:
             image = self._stretch.to_8_bit(image, said, _stamp_s(message))
         # image_transport compresses a raw Bayer mosaic as it is: grey, with its pattern in the format
@@ -203,7 +198,17 @@ class LumaStep:
         self.step = message.width if tight else message.step
 
 
-def check_container(data: np.ndarray, said: str) -> None:
+def decompressed(data: np.ndarray, said: str) -> np.ndarray:
+    """Return the image of a JPEG or PNG, bytes (n,), that is `said` to be of some format; InputError or cv2.error."""
+    _check_container(data, said)
+    # the pixels as the sensor delivered them: a turn asked for by EXIF would change the camera's geometry
+    image = cv2.imdecode(data, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image is None:
+        raise InputError(f"compressed image of format '{said}', {len(data)} bytes, cannot be decoded")
+    return image
+
+
+def _check_container(data: np.ndarray, said: str) -> None:
     """Go by the bytes: `format` is often wrong, and OpenCV fills what a torn JPEG lacks with grey."""
     head = data[:8].tobytes()
     if head.startswith(b'\xff\xd8\xff'):

@@ -10,7 +10,7 @@ from autocalib_ros.camera_info import rectified_matrix
 from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.known_camera import KnownCamera
 from autocalib_ros.pictures.plotted import Plotted, draw_metre_grid, draw_scale_bar
-from autocalib_ros.pictures.views import FARTHEST_HEIGHTS, TopView, rectified_sources, resample
+from autocalib_ros.pictures.views import FARTHEST_HEIGHTS, TopView, rectified_sources, resample, unit
 
 LONGEST_PX = 1000
 """Longer side of a view from above for which no scale is given."""
@@ -61,8 +61,8 @@ def top_view_of(known: KnownCamera, px_per_m: float | None = None, x_m: tuple[fl
 
 def from_above(known: KnownCamera, view: TopView, *, grid: bool, scale_bar: bool) -> Callable[[np.ndarray], np.ndarray]:
     """Return what makes a view of images, with what is to be drawn over it."""
-    unit = 'm' if known.ground.metric else 'camera heights'
     sources = view.sources(known.lens, known.ground)
     drawings = [draw for draw, wanted in ((draw_metre_grid, grid), (draw_scale_bar, scale_bar)) if wanted]
-    overlay = Plotted.drawn(view.columns, view.rows, lambda axes: [draw(axes, view, unit) for draw in drawings])
+    overlay = Plotted.drawn(view.columns, view.rows, lambda axes: [
+        draw(axes, view, unit(known.ground)) for draw in drawings])
     return lambda image: overlay.over(resample(image, sources))

@@ -33,6 +33,7 @@ from autocalib_ros.pictures.views import (
     TopView,
     great_circle,
     grid_step,
+    length_words,
     nice_length,
     rectified_sources,
     road_in_image,
@@ -118,7 +119,7 @@ class DebugPicture:
         lines = road_lines(camera, ground, grid.lines_m)
         self._overlay.add_paths(lines, INK, 3 * width_px, 0.2)
         self._overlay.add_paths(lines, PAPER, width_px, 0.6)
-        self._entries.append((PAPER, f'squares of {length(grid.step_m, ground)}'))
+        self._entries.append((PAPER, f'squares of {length_words(grid.step_m, ground)}'))
         for axis, (name, colour) in enumerate(zip('xy', AXES, strict=True)):
             arm = np.linspace([*grid.middle_m, 0], [*(grid.middle_m + grid.step_m * np.eye(2)[axis]), 0], 20)
             for path in road_lines(camera, ground, [arm]):
@@ -197,7 +198,7 @@ class TopPicture:
         bar = np.array([[left, foot], [left + bar_m * self.view.px_per_m, foot]])
         self._overlay.add_paths([bar], PAPER, 6 * width_px)
         self._overlay.add_paths([bar], INK, 3 * width_px)
-        self._write(length(bar_m, ground), left, foot - 1.6 * letter, letter)
+        self._write(length_words(bar_m, ground), left, foot - 1.6 * letter, letter)
 
     def _write(self, text: str, left: float, top: float, letter: float) -> None:
         """Write dark on a light box: what lies below may be anything."""
@@ -217,8 +218,3 @@ class RectifiedPicture:
     def draw(self, image: np.ndarray) -> np.ndarray:
         """Return an image, grey or BGR, as the distortion-free camera of P takes it."""
         return self._lookup.of(image)
-
-
-def length(metres: float, ground: GroundPlane) -> str:
-    """Return a length on the road in words."""
-    return f'{metres:g} m' if ground.metric else f'{metres:g} camera heights'

@@ -10,9 +10,10 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from autocalib_ros.calibration import GroundPlane
-from autocalib_ros.camera import Camera
+from autocalib_ros.camera import Camera, field_of_view_deg
 from autocalib_ros.errors import InputError
 from autocalib_ros.known_camera import KnownCamera
+from autocalib_ros.pictures.drawing import bgr
 from autocalib_ros.pictures.plotted import INK, POINT, WHITE, Plotted, draw_plate, draw_scale_bar
 from autocalib_ros.pictures.views import (
     TopView,
@@ -21,7 +22,9 @@ from autocalib_ros.pictures.views import (
     grid_step,
     ground_to_image,
     image_to_ground,
+    in_image,
     resample,
+    unit,
 )
 
 IMAGE_PX, VIEW_PX, GAP_PX, STRIP_PX = 1080, 508, 12, 92
@@ -48,7 +51,7 @@ def showcase(known: KnownCamera, image: np.ndarray) -> np.ndarray:
     small = known.scaled_to(IMAGE_PX, rows)
     camera, ground = small.lens, _upright(known.ground)
     view = _view(camera, ground, rows)
-    page = np.full((rows + STRIP_PX, IMAGE_PX + GAP_PX + VIEW_PX, 3), _bgr(INK), np.uint8)
+    page = np.full((rows + STRIP_PX, IMAGE_PX + GAP_PX + VIEW_PX, 3), bgr(INK), np.uint8)
     page[:rows, :IMAGE_PX] = cv2.resize(image, (IMAGE_PX, rows), interpolation=cv2.INTER_AREA)
     page[:rows, IMAGE_PX + GAP_PX:] = _from_above(known, _upright(known.ground), image, view)
     step = grid_step(ground)
@@ -59,7 +62,7 @@ def showcase(known: KnownCamera, image: np.ndarray) -> np.ndarray:
             _line(axes, ground_to_image(camera, ground, line), GRID, GRID_PX)
             _line(axes, view.pixels(line) + [IMAGE_PX + GAP_PX, 0], GRID, GRID_PX)
         for line in great_circle(camera, ground.normal_in_camera):
-            _line(axes, np.where(_inside(small, line)[:, None], line, np.nan), HORIZON, HORIZON_PX)
+            _line(axes, np.where(in_image(small, line)[:, None], line, np.nan), HORIZON, HORIZON_PX)
         _name_horizon(axes, camera, ground)
         draw_scale_bar(axes, view, 'm' if ground.metric else 'heights', (IMAGE_PX + GAP_PX + 14.0, rows - 14.0),
                        SMALL_PX)
@@ -93,20 +96,15 @@ def _from_above(known: KnownCamera, ground: GroundPlane, image: np.ndarray, view
     """Return the view of the image, in the colour of the page where that does not reach."""
     sources = view.sources(known.lens, ground)
     seen = ((sources >= 0) & (sources <= [known.width - 1, known.height - 1])).all(axis=-1)
-    return np.where(seen[..., None], resample(image, sources), np.array(_bgr(INK), np.uint8))
+    return np.where(seen[..., None], resample(image, sources), np.array(bgr(INK), np.uint8))
 
 
 def _seen(known: KnownCamera, ground: GroundPlane, view: TopView, lines: list[np.ndarray]) -> list[np.ndarray]:
     """Return lines (n, 3) on the road with nan where they are not in the image and in the view from above."""
     low, high = np.array(view.low_m), np.array(view.high_m)
-    return [np.where((_inside(known, ground_to_image(known.lens, ground, line))
+    return [np.where((in_image(known, ground_to_image(known.lens, ground, line))
                       & ((line[:, :2] > low) & (line[:, :2] < high)).all(axis=1))[:, None], line, np.nan)
             for line in lines]
-
-
-def _inside(known: KnownCamera, pixels: np.ndarray) -> np.ndarray:
-    """Say which pixels (n, 2) are in the image; nan are not."""
-    return ((pixels > -0.5) & (pixels < [known.width - 0.5, known.height - 0.5])).all(axis=1)
 
 
 def _line(axes: Axes, points: np.ndarray, colour: str, width_px: float) -> None:
@@ -130,10 +128,9 @@ def _name_horizon(axes: Axes, camera: Camera, ground: GroundPlane) -> None:
 def _captions(axes: Axes, known: KnownCamera, step: float, rows: int) -> None:
     sigma = known.stddev
     tilt = float(np.degrees(np.arcsin(np.clip(-known.ground.normal_in_camera[2], -1, 1))))
-    unit = 'm' if known.ground.metric else 'camera heights'
     height = f' from {known.ground.height_m:.1f} m' if known.ground.metric else ''
-    field = _field_deg(known)
-    left = (f'Lens, horizon and road found from the traffic: squares of {step:g} {unit}',
+    field = field_of_view_deg(known)[0]
+    left = (f'Lens, horizon and road found from the traffic: squares of {step:g} {unit(known.ground)}',
             f'{field:.0f} degrees wide, looks {_pm(tilt, sigma.tilt_deg)} degrees down{height}')
     right = ('The same moment from above', 'the same squares, to scale')
     for x, (title, words) in ((16.0, left), (IMAGE_PX + GAP_PX + 4.0, right)):
@@ -141,17 +138,5 @@ def _captions(axes: Axes, known: KnownCamera, step: float, rows: int) -> None:
         axes.text(x, rows + 70.0, words, color='#a9b6c2', fontsize=SMALL_PX * POINT, va='baseline')
 
 
-def _field_deg(known: KnownCamera) -> float:
-    """Return the angle between the middles of the left and the right border."""
-    level = known.principal_point_px[1]
-    (one, other), _ = known.unproject(np.array([[0.0, level], [known.width - 1.0, level]]))
-    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(one, other)), one @ other)))
-
-
 def _pm(value: float, sigma: float | None) -> str:
     return f'{value:.1f}' if sigma is None else f'{value:.1f} ± {sigma:.1f}'
-
-
-def _bgr(colour: str) -> tuple[int, int, int]:
-    red, green, blue = (int(colour[index:index + 2], 16) for index in (1, 3, 5))
-    return blue, green, red

@@ -178,3 +178,18 @@ def nice_length(length: float) -> float:
     """Return 1, 2 or 5 times a power of ten, the largest not above `length`."""
     power = 10.0 ** np.floor(np.log10(length))
     return float(max(factor * power for factor in (1, 2, 5) if factor * power <= length * (1 + 1e-9)))
+
+
+def unit(ground: GroundPlane) -> str:
+    """Return the unit of lengths on the road."""
+    return 'm' if ground.metric else 'camera heights'
+
+
+def length_words(length: float, ground: GroundPlane) -> str:
+    """Return a length on the road with its unit."""
+    return f'{length:g} {unit(ground).removesuffix("s") if length == 1 else unit(ground)}'
+
+
+def in_image(camera: Lens, pixels: np.ndarray) -> np.ndarray:
+    """Say which pixels (n, 2) lie in the image, up to the outer edges of its pixels, shape (n,); nan do not."""
+    return ((pixels > -0.5) & (pixels < [camera.width - 0.5, camera.height - 0.5])).all(axis=1)

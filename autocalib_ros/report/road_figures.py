@@ -14,10 +14,13 @@ from autocalib_ros.pictures.views import (
     grid_step,
     ground_to_image,
     image_to_ground,
+    in_image,
+    length_words,
     near_on_road,
     nice_length,
     resample,
     road_lines,
+    unit,
 )
 from autocalib_ros.report.canvas import (
     BELOW_IN,
@@ -144,7 +147,7 @@ def place_sigma_m(scene: Scene, points_m: np.ndarray) -> np.ndarray | None:
         return None
     camera = calibration.camera
     pixels = ground_to_image(camera, calibration.ground, np.pad(points_m, ((0, 0), (0, 1))))
-    inside = ((pixels > -0.5) & (pixels < [camera.width - 0.5, camera.height - 0.5])).all(axis=1)
+    inside = in_image(camera, pixels)
     sigma = Ground.of(calibration).points(np.where(inside[:, None], pixels, np.nan)).sigma_m
     return None if sigma is None else np.where(inside, sigma, np.nan)
 
@@ -184,13 +187,3 @@ def _draw_scale(axes: Axes, view: TopView, ground: GroundPlane) -> None:
     axes.text(begin[0], begin[1] + 0.025 * (high[1] - low[1]), length_words(length, ground), va='bottom', color=INK,
               bbox={'boxstyle': 'round,pad=0.2', 'facecolor': WHITE, 'edgecolor': 'none',
                                             'alpha': 0.8})
-
-
-def unit(ground: GroundPlane) -> str:
-    """Return the unit of lengths on the road."""
-    return 'm' if ground.metric else 'camera heights'
-
-
-def length_words(length: float, ground: GroundPlane) -> str:
-    """Return a length on the road with its unit."""
-    return f'{length:g} {unit(ground).removesuffix("s") if length == 1 else unit(ground)}'

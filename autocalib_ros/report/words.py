@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from autocalib_ros.calibration import GROUND_DISTANCES_M, Calibration, Refusal
-from autocalib_ros.camera import Camera
+from autocalib_ros.camera import field_of_view_deg
 from autocalib_ros.config import GateOptions
 from autocalib_ros.estimation.evidence_gate import drift_limit_px
 from autocalib_ros.estimation.ground_plane import tilt_and_roll_deg
@@ -142,16 +142,6 @@ def _evidence_rows(result: Calibration | Refusal, accepted_at_s: float | None) -
                            f'{evidence.segments} segments'),
             Row('coverage', f'{100 * evidence.coverage:.0f} % of the image')]
     return rows + ([] if accepted_at_s is None else [Row('accepted after', f'{accepted_at_s:.1f} s')])
-
-
-def field_of_view_deg(camera: Camera) -> tuple[float, float]:
-    """Return the angles between the middles of the left and right, and of the top and bottom border."""
-    cx, cy = camera.principal_point_px
-    right, bottom = camera.width - 1, camera.height - 1
-    bearings, _ = camera.unproject(np.array([[0, cy], [right, cy], [cx, 0], [cx, bottom]], float))
-    cosines = np.clip([bearings[0] @ bearings[1], bearings[2] @ bearings[3]], -1, 1)
-    across, down = np.degrees(np.arccos(cosines))
-    return float(across), float(down)
 
 
 def _number(value: float | None, digits: int) -> str:

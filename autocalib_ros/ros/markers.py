@@ -11,6 +11,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from autocalib_ros.calibration import Calibration
 from autocalib_ros.pictures.road import Ellipse, Grid, ellipses, enlargement, field_of_view
+from autocalib_ros.pictures.views import length_words
 from autocalib_ros.ros.wording import described_numbers
 
 LINE_SHARE = 0.005
@@ -63,7 +64,7 @@ def _uncertainty(shown: Sequence[Ellipse], unit_m: float) -> Iterator[Marker]:
 def _words(result: Calibration, grid: Grid | None, shown: Sequence[Ellipse]) -> str:
     lines = [f'grade {result.grade}', *described_numbers(result)]
     if grid is not None:
-        lines.append(f'squares of {grid.step_m:g} {"m" if result.ground.metric else "camera heights"}')
+        lines.append(f'squares of {length_words(grid.step_m, result.ground)}')
     factor = enlargement(list(shown))
     if shown:
         lines.append('ellipses: one sigma of a road point' + (f', enlarged {factor} times' if factor > 1 else ''))
