@@ -184,3 +184,9 @@ def field_of_view_deg(camera: Camera) -> tuple[float, float]:
     cosines = np.clip([bearings[0] @ bearings[1], bearings[2] @ bearings[3]], -1, 1)
     across, down = np.degrees(np.arccos(cosines))
     return float(across), float(down)
+
+
+def pixel_grid(camera: Lens, columns: int, rows: int) -> np.ndarray:
+    """Return pixels (columns * rows, 2) evenly over the image, those of its borders included, row by row."""
+    across, down = np.linspace(0, camera.width - 1, columns), np.linspace(0, camera.height - 1, rows)
+    return np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from autocalib_ros.calibration import GROUND_DISTANCES_M, GroundPlane
-from autocalib_ros.camera import Camera
+from autocalib_ros.camera import Camera, pixel_grid
 from autocalib_ros.comparison import Comparison, Difference, RayDifference, RoadDifference
 from autocalib_ros.estimation.ground_plane import angles_deg, pixels_ahead, tilt_and_roll_deg
 from autocalib_ros.ground import SHARE_OF_SIGMA, Ground
@@ -41,7 +41,7 @@ def compared(first: KnownCamera, second: KnownCamera) -> Comparison:
     metric = both and first.ground.metric and second.ground.metric
     ahead = pixels_ahead(first.lens, first.ground.normal_in_camera, first.ground.height_m,
                          np.array(GROUND_DISTANCES_M)) if metric else np.zeros((0, 2))
-    grid = _grid(first)
+    grid = pixel_grid(first, *GRID)
     sides = _Side.of(first, np.vstack([grid, ahead])), _Side.of(second, np.vstack([grid, ahead]))
     everywhere = sides[0].part(slice(len(grid))), sides[1].part(slice(len(grid)))
     lens, lens_notes = _lens_differences(first, second)
@@ -50,25 +50,18 @@ def compared(first: KnownCamera, second: KnownCamera) -> Comparison:
     return Comparison(
         lens=lens, lens_px=lenses_apart_px(first, second), rays=_ray_difference(*everywhere, grid, turned=False),
         rays_turned=_ray_difference(*everywhere, grid, turned=True),
-        turned_deg=_angle_deg(_best_turn(everywhere[0].here.rays, everywhere[1].here.rays)), pose=pose,
+        turned_deg=_angle_deg(best_turn(everywhere[0].here.rays, everywhere[1].here.rays)), pose=pose,
         normal_deg=_between_deg(first.ground, second.ground) if both else None, road=road, stated=stated,
         notes=(*notes, *lens_notes, *pose_notes, *road_notes))
 
 
 def lenses_apart_px(first: KnownCamera | Camera, second: KnownCamera | Camera) -> float:
     """Return how far apart at the most two lenses of one image size image the same direction, pixels."""
-    pixels = _grid(first)
+    pixels = pixel_grid(first, *GRID)
     bearings, reached = first.unproject(pixels)
     seen, valid = second.project(np.where(reached[:, None], bearings, [0.0, 0.0, 1.0]))
     apart = np.hypot(*(seen - pixels).T)[reached & valid]
     return float(apart.max()) if len(apart) else math.inf
-
-
-def _grid(camera: KnownCamera | Camera) -> np.ndarray:
-    """Return pixels (n, 2) all over the image."""
-    across, down = (np.linspace(0, size - 1, count) for size, count in zip((camera.width, camera.height), GRID,
-                                                                           strict=True))
-    return np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
 
 
 def _lens_differences(first: KnownCamera, second: KnownCamera) -> tuple[tuple[Difference, ...], list[str]]:
@@ -158,7 +151,7 @@ class _Side:
 
 def _ray_difference(first: _Side, second: _Side, pixels: np.ndarray, *, turned: bool) -> RayDifference:
     def apart(one: _View, other: _View) -> np.ndarray:
-        return (other.rays @ _best_turn(one.rays, other.rays).T if turned else other.rays) - one.rays
+        return (other.rays @ best_turn(one.rays, other.rays).T if turned else other.rays) - one.rays
 
     chords = np.linalg.norm(apart(first.here, second.here), axis=1)
     seen = np.isfinite(chords)
@@ -208,7 +201,7 @@ def _sigma(first: _Side, second: _Side, apart: Callable[[_View, _View], np.ndarr
     return float(np.sqrt((steps**2).sum()))
 
 
-def _best_turn(ones: np.ndarray, others: np.ndarray) -> np.ndarray:
+def best_turn(ones: np.ndarray, others: np.ndarray) -> np.ndarray:
     """Return the rotation (3, 3) that brings rays `others` (n, 3) nearest to `ones`, in the least-squares sense."""
     both = np.isfinite(ones).all(axis=1) & np.isfinite(others).all(axis=1)
     if not both.any():

@@ -21,7 +21,8 @@ import numpy as np
 
 from autocalib_ros.calibration import Calibration, GroundPlane, Refusal
 from autocalib_ros.calibrator import solve
-from autocalib_ros.camera import Camera
+from autocalib_ros.camera import Camera, pixel_grid
+from autocalib_ros.compare import best_turn
 from autocalib_ros.config import Options
 from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.estimation.ground_plane import angles_deg, tilt_and_roll_deg
@@ -169,13 +170,10 @@ def _pose_errors_deg(ground: GroundPlane | None, true_normal: np.ndarray) -> tup
 
 def rays_error_deg(camera: Camera, true: Camera) -> float:
     """Mean angle over the image between the rays of two lenses, the one turned onto the other as well as can be."""
-    across, down = np.linspace(0, true.width - 1, RAY_GRID[0]), np.linspace(0, true.height - 1, RAY_GRID[1])
-    pixels = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
+    pixels = pixel_grid(true, *RAY_GRID)
     (found, valid), (wanted, there) = camera.unproject(pixels), true.unproject(pixels)
     found, wanted = found[valid & there], wanted[valid & there]
-    left, _, right = np.linalg.svd(found.T @ wanted)
-    aligned = found @ left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
-    return float(angles_deg(aligned, wanted).mean()) if len(found) else NAN
+    return float(angles_deg(found @ best_turn(wanted, found).T, wanted).mean()) if len(found) else NAN
 
 
 def distance_error(camera: Camera, ground: GroundPlane | None, junction: Junction) -> float:

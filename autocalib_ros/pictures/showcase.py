@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from autocalib_ros.calibration import GroundPlane
-from autocalib_ros.camera import Camera, field_of_view_deg
+from autocalib_ros.camera import Camera, field_of_view_deg, pixel_grid
 from autocalib_ros.errors import InputError
 from autocalib_ros.known_camera import KnownCamera
 from autocalib_ros.pictures.drawing import bgr
@@ -21,8 +21,8 @@ from autocalib_ros.pictures.views import (
     grid_lines,
     grid_step,
     ground_to_image,
-    image_to_ground,
     in_image,
+    near_on_road,
     resample,
     unit,
 )
@@ -80,9 +80,7 @@ def _upright(ground: GroundPlane) -> GroundPlane:
 
 
 def _view(camera: Camera, ground: GroundPlane, rows: int) -> TopView:
-    across, down = np.linspace(0, camera.width - 1, SEEN_PIXELS), np.linspace(0, camera.height - 1, SEEN_PIXELS)
-    points = image_to_ground(camera, ground, np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2))
-    near = points[np.hypot(*points.T) < NEAR_HEIGHTS * ground.height_m]
+    near = near_on_road(camera, ground, pixel_grid(camera, SEEN_PIXELS, SEEN_PIXELS), NEAR_HEIGHTS)
     if len(near) < 2:
         raise InputError(f'its image shows no road nearer than {NEAR_HEIGHTS:g} times the height of the camera')
     middle = (near.min(axis=0) + near.max(axis=0)) / 2

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from autocalib_ros.calibration import GroundPlane
-from autocalib_ros.camera import Camera, Lens
+from autocalib_ros.camera import Camera, Lens, pixel_grid
 
 FARTHEST_HEIGHTS = 10.0
 """Views of the road end this many camera heights away: beyond, a pixel covers metres."""
@@ -45,17 +45,16 @@ def image_to_ground(camera: Camera, ground: GroundPlane, pixels: np.ndarray) -> 
     return rays[..., :2] * (-ground.height_m / down)[..., None]
 
 
-def near_on_road(camera: Camera, ground: GroundPlane, pixels: np.ndarray) -> np.ndarray:
-    """Return the points (m, 2) on the road of those pixels (n, 2) that show it within FARTHEST_HEIGHTS."""
+def near_on_road(camera: Camera, ground: GroundPlane, pixels: np.ndarray,
+                 heights: float = FARTHEST_HEIGHTS) -> np.ndarray:
+    """Return the points (m, 2) on the road of those pixels (n, 2) that show it within so many camera heights."""
     points = image_to_ground(camera, ground, pixels)
-    return points[np.hypot(*points.T) < FARTHEST_HEIGHTS * ground.height_m]
+    return points[np.hypot(*points.T) < heights * ground.height_m]
 
 
 def road_in_image(camera: Camera, ground: GroundPlane) -> np.ndarray:
     """Return points (m, 2) of the road that is in the image and near, as dense as the image shows them."""
-    across = np.linspace(0, camera.width - 1, SEEN_PIXELS)
-    down = np.linspace(0, camera.height - 1, SEEN_PIXELS)
-    return near_on_road(camera, ground, np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2))
+    return near_on_road(camera, ground, pixel_grid(camera, SEEN_PIXELS, SEEN_PIXELS))
 
 
 def resample(picture: np.ndarray, sources: np.ndarray) -> np.ndarray:
