@@ -8,6 +8,7 @@ import numpy as np
 
 from autocalib_ros.calibration import Reason
 from autocalib_ros.config import GateOptions
+from autocalib_ros.estimation.differences import differences, expected_of_halves
 from autocalib_ros.estimation.great_circles import Seen, TrackSet, every_track
 from autocalib_ros.estimation.ground_plane import BELOW_HORIZON
 from autocalib_ros.estimation.joint import MIN_ROWS, JointFit, assign, road_support, solve_joint
@@ -43,7 +44,9 @@ MOTION_TELLS = 0.1
 that were taken for roads are off by more."""
 ASSUMED = 3.0
 """A plane that rests on an assumption may be so many times less sure than one that was measured."""
-HALVES_SIGMAS = 3.5
+HALVES_SIGMAS, WHOLE_SIGMAS = 3.5, 3.0
+"""Two halves of the evidence may differ by so many standard deviations: of their own, and of what the whole lets them.
+"""
 HALVES_FOCAL = 0.03
 HALVES_DEG = 1.5
 """Two halves of the evidence may always differ by so much: it is within what the program promises."""
@@ -209,10 +212,12 @@ def halves_doubt(fit: JointFit, tracks: TrackSet, gate: GateOptions) -> Reason |
         fits.append(solve_joint(fit.state, part, part_setting, refine=True, inner=inner))
         if any(mask.sum() < gate.min_tracks_per_road // 2 for mask in road_support(fits[-1], part)):
             return NOT_CROSS_CHECKED
-    (focal, focal_sigma), (turn, turn_sigma) = _difference(*fits)
-    if not fit.plane_known:
-        turn = 0.0  # one road leaves the normal free
-    if focal > max(HALVES_SIGMAS * focal_sigma, HALVES_FOCAL) or turn > max(HALVES_SIGMAS * turn_sigma, HALVES_DEG):
+    apart = differences(*fits)
+    focal, turn = apart.focal, apart.normal_deg if fit.plane_known else 0.0  # one road leaves the normal free
+    # what either half says of itself is no excuse where the whole claims to know better
+    focal_limit, turn_limit = np.maximum((HALVES_FOCAL, HALVES_DEG), np.minimum(
+        HALVES_SIGMAS * apart.sigmas, WHOLE_SIGMAS * expected_of_halves(fit, *fits)))
+    if focal > focal_limit or turn > turn_limit:
         return Reason(
             'halves_disagree', f'the earlier and the later half of the traffic disagree: focal length by {focal:.1%}, '
             f'ground normal by {turn:.1f} degrees', 'record for longer; check that the camera is firmly fixed')
@@ -234,16 +239,3 @@ def _earlier(*seen: tuple[np.ndarray, np.ndarray]) -> list[np.ndarray]:
 def _mean_times(owners: np.ndarray, times_s: np.ndarray) -> np.ndarray:
     _, inverse, counts = np.unique(owners, return_inverse=True, return_counts=True)
     return (np.bincount(inverse, times_s) / counts)[inverse]
-
-
-def _difference(first: JointFit, second: JointFit) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Differences of relative focal length and of the normal in degrees, each with its standard deviation."""
-    normals = [fit.state.rotation[:, 2] for fit in (first, second)]
-    cosine = abs(float(normals[0] @ normals[1]))
-    sigmas = [fit.sigma(lambda state, at=normal: np.array([
-        np.log(state.camera.focal_px), *np.degrees(np.cross(at, state.rotation[:, 2]))]))
-        for fit, normal in zip((first, second), normals, strict=True)]
-    focal = abs(float(np.log(first.state.camera.focal_px / second.state.camera.focal_px)))
-    total = np.hypot(*sigmas)
-    return (focal, float(total[0])), (float(np.degrees(np.arccos(min(cosine, 1.0)))),
-                                      float(np.linalg.norm(total[1:])))

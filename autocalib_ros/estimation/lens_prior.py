@@ -62,13 +62,16 @@ class LensPrior:
                        principal_point_px=(float(cx + change[1]), float(cy + change[2])),
                        k=(float(k1 + change[3]), float(k2 + change[4]), k3, k4))
 
+    def step(self, camera: Camera, other: Camera) -> np.ndarray:
+        """Return the step of the free parameters, in their units, by which `moved` takes a camera to another."""
+        shift = np.subtract(other.principal_point_px, camera.principal_point_px)
+        change = np.array([np.log(other.focal_px / camera.focal_px), *shift,
+                           other.k[0] - camera.k[0], other.k[1] - camera.k[1]])
+        return change[self.free] / self.units
+
     def deviations(self, camera: Camera) -> np.ndarray:
         """Deviation from the centre of each free parameter in sigmas, 0 where nothing is known; shape (free,)."""
-        shift = np.subtract(camera.principal_point_px, self.centre.principal_point_px)
-        change = np.array([np.log(camera.focal_px / self.centre.focal_px), *shift,
-                           camera.k[0] - self.centre.k[0], camera.k[1] - self.centre.k[1]])
-        known = np.isfinite(self.sigma[self.free])
-        return np.where(known, change[self.free] / self.units, 0.0)
+        return np.where(np.isfinite(self.sigma[self.free]), self.step(self.centre, camera), 0.0)
 
     @cached_property
     def information(self) -> np.ndarray:

@@ -31,6 +31,7 @@ from autocalib_ros.estimation.turning import (
     from_turning,
     one_centre_doubt,
     over_lives,
+    with_lives_apart,
     with_sliding,
     with_turning,
 )
@@ -151,7 +152,7 @@ def _completed(fit: JointFit, tracks: TrackSet, across: str, traffic: _Traffic, 
     fit = with_further_roads(fit, tracks, gate)
     fit, angle = with_right_angle(fit, tracks, options)
     fit = with_k2_if_asked_for(fit, tracks)
-    fit = over_lives(fit, tracks, traffic.windows, traffic.instants)
+    fit, by_lives = over_lives(fit, tracks, traffic.windows, traffic.instants)
     fit, held = with_what_can_be_told(fit, tracks)
     doubt = _lens_doubt(fit, tracks, traffic, turned=turned) or (
         one_centre_doubt(fit, traffic.windows) if len(fit.state.angles_rad) < 2 else None)
@@ -160,7 +161,7 @@ def _completed(fit: JointFit, tracks: TrackSet, across: str, traffic: _Traffic, 
     halves = halves_doubt(fit, tracks, gate)
     if isinstance(halves, Reason):
         return halves
-    fit = with_sliding(fit, traffic.windows)
+    fit = with_lives_apart(with_sliding(fit, traffic.windows), by_lives)
     along, flow = main_road(fit, tracks)
     assumptions = lens_assumptions(fit, held)
     if fit.plane_known:

@@ -105,6 +105,13 @@ class Steps:
         angles[list(self.free_angles)] += step[turns:]
         return State(self.camera(step[:self.lens]), self.base.rotation @ self.turned(step[self.lens:turns]), angles)
 
+    def to(self, state: State) -> np.ndarray:
+        """Return the step (parameters,) from the base to a state near it, as far as the parameters reach."""
+        turn = Rotation.from_matrix(self.base.rotation.T @ state.rotation).as_rotvec()
+        angles = np.angle(np.exp(1j * (state.angles_rad - self.base.angles_rad)))
+        return np.concatenate([self.setting.prior.step(self.base.camera, state.camera), self.axes @ turn,
+                               angles[list(self.free_angles)]])
+
     def camera(self, step: np.ndarray) -> Camera:
         """Return the lens at a step (lens,) of its own parameters."""
         return self.setting.prior.moved(self.base.camera, step)

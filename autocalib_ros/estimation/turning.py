@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from autocalib_ros.calibration import Reason
+from autocalib_ros.estimation.differences import differences
 from autocalib_ros.estimation.great_circles import TrackSet
 from autocalib_ros.estimation.joint import JointFit, solve_joint
 from autocalib_ros.estimation.lives import find_lives, no_lives
@@ -28,6 +29,12 @@ ONE_CENTRE = 0.5
 ONE_CENTRE_SIGMA = 0.02
 """Largest relative standard deviation of a focal length that rests on one centre. What noise biases grows as its
 variance does, and faster than the deviation: on simulated rings they are alike at 2.5 %, a half of it at 1.5 %."""
+APART = 3.0
+"""Standard deviations of the less sure one by which solutions by windows and by lives may differ."""
+BEGINNINGS = 4
+"""Most times that lives are begun anew."""
+BETTER = 1.0
+"""A life begun anew is another one when its cost is lower by this: twice the negative logarithm of a probability."""
 SLIDING_FOCAL = 0.4
 """Relative standard deviation of a focal length by turning traffic, for all of the turn that sliding points take away:
 it was off by 0.2 and 0.7 of that on two rendered roundabouts."""
@@ -60,21 +67,60 @@ def with_turning(fit: JointFit, tracks: TrackSet, windows: Windows) -> JointFit 
                        refine=True)
 
 
-def over_lives(fit: JointFit, tracks: TrackSet, windows: Windows, instants: Instants) -> JointFit:
-    """Solve a last time with those vehicles over their lives, where they are followed, and how they correlate."""
+def over_lives(fit: JointFit, tracks: TrackSet, windows: Windows,
+               instants: Instants) -> tuple[JointFit, State | None]:
+    """Solve a last time with those vehicles over their lives, where they are followed, and how they correlate.
+
+    Windows and lives are cut from the same tracks: solutions by the one and by the other that differ by more than
+    either knows mean that one of the two models is wrong. Then windows stand, which assume less, and the state that
+    lives lead to comes with them.
+    """
     setting = replace(fit.problem.setting, vehicle_correlation=fit.vehicle_correlation)
+    by_windows = solve_joint(fit.state, tracks, setting, refine=True, inner=fit.problem.inner)
     chosen = _turning(fit, windows) if setting.turning else None
     lives = no_lives() if chosen is None else find_lives(chosen, instants, MOST_LIVES)
     if chosen is None or not len(lives):
-        return solve_joint(fit.state, tracks, setting, refine=True, inner=fit.problem.inner)
+        return by_windows, None
     drifting = Bundle(lives, setting.options.noise_px, setting.options.drift_px)
     setting = replace(setting, windows=chosen.subset(chosen.of_segments).spread(MOST_WINDOWS), bundle=drifting)
     solved = solve_joint(fit.state, tracks, setting, refine=True)
     steady, (_, _, shapes) = drifting.steady(), solved.problem.inner
     camera, plane = solved.state.camera, solved.state.rotation
-    if shapes is None or steady.noise_cost(camera, plane, shapes) >= drifting.noise_cost(camera, plane, shapes):
-        return solved
-    return solve_joint(solved.state, tracks, replace(setting, bundle=steady), refine=True, inner=solved.problem.inner)
+    if shapes is not None and (
+            steady.noise_cost(camera, plane, shapes) < drifting.noise_cost(camera, plane, shapes)):
+        solved = solve_joint(solved.state, tracks, replace(setting, bundle=steady), refine=True,
+                             inner=solved.problem.inner)
+    solved = begun_anew(solved, tracks)
+    return (by_windows, solved.state) if differences(by_windows, solved).beyond(APART) else (solved, None)
+
+
+def begun_anew(fit: JointFit, tracks: TrackSet) -> JointFit:
+    """Solve again with lives begun anew at a solution, where that suits any better than how it was carried there.
+
+    A life has more than one shape that no small change improves. Where lives are few, a single one that was begun far
+    from the solution, and is stuck in such a shape, holds the solution back by degrees.
+    """
+    for _ in range(BEGINNINGS):
+        bundle, (_, motion, shapes) = fit.problem.setting.bundle, fit.problem.inner
+        if bundle is None or shapes is None:
+            return fit
+        camera, plane = fit.state.camera, fit.state.rotation
+        anew = bundle.begun(camera, plane)
+        carried_cost, anew_cost = (bundle.cost(bundle.residuals(camera, plane, each)) for each in (shapes, anew))
+        better = anew_cost < carried_cost - BETTER
+        if not better.any():
+            return fit
+        fit = solve_joint(fit.state, tracks, fit.problem.setting, refine=True,
+                          inner=(None, motion, shapes.where(better, anew)))
+    return fit
+
+
+def with_lives_apart(fit: JointFit, by_lives: State | None) -> JointFit:
+    """Widen the deviations of a solution by how far the state is that lives led to, where that was not believed."""
+    if by_lives is None:
+        return fit
+    step = fit.problem.steps.to(by_lives)
+    return replace(fit, covariance=fit.covariance + np.outer(step, step))
 
 
 def one_centre_doubt(fit: JointFit, windows: Windows) -> Reason | None:

@@ -12,6 +12,10 @@ SINGULAR = 1e-10
 LEAST_CURVATURE = 0.5
 """A redescending loss curves less than its weights claim; what is left, as a share, when it would hardly curve."""
 
+NOISE_VEHICLES = 5
+"""How many vehicles the noise of the rows counts for as a witness of the spread: few against a road full of them, but
+a dozen agree by chance to a third of their spread once in some dozens."""
+
 
 def cluster_covariance(gradients: np.ndarray, curvatures: np.ndarray, weight: np.ndarray, bend: np.ndarray,
                        owners: np.ndarray, prior: np.ndarray) -> np.ndarray:
@@ -21,8 +25,9 @@ def cluster_covariance(gradients: np.ndarray, curvatures: np.ndarray, weight: np
     residuals r; `weight` (rows,) is the derivative of a row's loss by half its squared distance, `bend` (rows,) the
     factor of g g^T in the second derivative; `owners` (rows,) are the vehicles, `prior` (parameters,) is the prior's
     information. One Newton step from the solution stands for each vehicle's solution without it: the cluster
-    jackknife, CR3 of Bell & McCaffrey (2002), for an M-estimate. Few vehicles widen it; the prior's own spread is
-    added. Undetermined directions get an infinite variance.
+    jackknife, CR3 of Bell & McCaffrey (2002), for an M-estimate. Few vehicles widen it, above all where they agree
+    better than their noise lets them; the prior's own spread is added. Undetermined directions get an infinite
+    variance.
     """
     size = gradients.shape[1]
     clusters, inverse = np.unique(owners, return_inverse=True)
@@ -44,10 +49,23 @@ def cluster_covariance(gradients: np.ndarray, curvatures: np.ndarray, weight: np
     inverted = np.einsum('vij,vj,vkj->vik', turned, 1.0 / np.maximum(low, 0.5 * LEAST_CURVATURE), turned)
     moves = np.einsum('vij,vj->vi', inverted, scores)
     inverse_curved = (axes / shares) @ axes.T
-    by_prior = whiten @ inverse_curved @ whiten.T
+    by_prior = (inverse_curved @ whiten.T) * np.sqrt(prior)
     moved = moves @ whiten.T
     moved = moved * few_factor(moved)
-    return moved.T @ moved + by_prior @ np.diag(prior) @ by_prior
+    besides = by_prior @ by_prior.T
+    besides += _agreeing_by_chance(moves.T @ moves + besides, len(clusters))
+    return moved.T @ moved + whiten @ besides @ whiten.T
+
+
+def _agreeing_by_chance(spread: np.ndarray, vehicles: int) -> np.ndarray:
+    """Variance (parameters, parameters) by which few vehicles that happen to agree fall short of what noise leaves.
+
+    The `spread` (parameters, parameters) that they show is in units of what the noise of the rows would leave, which
+    counts as so many vehicles more where it is the larger.
+    """
+    found, axes = np.linalg.eigh(spread)
+    missing = np.maximum(1.0 - found, 0.0) * NOISE_VEHICLES / (vehicles + NOISE_VEHICLES)
+    return (axes * missing) @ axes.T
 
 
 def few_factor(moves: np.ndarray) -> np.ndarray:

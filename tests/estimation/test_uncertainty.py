@@ -46,6 +46,17 @@ def test_few_vehicles_widen_deviations_as_student_does() -> None:
     assert few_factor(one)[0] > 1.5
 
 
+def test_few_vehicles_that_agree_by_chance_are_not_believed_beyond_their_noise() -> None:
+    slopes = np.ones((12, 1))
+    quiet, loud = (plain(slopes, noise * np.resize([1.0, -1.0], 12), np.arange(12), np.zeros(1))[0, 0]
+                   for noise in (0.1, 3.0))
+    of_noise = 1.0 / 12  # residuals of one, of twelve vehicles, for a mean
+    assert 0.2 * of_noise < quiet < 0.5 * of_noise
+    assert loud > 9.0 * of_noise
+    many = plain(np.ones((1200, 1)), 0.1 * np.resize([1.0, -1.0], 1200), np.arange(1200), np.zeros(1))[0, 0]
+    assert many < 0.02 / 1200
+
+
 def test_what_only_the_prior_knows_has_the_spread_of_the_prior() -> None:
     slopes = np.column_stack([np.ones(50), np.zeros(50)])
     covariance = plain(slopes, np.zeros(50), np.arange(50), np.array([0.0, 1.0]))

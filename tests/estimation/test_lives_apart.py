@@ -1,0 +1,142 @@
+"""Lives that are stuck, lives that contradict windows, and halves that contradict the whole."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from autocalib_ros.calibration import Calibration, Reason
+from autocalib_ros.calibrator import solve
+from autocalib_ros.camera import Camera
+from autocalib_ros.config import GateOptions, JointOptions, Options
+from autocalib_ros.estimation import turning
+from autocalib_ros.estimation.differences import differences, expected_of_halves
+from autocalib_ros.estimation.doubts import halves_doubt
+from autocalib_ros.estimation.great_circles import TrackSet, select_tracks
+from autocalib_ros.estimation.ground_plane import tilt_and_roll_deg
+from autocalib_ros.estimation.joint import JointFit, solve_joint
+from autocalib_ros.estimation.lens_prior import known_lens, lens_priors
+from autocalib_ros.estimation.lives import Lives, find_lives
+from autocalib_ros.estimation.rigid_bodies import Bundle
+from autocalib_ros.estimation.state import Setting, State, Steps
+from autocalib_ros.estimation.windows import Instants, Windows, find_windows
+from autocalib_ros.evidence import Evidence
+from autocalib_ros.offline.synthetic_evidence import Junction, synthetic_evidence
+from autocalib_ros.offline.synthetic_traffic import drive_arc
+
+TURNING = Junction(drive=partial(drive_arc, radii_m=(12.0, 60.0)), vehicles=14, points_per_vehicle=8, noise_px=0.3)
+TRUTH = State(TURNING.camera, TURNING.camera_from_ground, np.zeros(0))
+
+
+def evidence_of(seed: int) -> Evidence:
+    return synthetic_evidence(TURNING, np.random.default_rng(seed))
+
+
+def slid(evidence: Evidence, generator: np.random.Generator, reach_px: float) -> Evidence:
+    """Let each followed point slide on its vehicle, to and fro over some 600 px of its way."""
+    points = evidence.points_px.copy()
+    for begin, end in zip(evidence.track_starts[:-1], evidence.track_starts[1:], strict=True):
+        steps = np.hypot(*np.diff(points[begin:end], axis=0).T)
+        way = np.concatenate([[0.0], np.cumsum(steps)])[:, None]
+        phase, length_px = generator.uniform(0, 2 * np.pi, 2), generator.uniform(420, 840)
+        points[begin:end] += reach_px * generator.normal(size=2) * np.sin(2 * np.pi * way / length_px + phase)
+    return replace(evidence, points_px=points)
+
+
+def sigmas_off(result: Calibration) -> float:
+    """How far tilt or roll is off in standard deviations of its own, whichever is more."""
+    assert result.ground is not None
+    sigma = np.array([result.stddev.tilt_deg, result.stddev.roll_deg], float)
+    off_deg = tilt_and_roll_deg(result.ground.normal_in_camera) - tilt_and_roll_deg(TURNING.normal_in_camera)
+    return float((np.abs(off_deg) / sigma).max())
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_few_vehicles_whose_points_slide_do_not_mislead(seed: int) -> None:
+    generator = np.random.default_rng(seed)
+    evidence = slid(synthetic_evidence(TURNING, generator), generator, 1.0)
+    result = solve(evidence, Options(camera_height=8.0), lens=TURNING.camera)
+    if isinstance(result, Calibration) and result.ground is not None:
+        assert sigmas_off(result) < 3.0
+
+
+def turned_lives(windows: Windows, instants: Instants, limit: int, *, by_deg: float) -> Lives:
+    """Find lives as a camera turned a little would see them: bodies that move in another plane."""
+    lives = find_lives(windows, instants, limit)
+    bearings, _ = TURNING.camera.unproject(lives.pixels)
+    turn = Rotation.from_rotvec(np.radians([by_deg, 0.0, 0.0])).as_matrix()
+    pixels, _ = TURNING.camera.project(bearings @ turn.T)
+    return replace(lives, pixels=np.where(lives.mask[..., None], pixels, 0.0))
+
+
+def test_lives_that_contradict_windows_are_not_believed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(turning, 'find_lives', partial(turned_lives, by_deg=8.0))
+    result = solve(evidence_of(1), Options(camera_height=8.0), lens=TURNING.camera)
+    if isinstance(result, Calibration) and result.ground is not None:
+        assert sigmas_off(result) < 3.0
+    windows, fit, tracks = by_windows(evidence_of(1))
+    kept, by_lives = turning.over_lives(fit, tracks, windows, Instants(evidence_of(1)))
+    assert by_lives is not None
+    assert differences(kept, fit).normal_deg < 0.1
+    assert turning.with_lives_apart(kept, None) is kept
+    widened = turning.with_lives_apart(kept, by_lives)
+    before, after = differences(kept, kept).sigmas[1], differences(widened, widened).sigmas[1]
+    apart_deg = np.degrees(np.arccos(kept.state.rotation[:, 2] @ by_lives.rotation[:, 2]))
+    assert apart_deg > 5.0
+    assert after**2 - before**2 == pytest.approx(2 * apart_deg**2, rel=0.05)  # as if of two, each so far off
+
+
+def by_windows(evidence: Evidence) -> tuple[Windows, JointFit, TrackSet]:
+    """Solve with windows alone, from the truth."""
+    windows = find_windows(evidence, Instants(evidence))
+    nothing = select_tracks(evidence, 500).subset(np.zeros(0, int))
+    fit = solve_joint(TRUTH, nothing, Setting(known_lens(TURNING.camera), JointOptions(), windows=windows), refine=True)
+    return windows, turning.with_turning(fit, nothing, windows) or fit, nothing
+
+
+def test_a_stuck_life_is_begun_anew() -> None:
+    evidence = evidence_of(3)
+    windows, fit, nothing = by_windows(evidence)
+    lives = find_lives(windows, Instants(evidence), 100)
+    bundle = Bundle(lives, 0.3, 0.0)
+    setting = replace(fit.problem.setting, windows=windows.subset(np.zeros(0, int)), bundle=bundle)
+    good = solve_joint(TRUTH, nothing, setting, refine=True)
+    shapes = good.problem.inner[2]
+    assert shapes is not None
+    # a body that turns the other way: nothing small leads from there to how it moved
+    turns_rad = np.where(np.arange(len(lives))[:, None] < 3, -shapes.turns_rad, shapes.turns_rad)
+    stuck = replace(shapes, turns_rad=turns_rad)
+    bad = solve_joint(TRUTH, nothing, setting, refine=True, inner=(None, None, stuck))
+    mended = turning.begun_anew(bad, nothing)
+    assert (bad.turning2[:3] > 1.5 * good.turning2[:3]).any()
+    assert (mended.turning2[:3] < 1.1 * good.turning2[:3]).all()
+
+
+def test_halves_answer_for_the_deviation_of_the_whole() -> None:
+    generator = np.random.default_rng(1)
+    _, fit, nothing = by_windows(slid(synthetic_evidence(TURNING, generator), generator, 8.0))
+    assert isinstance(halves_doubt(fit, nothing, GateOptions()), str)
+    boasting = replace(fit, covariance=1e-4 * fit.covariance)
+    doubt = halves_doubt(boasting, nothing, GateOptions())
+    assert isinstance(doubt, Reason) and doubt.code == 'halves_disagree'
+
+
+def test_halves_that_tell_alike_differ_by_twice_the_deviation_of_the_whole() -> None:
+    _, fit, _ = by_windows(evidence_of(2))
+    half = replace(fit, information=0.5 * fit.information)
+    whole = differences(fit, fit).sigmas / np.sqrt(2)
+    assert expected_of_halves(fit, half, half) == pytest.approx(2 * whole, rel=1e-3)
+    third, rest = (replace(fit, information=share * fit.information) for share in (0.2, 0.8))
+    assert expected_of_halves(fit, third, rest)[1] == pytest.approx(2.5 * whole[1], rel=1e-3)
+
+
+def test_the_step_to_a_state_leads_there() -> None:
+    prior = lens_priors((1280, 720), JointOptions())[0]
+    base = State(Camera(1280, 720, 560.0, (640.0, 360.0), (0.01, 0, 0, 0)), TRUTH.rotation, np.array([0.0, 1.5]))
+    steps = Steps(base, Setting(prior, JointOptions()))
+    step = np.random.default_rng(0).normal(scale=0.05, size=steps.size)
+    assert steps.to(steps.state(step)) == pytest.approx(step, abs=1e-9)
