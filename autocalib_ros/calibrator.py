@@ -130,6 +130,7 @@ class AutoCalibrator:
         if self._observer.drift_px > drift_limit_px(self._size[0], self._options.gate):
             self._moved_s = time_s
         self._moved_s = max(self._moved_s, self._observer.lost_s)
+        self._observer.forget_view_before(self._moved_s)
         if time_s - self._moved_s <= memory_s:
             self._buffer.forget_before(time_s - memory_s)
         else:
@@ -166,6 +167,11 @@ class AutoCalibrator:
 
     def snapshot(self) -> Evidence | None:
         """Freeze the evidence so far; None before the first image."""
+        evidence = self._held()
+        return evidence and replace(evidence, still_lines_px=self._observer.still_lines())
+
+    def _held(self) -> Evidence | None:
+        """Freeze what the buffer holds."""
         if self._observer is None:
             return None
         return self._buffer.snapshot(
@@ -174,7 +180,7 @@ class AutoCalibrator:
 
     def progress(self) -> Progress:
         """Say how much of the evidence that a solution needs is there."""
-        evidence, gate = self.snapshot(), self._options.gate
+        evidence, gate = self._held(), self._options.gate
         if evidence is None:
             return Progress(0.0, ('no image yet',))
         evidence, _ = of_vehicles(evidence)
@@ -346,7 +352,7 @@ def _calibration(options: Options, solution: Solution, lens: Calibration) -> Cal
         return replace(lens, ground_refusal=doubt)
     normal = plane.normal(plane.fit.state)
     tilt, roll = plane.sigma(lambda _, normal: tilt_and_roll_deg(normal))
-    grade = 'unit_scale' if not scale.metric else 'full' if plane.assumed is None else 'assumed'
+    grade = 'unit_scale' if not scale.metric else 'assumed' if solution.assumed else 'full'
     return replace(
         lens, grade=grade, ground=ground_plane(normal, solution.along, height, metric=scale.metric),
         assumptions=(*lens.assumptions, *scale.assumption(height, height_sigma)),

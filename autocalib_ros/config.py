@@ -178,6 +178,9 @@ class JointOptions(_Checked):
     transverse_edges: bool = option(
         True, 'where one road alone is seen: take bumpers, windscreens and roof lines of vehicles for square to it; '
         'they then give a ground plane of grade assumed')
+    road_markings: bool = option(
+        True, 'where the traffic alone gives no full result: take lane lines, stop lines, crosswalks and kerbs for '
+        'parallel or square to each other; where the traffic agrees they give lens and ground plane, of grade assumed')
 
     def __post_init__(self) -> None:
         if isinstance(self.road_angle, (int, float)) and not isinstance(self.road_angle, bool):

@@ -94,6 +94,8 @@ class Evidence:
     """Shape (edges,)."""
     edge_times_s: np.ndarray = field(default_factory=lambda: np.zeros(0))
     """Shape (edges,)."""
+    still_lines_px: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))
+    """Straight lines of the road and around it, without the traffic, x0, y0, x1, y1, shape (lines, 4)."""
     track_kinds: np.ndarray = field(default_factory=lambda: np.zeros(0, np.uint8))
     """`Kind` of each track, uint8, shape (tracks,); all unknown where it is not given."""
 
@@ -145,6 +147,8 @@ class Evidence:
     def save(self, path: Path) -> None:
         """Write the snapshot as .npz."""
         arrays = {name: getattr(self, name) for name in (*ARRAYS, *EDGE_ARRAYS)}
+        if len(self.still_lines_px):
+            arrays[STILL_LINES] = self.still_lines_px
         if self.track_kinds.any():
             arrays[KINDS] = self.track_kinds
         path = Path(path)
@@ -170,7 +174,7 @@ class Evidence:
                 evidence = cls(image_size=(width, height), first_stamp_ns=first, newest_stamp_ns=newest,
                                frames=int(data['frames']), drift_px=float(data['drift_px']),
                                **{name: data[name] for name in ARRAYS},
-                               **{name: data[name] for name in (*EDGE_ARRAYS, KINDS) if name in data})
+                               **{name: data[name] for name in (*EDGE_ARRAYS, STILL_LINES, KINDS) if name in data})
             _require_consistent(evidence)
         except UNREADABLE as error:
             reason = ' '.join(str(error).split())
@@ -182,6 +186,8 @@ ARRAYS = ('track_starts', 'points_px', 'times_s', 'track_vehicles', 'segments_px
           'segment_times_s')
 EDGE_ARRAYS = ('edges_px', 'edge_vehicles', 'edge_times_s')
 """Files written before edges were gathered have none of them."""
+STILL_LINES = 'still_lines_px'
+"""Files of little evidence, and those written before they were looked for, have none."""
 KINDS = 'track_kinds'
 """Only in files of evidence that was gathered with a detector."""
 
@@ -198,7 +204,8 @@ def _require_consistent(evidence: Evidence) -> None:
               'track_vehicles': (tracks,), 'segments_px': (len(evidence.segments_px), 4),
               'segment_vehicles': (len(evidence.segments_px),), 'segment_times_s': (len(evidence.segments_px),),
               'edges_px': (len(evidence.edges_px), 4), 'edge_vehicles': (len(evidence.edges_px),),
-              'edge_times_s': (len(evidence.edges_px),), KINDS: (tracks,)}
+              'edge_times_s': (len(evidence.edges_px),), STILL_LINES: (len(evidence.still_lines_px), 4),
+              KINDS: (tracks,)}
     for name, shape in shapes.items():
         array = getattr(evidence, name)
         kinds = 'iu' if name in ('track_starts', KINDS) or name.endswith('vehicles') else 'f'

@@ -99,6 +99,11 @@ def lens_doubt(fit: JointFit, tracks: TrackSet, evidence: Evidence, gate: GateOp
     return _turning(fit, share, needed) if share < needed else None
 
 
+def view_doubt(fit: JointFit, tracks: TrackSet) -> Reason | None:
+    """Say why what was found without the traffic cannot be how it is seen, if so."""
+    return _horizon_doubt(fit, tracks) or _model_doubt(fit)
+
+
 def _horizon_doubt(fit: JointFit, tracks: TrackSet) -> Reason | None:
     _, below = above_traffic(fit.state.rotation[:, 2], fit.state.camera, tracks)
     if not fit.plane_known or below >= BELOW_HORIZON:
@@ -179,15 +184,15 @@ def _model_doubt(fit: JointFit) -> Reason | None:
     return None
 
 
-def plane_doubt(plane: Plane, gate: GateOptions) -> Reason | None:
-    """Say why the ground plane cannot be trusted, if so; an assumption may be as wrong as it says on top."""
+def plane_doubt(plane: Plane, gate: GateOptions, *, assumed: bool = False) -> Reason | None:
+    """Say why the ground plane cannot be trusted, if so; one that is `assumed` may be less sure."""
     sigma = plane.worst_sigma_deg
     if isinstance(plane.assumed, LevelCamera) and not plane.assumed.tells(plane.fit.state):
         return Reason('plane_uncertain', 'the road leads level across the image, where the roll of the camera tells '
                       'nothing of the plane', 'wait for traffic across the road, or that turns')
     if plane.assumed is not None and plane.below < BELOW_HORIZON:
         return _above_horizon(plane.below)
-    needed = gate.max_sigma_tilt_deg * (1.0 if plane.assumed is None else ASSUMED)
+    needed = gate.max_sigma_tilt_deg * (ASSUMED if assumed or plane.assumed is not None else 1.0)
     if not sigma <= needed:
         return Reason(
             'plane_uncertain', f'the ground normal is known to {min(sigma, 90.0):.1f} degrees, {needed:g} are needed',

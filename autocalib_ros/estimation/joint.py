@@ -328,6 +328,16 @@ def judged_with(fit: JointFit, tracks: TrackSet, setting: Setting) -> JointFit:
     return _judged(Problem(fit.state, tracks, fit.labels, setting, inner), fit.state, inner, tracks)
 
 
+def judged_at(state: State, tracks: TrackSet, setting: Setting, covariance: np.ndarray) -> JointFit:
+    """See how tracks follow the roads of a state that was found otherwise, with the covariance that it has from there.
+
+    Its parameters are those of `Steps(state, setting)`.
+    """
+    labels, _ = assign(state, Seen.through(state.camera, tracks))
+    fit = _judged(Problem(state, tracks, labels, setting), state, (None, None, None), tracks)
+    return replace(fit, covariance=covariance)
+
+
 def cost_at(fit: JointFit, tracks: TrackSet, scales: np.ndarray) -> float:
     """Twice the negative logarithm of a fit's probability, for comparison between fits of the same evidence.
 

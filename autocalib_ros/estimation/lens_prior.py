@@ -24,6 +24,8 @@ K2_SIGMA = 0.02
 """Standard deviation of k2 about its family: at one radian it moves an image point by 2 %, as k1 does by 3 %."""
 PRINCIPAL_POINT_SHARE = 0.01
 """Standard deviation of the principal point, share of the image width, unless given in pixels."""
+LOOSE_POINT_SHARE = 0.1
+"""The same for evidence that tells the principal point: an image may be cut out of a larger one, or magnified."""
 PARAMETERS = ('focal length', 'principal point x', 'principal point y', 'k1', 'k2')
 
 
@@ -86,6 +88,12 @@ class LensPrior:
         """Return the prior with parameters held."""
         held = np.array([name in names for name in PARAMETERS])
         return replace(self, sigma=np.where(held, 0.0, self.sigma))
+
+    def with_loose_point(self) -> LensPrior:
+        """Return the prior with the principal point anywhere near the middle, unless it is held."""
+        sigma = self.sigma.copy()
+        sigma[1:3] = np.where(sigma[1:3] > 0, LOOSE_POINT_SHARE * self.centre.width, 0.0)
+        return replace(self, sigma=sigma)
 
     def with_k2(self) -> LensPrior:
         """Return the prior with k2 set free about its centre."""

@@ -14,9 +14,10 @@ from autocalib_ros.estimation.great_circles import TrackSet, evenly
 from autocalib_ros.estimation.held import lens_assumptions, with_k2_if_asked_for, with_what_can_be_told
 from autocalib_ros.estimation.joint import JointFit, noise_cost, road_support, solve_joint, with_bodies
 from autocalib_ros.estimation.lens_prior import LensPrior, known_lens, lens_priors
+from autocalib_ros.estimation.painted import fit_to_markings, with_lens_known
 from autocalib_ros.estimation.path_noise import USUAL_HEIGHT_M
 from autocalib_ros.estimation.people import walkers
-from autocalib_ros.estimation.plane import LevelCamera, Plane, agreement
+from autocalib_ros.estimation.plane import AGREE_SIGMAS, LevelCamera, Plane, agreement
 from autocalib_ros.estimation.roads import (
     main_road,
     with_further_roads,
@@ -40,6 +41,10 @@ from autocalib_ros.evidence import Evidence
 
 NEARLY_LEVEL_DEG = 5.0
 """Roll up to which walking can be told from driving as if there were none."""
+AGREE_DEG = 1.5
+"""Two planes that differ by less agree: it is within what the program promises."""
+CONFIRMS_DEG = 4.5
+"""Traffic that tells the plane, or its road, no better confirms nothing: standard deviation, degrees."""
 VOTERS = 200
 """Tracks, evenly out of all, from which the starts are made and compared; the solution then uses every track."""
 
@@ -57,6 +62,18 @@ class Solution:
     assumptions: tuple[str, ...]
     checks: tuple[str, ...]
     no_plane: Reason | None
+    by_markings: bool = False
+    """Whether lens and plane are those of the lines on the road."""
+
+    @property
+    def assumed(self) -> bool:
+        """Whether the plane rests on more than the motion of vehicles."""
+        return self.plane.assumed is not None or self.by_markings
+
+    @property
+    def full(self) -> bool:
+        """Whether the motion of vehicles gives all of it."""
+        return self.no_plane is None and not self.assumed
 
 
 @dataclass(frozen=True)
@@ -82,7 +99,8 @@ def find_solution(evidence: Evidence, tracks: TrackSet, options: JointOptions, g
     """Estimate lens, plane and roads from evidence and the tracks chosen of it; a reason when they cannot be trusted.
 
     Straight traffic is tried first, with what turns to complete it; where that gives no plane, or one that rests on
-    an assumption, the traffic that turns alone. A known `lens` is kept, and only the pose is found.
+    an assumption, the traffic that turns alone, and then the lines on the road. A known `lens` is kept, and only the
+    pose is found.
     """
     if len(tracks) < gate.min_tracks:
         return Reason('too_few_tracks', f'{len(tracks)} tracks of the {gate.min_tracks} needed are long enough',
@@ -92,24 +110,102 @@ def find_solution(evidence: Evidence, tracks: TrackSet, options: JointOptions, g
     instants = Instants(evidence)
     traffic = _Traffic(tracks, find_windows(evidence, instants), instants, priors, gate, evidence, generator)
     setting = Setting(priors[0], options, height_m, crossing)
+    found = _from_traffic(traffic, setting)
+    if not options.road_markings or isinstance(found, Solution) and found.full:
+        return found
+    painted = _from_markings(traffic, setting)
+    return painted if _tells_more(painted, found) else found
+
+
+def _from_traffic(traffic: _Traffic, setting: Setting) -> Solution | Reason:
+    """Solve from straight traffic; where that leaves anything open, from the traffic that turns."""
     straight = _from_straight(traffic, setting)
-    if isinstance(straight, Solution) and straight.no_plane is None and straight.plane.assumed is None:
+    if isinstance(straight, Solution) and straight.full:
         return straight
-    turned = from_turning(tracks, traffic.windows, setting)
-    if turned is None:
-        return straight
-    fit, tracks = _with_noise(with_further_roads(turned, tracks, gate), traffic)
-    turning = _completed(fit, tracks, '', traffic, turned=True)
+    turning = _from_turning(traffic, setting)
     return turning if _tells_more(turning, straight) else straight
 
 
-def _tells_more(turning: Solution | Reason, straight: Solution | Reason) -> bool:
-    """Whether a solution by traffic that turns says more than what straight traffic does."""
-    if isinstance(turning, Reason) or isinstance(straight, Reason):
-        return isinstance(turning, Solution)
-    if turning.no_plane or straight.no_plane:
-        return turning.no_plane is None
-    return turning.plane.worst_sigma_deg < straight.plane.worst_sigma_deg
+def _from_turning(traffic: _Traffic, setting: Setting) -> Solution | Reason:
+    """Solve from the motion of vehicles that turn."""
+    turned = from_turning(traffic.tracks, traffic.windows, setting)
+    if turned is None:
+        return Reason('too_little_turning', 'too few vehicles turn', 'wait for more vehicles that turn')
+    fit, tracks = _with_noise(with_further_roads(turned, traffic.tracks, traffic.gate), traffic)
+    return _completed(fit, tracks, '', traffic, turned=True)
+
+
+def _tells_more(other: Solution | Reason, found: Solution | Reason) -> bool:
+    """Whether another solution says more than the one that was found before."""
+    if isinstance(other, Reason) or isinstance(found, Reason):
+        return isinstance(other, Solution)
+    if other.no_plane or found.no_plane:
+        return other.no_plane is None
+    return other.plane.worst_sigma_deg < found.plane.worst_sigma_deg
+
+
+def _from_markings(traffic: _Traffic, setting: Setting) -> Solution | Reason:
+    """Solve from the lines on the road; what the traffic tells, seen by the lens found, has to agree."""
+    asserted = setting.options.principal_point_sigma_px >= 0
+    priors = traffic.priors if asserted else [prior.with_loose_point() for prior in traffic.priors]
+    painted = fit_to_markings(traffic.evidence, traffic.tracks, priors, setting, traffic.gate)
+    if isinstance(painted, Reason):
+        return painted
+    fit, assumed = painted
+    known = known_lens(fit.state.camera)
+    by_that_lens = replace(traffic, priors=[known]), replace(setting, prior=known)
+    checks = agreed_by(fit, _from_straight(*by_that_lens), _from_turning(*by_that_lens))
+    if isinstance(checks, Reason):
+        return checks
+    along, flow = main_road(fit, traffic.tracks)
+    plane = Plane.of(fit, traffic.tracks)
+    return Solution(fit, plane, along, flow, (*lens_assumptions(fit, ()), assumed), checks,
+                    plane_doubt(plane, traffic.gate, assumed=True), by_markings=True)
+
+
+def agreed_by(painted: JointFit, *found: Solution | Reason) -> tuple[str, ...] | Reason:
+    """Say how the lines on the road agree with what the traffic shows, seen by the lens of the lines.
+
+    All that tells enough has to agree, and something has to tell enough.
+    """
+    painted, checks, missing = with_lens_known(painted), [], []
+    for solution in found:
+        if isinstance(solution, Reason):
+            missing.append(solution)
+            continue
+        apart_deg, own_deg, sigma_deg, what = _apart(painted, solution)
+        if not own_deg <= CONFIRMS_DEG:
+            missing.append(Reason('plane_uncertain', f'it tells the plane to {min(own_deg, 90.0):.0f} degrees',
+                                  'wait for more traffic'))
+        elif apart_deg > max(AGREE_SIGMAS * sigma_deg, AGREE_DEG):
+            return Reason(
+                'markings_contradicted', f'{what} are {apart_deg:.1f} degrees apart, {sigma_deg:.1f} were expected',
+                'wait for more traffic; if the markings are askew, set joint.road_markings to false')
+        else:
+            checks.append(f'{what} are {apart_deg:.1f} degrees apart, {sigma_deg:.1f} were expected')
+    if checks:
+        return tuple(checks)
+    return Reason('markings_unconfirmed', 'the traffic does not confirm the lines on the road: with the lens that they '
+                  f'give, {missing[0].message}', missing[0].remedy)
+
+
+def _apart(painted: JointFit, found: Solution) -> tuple[float, float, float, str]:
+    """Angle of what the traffic tells from the lines, its standard deviation, that of the difference, and its name."""
+    if found.fit.plane_known:
+        angle = _angle_deg(painted.state.rotation[:, 2], found.plane.normal(found.fit.state))
+        own, other = found.plane.worst_sigma_deg, Plane(painted, 1.0).worst_sigma_deg
+        what = 'ground normals of the traffic and of the lines'
+    else:
+        angle = min(_angle_deg(axis, found.along) for axis in painted.state.directions)
+        own, other = (float(np.degrees(np.linalg.norm(fit.sigma(lambda state: state.directions[0]))))
+                      for fit in (found.fit, painted))
+        what = 'the road of the traffic and the lines along it'
+    return angle, own, float(np.hypot(own, other)), what
+
+
+def _angle_deg(one: np.ndarray, other: np.ndarray) -> float:
+    """Angle between two unit vectors (3,), whichever way they point, degrees."""
+    return float(np.degrees(np.arccos(min(abs(float(one @ other)), 1.0))))
 
 
 def _from_straight(traffic: _Traffic, setting: Setting) -> Solution | Reason:

@@ -18,7 +18,7 @@ import numpy as np
 
 from autocalib_ros.camera import Camera
 from autocalib_ros.estimation.edge_mixture import Turns, find_peaks, folded
-from autocalib_ros.estimation.great_circles import TrackSet, earlier_ones, rays_of
+from autocalib_ros.estimation.great_circles import TrackSet, along_px, earlier_ones, rays_of
 from autocalib_ros.estimation.joint import JointFit
 from autocalib_ros.estimation.small_matrices import cross, dot
 from autocalib_ros.estimation.state import State, level_normal
@@ -74,18 +74,9 @@ def turns_of(camera: Camera, along: np.ndarray, across: np.ndarray, ends_px: np.
     """Return the turns about a road `along` (3,), counted from `across` (3,), of edges (n, 4)."""
     middle, step = (ends_px[:, :2] + ends_px[:, 2:]) / 2, ends_px[:, 2:] - ends_px[:, :2]
     length = np.maximum(np.hypot(*step.T), 1e-9)
-    rays = rays_of(camera, middle)
-    outward = middle - camera.principal_point_px
-    outward = outward / np.maximum(np.hypot(*outward.T), 1e-9)[:, None]
-
-    def moved(way: np.ndarray) -> np.ndarray:
-        """Change of the bearing for one pixel along a way (n, 2) in the image."""
-        return (rays.radial * (way * outward).sum(axis=1)[:, None]
-                + rays.tangential * (way[:, 1] * outward[:, 0] - way[:, 0] * outward[:, 1])[:, None])
-
-    unit = step / length[:, None]
-    circles = cross(rays.bearings, moved(unit))
-    slopes = cross(rays.bearings, moved(np.column_stack([-unit[:, 1], unit[:, 0]])))
+    rays, unit = rays_of(camera, middle), step / length[:, None]
+    circles = cross(rays.bearings, along_px(rays, camera, middle, unit))
+    slopes = cross(rays.bearings, along_px(rays, camera, middle, np.column_stack([-unit[:, 1], unit[:, 0]])))
     basis = np.stack([across, np.cross(along, across)])
     (p, q), (slope_p, slope_q) = basis @ circles.T, basis @ slopes.T
     aside2 = np.maximum(p * p + q * q, 1e-30)

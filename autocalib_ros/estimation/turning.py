@@ -76,22 +76,28 @@ def over_lives(fit: JointFit, tracks: TrackSet, windows: Windows,
     lives lead to comes with them.
     """
     setting = replace(fit.problem.setting, vehicle_correlation=fit.vehicle_correlation)
-    by_windows = solve_joint(fit.state, tracks, setting, refine=True, inner=fit.problem.inner)
     chosen = _turning(fit, windows) if setting.turning else None
     lives = no_lives() if chosen is None else find_lives(chosen, instants, MOST_LIVES)
-    if chosen is None or not len(lives):
-        return by_windows, None
-    drifting = Bundle(lives, setting.options.noise_px, setting.options.drift_px)
-    setting = replace(setting, windows=chosen.subset(chosen.of_segments).spread(MOST_WINDOWS), bundle=drifting)
+    by_lives = None if chosen is None or not len(lives) else _by_lives(fit, tracks, replace(
+        setting, windows=chosen.subset(chosen.of_segments).spread(MOST_WINDOWS),
+        bundle=Bundle(lives, setting.options.noise_px, setting.options.drift_px)))
+    if by_lives is not None and not differences(fit, by_lives).beyond(APART):
+        return by_lives, None
+    by_windows = solve_joint(fit.state, tracks, setting, refine=True, inner=fit.problem.inner)
+    return by_windows, None if by_lives is None else by_lives.state
+
+
+def _by_lives(fit: JointFit, tracks: TrackSet, setting: Setting) -> JointFit:
+    """Solve with a bundle, of points that drift or of such that do not: whichever makes them more probable."""
     solved = solve_joint(fit.state, tracks, setting, refine=True)
-    steady, (_, _, shapes) = drifting.steady(), solved.problem.inner
-    camera, plane = solved.state.camera, solved.state.rotation
-    if shapes is not None and (
-            steady.noise_cost(camera, plane, shapes) < drifting.noise_cost(camera, plane, shapes)):
+    drifting, (_, _, shapes) = solved.problem.setting.bundle, solved.problem.inner
+    if drifting is None or shapes is None:
+        return solved
+    steady, camera, plane = drifting.steady(), solved.state.camera, solved.state.rotation
+    if steady.noise_cost(camera, plane, shapes) < drifting.noise_cost(camera, plane, shapes):
         solved = solve_joint(solved.state, tracks, replace(setting, bundle=steady), refine=True,
                              inner=solved.problem.inner)
-    solved = begun_anew(solved, tracks)
-    return (by_windows, solved.state) if differences(by_windows, solved).beyond(APART) else (solved, None)
+    return begun_anew(solved, tracks)
 
 
 def begun_anew(fit: JointFit, tracks: TrackSet) -> JointFit:

@@ -16,6 +16,7 @@ from autocalib_ros.perception.edges import EdgeFinder
 from autocalib_ros.perception.privacy import Ignored, black_out, require_seen
 from autocalib_ros.perception.segments import Keypoints, find_keypoints, match_segments
 from autocalib_ros.perception.shutter import LEAP_LEVELS, Seen, View
+from autocalib_ros.perception.still_lines import StillLines
 from autocalib_ros.perception.stillness import Stillness
 from autocalib_ros.perception.tracks import PointTracker
 from autocalib_ros.perception.vehicles import MotionMask, Region, without
@@ -60,6 +61,7 @@ class Observer:
         self._tracker = PointTracker(options.tracking, self._avoided)
         self._stillness = Stillness(options.buffer.seconds, self._ignored)
         self._background = Background()
+        self._still_lines = StillLines(self._avoided)
         self._sift = cv2.SIFT_create(contrastThreshold=0.03)
         self._keypoints: Keypoints | None = None
         self._view = View(REPEATED_LEVELS, LEAP_LEVELS)
@@ -174,6 +176,18 @@ class Observer:
     def compare_since(self, time_s: float) -> None:
         """Let `drift_px` go back to `time_s`, that of the oldest evidence, where that is before `buffer.seconds`."""
         self._stillness.compare_since(time_s)
+
+    def forget_view_before(self, time_s: float) -> None:
+        """Let the background begin at `time_s` at the earliest: the camera stood otherwise before."""
+        self._background.forget_before(time_s)
+
+    def still_lines(self) -> np.ndarray:
+        """Return straight lines of the background, pixels of the full image, x0, y0, x1, y1, shape (n, 4)."""
+        times = self._background.times_s
+        if not self._still_lines.up_to_date(times):
+            grey = self._background.grey()
+            self._still_lines.find(None if grey is None else self._tracked_image(grey), times)
+        return self._full_pixels(self._still_lines.lines_px.reshape(-1, 2)).reshape(-1, 4)
 
     def background(self) -> np.ndarray | None:
         """Return the road without its traffic, BGR uint8 (H, W, 3)."""

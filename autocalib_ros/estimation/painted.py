@@ -1,0 +1,86 @@
+"""Lens and plane by the markings of the road, and what speaks against them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from autocalib_ros.calibration import Reason
+from autocalib_ros.config import GateOptions
+from autocalib_ros.estimation.doubts import view_doubt
+from autocalib_ros.estimation.great_circles import TrackSet
+from autocalib_ros.estimation.joint import JointFit, judged_at
+from autocalib_ros.estimation.lens_prior import LensPrior
+from autocalib_ros.estimation.markings import ASKEW_RAD, Grid, Lines, beside_traffic, lines_on_road, square_grids
+from autocalib_ros.estimation.state import Setting, State
+from autocalib_ros.evidence import Evidence
+
+LEAST_SHARE = 0.1
+"""Of the lines along either direction: by chance a few in a hundred are, and one road's own are along the other."""
+LEAST_GROUPS = 5
+"""Places along either direction: a single stop line, or the shadow of a lamp post, may be askew."""
+AMBIGUOUS, AMBIGUOUS_DEG = 5.0, 3.0
+"""Another plane, so far from the best, speaks against it when its probability is no less than e to the minus this of
+the best one's."""
+SQUARE_SIGMAS = 2.5
+"""Markings are square when the angle between them differs by no more from a right one."""
+
+
+def fit_to_markings(evidence: Evidence, tracks: TrackSet, priors: list[LensPrior], setting: Setting,
+                    gate: GateOptions) -> tuple[JointFit, str] | Reason:
+    """Estimate lens and plane from the lines on the road; with what was assumed in words, or a reason why not."""
+    lines = lines_on_road(evidence)
+    grids = square_grids(lines, priors)
+    if not grids:
+        return _none(f'there are {len(lines)}')
+    nearer = beside_traffic(lines, grids[0], evidence)
+    if nearer is None:
+        return _none('too few are beside the traffic')
+    lines, best = nearer
+    doubt = _ambiguity(grids) or _axes_doubt(lines, best)
+    if doubt:
+        return doubt
+    state = State(best.camera, best.rotation, np.array([0.0, np.pi / 2 + best.askew_rad]))
+    fit = judged_at(state, tracks, replace(setting, prior=best.prior, crossing_rad=None), best.covariance)
+    if not fit.focal_sigma <= gate.max_sigma_focal_rel:
+        return _none(f'the focal length to {min(fit.focal_sigma, 9.99):.1%}, {gate.max_sigma_focal_rel:.0%} is needed')
+    told = best.members[:2].max(axis=0) > 0.5
+    places, tested_deg = len(np.unique(lines.groups[told])), 90.0 + np.degrees(best.askew_rad)
+    return view_doubt(fit, tracks) or (
+        fit, f'{told.sum()} lines in {places} places on the road taken as parallel or square to each other: '
+        f'90 +- {np.degrees(ASKEW_RAD):g} degrees (tested: {tested_deg:.1f})')
+
+
+def with_lens_known(fit: JointFit) -> JointFit:
+    """Return a fit with the deviations that it has for somebody who knows its lens."""
+    lens, covariance = fit.problem.steps.lens, np.zeros(fit.covariance.shape)
+    covariance[lens:, lens:] = np.linalg.inv(np.linalg.inv(fit.covariance)[lens:, lens:])
+    return replace(fit, covariance=covariance)
+
+
+def _ambiguity(grids: list[Grid]) -> Reason | None:
+    """Say that another plane suits the lines as well, if so."""
+    best = grids[0]
+    for other in grids[1:]:
+        cosine = abs(float(best.rotation[:, 2] @ other.rotation[:, 2]))
+        apart_deg = float(np.degrees(np.arccos(min(cosine, 1.0))))
+        if other.improbability < best.improbability + AMBIGUOUS and apart_deg > AMBIGUOUS_DEG:
+            return _none(f'they suit two planes {apart_deg:.0f} degrees apart')
+    return None
+
+
+def _axes_doubt(lines: Lines, grid: Grid) -> Reason | None:
+    """Say that too little is along either of the two directions, or that these are not square, if so."""
+    places = min(len(np.unique(lines.groups[mask])) for mask in grid.members[:2] > 0.5)
+    share = grid.shares[:2].min()
+    if share < LEAST_SHARE or places < LEAST_GROUPS:
+        return _none(f'{share:.0%} of them, in {places} places, are along the second of two directions; '
+                     f'{LEAST_SHARE:.0%} in {LEAST_GROUPS} places are needed')
+    if abs(grid.askew_rad) > SQUARE_SIGMAS * ASKEW_RAD:
+        return _none(f'they cross at {90 + np.degrees(grid.askew_rad):.1f} degrees, not at a right angle')
+    return None
+
+
+def _none(why: str) -> Reason:
+    return Reason('no_markings', f'lines on the road do not tell lens and plane: {why}', 'wait for more traffic')
