@@ -89,10 +89,11 @@ class LensPrior:
         held = np.array([name in names for name in PARAMETERS])
         return replace(self, sigma=np.where(held, 0.0, self.sigma))
 
-    def with_loose_point(self) -> LensPrior:
-        """Return the prior with the principal point anywhere near the middle, unless it is held."""
+    def loosened(self) -> LensPrior:
+        """Return the prior with the principal point anywhere near the middle, and k2 free, unless these are held."""
         sigma = self.sigma.copy()
         sigma[1:3] = np.where(sigma[1:3] > 0, LOOSE_POINT_SHARE * self.centre.width, 0.0)
+        sigma[4] = max(sigma[4], K2_SIGMA) if sigma[3] > 0 else sigma[4]
         return replace(self, sigma=sigma)
 
     def with_k2(self) -> LensPrior:

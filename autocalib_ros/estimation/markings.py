@@ -200,7 +200,7 @@ def square_grids(lines: Lines, priors: list[LensPrior]) -> list[Grid]:
 
     From many starts with the first family of lenses; the best of these with the others.
     """
-    if len(lines) < len(priors[0].free) + 4:
+    if not _enough(lines, priors[0]):
         return []
     grids = [_settled(lines, priors[0], *start, WIDENED_RAD) for start in _starts(lines, priors[0])]
     best = min(grids, key=lambda grid: grid.improbability, default=None)
@@ -212,6 +212,19 @@ def square_grids(lines: Lines, priors: list[LensPrior]) -> list[Grid]:
         ASKED_FOR if grid.prior is not priors[0] else 0.0))
 
 
+def square_grid_near(lines: Lines, prior: LensPrior, camera: Camera, normal: np.ndarray) -> Grid | None:
+    """Find the lens and plane near a lens and a normal (3,) under which lines are so; None where there are few."""
+    if not _enough(lines, prior):
+        return None
+    costs, headings = _widened_costs(lines, camera, np.array(_headings(normal)), WIDENED_RAD[1]), _headings(normal)
+    return _settled(lines, prior, camera, headings[int(np.argmin(costs))], WIDENED_RAD[1:])
+
+
+def _enough(lines: Lines, prior: LensPrior) -> bool:
+    """Whether there are more lines than unknowns."""
+    return len(lines) >= len(prior.free) + 4
+
+
 def beside_traffic(lines: Lines, grid: Grid, evidence: Evidence) -> tuple[Lines, Grid] | None:
     """Keep the lines that are beside traffic on the plane of a grid, and settle it with them; None where few are."""
     places, points = (_on_plane(grid, pixels) for pixels in (traffic_places(evidence), along_lines(lines.ends_px)))
@@ -220,7 +233,7 @@ def beside_traffic(lines: Lines, grid: Grid, evidence: Evidence) -> tuple[Lines,
                            NEAR_TRAFFIC_HEIGHTS)
     # posts stand anywhere
     kept |= grid.members[2] > 0.5
-    if kept.sum() < len(grid.prior.free) + 4:
+    if not _enough(lines.subset(kept), grid.prior):
         return None
     return lines.subset(kept), _settled(lines.subset(kept), grid.prior, grid.camera, grid.rotation, WIDENED_RAD[-2:])
 
@@ -238,28 +251,34 @@ def _planes() -> np.ndarray:
     for tilt in np.radians(TILTS_DEG):
         for roll in np.radians(ROLLS_DEG):
             up = -np.array([np.sin(roll) * np.cos(tilt), np.cos(roll) * np.cos(tilt), np.sin(tilt)])
-            right = np.cross([0.0, 0.0, 1.0], up)
-            right /= np.linalg.norm(right)
-            ahead = np.cross(up, right)
-            for heading in np.radians(HEADINGS_DEG):
-                first = np.cos(heading) * ahead + np.sin(heading) * right
-                found.append(np.column_stack([first, np.cross(up, first), up]))
+            found += _headings(up)
     return np.array(found)
+
+
+def _headings(up: np.ndarray) -> list[np.ndarray]:
+    """camera_from_plane (3, 3) of planes with a normal (3,), turned about it."""
+    right = np.cross([0.0, 0.0, 1.0], up)
+    right /= max(np.linalg.norm(right), 1e-9)
+    ahead = np.cross(up, right)
+    first = [np.cos(heading) * ahead + np.sin(heading) * right for heading in np.radians(HEADINGS_DEG)]
+    return [np.column_stack([along, np.cross(up, along), up]) for along in first]
+
+
+def _widened_costs(lines: Lines, camera: Camera, planes: np.ndarray, widened: float) -> np.ndarray:
+    """Negative logarithm of how probable lines are with widened peaks, seen by a lens over planes (n, 3, 3); (n,)."""
+    sight, sigmas = Sight.through(camera, lines.ends_px), np.hypot(_noise_rad(lines), widened)
+    each = START_SHARES * _student(sight.misses(planes.transpose(0, 2, 1)), sigmas)
+    each[:, :2] *= (planes[:, :, 2] @ sight.bearings.T < -LOWEST)[:, None]
+    return -np.log(each.sum(axis=1) + (1.0 - START_SHARES.sum()) / np.pi) @ lines.weights
 
 
 def _starts(lines: Lines, prior: LensPrior) -> list[tuple[Camera, np.ndarray]]:
     """Lenses and planes whose widened peaks hold most, distinct."""
-    planes, weights = _planes(), lines.weights
-    sigmas = np.hypot(_noise_rad(lines), WIDENED_RAD[0])
+    planes, found = _planes(), []
     diagonal = np.hypot(prior.centre.width, prior.centre.height)
-    found = []
     for focal in [prior.centre.focal_px] if prior.focal_known else diagonal * DIAGONALS:
         camera = prior.start(focal)
-        sight = Sight.through(camera, lines.ends_px)
-        each = START_SHARES * _student(sight.misses(planes.transpose(0, 2, 1)), sigmas)
-        each[:, :2] *= (planes[:, :, 2] @ sight.bearings.T < -LOWEST)[:, None]
-        density = each.sum(axis=1) + (1.0 - START_SHARES.sum()) / np.pi
-        costs = -np.log(density) @ weights
+        costs = _widened_costs(lines, camera, planes, WIDENED_RAD[0])
         found += [(costs[index], camera, planes[index]) for index in np.argsort(costs, kind='stable')[:5 * STARTS]]
     chosen: list[tuple[Camera, np.ndarray]] = []
     for _, camera, plane in sorted(found, key=lambda start: start[0]):

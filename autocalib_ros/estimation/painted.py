@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from autocalib_ros.calibration import Reason
 from autocalib_ros.config import GateOptions
@@ -12,14 +13,24 @@ from autocalib_ros.estimation.doubts import view_doubt
 from autocalib_ros.estimation.great_circles import TrackSet
 from autocalib_ros.estimation.joint import JointFit, judged_at
 from autocalib_ros.estimation.lens_prior import LensPrior
-from autocalib_ros.estimation.markings import ASKEW_RAD, Grid, Lines, beside_traffic, lines_on_road, square_grids
-from autocalib_ros.estimation.state import Setting, State
+from autocalib_ros.estimation.markings import (
+    ASKEW_RAD,
+    Grid,
+    Lines,
+    beside_traffic,
+    lines_on_road,
+    square_grid_near,
+    square_grids,
+)
+from autocalib_ros.estimation.state import Setting, State, Steps
+from autocalib_ros.estimation.windows import no_windows
 from autocalib_ros.evidence import Evidence
 
 LEAST_SHARE = 0.1
 """Of the lines along either direction: by chance a few in a hundred are, and one road's own are along the other."""
-LEAST_GROUPS = 5
-"""Places along either direction: a single stop line, or the shadow of a lamp post, may be askew."""
+LEAST_PLACES, CONFIRMED_PLACES = 5, 3
+"""Places along either direction, and where the traffic tells lens and plane as well: a single stop line, or the shadow
+of a lamp post, may be askew."""
 AMBIGUOUS, AMBIGUOUS_DEG = 5.0, 3.0
 """Another plane, so far from the best, speaks against it when its probability is no less than e to the minus this of
 the best one's."""
@@ -38,18 +49,60 @@ def fit_to_markings(evidence: Evidence, tracks: TrackSet, priors: list[LensPrior
     if nearer is None:
         return _none('too few are beside the traffic')
     lines, best = nearer
-    doubt = _ambiguity(grids) or _axes_doubt(lines, best)
+    doubt = _ambiguity(grids) or _axes_doubt(lines, best, LEAST_PLACES)
     if doubt:
         return doubt
     state = State(best.camera, best.rotation, np.array([0.0, np.pi / 2 + best.askew_rad]))
     fit = judged_at(state, tracks, replace(setting, prior=best.prior, crossing_rad=None), best.covariance)
     if not fit.focal_sigma <= gate.max_sigma_focal_rel:
         return _none(f'the focal length to {min(fit.focal_sigma, 9.99):.1%}, {gate.max_sigma_focal_rel:.0%} is needed')
-    told = best.members[:2].max(axis=0) > 0.5
-    places, tested_deg = len(np.unique(lines.groups[told])), 90.0 + np.degrees(best.askew_rad)
-    return view_doubt(fit, tracks) or (
-        fit, f'{told.sum()} lines in {places} places on the road taken as parallel or square to each other: '
-        f'90 +- {np.degrees(ASKEW_RAD):g} degrees (tested: {tested_deg:.1f})')
+    return view_doubt(fit, tracks) or (fit, _words(lines, best))
+
+
+def sharpened(fit: JointFit, evidence: Evidence, tracks: TrackSet,
+              prior: LensPrior) -> tuple[JointFit, str] | Reason:
+    """Return the lens and plane near those of a solution to which the lines on the road lead, with its roads.
+
+    With what was assumed in words, or a reason why not.
+    """
+    up, state = _upward(fit), fit.state
+    lines = lines_on_road(evidence)
+    near = square_grid_near(lines, prior, state.camera, up)
+    nearer = beside_traffic(lines, near, evidence) if near else None
+    if nearer is None:
+        return _none('too few are beside the traffic')
+    lines, grid = nearer
+    doubt = _axes_doubt(lines, grid, CONFIRMED_PLACES)
+    if doubt:
+        return doubt
+    setting = replace(fit.problem.setting, prior=prior, windows=no_windows(), bundle=None)
+    road, normal = state.rotation[:, 0], grid.rotation[:, 2] * np.sign(state.rotation[:, 2] @ grid.rotation[:, 2])
+    along = road - (road @ normal) * normal
+    along /= np.linalg.norm(along)
+    rotation = np.column_stack([along, np.cross(normal, along), normal])
+    there = State(grid.camera, rotation, state.angles_rad)
+    steps, lens = Steps(there, setting), len(prior.free)
+    covariance, angles = np.zeros((steps.size, steps.size)), len(steps.free_angles)
+    # turns about the axes of the grid, as turns about those of the roads
+    turned = block_diag(np.eye(lens), steps.axes @ rotation.T @ grid.rotation)
+    told = steps.size - angles
+    covariance[:told, :told] = turned @ grid.covariance[:-1, :-1] @ turned.T
+    if angles:
+        covariance[-angles:, -angles:] = fit.covariance[-angles:, -angles:]
+    return judged_at(there, tracks, setting, covariance), _words(lines, grid)
+
+
+def _upward(fit: JointFit) -> np.ndarray:
+    """The normal (3,) of a solution, to the side where the image's top is."""
+    normal = fit.state.rotation[:, 2]
+    return -normal if normal[1] > 0 else normal
+
+
+def _words(lines: Lines, grid: Grid) -> str:
+    told = grid.members[:2].max(axis=0) > 0.5
+    places, tested_deg = len(np.unique(lines.groups[told])), 90.0 + np.degrees(grid.askew_rad)
+    return (f'{told.sum()} lines in {places} places on the road taken as parallel or square to each other: '
+            f'90 +- {np.degrees(ASKEW_RAD):g} degrees (tested: {tested_deg:.1f})')
 
 
 def with_lens_known(fit: JointFit) -> JointFit:
@@ -70,13 +123,13 @@ def _ambiguity(grids: list[Grid]) -> Reason | None:
     return None
 
 
-def _axes_doubt(lines: Lines, grid: Grid) -> Reason | None:
+def _axes_doubt(lines: Lines, grid: Grid, least_places: int) -> Reason | None:
     """Say that too little is along either of the two directions, or that these are not square, if so."""
     places = min(len(np.unique(lines.groups[mask])) for mask in grid.members[:2] > 0.5)
     share = grid.shares[:2].min()
-    if share < LEAST_SHARE or places < LEAST_GROUPS:
+    if share < LEAST_SHARE or places < least_places:
         return _none(f'{share:.0%} of them, in {places} places, are along the second of two directions; '
-                     f'{LEAST_SHARE:.0%} in {LEAST_GROUPS} places are needed')
+                     f'{LEAST_SHARE:.0%} in {least_places} places are needed')
     if abs(grid.askew_rad) > SQUARE_SIGMAS * ASKEW_RAD:
         return _none(f'they cross at {90 + np.degrees(grid.askew_rad):.1f} degrees, not at a right angle')
     return None

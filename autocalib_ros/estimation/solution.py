@@ -9,12 +9,13 @@ import numpy as np
 from autocalib_ros.calibration import Reason
 from autocalib_ros.camera import Camera
 from autocalib_ros.config import GateOptions, JointOptions
+from autocalib_ros.estimation.differences import differences
 from autocalib_ros.estimation.doubts import halves_doubt, lens_doubt, plane_doubt, traffic_doubt
 from autocalib_ros.estimation.great_circles import TrackSet, evenly
 from autocalib_ros.estimation.held import lens_assumptions, with_k2_if_asked_for, with_what_can_be_told
 from autocalib_ros.estimation.joint import JointFit, noise_cost, road_support, solve_joint, with_bodies
 from autocalib_ros.estimation.lens_prior import LensPrior, known_lens, lens_priors
-from autocalib_ros.estimation.painted import fit_to_markings, with_lens_known
+from autocalib_ros.estimation.painted import fit_to_markings, sharpened, with_lens_known
 from autocalib_ros.estimation.path_noise import USUAL_HEIGHT_M
 from autocalib_ros.estimation.people import walkers
 from autocalib_ros.estimation.plane import AGREE_SIGMAS, LevelCamera, Plane, agreement
@@ -111,8 +112,10 @@ def find_solution(evidence: Evidence, tracks: TrackSet, options: JointOptions, g
     traffic = _Traffic(tracks, find_windows(evidence, instants), instants, priors, gate, evidence, generator)
     setting = Setting(priors[0], options, height_m, crossing)
     found = _from_traffic(traffic, setting)
-    if not options.road_markings or isinstance(found, Solution) and found.full:
+    if not options.road_markings:
         return found
+    if isinstance(found, Solution) and found.full:
+        return _sharpened(found, traffic)
     painted = _from_markings(traffic, setting)
     return painted if _tells_more(painted, found) else found
 
@@ -122,17 +125,12 @@ def _from_traffic(traffic: _Traffic, setting: Setting) -> Solution | Reason:
     straight = _from_straight(traffic, setting)
     if isinstance(straight, Solution) and straight.full:
         return straight
-    turning = _from_turning(traffic, setting)
-    return turning if _tells_more(turning, straight) else straight
-
-
-def _from_turning(traffic: _Traffic, setting: Setting) -> Solution | Reason:
-    """Solve from the motion of vehicles that turn."""
     turned = from_turning(traffic.tracks, traffic.windows, setting)
     if turned is None:
-        return Reason('too_little_turning', 'too few vehicles turn', 'wait for more vehicles that turn')
+        return straight
     fit, tracks = _with_noise(with_further_roads(turned, traffic.tracks, traffic.gate), traffic)
-    return _completed(fit, tracks, '', traffic, turned=True)
+    turning = _completed(fit, tracks, '', traffic, turned=True)
+    return turning if _tells_more(turning, straight) else straight
 
 
 def _tells_more(other: Solution | Reason, found: Solution | Reason) -> bool:
@@ -146,15 +144,16 @@ def _tells_more(other: Solution | Reason, found: Solution | Reason) -> bool:
 
 def _from_markings(traffic: _Traffic, setting: Setting) -> Solution | Reason:
     """Solve from the lines on the road; what the traffic tells, seen by the lens found, has to agree."""
-    asserted = setting.options.principal_point_sigma_px >= 0
-    priors = traffic.priors if asserted else [prior.with_loose_point() for prior in traffic.priors]
+    priors = [_for_lines(prior, setting.options) for prior in traffic.priors]
     painted = fit_to_markings(traffic.evidence, traffic.tracks, priors, setting, traffic.gate)
     if isinstance(painted, Reason):
         return painted
     fit, assumed = painted
     known = known_lens(fit.state.camera)
-    by_that_lens = replace(traffic, priors=[known]), replace(setting, prior=known)
-    checks = agreed_by(fit, _from_straight(*by_that_lens), _from_turning(*by_that_lens))
+    straight = _from_straight(replace(traffic, priors=[known]), replace(setting, prior=known))
+    turned = from_turning(traffic.tracks, traffic.windows, replace(setting, prior=known))
+    checks = agreed_by(fit, [*([] if isinstance(straight, Reason) else [straight.plane]),
+                             *([] if turned is None else [Plane.of(turned, traffic.tracks)])])
     if isinstance(checks, Reason):
         return checks
     along, flow = main_road(fit, traffic.tracks)
@@ -163,44 +162,63 @@ def _from_markings(traffic: _Traffic, setting: Setting) -> Solution | Reason:
                     plane_doubt(plane, traffic.gate, assumed=True), by_markings=True)
 
 
-def agreed_by(painted: JointFit, *found: Solution | Reason) -> tuple[str, ...] | Reason:
-    """Say how the lines on the road agree with what the traffic shows, seen by the lens of the lines.
+def _for_lines(prior: LensPrior, options: JointOptions) -> LensPrior:
+    """Return the prior for lines on the road, which tell the principal point, unless that is asserted."""
+    return prior if options.principal_point_sigma_px >= 0 else prior.loosened()
 
-    All that tells enough has to agree, and something has to tell enough.
+
+def _sharpened(found: Solution, traffic: _Traffic) -> Solution:
+    """Return a solution with the lens and plane of the lines on the road, where both agree and the lines are surer."""
+    setting = found.fit.problem.setting
+    painted = sharpened(found.fit, traffic.evidence, traffic.tracks, _for_lines(setting.prior, setting.options))
+    if isinstance(painted, Reason):
+        return found
+    fit, assumed = painted
+    apart = differences(found.fit, fit)
+    words = (f'lines on the road give a focal length {apart.focal:.1%} and a ground normal {apart.normal_deg:.1f} '
+             'degrees from those of the traffic')
+    plane = Plane.of(fit, traffic.tracks)
+    if apart.beyond(AGREE_SIGMAS) or plane_doubt(plane, traffic.gate):
+        return replace(found, checks=(*found.checks, f'{words}: not used'))
+    if fit.focal_sigma * plane.worst_sigma_deg > found.fit.focal_sigma * found.plane.worst_sigma_deg:
+        return replace(found, checks=(*found.checks, words))
+    along, flow = main_road(fit, traffic.tracks)
+    return replace(found, fit=fit, plane=plane, along=along, flow=flow, checks=(*found.checks, words),
+                   assumptions=(*lens_assumptions(fit, ()), assumed))
+
+
+def agreed_by(painted: JointFit, told: list[Plane]) -> tuple[str, ...] | Reason:
+    """Say how the lines on the road agree with planes that the traffic tells, seen by the lens of the lines.
+
+    Each that is known well enough has to agree, and one has to be.
     """
-    painted, checks, missing = with_lens_known(painted), [], []
-    for solution in found:
-        if isinstance(solution, Reason):
-            missing.append(solution)
-            continue
-        apart_deg, own_deg, sigma_deg, what = _apart(painted, solution)
-        if not own_deg <= CONFIRMS_DEG:
-            missing.append(Reason('plane_uncertain', f'it tells the plane to {min(own_deg, 90.0):.0f} degrees',
-                                  'wait for more traffic'))
-        elif apart_deg > max(AGREE_SIGMAS * sigma_deg, AGREE_DEG):
-            return Reason(
-                'markings_contradicted', f'{what} are {apart_deg:.1f} degrees apart, {sigma_deg:.1f} were expected',
-                'wait for more traffic; if the markings are askew, set joint.road_markings to false')
-        else:
-            checks.append(f'{what} are {apart_deg:.1f} degrees apart, {sigma_deg:.1f} were expected')
-    if checks:
-        return tuple(checks)
-    return Reason('markings_unconfirmed', 'the traffic does not confirm the lines on the road: with the lens that they '
-                  f'give, {missing[0].message}', missing[0].remedy)
+    painted, checks, best_deg = with_lens_known(painted), [], np.inf
+    for plane in told:
+        apart_deg, own_deg, other_deg, what = _apart(painted, plane)
+        best_deg, sigma_deg = min(best_deg, own_deg), float(np.hypot(own_deg, other_deg))
+        words = f'{what} are {apart_deg:.1f} degrees apart, {sigma_deg:.1f} were expected'
+        if own_deg <= CONFIRMS_DEG and apart_deg > max(AGREE_SIGMAS * sigma_deg, AGREE_DEG):
+            return Reason('markings_contradicted', words,
+                          'wait for more traffic; if the markings are askew, set joint.road_markings to false')
+        if own_deg <= CONFIRMS_DEG:
+            checks.append(words)
+    seen = f'tells the plane to {best_deg:.0f} degrees' if best_deg < 90.0 else 'tells nothing'
+    return tuple(checks) if checks else Reason(
+        'markings_unconfirmed', 'lines on the road give lens and plane, but nothing confirms them: with that lens the '
+        f'traffic {seen}, {CONFIRMS_DEG:g} are needed', 'wait for more traffic, straight or turning')
 
 
-def _apart(painted: JointFit, found: Solution) -> tuple[float, float, float, str]:
-    """Angle of what the traffic tells from the lines, its standard deviation, that of the difference, and its name."""
-    if found.fit.plane_known:
-        angle = _angle_deg(painted.state.rotation[:, 2], found.plane.normal(found.fit.state))
-        own, other = found.plane.worst_sigma_deg, Plane(painted, 1.0).worst_sigma_deg
-        what = 'ground normals of the traffic and of the lines'
-    else:
-        angle = min(_angle_deg(axis, found.along) for axis in painted.state.directions)
-        own, other = (float(np.degrees(np.linalg.norm(fit.sigma(lambda state: state.directions[0]))))
-                      for fit in (found.fit, painted))
-        what = 'the road of the traffic and the lines along it'
-    return angle, own, float(np.hypot(own, other)), what
+def _apart(painted: JointFit, told: Plane) -> tuple[float, float, float, str]:
+    """Angle of what the traffic tells from the lines, its own standard deviation, that of the lines, and its name."""
+    if told.fit.plane_known:
+        angle = _angle_deg(painted.state.rotation[:, 2], told.normal(told.fit.state))
+        return (angle, told.worst_sigma_deg, Plane(painted, 1.0).worst_sigma_deg,
+                'ground normals of the traffic and of the lines')
+    road = told.fit.state.directions[0]
+    angle = min(_angle_deg(axis, road) for axis in painted.state.directions)
+    own, other = (float(np.degrees(np.linalg.norm(fit.sigma(lambda state: state.directions[0]))))
+                  for fit in (told.fit, painted))
+    return angle, own, other, 'the road of the traffic and the lines along it'
 
 
 def _angle_deg(one: np.ndarray, other: np.ndarray) -> float:
