@@ -17,7 +17,7 @@ from autocalib_ros.estimation.great_circles import TrackSet, select_tracks
 from autocalib_ros.estimation.ground_plane import ground_plane, ground_points, pixels_ahead, tilt_and_roll_deg
 from autocalib_ros.estimation.paper import solve_paper
 from autocalib_ros.estimation.path_noise import USUAL_HEIGHT_M
-from autocalib_ros.estimation.people import walkers
+from autocalib_ros.estimation.people import people
 from autocalib_ros.estimation.plane import Plane
 from autocalib_ros.estimation.residuals import residuals_of
 from autocalib_ros.estimation.scale import Scale, is_unusual, known_scale, scale_doubt
@@ -98,6 +98,8 @@ class AutoCalibrator:
             self._buffer.add_segments(observed.segments)
         if observed.edges is not None:
             self._buffer.add_edges(observed.edges)
+        if observed.outlines is not None:
+            self._buffer.add_outlines(observed.outlines)
         if time_s >= self._forget_s:
             self._forget(time_s)
         self._newest_stamp_ns = stamp_ns
@@ -246,29 +248,58 @@ def _solved(evidence: Evidence, options: Options, lens: Camera | None) -> Calibr
     if options.method == 'paper':
         published = solve_paper(evidence, options, intrinsics, figures)
         return refused(published) if isinstance(published, Reason) else published
-    tracks = select_tracks(traffic, options.joint.max_tracks)
-    solution = _solution(traffic, tracks, options, lens)
-    if isinstance(solution, Reason):
-        return refused(solution)
-    figures = _figures(figures, solution, kept[tracks.indices], evidence, options)
-    paper = None if intrinsics is None else intrinsics.report
-    calibration = _calibration(options, solution, Calibration(
-        method=options.method, grade='lens', assumptions=solution.assumptions, checks=solution.checks,
-        camera=solution.fit.state.camera, ground=None, ground_refusal=solution.no_plane,
-        road_directions=solution.fit.state.directions, stddev=_lens_deviations(solution), paper=paper,
-        evidence=evidence.summary(), newest_stamp_ns=evidence.newest_stamp_ns, figures=figures))
-    return _with_people_told(calibration, traffic)
+    def solved(traffic: Evidence, kept: np.ndarray) -> Calibration | Reason:
+        """Solve the traffic, the tracks `kept` of the evidence."""
+        tracks = select_tracks(traffic, options.joint.max_tracks)
+        solution = _solution(traffic, tracks, options, lens)
+        if isinstance(solution, Reason):
+            return solution
+        return _calibration(options, solution, Calibration(
+            method=options.method, grade='lens', assumptions=solution.assumptions, checks=solution.checks,
+            camera=solution.fit.state.camera, ground=None, ground_refusal=solution.no_plane,
+            road_directions=solution.fit.state.directions, stddev=_lens_deviations(solution),
+            paper=None if intrinsics is None else intrinsics.report, evidence=evidence.summary(),
+            newest_stamp_ns=evidence.newest_stamp_ns,
+            figures=_figures(figures, solution, kept[tracks.indices], evidence, options)))
+
+    result = solved(traffic, kept)
+    if isinstance(result, Reason):
+        return refused(result)
+    told = _people_in(result, traffic)
+    if not len(told):
+        return result
+    drive = np.flatnonzero(~np.isin(traffic.track_vehicles, told))
+    alone = traffic.without(told)
+    return _counted(_preferred(result, shortfall(alone, options.gate) or solved(alone, kept[drive])), len(told))
 
 
-def _with_people_told(result: Calibration, evidence: Evidence) -> Calibration:
-    """Count who walks apart from the vehicles, where lens and plane tell them and no detector did."""
+def _people_in(result: Calibration, evidence: Evidence) -> np.ndarray:
+    """Numbers (n,) of who walks or cycles, where lens and plane tell them and no detector did."""
     ground = result.ground
     if ground is None:
-        return result
+        return np.zeros(0, int)
     height = ground.height_m if ground.metric else USUAL_HEIGHT_M
     untold = evidence.selected(np.flatnonzero(evidence.track_kinds == Kind.UNKNOWN))
-    told, seen = len(walkers(untold, result.camera, ground.normal_in_camera, height)), result.evidence
-    return replace(result, evidence=replace(seen, vehicles=seen.vehicles - told, people=seen.people + told))
+    return people(untold, result.camera, ground.normal_in_camera, height)
+
+
+def _preferred(of_all: Calibration, of_vehicles_alone: Calibration | Reason) -> Calibration:
+    """Choose the solution of vehicles alone wherever it has a ground plane.
+
+    Where it has none, too few vehicles are left: that says nothing against the plane of all, on which people walk too
+    and which was doubted like any other.
+    """
+    doubt = (of_vehicles_alone if isinstance(of_vehicles_alone, Reason) else of_vehicles_alone.ground_refusal)
+    if doubt is None:
+        return of_vehicles_alone
+    return replace(of_all, checks=(*of_all.checks, f'the plane is of people too: without them, {doubt.message}'))
+
+
+def _counted(result: Calibration, people_told: int) -> Calibration:
+    """Count people apart from the vehicles."""
+    seen = result.evidence
+    return replace(result, evidence=replace(seen, vehicles=seen.vehicles - people_told,
+                                            people=seen.people + people_told))
 
 
 def _solution(evidence: Evidence, tracks: TrackSet, options: Options, lens: Camera | None) -> Solution | Reason:

@@ -132,6 +132,8 @@ class BufferOptions(_Checked):
                                low=100, high=1000000)
     max_edges: int = option(10000, 'straight edges on vehicles kept at the most; vehicles that add least to newer ones '
                             'go first', low=100, high=1000000)
+    max_outlines: int = option(8000, 'outlines of what moves kept at the most, by which cyclists are told; those that '
+                               'add least to newer ones go first', low=100, high=1000000)
 
 
 @dataclass(frozen=True, kw_only=True)

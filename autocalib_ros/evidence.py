@@ -64,6 +64,21 @@ class Edges:
     """x0, y0, x1, y1 in observed pixels, shape (n, 4)."""
 
 
+OUTLINE_COLUMNS = 17
+
+
+@dataclass(frozen=True)
+class Outlines:
+    """Outlines of what moves in one image, eight points of each, and how far it is from what may hide a part of it."""
+
+    time_s: float
+    vehicles: np.ndarray
+    """Vehicle of each outline, shape (n,)."""
+    ends_px: np.ndarray
+    """Where each reaches farthest up left, down right, down left, up right, left, right, up and down, x and y of each,
+    and its gap to the nearest other outline, ignored place or border, observed pixels, shape (n, OUTLINE_COLUMNS)."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Evidence:
     """A snapshot of the buffer: every estimator can be run on it again without images."""
@@ -94,6 +109,12 @@ class Evidence:
     """Shape (edges,)."""
     edge_times_s: np.ndarray = field(default_factory=lambda: np.zeros(0))
     """Shape (edges,)."""
+    outlines_px: np.ndarray = field(default_factory=lambda: np.zeros((0, OUTLINE_COLUMNS), np.float32))
+    """Outlines of what moves, as `Outlines.ends_px`, float32, shape (outlines, OUTLINE_COLUMNS)."""
+    outline_vehicles: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
+    """Shape (outlines,)."""
+    outline_times_s: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    """Shape (outlines,)."""
     still_lines_px: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))
     """Straight lines of the road and around it, without the traffic, x0, y0, x1, y1, shape (lines, 4)."""
     track_kinds: np.ndarray = field(default_factory=lambda: np.zeros(0, np.uint8))
@@ -144,9 +165,22 @@ class Evidence:
         """Return the evidence with only the tracks whose indices are in `keep`; segments and edges unchanged."""
         return replace(self, **_track_arrays([self.track(index) for index in keep]))
 
+    def without(self, vehicles: np.ndarray) -> Evidence:
+        """Return the evidence without all that is of these vehicles (n,)."""
+        tracks, segments, edges, outlines = (~np.isin(owners, vehicles) for owners in (
+            self.track_vehicles, self.segment_vehicles, self.edge_vehicles, self.outline_vehicles))
+        return replace(
+            self.selected(np.flatnonzero(tracks)), segments_px=self.segments_px[segments],
+            segment_vehicles=self.segment_vehicles[segments], segment_times_s=self.segment_times_s[segments],
+            edges_px=self.edges_px[edges], edge_vehicles=self.edge_vehicles[edges],
+            edge_times_s=self.edge_times_s[edges], outlines_px=self.outlines_px[outlines],
+            outline_vehicles=self.outline_vehicles[outlines], outline_times_s=self.outline_times_s[outlines])
+
     def save(self, path: Path) -> None:
         """Write the snapshot as .npz."""
         arrays = {name: getattr(self, name) for name in (*ARRAYS, *EDGE_ARRAYS)}
+        if len(self.outlines_px):
+            arrays |= {name: getattr(self, name) for name in OUTLINE_ARRAYS}
         if len(self.still_lines_px):
             arrays[STILL_LINES] = self.still_lines_px
         if self.track_kinds.any():
@@ -174,7 +208,8 @@ class Evidence:
                 evidence = cls(image_size=(width, height), first_stamp_ns=first, newest_stamp_ns=newest,
                                frames=int(data['frames']), drift_px=float(data['drift_px']),
                                **{name: data[name] for name in ARRAYS},
-                               **{name: data[name] for name in (*EDGE_ARRAYS, STILL_LINES, KINDS) if name in data})
+                               **{name: data[name] for name in (*EDGE_ARRAYS, *OUTLINE_ARRAYS, STILL_LINES, KINDS)
+                                  if name in data})
             _require_consistent(evidence)
         except UNREADABLE as error:
             reason = ' '.join(str(error).split())
@@ -186,6 +221,8 @@ ARRAYS = ('track_starts', 'points_px', 'times_s', 'track_vehicles', 'segments_px
           'segment_times_s')
 EDGE_ARRAYS = ('edges_px', 'edge_vehicles', 'edge_times_s')
 """Files written before edges were gathered have none of them."""
+OUTLINE_ARRAYS = ('outlines_px', 'outline_vehicles', 'outline_times_s')
+"""Only in files of evidence that was gathered without a detector; older ones have none of them."""
 STILL_LINES = 'still_lines_px'
 """Files of little evidence, and those written before they were looked for, have none."""
 KINDS = 'track_kinds'
@@ -205,7 +242,8 @@ def _require_consistent(evidence: Evidence) -> None:
               'segment_vehicles': (len(evidence.segments_px),), 'segment_times_s': (len(evidence.segments_px),),
               'edges_px': (len(evidence.edges_px), 4), 'edge_vehicles': (len(evidence.edges_px),),
               'edge_times_s': (len(evidence.edges_px),), STILL_LINES: (len(evidence.still_lines_px), 4),
-              KINDS: (tracks,)}
+              'outlines_px': (len(evidence.outlines_px), OUTLINE_COLUMNS), KINDS: (tracks,),
+              'outline_vehicles': (len(evidence.outlines_px),), 'outline_times_s': (len(evidence.outlines_px),)}
     for name, shape in shapes.items():
         array = getattr(evidence, name)
         kinds = 'iu' if name in ('track_starts', KINDS) or name.endswith('vehicles') else 'f'
@@ -235,14 +273,14 @@ def _track_arrays(tracks: list[Track]) -> dict[str, np.ndarray]:
 
 
 class _Lines:
-    """Lines of vehicles, in arrays: what adds least goes when there is no room."""
+    """Lines of vehicles, or outlines of them, in arrays: what adds least goes when there is no room."""
 
-    def __init__(self, limit: int) -> None:
-        self._ends_px = np.zeros((limit, 4))
+    def __init__(self, limit: int, columns: int = 4, dtype: type = float) -> None:
+        self._ends_px = np.zeros((limit, columns), dtype)
         self._vehicles = np.zeros(limit, int)
         self.held = Holdings(limit)
 
-    def add(self, lines: Segments | Edges) -> None:
+    def add(self, lines: Segments | Edges | Outlines) -> None:
         """Take the lines of one time; where there is no room, vehicles that add least make some."""
         limit = len(self._ends_px)
         ends, vehicles = lines.ends_px[:limit], lines.vehicles[:limit]
@@ -252,7 +290,8 @@ class _Lines:
             self.keep(self.held.with_room(len(ends)))
         part = slice(self.held.count, self.held.count + len(ends))
         self._ends_px[part], self._vehicles[part] = ends, vehicles
-        self.held.add(vehicles, 0.5 * (ends[:, :2] + ends[:, 2:]), ends[:, 2:] - ends[:, :2], lines.time_s)
+        first, last = ends[:, :2], ends[:, 2:4]
+        self.held.add(vehicles, 0.5 * (first + last), last - first, lines.time_s)
 
     def keep(self, rows: np.ndarray) -> None:
         """Keep the lines of these rows."""
@@ -261,16 +300,16 @@ class _Lines:
             self._ends_px[:len(rows)], self._vehicles[:len(rows)] = self._ends_px[rows], self._vehicles[rows]
 
     def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Ends (lines, 4), vehicles (lines,) and times (lines,) of all that is held."""
+        """Ends (lines, columns), vehicles (lines,) and times (lines,) of all that is held."""
         count = self.held.count
         return self._ends_px[:count].copy(), self._vehicles[:count].copy(), self.held.times_s.copy()
 
 
 class EvidenceBuffer:
-    """Finished tracks, segments and edges, bounded in number: what adds least goes first, by whole vehicles.
+    """Finished tracks, segments, edges and outlines, bounded in number: what adds least goes first, by whole vehicles.
 
-    A track holds at most `tracking.max_samples` points of 24 bytes and 0.4 kB of its own, a segment or an edge 80
-    bytes: with the default options no more than 25 MB are held, however long it runs.
+    A track holds at most `tracking.max_samples` points of 24 bytes and 0.4 kB of its own, a segment or an
+    edge 80 bytes, an outline 120: with the default options no more than 26 MB are held, however long it runs.
     """
 
     def __init__(self, options: BufferOptions) -> None:
@@ -279,6 +318,8 @@ class EvidenceBuffer:
         self._max_tracks = options.max_tracks
         self._segments = _Lines(options.max_segments)
         self._edges = _Lines(options.max_edges)
+        self._outlines = _Lines(options.max_outlines, OUTLINE_COLUMNS, np.float32)
+        self._lines = (self._segments, self._edges, self._outlines)
 
     def add_track(self, track: Track) -> None:
         """Take a finished track; where there is no room, vehicles that add least make some."""
@@ -297,16 +338,20 @@ class EvidenceBuffer:
         """Take the edges of one image."""
         self._edges.add(edges)
 
+    def add_outlines(self, outlines: Outlines) -> None:
+        """Take the outlines of one image."""
+        self._outlines.add(outlines)
+
     def forget_replaced(self, time_s: float) -> None:
         """Drop the vehicles last seen before `time_s` in whose place there are enough newer ones."""
         self._keep_tracks(self._of_tracks.not_replaced(time_s))
-        for lines in (self._segments, self._edges):
+        for lines in self._lines:
             lines.keep(lines.held.not_replaced(time_s))
 
     def forget_before(self, time_s: float) -> None:
         """Drop all that ended before `time_s`: the camera may have stood otherwise then."""
         self._keep_tracks(self._of_tracks.since(time_s))
-        for lines in (self._segments, self._edges):
+        for lines in self._lines:
             lines.keep(lines.held.since(time_s))
 
     def _keep_tracks(self, rows: np.ndarray) -> None:
@@ -322,15 +367,17 @@ class EvidenceBuffer:
     @property
     def oldest_s(self) -> float:
         """When the oldest of what is held ended; infinite where there is nothing."""
-        return min(held.oldest_s for held in (self._of_tracks, self._segments.held, self._edges.held))
+        return min(held.oldest_s for held in (self._of_tracks, *(lines.held for lines in self._lines)))
 
     def snapshot(self, *, image_size: tuple[int, int], first_stamp_ns: int, newest_stamp_ns: int, frames: int,
                  drift_px: float, unfinished: list[Track]) -> Evidence:
         """Freeze what is held, with the tracks that are still being followed."""
         segments_px, segment_vehicles, segment_times_s = self._segments.arrays()
         edges_px, edge_vehicles, edge_times_s = self._edges.arrays()
+        outlines_px, outline_vehicles, outline_times_s = self._outlines.arrays()
         return Evidence(
             image_size=image_size, first_stamp_ns=first_stamp_ns, newest_stamp_ns=newest_stamp_ns, frames=frames,
             drift_px=drift_px, segments_px=segments_px, segment_vehicles=segment_vehicles,
             segment_times_s=segment_times_s, edges_px=edges_px, edge_vehicles=edge_vehicles, edge_times_s=edge_times_s,
+            outlines_px=outlines_px, outline_vehicles=outline_vehicles, outline_times_s=outline_times_s,
             **_track_arrays([*self._tracks, *unfinished]))

@@ -9,7 +9,19 @@ import pytest
 
 from autocalib_ros.config import BufferOptions
 from autocalib_ros.errors import InputError
-from autocalib_ros.evidence import EDGE_ARRAYS, KINDS, Edges, Evidence, EvidenceBuffer, Kind, Segments, Track
+from autocalib_ros.evidence import (
+    EDGE_ARRAYS,
+    KINDS,
+    OUTLINE_ARRAYS,
+    OUTLINE_COLUMNS,
+    Edges,
+    Evidence,
+    EvidenceBuffer,
+    Kind,
+    Outlines,
+    Segments,
+    Track,
+)
 
 
 def track(vehicle: int, end_s: float) -> Track:
@@ -19,6 +31,11 @@ def track(vehicle: int, end_s: float) -> Track:
 
 def segments(time_s: float, count: int) -> Segments:
     return Segments(time_s, np.arange(count), np.ones((count, 4)))
+
+
+def outlines(time_s: float, vehicles: list[int]) -> Outlines:
+    ends = np.arange(len(vehicles) * OUTLINE_COLUMNS) + 0.25
+    return Outlines(time_s, np.array(vehicles), ends.reshape(-1, OUTLINE_COLUMNS))
 
 
 def snapshot(buffer: EvidenceBuffer) -> Evidence:
@@ -31,8 +48,9 @@ def test_a_snapshot_survives_its_file_to_the_last_bit(tmp_path: Path) -> None:
     buffer.add_track(track(3, 5.0))
     buffer.add_segments(segments(5.0, 4))
     buffer.add_edges(Edges(5.0, np.array([3, 3]), np.arange(8.0).reshape(2, 4)))
+    buffer.add_outlines(outlines(5.0, [3, 4, 3]))
     before = snapshot(buffer)
-    assert len(before.edges_px) == 2
+    assert len(before.edges_px) == 2 and len(before.outlines_px) == 3
     before.save(tmp_path / 'evidence.npz')
     after = Evidence.load(tmp_path / 'evidence.npz')
     for name in vars(before):
@@ -95,6 +113,55 @@ def test_a_file_from_before_edges_were_gathered_has_none(tmp_path: Path) -> None
 def test_edges_without_their_vehicles_are_an_input_error(tmp_path: Path) -> None:
     with pytest.raises(InputError, match='edge'):
         Evidence.load(rewritten(tmp_path, ('edges_px', 'edge_times_s')))
+
+
+def test_a_file_without_outlines_has_none(tmp_path: Path) -> None:
+    buffer = EvidenceBuffer(BufferOptions())
+    buffer.add_track(track(3, 5.0))
+    snapshot(buffer).save(tmp_path / 'evidence.npz')
+    with np.load(tmp_path / 'evidence.npz') as data:
+        assert not set(OUTLINE_ARRAYS) & set(data.files)
+    evidence = Evidence.load(tmp_path / 'evidence.npz')
+    assert evidence.outlines_px.shape == (0, OUTLINE_COLUMNS) and evidence.outline_times_s.shape == (0,)
+
+
+@pytest.mark.parametrize('missing', OUTLINE_ARRAYS)
+def test_outlines_that_are_not_all_there_are_an_input_error(tmp_path: Path, missing: str) -> None:
+    buffer = EvidenceBuffer(BufferOptions())
+    buffer.add_track(track(3, 5.0))
+    buffer.add_outlines(outlines(5.0, [3]))
+    path = tmp_path / 'evidence.npz'
+    snapshot(buffer).save(path)
+    with np.load(path) as data:
+        arrays = {name: data[name] for name in data.files if name != missing}
+    np.savez(path, **arrays)
+    with pytest.raises(InputError, match='outline'):
+        Evidence.load(path)
+
+
+def test_the_buffer_keeps_no_more_outlines_than_allowed_and_forgets_old_ones() -> None:
+    buffer = EvidenceBuffer(BufferOptions(max_outlines=100))
+    for index in range(50):
+        buffer.add_outlines(outlines(float(index), list(range(3 * index, 3 * index + 7))))
+        assert len(snapshot(buffer).outlines_px) <= 100
+    assert len(snapshot(buffer).outlines_px) > 50
+    assert buffer.oldest_s < 48.0
+    buffer.forget_before(48.0)
+    assert snapshot(buffer).outline_times_s.tolist() == [48.0] * 7 + [49.0] * 7
+
+
+def test_evidence_without_a_vehicle_has_nothing_of_it() -> None:
+    buffer = EvidenceBuffer(BufferOptions())
+    for vehicle in (1, 2, 3):
+        buffer.add_track(track(vehicle, 5.0))
+    buffer.add_segments(segments(5.0, 4))
+    buffer.add_edges(Edges(5.0, np.array([3, 2]), np.arange(8.0).reshape(2, 4)))
+    buffer.add_outlines(outlines(5.0, [2, 1, 2]))
+    left = snapshot(buffer).without(np.array([2, 7]))
+    assert left.track_vehicles.tolist() == [1, 3] and len(left.points_px) == len(left.times_s) == 20
+    assert left.segment_vehicles.tolist() == [0, 1, 3] and len(left.segments_px) == len(left.segment_times_s) == 3
+    assert left.edge_vehicles.tolist() == [3] and left.edges_px.tolist() == [[0.0, 1.0, 2.0, 3.0]]
+    assert left.outline_vehicles.tolist() == [1] and left.outlines_px[0, 0] == OUTLINE_COLUMNS + 0.25
 
 
 def test_the_buffer_keeps_no_more_tracks_than_allowed() -> None:

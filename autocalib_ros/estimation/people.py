@@ -1,7 +1,6 @@
-"""Who walks: told from vehicles by speed, width and way, once lens and plane give them in metres.
+"""Who walks or cycles: told from vehicles once lens and plane give speeds, ways and sizes in metres.
 
-People are not left out of the evidence: they walk straight along the roads, and what they add is counted one person as
-one vehicle. They are told so that nobody takes them for traffic.
+The ground plane is then solved once more without them: they sway, keep to no lane and turn on the spot.
 """
 
 from __future__ import annotations
@@ -11,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from autocalib_ros.camera import Camera
+from autocalib_ros.estimation.cyclists import BELIEVED, cyclists
 from autocalib_ros.estimation.ground_plane import ground_points
 from autocalib_ros.estimation.planar_motion import WALK_M_S
 from autocalib_ros.estimation.windows import INTERVAL_S, Instants, members_of
@@ -26,8 +26,6 @@ INTERVALS = 3
 """Of `INTERVAL_S`: the time over which speed is taken; the noise of the places is small over so long."""
 FASTER, FLOWS = 0.75, 2.0
 """Traffic flows when this quantile of the highest speeds of all movers is so many times that of who walks."""
-BELIEVED = 8.0
-"""Heights of the camera from its foot beyond which a pixel is worth too many metres."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +43,11 @@ class Mover:
         """Whether it is one who walks, or, where these can be told, several together."""
         slow = 0 < self.speed_m_s < WALK_M_S and self.way_m >= LEAST_WAY_M
         return slow and (self.width_m < NARROW_M or groups and self.way_m >= STROLL_M)
+
+
+def people(evidence: Evidence, camera: Camera, normal: np.ndarray, height_m: float) -> np.ndarray:
+    """Numbers of those, of `evidence.track_vehicles`, that walk or cycle, ascending."""
+    return np.union1d(walkers(evidence, camera, normal, height_m), cyclists(evidence, camera, normal, height_m))
 
 
 def walkers(evidence: Evidence, camera: Camera, normal: np.ndarray, height_m: float) -> np.ndarray:

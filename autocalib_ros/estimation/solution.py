@@ -17,7 +17,7 @@ from autocalib_ros.estimation.joint import JointFit, noise_cost, road_support, s
 from autocalib_ros.estimation.lens_prior import LensPrior, known_lens, lens_priors
 from autocalib_ros.estimation.painted import fit_to_markings, sharpened, with_lens_known
 from autocalib_ros.estimation.path_noise import USUAL_HEIGHT_M
-from autocalib_ros.estimation.people import walkers
+from autocalib_ros.estimation.people import people
 from autocalib_ros.estimation.plane import AGREE_SIGMAS, LevelCamera, Plane, agreement
 from autocalib_ros.estimation.roads import (
     main_road,
@@ -310,8 +310,8 @@ def _driving(fit: JointFit, tracks: TrackSet, evidence: Evidence) -> np.ndarray:
     if level is not None and not level.tells(fit.state):
         return np.ones(len(tracks), bool)
     camera, normal = Plane.of(fit, tracks, level).here
-    people = walkers(evidence, camera, normal, fit.problem.setting.height_m or USUAL_HEIGHT_M)
-    return ~np.isin(evidence.track_vehicles[tracks.indices], people)
+    told = people(evidence, camera, normal, fit.problem.setting.height_m or USUAL_HEIGHT_M)
+    return ~np.isin(evidence.track_vehicles[tracks.indices], told)
 
 
 def _assumed(fit: JointFit, tracks: TrackSet,

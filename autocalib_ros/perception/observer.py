@@ -8,11 +8,12 @@ import cv2
 import numpy as np
 
 from autocalib_ros.config import Options
-from autocalib_ros.evidence import Edges, Kind, Segments, Track
+from autocalib_ros.evidence import Edges, Kind, Outlines, Segments, Track
 from autocalib_ros.perception.background import Background
 from autocalib_ros.perception.detected import DetectedVehicles
 from autocalib_ros.perception.detector.detector import VehicleDetector
 from autocalib_ros.perception.edges import EdgeFinder
+from autocalib_ros.perception.outlines import outlines_of
 from autocalib_ros.perception.privacy import Ignored, black_out, require_seen
 from autocalib_ros.perception.segments import Keypoints, find_keypoints, match_segments
 from autocalib_ros.perception.shutter import LEAP_LEVELS, Seen, View
@@ -39,6 +40,7 @@ class Observations:
     tracks: list[Track]
     segments: Segments | None
     edges: Edges | None
+    outlines: Outlines | None = None
 
 
 class Observer:
@@ -85,10 +87,10 @@ class Observer:
             self._motion.update(grey, time_s)
         if self._detected is not None:
             self._detected.follow(image, time_s, self._tracker, self._reduction)
-        segments, edges = self._detect(grey, time_s) if detect else (None, None)
+        segments, edges, outlines = self._detect(grey, time_s) if detect else (None, None, None)
         self._stillness.update(grey, time_s)
         self._frames += 1
-        return Observations(tracks, segments, edges)
+        return Observations(tracks, segments, edges, outlines)
 
     def _look_anew(self) -> list[Track]:
         """Forget all that rests on earlier grey levels; return the tracks that so end."""
@@ -106,9 +108,10 @@ class Observer:
         width, height = self._image_size
         return round(width / self._reduction), round(height / self._reduction)
 
-    def _detect(self, grey: np.ndarray, time_s: float) -> tuple[Segments | None, Edges | None]:
+    def _detect(self, grey: np.ndarray, time_s: float) -> tuple[Segments | None, Edges | None, Outlines | None]:
         """Look into the moving regions for edges and keypoints, which start tracks, and matched are segments."""
         regions, vehicles, people = self._moving(grey.shape)
+        outlines = self._outlines_of(regions, vehicles, grey.shape, time_s)
         keypoints = find_keypoints(grey, regions, self._sift)
         of_keypoint, of_person = vehicles[keypoints.regions], people[keypoints.regions]
         order = np.lexsort((-keypoints.responses, of_person))  # the strongest first, and people last
@@ -118,9 +121,10 @@ class Observer:
                                vehicles[~people], time_s)
         before, self._keypoints = self._keypoints, keypoints
         if before is None:
-            return None, edges
+            return None, edges, outlines
         ends, matched = match_segments(before, keypoints, grey.shape[1])
-        return Segments(time_s, of_keypoint[matched], self._full_pixels(ends.reshape(-1, 2)).reshape(-1, 4)), edges
+        segments = Segments(time_s, of_keypoint[matched], self._full_pixels(ends.reshape(-1, 2)).reshape(-1, 4))
+        return segments, edges, outlines
 
     def _moving(self, shape: tuple[int, int]) -> tuple[list[Region], np.ndarray, np.ndarray]:
         """What moves: regions, the vehicle of each (n,), and whether that is known as a person (n,)."""
@@ -137,6 +141,14 @@ class Observer:
             return None
         ends, of_edge = self._edge_finder.find(grey, regions)
         return Edges(time_s, vehicles[of_edge], self._full_pixels(ends.reshape(-1, 2)).reshape(-1, 4))
+
+    def _outlines_of(self, regions: list[Region], vehicles: np.ndarray, shape: tuple[int, int],
+                     time_s: float) -> Outlines | None:
+        """Outline what moves; a detector tells cyclists by itself."""
+        if self._detected is not None or not regions:
+            return None
+        return Outlines(time_s, vehicles, outlines_of(regions, self._motion.grown_px, shape, self._reduction,
+                                                      self._avoided))
 
     def _vehicles_of(self, regions: list[Region]) -> np.ndarray:
         """Give each region (n,) the vehicle that most points followed inside it belong to, or a new one."""

@@ -60,6 +60,11 @@ class MotionMask:
         large.sort(key=lambda label: -stats[label, cv2.CC_STAT_AREA])
         return [self._region(labels == label, stats[label]) for label in large]
 
+    @property
+    def grown_px(self) -> tuple[float, float]:
+        """By how many pixels of the tracked image, along x and y, regions are larger than what moves, on each side."""
+        return (0.0, 0.0) if self._mask is None else tuple(np.divide(self._size, self._mask.shape[::-1]).tolist())
+
     def _region(self, inside: np.ndarray, stats: np.ndarray) -> Region:
         """Bring one region to the size of the tracked image, grown by one reduced pixel for its outline."""
         width, height = self._size

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from autocalib_ros.offline.simulate import SimulationOptions
+from autocalib_ros.offline.simulate import Simulation, SimulationOptions
 from autocalib_ros.offline.simulate.network import Network
 from autocalib_ros.offline.simulate.scenes import junction, network_of
 from autocalib_ros.offline.simulate.traffic import simulate_traffic
@@ -130,3 +130,39 @@ def test_same_seed_gives_the_same_traffic(network, traffic):
 def test_another_seed_gives_other_traffic(network, traffic):
     other = simulate_traffic(network, SimulationOptions(seed=1))
     assert [v.start_s for v in other.vehicles] != [v.start_s for v in traffic.vehicles]
+
+
+def test_cyclists_ride_along_their_road_and_are_in_the_truth():
+    options = SimulationOptions(cyclists=8, pedestrians=4, duration_s=20.0)
+    truth = Simulation(options).truth()
+    everybody = [track for track in truth['people']['tracks'] if track['type'] == 'cyclist']
+    assert len(everybody) >= 6
+    assert {track['type'] for track in truth['people']['tracks']} == {'cyclist', 'pedestrian'}
+    for track in everybody:
+        t, x, y, heading, speed = np.array(track['rows'])[:, :5].T
+        on = np.diff(t) < 0.3
+        way = np.hypot(np.diff(x), np.diff(y))
+        begins_anew = way > 5.0
+        assert 4.0 <= speed[0] <= 7.0
+        np.testing.assert_allclose((way / np.diff(t))[on & ~begins_anew], speed[0], atol=0.1)
+        turn = np.arctan2(np.diff(y), np.diff(x)) - heading[:-1]
+        assert np.abs(np.angle(np.exp(1j * turn)))[on & ~begins_anew].max() < 0.1
+
+
+def test_cyclists_change_the_picture_only_where_they_are():
+    small = {'width_px': 320, 'height_px': 180, 'focal_px': 140.0, 'noise_sigma': 0.0, 'duration_s': 5.0}
+    alone, ridden = (Simulation(SimulationOptions(cyclists=number, **small)) for number in (0, 6))
+    assert len(alone.traffic.vehicles) == len(ridden.traffic.vehicles)
+    changed = (alone.frame(10) != ridden.frame(10)).any(axis=2)
+    assert 10 < changed.sum() < 0.05 * changed.size
+    time_s = ridden.time_s(10)
+    places = np.array([cyclist.place(time_s)[:2] for cyclist in ridden.cyclists])
+    pixels, seen = ridden.lens.project(ridden.pose.to_camera(np.pad(places, ((0, 0), (0, 1)), constant_values=0.9)))
+    rows, columns = np.nonzero(changed)
+    apart = np.hypot(columns[:, None] - pixels[seen, 0], rows[:, None] - pixels[seen, 1]).min(axis=1)
+    assert apart.max() < 25.0  # a rider is 15 px tall at 15 m
+
+
+@pytest.mark.parametrize('scene', ['highway', 'roundabout'])
+def test_where_nobody_may_cycle_nobody_does(scene):
+    assert not Simulation(SimulationOptions(scene=scene, cyclists=8)).cyclists

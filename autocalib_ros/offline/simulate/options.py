@@ -65,7 +65,8 @@ class SimulationOptions:
     one_way: bool = _option(False, 'one road only, driven in one direction')
     wander_m: float = _option(0.1, 'standard deviation of the wander within the lane')
     pedestrians: int = _option(10, 'people on the pavements')
-    empty: bool = _option(False, 'no vehicles and no pedestrians')
+    cyclists: int = _option(0, 'cyclists along the kerbs and on the pavements; none round a roundabout')
+    empty: bool = _option(False, 'no vehicles and no people')
 
     noise_sigma: float = _option(2.0, 'sensor noise in grey levels')
     night: bool = _option(False, 'darkness, head lamps, more noise')
@@ -188,6 +189,7 @@ _RANGES = {
     'road_angle_deg': (45.0, 135.0),
     'wander_m': (0.0, 1.0),
     'pedestrians': (0, 200),
+    'cyclists': (0, 200),
     'noise_sigma': (0.0, 30.0),
     'shutter_every_s': (2.0, 3600.0),
     'shake_px': (0.0, 20.0),

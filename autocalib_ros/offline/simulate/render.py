@@ -9,9 +9,10 @@ from itertools import zip_longest
 import cv2
 import numpy as np
 
-from . import bodies, lamps, people, sensor
+from . import bodies, cyclists, lamps, people, sensor
 from .backdrop import draw_backdrop
 from .bodies import body_of, shadow_of
+from .cyclists import Cyclist
 from .faces import NO_MAP, SAMPLES, Canvas, Drawing, Faces, Window
 from .ground import paint_ground
 from .lens import CameraPose, Lens
@@ -47,6 +48,7 @@ class Scene:
     shake: np.ndarray | None
     vehicles: list[tuple[Vehicle, VehicleState]]
     people: list[tuple[Person, tuple[float, float, float]]]
+    cyclists: list[tuple[Cyclist, tuple[float, float, float, float]]]
     shut: bool = False
 
 
@@ -154,6 +156,8 @@ class Artist:
             flats.append(flat.moved(*place) if near or self._options.night else _NOTHING)
         for person, place in scene.people:
             solids.append(people.faces_of(person, place, pose.position_m[:2], thermal))
+        for cyclist, place in scene.cyclists:
+            solids.append(cyclists.faces_of(cyclist, place, pose.position_m[:2], thermal))
         if self._roadside is not None:
             solids += self._roadside.at(scene.time_s)
         return self._canvas.plan(flats, pose, gain=True), self._canvas.plan(solids, pose)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from . import people
+from . import cyclists, people
 from .lens import CameraPose, look, rotation
 from .microbolometer import shut_since
 from .options import SimulationOptions
@@ -30,6 +30,7 @@ class Simulation:
         self.network = network_of(options)
         self.traffic = simulate_traffic(self.network, options)
         self.people = people.people_of(self.network, self.traffic.greens, options)
+        self.cyclists = cyclists.cyclists_of(self.network, options)
         x, y = options.position_m or self.network.viewpoint_m
         yaw = self.network.view_yaw_deg if options.yaw_deg is None else options.yaw_deg
         self.pose = CameraPose(
@@ -61,6 +62,7 @@ class Simulation:
             self.shake(index) if self.options.shake_px else None,
             self.states(time_s),
             [(person, place) for person, place in walking if place is not None],
+            [(cyclist, cyclist.place(time_s)) for cyclist in self.cyclists],
             shut_since(self.options, time_s) is not None,
         )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
@@ -11,8 +12,12 @@ from .ground import PAVEMENT_M, edge_distance
 from .lens import CameraPose
 
 if TYPE_CHECKING:
+    from .cyclists import Cyclist
+    from .people import Person
     from .simulation import Simulation
-    from .vehicles import Vehicle
+    from .vehicles import VehicleState
+
+    _State = tuple[float, float, float, float]  # x, y, heading, speed
 
 TRACK_RATE_HZ = 5
 _RANGE_M = 60.0
@@ -41,6 +46,7 @@ def truth_of(simulation: Simulation) -> dict[str, Any]:
                             for direction in simulation.network.directions().round(9).tolist()],
         'ground_points': _ground_points(simulation, bumped=False),
         'vehicles': _vehicles(simulation),
+        'people': _people(simulation),
         'options': asdict(options),
     }
     if options.bump_at_s is not None:
@@ -113,14 +119,17 @@ def _ground_points(simulation: Simulation, bumped: bool) -> dict[str, Any]:
     return {'columns': ['X', 'Y', 'u', 'v'], 'rows': rows.tolist()}
 
 
+_COLUMNS = ['t', 'X', 'Y', 'heading_rad', 'speed_mps', 'u', 'v']
+
+
 def _vehicles(simulation: Simulation) -> dict[str, Any]:
     tracks = []
     for vehicle in simulation.traffic.vehicles:
-        rows = _track(simulation, vehicle)
+        rows = _track(simulation, lambda t, vehicle=vehicle: _driven(vehicle.state(t)))
         if rows:
             tracks.append({'id': f'v{vehicle.number}', 'type': vehicle.kind, 'rows': rows})
     return {
-        'columns': ['t', 'X', 'Y', 'heading_rad', 'speed_mps', 'u', 'v'],
+        'columns': _COLUMNS,
         'note': f'ground-plane centre of the vehicle footprint, {TRACK_RATE_HZ} Hz, only while in '
                 f'view, within {_RANGE_M:.0f} m and not hidden by static objects (may be hidden '
                 'by other vehicles); shake of the camera not included',
@@ -128,17 +137,42 @@ def _vehicles(simulation: Simulation) -> dict[str, Any]:
     }
 
 
-def _track(simulation: Simulation, vehicle: Vehicle) -> list[list[float]]:
-    """Return the rows of a vehicle while it can be seen."""
+def _people(simulation: Simulation) -> dict[str, Any]:
+    """Return the tracks of who walks and who cycles, each with a gap where it begins anew."""
+    tracks = []
+    for kind, everybody, state in (('pedestrian', simulation.people, _walked),
+                                   ('cyclist', simulation.cyclists, _cycled)):
+        for number, person in enumerate(everybody, 1):
+            rows = _track(simulation, lambda t, person=person, state=state: state(person, t))
+            if rows:
+                tracks.append({'id': f'{kind[0]}{number}', 'type': kind, 'rows': rows})
+    return {'columns': _COLUMNS, 'tracks': tracks}
+
+
+def _driven(state: VehicleState | None) -> _State | None:
+    return None if state is None else (state.x, state.y, state.heading, state.speed_mps)
+
+
+def _walked(person: Person, time_s: float) -> _State | None:
+    place = person.place(time_s)
+    return None if place is None else (*place[:2], person.heading, person.speed_mps)
+
+
+def _cycled(cyclist: Cyclist, time_s: float) -> _State:
+    return (*cyclist.place(time_s)[:3], cyclist.speed_mps)
+
+
+def _track(simulation: Simulation, state: Callable[[float], _State | None]) -> list[list[float]]:
+    """Return the rows of what is in a `state` at a time, while it can be seen."""
     duration = simulation.options.frame_count / simulation.options.rate_hz
     times = np.arange(int(np.ceil(duration * TRACK_RATE_HZ - 1e-9))) / TRACK_RATE_HZ
-    found = [(t, state) for t in times.tolist() if (state := vehicle.state(t)) is not None]
+    found = [(t, here) for t in times.tolist() if (here := state(t)) is not None]
     rows: list[list[float]] = []
     for bumped in (False, True):
-        part = [(t, s) for t, s in found if simulation.is_bumped(t) == bumped]
+        part = [(t, *here) for t, here in found if simulation.is_bumped(t) == bumped]
         if not part:
             continue
-        values = np.array([(t, s.x, s.y, s.heading, s.speed_mps) for t, s in part])
+        values = np.array(part)
         pose = simulation.bumped_pose() if bumped else simulation.pose
         centres = np.pad(values[:, 1:3], ((0, 0), (0, 1)))
         pixels, seen = _visible(simulation, pose, bumped, centres)

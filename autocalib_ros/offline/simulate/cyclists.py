@@ -1,0 +1,122 @@
+"""Cyclists: as narrow as who walks, as fast as a car that turns, along the kerb or on the pavement."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from . import paint
+from .faces import Faces, Texture
+from .network import Network, Road
+from .options import SimulationOptions
+from .palette import palette_of
+
+_REACH_M = 45.0  # from the middle of the network, either way
+_FROM_KERB_M = 0.6
+_LENGTH_M, _TOP_M = 1.75, 1.0  # of the bicycle
+_WHEEL_M = 0.34
+_SCALE = 60  # texels to the metre
+
+
+@dataclass(frozen=True)
+class Cyclist:
+    """Somebody who rides along a road, again and again."""
+
+    road: Road
+    aside_m: float
+    """To the left of the road's axis."""
+    forward: bool
+    """Along the axis or against it."""
+    speed_mps: float
+    first_s: float
+    clothes: int
+
+    def place(self, time_s: float) -> tuple[float, float, float, float]:
+        """Return (x, y, heading, phase of the pedals in radians)."""
+        way = (time_s - self.first_s) * self.speed_mps % (2 * _REACH_M)
+        along = way - _REACH_M if self.forward else _REACH_M - way
+        x, y = self.road.at(along, self.aside_m + 0.06 * math.sin(way / 1.3)).tolist()
+        return x, y, self.road.heading(along) + (0.0 if self.forward else math.pi), way * 2 * math.pi / 4.5
+
+
+def cyclists_of(network: Network, options: SimulationOptions) -> tuple[Cyclist, ...]:
+    """Return the cyclists of a recording; none where there is no pavement, and none round a roundabout."""
+    if options.empty or network.rural or network.roundabout is not None:
+        return ()
+    rng = np.random.default_rng([options.seed, 12])
+    return tuple(_cyclist(network, rng) for _ in range(options.cyclists))
+
+
+def _cyclist(network: Network, rng: np.random.Generator) -> Cyclist:
+    road = network.roads[int(rng.integers(len(network.roads)))]
+    forward = bool(rng.integers(2))
+    right = road.half_width_m + (-_FROM_KERB_M if rng.integers(2) else rng.uniform(0.8, 1.6))
+    return Cyclist(road, -right if forward else right, forward, float(rng.uniform(4.0, 7.0)),
+                   -float(rng.uniform(0.0, 30.0)), int(rng.integers(15)))
+
+
+def faces_of(cyclist: Cyclist, place: tuple[float, float, float, float], viewer_xy: np.ndarray, thermal: bool) -> Faces:
+    """Return a flat bicycle, seen from both sides, and upright rectangles of its rider that face the viewer (2,)."""
+    x, y, heading, phase = place
+    ride = np.array([math.cos(heading), math.sin(heading)])
+    left = np.array([-ride[1], ride[0]])
+    to_viewer = math.atan2(viewer_xy[1] - y, viewer_xy[0] - x)
+    across = np.array([-math.sin(to_viewer), math.cos(to_viewer)])
+    here = np.array([x, y])
+    front, rear = here + ride * _LENGTH_M / 2, here - ride * _LENGTH_M / 2
+    corners = [
+        [(*start, _TOP_M), (*(end - start), 0.0), (0.0, 0.0, -_TOP_M)] for start, end in ((front, rear), (rear, front))
+    ]
+    swing = 0.17 * math.sin(phase)
+    for ahead_low, aside_low, low, ahead_high, aside_high, high, width in (
+        (0.05 + swing, 0.1, 0.2 + 0.1 * math.cos(phase), -0.15, 0.1, 0.98, 0.17),
+        (0.05 - swing, -0.1, 0.2 - 0.1 * math.cos(phase), -0.15, -0.1, 0.98, 0.17),
+        (-0.15, 0.0, 0.9, 0.12, 0.0, 1.48, 0.44),
+        (0.48, 0.25, 0.95, 0.12, 0.2, 1.42, 0.11),
+        (0.48, -0.25, 0.95, 0.12, -0.2, 1.42, 0.11),
+        (0.17, 0.0, 1.46, 0.2, 0.0, 1.74, 0.21),
+    ):
+        top = here + ride * ahead_high + left * aside_high - across * width / 2
+        foot = here + ride * ahead_low + left * aside_low - across * width / 2
+        corners.append([(*top, high), (*(across * width), 0.0), (*(foot - top), low - high)])
+    return Faces(np.array(corners), _textures(cyclist.clothes, thermal))
+
+
+@lru_cache(maxsize=32)
+def _textures(clothes: int, thermal: bool) -> tuple[Texture, ...]:
+    palette = palette_of(thermal)
+    rng = np.random.default_rng([clothes, 6])
+    coat = palette.clothes[clothes % len(palette.clothes)]
+    legs = palette.clothes[(clothes * 3 + 1) % len(palette.clothes)]
+    bicycle = Texture(_bicycle(palette.tyre, palette.bodies[clothes % len(palette.bodies)]))
+    pictures = []
+    for colour, size in (
+        (legs, (44, 10)), (paint.mixed(legs, palette.trim, 0.3), (44, 10)), (coat, (36, 26)), (coat, (32, 7)),
+        (coat, (32, 7)), (palette.skin, (17, 13)),
+    ):
+        picture = paint.filled(*size, colour)
+        paint.roughen(picture, paint.grain(*size, ((2.0, 6.0 * palette.texture), (8.0, 8.0 * palette.texture)), rng))
+        pictures.append(picture)
+    return bicycle, bicycle, *(Texture(picture) for picture in pictures)
+
+
+def _bicycle(tyre: tuple[int, int, int], frame: tuple[int, int, int]) -> np.ndarray:
+    """Paint two wheels and the bars of the frame; alpha cuts the rest out."""
+    height, width = round(_TOP_M * _SCALE), round(_LENGTH_M * _SCALE)
+    picture = paint.filled(height, width, tyre)
+    alpha = np.zeros((height, width), np.uint8)
+    hub = height - _WHEEL_M * _SCALE
+    wheels = [(_WHEEL_M * _SCALE, hub), (width - _WHEEL_M * _SCALE, hub)]
+    for wheel in wheels:
+        paint.disc(alpha, wheel, _WHEEL_M * _SCALE, (255,))
+        paint.disc(alpha, wheel, (_WHEEL_M - 0.06) * _SCALE, (70,))
+    saddle, bar, pedals = (0.62 * width, 0.1 * height), (0.27 * width, 0.08 * height), (0.5 * width, hub)
+    for start, end in ((wheels[0], bar), (wheels[1], saddle), (bar, pedals), (saddle, pedals), (saddle, bar),
+                       (pedals, wheels[1])):
+        paint.line(alpha, start, end, (255,), 4)
+        paint.line(picture, start, end, (*frame, 255), 4)
+    picture[..., 3] = alpha
+    return picture

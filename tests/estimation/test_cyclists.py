@@ -1,0 +1,134 @@
+"""Who cycles is told from who drives by the size of what moves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from outlined import CAR_M, RIDER_M, driven, with_outlines
+
+from autocalib_ros.calibration import Calibration
+from autocalib_ros.calibrator import solve
+from autocalib_ros.config import Options
+from autocalib_ros.estimation.cyclists import cyclists
+from autocalib_ros.evidence import Evidence, Outlines, Track
+from autocalib_ros.offline.synthetic_evidence import Junction, gathered, synthetic_evidence
+
+JUNCTION = Junction(vehicles=30)
+FIRST_RIDER, FIRST_CAR = 1000, 2000
+
+
+def ridden(number: int, size_m: tuple[float, float, float], speed_m_s: float | None,
+           generator: np.random.Generator) -> tuple[list[Track], list[Outlines]]:
+    """A body that crosses the junction along one of its roads, either way."""
+    heading = np.pi / 2 * generator.integers(4)
+    speed = speed_m_s or generator.uniform(4.0, 7.0)
+    way = np.array([np.cos(heading), np.sin(heading)])
+    start = np.array(JUNCTION.centre_m) + generator.uniform(-5.0, 5.0, 2) - 5.0 * speed * way
+    return driven(JUNCTION, number, 3.0 * (number % 1000), size_m, start, heading, speed, generator)
+
+
+def several(first: int, count: int, size_m: tuple[float, float, float], speed_m_s: float | None = None,
+            seed: int = 1) -> tuple[list[Track], list[Outlines]]:
+    generator = np.random.default_rng(seed)
+    pairs = [ridden(first + number, size_m, speed_m_s, generator) for number in range(count)]
+    return [track for tracks, _ in pairs for track in tracks], [each for _, outlines in pairs for each in outlines]
+
+
+def told(tracks: list[Track], outlines: list[Outlines]) -> np.ndarray:
+    newest = max(float(track.times_s[-1]) for track in tracks)
+    evidence = with_outlines(gathered(tracks, JUNCTION.image_size, newest), outlines)
+    return cyclists(evidence, JUNCTION.camera, JUNCTION.normal_in_camera, JUNCTION.height_m)
+
+
+def test_riders_are_told_from_cars_of_the_same_speed() -> None:
+    riders, cars = several(FIRST_RIDER, 20, RIDER_M), several(FIRST_CAR, 30, CAR_M)
+    found = told(riders[0] + cars[0], riders[1] + cars[1])
+    assert (found < FIRST_CAR).all()
+    assert len(found) >= 16
+
+
+@pytest.mark.parametrize('size_m', [(2.7, 1.66, 1.55), (3.6, 1.6, 1.5), (11.0, 2.5, 3.0)])
+def test_no_vehicle_that_is_seen_whole_is_told(size_m: tuple[float, float, float]) -> None:
+    assert not len(told(*several(FIRST_CAR, 20, size_m)))
+
+
+def test_who_is_faster_than_bicycles_is_a_vehicle() -> None:
+    assert not len(told(*several(FIRST_RIDER, 20, RIDER_M, speed_m_s=13.0)))
+
+
+def test_a_part_of_a_car_that_is_as_low_as_a_bumper_is_no_rider() -> None:
+    tracks, _ = several(FIRST_CAR, 20, CAR_M)
+    _, outlines = several(FIRST_CAR, 20, (1.75, 0.6, 0.5))
+    assert not len(told(tracks, outlines))
+
+
+def test_what_is_seen_whole_now_and_then_is_told_by_that() -> None:
+    """A car of which a quarter of the outlines are whole, and the rest of a part as narrow as a rider."""
+    tracks, whole = several(FIRST_CAR, 20, CAR_M)
+    _, parts = several(FIRST_CAR, 20, RIDER_M)
+    now_and_then = {(each.time_s, int(each.vehicles[0])): each for each in whole[::4]}
+    assert not len(told(tracks, [now_and_then.get((each.time_s, int(each.vehicles[0])), each) for each in parts]))
+
+
+@pytest.mark.parametrize('gap_px', [0.0, 7.0])
+def test_what_touches_something_else_is_not_told(gap_px: float) -> None:
+    tracks, outlines = several(FIRST_RIDER, 20, RIDER_M)
+    touching = [replace(each, ends_px=np.column_stack([each.ends_px[:, :-1], [gap_px]])) for each in outlines]
+    assert not len(told(tracks, touching))
+
+
+def test_what_is_torn_in_two_is_not_told() -> None:
+    tracks, outlines = several(FIRST_RIDER, 20, RIDER_M)
+    torn = [Outlines(each.time_s, np.tile(each.vehicles, 2),
+                     np.concatenate([each.ends_px, each.ends_px + [*[300, 0] * 8, 0]]))
+            for each in outlines]
+    assert not len(told(tracks, torn))
+
+
+def test_three_outlines_tell_nothing() -> None:
+    tracks, outlines = several(FIRST_RIDER, 20, RIDER_M)
+    seen: dict[int, list[Outlines]] = {}
+    for each in outlines:
+        seen.setdefault(int(each.vehicles[0]), []).append(each)
+    assert not len(told(tracks, [each for one in seen.values() for each in one[:3]]))
+
+
+def test_evidence_without_outlines_has_no_cyclists() -> None:
+    tracks, _ = several(FIRST_RIDER, 10, RIDER_M)
+    assert not len(told(tracks, []))
+
+
+@pytest.fixture(scope='module')
+def street() -> tuple[Evidence, Evidence]:
+    """Thirty vehicles; and the same with twenty riders among them."""
+    vehicles = synthetic_evidence(JUNCTION, np.random.default_rng(5))
+    tracks, outlines = several(FIRST_RIDER, 20, RIDER_M)
+    both = [*vehicles.tracks(), *tracks]
+    return vehicles, with_outlines(gathered(both, JUNCTION.image_size, 100.0), outlines)
+
+
+def test_lens_and_plane_are_of_the_vehicles_alone(street: tuple[Evidence, Evidence]) -> None:
+    alone, among = (solve(each, Options(camera_height=JUNCTION.height_m)) for each in street)
+    assert isinstance(alone, Calibration) and isinstance(among, Calibration)
+    found = among.evidence.people
+    assert 17 <= found <= 21
+    assert among.evidence.vehicles == len(np.unique(street[1].track_vehicles)) - found
+    riders = street[1].track_vehicles >= FIRST_RIDER
+    assert (among.figures.track_labels[riders] == -1).mean() > 0.8
+    assert among.camera.focal_px == pytest.approx(alone.camera.focal_px, abs=alone.stddev.focal_px)
+    off_deg = np.degrees(np.arccos(min(1.0, float(among.ground.normal_in_camera @ JUNCTION.normal_in_camera))))
+    assert off_deg < 3.0 * np.hypot(among.stddev.tilt_deg, among.stddev.roll_deg)
+
+
+def test_where_too_few_vehicles_are_left_the_plane_is_of_all_and_says_so(street: tuple[Evidence, Evidence]) -> None:
+    options = Options(camera_height=JUNCTION.height_m)
+    _, among = street
+    least = int((among.track_vehicles < FIRST_RIDER).sum()) + 20
+    demanding = replace(options, gate=replace(options.gate, min_tracks=least))
+    result = solve(among, demanding)
+    assert isinstance(result, Calibration), result
+    [check] = [words for words in result.checks if 'people' in words]
+    assert f'of the {least} needed' in check
+    assert result.evidence.people >= 17
