@@ -14,6 +14,7 @@ from autocalib_ros.estimation.doubts import halves_doubt, lens_doubt, plane_doub
 from autocalib_ros.estimation.great_circles import TrackSet, evenly
 from autocalib_ros.estimation.held import lens_assumptions, with_k2_if_asked_for, with_what_can_be_told
 from autocalib_ros.estimation.joint import JointFit, noise_cost, road_support, solve_joint, with_bodies
+from autocalib_ros.estimation.lane_changes import by_lane_changes
 from autocalib_ros.estimation.lens_prior import LensPrior, known_lens, lens_priors
 from autocalib_ros.estimation.painted import fit_to_markings, sharpened, with_lens_known
 from autocalib_ros.estimation.path_noise import USUAL_HEIGHT_M
@@ -63,17 +64,17 @@ class Solution:
     assumptions: tuple[str, ...]
     checks: tuple[str, ...]
     no_plane: Reason | None
-    by_markings: bool = False
-    """Whether lens and plane are those of the lines on the road."""
+    reduced: bool = False
+    """Whether the plane rests on less than roads that cross or vehicles that turn, though `plane` assumes nothing."""
 
     @property
     def assumed(self) -> bool:
-        """Whether the plane rests on more than the motion of vehicles."""
-        return self.plane.assumed is not None or self.by_markings
+        """Whether the plane rests on what is named among the assumptions."""
+        return self.plane.assumed is not None or self.reduced
 
     @property
     def full(self) -> bool:
-        """Whether the motion of vehicles gives all of it."""
+        """Whether roads that cross or vehicles that turn give all of it."""
         return self.no_plane is None and not self.assumed
 
 
@@ -159,7 +160,7 @@ def _from_markings(traffic: _Traffic, setting: Setting) -> Solution | Reason:
     along, flow = main_road(fit, traffic.tracks)
     plane = Plane.of(fit, traffic.tracks)
     return Solution(fit, plane, along, flow, (*lens_assumptions(fit, ()), assumed), checks,
-                    plane_doubt(plane, traffic.gate, assumed=True), by_markings=True)
+                    plane_doubt(plane, traffic.gate, assumed=True), reduced=True)
 
 
 def _for_lines(prior: LensPrior, options: JointOptions) -> LensPrior:
@@ -283,6 +284,14 @@ def _completed(fit: JointFit, tracks: TrackSet, across: str, traffic: _Traffic, 
         plane = Plane.of(fit, tracks)
         return Solution(fit, plane, along, flow, (*assumptions, angle) if fit.crossing_held and angle else assumptions,
                         checks, plane_doubt(plane, gate))
+    return _with_lane_changes(_about_one_road(fit, tracks, traffic, assumptions, halves, across), tracks, traffic)
+
+
+def _about_one_road(fit: JointFit, tracks: TrackSet, traffic: _Traffic, assumptions: tuple[str, ...], halves: str,
+                    across: str) -> Solution:
+    """Complete a solution of one road, about which the plane is free, by what may be assumed."""
+    gate, options = traffic.gate, fit.problem.setting.options
+    along, flow = main_road(fit, tracks)
     assumed, checks = _assumed(fit, tracks, traffic)
     plane, checks = Plane.of(fit, tracks, None if isinstance(assumed, Reason) else assumed), (halves, *checks)
     if not isinstance(assumed, Reason | None):
@@ -293,6 +302,33 @@ def _completed(fit: JointFit, tracks: TrackSet, across: str, traffic: _Traffic, 
         'follow one road, and rotation about it is free'
         + (': edges of vehicles do not tell it either' if options.transverse_edges else ''),
         'wait for traffic across the main road, or that turns; or allow joint.roll_prior_deg'))
+
+
+def _with_lane_changes(found: Solution, tracks: TrackSet, traffic: _Traffic) -> Solution:
+    """Return a solution of one road with the plane that vehicles tell which leave their lanes, where they tell more."""
+    changing = by_lane_changes(found.fit, tracks, traffic.windows)
+    if changing is None:
+        return found
+    fit, vehicles = changing
+    plane, road = Plane.of(fit, tracks), fit.state.directions[0]
+    if plane_doubt(plane, traffic.gate, assumed=True):
+        return found
+    normal = plane.normal(fit.state)
+    about_deg = float(np.degrees(fit.sigma(lambda state: np.array([np.cross(normal, state.rotation[:, 2]) @ road]))[0]))
+    words, checks = f'{vehicles} vehicles that change lanes: +- {about_deg:.1f} degrees about the road', found.checks
+    if found.no_plane is None:
+        apart_deg = _angle_deg(normal, found.plane.normal(found.fit.state))
+        sigma_deg = float(np.hypot(plane.worst_sigma_deg, found.plane.worst_sigma_deg))
+        if apart_deg > max(AGREE_SIGMAS * sigma_deg, AGREE_DEG):
+            return replace(found, no_plane=Reason(
+                'plane_uncertain', f'{found.plane.assumed.words}, and {words}, are {apart_deg:.1f} degrees apart',
+                'wait for more traffic, above all across the road or turning'))
+        checks = (*checks, f'{words}, {apart_deg:.1f} degrees from what is assumed')
+        if found.plane.worst_sigma_deg <= plane.worst_sigma_deg:
+            return replace(found, checks=checks)
+    along, flow = main_road(fit, tracks)
+    return Solution(fit, plane, along, flow, (*lens_assumptions(fit, ()), f'ground plane by one road and {words}'),
+                    checks, None, reduced=True)
 
 
 def _lens_doubt(fit: JointFit, tracks: TrackSet, traffic: _Traffic, *, turned: bool) -> Reason | None:

@@ -1,0 +1,52 @@
+"""The rotation of the ground plane about a lone road, from vehicles that change lanes or merge.
+
+Their ways lie in the plane as all ways do, and not along the road: a few degrees off it, so that one vehicle tells the
+rotation to tens of degrees, and hundreds to a few.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from autocalib_ros.estimation.great_circles import TrackSet, rays_of
+from autocalib_ros.estimation.joint import JointFit, solve_joint
+from autocalib_ros.estimation.path_noise import USUAL_HEIGHT_M
+from autocalib_ros.estimation.planar_motion import View, first_motion, on_course, paths
+from autocalib_ros.estimation.state import State, level_normal
+from autocalib_ros.estimation.windows import Windows
+
+ASIDE_DEG = 1.5, 20.0
+"""A window is of a change of lanes when it leads aside from the road by more than drivers wander, and less than who
+turns off."""
+MIN_VEHICLES = 8
+"""Fewer may be wrong groups each."""
+MOST_WINDOWS = 300
+
+
+def by_lane_changes(fit: JointFit, tracks: TrackSet, windows: Windows) -> tuple[JointFit, int] | None:
+    """Solve again with the vehicles that leave their lanes on the one road of a solution; None where they are few.
+
+    With the number of those vehicles.
+    """
+    if fit.plane_known or len(fit.state.angles_rad) != 1:
+        return None
+    camera, road, setting = fit.state.camera, fit.state.directions[0], fit.problem.setting
+    up = level_normal(road)
+    if np.median(rays_of(camera, tracks.pixels).bearings @ up) > 0:
+        up = -up
+    plane = np.column_stack([road, np.cross(up, road), up])
+    view = View.of(windows, camera, plane, setting.options)
+    course, _ = on_course(windows, view, first_motion(view), camera, plane, setting.height_m or USUAL_HEIGHT_M)
+    chosen = np.flatnonzero(course & ~windows.of_segments)
+    first, _, second = paths(windows.subset(chosen), camera, plane)
+    away = ~windows.mask[chosen]
+    along, aside = (np.ma.array((second - first)[..., axis], mask=away).mean(axis=1).filled(0.0) for axis in (0, 1))
+    off_deg = np.degrees(np.arctan2(np.abs(aside), np.abs(along)))
+    chosen = chosen[(off_deg > ASIDE_DEG[0]) & (off_deg < ASIDE_DEG[1])]
+    vehicles = len(np.unique(windows.bodies[chosen]))
+    if vehicles < MIN_VEHICLES:
+        return None
+    changing = replace(setting, windows=windows.subset(chosen).spread(MOST_WINDOWS))
+    return solve_joint(State(camera, plane, np.zeros(1)), tracks, changing, refine=True), vehicles

@@ -1,0 +1,57 @@
+"""The rotation about a lone road, from vehicles that change lanes on a motorway."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from autocalib_ros.calibration import Calibration
+from autocalib_ros.calibrator import solve
+from autocalib_ros.config import Options
+from autocalib_ros.evidence import Evidence
+from autocalib_ros.offline.accuracy_families import motorway
+from autocalib_ros.offline.synthetic_evidence import Junction, synthetic_evidence
+
+SEED = 4
+
+
+def watched(vehicles: int) -> tuple[Junction, Evidence]:
+    """A motorway of which so many vehicles were seen, a third of them changing lanes; no edges, no lines."""
+    generator = np.random.default_rng(SEED)
+    junction = replace(motorway(generator), vehicles=vehicles)
+    return junction, synthetic_evidence(junction, generator)
+
+
+def solved(junction: Junction, evidence: Evidence) -> Calibration:
+    result = solve(evidence, Options(camera_height=junction.height_m))
+    assert isinstance(result, Calibration), result.message
+    return result
+
+
+@pytest.fixture(scope='module')
+def many() -> tuple[Junction, Calibration]:
+    junction, evidence = watched(350)
+    return junction, solved(junction, evidence)
+
+
+def test_many_lane_changes_tell_the_plane(many):
+    junction, result = many
+    assert result.grade == 'assumed' and result.ground is not None
+    cosine = abs(float(result.ground.normal_in_camera @ junction.camera_from_ground[:, 2]))
+    error_deg, sigma_deg = np.degrees(np.arccos(min(cosine, 1.0))), result.stddev.tilt_deg
+    assert error_deg < 3.0 * np.hypot(sigma_deg, result.stddev.roll_deg)
+    assert error_deg < 2.0
+    assert sigma_deg < 3.0
+
+
+def test_they_are_named_with_their_deviation(many):
+    words, = (words for words in many[1].assumptions if 'change lanes' in words)
+    assert words.startswith('ground plane by one road and ') and words.endswith(' degrees about the road')
+
+
+def test_few_lane_changes_do_not():
+    result = solved(*watched(25))
+    assert result.grade == 'lens' and result.ground is None
+    assert result.ground_refusal.code == 'one_direction'
