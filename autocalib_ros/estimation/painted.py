@@ -34,6 +34,7 @@ of a lamp post, may be askew."""
 AMBIGUOUS, AMBIGUOUS_DEG = 5.0, 3.0
 """Another plane, so far from the best, speaks against it when its probability is no less than e to the minus this of
 the best one's."""
+NO_MARKINGS = 'no_markings'
 SQUARE_SIGMAS = 2.5
 """Markings are square when the angle between them differs by no more from a right one."""
 
@@ -136,4 +137,4 @@ def _axes_doubt(lines: Lines, grid: Grid, least_places: int) -> Reason | None:
 
 
 def _none(why: str) -> Reason:
-    return Reason('no_markings', f'lines on the road do not tell lens and plane: {why}', 'wait for more traffic')
+    return Reason(NO_MARKINGS, f'lines on the road do not tell lens and plane: {why}', 'wait for more traffic')

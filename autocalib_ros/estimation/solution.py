@@ -16,7 +16,7 @@ from autocalib_ros.estimation.held import lens_assumptions, with_k2_if_asked_for
 from autocalib_ros.estimation.joint import JointFit, noise_cost, road_support, solve_joint, with_bodies
 from autocalib_ros.estimation.lane_changes import by_lane_changes
 from autocalib_ros.estimation.lens_prior import LensPrior, known_lens, lens_priors
-from autocalib_ros.estimation.painted import fit_to_markings, sharpened, with_lens_known
+from autocalib_ros.estimation.painted import NO_MARKINGS, fit_to_markings, sharpened, with_lens_known
 from autocalib_ros.estimation.path_noise import USUAL_HEIGHT_M
 from autocalib_ros.estimation.people import people
 from autocalib_ros.estimation.plane import AGREE_SIGMAS, LevelCamera, Plane, agreement
@@ -118,7 +118,18 @@ def find_solution(evidence: Evidence, tracks: TrackSet, options: JointOptions, g
     if isinstance(found, Solution) and found.full:
         return _sharpened(found, traffic)
     painted = _from_markings(traffic, setting)
-    return painted if _tells_more(painted, found) else found
+    if _tells_more(painted, found):
+        return painted
+    told_more = isinstance(painted, Reason) and painted.code != NO_MARKINGS
+    return _also(found, painted.message) if told_more else found
+
+
+def _also(found: Solution | Reason, words: str) -> Solution | Reason:
+    """Add to what is missing, if anything, what else was tried."""
+    if isinstance(found, Reason):
+        return replace(found, message=f'{found.message}; {words}')
+    return replace(found, no_plane=found.no_plane and replace(found.no_plane,
+                                                              message=f'{found.no_plane.message}; {words}'))
 
 
 def _from_traffic(traffic: _Traffic, setting: Setting) -> Solution | Reason:
@@ -311,7 +322,7 @@ def _with_lane_changes(found: Solution, tracks: TrackSet, traffic: _Traffic) -> 
         return found
     fit, vehicles = changing
     plane, road = Plane.of(fit, tracks), fit.state.directions[0]
-    if plane_doubt(plane, traffic.gate, assumed=True):
+    if plane_doubt(plane, traffic.gate):
         return found
     normal = plane.normal(fit.state)
     about_deg = float(np.degrees(fit.sigma(lambda state: np.array([np.cross(normal, state.rotation[:, 2]) @ road]))[0]))

@@ -43,7 +43,7 @@ def test_many_lane_changes_tell_the_plane(many):
     error_deg, sigma_deg = np.degrees(np.arccos(min(cosine, 1.0))), result.stddev.tilt_deg
     assert error_deg < 3.0 * np.hypot(sigma_deg, result.stddev.roll_deg)
     assert error_deg < 2.0
-    assert sigma_deg < 3.0
+    assert sigma_deg < 1.5
 
 
 def test_they_are_named_with_their_deviation(many):
