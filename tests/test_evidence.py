@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from autocalib_ros.evidence import (
     KINDS,
     OUTLINE_ARRAYS,
     OUTLINE_COLUMNS,
+    STILL_LINES,
     Edges,
     Evidence,
     EvidenceBuffer,
@@ -162,6 +164,40 @@ def test_evidence_without_a_vehicle_has_nothing_of_it() -> None:
     assert left.segment_vehicles.tolist() == [0, 1, 3] and len(left.segments_px) == len(left.segment_times_s) == 3
     assert left.edge_vehicles.tolist() == [3] and left.edges_px.tolist() == [[0.0, 1.0, 2.0, 3.0]]
     assert left.outline_vehicles.tolist() == [1] and left.outlines_px[0, 0] == OUTLINE_COLUMNS + 0.25
+
+
+def with_lines(count: int) -> Evidence:
+    lines = np.random.default_rng(0).uniform(0, 360, (count, 4))
+    return replace(of_kinds(Kind.UNKNOWN, Kind.VEHICLE), still_lines_px=lines)
+
+
+def test_still_lines_survive_their_file_to_the_last_bit(tmp_path: Path) -> None:
+    before = with_lines(7)
+    before.save(tmp_path / 'evidence.npz')
+    after = Evidence.load(tmp_path / 'evidence.npz')
+    np.testing.assert_array_equal(after.still_lines_px, before.still_lines_px)
+    # what is chosen of the tracks has no bearing on what stands still
+    np.testing.assert_array_equal(after.selected(np.array([1])).still_lines_px, before.still_lines_px)
+
+
+def test_without_still_lines_a_file_is_what_it_was_before_they_were_looked_for(tmp_path: Path) -> None:
+    with_lines(0).save(tmp_path / 'evidence.npz')
+    with np.load(tmp_path / 'evidence.npz') as data:
+        assert STILL_LINES not in data.files
+    assert Evidence.load(tmp_path / 'evidence.npz').still_lines_px.shape == (0, 4)
+
+
+@pytest.mark.parametrize('lines', [
+    np.zeros(4), np.zeros((2, 3)), np.zeros((2, 2, 2)), np.zeros((2, 4), int), np.full((2, 4), np.inf),
+    np.array([[0.0, 1.0, np.nan, 3.0]]), np.full((2, 4), 'x'), np.array(1.0)])
+def test_still_lines_that_are_none_are_an_input_error(tmp_path: Path, lines: np.ndarray) -> None:
+    path = tmp_path / 'evidence.npz'
+    with_lines(3).save(path)
+    with np.load(path) as data:
+        arrays = {name: data[name] for name in data.files}
+    np.savez(path, **{**arrays, STILL_LINES: lines})
+    with pytest.raises(InputError, match='not a file of saved evidence'):
+        Evidence.load(path)
 
 
 def test_the_buffer_keeps_no_more_tracks_than_allowed() -> None:

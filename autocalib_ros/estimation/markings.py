@@ -13,6 +13,7 @@ That markings are square is an assumption. Where the traffic tells less than the
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -59,6 +60,9 @@ ROLLS_DEG = (-9.0, -4.5, 0.0, 4.5, 9.0)
 HEADINGS_DEG = tuple(range(0, 90, 6))
 WIDENED_RAD = (np.radians(3.0), np.radians(1.5), np.radians(0.7), 0.0)
 """The peaks are widened by this, round by round, so that a start some degrees off still reaches the best solution."""
+NEARBY = (0.8, 0.87, 0.93, 1.07, 1.14, 1.22)
+"""Focal lengths to start from once more, in ones of the best solution: along focal length and distortion, which lines
+hardly tell apart, there are several solutions that single groups of lines hold in place."""
 STARTS = 6
 ASKED_FOR = 4.5
 """A rarer family of lenses is chosen when that makes the lines so much more probable: the logarithm, three sigmas."""
@@ -69,6 +73,8 @@ SETTLED = 1e-5
 START_SHARES = np.array([0.35, 0.35, 0.1])[:, None]
 LEAST_SHARE, LARGEST_SHARE, LARGEST_SUM = 0.02, 0.9, 0.95
 DIFFERENCE = 1e-5
+LENSES_KEPT = 8
+"""Lenses whose sight is kept: that of a pose, and those a step of a parameter away. Most steps leave the lens."""
 
 
 @dataclass(frozen=True)
@@ -198,12 +204,15 @@ class Grid:
 def square_grids(lines: Lines, priors: list[LensPrior]) -> list[Grid]:
     """Find lenses and planes under which lines are parallel to two directions square to each other, the best first.
 
-    From many starts with the first family of lenses; the best of these with the others.
+    From many starts with the first family of lenses, and from beside the best; the best of these with the others.
     """
     if not _enough(lines, priors[0]):
         return []
     grids = [_settled(lines, priors[0], *start, WIDENED_RAD) for start in _starts(lines, priors[0])]
     best = min(grids, key=lambda grid: grid.improbability, default=None)
+    if best:
+        grids += _beside(lines, best)
+        best = min(grids, key=lambda grid: grid.improbability)
     rarer = []
     for prior in priors[1:] if best else []:
         near = replace(prior.start(best.camera.focal_px), principal_point_px=best.camera.principal_point_px)
@@ -212,12 +221,22 @@ def square_grids(lines: Lines, priors: list[LensPrior]) -> list[Grid]:
         ASKED_FOR if grid.prior is not priors[0] else 0.0))
 
 
-def square_grid_near(lines: Lines, prior: LensPrior, camera: Camera, normal: np.ndarray) -> Grid | None:
-    """Find the lens and plane near a lens and a normal (3,) under which lines are so; None where there are few."""
+def square_grids_near(lines: Lines, prior: LensPrior, camera: Camera, normal: np.ndarray) -> list[Grid]:
+    """Find those near a lens and a normal (3,), the best first."""
     if not _enough(lines, prior):
-        return None
-    costs, headings = _widened_costs(lines, camera, np.array(_headings(normal)), WIDENED_RAD[1]), _headings(normal)
-    return _settled(lines, prior, camera, headings[int(np.argmin(costs))], WIDENED_RAD[1:])
+        return []
+    headings = _headings(normal)
+    costs = _widened_costs(lines, camera, np.array(headings), WIDENED_RAD[1])
+    near = _settled(lines, prior, camera, headings[int(np.argmin(costs))], WIDENED_RAD[1:])
+    return sorted([near, *_beside(lines, near)], key=lambda grid: grid.improbability)
+
+
+def _beside(lines: Lines, best: Grid) -> list[Grid]:
+    """Solutions from other focal lengths than that of the best, if it is free."""
+    prior = best.prior
+    return [] if prior.focal_known or not len(prior.free) else [
+        _settled(lines, prior, prior.start(ratio * best.camera.focal_px), best.rotation, WIDENED_RAD[-2:])
+        for ratio in NEARBY]
 
 
 def _enough(lines: Lines, prior: LensPrior) -> bool:
@@ -327,20 +346,21 @@ class _Mixture:
     def __init__(self, lines: Lines, prior: LensPrior) -> None:
         self.lines, self.prior, self.weights, self._noise = lines, prior, lines.weights, _noise_rad(lines)
         self.shares, self.scale = START_SHARES[:, 0], 1.0
+        self._through = lru_cache(maxsize=LENSES_KEPT)(partial(Sight.through, ends_px=lines.ends_px))
 
     def misses(self, pose: _Pose) -> np.ndarray:
         """Of each direction, shape (3, n)."""
-        return Sight.through(pose.camera, self.lines.ends_px).misses(pose.directions)
+        return self._through(pose.camera).misses(pose.directions)
 
     def sigmas(self, pose: _Pose, widened: float) -> np.ndarray:
         """What is expected of them, shape (3, n)."""
-        levers = Sight.through(pose.camera, self.lines.ends_px).levers(pose.directions[:2], pose.rotation[:, 2])
+        levers = self._through(pose.camera).levers(pose.directions[:2], pose.rotation[:, 2])
         askew = np.concatenate([PAINTED_RAD * levers, np.full((1, len(self.lines)), LEAN_RAD)])
         return np.sqrt(self.scale**2 * (self._noise**2 + askew**2) + widened**2)
 
     def cost(self, pose: _Pose, sigmas: np.ndarray) -> tuple[float, np.ndarray]:
         """Negative logarithm of the probability, and of each line to be along each direction, shape (3, n)."""
-        sight = Sight.through(pose.camera, self.lines.ends_px)
+        sight = self._through(pose.camera)
         each = self.shares[:, None] * _student(sight.misses(pose.directions), sigmas)
         each[:2] *= sight.bearings @ pose.rotation[:, 2] < -LOWEST
         density = each.sum(axis=0) + (1.0 - self.shares.sum()) / np.pi

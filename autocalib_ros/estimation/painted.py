@@ -6,11 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 from scipy.linalg import block_diag
+from scipy.spatial.transform import Rotation
 
 from autocalib_ros.calibration import Reason
 from autocalib_ros.config import GateOptions
 from autocalib_ros.estimation.doubts import view_doubt
-from autocalib_ros.estimation.great_circles import TrackSet
+from autocalib_ros.estimation.great_circles import TrackSet, rays_of
 from autocalib_ros.estimation.joint import JointFit, judged_at
 from autocalib_ros.estimation.lens_prior import LensPrior
 from autocalib_ros.estimation.markings import (
@@ -19,8 +20,8 @@ from autocalib_ros.estimation.markings import (
     Lines,
     beside_traffic,
     lines_on_road,
-    square_grid_near,
     square_grids,
+    square_grids_near,
 )
 from autocalib_ros.estimation.state import Setting, State, Steps
 from autocalib_ros.estimation.windows import no_windows
@@ -33,7 +34,7 @@ LEAST_PLACES, CONFIRMED_PLACES = 5, 3
 of a lamp post, may be askew."""
 AMBIGUOUS, AMBIGUOUS_DEG = 5.0, 3.0
 """Another plane, so far from the best, speaks against it when its probability is no less than e to the minus this of
-the best one's."""
+the best one's; and so does another focal length that is farther away than its deviation may be."""
 NO_MARKINGS = 'no_markings'
 SQUARE_SIGMAS = 2.5
 """Markings are square when the angle between them differs by no more from a right one."""
@@ -42,15 +43,15 @@ SQUARE_SIGMAS = 2.5
 def fit_to_markings(evidence: Evidence, tracks: TrackSet, priors: list[LensPrior], setting: Setting,
                     gate: GateOptions) -> tuple[JointFit, str] | Reason:
     """Estimate lens and plane from the lines on the road; with what was assumed in words, or a reason why not."""
-    lines = lines_on_road(evidence)
-    grids = square_grids(lines, priors)
+    every = lines_on_road(evidence)
+    grids = square_grids(every, priors)
     if not grids:
-        return _none(f'there are {len(lines)}')
-    nearer = beside_traffic(lines, grids[0], evidence)
+        return _none(f'there are {len(every)}')
+    nearer = beside_traffic(every, grids[0], evidence)
     if nearer is None:
         return _none('too few are beside the traffic')
     lines, best = nearer
-    doubt = _ambiguity(grids) or _axes_doubt(lines, best, LEAST_PLACES)
+    doubt = _ambiguity(every, grids, gate) or _axes_doubt(lines, best, LEAST_PLACES)
     if doubt:
         return doubt
     state = State(best.camera, best.rotation, np.array([0.0, np.pi / 2 + best.askew_rad]))
@@ -60,20 +61,20 @@ def fit_to_markings(evidence: Evidence, tracks: TrackSet, priors: list[LensPrior
     return view_doubt(fit, tracks) or (fit, _words(lines, best))
 
 
-def sharpened(fit: JointFit, evidence: Evidence, tracks: TrackSet,
-              prior: LensPrior) -> tuple[JointFit, str] | Reason:
+def sharpened(fit: JointFit, evidence: Evidence, tracks: TrackSet, prior: LensPrior,
+              gate: GateOptions) -> tuple[JointFit, str] | Reason:
     """Return the lens and plane near those of a solution to which the lines on the road lead, with its roads.
 
     With what was assumed in words, or a reason why not.
     """
     up, state = _upward(fit), fit.state
-    lines = lines_on_road(evidence)
-    near = square_grid_near(lines, prior, state.camera, up)
-    nearer = beside_traffic(lines, near, evidence) if near else None
+    every = lines_on_road(evidence)
+    grids = square_grids_near(every, prior, state.camera, up)
+    nearer = beside_traffic(every, grids[0], evidence) if grids else None
     if nearer is None:
         return _none('too few are beside the traffic')
     lines, grid = nearer
-    doubt = _axes_doubt(lines, grid, CONFIRMED_PLACES)
+    doubt = _ambiguity(every, grids, gate) or _axes_doubt(lines, grid, CONFIRMED_PLACES)
     if doubt:
         return doubt
     setting = replace(fit.problem.setting, prior=prior, windows=no_windows(), bundle=None)
@@ -113,15 +114,30 @@ def with_lens_known(fit: JointFit) -> JointFit:
     return replace(fit, covariance=covariance)
 
 
-def _ambiguity(grids: list[Grid]) -> Reason | None:
-    """Say that another plane suits the lines as well, if so."""
+def _ambiguity(lines: Lines, grids: list[Grid], gate: GateOptions) -> Reason | None:
+    """Say that another plane or lens suits the lines as well, if so."""
     best = grids[0]
     for other in grids[1:]:
-        cosine = abs(float(best.rotation[:, 2] @ other.rotation[:, 2]))
-        apart_deg = float(np.degrees(np.arccos(min(cosine, 1.0))))
-        if other.improbability < best.improbability + AMBIGUOUS and apart_deg > AMBIGUOUS_DEG:
+        if other.improbability > best.improbability + AMBIGUOUS:
+            continue
+        apart_deg = _apart_deg(lines, best, other)
+        if apart_deg > AMBIGUOUS_DEG:
             return _none(f'they suit two planes {apart_deg:.0f} degrees apart')
+        focals = sorted(grid.camera.focal_px for grid in (best, other))
+        if other.prior is best.prior and np.log(focals[1] / focals[0]) > gate.max_sigma_focal_rel:
+            return _none(f'they suit two focal lengths, {focals[0]:.0f} and {focals[1]:.0f} px')
     return None
+
+
+def _apart_deg(lines: Lines, one: Grid, other: Grid) -> float:
+    """Angle between the normals of two grids, degrees, once their rays of the lines are turned onto each other.
+
+    A principal point farther down is an axis that looks farther down: that is no other plane.
+    """
+    middles = (lines.ends_px[:, :2] + lines.ends_px[:, 2:]) / 2
+    turn, _ = Rotation.align_vectors(*(rays_of(grid.camera, middles).bearings for grid in (one, other)))
+    cosine = abs(float(one.rotation[:, 2] @ turn.apply(other.rotation[:, 2])))
+    return float(np.degrees(np.arccos(min(cosine, 1.0))))
 
 
 def _axes_doubt(lines: Lines, grid: Grid, least_places: int) -> Reason | None:

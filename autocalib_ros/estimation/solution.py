@@ -182,7 +182,8 @@ def _for_lines(prior: LensPrior, options: JointOptions) -> LensPrior:
 def _sharpened(found: Solution, traffic: _Traffic) -> Solution:
     """Return a solution with the lens and plane of the lines on the road, where both agree and the lines are surer."""
     setting = found.fit.problem.setting
-    painted = sharpened(found.fit, traffic.evidence, traffic.tracks, _for_lines(setting.prior, setting.options))
+    prior = _for_lines(setting.prior, setting.options)
+    painted = sharpened(found.fit, traffic.evidence, traffic.tracks, prior, traffic.gate)
     if isinstance(painted, Reason):
         return found
     fit, assumed = painted

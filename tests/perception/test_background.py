@@ -1,0 +1,101 @@
+"""The median of a few images: exact, free of what passes, and bounded in memory."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from autocalib_ros.perception.background import LEAST_SAMPLES, LONGEST_INTERVAL_S, SAMPLES, Background, median
+
+JPEG = 3
+"""Levels by which flat grey comes back otherwise."""
+
+
+def flat(level: int) -> np.ndarray:
+    return np.full((24, 32), level, np.uint8)
+
+
+@pytest.mark.parametrize('count', range(1, 12))
+def test_the_median_is_that_of_sorting(count: int) -> None:
+    images = np.random.default_rng(count).integers(0, 256, (count, 7, 5), np.uint8)
+    before = images.copy()
+    # of an even number the upper one: the middle of the two would be a level that no image has
+    np.testing.assert_array_equal(median(list(images)), np.sort(images, axis=0)[count // 2])
+    np.testing.assert_array_equal(images, before)
+
+
+def test_colours_have_medians_of_their_own() -> None:
+    images = np.random.default_rng(0).integers(0, 256, (5, 6, 4, 3), np.uint8)
+    np.testing.assert_array_equal(median(list(images)), np.sort(images, axis=0)[2])
+
+
+@pytest.mark.parametrize(('count', 'there'), [(LEAST_SAMPLES - 1, False), (LEAST_SAMPLES, True)])
+def test_there_is_no_grey_before_traffic_is_outvoted(count: int, there: bool) -> None:
+    background = Background()
+    assert background.grey() is None and background.image() is None
+    for index in range(count):
+        # something dark covers the road in the first two
+        background.update(flat(30 if index < 2 else 150), float(index))
+    assert (background.grey() is not None) == there
+    assert background.image().shape == (24, 32, 3)
+    if there:
+        assert np.abs(background.grey().astype(int) - 150).max() <= JPEG
+
+
+def test_images_between_the_intervals_are_not_kept() -> None:
+    background = Background()
+    for index in range(31):
+        background.update(flat(100), 0.1 * index)
+    np.testing.assert_allclose(background.times_s, (0.0, 1.0, 2.0, 3.0))
+
+
+def test_the_interval_grows_until_the_longest_and_no_more_images_are_held() -> None:
+    background, image, gaps = Background(), flat(90), []
+    step_s, seconds = 8.0, 6 * SAMPLES * LONGEST_INTERVAL_S
+    for time_s in np.arange(0.0, seconds, step_s):
+        background.update(image, float(time_s))
+        assert len(background.times_s) <= SAMPLES
+        gaps.append(np.diff(background.times_s).max(initial=0.0))
+    # it has doubled from one second, and doubles no more where that would be longer than the longest
+    assert LONGEST_INTERVAL_S / 2 < gaps[-1]
+    assert max(gaps) <= LONGEST_INTERVAL_S
+    assert len(background.times_s) == SAMPLES
+    # nothing is left of what the road looked like long ago
+    assert background.times_s[0] > seconds - (SAMPLES + 1) * LONGEST_INTERVAL_S
+    assert background.times_s[-1] > seconds - LONGEST_INTERVAL_S - step_s
+
+
+def test_what_was_before_a_bump_is_forgotten_and_images_come_faster_again() -> None:
+    background = Background()
+    for time_s in range(100):
+        background.update(flat(60), float(time_s))
+    for time_s in range(100, 140):
+        background.update(flat(180), float(time_s))
+    assert np.diff(background.times_s).min() > 2.0
+    background.forget_before(100.0)
+    assert min(background.times_s) >= 100.0
+    for time_s in range(140, 147):
+        background.update(flat(180), float(time_s))
+    assert np.diff(background.times_s)[-4:].max() == pytest.approx(1.0)
+    assert np.abs(background.grey().astype(int) - 180).max() <= JPEG
+
+
+def test_the_newest_image_stays_where_all_are_from_before() -> None:
+    background = Background()
+    for time_s in range(20):
+        background.update(flat(60 + time_s), float(time_s))
+    newest = background.times_s[-1]
+    background.forget_before(50.0)
+    assert background.times_s == (newest,)
+    assert background.image() is not None and background.grey() is None
+    background.forget_before(50.0)
+    assert background.times_s == (newest,)
+
+
+def test_nothing_is_forgotten_of_after_the_bump() -> None:
+    background = Background()
+    for time_s in range(20):
+        background.update(flat(60), float(time_s))
+    before = background.times_s
+    background.forget_before(-np.inf)
+    assert background.times_s == before
