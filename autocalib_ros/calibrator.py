@@ -248,8 +248,9 @@ def _solved(evidence: Evidence, options: Options, lens: Camera | None) -> Calibr
     if options.method == 'paper':
         published = solve_paper(evidence, options, intrinsics, figures)
         return refused(published) if isinstance(published, Reason) else published
-    def solved(traffic: Evidence, kept: np.ndarray) -> Calibration | Reason:
-        """Solve the traffic, the tracks `kept` of the evidence."""
+
+    def solved(traffic: Evidence, kept: np.ndarray) -> tuple[Calibration, bool] | Reason:
+        """Solve the traffic, the tracks `kept` of the evidence; and whether lens and plane rest on it."""
         tracks = select_tracks(traffic, options.joint.max_tracks)
         solution = _solution(traffic, tracks, options, lens)
         if isinstance(solution, Reason):
@@ -260,17 +261,19 @@ def _solved(evidence: Evidence, options: Options, lens: Camera | None) -> Calibr
             road_directions=solution.fit.state.directions, stddev=_lens_deviations(solution),
             paper=None if intrinsics is None else intrinsics.report, evidence=evidence.summary(),
             newest_stamp_ns=evidence.newest_stamp_ns,
-            figures=_figures(figures, solution, kept[tracks.indices], evidence, options)))
+            figures=_figures(figures, solution, kept[tracks.indices], evidence, options))), not solution.by_lines
 
-    result = solved(traffic, kept)
-    if isinstance(result, Reason):
-        return refused(result)
+    found = solved(traffic, kept)
+    if isinstance(found, Reason):
+        return refused(found)
+    result, by_traffic = found
     told = _people_in(result, traffic)
-    if not len(told):
-        return result
-    drive = np.flatnonzero(~np.isin(traffic.track_vehicles, told))
-    alone = traffic.without(told)
-    return _counted(_preferred(result, shortfall(alone, options.gate) or solved(alone, kept[drive])), len(told))
+    if len(told) and by_traffic:
+        drive = np.flatnonzero(~np.isin(traffic.track_vehicles, told))
+        alone = traffic.without(told)
+        again = shortfall(alone, options.gate) or solved(alone, kept[drive])
+        result = _preferred(result, again if isinstance(again, Reason) else again[0])
+    return _counted(result, len(told))
 
 
 def _people_in(result: Calibration, evidence: Evidence) -> np.ndarray:
@@ -284,15 +287,20 @@ def _people_in(result: Calibration, evidence: Evidence) -> np.ndarray:
 
 
 def _preferred(of_all: Calibration, of_vehicles_alone: Calibration | Reason) -> Calibration:
-    """Choose the solution of vehicles alone wherever it has a ground plane.
+    """Choose the solution of vehicles alone wherever it has a ground plane that is no lesser one.
 
     Where it has none, too few vehicles are left: that says nothing against the plane of all, on which people walk too
     and which was doubted like any other.
     """
-    doubt = (of_vehicles_alone if isinstance(of_vehicles_alone, Reason) else of_vehicles_alone.ground_refusal)
-    if doubt is None:
+    if isinstance(of_vehicles_alone, Reason):
+        lacking = of_vehicles_alone.message
+    elif of_vehicles_alone.ground_refusal is not None:
+        lacking = of_vehicles_alone.ground_refusal.message
+    elif of_all.grade == 'full' and of_vehicles_alone.grade != 'full':
+        lacking = f'the grade is {of_vehicles_alone.grade}'
+    else:
         return of_vehicles_alone
-    return replace(of_all, checks=(*of_all.checks, f'the plane is of people too: without them, {doubt.message}'))
+    return replace(of_all, checks=(*of_all.checks, f'the plane is of people too: without them, {lacking}'))
 
 
 def _counted(result: Calibration, people_told: int) -> Calibration:

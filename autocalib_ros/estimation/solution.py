@@ -66,6 +66,8 @@ class Solution:
     no_plane: Reason | None
     reduced: bool = False
     """Whether the plane rests on less than roads that cross or vehicles that turn, though `plane` assumes nothing."""
+    by_lines: bool = False
+    """Whether lens and plane are those of the lines on the road."""
 
     @property
     def assumed(self) -> bool:
@@ -171,7 +173,7 @@ def _from_markings(traffic: _Traffic, setting: Setting) -> Solution | Reason:
     along, flow = main_road(fit, traffic.tracks)
     plane = Plane.of(fit, traffic.tracks)
     return Solution(fit, plane, along, flow, (*lens_assumptions(fit, ()), assumed), checks,
-                    plane_doubt(plane, traffic.gate, assumed=True), reduced=True)
+                    plane_doubt(plane, traffic.gate, assumed=True), reduced=True, by_lines=True)
 
 
 def _for_lines(prior: LensPrior, options: JointOptions) -> LensPrior:
@@ -197,7 +199,7 @@ def _sharpened(found: Solution, traffic: _Traffic) -> Solution:
         return replace(found, checks=(*found.checks, words))
     along, flow = main_road(fit, traffic.tracks)
     return replace(found, fit=fit, plane=plane, along=along, flow=flow, checks=(*found.checks, words),
-                   assumptions=(*lens_assumptions(fit, ()), assumed))
+                   assumptions=(*lens_assumptions(fit, ()), assumed), by_lines=True)
 
 
 def agreed_by(painted: JointFit, told: list[Plane]) -> tuple[str, ...] | Reason:
