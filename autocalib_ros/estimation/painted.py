@@ -14,15 +14,9 @@ from autocalib_ros.estimation.doubts import view_doubt
 from autocalib_ros.estimation.great_circles import TrackSet, rays_of
 from autocalib_ros.estimation.joint import JointFit, judged_at
 from autocalib_ros.estimation.lens_prior import LensPrior
-from autocalib_ros.estimation.markings import (
-    ASKEW_RAD,
-    Grid,
-    Lines,
-    beside_traffic,
-    lines_on_road,
-    square_grids,
-    square_grids_near,
-)
+from autocalib_ros.estimation.line_mixture import ASKEW_RAD, Grid
+from autocalib_ros.estimation.markings import beside_traffic, square_grids, square_grids_near
+from autocalib_ros.estimation.road_lines import Lines, lines_on_road
 from autocalib_ros.estimation.state import Setting, State, Steps
 from autocalib_ros.estimation.windows import no_windows
 from autocalib_ros.evidence import Evidence

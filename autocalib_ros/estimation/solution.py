@@ -13,7 +13,14 @@ from autocalib_ros.estimation.differences import differences
 from autocalib_ros.estimation.doubts import halves_doubt, lens_doubt, plane_doubt, traffic_doubt
 from autocalib_ros.estimation.great_circles import TrackSet, evenly
 from autocalib_ros.estimation.held import lens_assumptions, with_k2_if_asked_for, with_what_can_be_told
-from autocalib_ros.estimation.joint import JointFit, noise_cost, road_support, solve_joint, with_bodies
+from autocalib_ros.estimation.joint import (
+    UNMODELLED_FOCAL,
+    JointFit,
+    noise_cost,
+    road_support,
+    solve_joint,
+    with_bodies,
+)
 from autocalib_ros.estimation.lane_changes import by_lane_changes
 from autocalib_ros.estimation.lens_prior import LensPrior, known_lens, lens_priors
 from autocalib_ros.estimation.painted import NO_MARKINGS, fit_to_markings, sharpened, with_lens_known
@@ -195,7 +202,9 @@ def _sharpened(found: Solution, traffic: _Traffic) -> Solution:
     plane = Plane.of(fit, traffic.tracks)
     if apart.beyond(AGREE_SIGMAS) or plane_doubt(plane, traffic.gate):
         return replace(found, checks=(*found.checks, f'{words}: not used'))
-    if fit.focal_sigma * plane.worst_sigma_deg > found.fit.focal_sigma * found.plane.worst_sigma_deg:
+    one, other = ((max(solved.focal_sigma, UNMODELLED_FOCAL), told.worst_sigma_deg)
+                  for solved, told in ((fit, plane), (found.fit, found.plane)))
+    if one[0] * one[1] > other[0] * other[1]:
         return replace(found, checks=(*found.checks, words))
     along, flow = main_road(fit, traffic.tracks)
     return replace(found, fit=fit, plane=plane, along=along, flow=flow, checks=(*found.checks, words),

@@ -18,9 +18,10 @@ from autocalib_ros.estimation.great_circles import TrackSet, select_tracks
 from autocalib_ros.estimation.ground_plane import tilt_and_roll_deg
 from autocalib_ros.estimation.joint import JointFit
 from autocalib_ros.estimation.lens_prior import known_lens, lens_priors
-from autocalib_ros.estimation.markings import lines_on_road, square_grids
+from autocalib_ros.estimation.markings import square_grids
 from autocalib_ros.estimation.painted import fit_to_markings
 from autocalib_ros.estimation.plane import Plane
+from autocalib_ros.estimation.road_lines import lines_on_road
 from autocalib_ros.estimation.solution import Solution, agreed_by, find_solution
 from autocalib_ros.estimation.state import Setting
 from autocalib_ros.evidence import Evidence

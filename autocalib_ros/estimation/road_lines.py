@@ -1,0 +1,125 @@
+"""Straight lines on the road: those of the still background beside the traffic, and how a lens sees them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from autocalib_ros.camera import Camera
+from autocalib_ros.estimation.edge_mixture import folded
+from autocalib_ros.estimation.great_circles import along_px, earlier_ones, independence, rays_of
+from autocalib_ros.evidence import Evidence
+
+NEAR_TRAFFIC = 0.06
+"""A line is on the road when all of it lies within this of a place where traffic was seen, share of the image width:
+half of a lane, or what vehicles are high."""
+GRAIN = 0.01
+"""Places of traffic are told apart by so much, share of the image width."""
+MOST_LINES = 400
+"""Lines in one solution: of each group in turn, the longest first."""
+TOGETHER, TOGETHER_RAD = 0.05, np.radians(12.0)
+"""Lines of one group, a crosswalk say, lie within this of a neighbour, share of the image width, and are as parallel in
+the image: whoever painted one askew did so with all."""
+CORRELATION = 0.3
+"""How much the errors of a group's lines correlate: several edges are of one stripe, and stripes of one crosswalk."""
+
+
+@dataclass(frozen=True)
+class Lines:
+    """Straight lines on the road."""
+
+    ends_px: np.ndarray
+    """x0, y0, x1, y1, shape (n, 4)."""
+    groups: np.ndarray
+    """Which belong together, shape (n,)."""
+
+    def __len__(self) -> int:
+        return len(self.groups)
+
+    def subset(self, keep: np.ndarray) -> Lines:
+        """Return the lines that `keep`, a mask or indices, selects."""
+        return Lines(self.ends_px[keep], self.groups[keep])
+
+    @property
+    def lengths_px(self) -> np.ndarray:
+        """Shape (n,)."""
+        return np.hypot(*(self.ends_px[:, 2:] - self.ends_px[:, :2]).T)
+
+    @property
+    def weights(self) -> np.ndarray:
+        """Shape (n,): those of one group count less each."""
+        return independence(self.groups, CORRELATION)
+
+
+def lines_on_road(evidence: Evidence) -> Lines:
+    """Return the still lines where traffic was seen, at most `MOST_LINES`."""
+    width, ends = evidence.image_size[0], evidence.still_lines_px
+    if not len(ends) or not len(evidence.points_px):
+        return Lines(np.zeros((0, 4)), np.zeros(0, int))
+    ends = ends[within(along_lines(ends), traffic_places(evidence), NEAR_TRAFFIC * width)]
+    lines = Lines(ends, _groups(ends, width))
+    best_first = lines.subset(np.argsort(-lines.lengths_px, kind='stable'))
+    return best_first.subset(np.argsort(earlier_ones(best_first.groups), kind='stable')[:MOST_LINES])
+
+
+def traffic_places(evidence: Evidence) -> np.ndarray:
+    """Pixels (n, 2) where traffic was seen, each once."""
+    grain = GRAIN * evidence.image_size[0]
+    return np.unique(np.round(evidence.points_px / grain), axis=0) * grain
+
+
+def along_lines(ends: np.ndarray) -> np.ndarray:
+    """Points along lines (n, 4), shape (n, 5, 2)."""
+    share = np.linspace(0.0, 1.0, 5)[:, None]
+    return ends[:, None, :2] + share * (ends[:, 2:] - ends[:, :2])[:, None]
+
+
+def within(points: np.ndarray, places: np.ndarray, reach: float) -> np.ndarray:
+    """Tell of which lines all points (n, m, 2) are within reach of one of some places (k, 2), shape (n,)."""
+    away, _ = cKDTree(places).query(points.reshape(-1, 2), distance_upper_bound=reach)
+    return np.isfinite(away).reshape(points.shape[:2]).all(axis=1)
+
+
+def _groups(ends: np.ndarray, width: int) -> np.ndarray:
+    """Number the groups of lines (n, 4), shape (n,)."""
+    middle, step = (ends[:, :2] + ends[:, 2:]) / 2, ends[:, 2:] - ends[:, :2]
+    heading = np.arctan2(step[:, 1], step[:, 0])
+    near = np.hypot(*(middle[:, None] - middle).transpose(2, 0, 1)) < TOGETHER * width
+    parallel = np.abs(folded(heading[:, None] - heading)) < TOGETHER_RAD
+    return connected_components(coo_matrix(near & parallel), directed=False)[1]
+
+
+@dataclass(frozen=True)
+class Sight:
+    """Lines as a lens sees them, on the sphere about the camera."""
+
+    bearings: np.ndarray
+    """Of the lines' middles, shape (n, 3)."""
+    along: np.ndarray
+    """Unit tangents there, shape (n, 3)."""
+    circles: np.ndarray
+    """Normals of the lines' great circles, shape (n, 3)."""
+
+    @classmethod
+    def through(cls, camera: Camera, ends_px: np.ndarray) -> Sight:
+        """See lines (n, 4) through a lens."""
+        middle, step = (ends_px[:, :2] + ends_px[:, 2:]) / 2, ends_px[:, 2:] - ends_px[:, :2]
+        rays = rays_of(camera, middle)
+        along = along_px(rays, camera, middle, step)
+        along /= np.maximum(np.linalg.norm(along, axis=1), 1e-12)[:, None]
+        return cls(rays.bearings, along, np.cross(rays.bearings, along))
+
+    def misses(self, directions: np.ndarray) -> np.ndarray:
+        """Angle of each line from each of some directions (..., 3): within a quarter of a turn, shape (..., n)."""
+        return folded(np.arctan2(directions @ self.circles.T, directions @ self.along.T))
+
+    def levers(self, directions: np.ndarray, normal: np.ndarray) -> np.ndarray:
+        """How far misses change with a turn of the directions (k, 3) about the normal (3,), shape (k, n)."""
+        turned = np.cross(normal, directions)
+        sine, cosine = directions @ self.circles.T, directions @ self.along.T
+        sine_by, cosine_by = turned @ self.circles.T, turned @ self.along.T
+        return (cosine * sine_by - sine * cosine_by) / np.maximum(sine**2 + cosine**2, 1e-12)
