@@ -30,6 +30,8 @@ AMBIGUOUS, AMBIGUOUS_DEG = 5.0, 3.0
 """Another plane, so far from the best, speaks against it when its probability is no less than e to the minus this of
 the best one's; and so does another focal length that is farther away than its deviation may be."""
 NO_MARKINGS = 'no_markings'
+LEAST_VARIANCE = 1e-12
+"""Lines without noise, as tests make them, leave parameters without any spread."""
 SQUARE_SIGMAS = 2.5
 """Markings are square when the angle between them differs by no more from a right one."""
 
@@ -104,7 +106,8 @@ def _words(lines: Lines, grid: Grid) -> str:
 def with_lens_known(fit: JointFit) -> JointFit:
     """Return a fit with the deviations that it has for somebody who knows its lens."""
     lens, covariance = fit.problem.steps.lens, np.zeros(fit.covariance.shape)
-    covariance[lens:, lens:] = np.linalg.inv(np.linalg.inv(fit.covariance)[lens:, lens:])
+    information = np.linalg.inv(fit.covariance + LEAST_VARIANCE * np.eye(len(covariance)))
+    covariance[lens:, lens:] = np.linalg.inv(information[lens:, lens:])
     return replace(fit, covariance=covariance)
 
 

@@ -19,7 +19,7 @@ from autocalib_ros.estimation.ground_plane import tilt_and_roll_deg
 from autocalib_ros.estimation.joint import JointFit
 from autocalib_ros.estimation.lens_prior import known_lens, lens_priors
 from autocalib_ros.estimation.markings import square_grids
-from autocalib_ros.estimation.painted import fit_to_markings
+from autocalib_ros.estimation.painted import fit_to_markings, with_lens_known
 from autocalib_ros.estimation.plane import Plane
 from autocalib_ros.estimation.road_lines import lines_on_road
 from autocalib_ros.estimation.solution import Solution, agreed_by, find_solution
@@ -139,6 +139,9 @@ def test_exact_lines_give_the_truth() -> None:
     # a chord has the direction of its arc in the middle but for terms of the third order
     assert abs(focal_error(fit, JUNCTION)) < 2e-3
     assert angle_deg(fit.state.rotation[:, 2], JUNCTION.normal_in_camera) < 0.1
+    # who knows the lens knows the plane no worse, though nothing is left of noise
+    for known in (with_lens_known(fit), with_lens_known(replace(fit, covariance=0.0 * fit.covariance))):
+        assert Plane(known, 1.0).worst_sigma_deg <= Plane(fit, 1.0).worst_sigma_deg + 1e-3
 
 
 def test_half_of_the_lines_may_be_clutter() -> None:
