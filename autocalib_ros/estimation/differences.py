@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from autocalib_ros.estimation.ground_plane import undirected_deg
 from autocalib_ros.estimation.joint import JointFit
 from autocalib_ros.estimation.state import State
 from autocalib_ros.estimation.uncertainty import propagate
@@ -42,8 +43,7 @@ class Differences:
 def differences(first: JointFit, second: JointFit) -> Differences:
     """Compare two solutions."""
     focal = abs(float(np.log(first.state.camera.focal_px / second.state.camera.focal_px)))
-    cosine = abs(float(first.state.rotation[:, 2] @ second.state.rotation[:, 2]))
-    return Differences(focal, float(np.degrees(np.arccos(min(cosine, 1.0)))),
+    return Differences(focal, undirected_deg(first.state.rotation[:, 2], second.state.rotation[:, 2]),
                        np.array([_both(fit.sigma(_moved_from(fit))) for fit in (first, second)]))
 
 

@@ -113,8 +113,7 @@ class _Mixture:
 
     def _densities(self, misses: np.ndarray, sigmas: np.ndarray) -> np.ndarray:
         """Of each peak, by its share (2, n, turns)."""
-        apart = 1.0 + (misses / sigmas) ** 2 / FREEDOM
-        return np.array(self.shares)[:, None, None] * STUDENT / sigmas / (apart * apart * np.sqrt(apart))
+        return np.array(self.shares)[:, None, None] * student(misses, sigmas)
 
     @property
     def _rest(self) -> float:
@@ -130,7 +129,7 @@ class _Mixture:
         misses, sigmas = self._misses(np.array([turn]))
         each = self._densities(misses, sigmas)[:, :, 0]
         members = each / (each.sum(axis=0) + self._rest)
-        return members, members * _robust(misses, sigmas)[:, :, 0] / sigmas[:, :, 0] ** 2
+        return members, members * robust(misses, sigmas)[:, :, 0] / sigmas[:, :, 0] ** 2
 
     def bulging(self, pull: np.ndarray) -> tuple[float, float]:
         """How much a bulge of one turns the estimate, by the pulls (n,) of edges across; and its standard deviation."""
@@ -142,7 +141,7 @@ class _Mixture:
         """Return the mixture after one round with the direction across the road at a turn, edges weighing (n,)."""
         members, pulls = self.members(turn)
         misses, sigmas = self._misses(np.array([turn]))
-        squared = (_robust(misses, sigmas) * misses**2)[:, :, 0]
+        squared = (robust(misses, sigmas) * misses**2)[:, :, 0]
         held, pull = members * weights, pulls[0] * weights
         sums = np.maximum(held.sum(axis=1), 1e-9)
         beyond = (held * (squared - self.told.sigmas_rad**2) / self._levers() ** 2).sum(axis=1) / sums
@@ -154,7 +153,13 @@ class _Mixture:
         return _Mixture(self.told, tuple(shares.tolist()), tuple(spreads.tolist()), float(bulge))
 
 
-def _robust(misses: np.ndarray, sigmas: np.ndarray) -> np.ndarray:
+def student(misses: np.ndarray, sigmas: np.ndarray) -> np.ndarray:
+    """Density of each miss by Student's distribution of these scales."""
+    apart = 1.0 + (misses / sigmas) ** 2 / FREEDOM
+    return STUDENT / sigmas / (apart * apart * np.sqrt(apart))
+
+
+def robust(misses: np.ndarray, sigmas: np.ndarray) -> np.ndarray:
     """Weight of each miss by Student's distribution."""
     return (FREEDOM + 1.0) / (FREEDOM + (misses / sigmas) ** 2)
 

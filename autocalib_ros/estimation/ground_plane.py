@@ -83,3 +83,8 @@ def angles_deg(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Angles in degrees between vectors (..., 3)."""
     across = np.linalg.norm(np.cross(first, second), axis=-1)
     return np.degrees(np.arctan2(across, (first * second).sum(axis=-1)))
+
+
+def undirected_deg(one: np.ndarray, other: np.ndarray) -> float:
+    """Angle between two unit vectors (3,), whichever way they point, degrees."""
+    return float(np.degrees(np.arccos(min(abs(float(one @ other)), 1.0))))

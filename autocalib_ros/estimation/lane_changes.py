@@ -14,7 +14,7 @@ from autocalib_ros.estimation.great_circles import TrackSet, rays_of
 from autocalib_ros.estimation.joint import JointFit, solve_joint
 from autocalib_ros.estimation.path_noise import USUAL_HEIGHT_M
 from autocalib_ros.estimation.planar_motion import View, first_motion, on_course, paths
-from autocalib_ros.estimation.state import State, level_normal
+from autocalib_ros.estimation.state import State, ground_up
 from autocalib_ros.estimation.windows import Windows
 
 ASIDE_DEG = 1.5, 20.0
@@ -33,9 +33,7 @@ def by_lane_changes(fit: JointFit, tracks: TrackSet, windows: Windows) -> tuple[
     if fit.plane_known or len(fit.state.angles_rad) != 1:
         return None
     camera, road, setting = fit.state.camera, fit.state.directions[0], fit.problem.setting
-    up = level_normal(road)
-    if np.median(rays_of(camera, tracks.pixels).bearings @ up) > 0:
-        up = -up
+    up = ground_up(fit.state, setting, rays_of(camera, tracks.pixels))
     plane = np.column_stack([road, np.cross(up, road), up])
     view = View.of(windows, camera, plane, setting.options)
     course, _ = on_course(windows, view, first_motion(view), camera, plane, setting.height_m or USUAL_HEIGHT_M)

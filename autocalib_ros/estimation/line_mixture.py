@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from autocalib_ros.camera import Camera
-from autocalib_ros.estimation.edge_mixture import FREEDOM, STUDENT, folded
+from autocalib_ros.estimation.edge_mixture import folded, robust, student
 from autocalib_ros.estimation.lens_prior import LensPrior
 from autocalib_ros.estimation.road_lines import Lines, Sight
 from autocalib_ros.estimation.uncertainty import cluster_covariance
@@ -68,18 +68,13 @@ class Grid:
 def widened_costs(lines: Lines, camera: Camera, planes: np.ndarray, widened: float) -> np.ndarray:
     """Negative logarithm of how probable lines are with widened peaks, seen by a lens over planes (n, 3, 3); (n,)."""
     sight, sigmas = Sight.through(camera, lines.ends_px), np.hypot(_noise_rad(lines), widened)
-    each = START_SHARES * _student(sight.misses(planes.transpose(0, 2, 1)), sigmas)
+    each = START_SHARES * student(sight.misses(planes.transpose(0, 2, 1)), sigmas)
     each[:, :2] *= (planes[:, :, 2] @ sight.bearings.T < -LOWEST)[:, None]
     return -np.log(each.sum(axis=1) + (1.0 - START_SHARES.sum()) / np.pi) @ lines.weights
 
 
 def _noise_rad(lines: Lines) -> np.ndarray:
     return END_PX * np.sqrt(2.0) / lines.lengths_px
-
-
-def _student(misses: np.ndarray, sigmas: np.ndarray) -> np.ndarray:
-    apart = 1.0 + (misses / sigmas) ** 2 / FREEDOM
-    return STUDENT / sigmas / (apart * apart * np.sqrt(apart))
 
 
 @dataclass(frozen=True)
@@ -125,7 +120,7 @@ class _Mixture:
     def cost(self, pose: _Pose, sigmas: np.ndarray) -> tuple[float, np.ndarray]:
         """Negative logarithm of the probability, and of each line to be along each direction, shape (3, n)."""
         sight = self._through(pose.camera)
-        each = self.shares[:, None] * _student(sight.misses(pose.directions), sigmas)
+        each = self.shares[:, None] * student(sight.misses(pose.directions), sigmas)
         each[:2] *= sight.bearings @ pose.rotation[:, 2] < -LOWEST
         density = each.sum(axis=0) + (1.0 - self.shares.sum()) / np.pi
         known = np.append(self.prior.deviations(pose.camera), pose.askew_rad / ASKEW_RAD)
@@ -139,8 +134,8 @@ class _Mixture:
     def fit_scale(self, members: np.ndarray, misses: np.ndarray, sigmas: np.ndarray) -> None:
         """One round of maximisation for the scale."""
         squared, held = (misses / sigmas) ** 2, members * self.weights
-        robust = held * _robust(misses, sigmas) * squared
-        self.scale *= float(np.sqrt(robust.sum() / max(held.sum(), 1e-12)))
+        trusted = held * robust(misses, sigmas) * squared
+        self.scale *= float(np.sqrt(trusted.sum() / max(held.sum(), 1e-12)))
         self.scale = float(np.clip(self.scale, LEAST_SCALE, LARGEST_SCALE))
 
     def linearised(self, pose: _Pose, members: np.ndarray, sigmas: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -148,7 +143,7 @@ class _Mixture:
         here, size = self.misses(pose), len(self.prior.free) + 4
         slopes = np.stack([folded(self.misses(pose.moved(DIFFERENCE * unit, self.prior)) - here) / DIFFERENCE
                            for unit in np.eye(size)], axis=-1)
-        pull = members * _robust(here, sigmas) / sigmas**2
+        pull = members * robust(here, sigmas) / sigmas**2
         return (((pull * here)[..., None] * slopes).sum(axis=0),
                 np.einsum('kn,kni,knj->nij', pull, slopes, slopes))
 
@@ -161,13 +156,8 @@ class _Mixture:
         return gradient, information
 
 
-def _robust(misses: np.ndarray, sigmas: np.ndarray) -> np.ndarray:
-    """Weight of each miss by Student's distribution."""
-    return (FREEDOM + 1.0) / (FREEDOM + (misses / sigmas) ** 2)
-
-
 def settled_grid(lines: Lines, prior: LensPrior, camera: Camera, rotation: np.ndarray,
-             widening: tuple[float, ...]) -> Grid:
+                 widening: tuple[float, ...]) -> Grid:
     """Solve from a start: shares, scale, and damped Gauss-Newton steps on the mixture's probability."""
     mixture, pose = _Mixture(lines, prior), _Pose(camera, rotation)
     for widened in widening:

@@ -11,12 +11,13 @@ from scipy.spatial.transform import Rotation
 from autocalib_ros.calibration import Reason
 from autocalib_ros.config import GateOptions
 from autocalib_ros.estimation.doubts import view_doubt
-from autocalib_ros.estimation.great_circles import TrackSet, rays_of
+from autocalib_ros.estimation.great_circles import TrackSet
+from autocalib_ros.estimation.ground_plane import undirected_deg
 from autocalib_ros.estimation.joint import JointFit, judged_at
 from autocalib_ros.estimation.lens_prior import LensPrior
 from autocalib_ros.estimation.line_mixture import ASKEW_RAD, Grid
 from autocalib_ros.estimation.markings import beside_traffic, square_grids, square_grids_near
-from autocalib_ros.estimation.road_lines import Lines, lines_on_road
+from autocalib_ros.estimation.road_lines import Lines, Sight, lines_on_road
 from autocalib_ros.estimation.state import Setting, State, Steps
 from autocalib_ros.estimation.windows import no_windows
 from autocalib_ros.evidence import Evidence
@@ -41,15 +42,10 @@ def fit_to_markings(evidence: Evidence, tracks: TrackSet, priors: list[LensPrior
     """Estimate lens and plane from the lines on the road; with what was assumed in words, or a reason why not."""
     every = lines_on_road(evidence)
     grids = square_grids(every, priors)
-    if not grids:
-        return _none(f'there are {len(every)}')
-    nearer = beside_traffic(every, grids[0], evidence)
-    if nearer is None:
-        return _none('too few are beside the traffic')
+    nearer = _undoubted(every, grids, evidence, gate, LEAST_PLACES)
+    if isinstance(nearer, Reason):
+        return nearer
     lines, best = nearer
-    doubt = _ambiguity(every, grids, gate) or _axes_doubt(lines, best, LEAST_PLACES)
-    if doubt:
-        return doubt
     state = State(best.camera, best.rotation, np.array([0.0, np.pi / 2 + best.askew_rad]))
     fit = judged_at(state, tracks, replace(setting, prior=best.prior, crossing_rad=None), best.covariance)
     if not fit.focal_sigma <= gate.max_sigma_focal_rel:
@@ -66,13 +62,10 @@ def sharpened(fit: JointFit, evidence: Evidence, tracks: TrackSet, prior: LensPr
     up, state = _upward(fit), fit.state
     every = lines_on_road(evidence)
     grids = square_grids_near(every, prior, state.camera, up)
-    nearer = beside_traffic(every, grids[0], evidence) if grids else None
-    if nearer is None:
-        return _none('too few are beside the traffic')
+    nearer = _undoubted(every, grids, evidence, gate, CONFIRMED_PLACES)
+    if isinstance(nearer, Reason):
+        return nearer
     lines, grid = nearer
-    doubt = _ambiguity(every, grids, gate) or _axes_doubt(lines, grid, CONFIRMED_PLACES)
-    if doubt:
-        return doubt
     setting = replace(fit.problem.setting, prior=prior, windows=no_windows(), bundle=None)
     road, normal = state.rotation[:, 0], grid.rotation[:, 2] * np.sign(state.rotation[:, 2] @ grid.rotation[:, 2])
     along = road - (road @ normal) * normal
@@ -111,6 +104,17 @@ def with_lens_known(fit: JointFit) -> JointFit:
     return replace(fit, covariance=covariance)
 
 
+def _undoubted(every: Lines, grids: list[Grid], evidence: Evidence, gate: GateOptions,
+               least_places: int) -> tuple[Lines, Grid] | Reason:
+    """Return the lines beside traffic and the best grid by them, or what speaks against it."""
+    if not grids:
+        return _none(f'there are {len(every)}')
+    nearer = beside_traffic(every, grids[0], evidence)
+    if nearer is None:
+        return _none('too few are beside the traffic')
+    return _ambiguity(every, grids, gate) or _axes_doubt(*nearer, least_places) or nearer
+
+
 def _ambiguity(lines: Lines, grids: list[Grid], gate: GateOptions) -> Reason | None:
     """Say that another plane or lens suits the lines as well, if so."""
     best = grids[0]
@@ -131,10 +135,8 @@ def _apart_deg(lines: Lines, one: Grid, other: Grid) -> float:
 
     A principal point farther down is an axis that looks farther down: that is no other plane.
     """
-    middles = (lines.ends_px[:, :2] + lines.ends_px[:, 2:]) / 2
-    turn, _ = Rotation.align_vectors(*(rays_of(grid.camera, middles).bearings for grid in (one, other)))
-    cosine = abs(float(one.rotation[:, 2] @ turn.apply(other.rotation[:, 2])))
-    return float(np.degrees(np.arccos(min(cosine, 1.0))))
+    turn, _ = Rotation.align_vectors(*(Sight.through(grid.camera, lines.ends_px).bearings for grid in (one, other)))
+    return undirected_deg(one.rotation[:, 2], turn.apply(other.rotation[:, 2]))
 
 
 def _axes_doubt(lines: Lines, grid: Grid, least_places: int) -> Reason | None:

@@ -12,6 +12,7 @@ from autocalib_ros.config import GateOptions, JointOptions
 from autocalib_ros.estimation.differences import differences
 from autocalib_ros.estimation.doubts import halves_doubt, lens_doubt, plane_doubt, traffic_doubt
 from autocalib_ros.estimation.great_circles import TrackSet, evenly
+from autocalib_ros.estimation.ground_plane import undirected_deg
 from autocalib_ros.estimation.held import lens_assumptions, with_k2_if_asked_for, with_what_can_be_told
 from autocalib_ros.estimation.joint import (
     UNMODELLED_FOCAL,
@@ -235,19 +236,14 @@ def agreed_by(painted: JointFit, told: list[Plane]) -> tuple[str, ...] | Reason:
 def _apart(painted: JointFit, told: Plane) -> tuple[float, float, float, str]:
     """Angle of what the traffic tells from the lines, its own standard deviation, that of the lines, and its name."""
     if told.fit.plane_known:
-        angle = _angle_deg(painted.state.rotation[:, 2], told.normal(told.fit.state))
+        angle = undirected_deg(painted.state.rotation[:, 2], told.normal(told.fit.state))
         return (angle, told.worst_sigma_deg, Plane(painted, 1.0).worst_sigma_deg,
                 'ground normals of the traffic and of the lines')
     road = told.fit.state.directions[0]
-    angle = min(_angle_deg(axis, road) for axis in painted.state.directions)
+    angle = min(undirected_deg(axis, road) for axis in painted.state.directions)
     own, other = (float(np.degrees(np.linalg.norm(fit.sigma(lambda state: state.directions[0]))))
                   for fit in (told.fit, painted))
     return angle, own, other, 'the road of the traffic and the lines along it'
-
-
-def _angle_deg(one: np.ndarray, other: np.ndarray) -> float:
-    """Angle between two unit vectors (3,), whichever way they point, degrees."""
-    return float(np.degrees(np.arccos(min(abs(float(one @ other)), 1.0))))
 
 
 def _from_straight(traffic: _Traffic, setting: Setting) -> Solution | Reason:
@@ -340,7 +336,7 @@ def _with_lane_changes(found: Solution, tracks: TrackSet, traffic: _Traffic) -> 
     about_deg = float(np.degrees(fit.sigma(lambda state: np.array([np.cross(normal, state.rotation[:, 2]) @ road]))[0]))
     words, checks = f'{vehicles} vehicles that change lanes: +- {about_deg:.1f} degrees about the road', found.checks
     if found.no_plane is None:
-        apart_deg = _angle_deg(normal, found.plane.normal(found.fit.state))
+        apart_deg = undirected_deg(normal, found.plane.normal(found.fit.state))
         sigma_deg = float(np.hypot(plane.worst_sigma_deg, found.plane.worst_sigma_deg))
         if apart_deg > max(AGREE_SIGMAS * sigma_deg, AGREE_DEG):
             return replace(found, no_plane=Reason(
