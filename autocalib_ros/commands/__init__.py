@@ -5,3 +5,5 @@ Everything heavy (OpenCV, SciPy, rosbags, matplotlib) is imported where it is us
 
 DONE, WRONG_USE, REFUSED, INTERRUPTED = 0, 2, 3, 130
 """Exit statuses: calibrated, or else what was asked for; wrong usage or unreadable input; refused; stopped by hand."""
+MOVED = 3
+"""Exit status where golden evidence gives other values than are expected of it."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from autocalib_ros.commands import DONE
+from autocalib_ros.commands import DONE, MOVED
 
 HELP = 'measure what the program costs on this machine'
 DESCRIPTION = None
@@ -25,6 +25,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     accuracy.add_argument('--jobs', type=int, default=1, metavar='J', help='processes (default: %(default)s)')
     accuracy.add_argument('--seed', type=int, default=0, metavar='S', help='seed of the draws (default: %(default)s)')
     accuracy.add_argument('--out', type=Path, metavar='FILE', help='CSV to write, one row a run')
+    golden = what.add_parser(
+        'golden', help='whether saved evidence still gives the verdicts and numbers that are expected of it',
+        description='Solve saved evidence and print what moved. Exit status 0 when nothing did, 3 when something did, '
+                    'also where --update took it for expected.')
+    golden.add_argument('folder', metavar='FOLDER', nargs='?', type=Path, default=Path('tests/golden'),
+                        help='evidence and expected.json (default: %(default)s)')
+    golden.add_argument('--only', nargs='+', default=[], metavar='NAME', help='cases to solve (default: all)')
+    golden.add_argument('--tolerance', type=float, default=0.1, metavar='T',
+                        help='a number has moved when it differs by more than this part of its stated standard '
+                             'deviation (default: %(default)s)')
+    golden.add_argument('--exact', action='store_true', help='instead: when it differs in its last digit')
+    golden.add_argument('--update', action='store_true',
+                        help='of cases in which something moved, expect what was found from now on')
+    golden.add_argument('--jobs', type=int, default=1, metavar='J', help='processes (default: %(default)s)')
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -34,6 +48,15 @@ def run(arguments: argparse.Namespace) -> int:
 
         print(cost(arguments.source, arguments.duration))
         return DONE
+    if arguments.what == 'golden':
+        from autocalib_ros.offline import golden
+
+        measured = golden.measure(arguments.folder, arguments.only, tolerance=arguments.tolerance,
+                                  exact=arguments.exact, jobs=arguments.jobs)
+        print('\n'.join(golden.lines(measured)))
+        if arguments.update:
+            golden.update(arguments.folder, measured)
+        return MOVED if measured.moved else DONE
     from autocalib_ros.offline.accuracy import measure
     from autocalib_ros.offline.accuracy_table import tables
 

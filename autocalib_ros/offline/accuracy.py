@@ -11,10 +11,8 @@ import math
 import time
 import zlib
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
-from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -29,10 +27,10 @@ from autocalib_ros.estimation.ground_plane import angles_deg, tilt_and_roll_deg
 from autocalib_ros.evidence import Evidence
 from autocalib_ros.offline.accuracy_families import families
 from autocalib_ros.offline.against_truth import NEAR_M, distances_error
+from autocalib_ros.offline.processes import in_order
 from autocalib_ros.offline.progress import progress_bar
 from autocalib_ros.offline.synthetic_evidence import Junction
 from autocalib_ros.pictures.views import ground_to_image, image_to_ground
-from autocalib_ros.threads import use_one_thread_for_linear_algebra
 
 RAY_GRID = (49, 28)
 GROUND_GRID = 5
@@ -88,7 +86,7 @@ def measure(names: Sequence[str], methods: Sequence[str], runs: int, *, seed: in
     tasks = [Task(family, seed, run, tuple(methods)) for family in known(names) for run in range(runs)]
     done: list[Run] = []
     with csv_rows(out) as write, progress_bar(len(tasks), 'draws', 'accuracy', quiet=quiet) as progress:
-        for count, results in enumerate(_results(tasks, jobs), 1):
+        for count, results in enumerate(in_order(run_task, tasks, jobs), 1):
             write(results)
             done += results
             progress.update_to(count, results[-1].family)
@@ -102,19 +100,6 @@ def known(names: Sequence[str]) -> list[str]:
         if name not in every:
             raise UsageError(f"no family of evidence is called '{name}'; there are {', '.join(every)}")
     return list(names) or every
-
-
-def _results(tasks: Sequence[Task], jobs: int) -> Iterator[list[Run]]:
-    """Yield the results in the order of the tasks, whatever the number of processes."""
-    if jobs == 1:
-        yield from map(run_task, tasks)
-        return
-    # spawned, not forked: a worker has to set its threads before numpy comes in
-    with ProcessPoolExecutor(jobs, get_context('spawn'), use_one_thread_for_linear_algebra) as pool:
-        try:
-            yield from pool.map(run_task, tasks)
-        finally:
-            pool.shutdown(cancel_futures=True)
 
 
 def run_task(task: Task) -> list[Run]:

@@ -1,0 +1,26 @@
+"""Work that is shared by processes, with results in the order of the tasks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from typing import TypeVar
+
+from autocalib_ros.threads import use_one_thread_for_linear_algebra
+
+Task = TypeVar('Task')
+Result = TypeVar('Result')
+
+
+def in_order(work: Callable[[Task], Result], tasks: Sequence[Task], jobs: int) -> Iterator[Result]:
+    """Yield the results in the order of the tasks, whatever the number of processes."""
+    if jobs == 1:
+        yield from map(work, tasks)
+        return
+    # spawned, not forked: a worker has to set its threads before numpy comes in
+    with ProcessPoolExecutor(jobs, get_context('spawn'), use_one_thread_for_linear_algebra) as pool:
+        try:
+            yield from pool.map(work, tasks)
+        finally:
+            pool.shutdown(cancel_futures=True)
