@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from autocalib_ros.camera import Camera
 from autocalib_ros.camera_info import CameraInfo, camera_info
-from autocalib_ros.files import write_atomically
+from autocalib_ros.util.files import write_atomically
 
 JSON_VERSION = 1
 GROUND_DISTANCES_M = (10.0, 20.0, 40.0)

@@ -15,7 +15,6 @@ import yaml
 
 from autocalib_ros.camera import Camera, Lens
 from autocalib_ros.errors import AutocalibError, InputError, UsageError
-from autocalib_ros.files import write_atomically
 from autocalib_ros.opencv_lens import (
     MAX_ERROR_PX,
     MAX_SLOPE_ANGLE_RAD,
@@ -24,6 +23,7 @@ from autocalib_ros.opencv_lens import (
     nearest_coefficients,
     seen_angle_rad,
 )
+from autocalib_ros.util.files import write_atomically
 
 EQUIDISTANT_FLOOR = 1e-9
 """image_proc and image_geometry take an all-zero D for "no distortion" whatever the model is called."""

@@ -25,7 +25,7 @@ from autocalib_ros.commands import (
     topview,
 )
 from autocalib_ros.errors import AutocalibError, UsageError
-from autocalib_ros.threads import use_one_thread_for_linear_algebra
+from autocalib_ros.util.threads import use_one_thread_for_linear_algebra
 
 COMMANDS = {'replay': replay, 'evidence': evidence, 'compare': compare, 'rectify': rectify, 'topview': topview,
             'picture': picture, 'simulate': simulate, 'demo': demo, 'benchmark': benchmark}

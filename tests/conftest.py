@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from autocalib_ros.threads import use_one_thread_for_linear_algebra
+from autocalib_ros.util.threads import use_one_thread_for_linear_algebra
 from stored import quick_folder
 
 use_one_thread_for_linear_algebra()

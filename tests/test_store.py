@@ -215,7 +215,7 @@ def test_full_disk_leaves_what_was_there(store, monkeypatch):
     def full(handle):
         raise OSError(28, 'No space left on device')
 
-    monkeypatch.setattr('autocalib_ros.files.os.fsync', full)
+    monkeypatch.setattr('autocalib_ros.util.files.os.fsync', full)
     with pytest.raises(InputError, match='No space left on device'):
         store.save(THIRD)
     monkeypatch.undo()

@@ -21,11 +21,11 @@ from autocalib_ros.config import Options
 from autocalib_ros.errors import AutocalibError, InputError, UsageError
 from autocalib_ros.estimation.ground_plane import tilt_and_roll_deg
 from autocalib_ros.evidence import Evidence
-from autocalib_ros.files import write_atomically
 from autocalib_ros.offline.params import options_with
 from autocalib_ros.offline.processes import in_order
 from autocalib_ros.offline.progress import progress_bar
 from autocalib_ros.offline.terminal import aligned
+from autocalib_ros.util.files import write_atomically
 
 EXPECTED = 'expected.json'
 WORDS = ('state', 'grade', 'refusal', 'ground_refusal', 'roads', 'people')

@@ -7,7 +7,7 @@ from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from typing import TypeVar
 
-from autocalib_ros.threads import use_one_thread_for_linear_algebra
+from autocalib_ros.util.threads import use_one_thread_for_linear_algebra
 
 Task = TypeVar('Task')
 Result = TypeVar('Result')

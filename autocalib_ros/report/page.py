@@ -15,7 +15,6 @@ from matplotlib.figure import Figure
 from autocalib_ros import __version__
 from autocalib_ros.calibration import Calibration, Refusal
 from autocalib_ros.errors import InputError
-from autocalib_ros.files import write_atomically
 from autocalib_ros.report import (
     direction_figures,
     lens_figures,
@@ -28,6 +27,7 @@ from autocalib_ros.report import (
 from autocalib_ros.report.canvas import STYLE, jpeg, png, rendered
 from autocalib_ros.report.scene import Scene
 from autocalib_ros.report.words import file_rows, how_sure, needs, next_step, number_rows, verdict
+from autocalib_ros.util.files import write_atomically
 
 JPEG_SAVES = 1.5
 """A diagram is sharper as PNG, and hardly larger."""

@@ -14,7 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
 from autocalib_ros.errors import AutocalibError, UsageError
-from autocalib_ros.threads import use_one_thread_for_linear_algebra
+from autocalib_ros.util.threads import use_one_thread_for_linear_algebra
 
 if TYPE_CHECKING:
     from autocalib_ros.ros.autocalib_node import AutocalibNode

@@ -151,7 +151,7 @@ def quantiles(values: list[float]) -> dict:
 
 def run_node(options: argparse.Namespace) -> dict:
     """Run a node with clocks in it until it is interrupted."""
-    from autocalib_ros.threads import use_one_thread_for_linear_algebra
+    from autocalib_ros.util.threads import use_one_thread_for_linear_algebra
     use_one_thread_for_linear_algebra()
     from autocalib_ros.ros import autocalib_node, diagnostics, image_input, node, pipeline, solver
     timed, latencies_ms, solved_s, ends = Timed(), [], [], []

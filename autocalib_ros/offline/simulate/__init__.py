@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from .command import add_arguments, options_from, run
-from .options import SimulationOptions
-from .simulation import Simulation
+from autocalib_ros.offline.simulate.command import add_arguments, options_from, run
+from autocalib_ros.offline.simulate.options import SimulationOptions
+from autocalib_ros.offline.simulate.simulation import Simulation
 
 __all__ = [
     'Simulation', 'SimulationOptions', 'add_arguments', 'options_from', 'run', 'write_bag'
@@ -23,6 +23,6 @@ def write_bag(
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
     """Simulate a recording into a new bag folder; see `bag.write_bag`."""
-    from .bag import write_bag as write  # rosbags is needed for nothing else
+    from autocalib_ros.offline.simulate.bag import write_bag as write  # rosbags is needed for nothing else
 
     return write(path, options, workers=workers, overwrite=overwrite, progress=progress)

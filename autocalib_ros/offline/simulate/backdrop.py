@@ -5,10 +5,10 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from .faces import SAMPLES, Canvas, Faces
-from .ground import GroundMap
-from .lens import CameraPose
-from .palette import Palette
+from autocalib_ros.offline.simulate.faces import SAMPLES, Canvas, Faces
+from autocalib_ros.offline.simulate.ground import GroundMap
+from autocalib_ros.offline.simulate.lens import CameraPose
+from autocalib_ros.offline.simulate.palette import Palette
 
 _HAZE_M = 260.0
 

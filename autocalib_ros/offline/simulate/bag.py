@@ -20,9 +20,8 @@ from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
 from autocalib_ros.errors import InputError, UsageError
-
-from .options import SimulationOptions
-from .simulation import Simulation
+from autocalib_ros.offline.simulate.options import SimulationOptions
+from autocalib_ros.offline.simulate.simulation import Simulation
 
 TRUTH_NAME = 'truth.json'
 _BAG_VERSION: Literal[9] = 9

@@ -7,10 +7,10 @@ from functools import lru_cache
 
 import numpy as np
 
-from . import paint
-from .faces import Faces, Texture
-from .palette import palette_of
-from .shapes import SHAPES, Outline, Part, Shape
+from autocalib_ros.offline.simulate import paint
+from autocalib_ros.offline.simulate.faces import Faces, Texture
+from autocalib_ros.offline.simulate.palette import palette_of
+from autocalib_ros.offline.simulate.shapes import SHAPES, Outline, Part, Shape
 
 FINE, COARSE = 80, 40  # texels to the metre
 _BANK = 1024

@@ -8,8 +8,7 @@ from dataclasses import MISSING, fields
 from typing import Any
 
 from autocalib_ros.errors import UsageError
-
-from .options import SCENES, SHUTTER_SHOWS, STORAGES, SimulationOptions
+from autocalib_ros.offline.simulate.options import SCENES, SHUTTER_SHOWS, STORAGES, SimulationOptions
 
 _UNIT = re.compile(r'_(px|deg|m|s|hz)$')
 _BY_HAND = ('width_px', 'height_px', 'k')
@@ -49,8 +48,7 @@ def options_from(args: argparse.Namespace) -> SimulationOptions:
 def run(args: argparse.Namespace) -> int:
     """Write the bag; return the exit status."""
     from autocalib_ros.offline.progress import progress_bar
-
-    from .bag import TRUTH_NAME, write_bag
+    from autocalib_ros.offline.simulate.bag import TRUTH_NAME, write_bag
 
     options = options_from(args)
     with progress_bar(options.frame_count, unit='frame', label='simulating') as bar:

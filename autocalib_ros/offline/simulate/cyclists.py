@@ -8,11 +8,11 @@ from functools import lru_cache
 
 import numpy as np
 
-from . import paint
-from .faces import Faces, Texture
-from .network import Network, Road
-from .options import SimulationOptions
-from .palette import palette_of
+from autocalib_ros.offline.simulate import paint
+from autocalib_ros.offline.simulate.faces import Faces, Texture
+from autocalib_ros.offline.simulate.network import Network, Road
+from autocalib_ros.offline.simulate.options import SimulationOptions
+from autocalib_ros.offline.simulate.palette import palette_of
 
 _REACH_M = 45.0  # from the middle of the network, either way
 _FROM_KERB_M = 0.6

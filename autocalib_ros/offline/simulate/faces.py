@@ -16,7 +16,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from .lens import CameraPose, Lens
+from autocalib_ros.offline.simulate.lens import CameraPose, Lens
 
 NO_MAP: Any = None  # to cv2.remap: its first map holds x and y; the stubs know no None
 SAMPLES = 2  # per pixel and axis

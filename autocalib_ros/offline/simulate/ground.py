@@ -8,9 +8,9 @@ from functools import partial, reduce
 import cv2
 import numpy as np
 
-from . import paint
-from .network import CROSSING_WIDTH_M, Network, Road, Roundabout
-from .palette import Palette
+from autocalib_ros.offline.simulate import paint
+from autocalib_ros.offline.simulate.network import CROSSING_WIDTH_M, Network, Road, Roundabout
+from autocalib_ros.offline.simulate.palette import Palette
 
 PAVEMENT_M = 3.2
 KERB_M = 0.25

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from .network import (
+from autocalib_ros.offline.simulate.network import (
     ARM_LENGTH_M,
     CROSSING_WIDTH_M,
     LANE_WIDTH_M,
@@ -12,7 +12,7 @@ from .network import (
     Route,
     straight_road,
 )
-from .paths import Path, corner, joined, line, tangent_per_radius
+from autocalib_ros.offline.simulate.paths import Path, corner, joined, line, tangent_per_radius
 
 RIGHT_RADIUS_M = 8.0
 """About the same point as the kerb of the corner."""

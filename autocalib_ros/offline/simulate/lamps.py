@@ -8,12 +8,12 @@ from functools import lru_cache
 
 import numpy as np
 
-from .faces import SAMPLES, Canvas, Faces, Texture
-from .lens import CameraPose
-from .paint import mixed
-from .sensor import add_glow
-from .shapes import SHAPES
-from .vehicles import Vehicle, VehicleState
+from autocalib_ros.offline.simulate.faces import SAMPLES, Canvas, Faces, Texture
+from autocalib_ros.offline.simulate.lens import CameraPose
+from autocalib_ros.offline.simulate.paint import mixed
+from autocalib_ros.offline.simulate.sensor import add_glow
+from autocalib_ros.offline.simulate.shapes import SHAPES
+from autocalib_ros.offline.simulate.vehicles import Vehicle, VehicleState
 
 _HEAD = (215, 240, 255)
 _TAIL = (40, 30, 230)

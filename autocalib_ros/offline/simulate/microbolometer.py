@@ -7,7 +7,7 @@ import math
 import cv2
 import numpy as np
 
-from .options import SimulationOptions
+from autocalib_ros.offline.simulate.options import SimulationOptions
 
 COUNTS_PER_LEVEL = 8.0
 """Counts to one grey level of the palette: at 25 counts a kelvin, which is usual, engines are 19 K above the road."""

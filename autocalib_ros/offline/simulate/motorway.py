@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from .network import Network, Route, straight_road
-from .paths import Path, lane_change, line
+from autocalib_ros.offline.simulate.network import Network, Route, straight_road
+from autocalib_ros.offline.simulate.paths import Path, lane_change, line
 
 MOTORWAY_LANE_M = 3.6
 MOTORWAY_REACH_M = 150.0

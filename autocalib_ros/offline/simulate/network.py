@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import cKDTree
 
-from .paths import Path, Piece
+from autocalib_ros.offline.simulate.paths import Path, Piece
 
 LANE_WIDTH_M = 3.2
 RURAL_LANE_M = 3.5

@@ -7,8 +7,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 from autocalib_ros.errors import UsageError
-
-from .lens import Lens
+from autocalib_ros.offline.simulate.lens import Lens
 
 SCENES = ('junction', 'road', 'highway', 'bend', 'roundabout', 'skew', 'tee', 'sparse')
 SQUARE_DEG = 90.0

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import cv2
 import numpy as np
 
-from .palette import Colour
+from autocalib_ros.offline.simulate.palette import Colour
 
 _SHIFT = 4  # fractional bits of the drawing functions of OpenCV
 

@@ -8,11 +8,11 @@ from functools import lru_cache
 
 import numpy as np
 
-from . import paint
-from .faces import Faces, Texture
-from .network import CROSSING_WIDTH_M, Network, Road
-from .options import SimulationOptions
-from .palette import palette_of
+from autocalib_ros.offline.simulate import paint
+from autocalib_ros.offline.simulate.faces import Faces, Texture
+from autocalib_ros.offline.simulate.network import CROSSING_WIDTH_M, Network, Road
+from autocalib_ros.offline.simulate.options import SimulationOptions
+from autocalib_ros.offline.simulate.palette import palette_of
 
 _WALK_RANGE_M = 45.0
 

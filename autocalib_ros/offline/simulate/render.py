@@ -9,22 +9,22 @@ from itertools import zip_longest
 import cv2
 import numpy as np
 
-from . import bodies, cyclists, lamps, people, sensor
-from .backdrop import draw_backdrop
-from .bodies import body_of, shadow_of
-from .cyclists import Cyclist
-from .faces import NO_MAP, SAMPLES, Canvas, Drawing, Faces, Window
-from .ground import paint_ground
-from .lens import CameraPose, Lens
-from .microbolometer import Microbolometer
-from .network import Network
-from .options import SimulationOptions
-from .palette import palette_of
-from .people import Person
-from .scenery import lamp_places, scenery_of
-from .swaying import Roadside
-from .vehicles import Vehicle, VehicleState
-from .weather import View, Weather
+from autocalib_ros.offline.simulate import bodies, cyclists, lamps, people, sensor
+from autocalib_ros.offline.simulate.backdrop import draw_backdrop
+from autocalib_ros.offline.simulate.bodies import body_of, shadow_of
+from autocalib_ros.offline.simulate.cyclists import Cyclist
+from autocalib_ros.offline.simulate.faces import NO_MAP, SAMPLES, Canvas, Drawing, Faces, Window
+from autocalib_ros.offline.simulate.ground import paint_ground
+from autocalib_ros.offline.simulate.lens import CameraPose, Lens
+from autocalib_ros.offline.simulate.microbolometer import Microbolometer
+from autocalib_ros.offline.simulate.network import Network
+from autocalib_ros.offline.simulate.options import SimulationOptions
+from autocalib_ros.offline.simulate.palette import palette_of
+from autocalib_ros.offline.simulate.people import Person
+from autocalib_ros.offline.simulate.scenery import lamp_places, scenery_of
+from autocalib_ros.offline.simulate.swaying import Roadside
+from autocalib_ros.offline.simulate.vehicles import Vehicle, VehicleState
+from autocalib_ros.offline.simulate.weather import View, Weather
 
 _DRAWN_RANGE_M = 130.0
 _REACH_M = 14.0  # a bus and its beam, from its middle

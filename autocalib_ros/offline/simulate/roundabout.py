@@ -6,8 +6,16 @@ import math
 
 from scipy.optimize import brentq
 
-from .network import ARM_LENGTH_M, RURAL_LANE_M, Circulation, Network, Roundabout, Route, straight_road
-from .paths import Path, Piece, chained, line
+from autocalib_ros.offline.simulate.network import (
+    ARM_LENGTH_M,
+    RURAL_LANE_M,
+    Circulation,
+    Network,
+    Roundabout,
+    Route,
+    straight_road,
+)
+from autocalib_ros.offline.simulate.paths import Path, Piece, chained, line
 
 RING_RADIUS_M = 19.0
 """Of the path on the ring of a roundabout."""

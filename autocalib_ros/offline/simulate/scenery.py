@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 
-from . import paint
-from .faces import Faces, Texture, join
-from .ground import PAVEMENT_M, edge_distance
-from .network import Network, Road
-from .palette import Palette
+from autocalib_ros.offline.simulate import paint
+from autocalib_ros.offline.simulate.faces import Faces, Texture, join
+from autocalib_ros.offline.simulate.ground import PAVEMENT_M, edge_distance
+from autocalib_ros.offline.simulate.network import Network, Road
+from autocalib_ros.offline.simulate.palette import Palette
 
 _TEXELS_PER_M = 24
 _PANEL_M = 6.0

@@ -5,12 +5,20 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from .junctions import junction
-from .motorway import highway
-from .network import ARM_LENGTH_M, LANE_WIDTH_M, RURAL_LANE_M, Network, Road, Route, straight_road
-from .options import SimulationOptions
-from .paths import Path, apex_per_radius, joined, line
-from .roundabout import roundabout
+from autocalib_ros.offline.simulate.junctions import junction
+from autocalib_ros.offline.simulate.motorway import highway
+from autocalib_ros.offline.simulate.network import (
+    ARM_LENGTH_M,
+    LANE_WIDTH_M,
+    RURAL_LANE_M,
+    Network,
+    Road,
+    Route,
+    straight_road,
+)
+from autocalib_ros.offline.simulate.options import SimulationOptions
+from autocalib_ros.offline.simulate.paths import Path, apex_per_radius, joined, line
+from autocalib_ros.offline.simulate.roundabout import roundabout
 
 SPARSE_SHARE = 1 / 15
 """Of the traffic of a junction: a vehicle every ten to fifteen seconds on all its arms together."""

@@ -7,8 +7,8 @@ import math
 import cv2
 import numpy as np
 
-from .microbolometer import NOISE_COUNTS
-from .options import SimulationOptions
+from autocalib_ros.offline.simulate.microbolometer import NOISE_COUNTS
+from autocalib_ros.offline.simulate.options import SimulationOptions
 
 _NOISE_MARGIN_PX = 64
 NIGHT_GAIN = 0.28

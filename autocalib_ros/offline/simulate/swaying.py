@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from . import paint
-from .faces import Faces, Texture
-from .ground import PAVEMENT_M, edge_distance
-from .lens import CameraPose, Lens
-from .network import Network
-from .palette import Palette
-from .scenery import crown, upright
+from autocalib_ros.offline.simulate import paint
+from autocalib_ros.offline.simulate.faces import Faces, Texture
+from autocalib_ros.offline.simulate.ground import PAVEMENT_M, edge_distance
+from autocalib_ros.offline.simulate.lens import CameraPose, Lens
+from autocalib_ros.offline.simulate.network import Network
+from autocalib_ros.offline.simulate.palette import Palette
+from autocalib_ros.offline.simulate.scenery import crown, upright
 
 TREES, FLAGS, SIGNS = 5, 3, 2
 _GUST_S = 9.0

@@ -12,11 +12,11 @@ from itertools import permutations
 
 import numpy as np
 
-from .network import CITY_SPEED_MPS, Network, Route
-from .options import SimulationOptions
-from .shapes import SHAPES, Shape
-from .signals import Signals
-from .vehicles import STEP_S, Traffic, Vehicle, Wander
+from autocalib_ros.offline.simulate.network import CITY_SPEED_MPS, Network, Route
+from autocalib_ros.offline.simulate.options import SimulationOptions
+from autocalib_ros.offline.simulate.shapes import SHAPES, Shape
+from autocalib_ros.offline.simulate.signals import Signals
+from autocalib_ros.offline.simulate.vehicles import STEP_S, Traffic, Vehicle, Wander
 
 WARM_UP_S = 52.0
 STANDSTILL_GAP_M = 2.0

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .ground import PAVEMENT_M, edge_distance
-from .lens import CameraPose
+from autocalib_ros.offline.simulate.ground import PAVEMENT_M, edge_distance
+from autocalib_ros.offline.simulate.lens import CameraPose
 
 if TYPE_CHECKING:
-    from .cyclists import Cyclist
-    from .people import Person
-    from .simulation import Simulation
-    from .vehicles import VehicleState
+    from autocalib_ros.offline.simulate.cyclists import Cyclist
+    from autocalib_ros.offline.simulate.people import Person
+    from autocalib_ros.offline.simulate.simulation import Simulation
+    from autocalib_ros.offline.simulate.vehicles import VehicleState
 
     _State = tuple[float, float, float, float]  # x, y, heading, speed
 

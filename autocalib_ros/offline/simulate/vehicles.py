@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .network import CITY_SPEED_MPS, Route
-from .shapes import SHAPES, Shape
+from autocalib_ros.offline.simulate.network import CITY_SPEED_MPS, Route
+from autocalib_ros.offline.simulate.shapes import SHAPES, Shape
 
 STEP_S = 0.1
 _TANGENT_M = 0.1  # short enough for the tangent of a path

@@ -9,15 +9,15 @@ from typing import Any
 import cv2
 import numpy as np
 
-from .faces import NO_MAP
-from .ground import edge_distance
-from .lamps import lamps_of
-from .lens import CameraPose, Lens
-from .network import Network
-from .options import SimulationOptions
-from .paint import grain
-from .sensor import add_glow
-from .vehicles import Vehicle, VehicleState
+from autocalib_ros.offline.simulate.faces import NO_MAP
+from autocalib_ros.offline.simulate.ground import edge_distance
+from autocalib_ros.offline.simulate.lamps import lamps_of
+from autocalib_ros.offline.simulate.lens import CameraPose, Lens
+from autocalib_ros.offline.simulate.network import Network
+from autocalib_ros.offline.simulate.options import SimulationOptions
+from autocalib_ros.offline.simulate.paint import grain
+from autocalib_ros.offline.simulate.sensor import add_glow
+from autocalib_ros.offline.simulate.vehicles import Vehicle, VehicleState
 
 _NEARER_M = 0.4
 """What is nearer than the ground behind it by more stands before it."""
