@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from autocalib_ros.camera import Camera
-from autocalib_ros.camera_info import CameraInfo, camera_info
+from autocalib_ros.lens.camera import Camera
+from autocalib_ros.lens.camera_info import CameraInfo, camera_info
 from autocalib_ros.util.files import write_atomically
 
 JSON_VERSION = 1

@@ -20,8 +20,8 @@ from autocalib_ros.calibration import (
     Reason,
     StandardDeviations,
 )
-from autocalib_ros.camera import Camera
 from autocalib_ros.errors import AutocalibError, InputError
+from autocalib_ros.lens.camera import Camera
 
 MAX_BYTES = 1_000_000
 """A calibration takes a few thousand bytes."""

@@ -8,8 +8,6 @@ from enum import Enum
 import numpy as np
 
 from autocalib_ros.calibration import GROUND_DISTANCES_M, Calibration, Figures, Reason, Refusal, StandardDeviations
-from autocalib_ros.camera import Camera
-from autocalib_ros.camera_info import ModelMisfit
 from autocalib_ros.config import Options
 from autocalib_ros.errors import InputError
 from autocalib_ros.estimation.evidence_gate import drift_limit_px, outlook, requirements, shortfall, unsteady
@@ -26,6 +24,8 @@ from autocalib_ros.estimation.straightness import paper_intrinsics
 from autocalib_ros.estimation.traffic import of_vehicles
 from autocalib_ros.estimation.vanishing_points import segment_orientations
 from autocalib_ros.evidence import Evidence, EvidenceBuffer, Kind
+from autocalib_ros.lens.camera import Camera
+from autocalib_ros.lens.camera_info import ModelMisfit
 from autocalib_ros.perception.detector.detector import VehicleDetector, open_detector
 from autocalib_ros.perception.observer import Observer
 

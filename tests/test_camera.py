@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from autocalib_ros.camera import Camera
 from autocalib_ros.errors import UsageError
+from autocalib_ros.lens.camera import Camera
 
 LENSES = {
     'equidistant': Camera(1280, 720, 560.0, (639.5, 359.5)),

@@ -12,8 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
-from autocalib_ros.camera import Camera
-from autocalib_ros.camera_info import (
+from autocalib_ros.errors import InputError
+from autocalib_ros.lens.camera import Camera
+from autocalib_ros.lens.camera_info import (
     RECTIFIED_LIMIT_DEG,
     ModelMisfit,
     Readout,
@@ -23,8 +24,7 @@ from autocalib_ros.camera_info import (
     rectified_matrix,
     write_camera_info_yaml,
 )
-from autocalib_ros.errors import InputError
-from autocalib_ros.opencv_lens import MAX_ERROR_PX, nearest_coefficients, seen_angle_rad
+from autocalib_ros.lens.opencv_lens import MAX_ERROR_PX, nearest_coefficients, seen_angle_rad
 
 WIDTH, HEIGHT = 1280, 720
 EQUIDISTANT, BARREL, NARROWING, TANGENT = (

@@ -24,12 +24,12 @@ from autocalib_ros.calibration import (
     to_json,
 )
 from autocalib_ros.calibrator import solve
-from autocalib_ros.camera import Camera
-from autocalib_ros.camera_info import camera_info
 from autocalib_ros.config import JointOptions, Options, ScaleOptions
 from autocalib_ros.errors import InputError
 from autocalib_ros.estimation.ground_plane import pixels_ahead
 from autocalib_ros.ground import Ground
+from autocalib_ros.lens.camera import Camera
+from autocalib_ros.lens.camera_info import camera_info
 from autocalib_ros.offline.simulate.options import SimulationOptions
 from autocalib_ros.offline.simulate.simulation import Simulation
 from autocalib_ros.offline.synthetic_evidence import Junction, pose, synthetic_evidence

@@ -11,10 +11,10 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from autocalib_ros.calibration import COVARIANCE_OF, calibration_json, write_calibration_json
-from autocalib_ros.camera import Camera
-from autocalib_ros.camera_info import rectified_matrix, write_camera_info_yaml
 from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.known_camera import KnownCamera, read_known_camera
+from autocalib_ros.lens.camera import Camera
+from autocalib_ros.lens.camera_info import rectified_matrix, write_camera_info_yaml
 from autocalib_ros.store import document
 from stored import calibration, stored
 

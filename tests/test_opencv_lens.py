@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from autocalib_ros.opencv_lens import distorted, undistorted
+from autocalib_ros.lens.opencv_lens import distorted, undistorted
 
 LENSES = [(0.0,) * 8, (-0.3, 0.1, 0.0, 0.0, -0.02, 0.0, 0.0, 0.0), (0.0, 0.0, 0.003, -0.001, 0.0, 0.0, 0.0, 0.0),
           (-0.3, 0.1, -0.002, 0.004, -0.02, 0.0, 0.0, 0.0), (1.2, 0.3, 0.001, 0.0005, 0.01, 1.5, 0.5, 0.03)]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from autocalib_ros.config import Options
 
 if TYPE_CHECKING:
-    from autocalib_ros.camera import Camera
+    from autocalib_ros.lens.camera import Camera
 
 
 def add_solving(parser: argparse.ArgumentParser) -> None:
@@ -74,7 +74,7 @@ def known_lens(arguments: argparse.Namespace, options: Options) -> Camera | None
         file = camera_info_file(arguments.params_file) or None
     if file is None:
         return None
-    from autocalib_ros.camera_info import camera_info, read_camera_info
+    from autocalib_ros.lens.camera_info import camera_info, read_camera_info
 
     lens = read_camera_info(file)
     camera_info(lens, options.distortion_model)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from autocalib_ros.config import Options
 
 if TYPE_CHECKING:
-    from autocalib_ros.camera import Camera
+    from autocalib_ros.lens.camera import Camera
     from autocalib_ros.offline.replay import ReplayResult
     from autocalib_ros.offline.sources import Source
     from autocalib_ros.perception.detector.detector import VehicleDetector

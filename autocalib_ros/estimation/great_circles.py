@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from autocalib_ros.camera import Camera
 from autocalib_ros.estimation.small_matrices import cross, dot, least_axes
 from autocalib_ros.evidence import Evidence
+from autocalib_ros.lens.camera import Camera
 
 SAMPLES = 10
 """Points of a track that enter a fit; more of one path add correlated noise, not information."""

@@ -12,8 +12,8 @@ from functools import cached_property
 
 import numpy as np
 
-from autocalib_ros.camera import Camera, image_centre
 from autocalib_ros.config import JointOptions
+from autocalib_ros.lens.camera import Camera, image_centre
 
 EQUIDISTANT = (0.0, 0.0, 0.0, 0.0)
 DISTORTION_FREE = (1 / 3, 2 / 15, 17 / 315, 62 / 2835)

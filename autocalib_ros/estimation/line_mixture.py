@@ -12,11 +12,11 @@ from functools import lru_cache, partial
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from autocalib_ros.camera import Camera
 from autocalib_ros.estimation.edge_mixture import folded, robust, student
 from autocalib_ros.estimation.lens_prior import LensPrior
 from autocalib_ros.estimation.road_lines import Lines, Sight
 from autocalib_ros.estimation.uncertainty import cluster_covariance
+from autocalib_ros.lens.camera import Camera
 
 END_PX, PAINTED_RAD = 0.4, np.radians(0.5)
 """Standard deviation of an end of a line, across it, in the image; and of painted lines about their direction on the

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from autocalib_ros.camera import Camera
+from autocalib_ros.lens.camera import Camera
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 
 from autocalib_ros.calibration import Calibration, Figures, Reason, StandardDeviations
-from autocalib_ros.camera import Camera
 from autocalib_ros.config import Options
 from autocalib_ros.estimation.ground_plane import (
     focal_from_vanishing_points,
@@ -20,6 +19,7 @@ from autocalib_ros.estimation.scale import known_scale
 from autocalib_ros.estimation.straightness import PaperIntrinsics
 from autocalib_ros.estimation.vanishing_points import Orientations, segment_orientations, voted_points
 from autocalib_ros.evidence import Evidence
+from autocalib_ros.lens.camera import Camera
 
 ASSUMPTIONS = ('equidistant lens with the principal point at the image centre', 'the two roads are perpendicular',
                'the published method gives no uncertainty')

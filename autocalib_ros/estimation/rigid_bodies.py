@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from autocalib_ros.camera import Camera
 from autocalib_ros.estimation.great_circles import rays_of
 from autocalib_ros.estimation.lives import Lives
+from autocalib_ros.lens.camera import Camera
 
 DIFFERENCE = 1e-6
 DAMPING = 1e-4

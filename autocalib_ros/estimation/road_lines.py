@@ -9,10 +9,10 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from autocalib_ros.camera import Camera
 from autocalib_ros.estimation.edge_mixture import folded
 from autocalib_ros.estimation.great_circles import along_px, earlier_ones, independence, rays_of
 from autocalib_ros.evidence import Evidence
+from autocalib_ros.lens.camera import Camera
 
 NEAR_TRAFFIC = 0.06
 """A line is on the road when all of it lies within this of a place where traffic was seen, share of the image width:

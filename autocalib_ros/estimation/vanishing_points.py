@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from autocalib_ros.camera import Camera
 from autocalib_ros.config import PaperOptions
 from autocalib_ros.estimation.great_circles import TrackSet, fit_circles, orthonormal_basis, rays_of
 from autocalib_ros.estimation.small_matrices import LAST, NEXT, cofactors, cross
+from autocalib_ros.lens.camera import Camera
 
 HYPOTHESES = 400
 PROBES = 200

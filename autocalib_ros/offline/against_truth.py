@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from autocalib_ros.calibration import GroundPlane
-from autocalib_ros.camera import Camera
 from autocalib_ros.errors import InputError
+from autocalib_ros.lens.camera import Camera
 from autocalib_ros.pictures.views import image_to_ground
 
 NEAR_M = 40.0

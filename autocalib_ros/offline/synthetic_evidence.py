@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from autocalib_ros.camera import Camera
 from autocalib_ros.config import BufferOptions
 from autocalib_ros.errors import UsageError
 from autocalib_ros.evidence import Evidence, EvidenceBuffer, Segments, Track
+from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.synthetic_traffic import (
     INTERVAL_S,
     LANE_M,

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
-from autocalib_ros.camera import Camera
+from autocalib_ros.lens.camera import Camera
 
 SWAY_STEP_S = 0.5
 SWAY_S = 3000.0

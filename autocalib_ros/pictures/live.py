@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from autocalib_ros.calibration import Calibration, GroundPlane
-from autocalib_ros.camera import Camera
+from autocalib_ros.lens.camera import Camera
 from autocalib_ros.pictures.drawing import (
     GREY,
     INK,

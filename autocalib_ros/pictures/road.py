@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from autocalib_ros.calibration import GROUND_DISTANCES_M, Calibration, GroundPlane
-from autocalib_ros.camera import Camera
 from autocalib_ros.ground import Ground
+from autocalib_ros.lens.camera import Camera
 from autocalib_ros.pictures.views import grid_lines, grid_step, road_in_image
 
 SIDE_POINTS = 12

@@ -10,9 +10,9 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from autocalib_ros.calibration import GroundPlane
-from autocalib_ros.camera import Camera, field_of_view_deg, pixel_grid
 from autocalib_ros.errors import InputError
 from autocalib_ros.known_camera import KnownCamera
+from autocalib_ros.lens.camera import Camera, field_of_view_deg, pixel_grid
 from autocalib_ros.pictures.drawing import bgr
 from autocalib_ros.pictures.plotted import INK, POINT, WHITE, Plotted, draw_plate, draw_scale_bar
 from autocalib_ros.pictures.views import (

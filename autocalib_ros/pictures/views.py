@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from autocalib_ros.calibration import GroundPlane
-from autocalib_ros.camera import Camera, Lens, pixel_grid
+from autocalib_ros.lens.camera import Camera, Lens, pixel_grid
 
 FARTHEST_HEIGHTS = 10.0
 """Views of the road end this many camera heights away: beyond, a pixel covers metres."""

@@ -6,9 +6,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from autocalib_ros.camera import Camera
-from autocalib_ros.camera_info import rectified_matrix
 from autocalib_ros.estimation.vanishing_points import segment_orientations
+from autocalib_ros.lens.camera import Camera
+from autocalib_ros.lens.camera_info import rectified_matrix
 from autocalib_ros.pictures.views import great_circle
 from autocalib_ros.report.canvas import INK, MUTED, WHITE, chart, draw_legend, draw_paths, image_axes, road_colour
 from autocalib_ros.report.scene import Scene

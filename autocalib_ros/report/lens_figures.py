@@ -7,8 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from autocalib_ros.calibration import Calibration
-from autocalib_ros.camera import Camera
-from autocalib_ros.camera_info import rectified_matrix
+from autocalib_ros.lens.camera import Camera
+from autocalib_ros.lens.camera_info import rectified_matrix
 from autocalib_ros.pictures.views import rectified_sources, resample
 from autocalib_ros.report.canvas import (
     INK,

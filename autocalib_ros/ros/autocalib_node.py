@@ -16,9 +16,9 @@ from rclpy.task import Future
 from std_srvs.srv import Trigger
 
 from autocalib_ros.calibration import Calibration, Refusal
-from autocalib_ros.camera_info import camera_info, read_camera_info
 from autocalib_ros.config import NodeOptions, Options
 from autocalib_ros.errors import AutocalibError
+from autocalib_ros.lens.camera_info import camera_info, read_camera_info
 from autocalib_ros.perception.detector.detector import open_detector
 from autocalib_ros.perception.images import ImageDecoder
 from autocalib_ros.ros.diagnostics import Diagnostics

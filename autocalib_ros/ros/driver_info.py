@@ -6,8 +6,8 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo
 
-from autocalib_ros.camera_info import readout_doubt
 from autocalib_ros.config import NodeOptions
+from autocalib_ros.lens.camera_info import readout_doubt
 from autocalib_ros.ros.messages import readout
 
 QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)

@@ -14,9 +14,9 @@ from sensor_msgs.msg import CameraInfo
 from visualization_msgs.msg import MarkerArray
 
 from autocalib_ros.calibration import Calibration
-from autocalib_ros.camera_info import CameraInfo as CameraInfoFields
 from autocalib_ros.config import NodeOptions, Options
 from autocalib_ros.errors import InputError
+from autocalib_ros.lens.camera_info import CameraInfo as CameraInfoFields
 from autocalib_ros.ros import messages
 from autocalib_ros.ros.driver_info import DriverInfo
 from autocalib_ros.ros.headers import DEFAULT_FRAME, Headers

@@ -22,10 +22,10 @@ import numpy as np
 
 from autocalib_ros.calibration import Calibration, Refusal
 from autocalib_ros.calibrator import AutoCalibrator, Intake, Progress
-from autocalib_ros.camera import Camera
 from autocalib_ros.config import Options
 from autocalib_ros.errors import AutocalibError
 from autocalib_ros.evidence import Evidence
+from autocalib_ros.lens.camera import Camera
 from autocalib_ros.perception.detector.detector import VehicleDetector
 
 WAITING_IMAGES = 8

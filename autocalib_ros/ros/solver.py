@@ -15,10 +15,10 @@ from multiprocessing.process import BaseProcess
 
 from autocalib_ros.calibration import Calibration, Refusal
 from autocalib_ros.calibrator import solve
-from autocalib_ros.camera import Camera
 from autocalib_ros.config import Options
 from autocalib_ros.errors import AutocalibError
 from autocalib_ros.evidence import Evidence
+from autocalib_ros.lens.camera import Camera
 
 Result = Calibration | Refusal
 NICENESS = 10

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from autocalib_ros.camera import Camera
 from autocalib_ros.estimation.great_circles import (
     Rays,
     fit_circles,
@@ -14,6 +13,7 @@ from autocalib_ros.estimation.great_circles import (
     rays_of,
     select_tracks,
 )
+from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.synthetic_evidence import Junction, synthetic_evidence
 
 CAMERA = Camera(1280, 720, 400.0, (639.5, 359.5), (0.02, 0.0, 0.0, 0.0))

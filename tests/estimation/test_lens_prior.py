@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from autocalib_ros.camera import Camera
 from autocalib_ros.config import JointOptions
 from autocalib_ros.errors import UsageError
 from autocalib_ros.estimation.lens_prior import known_lens, lens_priors
+from autocalib_ros.lens.camera import Camera
 
 SIZE = (1280, 720)
 

@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from autocalib_ros.calibration import Calibration, Reason
 from autocalib_ros.calibrator import solve
-from autocalib_ros.camera import Camera
 from autocalib_ros.config import GateOptions, JointOptions, Options
 from autocalib_ros.estimation import turning
 from autocalib_ros.estimation.differences import differences, expected_of_halves
@@ -25,6 +24,7 @@ from autocalib_ros.estimation.rigid_bodies import Bundle
 from autocalib_ros.estimation.state import Setting, State, Steps
 from autocalib_ros.estimation.windows import Instants, Windows, find_windows
 from autocalib_ros.evidence import Evidence
+from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.synthetic_evidence import Junction, synthetic_evidence
 from autocalib_ros.offline.synthetic_traffic import drive_arc
 

@@ -11,7 +11,6 @@ from painted_road import Paint, painted_lines, post_lines, random_lines
 
 from autocalib_ros.calibration import Calibration, GroundPlane, Reason, to_json
 from autocalib_ros.calibrator import solve
-from autocalib_ros.camera import Camera
 from autocalib_ros.config import GateOptions, JointOptions, Options
 from autocalib_ros.estimation import markings
 from autocalib_ros.estimation.great_circles import TrackSet, select_tracks
@@ -25,6 +24,7 @@ from autocalib_ros.estimation.road_lines import lines_on_road
 from autocalib_ros.estimation.solution import Solution, agreed_by, find_solution
 from autocalib_ros.estimation.state import Setting
 from autocalib_ros.evidence import Evidence
+from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.accuracy import distance_error
 from autocalib_ros.offline.accuracy_families import viewpoint
 from autocalib_ros.offline.synthetic_evidence import Junction, pose, synthetic_evidence

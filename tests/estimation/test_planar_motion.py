@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from autocalib_ros.camera import Camera
 from autocalib_ros.config import JointOptions
 from autocalib_ros.estimation.lens_prior import lens_priors
 from autocalib_ros.estimation.planar_motion import Motion, View, first_motion, on_course, settled
 from autocalib_ros.estimation.rows import MotionRows
 from autocalib_ros.estimation.state import Setting, State, Steps
 from autocalib_ros.estimation.windows import Windows
+from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.synthetic_evidence import pose
 
 CAMERA = Camera(1280, 720, 560.0, (645.0, 352.0), (0.01, 0.0, 0.0, 0.0))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from autocalib_ros.camera import Camera
 from autocalib_ros.config import PaperOptions
 from autocalib_ros.estimation.great_circles import select_tracks
 from autocalib_ros.estimation.straightness import (
@@ -15,6 +14,7 @@ from autocalib_ros.estimation.straightness import (
     paper_intrinsics,
     straightness_sweep,
 )
+from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.synthetic_evidence import Junction, synthetic_evidence
 
 STRAIGHT = Junction(turning_share=0.0, wander_m=0.0, noise_px=0.2)

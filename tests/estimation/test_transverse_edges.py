@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from autocalib_ros.calibration import Calibration
 from autocalib_ros.calibrator import solve
-from autocalib_ros.camera import Camera
 from autocalib_ros.config import GateOptions, JointOptions, Options
 from autocalib_ros.estimation.doubts import plane_doubt
 from autocalib_ros.estimation.edge_mixture import folded
@@ -20,6 +19,7 @@ from autocalib_ros.estimation.solution import Solution, find_solution
 from autocalib_ros.estimation.state import State
 from autocalib_ros.estimation.transverse_edges import RoadEdges, SquareVehicles, square_to
 from autocalib_ros.evidence import Evidence
+from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.synthetic_evidence import Junction, pose, synthetic_evidence
 
 CAMERA = Camera(1280, 720, 560.0, (639.5, 359.5))

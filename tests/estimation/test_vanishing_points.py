@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from autocalib_ros.camera import Camera
 from autocalib_ros.config import PaperOptions
 from autocalib_ros.estimation.great_circles import select_tracks
 from autocalib_ros.estimation.vanishing_points import (
@@ -14,6 +13,7 @@ from autocalib_ros.estimation.vanishing_points import (
     segment_orientations,
     voted_points,
 )
+from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.synthetic_evidence import Junction, pose, synthetic_evidence
 
 

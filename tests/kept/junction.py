@@ -16,9 +16,9 @@ from autocalib_ros.calibration import (
     Residuals,
     StandardDeviations,
 )
-from autocalib_ros.camera import Camera
 from autocalib_ros.config import BufferOptions
 from autocalib_ros.evidence import Evidence, EvidenceBuffer, Segments, Track
+from autocalib_ros.lens.camera import Camera
 
 SPEED_M_S = 10.0
 """Of every vehicle."""

@@ -20,8 +20,8 @@ from autocalib_ros.calibration import (
     PaperReport,
     StandardDeviations,
 )
-from autocalib_ros.camera import Camera
-from autocalib_ros.camera_info import camera_info
+from autocalib_ros.lens.camera import Camera
+from autocalib_ros.lens.camera_info import camera_info
 from autocalib_ros.store import Stored
 
 SIZE = (640, 360)

@@ -22,9 +22,9 @@ from autocalib_ros.calibration import (
     Refusal,
     StandardDeviations,
 )
-from autocalib_ros.camera import Camera
 from autocalib_ros.cli import main
 from autocalib_ros.errors import InputError
+from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.accuracy import (
     Run,
     Task,

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import yaml
 
-from autocalib_ros.camera import Camera
-from autocalib_ros.camera_info import read_camera_info, write_camera_info_yaml
 from autocalib_ros.cli import main
+from autocalib_ros.lens.camera import Camera
+from autocalib_ros.lens.camera_info import read_camera_info, write_camera_info_yaml
 from autocalib_ros.offline.synthetic_evidence import Junction, synthetic_evidence
 
 JUNCTION = Junction(noise_px=0.2, turning_share=0.0)

@@ -13,9 +13,9 @@ import pytest
 import yaml
 
 from autocalib_ros.calibration import GroundPlane, write_calibration_json
-from autocalib_ros.camera import Camera
-from autocalib_ros.camera_info import rectified_matrix, write_camera_info_yaml
 from autocalib_ros.cli import main
+from autocalib_ros.lens.camera import Camera
+from autocalib_ros.lens.camera_info import rectified_matrix, write_camera_info_yaml
 from autocalib_ros.offline import view_files
 from autocalib_ros.pictures.views import EMPTY_GREY, ground_to_image, image_to_ground
 from stored import LOOKS_ALONG, calibration, lens_only

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from autocalib_ros.calibration import Calibration, EvidenceSummary, GroundPlane, StandardDeviations
-from autocalib_ros.camera import Camera
+from autocalib_ros.lens.camera import Camera
 
 
 def looking_down(dip_deg: float) -> GroundPlane:

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from autocalib_ros.camera_info import camera_info
+from autocalib_ros.lens.camera_info import camera_info
 from autocalib_ros.pictures.drawing import Caption, bgr
 from autocalib_ros.pictures.live import (
     FOLLOWED,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from autocalib_ros.calibration import COVARIANCE_OF, GROUND_DISTANCES_M
-from autocalib_ros.camera import Camera
+from autocalib_ros.lens.camera import Camera
 from autocalib_ros.pictures.road import Grid, ellipses, enlargement, field_of_view
 
 HEIGHT_SIGMA_M = 0.1

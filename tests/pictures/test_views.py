@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from autocalib_ros.calibration import GroundPlane
-from autocalib_ros.camera import Camera
-from autocalib_ros.camera_info import rectified_matrix
+from autocalib_ros.lens.camera import Camera
+from autocalib_ros.lens.camera_info import rectified_matrix
 from autocalib_ros.pictures.views import (
     EMPTY_GREY,
     TopView,

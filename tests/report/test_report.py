@@ -15,7 +15,7 @@ from junction import SPEED_M_S, junction_evidence
 from matplotlib.text import Text
 
 from autocalib_ros.calibration import GroundPlane, Refusal, Residuals
-from autocalib_ros.camera_info import rectified_matrix
+from autocalib_ros.lens.camera_info import rectified_matrix
 from autocalib_ros.pictures.views import ground_to_image, image_to_ground, nice_length
 from autocalib_ros.report.lens_figures import in_undistorted, line_error_px
 from autocalib_ros.report.page import ENTRIES, write_report

@@ -5,7 +5,7 @@ import threading
 import pytest
 from sensor_msgs.srv import SetCameraInfo
 
-from autocalib_ros.camera_info import camera_info
+from autocalib_ros.lens.camera_info import camera_info
 from autocalib_ros.ros import driver_upload
 from autocalib_ros.standing import CalibrationState
 from bench import calibration, wait_for

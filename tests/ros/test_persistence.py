@@ -13,7 +13,7 @@ import pytest
 from geometry_msgs.msg import TransformStamped
 from sensor_msgs.msg import CameraInfo
 
-from autocalib_ros.camera_info import camera_info, read_camera_info
+from autocalib_ros.lens.camera_info import camera_info, read_camera_info
 from autocalib_ros.ros.messages import stamp_ns
 from autocalib_ros.standing import CalibrationState
 from autocalib_ros.store import Kind, Store, Stored

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from autocalib_ros.camera import Camera
 from autocalib_ros.config import Options
 from autocalib_ros.errors import InputError
+from autocalib_ros.lens.camera import Camera
 from autocalib_ros.ros.pipeline import WAITING_IMAGES, Pipeline
 from bench import PATIENCE_S, PIXELS, calibration, refusal, wait_for
 

@@ -7,7 +7,7 @@ import pytest
 
 from autocalib_ros.calibration import Calibration, EvidenceSummary, GroundPlane, Reason, StandardDeviations
 from autocalib_ros.calibrator import Progress
-from autocalib_ros.camera import Camera
+from autocalib_ros.lens.camera import Camera
 from autocalib_ros.ros.silence import Silence
 from autocalib_ros.ros.status import ERROR, OK, RATE_WINDOW_S, WARN, Counts, Recent, Situation, State, state_of, status
 

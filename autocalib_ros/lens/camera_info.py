@@ -13,9 +13,9 @@ from typing import Any, TypeVar
 import numpy as np
 import yaml
 
-from autocalib_ros.camera import Camera, Lens
 from autocalib_ros.errors import AutocalibError, InputError, UsageError
-from autocalib_ros.opencv_lens import (
+from autocalib_ros.lens.camera import Camera, Lens
+from autocalib_ros.lens.opencv_lens import (
     MAX_ERROR_PX,
     MAX_SLOPE_ANGLE_RAD,
     OpencvLens,

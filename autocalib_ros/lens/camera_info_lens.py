@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from autocalib_ros.camera import Camera
-from autocalib_ros.camera_info import lens_of_fields
 from autocalib_ros.errors import InputError
-from autocalib_ros.opencv_lens import OpencvLens, distorted, distortion_slopes, radii_to_the_fold
+from autocalib_ros.lens.camera import Camera
+from autocalib_ros.lens.camera_info import lens_of_fields
+from autocalib_ros.lens.opencv_lens import OpencvLens, distorted, distortion_slopes, radii_to_the_fold
 
 NEWTON_STEPS = 12
 """Most: from the table of radii four or five steps reach the last digit."""

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from autocalib_ros.camera import Camera
 from autocalib_ros.errors import InputError
+from autocalib_ros.lens.camera import Camera
 
 MAX_ERROR_PX = 0.5
 """As much as the position of a tracked point is good for: more would spoil the pose."""

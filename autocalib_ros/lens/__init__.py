@@ -1,0 +1,1 @@
+"""Camera models: Kannala-Brandt, OpenCV's, and CameraInfo."""
