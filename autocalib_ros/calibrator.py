@@ -11,8 +11,6 @@ from autocalib_ros.calibration import GROUND_DISTANCES_M, Calibration, Figures, 
 from autocalib_ros.config import Options
 from autocalib_ros.errors import InputError
 from autocalib_ros.estimation.evidence_gate import drift_limit_px, outlook, requirements, shortfall, unsteady
-from autocalib_ros.estimation.great_circles import TrackSet, select_tracks
-from autocalib_ros.estimation.ground_plane import ground_plane, ground_points, pixels_ahead, tilt_and_roll_deg
 from autocalib_ros.estimation.paper import solve_paper
 from autocalib_ros.estimation.path_noise import USUAL_HEIGHT_M
 from autocalib_ros.estimation.people import people
@@ -24,6 +22,8 @@ from autocalib_ros.estimation.straightness import paper_intrinsics
 from autocalib_ros.estimation.traffic import of_vehicles
 from autocalib_ros.estimation.vanishing_points import segment_orientations
 from autocalib_ros.evidence import Evidence, EvidenceBuffer, Kind
+from autocalib_ros.geometry.great_circles import TrackSet, select_tracks
+from autocalib_ros.geometry.ground_plane import ground_plane, ground_points, pixels_ahead, tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.lens.camera_info import ModelMisfit
 from autocalib_ros.perception.detector.detector import VehicleDetector, open_detector

@@ -15,8 +15,8 @@ from autocalib_ros.compare import lenses_apart_px
 from autocalib_ros.comparison import AGREES_SIGMAS, SAME_LENS_PX, SAME_NUMBER
 from autocalib_ros.config import Options
 from autocalib_ros.errors import UsageError
-from autocalib_ros.estimation.ground_plane import tilt_and_roll_deg
 from autocalib_ros.estimation.scale import Scale, known_scale
+from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera
 
 GRADES = ('lens', 'unit_scale', 'assumed', 'full')

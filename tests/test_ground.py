@@ -26,7 +26,7 @@ from autocalib_ros.calibration import (
 from autocalib_ros.calibrator import solve
 from autocalib_ros.config import JointOptions, Options, ScaleOptions
 from autocalib_ros.errors import InputError
-from autocalib_ros.estimation.ground_plane import pixels_ahead
+from autocalib_ros.geometry.ground_plane import pixels_ahead
 from autocalib_ros.ground import Ground
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.lens.camera_info import camera_info

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from autocalib_ros.estimation.ground_plane import undirected_deg
 from autocalib_ros.estimation.joint import JointFit
 from autocalib_ros.estimation.state import State
 from autocalib_ros.estimation.uncertainty import propagate
+from autocalib_ros.geometry.ground_plane import undirected_deg
 
 UNTOLD = 1e-9
 """Information that is added along every parameter, so that what nothing tells has a large variance and not none."""

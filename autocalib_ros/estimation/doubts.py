@@ -9,14 +9,14 @@ import numpy as np
 from autocalib_ros.calibration import Reason
 from autocalib_ros.config import GateOptions
 from autocalib_ros.estimation.differences import differences, expected_of_halves
-from autocalib_ros.estimation.great_circles import Seen, TrackSet, every_track
-from autocalib_ros.estimation.ground_plane import BELOW_HORIZON
 from autocalib_ros.estimation.joint import MIN_ROWS, JointFit, assign, road_support, solve_joint
 from autocalib_ros.estimation.lives import no_lives
 from autocalib_ros.estimation.plane import LevelCamera, Plane, above_traffic
 from autocalib_ros.estimation.state import State
 from autocalib_ros.estimation.uncertainty import told_by_evidence
 from autocalib_ros.evidence import Evidence
+from autocalib_ros.geometry.great_circles import Seen, TrackSet, every_track
+from autocalib_ros.geometry.ground_plane import BELOW_HORIZON
 
 MIN_VEHICLES = 4
 """Vehicles, distinct, that make a road; fewer may be one driver's whim."""

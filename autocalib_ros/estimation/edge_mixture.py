@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from autocalib_ros.estimation.great_circles import independence
+from autocalib_ros.geometry.great_circles import independence
 
 CORRELATION = 0.3
 """How much the errors of one vehicle's edges correlate: the same bumper is seen again and again."""

@@ -10,12 +10,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from autocalib_ros.estimation.great_circles import TrackSet, rays_of
 from autocalib_ros.estimation.joint import JointFit, solve_joint
 from autocalib_ros.estimation.path_noise import USUAL_HEIGHT_M
 from autocalib_ros.estimation.planar_motion import View, first_motion, on_course, paths
 from autocalib_ros.estimation.state import State, ground_up
 from autocalib_ros.estimation.windows import Windows
+from autocalib_ros.geometry.great_circles import TrackSet, rays_of
 
 ASIDE_DEG = 1.5, 20.0
 """A window is of a change of lanes when it leads aside from the road by more than drivers wander, and less than who

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from autocalib_ros.estimation.great_circles import SAMPLES, independence
 from autocalib_ros.estimation.windows import (
     INTERVAL_S,
     MIN_POINTS,
@@ -16,6 +15,7 @@ from autocalib_ros.estimation.windows import (
     members_of,
     scattered,
 )
+from autocalib_ros.geometry.great_circles import SAMPLES, independence
 
 INSTANTS = 9
 """Most instants of a life: as long as a turn at a junction takes; a longer one goes on as another."""

@@ -11,8 +11,6 @@ from scipy.spatial.transform import Rotation
 from autocalib_ros.calibration import Reason
 from autocalib_ros.config import GateOptions
 from autocalib_ros.estimation.doubts import view_doubt
-from autocalib_ros.estimation.great_circles import TrackSet
-from autocalib_ros.estimation.ground_plane import undirected_deg
 from autocalib_ros.estimation.joint import JointFit, judged_at
 from autocalib_ros.estimation.lens_prior import LensPrior
 from autocalib_ros.estimation.line_mixture import ASKEW_RAD, Grid
@@ -21,6 +19,8 @@ from autocalib_ros.estimation.road_lines import Lines, Sight, lines_on_road
 from autocalib_ros.estimation.state import Setting, State, Steps
 from autocalib_ros.estimation.windows import no_windows
 from autocalib_ros.evidence import Evidence
+from autocalib_ros.geometry.great_circles import TrackSet
+from autocalib_ros.geometry.ground_plane import undirected_deg
 
 LEAST_SHARE = 0.1
 """Of the lines along either direction: by chance a few in a hundred are, and one road's own are along the other."""

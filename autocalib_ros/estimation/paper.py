@@ -8,17 +8,17 @@ import numpy as np
 
 from autocalib_ros.calibration import Calibration, Figures, Reason, StandardDeviations
 from autocalib_ros.config import Options
-from autocalib_ros.estimation.ground_plane import (
+from autocalib_ros.estimation.scale import known_scale
+from autocalib_ros.estimation.straightness import PaperIntrinsics
+from autocalib_ros.estimation.vanishing_points import Orientations, segment_orientations, voted_points
+from autocalib_ros.evidence import Evidence
+from autocalib_ros.geometry.ground_plane import (
     focal_from_vanishing_points,
     ground_plane,
     paper_translation,
     rotation_from_vanishing_points,
     upward,
 )
-from autocalib_ros.estimation.scale import known_scale
-from autocalib_ros.estimation.straightness import PaperIntrinsics
-from autocalib_ros.estimation.vanishing_points import Orientations, segment_orientations, voted_points
-from autocalib_ros.evidence import Evidence
 from autocalib_ros.lens.camera import Camera
 
 ASSUMPTIONS = ('equidistant lens with the principal point at the image centre', 'the two roads are perpendicular',

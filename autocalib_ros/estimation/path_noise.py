@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from autocalib_ros.config import JointOptions
-from autocalib_ros.estimation.great_circles import Rays
-from autocalib_ros.estimation.small_matrices import cross, dot, inverse_factors
+from autocalib_ros.geometry.great_circles import Rays
+from autocalib_ros.geometry.small_matrices import cross, dot, inverse_factors
 
 WANDER_LENGTH_M = 10.0
 """Distance over which a driver's sideways wander is forgotten: ways of 25 to 80 m from side to side and back."""

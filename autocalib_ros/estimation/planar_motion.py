@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from autocalib_ros.config import JointOptions
-from autocalib_ros.estimation.great_circles import Rays, rays_of
-from autocalib_ros.estimation.small_matrices import dot
 from autocalib_ros.estimation.windows import Windows
+from autocalib_ros.geometry.great_circles import Rays, rays_of
+from autocalib_ros.geometry.small_matrices import dot
 from autocalib_ros.lens.camera import Camera
 
 TURNS_DEG = (0.0, 2.0, 4.5, 7.5, 11.0, 15.0, 20.0, 26.0, 33.0, 42.0, 52.0, 65.0, 80.0, 100.0)

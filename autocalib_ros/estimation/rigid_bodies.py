@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from autocalib_ros.estimation.great_circles import rays_of
 from autocalib_ros.estimation.lives import Lives
+from autocalib_ros.geometry.great_circles import rays_of
 from autocalib_ros.lens.camera import Camera
 
 DIFFERENCE = 1e-6

@@ -11,19 +11,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from autocalib_ros.estimation.great_circles import (
+from autocalib_ros.estimation.path_noise import on_road, whitening
+from autocalib_ros.estimation.planar_motion import Motion, View, first_motion, settled, trust
+from autocalib_ros.estimation.rigid_bodies import Bundle, Shapes, lifted
+from autocalib_ros.estimation.state import State, Steps, ground_up
+from autocalib_ros.estimation.vehicles import corroborated, heading_off_deg
+from autocalib_ros.geometry.great_circles import (
     Rays,
     Seen,
     TrackSet,
     fit_circles_through,
     rays_of,
 )
-from autocalib_ros.estimation.path_noise import on_road, whitening
-from autocalib_ros.estimation.planar_motion import Motion, View, first_motion, settled, trust
-from autocalib_ros.estimation.rigid_bodies import Bundle, Shapes, lifted
-from autocalib_ros.estimation.small_matrices import cross, dot
-from autocalib_ros.estimation.state import State, Steps, ground_up
-from autocalib_ros.estimation.vehicles import corroborated, heading_off_deg
+from autocalib_ros.geometry.small_matrices import cross, dot
 
 DIFFERENCE = 1e-6
 """Step of the parameters, in their units, by which distances are differentiated where no closed form is used."""

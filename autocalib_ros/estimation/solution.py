@@ -10,8 +10,6 @@ from autocalib_ros.calibration import Reason
 from autocalib_ros.config import GateOptions, JointOptions
 from autocalib_ros.estimation.differences import differences
 from autocalib_ros.estimation.doubts import halves_doubt, lens_doubt, plane_doubt, traffic_doubt
-from autocalib_ros.estimation.great_circles import TrackSet, evenly
-from autocalib_ros.estimation.ground_plane import undirected_deg
 from autocalib_ros.estimation.held import lens_assumptions, with_k2_if_asked_for, with_what_can_be_told
 from autocalib_ros.estimation.joint import (
     UNMODELLED_FOCAL,
@@ -47,6 +45,8 @@ from autocalib_ros.estimation.turning import (
 )
 from autocalib_ros.estimation.windows import Instants, Windows, find_windows
 from autocalib_ros.evidence import Evidence
+from autocalib_ros.geometry.great_circles import TrackSet, evenly
+from autocalib_ros.geometry.ground_plane import undirected_deg
 from autocalib_ros.lens.camera import Camera
 
 NEARLY_LEVEL_DEG = 5.0

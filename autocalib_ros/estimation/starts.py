@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from autocalib_ros.estimation.great_circles import TrackSet
 from autocalib_ros.estimation.joint import JointFit, cost_at, solve_joint
 from autocalib_ros.estimation.lens_prior import LensPrior
 from autocalib_ros.estimation.state import Setting, initial_state
 from autocalib_ros.estimation.straightness import focal_trials
 from autocalib_ros.estimation.vanishing_points import INLIER_PX, Directions, consensus_directions
+from autocalib_ros.geometry.great_circles import TrackSet
 
 TRIALS = 14
 """Focal lengths tried as starts: steps of about 17 %, within which the joint problem converges."""

@@ -8,8 +8,8 @@ import numpy as np
 
 from autocalib_ros.calibration import PaperReport
 from autocalib_ros.config import PaperOptions
-from autocalib_ros.estimation.great_circles import TrackSet, fit_circles, path_lengths, rays_of
 from autocalib_ros.evidence import Evidence
+from autocalib_ros.geometry.great_circles import TrackSet, fit_circles, path_lengths, rays_of
 from autocalib_ros.lens.camera import Camera, image_centre
 
 RIM = 1.02

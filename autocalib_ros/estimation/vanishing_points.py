@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from autocalib_ros.config import PaperOptions
-from autocalib_ros.estimation.great_circles import TrackSet, fit_circles, orthonormal_basis, rays_of
-from autocalib_ros.estimation.small_matrices import LAST, NEXT, cofactors, cross
+from autocalib_ros.geometry.great_circles import TrackSet, fit_circles, orthonormal_basis, rays_of
+from autocalib_ros.geometry.small_matrices import LAST, NEXT, cofactors, cross
 from autocalib_ros.lens.camera import Camera
 
 HYPOTHESES = 400

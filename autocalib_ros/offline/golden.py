@@ -18,8 +18,8 @@ from autocalib_ros.calibration import COVARIANCE_OF, GROUND_DISTANCES_M, Calibra
 from autocalib_ros.calibrator import solve
 from autocalib_ros.config import Options
 from autocalib_ros.errors import AutocalibError, InputError, UsageError
-from autocalib_ros.estimation.ground_plane import tilt_and_roll_deg
 from autocalib_ros.evidence import Evidence
+from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.params import options_with
 from autocalib_ros.offline.processes import in_order

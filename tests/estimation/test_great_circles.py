@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from autocalib_ros.estimation.great_circles import (
+from autocalib_ros.geometry.great_circles import (
     Rays,
     fit_circles,
     fit_circles_through,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from autocalib_ros.estimation.ground_plane import (
+from autocalib_ros.geometry.ground_plane import (
     focal_from_vanishing_points,
     ground_plane,
     paper_translation,

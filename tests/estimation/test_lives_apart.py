@@ -15,8 +15,6 @@ from autocalib_ros.config import GateOptions, JointOptions, Options
 from autocalib_ros.estimation import turning
 from autocalib_ros.estimation.differences import differences, expected_of_halves
 from autocalib_ros.estimation.doubts import halves_doubt
-from autocalib_ros.estimation.great_circles import TrackSet, select_tracks
-from autocalib_ros.estimation.ground_plane import tilt_and_roll_deg
 from autocalib_ros.estimation.joint import JointFit, solve_joint
 from autocalib_ros.estimation.lens_prior import known_lens, lens_priors
 from autocalib_ros.estimation.lives import Lives, find_lives
@@ -24,6 +22,8 @@ from autocalib_ros.estimation.rigid_bodies import Bundle
 from autocalib_ros.estimation.state import Setting, State, Steps
 from autocalib_ros.estimation.windows import Instants, Windows, find_windows
 from autocalib_ros.evidence import Evidence
+from autocalib_ros.geometry.great_circles import TrackSet, select_tracks
+from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.synthetic_evidence import Junction, synthetic_evidence
 from autocalib_ros.offline.synthetic_traffic import drive_arc

@@ -13,8 +13,6 @@ from autocalib_ros.calibration import Calibration, GroundPlane, Reason, to_json
 from autocalib_ros.calibrator import solve
 from autocalib_ros.config import GateOptions, JointOptions, Options
 from autocalib_ros.estimation import markings
-from autocalib_ros.estimation.great_circles import TrackSet, select_tracks
-from autocalib_ros.estimation.ground_plane import tilt_and_roll_deg
 from autocalib_ros.estimation.joint import JointFit
 from autocalib_ros.estimation.lens_prior import known_lens, lens_priors
 from autocalib_ros.estimation.markings import square_grids
@@ -24,6 +22,8 @@ from autocalib_ros.estimation.road_lines import lines_on_road
 from autocalib_ros.estimation.solution import Solution, agreed_by, find_solution
 from autocalib_ros.estimation.state import Setting
 from autocalib_ros.evidence import Evidence
+from autocalib_ros.geometry.great_circles import TrackSet, select_tracks
+from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.accuracy import distance_error
 from autocalib_ros.offline.accuracy_families import viewpoint

@@ -11,11 +11,11 @@ from autocalib_ros.calibration import Calibration, Refusal
 from autocalib_ros.calibrator import solve
 from autocalib_ros.config import GateOptions, JointOptions, Options
 from autocalib_ros.estimation.doubts import NOT_CROSS_CHECKED, halves_doubt
-from autocalib_ros.estimation.great_circles import select_tracks
 from autocalib_ros.estimation.joint import solve_joint
 from autocalib_ros.estimation.lens_prior import lens_priors
 from autocalib_ros.estimation.state import Setting, State
 from autocalib_ros.evidence import Evidence
+from autocalib_ros.geometry.great_circles import select_tracks
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.accuracy import evidence_of
 from autocalib_ros.offline.accuracy_families import families

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from autocalib_ros.estimation.small_matrices import cofactors, cross, dot, inverse_factors, least_axes
+from autocalib_ros.geometry.small_matrices import cofactors, cross, dot, inverse_factors, least_axes
 
 COUNT = 300
 

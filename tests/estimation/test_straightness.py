@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from autocalib_ros.config import PaperOptions
-from autocalib_ros.estimation.great_circles import select_tracks
 from autocalib_ros.estimation.straightness import (
     distortion_polynomial,
     focal_trials,
@@ -14,6 +13,7 @@ from autocalib_ros.estimation.straightness import (
     paper_intrinsics,
     straightness_sweep,
 )
+from autocalib_ros.geometry.great_circles import select_tracks
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.synthetic_evidence import Junction, synthetic_evidence
 

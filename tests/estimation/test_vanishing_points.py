@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from autocalib_ros.config import PaperOptions
-from autocalib_ros.estimation.great_circles import select_tracks
 from autocalib_ros.estimation.vanishing_points import (
     Orientations,
     consensus_directions,
     segment_orientations,
     voted_points,
 )
+from autocalib_ros.geometry.great_circles import select_tracks
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.synthetic_evidence import Junction, pose, synthetic_evidence
 

@@ -1,0 +1,1 @@
+"""Geometry that every layer shares: great circles, small matrices, robust kernels, the ground plane."""
