@@ -7,7 +7,6 @@ from enum import Enum
 
 import numpy as np
 
-from autocalib_ros.calibration import GROUND_DISTANCES_M, Calibration, Figures, Reason, Refusal, StandardDeviations
 from autocalib_ros.config import Options
 from autocalib_ros.errors import InputError
 from autocalib_ros.estimation.evidence_gate import drift_limit_px, outlook, requirements, shortfall, unsteady
@@ -28,6 +27,14 @@ from autocalib_ros.lens.camera import Camera
 from autocalib_ros.lens.camera_info import ModelMisfit
 from autocalib_ros.perception.detector.detector import VehicleDetector, open_detector
 from autocalib_ros.perception.observer import Observer
+from autocalib_ros.results.calibration import (
+    GROUND_DISTANCES_M,
+    Calibration,
+    Figures,
+    Reason,
+    Refusal,
+    StandardDeviations,
+)
 
 REORDERED_NS = 1_000_000_000
 """Images overtake each other by less than this on any transport; a longer step back is another time."""

@@ -15,12 +15,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from autocalib_ros.calibration import GROUND_DISTANCES_M, GroundPlane
 from autocalib_ros.comparison import Comparison, Difference, RayDifference, RoadDifference
 from autocalib_ros.geometry.ground_plane import angles_deg, pixels_ahead, tilt_and_roll_deg
 from autocalib_ros.ground import SHARE_OF_SIGMA, Ground
-from autocalib_ros.known_camera import KnownCamera
 from autocalib_ros.lens.camera import Camera, pixel_grid
+from autocalib_ros.results.calibration import GROUND_DISTANCES_M, GroundPlane
+from autocalib_ros.results.saved_camera import KnownCamera
 
 GRID = (49, 28)
 """Pixels across and down at which two lenses are compared, borders included."""

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from autocalib_ros.calibration import EvidenceSummary
 from autocalib_ros.config import BufferOptions
 from autocalib_ros.errors import InputError
 from autocalib_ros.redundancy import Holdings
+from autocalib_ros.results.calibration import EvidenceSummary
 
 FORMAT = 1
 COVERAGE_CELLS = (16, 9)

@@ -20,11 +20,11 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from autocalib_ros.calibration import Calibration
-from autocalib_ros.calibration_reader import calibration_of, read_json
 from autocalib_ros.errors import InputError
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.lens.camera_info_lens import InfoLens, attribute
+from autocalib_ros.results.calibration import Calibration
+from autocalib_ros.results.calibration_json import calibration_of, read_json
 
 HORIZON_PX = 1.0
 """A pixel nearer than this to the horizon, or to where the plane asked for vanishes, is on it: the next one shows no

@@ -10,7 +10,6 @@ import math
 from dataclasses import dataclass, replace
 from enum import Enum
 
-from autocalib_ros.calibration import Calibration, GroundPlane, StandardDeviations
 from autocalib_ros.compare import lenses_apart_px
 from autocalib_ros.comparison import AGREES_SIGMAS, SAME_LENS_PX, SAME_NUMBER
 from autocalib_ros.config import Options
@@ -18,6 +17,7 @@ from autocalib_ros.errors import UsageError
 from autocalib_ros.estimation.scale import Scale, known_scale
 from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera
+from autocalib_ros.results.calibration import Calibration, GroundPlane, StandardDeviations
 
 GRADES = ('lens', 'unit_scale', 'assumed', 'full')
 """From the least that a calibration gives to the most."""

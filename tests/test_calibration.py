@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from autocalib_ros.calibration import (
+from autocalib_ros.lens.camera import Camera
+from autocalib_ros.results.calibration import (
     Calibration,
     EvidenceSummary,
     GroundPlane,
@@ -20,7 +21,6 @@ from autocalib_ros.calibration import (
     to_json,
     write_calibration_json,
 )
-from autocalib_ros.lens.camera import Camera
 
 CAMERA = Camera(1280, 720, 560.0, (639.5, 359.5))
 EVIDENCE = EvidenceSummary(image_size=(1280, 720), seconds=60.0, frames=900, tracks=300, segments=4000, vehicles=70,

@@ -8,9 +8,9 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from autocalib_ros.calibration import Reason, Refusal, calibration_json
-from autocalib_ros.calibration_reader import calibration_of, read_json
 from autocalib_ros.errors import InputError
+from autocalib_ros.results.calibration import Reason, Refusal, calibration_json
+from autocalib_ros.results.calibration_json import calibration_of, read_json
 from stored import calibration, lens_only
 
 WHOLE = calibration()

@@ -14,15 +14,6 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
-from autocalib_ros.calibration import (
-    GROUND_DISTANCES_M,
-    Calibration,
-    EvidenceSummary,
-    GroundPlane,
-    Reason,
-    StandardDeviations,
-    to_json,
-)
 from autocalib_ros.calibrator import solve
 from autocalib_ros.config import JointOptions, Options, ScaleOptions
 from autocalib_ros.errors import InputError
@@ -33,6 +24,15 @@ from autocalib_ros.lens.camera_info import camera_info
 from autocalib_ros.offline.simulate.options import SimulationOptions
 from autocalib_ros.offline.simulate.simulation import Simulation
 from autocalib_ros.offline.synthetic_evidence import Junction, pose, synthetic_evidence
+from autocalib_ros.results.calibration import (
+    GROUND_DISTANCES_M,
+    Calibration,
+    EvidenceSummary,
+    GroundPlane,
+    Reason,
+    StandardDeviations,
+    to_json,
+)
 
 TYPES = get_typestore(Stores.ROS2_JAZZY).types
 DATA = Path(os.environ.get('AUTOCALIB_TEST_DATA', '')) / 'data'

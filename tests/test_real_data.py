@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from autocalib_ros.calibration import Calibration, Refusal
 from autocalib_ros.config import DetectorOptions, Options
 from autocalib_ros.evidence import Kind
 from autocalib_ros.offline.replay import replay
 from autocalib_ros.offline.sources import open_source
 from autocalib_ros.perception.detector.detector import open_detector
+from autocalib_ros.results.calibration import Calibration, Refusal
 
 DATA = Path(os.environ.get('AUTOCALIB_TEST_DATA', '')) / 'data'
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(

@@ -14,7 +14,7 @@ import yaml
 
 from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.lens.camera_info import camera_info_yaml, read_camera_info
-from autocalib_ros.store import Kind, Store, document, path_of
+from autocalib_ros.results.store import Kind, Store, document, path_of
 from stored import calibration, lens_only, stored
 
 KILLS = 60

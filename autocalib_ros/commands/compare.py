@@ -27,9 +27,9 @@ def run(arguments: argparse.Namespace) -> int:
     import sys
 
     from autocalib_ros.compare import compared
-    from autocalib_ros.known_camera import read_known_camera
     from autocalib_ros.offline.comparison_text import comparison_document, comparison_lines, truth_lines
     from autocalib_ros.offline.terminal import painted
+    from autocalib_ros.results.saved_camera import read_known_camera
 
     both = [read_known_camera(path) for path in (arguments.first, arguments.second)]
     result = compared(*both)

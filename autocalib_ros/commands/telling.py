@@ -46,10 +46,10 @@ def tell_missing_height(options: Options, lens: Camera | None) -> None:
 
 def tell_result(replayed: ReplayResult, out: Path | None, names: list[str], *, quiet: bool, json: bool) -> None:
     """Print a refusal's reason on stderr; the summary on stdout, or instead calibration.json."""
-    from autocalib_ros.calibration import calibration_json
     from autocalib_ros.offline.terminal import columns_of, is_terminal, painted, state_colour
     from autocalib_ros.offline.terminal_summary import summary_lines
     from autocalib_ros.report.words import remedy, verdict
+    from autocalib_ros.results.calibration import calibration_json
 
     result = replayed.result
     if not result:

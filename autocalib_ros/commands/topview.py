@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 from autocalib_ros.commands import views
 
 if TYPE_CHECKING:
-    from autocalib_ros.known_camera import KnownCamera
     from autocalib_ros.offline.view_files import View
+    from autocalib_ros.results.saved_camera import KnownCamera
 
 HELP = 'show the road from above, from an image or video'
 DESCRIPTION = ('Show the road from above, from an image or video, with a saved calibration of the camera; x of the '

@@ -11,9 +11,9 @@ from autocalib_ros.commands import DONE
 from autocalib_ros.commands.compare import FILES
 
 if TYPE_CHECKING:
-    from autocalib_ros.known_camera import KnownCamera
     from autocalib_ros.offline.view_files import View
     from autocalib_ros.perception.privacy import Polygons
+    from autocalib_ros.results.saved_camera import KnownCamera
 
 
 def add_files(parser: argparse.ArgumentParser, calibration: str = FILES) -> None:
@@ -35,9 +35,9 @@ def write(arguments: argparse.Namespace, label: str, view_of: Callable[[KnownCam
     import numpy as np
 
     from autocalib_ros.errors import AutocalibError
-    from autocalib_ros.known_camera import read_known_camera
     from autocalib_ros.offline.view_files import Part, write_view
     from autocalib_ros.perception.privacy import black_out
+    from autocalib_ros.results.saved_camera import read_known_camera
 
     known = read_known_camera(arguments.calibration)
     ignored = _ignored(arguments.params_file)

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from autocalib_ros.calibration import Reason
 from autocalib_ros.config import GateOptions
 from autocalib_ros.estimation.differences import differences, expected_of_halves
 from autocalib_ros.estimation.joint import MIN_ROWS, JointFit, assign, road_support, solve_joint
@@ -17,6 +16,7 @@ from autocalib_ros.estimation.uncertainty import told_by_evidence
 from autocalib_ros.evidence import Evidence
 from autocalib_ros.geometry.great_circles import Seen, TrackSet, every_track
 from autocalib_ros.geometry.ground_plane import BELOW_HORIZON
+from autocalib_ros.results.calibration import Reason
 
 MIN_VEHICLES = 4
 """Vehicles, distinct, that make a road; fewer may be one driver's whim."""

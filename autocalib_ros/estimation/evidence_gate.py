@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from autocalib_ros.calibration import Reason
 from autocalib_ros.config import GateOptions
 from autocalib_ros.evidence import Evidence
+from autocalib_ros.results.calibration import Reason
 
 REFERENCE_WIDTH_PX = 1280
 """Image width for which `max_drift_px` is given; it scales with the width."""

@@ -8,7 +8,6 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
-from autocalib_ros.calibration import Reason
 from autocalib_ros.config import GateOptions
 from autocalib_ros.estimation.doubts import view_doubt
 from autocalib_ros.estimation.joint import JointFit, judged_at
@@ -21,6 +20,7 @@ from autocalib_ros.estimation.windows import no_windows
 from autocalib_ros.evidence import Evidence
 from autocalib_ros.geometry.great_circles import TrackSet
 from autocalib_ros.geometry.ground_plane import undirected_deg
+from autocalib_ros.results.calibration import Reason
 
 LEAST_SHARE = 0.1
 """Of the lines along either direction: by chance a few in a hundred are, and one road's own are along the other."""

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from autocalib_ros.calibration import Calibration, Figures, Reason, StandardDeviations
 from autocalib_ros.config import Options
 from autocalib_ros.estimation.scale import known_scale
 from autocalib_ros.estimation.straightness import PaperIntrinsics
@@ -20,6 +19,7 @@ from autocalib_ros.geometry.ground_plane import (
     upward,
 )
 from autocalib_ros.lens.camera import Camera
+from autocalib_ros.results.calibration import Calibration, Figures, Reason, StandardDeviations
 
 ASSUMPTIONS = ('equidistant lens with the principal point at the image centre', 'the two roads are perpendicular',
                'the published method gives no uncertainty')

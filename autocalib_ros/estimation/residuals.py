@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from autocalib_ros.calibration import Residuals
 from autocalib_ros.estimation.joint import JointFit
+from autocalib_ros.results.calibration import Residuals
 
 TURNING = -1
 """Stands for the road of what turns."""

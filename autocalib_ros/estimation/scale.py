@@ -11,12 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from autocalib_ros.calibration import Reason
 from autocalib_ros.config import GateOptions, Options, ScaleOptions
 from autocalib_ros.estimation.path_noise import USUAL_HEIGHT_M
 from autocalib_ros.geometry.great_circles import TrackSet
 from autocalib_ros.geometry.ground_plane import ground_points
 from autocalib_ros.lens.camera import Camera
+from autocalib_ros.results.calibration import Reason
 
 LIKE_USUAL = 1.25
 """A height within this factor of the usual one weighs near against far as that one did: nothing is solved again."""

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from autocalib_ros.calibration import Reason
 from autocalib_ros.config import GateOptions, JointOptions
 from autocalib_ros.estimation.differences import differences
 from autocalib_ros.estimation.doubts import halves_doubt, lens_doubt, plane_doubt, traffic_doubt
@@ -48,6 +47,7 @@ from autocalib_ros.evidence import Evidence
 from autocalib_ros.geometry.great_circles import TrackSet, evenly
 from autocalib_ros.geometry.ground_plane import undirected_deg
 from autocalib_ros.lens.camera import Camera
+from autocalib_ros.results.calibration import Reason
 
 NEARLY_LEVEL_DEG = 5.0
 """Roll up to which walking can be told from driving as if there were none."""

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from autocalib_ros.calibration import PaperReport
 from autocalib_ros.config import PaperOptions
 from autocalib_ros.evidence import Evidence
 from autocalib_ros.geometry.great_circles import TrackSet, fit_circles, path_lengths, rays_of
 from autocalib_ros.lens.camera import Camera, image_centre
+from autocalib_ros.results.calibration import PaperReport
 
 RIM = 1.02
 """The shortest trial focal length keeps tracked points this factor inside 90 degrees, where tan flips sign."""

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from autocalib_ros.calibration import Reason
 from autocalib_ros.estimation.differences import differences
 from autocalib_ros.estimation.joint import JointFit, solve_joint
 from autocalib_ros.estimation.lives import find_lives, no_lives
@@ -17,6 +16,7 @@ from autocalib_ros.estimation.starts import most_probable
 from autocalib_ros.estimation.state import Setting, State
 from autocalib_ros.estimation.windows import Instants, Windows
 from autocalib_ros.geometry.great_circles import TrackSet
+from autocalib_ros.results.calibration import Reason
 
 START_DIAGONALS = (0.35, 0.55, 0.85)
 """Focal lengths to start from, in image diagonals: lenses of about 100, 75 and 50 degrees across the diagonal."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from autocalib_ros.calibration import GroundPlane
 from autocalib_ros.lens.camera import Camera
+from autocalib_ros.results.calibration import GroundPlane
 
 BELOW_HORIZON = 0.95
 """Vehicles drive on the road: at least this share of what moves lies below the horizon."""

@@ -17,7 +17,6 @@ from pathlib import Path
 
 import numpy as np
 
-from autocalib_ros.calibration import Calibration, GroundPlane, Refusal
 from autocalib_ros.calibrator import solve
 from autocalib_ros.compare import best_turn
 from autocalib_ros.config import Options
@@ -31,6 +30,7 @@ from autocalib_ros.offline.processes import in_order
 from autocalib_ros.offline.progress import progress_bar
 from autocalib_ros.offline.synthetic_evidence import Junction
 from autocalib_ros.pictures.views import ground_to_image, image_to_ground
+from autocalib_ros.results.calibration import Calibration, GroundPlane, Refusal
 
 RAY_GRID = (49, 28)
 GROUND_GRID = 5

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from autocalib_ros.calibration import GroundPlane
 from autocalib_ros.errors import InputError
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.pictures.views import image_to_ground
+from autocalib_ros.results.calibration import GroundPlane
 
 NEAR_M = 40.0
 """Distances are compared between points of the road this near to the camera."""

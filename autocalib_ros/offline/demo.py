@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from autocalib_ros.calibration import Calibration, Refusal
 from autocalib_ros.config import Options, ScaleOptions
 from autocalib_ros.geometry.ground_plane import angles_deg
 from autocalib_ros.offline.against_truth import NEAR_M, distance_percent, near_points, read_truth
+from autocalib_ros.results.calibration import Calibration, Refusal
 
 MAX_FOCAL_ERROR_PERCENT = 3.0
 MAX_NORMAL_ERROR_DEG = 1.0

@@ -14,7 +14,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from autocalib_ros.calibration import COVARIANCE_OF, GROUND_DISTANCES_M, Calibration, Refusal
 from autocalib_ros.calibrator import solve
 from autocalib_ros.config import Options
 from autocalib_ros.errors import AutocalibError, InputError, UsageError
@@ -25,6 +24,7 @@ from autocalib_ros.offline.params import options_with
 from autocalib_ros.offline.processes import in_order
 from autocalib_ros.offline.progress import progress_bar
 from autocalib_ros.offline.terminal import aligned
+from autocalib_ros.results.calibration import COVARIANCE_OF, GROUND_DISTANCES_M, Calibration, Refusal
 from autocalib_ros.util.files import write_atomically
 
 EXPECTED = 'expected.json'

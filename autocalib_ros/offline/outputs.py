@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from autocalib_ros.calibration import Calibration, write_calibration_json
 from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.lens.camera_info import write_camera_info_yaml
 from autocalib_ros.offline.replay import ReplayResult
 from autocalib_ros.offline.sources import Source
 from autocalib_ros.report.scene import Scene
+from autocalib_ros.results.calibration import Calibration, write_calibration_json
 
 CAMERA_INFO, CALIBRATION, EVIDENCE, REPORT = 'camera_info.yaml', 'calibration.json', 'evidence.npz', 'report.html'
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from autocalib_ros.calibration import Calibration, Refusal
 from autocalib_ros.calibrator import AutoCalibrator, solve
 from autocalib_ros.config import Options
 from autocalib_ros.errors import InputError
@@ -16,6 +15,7 @@ from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.sources import Source
 from autocalib_ros.perception.detector.detector import VehicleDetector
 from autocalib_ros.report.scene import Moment, noted
+from autocalib_ros.results.calibration import Calibration, Refusal
 
 SETTLING = 2.0
 """Once accepted, a solution on the way is tried again when the recording has grown by this factor: by then a standard

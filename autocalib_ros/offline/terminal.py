@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from typing import TextIO
 
-from autocalib_ros.calibration import Calibration, Refusal
+from autocalib_ros.results.calibration import Calibration, Refusal
 
 ESCAPES = {'green': '\033[32m', 'yellow': '\033[33m', 'red': '\033[31m'}
 RESET = '\033[0m'

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from autocalib_ros.calibration import GroundPlane
 from autocalib_ros.compare import compared
 from autocalib_ros.errors import InputError
-from autocalib_ros.known_camera import KnownCamera
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.against_truth import NEAR_M, distance_percent
+from autocalib_ros.results.calibration import GroundPlane
+from autocalib_ros.results.saved_camera import KnownCamera
 
 TRUE_LENSES = ('equidistant', 'kannala_brandt')
 """Models of a truth.json that are read; both are the one of camera.py."""

@@ -7,10 +7,10 @@ from collections.abc import Callable
 import numpy as np
 
 from autocalib_ros.errors import InputError, UsageError
-from autocalib_ros.known_camera import KnownCamera
 from autocalib_ros.lens.camera_info import rectified_matrix
 from autocalib_ros.pictures.plotted import Plotted, draw_metre_grid, draw_scale_bar
 from autocalib_ros.pictures.views import FARTHEST_HEIGHTS, TopView, rectified_sources, resample, unit
+from autocalib_ros.results.saved_camera import KnownCamera
 
 LONGEST_PX = 1000
 """Longer side of a view from above for which no scale is given."""

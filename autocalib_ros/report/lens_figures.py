@@ -6,7 +6,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from autocalib_ros.calibration import Calibration
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.lens.camera_info import rectified_matrix
 from autocalib_ros.pictures.views import rectified_sources, resample
@@ -21,6 +20,7 @@ from autocalib_ros.report.canvas import (
     road_colour,
 )
 from autocalib_ros.report.scene import Scene
+from autocalib_ros.results.calibration import Calibration
 
 LEAST_ERROR_PX = 1e-3
 """Below this a track counts as straight; it keeps the logarithmic axes finite."""

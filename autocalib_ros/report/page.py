@@ -13,7 +13,6 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from autocalib_ros import __version__
-from autocalib_ros.calibration import Calibration, Refusal
 from autocalib_ros.errors import InputError
 from autocalib_ros.report import (
     direction_figures,
@@ -27,6 +26,7 @@ from autocalib_ros.report import (
 from autocalib_ros.report.canvas import STYLE, jpeg, png, rendered
 from autocalib_ros.report.scene import Scene
 from autocalib_ros.report.words import file_rows, how_sure, needs, next_step, number_rows, verdict
+from autocalib_ros.results.calibration import Calibration, Refusal
 from autocalib_ros.util.files import write_atomically
 
 JPEG_SAVES = 1.5

@@ -13,10 +13,10 @@ from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo
 from visualization_msgs.msg import MarkerArray
 
-from autocalib_ros.calibration import Calibration
 from autocalib_ros.config import NodeOptions, Options
 from autocalib_ros.errors import InputError
 from autocalib_ros.lens.camera_info import CameraInfo as CameraInfoFields
+from autocalib_ros.results.calibration import Calibration
 from autocalib_ros.ros import messages
 from autocalib_ros.ros.driver_info import DriverInfo
 from autocalib_ros.ros.headers import DEFAULT_FRAME, Headers

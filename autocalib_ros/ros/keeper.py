@@ -9,7 +9,7 @@ from concurrent.futures import Future
 from typing import Any
 
 from autocalib_ros.errors import AutocalibError
-from autocalib_ros.store import Store, Stored
+from autocalib_ros.results.store import Store, Stored
 
 SAVE_PERIOD_S = 60.0
 """Real seconds between two files that nobody asked for: solutions may follow each other by seconds, for months, and

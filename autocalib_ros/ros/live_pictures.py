@@ -23,12 +23,12 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
-from autocalib_ros.calibration import Calibration, Refusal
 from autocalib_ros.calibrator import Progress
 from autocalib_ros.evidence import Evidence
 from autocalib_ros.perception.privacy import Polygons, black_out
 from autocalib_ros.pictures.drawing import Caption
 from autocalib_ros.pictures.live import DebugPicture, JudgedTracks, RectifiedPicture, TopPicture
+from autocalib_ros.results.calibration import Calibration, Refusal
 from autocalib_ros.ros import messages
 from autocalib_ros.ros.headers import Headers
 from autocalib_ros.ros.in_force import InForce, Published

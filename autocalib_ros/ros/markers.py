@@ -9,9 +9,9 @@ from geometry_msgs.msg import Point
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-from autocalib_ros.calibration import Calibration
 from autocalib_ros.pictures.road import Ellipse, Grid, ellipses, enlargement, field_of_view
 from autocalib_ros.pictures.views import length_words
+from autocalib_ros.results.calibration import Calibration
 from autocalib_ros.ros.wording import described_numbers
 
 LINE_SHARE = 0.005

@@ -20,13 +20,13 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from autocalib_ros.calibration import Calibration, Refusal
 from autocalib_ros.calibrator import AutoCalibrator, Intake, Progress
 from autocalib_ros.config import Options
 from autocalib_ros.errors import AutocalibError
 from autocalib_ros.evidence import Evidence
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.perception.detector.detector import VehicleDetector
+from autocalib_ros.results.calibration import Calibration, Refusal
 
 WAITING_IMAGES = 8
 """Images that may wait for the perception thread: half a second of a hiccup at 15 Hz, 22 MB at 1280x720."""

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
 
-from autocalib_ros.calibration import Calibration
 from autocalib_ros.calibrator import Progress
+from autocalib_ros.results.calibration import Calibration
 from autocalib_ros.ros.silence import Silence
 from autocalib_ros.ros.wording import tilt_deg
 

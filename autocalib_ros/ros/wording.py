@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from autocalib_ros.calibration import Calibration, GroundPlane, Refusal
 from autocalib_ros.calibrator import Progress
+from autocalib_ros.results.calibration import Calibration, GroundPlane, Refusal
 
 
 def described(result: Calibration | Refusal) -> str:

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from outlined import CAR_M, RIDER_M, driven, with_outlines
 
-from autocalib_ros.calibration import Calibration
 from autocalib_ros.calibrator import solve
 from autocalib_ros.config import Options
 from autocalib_ros.estimation.cyclists import cyclists
 from autocalib_ros.evidence import Evidence, Outlines, Track
 from autocalib_ros.offline.synthetic_evidence import Junction, gathered, synthetic_evidence
+from autocalib_ros.results.calibration import Calibration
 
 JUNCTION = Junction(vehicles=30)
 FIRST_RIDER, FIRST_CAR = 1000, 2000

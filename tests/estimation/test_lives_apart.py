@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from autocalib_ros.calibration import Calibration, Reason
 from autocalib_ros.calibrator import solve
 from autocalib_ros.config import GateOptions, JointOptions, Options
 from autocalib_ros.estimation import turning
@@ -27,6 +26,7 @@ from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.synthetic_evidence import Junction, synthetic_evidence
 from autocalib_ros.offline.synthetic_traffic import drive_arc
+from autocalib_ros.results.calibration import Calibration, Reason
 
 TURNING = Junction(drive=partial(drive_arc, radii_m=(12.0, 60.0)), vehicles=14, points_per_vehicle=8, noise_px=0.3)
 TRUTH = State(TURNING.camera, TURNING.camera_from_ground, np.zeros(0))

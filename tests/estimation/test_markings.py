@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from painted_road import Paint, painted_lines, post_lines, random_lines
 
-from autocalib_ros.calibration import Calibration, GroundPlane, Reason, to_json
 from autocalib_ros.calibrator import solve
 from autocalib_ros.config import GateOptions, JointOptions, Options
 from autocalib_ros.estimation import markings
@@ -29,6 +28,7 @@ from autocalib_ros.offline.accuracy import distance_error
 from autocalib_ros.offline.accuracy_families import viewpoint
 from autocalib_ros.offline.synthetic_evidence import Junction, pose, synthetic_evidence
 from autocalib_ros.offline.synthetic_traffic import drive_ring
+from autocalib_ros.results.calibration import Calibration, GroundPlane, Reason, to_json
 
 WIDTH, HEIGHT = 1280, 720
 CENTRE = (639.5, 359.5)

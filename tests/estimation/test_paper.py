@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from autocalib_ros.calibration import Calibration, Refusal
 from autocalib_ros.calibrator import solve
 from autocalib_ros.config import Options, PaperOptions
 from autocalib_ros.offline.synthetic_evidence import Junction, pose, synthetic_evidence
+from autocalib_ros.results.calibration import Calibration, Refusal
 
 OPTIONS = Options(camera_height=8.0, method='paper', paper=PaperOptions(window_s=3.0, vote_sigmas=0.0))
 CLEAN = Junction(turning_share=0.0, wander_m=0.0, noise_px=0.2, camera_from_ground=pose(32.0, 1.0, 40.0))

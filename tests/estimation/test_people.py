@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from autocalib_ros.calibration import Calibration
 from autocalib_ros.calibrator import solve
 from autocalib_ros.config import Options
 from autocalib_ros.estimation.people import walkers
 from autocalib_ros.evidence import Evidence, Track
 from autocalib_ros.offline.synthetic_evidence import Junction, gathered, synthetic_evidence
+from autocalib_ros.results.calibration import Calibration
 
 FIRST_WALKER = 1000
 """Numbers from here on are people."""

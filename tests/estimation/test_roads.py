@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from autocalib_ros.calibration import Calibration, Refusal
 from autocalib_ros.calibrator import solve
 from autocalib_ros.config import GateOptions, JointOptions, Options
 from autocalib_ros.estimation.doubts import NOT_CROSS_CHECKED, halves_doubt
@@ -20,6 +19,7 @@ from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.accuracy import evidence_of
 from autocalib_ros.offline.accuracy_families import families
 from autocalib_ros.offline.synthetic_evidence import Junction, pose, synthetic_evidence
+from autocalib_ros.results.calibration import Calibration, Refusal
 
 OPTIONS = Options(camera_height=8.0)
 ONE_ROAD = Junction(road_angles_deg=(0.0,), turning_share=0.0, vehicles=120,

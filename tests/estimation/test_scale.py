@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from autocalib_ros.calibration import Calibration, Reason
 from autocalib_ros.calibrator import AutoCalibrator, solve
 from autocalib_ros.config import Options, ScaleOptions
 from autocalib_ros.errors import UsageError
@@ -17,6 +16,7 @@ from autocalib_ros.estimation.solution import Solution, find_solution
 from autocalib_ros.evidence import Evidence
 from autocalib_ros.geometry.great_circles import SAMPLES, TrackSet, select_tracks
 from autocalib_ros.offline.synthetic_evidence import Junction, pose, synthetic_evidence
+from autocalib_ros.results.calibration import Calibration, Reason
 
 JUNCTION = Junction()
 NEAR_M, FAR_M = ((10.0, -8.0), (18.0, -2.0)), ((25.0, -15.0), (38.0, -16.0))

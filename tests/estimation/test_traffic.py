@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from autocalib_ros.calibration import Calibration, Refusal
 from autocalib_ros.calibrator import solve
 from autocalib_ros.config import Options
 from autocalib_ros.estimation.traffic import of_vehicles
 from autocalib_ros.evidence import Evidence, Kind
 from autocalib_ros.offline.synthetic_evidence import Junction, synthetic_evidence
+from autocalib_ros.results.calibration import Calibration, Refusal
 
 
 def with_people(evidence: Evidence, count: int, generator: np.random.Generator) -> Evidence:

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from autocalib_ros.calibration import Calibration
 from autocalib_ros.calibrator import solve
 from autocalib_ros.config import GateOptions, JointOptions, Options
 from autocalib_ros.estimation.doubts import plane_doubt
@@ -21,6 +20,7 @@ from autocalib_ros.evidence import Evidence
 from autocalib_ros.geometry.great_circles import select_tracks
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.synthetic_evidence import Junction, pose, synthetic_evidence
+from autocalib_ros.results.calibration import Calibration
 
 CAMERA = Camera(1280, 720, 560.0, (639.5, 359.5))
 HEIGHT_M = 8.0

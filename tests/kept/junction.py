@@ -6,7 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from autocalib_ros.calibration import (
+from autocalib_ros.config import BufferOptions
+from autocalib_ros.evidence import Evidence, EvidenceBuffer, Segments, Track
+from autocalib_ros.lens.camera import Camera
+from autocalib_ros.results.calibration import (
     Calibration,
     Figures,
     GroundPlane,
@@ -16,9 +19,6 @@ from autocalib_ros.calibration import (
     Residuals,
     StandardDeviations,
 )
-from autocalib_ros.config import BufferOptions
-from autocalib_ros.evidence import Evidence, EvidenceBuffer, Segments, Track
-from autocalib_ros.lens.camera import Camera
 
 SPEED_M_S = 10.0
 """Of every vehicle."""

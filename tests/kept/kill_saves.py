@@ -13,7 +13,7 @@ from collections import Counter
 from pathlib import Path
 
 from autocalib_ros.lens.camera_info import read_camera_info
-from autocalib_ros.store import Kind, Store, document
+from autocalib_ros.results.store import Kind, Store, document
 from stored import calibration, stored
 
 LONGEST_LIFE_S = 0.08

@@ -12,7 +12,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from autocalib_ros.calibration import (
+from autocalib_ros.lens.camera import Camera
+from autocalib_ros.lens.camera_info import camera_info
+from autocalib_ros.results.calibration import (
     COVARIANCE_OF,
     Calibration,
     EvidenceSummary,
@@ -20,9 +22,7 @@ from autocalib_ros.calibration import (
     PaperReport,
     StandardDeviations,
 )
-from autocalib_ros.lens.camera import Camera
-from autocalib_ros.lens.camera_info import camera_info
-from autocalib_ros.store import Stored
+from autocalib_ros.results.store import Stored
 
 SIZE = (640, 360)
 LOOKS_ALONG = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])

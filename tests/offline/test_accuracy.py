@@ -13,15 +13,6 @@ import numpy as np
 import pytest
 
 import autocalib_ros
-from autocalib_ros.calibration import (
-    Calibration,
-    EvidenceSummary,
-    Figures,
-    GroundPlane,
-    Reason,
-    Refusal,
-    StandardDeviations,
-)
 from autocalib_ros.cli import main
 from autocalib_ros.errors import InputError
 from autocalib_ros.lens.camera import Camera
@@ -39,6 +30,15 @@ from autocalib_ros.offline.accuracy import (
 )
 from autocalib_ros.offline.accuracy_table import beyond_own_sigmas, falsely_accepted, tables
 from autocalib_ros.offline.synthetic_evidence import Junction, pose
+from autocalib_ros.results.calibration import (
+    Calibration,
+    EvidenceSummary,
+    Figures,
+    GroundPlane,
+    Reason,
+    Refusal,
+    StandardDeviations,
+)
 
 JUNCTION = Junction()
 TASK = Task('standard', 0, 7, ('joint',))

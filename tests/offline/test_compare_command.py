@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import yaml
 
-from autocalib_ros.calibration import GroundPlane, calibration_json, write_calibration_json
 from autocalib_ros.cli import main
 from autocalib_ros.lens.camera_info import camera_info, write_camera_info_yaml
 from autocalib_ros.pictures.views import ground_to_image
+from autocalib_ros.results.calibration import GroundPlane, calibration_json, write_calibration_json
 from stored import calibration
 
 OURS = calibration()

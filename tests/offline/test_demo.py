@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from autocalib_ros.calibration import GroundPlane
 from autocalib_ros.config import Options
 from autocalib_ros.errors import InputError
 from autocalib_ros.offline.demo import compare, options_from, read_truth
 from autocalib_ros.pictures.views import ground_to_image
+from autocalib_ros.results.calibration import GroundPlane
 
 
 @pytest.fixture

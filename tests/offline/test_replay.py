@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from autocalib_ros.calibration import Refusal
 from autocalib_ros.calibrator import solve
 from autocalib_ros.config import GateOptions, Options
 from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.replay import replay, solve_again
 from autocalib_ros.offline.sources import Frame, open_source
+from autocalib_ros.results.calibration import Refusal
 
 
 class Drive:

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from autocalib_ros.calibration import Calibration, EvidenceSummary, GroundPlane, StandardDeviations
 from autocalib_ros.lens.camera import Camera
+from autocalib_ros.results.calibration import Calibration, EvidenceSummary, GroundPlane, StandardDeviations
 
 
 def looking_down(dip_deg: float) -> GroundPlane:

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from autocalib_ros.calibration import COVARIANCE_OF, GROUND_DISTANCES_M
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.pictures.road import Grid, ellipses, enlargement, field_of_view
+from autocalib_ros.results.calibration import COVARIANCE_OF, GROUND_DISTANCES_M
 
 HEIGHT_SIGMA_M = 0.1
 

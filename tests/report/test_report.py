@@ -14,7 +14,6 @@ import pytest
 from junction import SPEED_M_S, junction_evidence
 from matplotlib.text import Text
 
-from autocalib_ros.calibration import GroundPlane, Refusal, Residuals
 from autocalib_ros.lens.camera_info import rectified_matrix
 from autocalib_ros.pictures.views import ground_to_image, image_to_ground, nice_length
 from autocalib_ros.report.lens_figures import in_undistorted, line_error_px
@@ -24,6 +23,7 @@ from autocalib_ros.report.scene import MOST_MOMENTS, Moment, noted
 from autocalib_ros.report.speed_figures import by_vehicle, pieces_on_road, speed_histogram, speeds_above
 from autocalib_ros.report.traffic_figures import kept_tracks
 from autocalib_ros.report.words import how_sure, needs, next_step, number_rows, verdict
+from autocalib_ros.results.calibration import GroundPlane, Refusal, Residuals
 
 ALL = {entry.name for entry in ENTRIES}
 ON_THE_ROAD = {'ground_grid', 'top_view', 'speeds', 'speed_histogram'}

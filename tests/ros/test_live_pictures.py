@@ -10,10 +10,10 @@ from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, Image
 
-from autocalib_ros.calibration import EvidenceSummary, GroundPlane, Reason
 from autocalib_ros.calibrator import AutoCalibrator, Progress
 from autocalib_ros.offline.synthetic_evidence import pose
 from autocalib_ros.pictures import live
+from autocalib_ros.results.calibration import EvidenceSummary, GroundPlane, Reason
 from autocalib_ros.ros.live_pictures import GOOD, WAITING, LivePictures, caption_of, image_message
 from autocalib_ros.ros.messages import header, stamp_ns, time_message, validated
 from autocalib_ros.standing import CalibrationState

@@ -10,7 +10,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, RegionOfInterest
 
-from autocalib_ros.calibration import StandardDeviations
+from autocalib_ros.results.calibration import StandardDeviations
 from autocalib_ros.ros.driver_info import size_doubt
 from autocalib_ros.ros.messages import stamp_ns, time_message
 from bench import SIZE, Bench, calibration, image, wait_for

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from autocalib_ros.calibration import Calibration, EvidenceSummary, GroundPlane, Reason, StandardDeviations
 from autocalib_ros.calibrator import Progress
 from autocalib_ros.lens.camera import Camera
+from autocalib_ros.results.calibration import Calibration, EvidenceSummary, GroundPlane, Reason, StandardDeviations
 from autocalib_ros.ros.silence import Silence
 from autocalib_ros.ros.status import ERROR, OK, RATE_WINDOW_S, WARN, Counts, Recent, Situation, State, state_of, status
 

@@ -10,7 +10,9 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from autocalib_ros.calibration import (
+from autocalib_ros.errors import AutocalibError, InputError
+from autocalib_ros.lens.camera import Camera
+from autocalib_ros.results.calibration import (
     COVARIANCE_OF,
     JSON_VERSION,
     Calibration,
@@ -20,8 +22,6 @@ from autocalib_ros.calibration import (
     Reason,
     StandardDeviations,
 )
-from autocalib_ros.errors import AutocalibError, InputError
-from autocalib_ros.lens.camera import Camera
 
 MAX_BYTES = 1_000_000
 """A calibration takes a few thousand bytes."""
