@@ -20,7 +20,7 @@ from autocalib_ros.estimation.solution import Solution, find_solution
 from autocalib_ros.estimation.straightness import paper_intrinsics
 from autocalib_ros.estimation.traffic import of_vehicles
 from autocalib_ros.estimation.vanishing_points import segment_orientations
-from autocalib_ros.evidence import Evidence, EvidenceBuffer, Kind
+from autocalib_ros.evidence.snapshot import Evidence, EvidenceBuffer, Kind
 from autocalib_ros.geometry.great_circles import TrackSet, select_tracks
 from autocalib_ros.geometry.ground_plane import ground_plane, ground_points, pixels_ahead, tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera

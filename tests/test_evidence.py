@@ -10,7 +10,7 @@ import pytest
 
 from autocalib_ros.config import BufferOptions
 from autocalib_ros.errors import InputError
-from autocalib_ros.evidence import (
+from autocalib_ros.evidence.snapshot import (
     EDGE_ARRAYS,
     KINDS,
     OUTLINE_ARRAYS,

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from autocalib_ros.config import DetectorOptions, Options
-from autocalib_ros.evidence import Kind
+from autocalib_ros.evidence.snapshot import Kind
 from autocalib_ros.offline.replay import replay
 from autocalib_ros.offline.sources import open_source
 from autocalib_ros.perception.detector.detector import open_detector

@@ -25,7 +25,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Solve; return the exit status."""
     options = options_of(arguments)
     lens = known_lens(arguments, options)
-    from autocalib_ros.evidence import Evidence
+    from autocalib_ros.evidence.snapshot import Evidence
     from autocalib_ros.offline import outputs
     from autocalib_ros.offline.replay import solve_again
 

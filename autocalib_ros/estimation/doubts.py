@@ -13,7 +13,7 @@ from autocalib_ros.estimation.lives import no_lives
 from autocalib_ros.estimation.plane import LevelCamera, Plane, above_traffic
 from autocalib_ros.estimation.state import State
 from autocalib_ros.estimation.uncertainty import told_by_evidence
-from autocalib_ros.evidence import Evidence
+from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.great_circles import Seen, TrackSet, every_track
 from autocalib_ros.geometry.ground_plane import BELOW_HORIZON
 from autocalib_ros.results.calibration import Reason

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from autocalib_ros.config import GateOptions
-from autocalib_ros.evidence import Evidence
+from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.results.calibration import Reason
 
 REFERENCE_WIDTH_PX = 1280

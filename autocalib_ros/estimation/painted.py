@@ -17,7 +17,7 @@ from autocalib_ros.estimation.markings import beside_traffic, square_grids, squa
 from autocalib_ros.estimation.road_lines import Lines, Sight, lines_on_road
 from autocalib_ros.estimation.state import Setting, State, Steps
 from autocalib_ros.estimation.windows import no_windows
-from autocalib_ros.evidence import Evidence
+from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.great_circles import TrackSet
 from autocalib_ros.geometry.ground_plane import undirected_deg
 from autocalib_ros.results.calibration import Reason

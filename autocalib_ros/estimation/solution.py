@@ -43,7 +43,7 @@ from autocalib_ros.estimation.turning import (
     with_turning,
 )
 from autocalib_ros.estimation.windows import Instants, Windows, find_windows
-from autocalib_ros.evidence import Evidence
+from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.great_circles import TrackSet, evenly
 from autocalib_ros.geometry.ground_plane import undirected_deg
 from autocalib_ros.lens.camera import Camera

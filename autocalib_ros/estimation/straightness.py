@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from autocalib_ros.config import PaperOptions
-from autocalib_ros.evidence import Evidence
+from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.great_circles import TrackSet, fit_circles, path_lengths, rays_of
 from autocalib_ros.lens.camera import Camera, image_centre
 from autocalib_ros.results.calibration import PaperReport

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from autocalib_ros.evidence import Evidence, Kind
+from autocalib_ros.evidence.snapshot import Evidence, Kind
 
 
 def of_vehicles(evidence: Evidence) -> tuple[Evidence, np.ndarray]:

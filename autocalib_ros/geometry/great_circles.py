@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from autocalib_ros.evidence import Evidence
+from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.small_matrices import cross, dot, least_axes
 from autocalib_ros.lens.camera import Camera
 

@@ -21,7 +21,7 @@ from autocalib_ros.calibrator import solve
 from autocalib_ros.compare import best_turn
 from autocalib_ros.config import Options
 from autocalib_ros.errors import InputError, UsageError
-from autocalib_ros.evidence import Evidence
+from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.ground_plane import angles_deg, tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera, pixel_grid
 from autocalib_ros.offline.accuracy_families import families

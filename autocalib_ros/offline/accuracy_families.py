@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from autocalib_ros.evidence import Evidence, Track
+from autocalib_ros.evidence.snapshot import Evidence, Track
 from autocalib_ros.lens.camera import Camera, image_centre
 from autocalib_ros.offline.simulate.junctions import junction as crossing
 from autocalib_ros.offline.simulate.motorway import highway

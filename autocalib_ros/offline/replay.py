@@ -10,7 +10,7 @@ import numpy as np
 from autocalib_ros.calibrator import AutoCalibrator, solve
 from autocalib_ros.config import Options
 from autocalib_ros.errors import InputError
-from autocalib_ros.evidence import Evidence
+from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.sources import Source
 from autocalib_ros.perception.detector.detector import VehicleDetector

@@ -10,7 +10,7 @@ from scipy.interpolate import CubicSpline
 
 from autocalib_ros.config import BufferOptions
 from autocalib_ros.errors import UsageError
-from autocalib_ros.evidence import Evidence, EvidenceBuffer, Segments, Track
+from autocalib_ros.evidence.snapshot import Evidence, EvidenceBuffer, Segments, Track
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.synthetic_traffic import (
     INTERVAL_S,

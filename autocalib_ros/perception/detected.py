@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from autocalib_ros.config import DetectorOptions
-from autocalib_ros.evidence import Kind
+from autocalib_ros.evidence.snapshot import Kind
 from autocalib_ros.perception.detector.detector import Detections, VehicleDetector
 from autocalib_ros.perception.tracks import PointTracker
 from autocalib_ros.perception.vehicles import Region

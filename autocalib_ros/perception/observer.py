@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from autocalib_ros.config import Options
-from autocalib_ros.evidence import Edges, Kind, Outlines, Segments, Track
+from autocalib_ros.evidence.snapshot import Edges, Kind, Outlines, Segments, Track
 from autocalib_ros.perception.background import Background
 from autocalib_ros.perception.detected import DetectedVehicles
 from autocalib_ros.perception.detector.detector import VehicleDetector

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from autocalib_ros.evidence import OUTLINE_COLUMNS
+from autocalib_ros.evidence.snapshot import OUTLINE_COLUMNS
 from autocalib_ros.perception.vehicles import Region
 
 DIRECTIONS = np.array([(-1, -1), (1, 1), (-1, 1), (1, -1), (-1, 0), (1, 0), (0, -1), (0, 1)])

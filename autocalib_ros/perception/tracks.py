@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from autocalib_ros.config import TrackingOptions
-from autocalib_ros.evidence import Track
+from autocalib_ros.evidence.snapshot import Track
 from autocalib_ros.perception.shutter import levelled
 
 CAPACITY = 256

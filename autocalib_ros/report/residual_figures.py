@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
-from autocalib_ros.evidence import COVERAGE_CELLS
+from autocalib_ros.evidence.snapshot import COVERAGE_CELLS
 from autocalib_ros.report.canvas import INK, TURNING, cell_map, chart, draw_legend, road_colour
 from autocalib_ros.report.scene import Scene
 

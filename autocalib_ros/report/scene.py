@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from autocalib_ros.config import Options
-from autocalib_ros.evidence import Evidence
+from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
 from autocalib_ros.results.calibration import Calibration, Refusal
 

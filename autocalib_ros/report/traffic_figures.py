@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from autocalib_ros.evidence import COVERAGE_CELLS
+from autocalib_ros.evidence.snapshot import COVERAGE_CELLS
 from autocalib_ros.report.canvas import TURNING, cell_map, draw_legend, draw_paths, image_axes, label_colour
 from autocalib_ros.report.scene import NOT_USED, REJECTED, Scene
 

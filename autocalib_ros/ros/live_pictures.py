@@ -24,7 +24,7 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
 from autocalib_ros.calibrator import Progress
-from autocalib_ros.evidence import Evidence
+from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.perception.privacy import Polygons, black_out
 from autocalib_ros.pictures.drawing import Caption
 from autocalib_ros.pictures.live import DebugPicture, JudgedTracks, RectifiedPicture, TopPicture

@@ -23,7 +23,7 @@ import numpy as np
 from autocalib_ros.calibrator import AutoCalibrator, Intake, Progress
 from autocalib_ros.config import Options
 from autocalib_ros.errors import AutocalibError
-from autocalib_ros.evidence import Evidence
+from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.perception.detector.detector import VehicleDetector
 from autocalib_ros.results.calibration import Calibration, Refusal

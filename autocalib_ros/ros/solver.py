@@ -16,7 +16,7 @@ from multiprocessing.process import BaseProcess
 from autocalib_ros.calibrator import solve
 from autocalib_ros.config import Options
 from autocalib_ros.errors import AutocalibError
-from autocalib_ros.evidence import Evidence
+from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.results.calibration import Calibration, Refusal
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from autocalib_ros.config import BufferOptions
-from autocalib_ros.evidence import Evidence, EvidenceBuffer, Outlines, Track
+from autocalib_ros.evidence.snapshot import Evidence, EvidenceBuffer, Outlines, Track
 from autocalib_ros.offline.synthetic_evidence import Junction
 from autocalib_ros.perception.outlines import DIRECTIONS
 

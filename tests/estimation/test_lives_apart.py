@@ -20,7 +20,7 @@ from autocalib_ros.estimation.lives import Lives, find_lives
 from autocalib_ros.estimation.rigid_bodies import Bundle
 from autocalib_ros.estimation.state import Setting, State, Steps
 from autocalib_ros.estimation.windows import Instants, Windows, find_windows
-from autocalib_ros.evidence import Evidence
+from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.great_circles import TrackSet, select_tracks
 from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera

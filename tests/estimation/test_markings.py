@@ -20,7 +20,7 @@ from autocalib_ros.estimation.plane import Plane
 from autocalib_ros.estimation.road_lines import lines_on_road
 from autocalib_ros.estimation.solution import Solution, agreed_by, find_solution
 from autocalib_ros.estimation.state import Setting
-from autocalib_ros.evidence import Evidence
+from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.great_circles import TrackSet, select_tracks
 from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera

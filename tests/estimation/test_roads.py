@@ -13,7 +13,7 @@ from autocalib_ros.estimation.doubts import NOT_CROSS_CHECKED, halves_doubt
 from autocalib_ros.estimation.joint import solve_joint
 from autocalib_ros.estimation.lens_prior import lens_priors
 from autocalib_ros.estimation.state import Setting, State
-from autocalib_ros.evidence import Evidence
+from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.great_circles import select_tracks
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.accuracy import evidence_of

@@ -16,7 +16,7 @@ from autocalib_ros.estimation.plane import LevelCamera, agreement
 from autocalib_ros.estimation.solution import Solution, find_solution
 from autocalib_ros.estimation.state import State
 from autocalib_ros.estimation.transverse_edges import RoadEdges, SquareVehicles, square_to
-from autocalib_ros.evidence import Evidence
+from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.great_circles import select_tracks
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.synthetic_evidence import Junction, pose, synthetic_evidence

@@ -8,7 +8,7 @@ import numpy as np
 
 from autocalib_ros.config import BufferOptions
 from autocalib_ros.estimation.windows import MIN_POINTS, find_windows, no_windows
-from autocalib_ros.evidence import Evidence, EvidenceBuffer, Segments, Track
+from autocalib_ros.evidence.snapshot import Evidence, EvidenceBuffer, Segments, Track
 from autocalib_ros.geometry.great_circles import SAMPLES
 
 SIZE = (1280, 720)

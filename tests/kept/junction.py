@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from autocalib_ros.config import BufferOptions
-from autocalib_ros.evidence import Evidence, EvidenceBuffer, Segments, Track
+from autocalib_ros.evidence.snapshot import Evidence, EvidenceBuffer, Segments, Track
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.results.calibration import (
     Calibration,

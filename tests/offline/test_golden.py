@@ -13,7 +13,7 @@ import pytest
 from junction import full_result, junction_evidence, lens_result, refusal
 
 from autocalib_ros.cli import main
-from autocalib_ros.evidence import Evidence
+from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.offline import golden
 from autocalib_ros.offline.golden import (
     Case,

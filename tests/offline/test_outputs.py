@@ -12,7 +12,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosDurability
 
 from autocalib_ros.errors import UsageError
-from autocalib_ros.evidence import Evidence
+from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.offline import outputs
 from autocalib_ros.offline.sources import open_source
 from autocalib_ros.offline.write_bag import camera_info_topic, write_bag

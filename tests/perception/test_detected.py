@@ -8,7 +8,7 @@ import pytest
 
 from autocalib_ros.calibrator import AutoCalibrator
 from autocalib_ros.config import DetectorOptions, Options
-from autocalib_ros.evidence import Kind, Track
+from autocalib_ros.evidence.snapshot import Kind, Track
 from autocalib_ros.perception.detected import DetectedVehicles
 from autocalib_ros.perception.detector.detector import Detections
 from autocalib_ros.perception.observer import Observer

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from autocalib_ros.config import MotionOptions, Options
-from autocalib_ros.evidence import OUTLINE_COLUMNS
+from autocalib_ros.evidence.snapshot import OUTLINE_COLUMNS
 from autocalib_ros.perception.observer import Observer
 from autocalib_ros.perception.outlines import outlines_of
 from autocalib_ros.perception.vehicles import MotionMask, Region

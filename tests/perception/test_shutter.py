@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from autocalib_ros.config import Options, TrackingOptions
-from autocalib_ros.evidence import Track
+from autocalib_ros.evidence.snapshot import Track
 from autocalib_ros.perception.images import ImageDecoder
 from autocalib_ros.perception.observer import Observer
 from autocalib_ros.perception.shutter import LEAP_LEVELS, Seen, View, levelled

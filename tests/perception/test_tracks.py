@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from autocalib_ros.config import TrackingOptions
-from autocalib_ros.evidence import Track
+from autocalib_ros.evidence.snapshot import Track
 from autocalib_ros.perception.tracks import PointTracker, _jumped
 
 SIZE = (160, 320)

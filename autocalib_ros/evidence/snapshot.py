@@ -13,7 +13,7 @@ import numpy as np
 
 from autocalib_ros.config import BufferOptions
 from autocalib_ros.errors import InputError
-from autocalib_ros.redundancy import Holdings
+from autocalib_ros.evidence.retention import Holdings
 from autocalib_ros.results.calibration import EvidenceSummary
 
 FORMAT = 1

@@ -1,0 +1,1 @@
+"""Observations over time: a bounded buffer, frozen snapshots and their files."""
