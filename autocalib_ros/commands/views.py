@@ -12,7 +12,7 @@ from autocalib_ros.commands.compare import FILES
 
 if TYPE_CHECKING:
     from autocalib_ros.offline.view_files import View
-    from autocalib_ros.perception.privacy import Polygons
+    from autocalib_ros.perception.ignore_regions import Polygons
     from autocalib_ros.results.saved_camera import KnownCamera
 
 
@@ -36,7 +36,7 @@ def write(arguments: argparse.Namespace, label: str, view_of: Callable[[KnownCam
 
     from autocalib_ros.errors import AutocalibError
     from autocalib_ros.offline.view_files import Part, write_view
-    from autocalib_ros.perception.privacy import black_out
+    from autocalib_ros.perception.ignore_regions import black_out
     from autocalib_ros.results.saved_camera import read_known_camera
 
     known = read_known_camera(arguments.calibration)

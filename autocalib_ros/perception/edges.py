@@ -7,7 +7,7 @@ from collections import deque
 import cv2
 import numpy as np
 
-from autocalib_ros.perception.vehicles import Region
+from autocalib_ros.perception.motion_mask import Region
 
 LEAST_LENGTH = 0.012
 """Shortest edge, share of the image width; below, its direction is hardly known."""

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from autocalib_ros.errors import InputError
-from autocalib_ros.perception.stretch import Stretch
+from autocalib_ros.perception.intensity_normalisation import Stretch
 
 LOG = logging.getLogger(__name__)
 

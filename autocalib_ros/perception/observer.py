@@ -10,17 +10,17 @@ import numpy as np
 from autocalib_ros.config import Options
 from autocalib_ros.evidence.snapshot import Edges, Kind, Outlines, Segments, Track
 from autocalib_ros.perception.background import Background
-from autocalib_ros.perception.detected import DetectedVehicles
 from autocalib_ros.perception.detector.detector import VehicleDetector
+from autocalib_ros.perception.detector_tracks import DetectedVehicles
+from autocalib_ros.perception.drift_monitor import Stillness
 from autocalib_ros.perception.edges import EdgeFinder
-from autocalib_ros.perception.outlines import outlines_of
-from autocalib_ros.perception.privacy import Ignored, black_out, require_seen
+from autocalib_ros.perception.frame_gate import LEAP_LEVELS, Seen, View
+from autocalib_ros.perception.ignore_regions import Ignored, black_out, require_seen
+from autocalib_ros.perception.klt_tracker import PointTracker
+from autocalib_ros.perception.line_segments import StillLines
+from autocalib_ros.perception.motion_mask import MotionMask, Region, without
 from autocalib_ros.perception.segments import Keypoints, find_keypoints, match_segments
-from autocalib_ros.perception.shutter import LEAP_LEVELS, Seen, View
-from autocalib_ros.perception.still_lines import StillLines
-from autocalib_ros.perception.stillness import Stillness
-from autocalib_ros.perception.tracks import PointTracker
-from autocalib_ros.perception.vehicles import MotionMask, Region, without
+from autocalib_ros.perception.silhouettes import outlines_of
 
 MASK_EVERY = 2
 """Images between two updates of the background: traffic needs no finer step in time."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from autocalib_ros.perception.vehicles import Region
+from autocalib_ros.perception.motion_mask import Region
 
 RATIO = 0.75
 """A match counts when its distance is below this share of the second best's (Lowe 2004)."""

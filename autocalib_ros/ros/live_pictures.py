@@ -25,7 +25,7 @@ from std_msgs.msg import Header
 
 from autocalib_ros.calibrator import Progress
 from autocalib_ros.evidence.snapshot import Evidence
-from autocalib_ros.perception.privacy import Polygons, black_out
+from autocalib_ros.perception.ignore_regions import Polygons, black_out
 from autocalib_ros.pictures.drawing import Caption
 from autocalib_ros.pictures.live import DebugPicture, JudgedTracks, RectifiedPicture, TopPicture
 from autocalib_ros.results.calibration import Calibration, Refusal

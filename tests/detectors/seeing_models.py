@@ -14,7 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from autocalib_ros.perception.detector.pictures import IMAGENET_MEAN, IMAGENET_STD
+from autocalib_ros.perception.detector.preprocessing import IMAGENET_MEAN, IMAGENET_STD
 
 CAR, PERSON = 2, 0
 """Of COCO's 80 classes."""

@@ -9,11 +9,11 @@ import pytest
 from autocalib_ros.calibrator import AutoCalibrator
 from autocalib_ros.config import DetectorOptions, Options
 from autocalib_ros.evidence.snapshot import Kind, Track
-from autocalib_ros.perception.detected import DetectedVehicles
 from autocalib_ros.perception.detector.detector import Detections
+from autocalib_ros.perception.detector_tracks import DetectedVehicles
+from autocalib_ros.perception.klt_tracker import PointTracker
+from autocalib_ros.perception.motion_mask import Region
 from autocalib_ros.perception.observer import Observer
-from autocalib_ros.perception.tracks import PointTracker
-from autocalib_ros.perception.vehicles import Region
 
 SIZE = (360, 640)
 RATE_HZ = 10.0

@@ -9,8 +9,8 @@ import pytest
 from autocalib_ros.config import BufferOptions, Options
 from autocalib_ros.evidence.snapshot import Edges, EvidenceBuffer
 from autocalib_ros.perception.edges import MAX_PER_REGION, MAX_REGIONS, EdgeFinder
+from autocalib_ros.perception.motion_mask import Region
 from autocalib_ros.perception.observer import Observer
-from autocalib_ros.perception.vehicles import Region
 
 SIZE = (360, 640)
 CAR = (60, 90)

@@ -8,9 +8,9 @@ import pytest
 
 from autocalib_ros.config import MotionOptions, Options
 from autocalib_ros.perception.background import Background
+from autocalib_ros.perception.drift_monitor import Stillness
+from autocalib_ros.perception.motion_mask import MotionMask
 from autocalib_ros.perception.observer import Observer
-from autocalib_ros.perception.stillness import Stillness
-from autocalib_ros.perception.vehicles import MotionMask
 
 SIZE = (360, 640)
 

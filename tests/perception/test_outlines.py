@@ -8,9 +8,9 @@ import pytest
 
 from autocalib_ros.config import MotionOptions, Options
 from autocalib_ros.evidence.snapshot import OUTLINE_COLUMNS
+from autocalib_ros.perception.motion_mask import MotionMask, Region
 from autocalib_ros.perception.observer import Observer
-from autocalib_ros.perception.outlines import outlines_of
-from autocalib_ros.perception.vehicles import MotionMask, Region
+from autocalib_ros.perception.silhouettes import outlines_of
 
 SHAPE = (360, 640)
 

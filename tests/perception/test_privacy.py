@@ -11,10 +11,10 @@ import pytest
 from autocalib_ros.calibrator import AutoCalibrator
 from autocalib_ros.config import Options
 from autocalib_ros.errors import InputError, UsageError
-from autocalib_ros.perception.black_images import blacked_out, require_blackable
+from autocalib_ros.perception.ignore_regions import black_out, ignored_mask
 from autocalib_ros.perception.images import ImageDecoder
+from autocalib_ros.perception.masked_messages import blacked_out, require_blackable
 from autocalib_ros.perception.observer import Observer
-from autocalib_ros.perception.privacy import black_out, ignored_mask
 
 HEIGHT, WIDTH = 200, 400
 UPPER = '-10 -10 405 -10 405 99.5 -10 99.5'

@@ -10,10 +10,10 @@ import pytest
 
 from autocalib_ros.config import Options, TrackingOptions
 from autocalib_ros.evidence.snapshot import Track
+from autocalib_ros.perception.frame_gate import LEAP_LEVELS, Seen, View, levelled
 from autocalib_ros.perception.images import ImageDecoder
+from autocalib_ros.perception.klt_tracker import PointTracker, _arrived
 from autocalib_ros.perception.observer import Observer
-from autocalib_ros.perception.shutter import LEAP_LEVELS, Seen, View, levelled
-from autocalib_ros.perception.tracks import PointTracker, _arrived
 
 HEIGHT, WIDTH = 240, 480
 RATE_HZ = 10.0

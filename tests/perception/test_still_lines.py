@@ -11,8 +11,8 @@ import pytest
 from autocalib_ros.calibrator import AutoCalibrator
 from autocalib_ros.config import Options
 from autocalib_ros.perception.background import LEAST_SAMPLES
+from autocalib_ros.perception.line_segments import LEAST_LENGTH, MOST_LINES, StillLines
 from autocalib_ros.perception.observer import Observer
-from autocalib_ros.perception.still_lines import LEAST_LENGTH, MOST_LINES, StillLines
 
 WIDTH, HEIGHT = 640, 360
 FINE = 8

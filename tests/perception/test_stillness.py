@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from autocalib_ros.perception.stillness import Stillness
+from autocalib_ros.perception.drift_monitor import Stillness
 
 WIDTH, HEIGHT = 640, 360
 LIMIT_PX = 1.5

@@ -8,7 +8,7 @@ import pytest
 
 from autocalib_ros.config import TrackingOptions
 from autocalib_ros.evidence.snapshot import Track
-from autocalib_ros.perception.tracks import PointTracker, _jumped
+from autocalib_ros.perception.klt_tracker import PointTracker, _jumped
 
 SIZE = (160, 320)
 

@@ -14,7 +14,7 @@ from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.perception.detector.classes import chosen_classes
 from autocalib_ros.perception.detector.decoding import without_doubles
 from autocalib_ros.perception.detector.layouts import LAYOUTS, Seen, class_count, layout_of
-from autocalib_ros.perception.detector.pictures import PAD_LEVEL, Colours, Placement, placed, tensor
+from autocalib_ros.perception.detector.preprocessing import PAD_LEVEL, Colours, Placement, placed, tensor
 from autocalib_ros.perception.detector.session import open_session
 
 NATIVE_PX = 1280

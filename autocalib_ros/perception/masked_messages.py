@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from autocalib_ros.errors import InputError, UsageError
+from autocalib_ros.perception.ignore_regions import Polygons, ignored_mask
 from autocalib_ros.perception.images import (
     CHANNELS,
     NUMBERS,
@@ -19,7 +20,6 @@ from autocalib_ros.perception.images import (
     known_encoding,
     rows_of,
 )
-from autocalib_ros.perception.privacy import Polygons, ignored_mask
 
 BLACK_LUMA, NO_CHROMA = 16, 128
 """Black in limited-range YUV."""

@@ -7,7 +7,7 @@ import numpy as np
 
 from autocalib_ros.config import TrackingOptions
 from autocalib_ros.evidence.snapshot import Track
-from autocalib_ros.perception.shutter import levelled
+from autocalib_ros.perception.frame_gate import levelled
 
 CAPACITY = 256
 """Images of one track at the most; a longer one is finished and goes on as a new one."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from autocalib_ros.perception.shutter import Seen, View
+from autocalib_ros.perception.frame_gate import Seen, View
 
 PERCENTILES = (1.0, 99.0)
 EASE_S = 20.0

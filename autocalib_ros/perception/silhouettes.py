@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from autocalib_ros.evidence.snapshot import OUTLINE_COLUMNS
-from autocalib_ros.perception.vehicles import Region
+from autocalib_ros.perception.motion_mask import Region
 
 DIRECTIONS = np.array([(-1, -1), (1, 1), (-1, 1), (1, -1), (-1, 0), (1, 0), (0, -1), (0, 1)])
 """In which an outline's points are its farthest, as `Outlines.ends_px` has them."""

@@ -12,8 +12,8 @@ import numpy as np
 from autocalib_ros.config import DetectorOptions
 from autocalib_ros.evidence.snapshot import Kind
 from autocalib_ros.perception.detector.detector import Detections, VehicleDetector
-from autocalib_ros.perception.tracks import PointTracker
-from autocalib_ros.perception.vehicles import Region
+from autocalib_ros.perception.klt_tracker import PointTracker
+from autocalib_ros.perception.motion_mask import Region
 
 LEAST_IOU = 0.3
 """A box is that of a detection when they share so much of their union (Bewley et al. 2016)."""
