@@ -9,7 +9,7 @@ import numpy as np
 from autocalib_ros.config import GateOptions
 from autocalib_ros.estimation.differences import differences, expected_of_halves
 from autocalib_ros.estimation.joint import MIN_ROWS, JointFit, assign, road_support, solve_joint
-from autocalib_ros.estimation.lives import no_lives
+from autocalib_ros.estimation.observations.tracklets import no_lives
 from autocalib_ros.estimation.plane import LevelCamera, Plane, above_traffic
 from autocalib_ros.estimation.state import State
 from autocalib_ros.estimation.uncertainty import told_by_evidence

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from autocalib_ros.config import JointOptions
-from autocalib_ros.estimation.windows import Windows
+from autocalib_ros.estimation.observations.two_frame_windows import Windows
 from autocalib_ros.geometry.great_circles import Rays, rays_of
 from autocalib_ros.geometry.small_matrices import dot
 from autocalib_ros.lens.camera import Camera

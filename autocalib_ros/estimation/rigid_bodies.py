@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from autocalib_ros.estimation.lives import Lives
+from autocalib_ros.estimation.observations.tracklets import Lives
 from autocalib_ros.geometry.great_circles import rays_of
 from autocalib_ros.lens.camera import Camera
 

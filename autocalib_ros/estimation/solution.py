@@ -20,6 +20,7 @@ from autocalib_ros.estimation.joint import (
 )
 from autocalib_ros.estimation.lane_changes import by_lane_changes
 from autocalib_ros.estimation.lens_prior import LensPrior, known_lens, lens_priors
+from autocalib_ros.estimation.observations.two_frame_windows import Instants, Windows, find_windows
 from autocalib_ros.estimation.painted import NO_MARKINGS, fit_to_markings, sharpened, with_lens_known
 from autocalib_ros.estimation.path_noise import USUAL_HEIGHT_M
 from autocalib_ros.estimation.people import people
@@ -42,7 +43,6 @@ from autocalib_ros.estimation.turning import (
     with_sliding,
     with_turning,
 )
-from autocalib_ros.estimation.windows import Instants, Windows, find_windows
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.great_circles import TrackSet, evenly
 from autocalib_ros.geometry.ground_plane import undirected_deg

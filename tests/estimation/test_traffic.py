@@ -8,7 +8,7 @@ import numpy as np
 
 from autocalib_ros.calibrator import solve
 from autocalib_ros.config import Options
-from autocalib_ros.estimation.traffic import of_vehicles
+from autocalib_ros.estimation.observations.selection import of_vehicles
 from autocalib_ros.evidence.snapshot import Evidence, Kind
 from autocalib_ros.offline.synthetic_evidence import Junction, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration, Refusal

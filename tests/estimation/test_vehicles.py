@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from autocalib_ros.estimation.vehicles import ALONE, bodies, corroborated, heading_off_deg
+from autocalib_ros.estimation.observations.vehicle_grouping import ALONE, bodies, corroborated, heading_off_deg
 from autocalib_ros.geometry.great_circles import SAMPLES, TrackSet
 
 

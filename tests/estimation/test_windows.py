@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from autocalib_ros.config import BufferOptions
-from autocalib_ros.estimation.windows import MIN_POINTS, find_windows, no_windows
+from autocalib_ros.estimation.observations.two_frame_windows import MIN_POINTS, find_windows, no_windows
 from autocalib_ros.evidence.snapshot import Evidence, EvidenceBuffer, Segments, Track
 from autocalib_ros.geometry.great_circles import SAMPLES
 

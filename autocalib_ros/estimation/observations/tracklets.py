@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from autocalib_ros.estimation.windows import (
+from autocalib_ros.estimation.observations.two_frame_windows import (
     INTERVAL_S,
     MIN_POINTS,
     Instants,
