@@ -7,8 +7,8 @@ import pytest
 
 from autocalib_ros.config import JointOptions
 from autocalib_ros.estimation.lens_prior import lens_priors
+from autocalib_ros.estimation.motion.planar_motion import Motion, View, first_motion, on_course, settled
 from autocalib_ros.estimation.observations.two_frame_windows import Windows
-from autocalib_ros.estimation.planar_motion import Motion, View, first_motion, on_course, settled
 from autocalib_ros.estimation.rows import MotionRows
 from autocalib_ros.estimation.state import Setting, State, Steps
 from autocalib_ros.lens.camera import Camera

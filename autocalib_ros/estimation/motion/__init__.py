@@ -1,0 +1,1 @@
+"""Motion models of vehicles: planar two-frame motion, and rigid bodies over several frames."""
