@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from autocalib_ros.estimation.joint import JointFit
-from autocalib_ros.estimation.state import State
-from autocalib_ros.estimation.uncertainty import propagate
+from autocalib_ros.estimation.adjustment.bundle_adjustment import JointFit
+from autocalib_ros.estimation.adjustment.covariance import propagate
+from autocalib_ros.estimation.adjustment.parameters import State
 from autocalib_ros.geometry.ground_plane import undirected_deg
 
 UNTOLD = 1e-9

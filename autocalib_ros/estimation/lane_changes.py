@@ -10,11 +10,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from autocalib_ros.estimation.joint import JointFit, solve_joint
+from autocalib_ros.estimation.adjustment.bundle_adjustment import JointFit, solve_joint
+from autocalib_ros.estimation.adjustment.noise_model import USUAL_HEIGHT_M
+from autocalib_ros.estimation.adjustment.parameters import State, ground_up
 from autocalib_ros.estimation.motion.planar_motion import View, first_motion, on_course, paths
 from autocalib_ros.estimation.observations.two_frame_windows import Windows
-from autocalib_ros.estimation.path_noise import USUAL_HEIGHT_M
-from autocalib_ros.estimation.state import State, ground_up
 from autocalib_ros.geometry.great_circles import TrackSet, rays_of
 
 ASIDE_DEG = 1.5, 20.0

@@ -9,14 +9,14 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from autocalib_ros.config import GateOptions
+from autocalib_ros.estimation.adjustment.bundle_adjustment import JointFit, judged_at
+from autocalib_ros.estimation.adjustment.lens_prior import LensPrior
+from autocalib_ros.estimation.adjustment.parameters import Setting, State, Steps
 from autocalib_ros.estimation.doubts import view_doubt
-from autocalib_ros.estimation.joint import JointFit, judged_at
-from autocalib_ros.estimation.lens_prior import LensPrior
 from autocalib_ros.estimation.line_mixture import ASKEW_RAD, Grid
 from autocalib_ros.estimation.markings import beside_traffic, square_grids, square_grids_near
 from autocalib_ros.estimation.observations.two_frame_windows import no_windows
 from autocalib_ros.estimation.road_lines import Lines, Sight, lines_on_road
-from autocalib_ros.estimation.state import Setting, State, Steps
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.great_circles import TrackSet
 from autocalib_ros.geometry.ground_plane import undirected_deg

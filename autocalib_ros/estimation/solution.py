@@ -7,10 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from autocalib_ros.config import GateOptions, JointOptions
-from autocalib_ros.estimation.differences import differences
-from autocalib_ros.estimation.doubts import halves_doubt, lens_doubt, plane_doubt, traffic_doubt
-from autocalib_ros.estimation.held import lens_assumptions, with_k2_if_asked_for, with_what_can_be_told
-from autocalib_ros.estimation.joint import (
+from autocalib_ros.estimation.adjustment.bundle_adjustment import (
     UNMODELLED_FOCAL,
     JointFit,
     noise_cost,
@@ -18,11 +15,15 @@ from autocalib_ros.estimation.joint import (
     solve_joint,
     with_bodies,
 )
+from autocalib_ros.estimation.adjustment.lens_prior import LensPrior, known_lens, lens_priors
+from autocalib_ros.estimation.adjustment.noise_model import USUAL_HEIGHT_M
+from autocalib_ros.estimation.adjustment.parameters import Setting
+from autocalib_ros.estimation.differences import differences
+from autocalib_ros.estimation.doubts import halves_doubt, lens_doubt, plane_doubt, traffic_doubt
+from autocalib_ros.estimation.held import lens_assumptions, with_k2_if_asked_for, with_what_can_be_told
 from autocalib_ros.estimation.lane_changes import by_lane_changes
-from autocalib_ros.estimation.lens_prior import LensPrior, known_lens, lens_priors
 from autocalib_ros.estimation.observations.two_frame_windows import Instants, Windows, find_windows
 from autocalib_ros.estimation.painted import NO_MARKINGS, fit_to_markings, sharpened, with_lens_known
-from autocalib_ros.estimation.path_noise import USUAL_HEIGHT_M
 from autocalib_ros.estimation.people import people
 from autocalib_ros.estimation.plane import AGREE_SIGMAS, LevelCamera, Plane, agreement
 from autocalib_ros.estimation.roads import (
@@ -33,7 +34,6 @@ from autocalib_ros.estimation.roads import (
     with_second_road,
 )
 from autocalib_ros.estimation.starts import agreed, in_likeliest_family
-from autocalib_ros.estimation.state import Setting
 from autocalib_ros.estimation.transverse_edges import SquareVehicles, square_vehicles
 from autocalib_ros.estimation.turning import (
     from_turning,

@@ -6,15 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 
+from autocalib_ros.estimation.adjustment.bundle_adjustment import JointFit, solve_joint
+from autocalib_ros.estimation.adjustment.noise_model import USUAL_HEIGHT_M
+from autocalib_ros.estimation.adjustment.parameters import Setting, State
 from autocalib_ros.estimation.differences import differences
-from autocalib_ros.estimation.joint import JointFit, solve_joint
 from autocalib_ros.estimation.motion.planar_motion import View, first_motion, on_course, sliding, turning_centres
 from autocalib_ros.estimation.motion.rigid_bodies import Bundle
 from autocalib_ros.estimation.observations.tracklets import find_lives, no_lives
 from autocalib_ros.estimation.observations.two_frame_windows import Instants, Windows
-from autocalib_ros.estimation.path_noise import USUAL_HEIGHT_M
 from autocalib_ros.estimation.starts import most_probable
-from autocalib_ros.estimation.state import Setting, State
 from autocalib_ros.geometry.great_circles import TrackSet
 from autocalib_ros.results.calibration import Reason
 

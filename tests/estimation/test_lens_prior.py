@@ -7,7 +7,7 @@ import pytest
 
 from autocalib_ros.config import JointOptions
 from autocalib_ros.errors import UsageError
-from autocalib_ros.estimation.lens_prior import known_lens, lens_priors
+from autocalib_ros.estimation.adjustment.lens_prior import known_lens, lens_priors
 from autocalib_ros.lens.camera import Camera
 
 SIZE = (1280, 720)

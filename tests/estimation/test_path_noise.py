@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from autocalib_ros.config import JointOptions
-from autocalib_ros.estimation.path_noise import OnRoad, whitening
+from autocalib_ros.estimation.adjustment.noise_model import OnRoad, whitening
 
 SAMPLES, TRACKS = 10, 4000
 OPTIONS = JointOptions()

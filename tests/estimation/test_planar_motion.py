@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from autocalib_ros.config import JointOptions
-from autocalib_ros.estimation.lens_prior import lens_priors
+from autocalib_ros.estimation.adjustment.lens_prior import lens_priors
+from autocalib_ros.estimation.adjustment.parameters import Setting, State, Steps
+from autocalib_ros.estimation.adjustment.residual_blocks import MotionRows
 from autocalib_ros.estimation.motion.planar_motion import Motion, View, first_motion, on_course, settled
 from autocalib_ros.estimation.observations.two_frame_windows import Windows
-from autocalib_ros.estimation.rows import MotionRows
-from autocalib_ros.estimation.state import Setting, State, Steps
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.synthetic_evidence import pose
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from autocalib_ros.estimation.uncertainty import (
+from autocalib_ros.estimation.adjustment.covariance import (
     cluster_covariance,
     correlation_within,
     few_factor,

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from autocalib_ros.estimation.adjustment.noise_model import on_road, whitening
+from autocalib_ros.estimation.adjustment.parameters import State, Steps, ground_up
 from autocalib_ros.estimation.motion.planar_motion import Motion, View, first_motion, settled, trust
 from autocalib_ros.estimation.motion.rigid_bodies import Bundle, Shapes, lifted
 from autocalib_ros.estimation.observations.vehicle_grouping import corroborated, heading_off_deg
-from autocalib_ros.estimation.path_noise import on_road, whitening
-from autocalib_ros.estimation.state import State, Steps, ground_up
 from autocalib_ros.geometry.great_circles import (
     Rays,
     Seen,

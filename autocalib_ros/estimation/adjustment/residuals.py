@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from autocalib_ros.estimation.joint import JointFit
+from autocalib_ros.estimation.adjustment.bundle_adjustment import JointFit
 from autocalib_ros.results.calibration import Residuals
 
 TURNING = -1

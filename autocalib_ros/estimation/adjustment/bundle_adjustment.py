@@ -14,14 +14,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from autocalib_ros.estimation.lens_prior import LensPrior
+from autocalib_ros.estimation.adjustment.covariance import cluster_covariance, correlation_within, propagate, propagated
+from autocalib_ros.estimation.adjustment.lens_prior import LensPrior
+from autocalib_ros.estimation.adjustment.noise_model import USUAL_HEIGHT_M
+from autocalib_ros.estimation.adjustment.parameters import Setting, State, Steps, crossed, ground_up
+from autocalib_ros.estimation.adjustment.residual_blocks import LifeRows, MotionRows, RoadRows, Rows
 from autocalib_ros.estimation.motion.planar_motion import Motion
 from autocalib_ros.estimation.motion.rigid_bodies import Shapes
 from autocalib_ros.estimation.observations.vehicle_grouping import bodies
-from autocalib_ros.estimation.path_noise import USUAL_HEIGHT_M
-from autocalib_ros.estimation.rows import LifeRows, MotionRows, RoadRows, Rows
-from autocalib_ros.estimation.state import Setting, State, Steps, crossed, ground_up
-from autocalib_ros.estimation.uncertainty import cluster_covariance, correlation_within, propagate, propagated
 from autocalib_ros.estimation.vanishing_points import distances2_through
 from autocalib_ros.geometry.great_circles import Seen, TrackSet, rays_of
 from autocalib_ros.lens.camera import Camera

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from autocalib_ros.config import JointOptions
-from autocalib_ros.estimation.lens_prior import LensPrior
+from autocalib_ros.estimation.adjustment.lens_prior import LensPrior
 from autocalib_ros.estimation.motion.rigid_bodies import Bundle
 from autocalib_ros.estimation.observations.two_frame_windows import Windows, no_windows
 from autocalib_ros.estimation.vanishing_points import Directions

@@ -1,0 +1,1 @@
+"""The bundle adjustment: parameters, prior, noise, residual blocks, solver, covariance, model selection."""
