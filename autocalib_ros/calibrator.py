@@ -18,8 +18,8 @@ from autocalib_ros.estimation.people import people
 from autocalib_ros.estimation.plane import Plane
 from autocalib_ros.estimation.scale import Scale, is_unusual, known_scale, scale_doubt
 from autocalib_ros.estimation.solution import Solution, find_solution
+from autocalib_ros.estimation.straight.consensus import segment_orientations
 from autocalib_ros.estimation.straightness import paper_intrinsics
-from autocalib_ros.estimation.vanishing_points import segment_orientations
 from autocalib_ros.evidence.snapshot import Evidence, EvidenceBuffer, Kind
 from autocalib_ros.geometry.great_circles import TrackSet, select_tracks
 from autocalib_ros.geometry.ground_plane import ground_plane, ground_points, pixels_ahead, tilt_and_roll_deg

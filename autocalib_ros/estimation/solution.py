@@ -26,14 +26,14 @@ from autocalib_ros.estimation.observations.two_frame_windows import Instants, Wi
 from autocalib_ros.estimation.painted import NO_MARKINGS, fit_to_markings, sharpened, with_lens_known
 from autocalib_ros.estimation.people import people
 from autocalib_ros.estimation.plane import AGREE_SIGMAS, LevelCamera, Plane, agreement
-from autocalib_ros.estimation.roads import (
+from autocalib_ros.estimation.straight.initialisation import agreed, in_likeliest_family
+from autocalib_ros.estimation.straight.roads import (
     main_road,
     with_further_roads,
     with_real_roads,
     with_right_angle,
     with_second_road,
 )
-from autocalib_ros.estimation.starts import agreed, in_likeliest_family
 from autocalib_ros.estimation.transverse_edges import SquareVehicles, square_vehicles
 from autocalib_ros.estimation.turning import (
     from_turning,

@@ -14,7 +14,7 @@ from autocalib_ros.estimation.motion.planar_motion import View, first_motion, on
 from autocalib_ros.estimation.motion.rigid_bodies import Bundle
 from autocalib_ros.estimation.observations.tracklets import find_lives, no_lives
 from autocalib_ros.estimation.observations.two_frame_windows import Instants, Windows
-from autocalib_ros.estimation.starts import most_probable
+from autocalib_ros.estimation.straight.initialisation import most_probable
 from autocalib_ros.geometry.great_circles import TrackSet
 from autocalib_ros.results.calibration import Reason
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from autocalib_ros.config import PaperOptions
-from autocalib_ros.estimation.vanishing_points import (
+from autocalib_ros.estimation.straight.consensus import (
     Orientations,
     consensus_directions,
     segment_orientations,

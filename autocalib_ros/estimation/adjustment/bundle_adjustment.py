@@ -22,7 +22,7 @@ from autocalib_ros.estimation.adjustment.residual_blocks import LifeRows, Motion
 from autocalib_ros.estimation.motion.planar_motion import Motion
 from autocalib_ros.estimation.motion.rigid_bodies import Shapes
 from autocalib_ros.estimation.observations.vehicle_grouping import bodies
-from autocalib_ros.estimation.vanishing_points import distances2_through
+from autocalib_ros.estimation.straight.consensus import distances2_through
 from autocalib_ros.geometry.great_circles import Seen, TrackSet, rays_of
 from autocalib_ros.lens.camera import Camera
 

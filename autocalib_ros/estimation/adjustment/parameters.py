@@ -12,7 +12,7 @@ from autocalib_ros.config import JointOptions
 from autocalib_ros.estimation.adjustment.lens_prior import LensPrior
 from autocalib_ros.estimation.motion.rigid_bodies import Bundle
 from autocalib_ros.estimation.observations.two_frame_windows import Windows, no_windows
-from autocalib_ros.estimation.vanishing_points import Directions
+from autocalib_ros.estimation.straight.consensus import Directions
 from autocalib_ros.geometry.great_circles import Rays
 from autocalib_ros.lens.camera import Camera
 

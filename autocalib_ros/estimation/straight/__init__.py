@@ -1,0 +1,1 @@
+"""Road directions from straight tracks: consensus, multi-start initialisation, further roads."""
