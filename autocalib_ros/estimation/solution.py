@@ -21,7 +21,6 @@ from autocalib_ros.estimation.adjustment.parameters import Setting
 from autocalib_ros.estimation.differences import differences
 from autocalib_ros.estimation.doubts import halves_doubt, lens_doubt, plane_doubt, traffic_doubt
 from autocalib_ros.estimation.held import lens_assumptions, with_k2_if_asked_for, with_what_can_be_told
-from autocalib_ros.estimation.lane_changes import by_lane_changes
 from autocalib_ros.estimation.observations.two_frame_windows import Instants, Windows, find_windows
 from autocalib_ros.estimation.painted import NO_MARKINGS, fit_to_markings, sharpened, with_lens_known
 from autocalib_ros.estimation.people import people
@@ -35,7 +34,8 @@ from autocalib_ros.estimation.straight.roads import (
     with_second_road,
 )
 from autocalib_ros.estimation.transverse_edges import SquareVehicles, square_vehicles
-from autocalib_ros.estimation.turning import (
+from autocalib_ros.estimation.turning.lane_changes import by_lane_changes
+from autocalib_ros.estimation.turning.turning_traffic import (
     from_turning,
     one_centre_doubt,
     over_lives,

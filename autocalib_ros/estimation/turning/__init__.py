@@ -1,0 +1,1 @@
+"""Lens and plane from vehicles that turn or change lanes."""
