@@ -17,8 +17,8 @@ from dataclasses import replace
 import numpy as np
 
 from autocalib_ros.estimation.adjustment.lens_prior import LensPrior
-from autocalib_ros.estimation.line_mixture import LOWEST, Grid, settled_grid, widened_costs
-from autocalib_ros.estimation.road_lines import Lines, along_lines, traffic_places, within
+from autocalib_ros.estimation.markings.grid_mixture import LOWEST, Grid, settled_grid, widened_costs
+from autocalib_ros.estimation.markings.road_segments import Lines, along_lines, traffic_places, within
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.great_circles import rays_of
 from autocalib_ros.lens.camera import Camera

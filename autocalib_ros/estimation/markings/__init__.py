@@ -1,0 +1,1 @@
+"""Lens and plane from lane markings: line segments, grid mixture, grid search."""
