@@ -33,7 +33,6 @@ from autocalib_ros.estimation.straight.roads import (
     with_right_angle,
     with_second_road,
 )
-from autocalib_ros.estimation.transverse_edges import SquareVehicles, square_vehicles
 from autocalib_ros.estimation.turning.lane_changes import by_lane_changes
 from autocalib_ros.estimation.turning.turning_traffic import (
     from_turning,
@@ -43,6 +42,7 @@ from autocalib_ros.estimation.turning.turning_traffic import (
     with_sliding,
     with_turning,
 )
+from autocalib_ros.estimation.vehicle_edges.transverse_edges import SquareVehicles, square_vehicles
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.great_circles import TrackSet, evenly
 from autocalib_ros.geometry.ground_plane import undirected_deg

@@ -1,0 +1,1 @@
+"""Rotation of the plane about a lone road from edges of vehicles."""
