@@ -14,7 +14,7 @@ from autocalib_ros.estimation.adjustment.residuals import residuals_of
 from autocalib_ros.estimation.evidence_gate import drift_limit_px, outlook, requirements, shortfall, unsteady
 from autocalib_ros.estimation.observations.selection import of_vehicles
 from autocalib_ros.estimation.paper import solve_paper
-from autocalib_ros.estimation.people import people
+from autocalib_ros.estimation.people.pedestrians import people
 from autocalib_ros.estimation.plane import Plane
 from autocalib_ros.estimation.scale import Scale, is_unusual, known_scale, scale_doubt
 from autocalib_ros.estimation.solution import Solution, find_solution

@@ -23,7 +23,7 @@ from autocalib_ros.estimation.doubts import halves_doubt, lens_doubt, plane_doub
 from autocalib_ros.estimation.held import lens_assumptions, with_k2_if_asked_for, with_what_can_be_told
 from autocalib_ros.estimation.markings.markings_solution import NO_MARKINGS, fit_to_markings, sharpened, with_lens_known
 from autocalib_ros.estimation.observations.two_frame_windows import Instants, Windows, find_windows
-from autocalib_ros.estimation.people import people
+from autocalib_ros.estimation.people.pedestrians import people
 from autocalib_ros.estimation.plane import AGREE_SIGMAS, LevelCamera, Plane, agreement
 from autocalib_ros.estimation.straight.initialisation import agreed, in_likeliest_family
 from autocalib_ros.estimation.straight.roads import (

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from outlined import box, outline
 
-from autocalib_ros.estimation.outlines import sizes_of
+from autocalib_ros.estimation.people.metric_silhouettes import sizes_of
 from autocalib_ros.offline.synthetic_evidence import Junction, pose
 
 JUNCTION = Junction(camera_from_ground=pose(32.0, 0.0, 0.0))

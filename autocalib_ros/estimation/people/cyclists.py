@@ -11,7 +11,7 @@ import numpy as np
 
 from autocalib_ros.estimation.motion.planar_motion import WALK_M_S
 from autocalib_ros.estimation.observations.two_frame_windows import INTERVAL_S, Instants, members_of
-from autocalib_ros.estimation.outlines import sizes_of
+from autocalib_ros.estimation.people.metric_silhouettes import sizes_of
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.ground_plane import ground_points
 from autocalib_ros.lens.camera import Camera

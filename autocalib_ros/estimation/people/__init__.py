@@ -1,0 +1,1 @@
+"""Pedestrians and cyclists, classified by metric size and speed."""
