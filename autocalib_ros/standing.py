@@ -14,7 +14,7 @@ from autocalib_ros.compare import lenses_apart_px
 from autocalib_ros.comparison import AGREES_SIGMAS, SAME_LENS_PX, SAME_NUMBER
 from autocalib_ros.config import Options
 from autocalib_ros.errors import UsageError
-from autocalib_ros.estimation.scale import Scale, known_scale
+from autocalib_ros.estimation.verification.scale import Scale, known_scale
 from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.results.calibration import Calibration, GroundPlane, StandardDeviations

@@ -18,13 +18,9 @@ from autocalib_ros.estimation.adjustment.bundle_adjustment import (
 from autocalib_ros.estimation.adjustment.lens_prior import LensPrior, known_lens, lens_priors
 from autocalib_ros.estimation.adjustment.noise_model import USUAL_HEIGHT_M
 from autocalib_ros.estimation.adjustment.parameters import Setting
-from autocalib_ros.estimation.differences import differences
-from autocalib_ros.estimation.doubts import halves_doubt, lens_doubt, plane_doubt, traffic_doubt
-from autocalib_ros.estimation.held import lens_assumptions, with_k2_if_asked_for, with_what_can_be_told
 from autocalib_ros.estimation.markings.markings_solution import NO_MARKINGS, fit_to_markings, sharpened, with_lens_known
 from autocalib_ros.estimation.observations.two_frame_windows import Instants, Windows, find_windows
 from autocalib_ros.estimation.people.pedestrians import people
-from autocalib_ros.estimation.plane import AGREE_SIGMAS, LevelCamera, Plane, agreement
 from autocalib_ros.estimation.straight.initialisation import agreed, in_likeliest_family
 from autocalib_ros.estimation.straight.roads import (
     main_road,
@@ -43,6 +39,14 @@ from autocalib_ros.estimation.turning.turning_traffic import (
     with_turning,
 )
 from autocalib_ros.estimation.vehicle_edges.transverse_edges import SquareVehicles, square_vehicles
+from autocalib_ros.estimation.verification.consistency import differences
+from autocalib_ros.estimation.verification.gates import halves_doubt, lens_doubt, plane_doubt, traffic_doubt
+from autocalib_ros.estimation.verification.ground_normal import AGREE_SIGMAS, LevelCamera, Plane, agreement
+from autocalib_ros.estimation.verification.identifiability import (
+    lens_assumptions,
+    with_k2_if_asked_for,
+    with_what_can_be_told,
+)
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.great_circles import TrackSet, evenly
 from autocalib_ros.geometry.ground_plane import undirected_deg

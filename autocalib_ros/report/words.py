@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from autocalib_ros.config import GateOptions
-from autocalib_ros.estimation.evidence_gate import drift_limit_px
+from autocalib_ros.estimation.verification.readiness import drift_limit_px
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
 from autocalib_ros.lens.camera import field_of_view_deg

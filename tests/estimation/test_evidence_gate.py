@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from autocalib_ros.config import GateOptions
-from autocalib_ros.estimation.evidence_gate import in_words, outlook, requirements
+from autocalib_ros.estimation.verification.readiness import in_words, outlook, requirements
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.offline.synthetic_evidence import Junction, synthetic_evidence
 

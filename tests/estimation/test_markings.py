@@ -18,8 +18,8 @@ from autocalib_ros.estimation.markings.grid_search import grid_search as marking
 from autocalib_ros.estimation.markings.grid_search import square_grids
 from autocalib_ros.estimation.markings.markings_solution import fit_to_markings, with_lens_known
 from autocalib_ros.estimation.markings.road_segments import lines_on_road
-from autocalib_ros.estimation.plane import Plane
 from autocalib_ros.estimation.solution import Solution, agreed_by, find_solution
+from autocalib_ros.estimation.verification.ground_normal import Plane
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.great_circles import TrackSet, select_tracks
 from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg

@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 from autocalib_ros.config import GateOptions, JointOptions
 from autocalib_ros.estimation.adjustment.bundle_adjustment import JointFit, road_support, solve_joint
 from autocalib_ros.estimation.adjustment.parameters import State, initial_state
-from autocalib_ros.estimation.doubts import crossing_deg, is_road
 from autocalib_ros.estimation.straight.consensus import Directions
 from autocalib_ros.estimation.straight.initialisation import APART_DEG, apart
+from autocalib_ros.estimation.verification.gates import crossing_deg, is_road
 from autocalib_ros.geometry.great_circles import TrackSet, evenly, fit_circles, rays_of
 
 MOST_ROADS = 4

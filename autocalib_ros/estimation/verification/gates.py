@@ -10,9 +10,9 @@ from autocalib_ros.config import GateOptions
 from autocalib_ros.estimation.adjustment.bundle_adjustment import MIN_ROWS, JointFit, assign, road_support, solve_joint
 from autocalib_ros.estimation.adjustment.covariance import told_by_evidence
 from autocalib_ros.estimation.adjustment.parameters import State
-from autocalib_ros.estimation.differences import differences, expected_of_halves
 from autocalib_ros.estimation.observations.tracklets import no_lives
-from autocalib_ros.estimation.plane import LevelCamera, Plane, above_traffic
+from autocalib_ros.estimation.verification.consistency import differences, expected_of_halves
+from autocalib_ros.estimation.verification.ground_normal import LevelCamera, Plane, above_traffic
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.great_circles import Seen, TrackSet, every_track
 from autocalib_ros.geometry.ground_plane import BELOW_HORIZON

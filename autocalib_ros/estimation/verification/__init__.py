@@ -1,0 +1,1 @@
+"""Acceptance: readiness, identifiability, consistency, gates, scale."""
