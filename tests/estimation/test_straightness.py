@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from autocalib_ros.config import PaperOptions
-from autocalib_ros.estimation.straightness import (
+from autocalib_ros.estimation.paper.intrinsics import (
     distortion_polynomial,
     focal_trials,
     paper_intervals,

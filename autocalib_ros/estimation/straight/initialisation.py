@@ -9,8 +9,8 @@ import numpy as np
 from autocalib_ros.estimation.adjustment.bundle_adjustment import JointFit, cost_at, solve_joint
 from autocalib_ros.estimation.adjustment.lens_prior import LensPrior
 from autocalib_ros.estimation.adjustment.parameters import Setting, initial_state
+from autocalib_ros.estimation.paper.intrinsics import focal_trials
 from autocalib_ros.estimation.straight.consensus import INLIER_PX, Directions, consensus_directions
-from autocalib_ros.estimation.straightness import focal_trials
 from autocalib_ros.geometry.great_circles import TrackSet
 
 TRIALS = 14

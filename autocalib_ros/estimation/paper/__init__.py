@@ -1,0 +1,1 @@
+"""The method of Jain and Saunier as published."""
