@@ -11,11 +11,11 @@ from autocalib_ros.config import Options
 from autocalib_ros.errors import InputError
 from autocalib_ros.estimation.adjustment.noise_model import USUAL_HEIGHT_M
 from autocalib_ros.estimation.adjustment.residuals import residuals_of
+from autocalib_ros.estimation.estimate import Solution, find_solution
 from autocalib_ros.estimation.observations.selection import of_vehicles
 from autocalib_ros.estimation.paper.intrinsics import paper_intrinsics
 from autocalib_ros.estimation.paper.published_method import solve_paper
 from autocalib_ros.estimation.people.pedestrians import people
-from autocalib_ros.estimation.solution import Solution, find_solution
 from autocalib_ros.estimation.straight.consensus import segment_orientations
 from autocalib_ros.estimation.verification.ground_normal import Plane
 from autocalib_ros.estimation.verification.readiness import drift_limit_px, outlook, requirements, shortfall, unsteady

@@ -14,11 +14,11 @@ from autocalib_ros.config import GateOptions, JointOptions, Options
 from autocalib_ros.estimation.adjustment.bundle_adjustment import JointFit
 from autocalib_ros.estimation.adjustment.lens_prior import known_lens, lens_priors
 from autocalib_ros.estimation.adjustment.parameters import Setting
+from autocalib_ros.estimation.estimate import Solution, agreed_by, find_solution
 from autocalib_ros.estimation.markings.grid_search import grid_search as markings
 from autocalib_ros.estimation.markings.grid_search import square_grids
 from autocalib_ros.estimation.markings.markings_solution import fit_to_markings, with_lens_known
 from autocalib_ros.estimation.markings.road_segments import lines_on_road
-from autocalib_ros.estimation.solution import Solution, agreed_by, find_solution
 from autocalib_ros.estimation.verification.ground_normal import Plane
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.great_circles import TrackSet, select_tracks

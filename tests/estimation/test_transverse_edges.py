@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from autocalib_ros.calibrator import solve
 from autocalib_ros.config import GateOptions, JointOptions, Options
 from autocalib_ros.estimation.adjustment.parameters import State
-from autocalib_ros.estimation.solution import Solution, find_solution
+from autocalib_ros.estimation.estimate import Solution, find_solution
 from autocalib_ros.estimation.vehicle_edges.edge_mixture import folded
 from autocalib_ros.estimation.vehicle_edges.transverse_edges import RoadEdges, SquareVehicles, square_to
 from autocalib_ros.estimation.verification.gates import plane_doubt
