@@ -13,7 +13,7 @@ from autocalib_ros.errors import UsageError
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.synthetic_evidence import Junction, pose, synthetic_evidence
 from autocalib_ros.results.calibration import Reason, StandardDeviations
-from autocalib_ros.standing import CalibrationState, decided, with_what_is_given
+from autocalib_ros.revalidation import CalibrationState, decided, with_what_is_given
 from stored import SIZE, calibration, lens_only
 
 NONE, RESTORED, VERIFIED, CALIBRATED = CalibrationState

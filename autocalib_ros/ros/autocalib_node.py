@@ -22,6 +22,7 @@ from autocalib_ros.perception.detector.detector import open_detector
 from autocalib_ros.perception.images import ImageDecoder
 from autocalib_ros.results.calibration import Calibration, Refusal
 from autocalib_ros.results.store import Store, Stored, path_of
+from autocalib_ros.revalidation import CalibrationState, with_what_is_given
 from autocalib_ros.ros.diagnostics import Diagnostics
 from autocalib_ros.ros.driver_info import DriverInfo
 from autocalib_ros.ros.driver_upload import DriverUpload
@@ -37,7 +38,6 @@ from autocalib_ros.ros.reports import Place, Reports
 from autocalib_ros.ros.solver import SolverProcess
 from autocalib_ros.ros.status import Counts, Recent, Situation
 from autocalib_ros.ros.wording import described, described_progress
-from autocalib_ros.standing import CalibrationState, with_what_is_given
 
 TELL_PROGRESS_S = 10.0
 REPEAT_S = 60.0

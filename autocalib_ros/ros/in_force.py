@@ -17,13 +17,13 @@ from autocalib_ros.config import NodeOptions, Options
 from autocalib_ros.errors import InputError
 from autocalib_ros.lens.camera_info import CameraInfo as CameraInfoFields
 from autocalib_ros.results.calibration import Calibration
+from autocalib_ros.revalidation import CalibrationState, Decision, decided
 from autocalib_ros.ros import messages
 from autocalib_ros.ros.driver_info import DriverInfo
 from autocalib_ros.ros.headers import DEFAULT_FRAME, Headers
 from autocalib_ros.ros.markers import markers, no_markers
 from autocalib_ros.ros.qos import latched_publisher
 from autocalib_ros.ros.transforms import Transforms
-from autocalib_ros.standing import CalibrationState, Decision, decided
 
 
 @dataclass(frozen=True)

@@ -29,11 +29,11 @@ from autocalib_ros.perception.ignore_regions import Polygons, black_out
 from autocalib_ros.pictures.drawing import Caption
 from autocalib_ros.pictures.live import DebugPicture, JudgedTracks, RectifiedPicture, TopPicture
 from autocalib_ros.results.calibration import Calibration, Refusal
+from autocalib_ros.revalidation import CalibrationState
 from autocalib_ros.ros import messages
 from autocalib_ros.ros.headers import Headers
 from autocalib_ros.ros.in_force import InForce, Published
 from autocalib_ros.ros.wording import described_numbers
-from autocalib_ros.standing import CalibrationState
 
 GOOD, WAITING = '#7ee08a', '#ffd166'
 """Colours of the state, where a calibration is vouched for and where it is not."""

@@ -6,8 +6,8 @@ import pytest
 from sensor_msgs.srv import SetCameraInfo
 
 from autocalib_ros.lens.camera_info import camera_info
+from autocalib_ros.revalidation import CalibrationState
 from autocalib_ros.ros import driver_upload
-from autocalib_ros.standing import CalibrationState
 from bench import calibration, wait_for
 from test_node import calibrated, publish_until
 

@@ -14,9 +14,9 @@ from autocalib_ros.calibrator import AutoCalibrator, Progress
 from autocalib_ros.offline.synthetic_evidence import pose
 from autocalib_ros.pictures import live
 from autocalib_ros.results.calibration import EvidenceSummary, GroundPlane, Reason
+from autocalib_ros.revalidation import CalibrationState
 from autocalib_ros.ros.live_pictures import GOOD, WAITING, LivePictures, caption_of, image_message
 from autocalib_ros.ros.messages import header, stamp_ns, time_message, validated
-from autocalib_ros.standing import CalibrationState
 from bench import PATIENCE_S, SIZE, calibration, image, refusal, wait_for
 
 START_NS = 1_700_000_000_123_456_789

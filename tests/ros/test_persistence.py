@@ -15,8 +15,8 @@ from sensor_msgs.msg import CameraInfo
 
 from autocalib_ros.lens.camera_info import camera_info, read_camera_info
 from autocalib_ros.results.store import Kind, Store, Stored
+from autocalib_ros.revalidation import CalibrationState
 from autocalib_ros.ros.messages import stamp_ns
-from autocalib_ros.standing import CalibrationState
 from bench import PATIENCE_S, SIZE, Bench, calibration, image, refusal, wait_for
 from test_node import GROUND, INFO, START_NS, calibrated, publish_until, used
 
