@@ -12,8 +12,8 @@ from autocalib_ros.commands.telling import replay_and_tell, tell
 from autocalib_ros.config import Options
 
 if TYPE_CHECKING:
+    from autocalib_ros.offline.recordings.sources import Source
     from autocalib_ros.offline.replay import ReplayResult
-    from autocalib_ros.offline.sources import Source
 
 HELP = 'calibrate from a recording'
 DESCRIPTION = 'Calibrate from a recording. Exit status: 0 calibrated, 3 refused, 2 wrong usage or unreadable input.'
@@ -38,7 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Replay; return the exit status."""
     options = options_of(arguments)
     lens = known_lens(arguments, options)
-    from autocalib_ros.offline.sources import open_source
+    from autocalib_ros.offline.recordings.sources import open_source
     from autocalib_ros.perception.detector.detector import open_detector
 
     detector = open_detector(options.detector)
@@ -59,6 +59,6 @@ def _write_bag(path: Path, replayed: ReplayResult, source: Source, options: Opti
     if not replayed.result:
         tell(f'{path} is not written: there is no calibration')
         return
-    from autocalib_ros.offline.write_bag import write_bag
+    from autocalib_ros.offline.recordings.write_bag import write_bag
 
     write_bag(path, replayed.result, source, options.tf_parent, options.ignored_polygons)

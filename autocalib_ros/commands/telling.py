@@ -10,8 +10,8 @@ from autocalib_ros.config import Options
 
 if TYPE_CHECKING:
     from autocalib_ros.lens.camera import Camera
+    from autocalib_ros.offline.recordings.sources import Source
     from autocalib_ros.offline.replay import ReplayResult
-    from autocalib_ros.offline.sources import Source
     from autocalib_ros.perception.detector.detector import VehicleDetector
 
 

@@ -12,7 +12,7 @@ from autocalib_ros.config import Options
 from autocalib_ros.errors import InputError
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.offline.sources import Source
+from autocalib_ros.offline.recordings.sources import Source
 from autocalib_ros.perception.detector.detector import VehicleDetector
 from autocalib_ros.report.scene import Moment, noted
 from autocalib_ros.results.calibration import Calibration, Refusal

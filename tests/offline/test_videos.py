@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from autocalib_ros.errors import InputError, UsageError
-from autocalib_ros.offline.sources import open_source
-from autocalib_ros.offline.videos import _Clock
+from autocalib_ros.offline.recordings.sources import open_source
+from autocalib_ros.offline.recordings.videos import _Clock
 
 
 @pytest.mark.parametrize('suffix', ['.mp4', '.avi', '.mkv'])

@@ -95,14 +95,14 @@ def open_source(path: str | Path, topic: str | None = None, start_s: float = 0.0
     path, window = Path(path), Window(start_s, duration_s)
     _check_readable(path)
     if path.is_dir() or path.suffix.lower() in BAG_SUFFIXES:
-        from autocalib_ros.offline.bags import BagSource  # imported late: a video needs no rosbags
+        from autocalib_ros.offline.recordings.bags import BagSource  # imported late: a video needs no rosbags
         return BagSource(path, topic, window)
     if path.suffix == '.zstd':
         raise InputError(f'{path} is a compressed part of a recording: give the folder with its metadata.yaml,'
                          ' or unpack it first (zstd -d)')
     if topic is not None:
         raise UsageError(f'{path} is a video: it has no topics to choose from')
-    from autocalib_ros.offline.videos import VideoSource
+    from autocalib_ros.offline.recordings.videos import VideoSource
     return VideoSource(path, window)
 
 

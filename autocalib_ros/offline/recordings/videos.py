@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 
 from autocalib_ros.errors import InputError
-from autocalib_ros.offline.sources import Frame, StoredImage, Window, nothing_in_window
+from autocalib_ros.offline.recordings.sources import Frame, StoredImage, Window, nothing_in_window
 
 LOG = logging.getLogger(__name__)
 

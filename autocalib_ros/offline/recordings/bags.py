@@ -17,8 +17,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from autocalib_ros.calibrator import REORDERED_NS
 from autocalib_ros.errors import AutocalibError, InputError, UsageError
-from autocalib_ros.offline.sources import Frame, StoredImage, Window, nothing_in_window
-from autocalib_ros.offline.torn_mcap import is_torn, sealed
+from autocalib_ros.offline.recordings.sources import Frame, StoredImage, Window, nothing_in_window
+from autocalib_ros.offline.recordings.truncated_mcap import is_torn, sealed
 from autocalib_ros.perception.images import ImageDecoder
 
 LOG = logging.getLogger(__name__)
