@@ -28,7 +28,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     from autocalib_ros.compare import compared
     from autocalib_ros.offline.comparison_text import comparison_document, comparison_lines, truth_lines
-    from autocalib_ros.offline.terminal import painted
+    from autocalib_ros.offline.terminal.style import painted
     from autocalib_ros.results.saved_camera import read_known_camera
 
     both = [read_known_camera(path) for path in (arguments.first, arguments.second)]

@@ -24,8 +24,8 @@ def replay_and_tell(source: Source, options: Options, out: Path, *, lens: Camera
                     detector: VehicleDetector | None = None, quiet: bool = False, json: bool = False) -> ReplayResult:
     """Replay, write the results and say what came out."""
     from autocalib_ros.offline.outputs import write_outputs
-    from autocalib_ros.offline.progress import progress_bar
     from autocalib_ros.offline.replay import replay
+    from autocalib_ros.offline.terminal.progress import progress_bar
 
     if not quiet:
         tell_missing_height(options, lens)
@@ -46,8 +46,8 @@ def tell_missing_height(options: Options, lens: Camera | None) -> None:
 
 def tell_result(replayed: ReplayResult, out: Path | None, names: list[str], *, quiet: bool, json: bool) -> None:
     """Print a refusal's reason on stderr; the summary on stdout, or instead calibration.json."""
-    from autocalib_ros.offline.terminal import columns_of, is_terminal, painted, state_colour
-    from autocalib_ros.offline.terminal_summary import summary_lines
+    from autocalib_ros.offline.terminal.style import columns_of, is_terminal, painted, state_colour
+    from autocalib_ros.offline.terminal.summary import summary_lines
     from autocalib_ros.report.words import remedy, verdict
     from autocalib_ros.results.calibration import calibration_json
 

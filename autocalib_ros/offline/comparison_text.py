@@ -7,7 +7,7 @@ from dataclasses import asdict
 from typing import Any
 
 from autocalib_ros.comparison import Comparison, Difference
-from autocalib_ros.offline.terminal import aligned
+from autocalib_ros.offline.terminal.style import aligned
 
 DIGITS = {'px': 2, 'deg': 2, 'm': 3, '': 5}
 SIGNED = ('focal length', 'tilt', 'roll', 'height')

@@ -22,8 +22,8 @@ from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.params import options_with
 from autocalib_ros.offline.processes import in_order
-from autocalib_ros.offline.progress import progress_bar
-from autocalib_ros.offline.terminal import aligned
+from autocalib_ros.offline.terminal.progress import progress_bar
+from autocalib_ros.offline.terminal.style import aligned
 from autocalib_ros.results.calibration import COVARIANCE_OF, GROUND_DISTANCES_M, Calibration, Refusal
 from autocalib_ros.util.files import write_atomically
 

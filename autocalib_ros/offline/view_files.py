@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 
 from autocalib_ros.errors import InputError, UsageError
-from autocalib_ros.offline.progress import progress_bar
 from autocalib_ros.offline.recordings.sources import Source, open_source
 from autocalib_ros.offline.recordings.videos import FALLBACK_FPS
+from autocalib_ros.offline.terminal.progress import progress_bar
 
 PICTURES = ('.png', '.jpg', '.jpeg')
 CODECS = {'.mp4': 'mp4v', '.avi': 'MJPG'}

@@ -7,7 +7,7 @@ import re
 
 import pytest
 
-from autocalib_ros.offline.progress import progress_bar
+from autocalib_ros.offline.terminal.progress import progress_bar
 
 
 class Terminal(io.StringIO):

@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import pytest
 
-from autocalib_ros.offline.terminal import aligned, painted, shortened, shows_colours, state_colour
-from autocalib_ros.offline.terminal_summary import summary_lines
+from autocalib_ros.offline.terminal.style import aligned, painted, shortened, shows_colours, state_colour
+from autocalib_ros.offline.terminal.summary import summary_lines
 
 
 class Terminal(io.StringIO):

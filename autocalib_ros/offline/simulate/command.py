@@ -47,8 +47,8 @@ def options_from(args: argparse.Namespace) -> SimulationOptions:
 
 def run(args: argparse.Namespace) -> int:
     """Write the bag; return the exit status."""
-    from autocalib_ros.offline.progress import progress_bar
     from autocalib_ros.offline.simulate.bag import TRUTH_NAME, write_bag
+    from autocalib_ros.offline.terminal.progress import progress_bar
 
     options = options_from(args)
     with progress_bar(options.frame_count, unit='frame', label='simulating') as bar:

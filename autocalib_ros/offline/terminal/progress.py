@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Protocol, TextIO
 
-from autocalib_ros.offline.terminal import columns_of, is_terminal, shortened
+from autocalib_ros.offline.terminal.style import columns_of, is_terminal, shortened
 
 LINE_EVERY_S = 5.0
 LINE_EVERY_SHARE = 0.1

@@ -5,7 +5,7 @@ from __future__ import annotations
 import textwrap
 from dataclasses import replace
 
-from autocalib_ros.offline.terminal import aligned
+from autocalib_ros.offline.terminal.style import aligned
 from autocalib_ros.report.words import number_rows, remedy
 from autocalib_ros.results.calibration import Calibration, Refusal
 

@@ -1,0 +1,1 @@
+"""What the commands print: progress, colours, and the summary of a result."""
