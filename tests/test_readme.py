@@ -16,7 +16,7 @@ from autocalib_ros.calibrator import solve
 from autocalib_ros.cli import main
 from autocalib_ros.commands.replay import DEFAULT_OUT
 from autocalib_ros.config import Declared, NodeOptions, Options, declared
-from autocalib_ros.offline.synthetic_evidence import Junction, synthetic_evidence
+from autocalib_ros.offline.synthetic.junction import Junction, synthetic_evidence
 from autocalib_ros.results.calibration import write_calibration_json
 from autocalib_ros.ros.status import Counts, Situation, status
 

@@ -11,7 +11,7 @@ from autocalib_ros.calibrator import solve
 from autocalib_ros.config import JointOptions, Options
 from autocalib_ros.errors import UsageError
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.offline.synthetic_evidence import Junction, pose, synthetic_evidence
+from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_evidence
 from autocalib_ros.results.calibration import Reason, StandardDeviations
 from autocalib_ros.revalidation import CalibrationState, decided, with_what_is_given
 from stored import SIZE, calibration, lens_only

@@ -21,8 +21,8 @@ from autocalib_ros.offline.simulate.network import Network
 from autocalib_ros.offline.simulate.roundabout import RING_RADIUS_M
 from autocalib_ros.offline.simulate.roundabout import roundabout as ring_roads
 from autocalib_ros.offline.simulate.scenes import bend as road_bend
-from autocalib_ros.offline.synthetic_evidence import HEADWAY_S, Junction, gathered, pose, synthetic_evidence
-from autocalib_ros.offline.synthetic_traffic import (
+from autocalib_ros.offline.synthetic.disturbances import random_walk, straggle, waving
+from autocalib_ros.offline.synthetic.drives import (
     INTERVAL_S,
     drive_arc,
     drive_bend,
@@ -30,7 +30,7 @@ from autocalib_ros.offline.synthetic_traffic import (
     drive_route,
     stroll,
 )
-from autocalib_ros.offline.synthetic_trouble import random_walk, straggle, waving
+from autocalib_ros.offline.synthetic.junction import HEADWAY_S, Junction, gathered, pose, synthetic_evidence
 
 WIDTH, HEIGHT = 1280, 720
 FOCAL_PX = (500.0, 640.0)

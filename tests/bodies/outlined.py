@@ -8,7 +8,7 @@ import numpy as np
 
 from autocalib_ros.config import BufferOptions
 from autocalib_ros.evidence.snapshot import Evidence, EvidenceBuffer, Outlines, Track
-from autocalib_ros.offline.synthetic_evidence import Junction
+from autocalib_ros.offline.synthetic.junction import Junction
 from autocalib_ros.perception.silhouettes import DIRECTIONS
 
 RIDER_M, CAR_M = (1.75, 0.6, 1.75), (4.3, 1.75, 1.45)

@@ -12,7 +12,7 @@ from autocalib_ros.calibrator import solve
 from autocalib_ros.config import Options
 from autocalib_ros.estimation.people.cyclists import cyclists
 from autocalib_ros.evidence.snapshot import Evidence, Outlines, Track
-from autocalib_ros.offline.synthetic_evidence import Junction, gathered, synthetic_evidence
+from autocalib_ros.offline.synthetic.junction import Junction, gathered, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration
 
 JUNCTION = Junction(vehicles=30)

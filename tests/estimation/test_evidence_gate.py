@@ -10,7 +10,7 @@ import pytest
 from autocalib_ros.config import GateOptions
 from autocalib_ros.estimation.verification.readiness import in_words, outlook, requirements
 from autocalib_ros.evidence.snapshot import Evidence
-from autocalib_ros.offline.synthetic_evidence import Junction, synthetic_evidence
+from autocalib_ros.offline.synthetic.junction import Junction, synthetic_evidence
 
 GATE = GateOptions()
 

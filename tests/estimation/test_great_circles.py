@@ -14,7 +14,7 @@ from autocalib_ros.geometry.great_circles import (
     select_tracks,
 )
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.offline.synthetic_evidence import Junction, synthetic_evidence
+from autocalib_ros.offline.synthetic.junction import Junction, synthetic_evidence
 
 CAMERA = Camera(1280, 720, 400.0, (639.5, 359.5), (0.02, 0.0, 0.0, 0.0))
 

@@ -13,7 +13,7 @@ from autocalib_ros.geometry.ground_plane import (
     tilt_and_roll_deg,
     upward,
 )
-from autocalib_ros.offline.synthetic_evidence import pose
+from autocalib_ros.offline.synthetic.junction import pose
 
 POSE = pose(32.0, -2.0, 35.0)
 

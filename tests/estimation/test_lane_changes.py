@@ -11,7 +11,7 @@ from autocalib_ros.calibrator import solve
 from autocalib_ros.config import Options
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.offline.accuracy_families import motorway
-from autocalib_ros.offline.synthetic_evidence import Junction, synthetic_evidence
+from autocalib_ros.offline.synthetic.junction import Junction, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration
 
 SEED = 4

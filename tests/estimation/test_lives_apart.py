@@ -24,8 +24,8 @@ from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.great_circles import TrackSet, select_tracks
 from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.offline.synthetic_evidence import Junction, synthetic_evidence
-from autocalib_ros.offline.synthetic_traffic import drive_arc
+from autocalib_ros.offline.synthetic.drives import drive_arc
+from autocalib_ros.offline.synthetic.junction import Junction, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration, Reason
 
 TURNING = Junction(drive=partial(drive_arc, radii_m=(12.0, 60.0)), vehicles=14, points_per_vehicle=8, noise_px=0.3)

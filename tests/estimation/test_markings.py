@@ -26,8 +26,8 @@ from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.accuracy import distance_error
 from autocalib_ros.offline.accuracy_families import viewpoint
-from autocalib_ros.offline.synthetic_evidence import Junction, pose, synthetic_evidence
-from autocalib_ros.offline.synthetic_traffic import drive_ring
+from autocalib_ros.offline.synthetic.drives import drive_ring
+from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration, GroundPlane, Reason, to_json
 
 WIDTH, HEIGHT = 1280, 720

@@ -7,7 +7,7 @@ import pytest
 from outlined import box, outline
 
 from autocalib_ros.estimation.people.metric_silhouettes import sizes_of
-from autocalib_ros.offline.synthetic_evidence import Junction, pose
+from autocalib_ros.offline.synthetic.junction import Junction, pose
 
 JUNCTION = Junction(camera_from_ground=pose(32.0, 0.0, 0.0))
 

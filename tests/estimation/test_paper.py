@@ -7,7 +7,7 @@ import pytest
 
 from autocalib_ros.calibrator import solve
 from autocalib_ros.config import Options, PaperOptions
-from autocalib_ros.offline.synthetic_evidence import Junction, pose, synthetic_evidence
+from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration, Refusal
 
 OPTIONS = Options(camera_height=8.0, method='paper', paper=PaperOptions(window_s=3.0, vote_sigmas=0.0))

@@ -11,7 +11,7 @@ from autocalib_ros.calibrator import solve
 from autocalib_ros.config import Options
 from autocalib_ros.estimation.people.pedestrians import walkers
 from autocalib_ros.evidence.snapshot import Evidence, Track
-from autocalib_ros.offline.synthetic_evidence import Junction, gathered, synthetic_evidence
+from autocalib_ros.offline.synthetic.junction import Junction, gathered, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration
 
 FIRST_WALKER = 1000

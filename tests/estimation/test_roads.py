@@ -18,7 +18,7 @@ from autocalib_ros.geometry.great_circles import select_tracks
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.accuracy import evidence_of
 from autocalib_ros.offline.accuracy_families import families
-from autocalib_ros.offline.synthetic_evidence import Junction, pose, synthetic_evidence
+from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration, Refusal
 
 OPTIONS = Options(camera_height=8.0)

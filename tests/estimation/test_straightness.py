@@ -15,7 +15,7 @@ from autocalib_ros.estimation.paper.intrinsics import (
 )
 from autocalib_ros.geometry.great_circles import select_tracks
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.offline.synthetic_evidence import Junction, synthetic_evidence
+from autocalib_ros.offline.synthetic.junction import Junction, synthetic_evidence
 
 STRAIGHT = Junction(turning_share=0.0, wander_m=0.0, noise_px=0.2)
 WINDOW = PaperOptions(window_s=3.0)  # synthetic vehicles cross the image in three to eight seconds

@@ -10,7 +10,7 @@ from autocalib_ros.calibrator import solve
 from autocalib_ros.config import Options
 from autocalib_ros.estimation.observations.selection import of_vehicles
 from autocalib_ros.evidence.snapshot import Evidence, Kind
-from autocalib_ros.offline.synthetic_evidence import Junction, synthetic_evidence
+from autocalib_ros.offline.synthetic.junction import Junction, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration, Refusal
 
 

@@ -19,7 +19,7 @@ from autocalib_ros.estimation.verification.ground_normal import LevelCamera, agr
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.great_circles import select_tracks
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.offline.synthetic_evidence import Junction, pose, synthetic_evidence
+from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration
 
 CAMERA = Camera(1280, 720, 560.0, (639.5, 359.5))

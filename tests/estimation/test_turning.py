@@ -10,8 +10,8 @@ import pytest
 
 from autocalib_ros.calibrator import solve
 from autocalib_ros.config import Options
-from autocalib_ros.offline.synthetic_evidence import Junction, pose, synthetic_evidence
-from autocalib_ros.offline.synthetic_traffic import Company, beside, drive_arc, drive_ring, shadow, stroll, trailer
+from autocalib_ros.offline.synthetic.drives import Company, beside, drive_arc, drive_ring, shadow, stroll, trailer
+from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration, Refusal
 
 TURNING = Junction(drive=partial(drive_arc, radii_m=(12.0, 60.0)), vehicles=40, points_per_vehicle=8)

@@ -14,7 +14,7 @@ from autocalib_ros.estimation.straight.consensus import (
 )
 from autocalib_ros.geometry.great_circles import select_tracks
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.offline.synthetic_evidence import Junction, pose, synthetic_evidence
+from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_evidence
 
 
 def angle_deg(first: np.ndarray, second: np.ndarray) -> float:

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from autocalib_ros.offline.synthetic_evidence import Junction
-from autocalib_ros.offline.synthetic_traffic import LANE_M
+from autocalib_ros.offline.synthetic.drives import LANE_M
+from autocalib_ros.offline.synthetic.junction import Junction
 
 ROAD_M = 2 * LANE_M
 """Half of a road is two lanes wide."""

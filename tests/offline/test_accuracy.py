@@ -29,7 +29,7 @@ from autocalib_ros.offline.accuracy import (
     run_task,
 )
 from autocalib_ros.offline.accuracy_table import beyond_own_sigmas, falsely_accepted, tables
-from autocalib_ros.offline.synthetic_evidence import Junction, pose
+from autocalib_ros.offline.synthetic.junction import Junction, pose
 from autocalib_ros.results.calibration import (
     Calibration,
     EvidenceSummary,

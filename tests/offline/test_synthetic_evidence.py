@@ -17,8 +17,8 @@ from autocalib_ros.offline.simulate.motorway import highway
 from autocalib_ros.offline.simulate.network import Network
 from autocalib_ros.offline.simulate.roundabout import RING_RADIUS_M, roundabout
 from autocalib_ros.offline.simulate.scenes import bend
-from autocalib_ros.offline.synthetic_evidence import Junction, pose, synthetic_evidence
-from autocalib_ros.offline.synthetic_traffic import (
+from autocalib_ros.offline.synthetic.disturbances import background_drift_px, fold, spoil, waving
+from autocalib_ros.offline.synthetic.drives import (
     INTERVAL_S,
     ROUTE_REACH_M,
     Path,
@@ -30,7 +30,7 @@ from autocalib_ros.offline.synthetic_traffic import (
     stroll,
     trailer,
 )
-from autocalib_ros.offline.synthetic_trouble import background_drift_px, fold, spoil, waving
+from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_evidence
 
 FAMILIES = tuple(families())
 TRACKS = {'standard': 60, 'few': 40, 'many': 400}

@@ -7,7 +7,7 @@ import pytest
 
 from autocalib_ros.calibrator import solve
 from autocalib_ros.config import Options
-from autocalib_ros.offline.synthetic_evidence import Junction, synthetic_evidence
+from autocalib_ros.offline.synthetic.junction import Junction, synthetic_evidence
 from autocalib_ros.pictures.views import TopView, grid_lines, grid_step, ground_to_image, image_to_ground
 from autocalib_ros.report.road_figures import place_sigma_m, traffic_on_road
 from autocalib_ros.report.scene import Scene

@@ -12,7 +12,7 @@ from sensor_msgs.msg import CameraInfo, PointCloud2
 from autocalib_ros.ground import Ground
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.lens.camera_info import camera_info
-from autocalib_ros.offline.synthetic_evidence import pose
+from autocalib_ros.offline.synthetic.junction import pose
 from autocalib_ros.results.calibration import GroundPlane
 from autocalib_ros.ros import messages
 from autocalib_ros.ros.ground_points import GroundPointsNode

@@ -11,7 +11,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, Image
 
 from autocalib_ros.calibrator import AutoCalibrator, Progress
-from autocalib_ros.offline.synthetic_evidence import pose
+from autocalib_ros.offline.synthetic.junction import pose
 from autocalib_ros.pictures import live
 from autocalib_ros.results.calibration import EvidenceSummary, GroundPlane, Reason
 from autocalib_ros.revalidation import CalibrationState

@@ -8,7 +8,7 @@ import pytest
 from visualization_msgs.msg import Marker, MarkerArray
 
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.offline.synthetic_evidence import Junction, pose, synthetic_evidence
+from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_evidence
 from autocalib_ros.results.calibration import COVARIANCE_OF, GroundPlane
 from autocalib_ros.ros.markers import markers, no_markers
 from autocalib_ros.ros.messages import InvalidMessage, validated

@@ -13,7 +13,7 @@ import numpy as np
 from autocalib_ros.offline.simulate.network import Network
 
 if TYPE_CHECKING:
-    from autocalib_ros.offline.synthetic_evidence import Junction
+    from autocalib_ros.offline.synthetic.junction import Junction
 
 INTERVAL_S = 0.1
 REACH_M = 45.0

@@ -12,7 +12,8 @@ from autocalib_ros.config import BufferOptions
 from autocalib_ros.errors import UsageError
 from autocalib_ros.evidence.snapshot import Evidence, EvidenceBuffer, Segments, Track
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.offline.synthetic_traffic import (
+from autocalib_ros.offline.synthetic.disturbances import Sway, background_drift_px, spoil
+from autocalib_ros.offline.synthetic.drives import (
     INTERVAL_S,
     LANE_M,
     Company,
@@ -20,7 +21,6 @@ from autocalib_ros.offline.synthetic_traffic import (
     beside,
     drive_across,
 )
-from autocalib_ros.offline.synthetic_trouble import Sway, background_drift_px, spoil
 
 SEGMENT_INTERVAL_S = 0.4
 MIN_LENGTH_PX = 25.0

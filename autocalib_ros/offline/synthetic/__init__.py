@@ -1,0 +1,1 @@
+"""Synthetic evidence without images: junctions, drives, disturbances."""
