@@ -44,12 +44,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Measure and print."""
     if arguments.what == 'cost':
-        from autocalib_ros.offline.benchmark import cost
+        from autocalib_ros.offline.benchmark.runtime import cost
 
         print(cost(arguments.source, arguments.duration))
         return DONE
     if arguments.what == 'golden':
-        from autocalib_ros.offline import golden
+        from autocalib_ros.offline.benchmark.runtime import golden
 
         measured = golden.measure(arguments.folder, arguments.only, tolerance=arguments.tolerance,
                                   exact=arguments.exact, jobs=arguments.jobs)
@@ -57,8 +57,8 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.update:
             golden.update(arguments.folder, measured)
         return MOVED if measured.moved else DONE
-    from autocalib_ros.offline.accuracy import measure
-    from autocalib_ros.offline.accuracy_table import tables
+    from autocalib_ros.offline.benchmark.monte_carlo import measure
+    from autocalib_ros.offline.benchmark.table import tables
 
     print(tables(measure(arguments.family, arguments.method, arguments.runs, seed=arguments.seed, jobs=arguments.jobs,
                          out=arguments.out)))

@@ -10,7 +10,7 @@ import pytest
 from autocalib_ros.calibrator import solve
 from autocalib_ros.config import Options
 from autocalib_ros.evidence.snapshot import Evidence
-from autocalib_ros.offline.accuracy_families import motorway
+from autocalib_ros.offline.benchmark.families import motorway
 from autocalib_ros.offline.synthetic.junction import Junction, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration
 

@@ -24,8 +24,8 @@ from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.great_circles import TrackSet, select_tracks
 from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.offline.accuracy import distance_error
-from autocalib_ros.offline.accuracy_families import viewpoint
+from autocalib_ros.offline.benchmark.families import viewpoint
+from autocalib_ros.offline.benchmark.monte_carlo import distance_error
 from autocalib_ros.offline.synthetic.drives import drive_ring
 from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration, GroundPlane, Reason, to_json

@@ -14,7 +14,7 @@ from autocalib_ros.estimation.observations.tracklets import INSTANTS, Lives, fin
 from autocalib_ros.estimation.observations.two_frame_windows import Instants, find_windows
 from autocalib_ros.geometry.great_circles import SAMPLES
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.offline.accuracy import evidence_of
+from autocalib_ros.offline.benchmark.monte_carlo import evidence_of
 from autocalib_ros.offline.synthetic.junction import pose
 
 CAMERA = Camera(1280, 720, 560.0, (645.0, 352.0), (0.01, 0.0, 0.0, 0.0))

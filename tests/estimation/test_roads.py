@@ -16,8 +16,8 @@ from autocalib_ros.estimation.verification.gates import NOT_CROSS_CHECKED, halve
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.great_circles import select_tracks
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.offline.accuracy import evidence_of
-from autocalib_ros.offline.accuracy_families import families
+from autocalib_ros.offline.benchmark.families import families
+from autocalib_ros.offline.benchmark.monte_carlo import evidence_of
 from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration, Refusal
 

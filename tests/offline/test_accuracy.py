@@ -16,7 +16,7 @@ import autocalib_ros
 from autocalib_ros.cli import main
 from autocalib_ros.errors import InputError
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.offline.accuracy import (
+from autocalib_ros.offline.benchmark.monte_carlo import (
     Run,
     Task,
     compared,
@@ -28,7 +28,7 @@ from autocalib_ros.offline.accuracy import (
     run_method,
     run_task,
 )
-from autocalib_ros.offline.accuracy_table import beyond_own_sigmas, falsely_accepted, tables
+from autocalib_ros.offline.benchmark.table import beyond_own_sigmas, falsely_accepted, tables
 from autocalib_ros.offline.synthetic.junction import Junction, pose
 from autocalib_ros.results.calibration import (
     Calibration,

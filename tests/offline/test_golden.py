@@ -14,8 +14,7 @@ from junction import full_result, junction_evidence, lens_result, refusal
 
 from autocalib_ros.cli import main
 from autocalib_ros.evidence.snapshot import Evidence
-from autocalib_ros.offline import golden
-from autocalib_ros.offline.golden import (
+from autocalib_ros.offline.benchmark.golden import (
     Case,
     Measured,
     Moved,
@@ -29,6 +28,7 @@ from autocalib_ros.offline.golden import (
     told,
     write_cases,
 )
+from autocalib_ros.offline.benchmark.runtime import golden
 
 STORED = Path(__file__).parents[1] / 'golden'
 CALIBRATED = {'state': 'calibrated', 'grade': 'full', 'refusal': None, 'ground_refusal': None, 'roads': 2, 'people': 0}

@@ -11,7 +11,7 @@ import pytest
 from autocalib_ros.errors import UsageError
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.offline.accuracy_families import distortion_free_lens, families, radial, short_piece, viewpoint
+from autocalib_ros.offline.benchmark.families import distortion_free_lens, families, radial, short_piece, viewpoint
 from autocalib_ros.offline.simulate.junctions import junction as crossing
 from autocalib_ros.offline.simulate.motorway import highway
 from autocalib_ros.offline.simulate.network import Network

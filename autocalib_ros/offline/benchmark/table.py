@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
-from autocalib_ros.offline.accuracy import Run
-from autocalib_ros.offline.accuracy_families import UNDERDETERMINED
+from autocalib_ros.offline.benchmark.families import UNDERDETERMINED
+from autocalib_ros.offline.benchmark.monte_carlo import Run
 
 COVERED_SIGMAS = 1.96
 """A normal error lies within so many sigmas in 95 % of the cases."""

@@ -1,0 +1,1 @@
+"""Benchmarks: accuracy by Monte Carlo, cost, and golden evidence."""
