@@ -35,7 +35,7 @@ def run(arguments: argparse.Namespace) -> int:
     result = compared(*both)
     errors = []
     if arguments.truth is not None:
-        from autocalib_ros.offline.against_truth import read_truth
+        from autocalib_ros.offline.ground_truth import read_truth
         from autocalib_ros.offline.truth_file import errors_against_truth
 
         truth = read_truth(arguments.truth)

@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Simulate, replay and compare; return the exit status."""
     from autocalib_ros.offline import outputs
-    from autocalib_ros.offline.demo import compare, options_from, simulate_into
+    from autocalib_ros.offline.demonstration import compare, options_from, simulate_into
     from autocalib_ros.offline.recordings.sources import open_source
 
     bag = arguments.out / 'recording'

@@ -27,7 +27,7 @@ def run(arguments: argparse.Namespace) -> int:
     lens = known_lens(arguments, options)
     from autocalib_ros.evidence.snapshot import Evidence
     from autocalib_ros.offline import outputs
-    from autocalib_ros.offline.replay import solve_again
+    from autocalib_ros.offline.replay_recording import solve_again
 
     evidence, out = Evidence.load(arguments.file), arguments.out
     if out is not None:

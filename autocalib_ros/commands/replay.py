@@ -13,7 +13,7 @@ from autocalib_ros.config import Options
 
 if TYPE_CHECKING:
     from autocalib_ros.offline.recordings.sources import Source
-    from autocalib_ros.offline.replay import ReplayResult
+    from autocalib_ros.offline.replay_recording import ReplayResult
 
 HELP = 'calibrate from a recording'
 DESCRIPTION = 'Calibrate from a recording. Exit status: 0 calibrated, 3 refused, 2 wrong usage or unreadable input.'

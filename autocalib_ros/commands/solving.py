@@ -37,7 +37,7 @@ def add_solving(parser: argparse.ArgumentParser) -> None:
 
 def options_of(arguments: argparse.Namespace) -> Options:
     """Put the options together: defaults, then the parameter file, then the command line."""
-    from autocalib_ros.offline.params import options_with, parse_assignments, read_params_file
+    from autocalib_ros.offline.parameter_file import options_with, parse_assignments, read_params_file
 
     values: dict[str, Any] = read_params_file(arguments.params_file) if arguments.params_file else {}
     values.update(parse_assignments(arguments.param))
@@ -67,7 +67,7 @@ def known_lens(arguments: argparse.Namespace, options: Options) -> Camera | None
 
     UsageError where the results could not say it in the distortion model that is asked for.
     """
-    from autocalib_ros.offline.params import camera_info_file
+    from autocalib_ros.offline.parameter_file import camera_info_file
 
     file = arguments.camera_info
     if file is None and arguments.params_file is not None:

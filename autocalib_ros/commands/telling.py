@@ -11,7 +11,7 @@ from autocalib_ros.config import Options
 if TYPE_CHECKING:
     from autocalib_ros.lens.camera import Camera
     from autocalib_ros.offline.recordings.sources import Source
-    from autocalib_ros.offline.replay import ReplayResult
+    from autocalib_ros.offline.replay_recording import ReplayResult
     from autocalib_ros.perception.detector.detector import VehicleDetector
 
 
@@ -24,7 +24,7 @@ def replay_and_tell(source: Source, options: Options, out: Path, *, lens: Camera
                     detector: VehicleDetector | None = None, quiet: bool = False, json: bool = False) -> ReplayResult:
     """Replay, write the results and say what came out."""
     from autocalib_ros.offline.outputs import write_outputs
-    from autocalib_ros.offline.replay import replay
+    from autocalib_ros.offline.replay_recording import replay
     from autocalib_ros.offline.terminal.progress import progress_bar
 
     if not quiet:

@@ -63,6 +63,6 @@ def _ignored(params_file: Path | None) -> Polygons:
     if params_file is None:
         return ()
     from autocalib_ros.config import Options
-    from autocalib_ros.offline.params import options_with, read_params_file
+    from autocalib_ros.offline.parameter_file import options_with, read_params_file
 
     return options_with(Options(), read_params_file(params_file)).ignored_polygons

@@ -8,7 +8,7 @@ from pathlib import Path
 from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.lens.camera_info import write_camera_info_yaml
 from autocalib_ros.offline.recordings.sources import Source
-from autocalib_ros.offline.replay import ReplayResult
+from autocalib_ros.offline.replay_recording import ReplayResult
 from autocalib_ros.report.scene import Scene
 from autocalib_ros.results.calibration import Calibration, write_calibration_json
 

@@ -10,7 +10,7 @@ import numpy as np
 from autocalib_ros.compare import compared
 from autocalib_ros.errors import InputError
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.offline.against_truth import NEAR_M, distance_percent
+from autocalib_ros.offline.ground_truth import NEAR_M, distance_percent
 from autocalib_ros.results.calibration import GroundPlane
 from autocalib_ros.results.saved_camera import KnownCamera
 

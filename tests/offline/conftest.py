@@ -15,7 +15,7 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from autocalib_ros.offline.replay import ReplayResult
+from autocalib_ros.offline.replay_recording import ReplayResult
 
 WIDTH, HEIGHT = 32, 24
 SECOND = 1_000_000_000

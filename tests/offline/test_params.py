@@ -6,7 +6,7 @@ import pytest
 
 from autocalib_ros.config import Options
 from autocalib_ros.errors import InputError, UsageError
-from autocalib_ros.offline.params import camera_info_file, options_with, parse_assignments, read_params_file
+from autocalib_ros.offline.parameter_file import camera_info_file, options_with, parse_assignments, read_params_file
 
 
 def options_from(tmp_path, text: str) -> Options:

@@ -12,7 +12,7 @@ from autocalib_ros.config import GateOptions, Options
 from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.recordings.sources import Frame, open_source
-from autocalib_ros.offline.replay import replay, solve_again
+from autocalib_ros.offline.replay_recording import replay, solve_again
 from autocalib_ros.results.calibration import Refusal
 
 
@@ -69,7 +69,7 @@ def test_a_known_lens_goes_into_each_solution_in_the_size_of_the_images(monkeypa
     def told_solve(evidence, options, *, lens):
         told.append(lens)
         return solve(evidence, options)
-    monkeypatch.setattr('autocalib_ros.offline.replay.solve', told_solve)
+    monkeypatch.setattr('autocalib_ros.offline.replay_recording.solve', told_solve)
     options = Options(first_solve_s=0.0, gate=GateOptions(min_tracks=4))
     replay(Drive(150), options, lens=Camera.equidistant(320, 240, 200.0))
     assert len(told) > 1
@@ -100,7 +100,7 @@ def test_a_refused_solution_is_what_is_missing_and_then_since_when_it_is_calibra
     refusal = Refusal(code='x', message='the halves disagree', remedy='wait', method='joint',
                       evidence=full.evidence.summary())
     results = iter([refusal])
-    monkeypatch.setattr('autocalib_ros.offline.replay.solve',
+    monkeypatch.setattr('autocalib_ros.offline.replay_recording.solve',
                         lambda due, options, lens: next(results, accepted))
     told = []
     # the box is all that there is to see, so that the background seems to drift by up to 100 px

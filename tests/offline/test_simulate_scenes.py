@@ -11,14 +11,14 @@ import pytest
 
 from autocalib_ros.errors import UsageError
 from autocalib_ros.offline.simulate import Simulation, SimulationOptions
-from autocalib_ros.offline.simulate.ground import edge_distance, paint_ground
+from autocalib_ros.offline.simulate.ground_surface import edge_distance, paint_ground
 from autocalib_ros.offline.simulate.network import Network
 from autocalib_ros.offline.simulate.options import SCENES
 from autocalib_ros.offline.simulate.palette import DAY
 from autocalib_ros.offline.simulate.roundabout import RING_RADIUS_M
 from autocalib_ros.offline.simulate.scenes import BEND_RADIUS_M, network_of
-from autocalib_ros.offline.simulate.traffic import simulate_traffic
-from autocalib_ros.offline.simulate.vehicles import STEP_S, Traffic, Vehicle, VehicleState
+from autocalib_ros.offline.simulate.traffic_flow import simulate_traffic
+from autocalib_ros.offline.simulate.vehicle_models import STEP_S, Traffic, Vehicle, VehicleState
 
 TINY = {'width_px': 192, 'height_px': 108, 'focal_px': 84.0, 'rate_hz': 2.0, 'duration_s': 2.0}
 TIMES_S = np.arange(0.03, 60.0, 4.7)

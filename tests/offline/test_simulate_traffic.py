@@ -10,8 +10,8 @@ import pytest
 from autocalib_ros.offline.simulate import Simulation, SimulationOptions
 from autocalib_ros.offline.simulate.network import Network
 from autocalib_ros.offline.simulate.scenes import junction, network_of
-from autocalib_ros.offline.simulate.traffic import simulate_traffic
-from autocalib_ros.offline.simulate.vehicles import STEP_S, Traffic, Vehicle, Wander
+from autocalib_ros.offline.simulate.traffic_flow import simulate_traffic
+from autocalib_ros.offline.simulate.vehicle_models import STEP_S, Traffic, Vehicle, Wander
 
 MINUTE = SimulationOptions()
 

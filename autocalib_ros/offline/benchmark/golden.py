@@ -21,7 +21,7 @@ from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.benchmark.processes import in_order
-from autocalib_ros.offline.params import options_with
+from autocalib_ros.offline.parameter_file import options_with
 from autocalib_ros.offline.terminal.progress import progress_bar
 from autocalib_ros.offline.terminal.style import aligned
 from autocalib_ros.results.calibration import COVARIANCE_OF, GROUND_DISTANCES_M, Calibration, Refusal

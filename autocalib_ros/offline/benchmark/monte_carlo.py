@@ -24,9 +24,9 @@ from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.ground_plane import angles_deg, tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera, pixel_grid
-from autocalib_ros.offline.against_truth import NEAR_M, distances_error
 from autocalib_ros.offline.benchmark.families import families
 from autocalib_ros.offline.benchmark.processes import in_order
+from autocalib_ros.offline.ground_truth import NEAR_M, distances_error
 from autocalib_ros.offline.synthetic.junction import Junction
 from autocalib_ros.offline.terminal.progress import progress_bar
 from autocalib_ros.pictures.views import ground_to_image, image_to_ground

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from autocalib_ros.offline.simulate.faces import SAMPLES, Canvas, Faces
-from autocalib_ros.offline.simulate.ground import GroundMap
+from autocalib_ros.offline.simulate.ground_surface import GroundMap
 from autocalib_ros.offline.simulate.lens import CameraPose
 from autocalib_ros.offline.simulate.palette import Palette
 

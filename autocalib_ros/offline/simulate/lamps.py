@@ -13,7 +13,7 @@ from autocalib_ros.offline.simulate.lens import CameraPose
 from autocalib_ros.offline.simulate.paint import mixed
 from autocalib_ros.offline.simulate.sensor import add_glow
 from autocalib_ros.offline.simulate.shapes import SHAPES
-from autocalib_ros.offline.simulate.vehicles import Vehicle, VehicleState
+from autocalib_ros.offline.simulate.vehicle_models import Vehicle, VehicleState
 
 _HEAD = (215, 240, 255)
 _TAIL = (40, 30, 230)

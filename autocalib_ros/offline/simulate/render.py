@@ -9,21 +9,23 @@ from itertools import zip_longest
 import cv2
 import numpy as np
 
-from autocalib_ros.offline.simulate import bodies, cyclists, lamps, people, sensor
+from autocalib_ros.offline.simulate import bodies, lamps, sensor
+from autocalib_ros.offline.simulate import cyclist_actors as cyclists
+from autocalib_ros.offline.simulate import pedestrian_actors as people
 from autocalib_ros.offline.simulate.backdrop import draw_backdrop
 from autocalib_ros.offline.simulate.bodies import body_of, shadow_of
-from autocalib_ros.offline.simulate.cyclists import Cyclist
+from autocalib_ros.offline.simulate.cyclist_actors import Cyclist
 from autocalib_ros.offline.simulate.faces import NO_MAP, SAMPLES, Canvas, Drawing, Faces, Window
-from autocalib_ros.offline.simulate.ground import paint_ground
+from autocalib_ros.offline.simulate.ground_surface import paint_ground
 from autocalib_ros.offline.simulate.lens import CameraPose, Lens
 from autocalib_ros.offline.simulate.microbolometer import Microbolometer
 from autocalib_ros.offline.simulate.network import Network
 from autocalib_ros.offline.simulate.options import SimulationOptions
 from autocalib_ros.offline.simulate.palette import palette_of
-from autocalib_ros.offline.simulate.people import Person
+from autocalib_ros.offline.simulate.pedestrian_actors import Person
 from autocalib_ros.offline.simulate.scenery import lamp_places, scenery_of
 from autocalib_ros.offline.simulate.swaying import Roadside
-from autocalib_ros.offline.simulate.vehicles import Vehicle, VehicleState
+from autocalib_ros.offline.simulate.vehicle_models import Vehicle, VehicleState
 from autocalib_ros.offline.simulate.weather import View, Weather
 
 _DRAWN_RANGE_M = 130.0

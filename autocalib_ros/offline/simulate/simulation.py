@@ -7,15 +7,16 @@ from typing import Any
 
 import numpy as np
 
-from autocalib_ros.offline.simulate import cyclists, people
+from autocalib_ros.offline.simulate import cyclist_actors as cyclists
+from autocalib_ros.offline.simulate import pedestrian_actors as people
 from autocalib_ros.offline.simulate.lens import CameraPose, look, rotation
 from autocalib_ros.offline.simulate.microbolometer import shut_since
 from autocalib_ros.offline.simulate.options import SimulationOptions
 from autocalib_ros.offline.simulate.render import Artist, Scene
 from autocalib_ros.offline.simulate.scenes import network_of
-from autocalib_ros.offline.simulate.traffic import simulate_traffic
+from autocalib_ros.offline.simulate.traffic_flow import simulate_traffic
 from autocalib_ros.offline.simulate.truth import truth_of
-from autocalib_ros.offline.simulate.vehicles import Vehicle, VehicleState
+from autocalib_ros.offline.simulate.vehicle_models import Vehicle, VehicleState
 
 _START_NS = 1_700_000_000_000_000_000
 _BUMP_AXIS = np.array([0.80, 0.50, 0.33])

@@ -9,7 +9,7 @@ import numpy as np
 
 from autocalib_ros.offline.simulate import paint
 from autocalib_ros.offline.simulate.faces import Faces, Texture
-from autocalib_ros.offline.simulate.ground import PAVEMENT_M, edge_distance
+from autocalib_ros.offline.simulate.ground_surface import PAVEMENT_M, edge_distance
 from autocalib_ros.offline.simulate.lens import CameraPose, Lens
 from autocalib_ros.offline.simulate.network import Network
 from autocalib_ros.offline.simulate.palette import Palette

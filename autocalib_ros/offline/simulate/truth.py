@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from autocalib_ros.offline.simulate.ground import PAVEMENT_M, edge_distance
+from autocalib_ros.offline.simulate.ground_surface import PAVEMENT_M, edge_distance
 from autocalib_ros.offline.simulate.lens import CameraPose
 
 if TYPE_CHECKING:
-    from autocalib_ros.offline.simulate.cyclists import Cyclist
-    from autocalib_ros.offline.simulate.people import Person
+    from autocalib_ros.offline.simulate.cyclist_actors import Cyclist
+    from autocalib_ros.offline.simulate.pedestrian_actors import Person
     from autocalib_ros.offline.simulate.simulation import Simulation
-    from autocalib_ros.offline.simulate.vehicles import VehicleState
+    from autocalib_ros.offline.simulate.vehicle_models import VehicleState
 
     _State = tuple[float, float, float, float]  # x, y, heading, speed
 

@@ -10,14 +10,14 @@ import cv2
 import numpy as np
 
 from autocalib_ros.offline.simulate.faces import NO_MAP
-from autocalib_ros.offline.simulate.ground import edge_distance
+from autocalib_ros.offline.simulate.ground_surface import edge_distance
 from autocalib_ros.offline.simulate.lamps import lamps_of
 from autocalib_ros.offline.simulate.lens import CameraPose, Lens
 from autocalib_ros.offline.simulate.network import Network
 from autocalib_ros.offline.simulate.options import SimulationOptions
 from autocalib_ros.offline.simulate.paint import grain
 from autocalib_ros.offline.simulate.sensor import add_glow
-from autocalib_ros.offline.simulate.vehicles import Vehicle, VehicleState
+from autocalib_ros.offline.simulate.vehicle_models import Vehicle, VehicleState
 
 _NEARER_M = 0.4
 """What is nearer than the ground behind it by more stands before it."""

@@ -16,7 +16,7 @@ from autocalib_ros.offline.simulate.network import CITY_SPEED_MPS, Network, Rout
 from autocalib_ros.offline.simulate.options import SimulationOptions
 from autocalib_ros.offline.simulate.shapes import SHAPES, Shape
 from autocalib_ros.offline.simulate.signals import Signals
-from autocalib_ros.offline.simulate.vehicles import STEP_S, Traffic, Vehicle, Wander
+from autocalib_ros.offline.simulate.vehicle_models import STEP_S, Traffic, Vehicle, Wander
 
 WARM_UP_S = 52.0
 STANDSTILL_GAP_M = 2.0

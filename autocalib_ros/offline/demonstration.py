@@ -11,7 +11,7 @@ import numpy as np
 
 from autocalib_ros.config import Options, ScaleOptions
 from autocalib_ros.geometry.ground_plane import angles_deg
-from autocalib_ros.offline.against_truth import NEAR_M, distance_percent, near_points, read_truth
+from autocalib_ros.offline.ground_truth import NEAR_M, distance_percent, near_points, read_truth
 from autocalib_ros.results.calibration import Calibration, Refusal
 
 MAX_FOCAL_ERROR_PERCENT = 3.0
