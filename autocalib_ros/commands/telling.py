@@ -48,7 +48,7 @@ def tell_result(replayed: ReplayResult, out: Path | None, names: list[str], *, q
     """Print a refusal's reason on stderr; the summary on stdout, or instead calibration.json."""
     from autocalib_ros.offline.terminal.style import columns_of, is_terminal, painted, state_colour
     from autocalib_ros.offline.terminal.summary import summary_lines
-    from autocalib_ros.report.words import remedy, verdict
+    from autocalib_ros.report.text import remedy, verdict
     from autocalib_ros.results.calibration import calibration_json
 
     result = replayed.result

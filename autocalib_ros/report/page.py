@@ -25,7 +25,7 @@ from autocalib_ros.report import (
 )
 from autocalib_ros.report.canvas import STYLE, jpeg, png, rendered
 from autocalib_ros.report.scene import Scene
-from autocalib_ros.report.words import file_rows, how_sure, needs, next_step, number_rows, verdict
+from autocalib_ros.report.text import file_rows, how_sure, needs, next_step, number_rows, verdict
 from autocalib_ros.results.calibration import Calibration, Refusal
 from autocalib_ros.util.files import write_atomically
 

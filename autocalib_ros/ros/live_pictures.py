@@ -27,7 +27,7 @@ from autocalib_ros.calibrator import Progress
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.perception.ignore_regions import Polygons, black_out
 from autocalib_ros.pictures.drawing import Caption
-from autocalib_ros.pictures.live import DebugPicture, JudgedTracks, RectifiedPicture, TopPicture
+from autocalib_ros.pictures.live_overlay import DebugPicture, JudgedTracks, RectifiedPicture, TopPicture
 from autocalib_ros.results.calibration import Calibration, Refusal
 from autocalib_ros.revalidation import CalibrationState
 from autocalib_ros.ros import messages

@@ -6,7 +6,7 @@ import pytest
 
 from autocalib_ros.lens.camera_info import camera_info
 from autocalib_ros.pictures.drawing import Caption, bgr
-from autocalib_ros.pictures.live import (
+from autocalib_ros.pictures.live_overlay import (
     FOLLOWED,
     HORIZON,
     MOST_PATHS,

@@ -21,8 +21,8 @@ from autocalib_ros.report.page import ENTRIES, write_report
 from autocalib_ros.report.road_figures import told_of_places, top_view
 from autocalib_ros.report.scene import MOST_MOMENTS, Moment, noted
 from autocalib_ros.report.speed_figures import by_vehicle, pieces_on_road, speed_histogram, speeds_above
+from autocalib_ros.report.text import how_sure, needs, next_step, number_rows, verdict
 from autocalib_ros.report.traffic_figures import kept_tracks
-from autocalib_ros.report.words import how_sure, needs, next_step, number_rows, verdict
 from autocalib_ros.results.calibration import GroundPlane, Refusal, Residuals
 
 ALL = {entry.name for entry in ENTRIES}

@@ -173,7 +173,7 @@ def run_node(options: argparse.Namespace) -> dict:
     timed.wrap(image_input.ImageInput, '_watch')
     timed.wrap(pipeline.Pipeline, '_use')
     if options.watch:
-        from autocalib_ros.pictures import live
+        from autocalib_ros.pictures import live_overlay as live
         from autocalib_ros.ros.live_pictures import LivePictures
         for owner, name in ((LivePictures, 'image_used'), (LivePictures, '_show'), (live.DebugPicture, 'draw'),
                             (live.TopPicture, 'draw'), (live.RectifiedPicture, 'draw')):

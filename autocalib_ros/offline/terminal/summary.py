@@ -6,7 +6,7 @@ import textwrap
 from dataclasses import replace
 
 from autocalib_ros.offline.terminal.style import aligned
-from autocalib_ros.report.words import number_rows, remedy
+from autocalib_ros.report.text import number_rows, remedy
 from autocalib_ros.results.calibration import Calibration, Refusal
 
 INDENT = '  '
