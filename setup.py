@@ -41,6 +41,6 @@ setup(
     entry_points={'console_scripts': [
         'autocalib = autocalib_ros.cli:main',
         'autocalib_node = autocalib_ros.ros.node:main',
-        'ground_points_node = autocalib_ros.ros.ground_points:main',
+        'ground_points_node = autocalib_ros.ros.ground_points_node:main',
     ]},
 )

@@ -23,21 +23,21 @@ from autocalib_ros.perception.images import ImageDecoder
 from autocalib_ros.results.calibration import Calibration, Refusal
 from autocalib_ros.results.store import Store, Stored, path_of
 from autocalib_ros.revalidation import CalibrationState, with_what_is_given
+from autocalib_ros.ros.declared_parameters import options_of
 from autocalib_ros.ros.diagnostics import Diagnostics
 from autocalib_ros.ros.driver_info import DriverInfo
 from autocalib_ros.ros.driver_upload import DriverUpload
 from autocalib_ros.ros.headers import DEFAULT_FRAME, Headers
 from autocalib_ros.ros.image_input import ImageInput
-from autocalib_ros.ros.in_force import InForce, Published
-from autocalib_ros.ros.keeper import Keeper
 from autocalib_ros.ros.live_parameters import LiveParameters
 from autocalib_ros.ros.live_pictures import LivePictures
-from autocalib_ros.ros.parameters import options_of
-from autocalib_ros.ros.pipeline import Pipeline, Result, Solve
-from autocalib_ros.ros.reports import Place, Reports
-from autocalib_ros.ros.solver import SolverProcess
+from autocalib_ros.ros.log_text import described, described_progress
+from autocalib_ros.ros.publication import InForce, Published
+from autocalib_ros.ros.report_writer import Place, Reports
+from autocalib_ros.ros.solver_process import SolverProcess
 from autocalib_ros.ros.status import Counts, Recent, Situation
-from autocalib_ros.ros.wording import described, described_progress
+from autocalib_ros.ros.store_writer import Keeper
+from autocalib_ros.ros.worker import Pipeline, Result, Solve
 
 TELL_PROGRESS_S = 10.0
 REPEAT_S = 60.0

@@ -14,7 +14,7 @@ from rclpy.subscription import Subscription
 from sensor_msgs.msg import CompressedImage, Image
 
 from autocalib_ros.config import NodeOptions
-from autocalib_ros.ros.silence import Offer, Silence, topic_beside, why_silent
+from autocalib_ros.ros.watchdog import Offer, Silence, topic_beside, why_silent
 
 DEPTH = 10
 """Images that DDS keeps while this process has no processor: a third of a second at 30 Hz.

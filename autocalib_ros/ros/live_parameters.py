@@ -11,7 +11,7 @@ from rclpy.parameter import Parameter
 
 from autocalib_ros.config import NodeOptions, Options, declared, may_change, with_values
 from autocalib_ros.errors import UsageError
-from autocalib_ros.ros.parameters import refuse_wrong_type, unknown
+from autocalib_ros.ros.declared_parameters import refuse_wrong_type, unknown
 
 Changed = Callable[[Options, NodeOptions], None]
 

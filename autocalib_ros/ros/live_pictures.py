@@ -32,8 +32,8 @@ from autocalib_ros.results.calibration import Calibration, Refusal
 from autocalib_ros.revalidation import CalibrationState
 from autocalib_ros.ros import messages
 from autocalib_ros.ros.headers import Headers
-from autocalib_ros.ros.in_force import InForce, Published
-from autocalib_ros.ros.wording import described_numbers
+from autocalib_ros.ros.log_text import described_numbers
+from autocalib_ros.ros.publication import InForce, Published
 
 GOOD, WAITING = '#7ee08a', '#ffd166'
 """Colours of the state, where a calibration is vouched for and where it is not."""

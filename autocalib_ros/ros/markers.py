@@ -12,7 +12,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from autocalib_ros.pictures.road import Ellipse, Grid, ellipses, enlargement, field_of_view
 from autocalib_ros.pictures.views import length_words
 from autocalib_ros.results.calibration import Calibration
-from autocalib_ros.ros.wording import described_numbers
+from autocalib_ros.ros.log_text import described_numbers
 
 LINE_SHARE = 0.005
 LETTER_SHARE = 0.06

@@ -9,8 +9,8 @@ from enum import Enum
 
 from autocalib_ros.calibrator import Progress
 from autocalib_ros.results.calibration import Calibration
-from autocalib_ros.ros.silence import Silence
-from autocalib_ros.ros.wording import tilt_deg
+from autocalib_ros.ros.log_text import tilt_deg
+from autocalib_ros.ros.watchdog import Silence
 
 OK, WARN, ERROR = 0, 1, 2
 """Levels of diagnostic_msgs/DiagnosticStatus; STALE is the aggregator's to say."""

@@ -153,7 +153,9 @@ def run_node(options: argparse.Namespace) -> dict:
     """Run a node with clocks in it until it is interrupted."""
     from autocalib_ros.util.threads import use_one_thread_for_linear_algebra
     use_one_thread_for_linear_algebra()
-    from autocalib_ros.ros import autocalib_node, diagnostics, image_input, node, pipeline, solver
+    from autocalib_ros.ros import autocalib_node, diagnostics, image_input, node
+    from autocalib_ros.ros import solver_process as solver
+    from autocalib_ros.ros import worker as pipeline
     timed, latencies_ms, solved_s, ends = Timed(), [], [], []
     if options.depth:
         image_input.DEPTH = options.depth

@@ -15,7 +15,7 @@ from autocalib_ros.lens.camera_info import camera_info
 from autocalib_ros.offline.synthetic.junction import pose
 from autocalib_ros.results.calibration import GroundPlane
 from autocalib_ros.ros import messages
-from autocalib_ros.ros.ground_points import GroundPointsNode
+from autocalib_ros.ros.ground_points_node import GroundPointsNode
 from autocalib_ros.ros.qos import LATCHED
 from bench import wait_for
 
@@ -158,7 +158,7 @@ def test_no_pixels_are_answered_by_no_points(calibrated):
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_the_executable_ends_quietly_when_it_is_asked_to(bench, number):
-    command = [sys.executable, '-m', 'autocalib_ros.ros.ground_points']
+    command = [sys.executable, '-m', 'autocalib_ros.ros.ground_points_node']
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         try:
             wait_for(lambda: bench.client.count_subscribers('pixels'), 'the node')

@@ -5,7 +5,7 @@ import threading
 import pytest
 
 from autocalib_ros.results.store import Store
-from autocalib_ros.ros.keeper import Keeper
+from autocalib_ros.ros.store_writer import Keeper
 from bench import PATIENCE_S, wait_for
 from stored import calibration, stored
 

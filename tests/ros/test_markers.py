@@ -134,6 +134,6 @@ def test_a_fault_in_the_markers_stops_no_calibration(bench, monkeypatch):
     def broken(*_given):
         raise ValueError('torn')
 
-    monkeypatch.setattr('autocalib_ros.ros.in_force.markers', broken)
+    monkeypatch.setattr('autocalib_ros.ros.publication.markers', broken)
     node = start(bench)
     assert node.in_force.published.markers == no_markers()

@@ -14,8 +14,8 @@ from rclpy.parameter import Parameter
 
 from autocalib_ros.config import NodeOptions, Options, declared, flattened, may_change
 from autocalib_ros.errors import UsageError
+from autocalib_ros.ros.declared_parameters import read
 from autocalib_ros.ros.live_parameters import changed_options
-from autocalib_ros.ros.parameters import read
 from bench import PATIENCE_S, Bench, wait_for
 
 OPTIONS = [*declared(Options()), *declared(NodeOptions())]

@@ -10,7 +10,7 @@ import pytest
 from autocalib_ros.config import Options
 from autocalib_ros.errors import InputError
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.ros.pipeline import WAITING_IMAGES, Pipeline
+from autocalib_ros.ros.worker import WAITING_IMAGES, Pipeline
 from bench import PATIENCE_S, PIXELS, calibration, refusal, wait_for
 
 FRAME_NS = 66_000_000
@@ -191,7 +191,7 @@ def test_other_options_are_solved_with_though_no_image_comes(start, heard):
 
 
 def test_solver_rests_unless_somebody_waits(start, heard, monkeypatch):
-    monkeypatch.setattr('autocalib_ros.ros.pipeline.REST', 1e6)
+    monkeypatch.setattr('autocalib_ros.ros.worker.REST', 1e6)
     pipeline = start(lambda evidence: threading.Event().wait(0.01) or calibration(evidence))
     feed(pipeline, heard, 1)
     assert result_of(pipeline.solve_now())
@@ -254,7 +254,7 @@ def test_image_of_another_shape_than_the_known_lens_is_left_out_and_told(start, 
 
 
 def test_progress_says_why_the_last_solution_was_refused(start, heard, monkeypatch):
-    monkeypatch.setattr('autocalib_ros.ros.pipeline.PROGRESS_PERIOD_S', 0.0)
+    monkeypatch.setattr('autocalib_ros.ros.worker.PROGRESS_PERIOD_S', 0.0)
     pipeline = start(refusal)
     pipeline.offer(0, PIXELS)
     pipeline.solve_now().result(PATIENCE_S)
@@ -339,7 +339,7 @@ def test_reset_returns_when_nothing_is_told_any_more(start, heard, monkeypatch):
 
 
 def test_progress_of_before_a_reset_is_forgotten(start, heard, monkeypatch):
-    monkeypatch.setattr('autocalib_ros.ros.pipeline.PROGRESS_PERIOD_S', 0.0)
+    monkeypatch.setattr('autocalib_ros.ros.worker.PROGRESS_PERIOD_S', 0.0)
     pipeline = start(refusal)
     feed(pipeline, heard, 1)
     result_of(pipeline.solve_now())

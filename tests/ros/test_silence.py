@@ -2,7 +2,7 @@
 
 import pytest
 
-from autocalib_ros.ros.silence import COMPRESSED, IMAGE, Offer, topic_beside, why_silent
+from autocalib_ros.ros.watchdog import COMPRESSED, IMAGE, Offer, topic_beside, why_silent
 
 RAW = Offer('/cam/driver', IMAGE, True)
 LOSSY = Offer('/cam/driver', IMAGE, False)

@@ -12,7 +12,7 @@ from autocalib_ros.calibrator import AutoCalibrator, solve
 from autocalib_ros.config import Options, ScaleOptions
 from autocalib_ros.errors import UsageError
 from autocalib_ros.results.calibration import Refusal
-from autocalib_ros.ros.solver import SolverEnded, SolverProcess
+from autocalib_ros.ros.solver_process import SolverEnded, SolverProcess
 from bench import PATIENCE_S, PIXELS
 
 OPTIONS = Options(camera_height=8.0)

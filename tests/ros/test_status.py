@@ -8,8 +8,8 @@ import pytest
 from autocalib_ros.calibrator import Progress
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.results.calibration import Calibration, EvidenceSummary, GroundPlane, Reason, StandardDeviations
-from autocalib_ros.ros.silence import Silence
 from autocalib_ros.ros.status import ERROR, OK, RATE_WINDOW_S, WARN, Counts, Recent, Situation, State, state_of, status
+from autocalib_ros.ros.watchdog import Silence
 
 TILT_DEG = 30.0
 COS, SIN = np.cos(np.radians(TILT_DEG)), np.sin(np.radians(TILT_DEG))

@@ -9,7 +9,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
 from autocalib_ros.ros.autocalib_node import AutocalibNode
-from autocalib_ros.ros.ground_points import GroundPointsNode
+from autocalib_ros.ros.ground_points_node import GroundPointsNode
 from bench import wait_for
 
 CONFIG = Path(__file__).parent.parent.parent / 'config'

@@ -17,7 +17,7 @@ from autocalib_ros.config import Options
 from autocalib_ros.evidence.snapshot import Evidence, EvidenceBuffer
 from autocalib_ros.report.scene import Moment, Scene, noted
 from autocalib_ros.results.calibration import Calibration, Refusal
-from autocalib_ros.ros.solver import NICENESS
+from autocalib_ros.ros.solver_process import NICENESS
 from autocalib_ros.util.threads import use_one_thread_for_linear_algebra
 
 END_S = 1.0
