@@ -11,19 +11,16 @@ from contextlib import contextmanager
 from typing import NoReturn
 
 from autocalib_ros import __version__
-from autocalib_ros.commands import (
-    INTERRUPTED,
-    WRONG_USE,
-    benchmark,
-    compare,
-    demo,
-    evidence,
-    picture,
-    rectify,
-    replay,
-    simulate,
-    topview,
-)
+from autocalib_ros.commands import INTERRUPTED, WRONG_USE
+from autocalib_ros.commands import benchmark_command as benchmark
+from autocalib_ros.commands import compare_command as compare
+from autocalib_ros.commands import demo_command as demo
+from autocalib_ros.commands import evidence_command as evidence
+from autocalib_ros.commands import picture_command as picture
+from autocalib_ros.commands import rectify_command as rectify
+from autocalib_ros.commands import replay_command as replay
+from autocalib_ros.commands import simulate_command as simulate
+from autocalib_ros.commands import topview_command as topview
 from autocalib_ros.errors import AutocalibError, UsageError
 from autocalib_ros.util.threads import use_one_thread_for_linear_algebra
 

@@ -14,7 +14,7 @@ import pytest
 
 from autocalib_ros.calibrator import solve
 from autocalib_ros.cli import main
-from autocalib_ros.commands.replay import DEFAULT_OUT
+from autocalib_ros.commands.replay_command import DEFAULT_OUT
 from autocalib_ros.config import Declared, NodeOptions, Options, declared
 from autocalib_ros.offline.synthetic.junction import Junction, synthetic_evidence
 from autocalib_ros.results.calibration import write_calibration_json

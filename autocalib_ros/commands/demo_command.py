@@ -7,8 +7,8 @@ import shutil
 from pathlib import Path
 
 from autocalib_ros.commands import DONE, REFUSED
-from autocalib_ros.commands.replay import DEFAULT_OUT
-from autocalib_ros.commands.telling import replay_and_tell, tell
+from autocalib_ros.commands.output import replay_and_tell, tell
+from autocalib_ros.commands.replay_command import DEFAULT_OUT
 
 HELP = 'simulate traffic, calibrate from it, compare with the truth'
 DESCRIPTION = None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from autocalib_ros.commands import views
+from autocalib_ros.commands import view_options as views
 
 HELP = 'take the distortion out of an image or video'
 DESCRIPTION = 'Take the distortion out of an image or video, with a saved calibration of the camera.'

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from autocalib_ros.commands import views
+from autocalib_ros.commands import view_options as views
 
 HELP = 'show in one picture what a calibration makes of an image: grid on the road, horizon, road from above'
 DESCRIPTION = ('One picture that tells what a calibration is: at the left the image with a grid on the road and the '

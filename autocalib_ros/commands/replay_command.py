@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from autocalib_ros.commands import DONE, REFUSED
-from autocalib_ros.commands.solving import add_solving, known_lens, options_of
-from autocalib_ros.commands.telling import replay_and_tell, tell
+from autocalib_ros.commands.output import replay_and_tell, tell
+from autocalib_ros.commands.solve_options import add_solving, known_lens, options_of
 from autocalib_ros.config import Options
 
 if TYPE_CHECKING:

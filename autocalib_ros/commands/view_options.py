@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from autocalib_ros.commands import DONE
-from autocalib_ros.commands.compare import FILES
+from autocalib_ros.commands.compare_command import FILES
 
 if TYPE_CHECKING:
     from autocalib_ros.offline.view_files import View

@@ -6,8 +6,8 @@ import argparse
 from pathlib import Path
 
 from autocalib_ros.commands import DONE, REFUSED
-from autocalib_ros.commands.solving import add_solving, known_lens, options_of
-from autocalib_ros.commands.telling import tell_missing_height, tell_result
+from autocalib_ros.commands.output import tell_missing_height, tell_result
+from autocalib_ros.commands.solve_options import add_solving, known_lens, options_of
 
 HELP = 'solve saved evidence again with other options'
 DESCRIPTION = ('Solve the evidence.npz of a replay again, without its pictures. Options of tracking, motion and buffer '

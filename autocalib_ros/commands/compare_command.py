@@ -26,8 +26,8 @@ def run(arguments: argparse.Namespace) -> int:
     import json
     import sys
 
+    from autocalib_ros.commands.comparison_table import comparison_document, comparison_lines, truth_lines
     from autocalib_ros.compare import compared
-    from autocalib_ros.offline.comparison_text import comparison_document, comparison_lines, truth_lines
     from autocalib_ros.offline.terminal.style import painted
     from autocalib_ros.results.saved_camera import read_known_camera
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from autocalib_ros.commands import views
+from autocalib_ros.commands import view_options as views
 
 if TYPE_CHECKING:
     from autocalib_ros.offline.view_files import View
