@@ -5,7 +5,7 @@ import os
 import pytest
 
 from autocalib_ros.util.threads import use_one_thread_for_linear_algebra
-from stored import quick_folder
+from stored_results import quick_folder
 
 use_one_thread_for_linear_algebra()
 os.environ.pop('FORCE_COLOR', None)  # some test machines set it, and messages are compared as they are

@@ -10,12 +10,12 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from junction import full_result, grey_road, junction_evidence, lens_result, refusal
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from autocalib_ros.offline.replay_recording import ReplayResult
+from synthetic_results import full_result, grey_road, junction_evidence, lens_result, refusal
 
 WIDTH, HEIGHT = 32, 24
 SECOND = 1_000_000_000

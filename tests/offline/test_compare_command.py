@@ -13,7 +13,7 @@ from autocalib_ros.cli import main
 from autocalib_ros.lens.camera_info import camera_info, write_camera_info_yaml
 from autocalib_ros.pictures.views import ground_to_image
 from autocalib_ros.results.calibration import GroundPlane, calibration_json, write_calibration_json
-from stored import calibration
+from stored_results import calibration
 
 OURS = calibration()
 STATED = np.diag([1.0, 2.1, 1.9, 0.004, 0.001, 0, 0, 0.2, 0.21, 0.05])**2

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from junction import full_result, junction_evidence, lens_result, refusal
 
 from autocalib_ros.cli import main
 from autocalib_ros.evidence.snapshot import Evidence
@@ -29,6 +28,7 @@ from autocalib_ros.offline.benchmark.golden import (
     write_cases,
 )
 from autocalib_ros.offline.benchmark.runtime import golden
+from synthetic_results import full_result, junction_evidence, lens_result, refusal
 
 STORED = Path(__file__).parents[1] / 'golden'
 CALIBRATED = {'state': 'calibrated', 'grade': 'full', 'refusal': None, 'ground_refusal': None, 'roads': 2, 'people': 0}

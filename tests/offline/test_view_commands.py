@@ -18,7 +18,7 @@ from autocalib_ros.lens.camera_info import rectified_matrix, write_camera_info_y
 from autocalib_ros.offline import view_files
 from autocalib_ros.pictures.views import EMPTY_GREY, ground_to_image, image_to_ground
 from autocalib_ros.results.calibration import GroundPlane, write_calibration_json
-from stored import LOOKS_ALONG, calibration, lens_only
+from stored_results import LOOKS_ALONG, calibration, lens_only
 
 DIP = np.radians(28.0)
 DOWN = np.array([[1.0, 0, 0], [0, np.cos(DIP), np.sin(DIP)], [0, -np.sin(DIP), np.cos(DIP)]])

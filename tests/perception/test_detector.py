@@ -8,13 +8,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-
 import seeing_models
+
 from autocalib_ros.config import DetectorOptions
 from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.perception.detector.detector import VehicleDetector, open_detector
 from autocalib_ros.perception.detector.layouts import LAYOUTS
-from seeing_models import CAR, PERSON, SCORE, SeeingModel, picture
+from onnx_models import CAR, PERSON, SCORE, SeeingModel, picture
 
 BGR_255 = {'order': 'bgr', 'white': 255.0}
 MODELS = {

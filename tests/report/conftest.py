@@ -7,11 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from junction import full_result, grey_road, junction_evidence, lens_result, refusal
 
 from autocalib_ros.config import Options
 from autocalib_ros.report.page import write_report
 from autocalib_ros.report.scene import Moment, Scene
+from synthetic_results import full_result, grey_road, junction_evidence, lens_result, refusal
 
 MOMENTS = (Moment(10.0, code='too_few_tracks'), Moment(20.0, 146.0, 4.0, 39.0, 0.5),
            Moment(60.0, 140.0, 1.5, 40.0, 0.2))

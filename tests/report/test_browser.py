@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import cv2
 import numpy as np
 import pytest
+
 from browser import Browser, browser, chromium
 
 pytestmark = pytest.mark.skipif(chromium() is None, reason='no Chromium: apt-get install chromium')

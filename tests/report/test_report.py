@@ -11,7 +11,6 @@ from html.parser import HTMLParser
 import cv2
 import numpy as np
 import pytest
-from junction import SPEED_M_S, junction_evidence
 from matplotlib.text import Text
 
 from autocalib_ros.lens.camera_info import rectified_matrix
@@ -24,6 +23,7 @@ from autocalib_ros.report.speed_figures import by_vehicle, pieces_on_road, speed
 from autocalib_ros.report.text import how_sure, needs, next_step, number_rows, verdict
 from autocalib_ros.report.traffic_figures import kept_tracks
 from autocalib_ros.results.calibration import GroundPlane, Refusal, Residuals
+from synthetic_results import SPEED_M_S, junction_evidence
 
 ALL = {entry.name for entry in ENTRIES}
 ON_THE_ROAD = {'ground_grid', 'top_view', 'speeds', 'speed_histogram'}

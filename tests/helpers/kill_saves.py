@@ -14,7 +14,7 @@ from pathlib import Path
 
 from autocalib_ros.lens.camera_info import read_camera_info
 from autocalib_ros.results.store import Kind, Store, document
-from stored import calibration, stored
+from stored_results import calibration, stored
 
 LONGEST_LIFE_S = 0.08
 """Several saves long."""

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from outlined import box, outline
 
 from autocalib_ros.estimation.people.metric_silhouettes import sizes_of
 from autocalib_ros.offline.synthetic.junction import Junction, pose
+from silhouette_evidence import box, outline
 
 JUNCTION = Junction(camera_from_ground=pose(32.0, 0.0, 0.0))
 

@@ -11,7 +11,7 @@ import pytest
 from autocalib_ros.errors import InputError
 from autocalib_ros.results.calibration import Reason, Refusal, calibration_json
 from autocalib_ros.results.calibration_json import calibration_of, read_json
-from stored import calibration, lens_only
+from stored_results import calibration, lens_only
 
 WHOLE = calibration()
 CASES = {

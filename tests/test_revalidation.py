@@ -14,7 +14,7 @@ from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_evidence
 from autocalib_ros.results.calibration import Reason, StandardDeviations
 from autocalib_ros.revalidation import CalibrationState, decided, with_what_is_given
-from stored import SIZE, calibration, lens_only
+from stored_results import SIZE, calibration, lens_only
 
 NONE, RESTORED, VERIFIED, CALIBRATED = CalibrationState
 KEPT = calibration()

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from outlined import CAR_M, RIDER_M, driven, with_outlines
 
 from autocalib_ros.calibrator import solve
 from autocalib_ros.config import Options
@@ -14,6 +13,7 @@ from autocalib_ros.estimation.people.cyclists import cyclists
 from autocalib_ros.evidence.snapshot import Evidence, Outlines, Track
 from autocalib_ros.offline.synthetic.junction import Junction, gathered, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration
+from silhouette_evidence import CAR_M, RIDER_M, driven, with_outlines
 
 JUNCTION = Junction(vehicles=30)
 FIRST_RIDER, FIRST_CAR = 1000, 2000

@@ -7,7 +7,7 @@ import pytest
 from autocalib_ros.results.store import Store
 from autocalib_ros.ros.store_writer import Keeper
 from bench import PATIENCE_S, wait_for
-from stored import calibration, stored
+from stored_results import calibration, stored
 
 NEVER_S = 1e6
 FIRST, SECOND, THIRD = (stored(calibration(300.0 + number, number=number)) for number in range(3))

@@ -7,7 +7,6 @@ from functools import partial
 
 import numpy as np
 import pytest
-from painted_road import Paint, painted_lines, post_lines, random_lines
 
 from autocalib_ros.calibrator import solve
 from autocalib_ros.config import GateOptions, JointOptions, Options
@@ -29,6 +28,7 @@ from autocalib_ros.offline.benchmark.monte_carlo import distance_error
 from autocalib_ros.offline.synthetic.drives import drive_ring
 from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration, GroundPlane, Reason, to_json
+from road_lines import Paint, painted_lines, post_lines, random_lines
 
 WIDTH, HEIGHT = 1280, 720
 CENTRE = (639.5, 359.5)

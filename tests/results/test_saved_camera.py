@@ -16,7 +16,7 @@ from autocalib_ros.lens.camera_info import rectified_matrix, write_camera_info_y
 from autocalib_ros.results.calibration import COVARIANCE_OF, calibration_json, write_calibration_json
 from autocalib_ros.results.saved_camera import KnownCamera, read_known_camera
 from autocalib_ros.results.store import document
-from stored import calibration, stored
+from stored_results import calibration, stored
 
 WHOLE = calibration()
 PIXELS = np.stack(np.meshgrid(np.linspace(0, 639, 9), np.linspace(0, 359, 7)), axis=-1)

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from junction import full_result, grey_road, junction_evidence
 
 from autocalib_ros.config import Options
 from autocalib_ros.results.store import Store
 from autocalib_ros.ros.report_writer import Place, Reports
 from bench import SIZE, calibration, wait_for
+from synthetic_results import full_result, grey_road, junction_evidence
 from test_node import calibrated
 from test_persistence import focal
 

@@ -15,7 +15,7 @@ import yaml
 from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.lens.camera_info import camera_info_yaml, read_camera_info
 from autocalib_ros.results.store import Kind, Store, document, path_of
-from stored import calibration, lens_only, stored
+from stored_results import calibration, lens_only, stored
 
 KILLS = 60
 FIRST, SECOND, THIRD = (stored(calibration(focal, number=number)) for number, focal in enumerate((300.0, 310.0, 320.0)))
@@ -111,9 +111,9 @@ def test_what_killed_writers_left_is_removed(store):
 
 
 def test_files_are_never_broken_whenever_the_writer_is_killed(quick_path):
-    script = Path(__file__).with_name('kept') / 'kill_saves.py'
+    script = Path(__file__).parents[1] / 'helpers' / 'kill_saves.py'
     done = subprocess.run([sys.executable, str(script), str(quick_path), str(KILLS)], capture_output=True, text=True,
-                          timeout=120, check=False, env={**os.environ, 'PYTHONPATH': str(Path(__file__).parents[1])})
+                          timeout=120, check=False, env={**os.environ, 'PYTHONPATH': str(Path(__file__).parents[2])})
     assert done.returncode == 0, done.stderr
     kills, saves = map(int, re.findall(r'\d+', done.stdout)[:2])
     assert kills == KILLS
