@@ -13,15 +13,16 @@ from autocalib_ros.estimation.adjustment.noise_model import USUAL_HEIGHT_M
 from autocalib_ros.estimation.adjustment.residuals import residuals_of
 from autocalib_ros.estimation.estimate import Solution, find_solution
 from autocalib_ros.estimation.observations.selection import of_vehicles
+from autocalib_ros.estimation.observations.track_set import TrackSet, select_tracks
 from autocalib_ros.estimation.paper.intrinsics import paper_intrinsics
 from autocalib_ros.estimation.paper.published_method import solve_paper
+from autocalib_ros.estimation.paper.vanishing_point_voting import segment_orientations
 from autocalib_ros.estimation.people.pedestrians import people
-from autocalib_ros.estimation.straight.consensus import segment_orientations
 from autocalib_ros.estimation.verification.ground_normal import Plane
 from autocalib_ros.estimation.verification.readiness import drift_limit_px, outlook, requirements, shortfall, unsteady
 from autocalib_ros.estimation.verification.scale import Scale, is_unusual, known_scale, scale_doubt
-from autocalib_ros.evidence.snapshot import Evidence, EvidenceBuffer, Kind
-from autocalib_ros.geometry.great_circles import TrackSet, select_tracks
+from autocalib_ros.evidence.buffer import EvidenceBuffer
+from autocalib_ros.evidence.snapshot import Evidence, Kind
 from autocalib_ros.geometry.ground_plane import ground_plane, ground_points, pixels_ahead, tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.lens.camera_info import ModelMisfit

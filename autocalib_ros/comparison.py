@@ -1,12 +1,223 @@
-"""How two calibrations of one camera differ, as values, and what that means.
+"""Finds how two calibrations of one camera differ.
 
-Every difference is B's less A's, and counted in combined standard deviations where any are stated.
+The same pixels are followed through both lenses and poses; a side that states no deviations is taken as exact. Lenses
+are compared as they stand, and after the rotation of B that brings its rays nearest to A's, as two lenses may trade
+principal point against rotation. On the road the camera's foot is one and the same point, and the heading of the
+ground frames, which each calibration chooses for itself, is turned so that the pixels of the near road lie in the same
+directions.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+
+import numpy as np
+
+from autocalib_ros.geometry.ground_plane import GroundPlane, angles_deg, pixels_ahead, tilt_and_roll_deg
+from autocalib_ros.ground import SHARE_OF_SIGMA, Ground
+from autocalib_ros.lens.camera import Camera, pixel_grid
+from autocalib_ros.results.calibration import GROUND_DISTANCES_M
+from autocalib_ros.results.saved_camera import KnownCamera
+
+GRID = (49, 28)
+"""Pixels across and down at which two lenses are compared, borders included."""
+TWO_COEFFICIENTS = 2
+"""More than k1 and k2 trade against each other, so that k1 of such a lens is no number by itself."""
+
+
+def compared(first: KnownCamera, second: KnownCamera) -> Comparison:
+    """Compare B, `second`, with A, `first`; UsageError where their images are of different shapes."""
+    notes = []
+    if (first.width, first.height) != (second.width, second.height):
+        notes.append(f'B is scaled from {second.width}x{second.height} to {first.width}x{first.height}')
+        second = second.scaled_to(first.width, first.height)
+    stated = first.stddev.focal_px is not None, second.stddev.focal_px is not None
+    notes += [f'{name} states no standard deviations and is taken as exact'
+              for name, told, other in zip('AB', stated, stated[::-1], strict=True) if not told and other]
+    both = first.ground is not None and second.ground is not None
+    metric = both and first.ground.metric and second.ground.metric
+    ahead = pixels_ahead(first.lens, first.ground.normal_in_camera, first.ground.height_m,
+                         np.array(GROUND_DISTANCES_M)) if metric else np.zeros((0, 2))
+    grid = pixel_grid(first, *GRID)
+    sides = _Side.of(first, np.vstack([grid, ahead])), _Side.of(second, np.vstack([grid, ahead]))
+    everywhere = sides[0].part(slice(len(grid))), sides[1].part(slice(len(grid)))
+    lens, lens_notes = _lens_differences(first, second)
+    pose, pose_notes = _pose_differences(first, second)
+    road, road_notes = _road_differences(*sides, ahead) if metric else ((), [])
+    return Comparison(
+        lens=lens, lens_px=lenses_apart_px(first, second), rays=_ray_difference(*everywhere, grid, turned=False),
+        rays_turned=_ray_difference(*everywhere, grid, turned=True),
+        turned_deg=_angle_deg(best_turn(everywhere[0].here.rays, everywhere[1].here.rays)), pose=pose,
+        normal_deg=_between_deg(first.ground, second.ground) if both else None, road=road, stated=stated,
+        notes=(*notes, *lens_notes, *pose_notes, *road_notes))
+
+
+def lenses_apart_px(first: KnownCamera | Camera, second: KnownCamera | Camera) -> float:
+    """Return how far apart at the most two lenses of one image size image the same direction, pixels."""
+    pixels = pixel_grid(first, *GRID)
+    bearings, reached = first.unproject(pixels)
+    seen, valid = second.project(np.where(reached[:, None], bearings, [0.0, 0.0, 1.0]))
+    apart = np.hypot(*(seen - pixels).T)[reached & valid]
+    return float(apart.max()) if len(apart) else math.inf
+
+
+def _lens_differences(first: KnownCamera, second: KnownCamera) -> tuple[tuple[Difference, ...], list[str]]:
+    points = [known.stddev.principal_point_px or (None, None) for known in (first, second)]
+    found = [_difference('focal length', 'px', first.focal_px, second.focal_px,
+                         first.stddev.focal_px, second.stddev.focal_px)]
+    found += [_difference(f'principal point {axis}', 'px', first.principal_point_px[index],
+                          second.principal_point_px[index], points[0][index], points[1][index])
+              for index, axis in enumerate('xy')]
+    if first.k is None or second.k is None:
+        return tuple(found), ['k1 and k2 are not compared: a lens is not near to Kannala-Brandt, see the rays']
+    if any(first.k[TWO_COEFFICIENTS:]) or any(second.k[TWO_COEFFICIENTS:]):
+        return tuple(found), ['k1 and k2 are not compared: a lens has more coefficients than these, see the rays']
+    found += [_difference('k1', '', first.k[0], second.k[0], first.stddev.k1, second.stddev.k1),
+              _difference('k2', '', first.k[1], second.k[1], first.stddev.k2, second.stddev.k2)]
+    return tuple(found), []
+
+
+def _pose_differences(first: KnownCamera, second: KnownCamera) -> tuple[tuple[Difference, ...], list[str]]:
+    missing = [name for name, known in (('A', first), ('B', second)) if known.ground is None]
+    if missing:
+        return (), [f'poses are not compared: {" and ".join(missing)} {"holds" if len(missing) == 1 else "hold"}'
+                    ' no ground plane']
+    angles = [tilt_and_roll_deg(known.ground.normal_in_camera) for known in (first, second)]
+    sigmas = [(known.stddev.tilt_deg, known.stddev.roll_deg) for known in (first, second)]
+    found = [_difference(name, 'deg', float(angles[0][index]), float(angles[1][index]), sigmas[0][index],
+                         sigmas[1][index]) for index, name in enumerate(('tilt', 'roll'))]
+    if not (first.ground.metric and second.ground.metric):
+        return tuple(found), ["heights and metres are not compared: a plane is in units of its camera's height"]
+    # a height that was given has no deviation: it is exact
+    height = Difference('height', 'm', first.ground.height_m, second.ground.height_m, math.hypot(
+        first.stddev.height_m or 0.0, second.stddev.height_m or 0.0))
+    return (*found, height), []
+
+
+def _difference(name: str, unit: str, first: float, second: float, *sigmas: float | None) -> Difference:
+    known = [sigma for sigma in sigmas if sigma is not None]
+    return Difference(name, unit, first, second, math.hypot(*known) if known else None)
+
+
+@dataclass(frozen=True)
+class _View:
+    """Unit rays (n, 3) of pixels, nan where the lens does not reach, and the pose where there is one."""
+
+    rays: np.ndarray
+    ground: GroundPlane | None
+
+    @classmethod
+    def of(cls, lens: KnownCamera | Camera, ground: GroundPlane | None, pixels: np.ndarray) -> _View:
+        there = np.isfinite(pixels).all(axis=1)
+        bearings, valid = lens.unproject(np.where(there[:, None], pixels, 0.0))
+        return cls(np.where((there & valid)[:, None], bearings, np.nan), ground)
+
+    def part(self, which: slice | np.ndarray) -> _View:
+        return _View(self.rays[which], self.ground)
+
+    def places(self) -> np.ndarray:
+        """Where the rays meet the road in the ground frame, x + iy (n,); nan at and above the horizon."""
+        rays = self.rays @ self.ground.rotation.T
+        down = np.where(rays[:, 2] < -1e-6, rays[:, 2], np.nan)
+        return rays[:, :2] @ [1.0, 1.0j] * (-self.ground.height_m / down)
+
+
+@dataclass(frozen=True)
+class _Side:
+    """What A or B makes of pixels."""
+
+    here: _View
+    nearby: list[_View] | None
+    """And a little to both sides along each axis of its covariance; none where it is exact, None where it states
+    deviations without a covariance."""
+
+    @classmethod
+    def of(cls, known: KnownCamera, pixels: np.ndarray) -> _Side:
+        here = _View.of(known, known.ground, pixels)
+        if known.covariance is None or known.ground is None:
+            return cls(here, [] if known.stddev.focal_px is None else None)
+        ground = Ground(lens=known.lens, rotation=known.ground.rotation, camera_m=known.ground.translation_m,
+                        covariance=known.covariance)
+        return cls(here, [_View.of(lens, GroundPlane(rotation, float(camera_m[2])), pixels)
+                          for lens, rotation, camera_m in ground.deviants])
+
+    def part(self, which: slice | np.ndarray) -> _Side:
+        return _Side(self.here.part(which),
+                     None if self.nearby is None else [view.part(which) for view in self.nearby])
+
+
+def _ray_difference(first: _Side, second: _Side, pixels: np.ndarray, *, turned: bool) -> RayDifference:
+    def apart(one: _View, other: _View) -> np.ndarray:
+        return (other.rays @ best_turn(one.rays, other.rays).T if turned else other.rays) - one.rays
+
+    chords = np.linalg.norm(apart(first.here, second.here), axis=1)
+    seen = np.isfinite(chords)
+    if not seen.any():
+        return RayDifference(math.nan, math.inf, (math.nan, math.nan), None)
+    angles_deg = np.degrees(2 * np.arcsin(np.clip(np.where(seen, chords, 0.0) / 2, 0, 1)))
+    worst = int(np.argmax(angles_deg))
+    sigma = _sigma(first, second, lambda one, other: apart(one, other)[worst])
+    return RayDifference(float(angles_deg[seen].mean()), float(angles_deg[worst]), tuple(map(float, pixels[worst])),
+                         None if sigma is None else math.degrees(sigma))
+
+
+def _road_differences(first: _Side, second: _Side,
+                      ahead: np.ndarray) -> tuple[tuple[RoadDifference, ...], list[str]]:
+    """Compare where the pixels `ahead` (m, 2), the last of both sides, meet the road; nan is not in the image."""
+    far, count = max(GROUND_DISTANCES_M), len(ahead)
+    near = np.logical_and(*(np.abs(side.here.places()) <= far for side in (first, second)))  # nan is not near
+    near[-count:] = False
+    if np.count_nonzero(near) < 2:
+        return (), [f'the road is not compared: hardly a pixel shows it within {far:g} m in both']
+    found, notes = [], []
+    for index, (distance, pixel) in enumerate(zip(GROUND_DISTANCES_M, ahead, strict=True)):
+        if not np.isfinite(pixel).all():
+            notes.append(f'{distance:g} m straight ahead is not in the image')
+            continue
+
+        def apart(one: _View, other: _View, index: int = index - count) -> np.ndarray:
+            ones, others = one.places(), other.places()
+            between = (ones * np.conj(others))[near]
+            heading = np.nansum(between / np.abs(between))
+            gap = others[index] * heading / np.abs(heading) - ones[index]
+            return np.array([gap.real, gap.imag])
+        apart_m = float(np.hypot(*apart(first.here, second.here)))
+        found.append(RoadDifference(distance, tuple(map(float, pixel)), math.inf if math.isnan(apart_m) else apart_m,
+                                    _sigma(first, second, apart)))
+    return tuple(found), notes
+
+
+def _sigma(first: _Side, second: _Side, apart: Callable[[_View, _View], np.ndarray]) -> float | None:
+    """Return one sigma of the length of `apart` of the two (n,), by the covariances of both; None where not known."""
+    if first.nearby is None or second.nearby is None:
+        return None
+    moves = [apart(view, second.here) for view in first.nearby] + [apart(first.here, view) for view in second.nearby]
+    if not moves:
+        return None
+    steps = (np.array(moves[::2]) - np.array(moves[1::2])) / (2 * SHARE_OF_SIGMA)
+    return float(np.sqrt((steps**2).sum()))
+
+
+def best_turn(ones: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Return the rotation (3, 3) that brings rays `others` (n, 3) nearest to `ones`, in the least-squares sense."""
+    both = np.isfinite(ones).all(axis=1) & np.isfinite(others).all(axis=1)
+    if not both.any():
+        return np.eye(3)
+    left, _, right = np.linalg.svd(ones[both].T @ others[both])
+    return left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+
+
+def _angle_deg(turn: np.ndarray) -> float:
+    """Return the angle of a rotation (3, 3)."""
+    off = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+    return float(np.degrees(np.arctan2(np.linalg.norm(off), np.trace(turn) - 1.0)))
+
+
+def _between_deg(first: GroundPlane, second: GroundPlane) -> float:
+    return float(angles_deg(first.normal_in_camera, second.normal_in_camera))
+
 
 AGREES_SIGMAS = 3.0
 """Two calibrations of one camera are farther apart than this in one number out of 400."""

@@ -10,14 +10,13 @@ import math
 from dataclasses import dataclass, replace
 from enum import Enum
 
-from autocalib_ros.compare import lenses_apart_px
-from autocalib_ros.comparison import AGREES_SIGMAS, SAME_LENS_PX, SAME_NUMBER
+from autocalib_ros.comparison import AGREES_SIGMAS, SAME_LENS_PX, SAME_NUMBER, lenses_apart_px
 from autocalib_ros.config import Options
 from autocalib_ros.errors import UsageError
 from autocalib_ros.estimation.verification.scale import Scale, known_scale
-from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
+from autocalib_ros.geometry.ground_plane import GroundPlane, tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.results.calibration import Calibration, GroundPlane, StandardDeviations
+from autocalib_ros.results.calibration import Calibration, StandardDeviations
 
 GRADES = ('lens', 'unit_scale', 'assumed', 'full')
 """From the least that a calibration gives to the most."""

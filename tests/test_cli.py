@@ -15,7 +15,7 @@ import pytest
 import autocalib_ros
 from autocalib_ros.cli import main
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.lens.camera_info import write_camera_info_yaml
+from autocalib_ros.lens.camera_info_yaml import write_camera_info_yaml
 
 
 @pytest.fixture

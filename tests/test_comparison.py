@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from autocalib_ros.compare import compared
+from autocalib_ros.comparison import compared
 from autocalib_ros.errors import UsageError
+from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.ground import Ground
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.lens.camera_info import camera_info
 from autocalib_ros.lens.opencv_lens import OpencvLens
-from autocalib_ros.results.calibration import COVARIANCE_OF, GroundPlane, StandardDeviations
+from autocalib_ros.results.calibration import COVARIANCE_OF, StandardDeviations
 from autocalib_ros.results.saved_camera import KnownCamera
 
 CAMERA = Camera(1280, 720, 560.0, (642.0, 357.0), (0.01, -0.002, 0.0, 0.0))

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from autocalib_ros.calibrator import solve
 from autocalib_ros.config import JointOptions, Options, ScaleOptions
 from autocalib_ros.errors import InputError
-from autocalib_ros.geometry.ground_plane import pixels_ahead
+from autocalib_ros.geometry.ground_plane import GroundPlane, pixels_ahead
 from autocalib_ros.ground import Ground
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.lens.camera_info import camera_info
@@ -28,11 +28,10 @@ from autocalib_ros.results.calibration import (
     GROUND_DISTANCES_M,
     Calibration,
     EvidenceSummary,
-    GroundPlane,
     Reason,
     StandardDeviations,
-    to_json,
 )
+from autocalib_ros.results.calibration_json import to_json
 
 TYPES = get_typestore(Stores.ROS2_JAZZY).types
 DATA = Path(os.environ.get('AUTOCALIB_TEST_DATA', '')) / 'data'

@@ -17,7 +17,7 @@ from autocalib_ros.cli import main
 from autocalib_ros.commands.replay_command import DEFAULT_OUT
 from autocalib_ros.config import Declared, NodeOptions, Options, declared
 from autocalib_ros.offline.synthetic.junction import Junction, synthetic_evidence
-from autocalib_ros.results.calibration import write_calibration_json
+from autocalib_ros.results.calibration_json import write_calibration_json
 from autocalib_ros.ros.status import Counts, Situation, status
 
 ROOT = Path(__file__).parent.parent

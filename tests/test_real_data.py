@@ -11,7 +11,7 @@ import pytest
 
 from autocalib_ros.config import DetectorOptions, Options
 from autocalib_ros.evidence.snapshot import Kind
-from autocalib_ros.offline.recordings.sources import open_source
+from autocalib_ros.offline.recordings.open import open_source
 from autocalib_ros.offline.replay_recording import replay
 from autocalib_ros.perception.detector.detector import open_detector
 from autocalib_ros.results.calibration import Calibration, Refusal

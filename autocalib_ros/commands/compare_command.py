@@ -27,7 +27,7 @@ def run(arguments: argparse.Namespace) -> int:
     import sys
 
     from autocalib_ros.commands.comparison_table import comparison_document, comparison_lines, truth_lines
-    from autocalib_ros.compare import compared
+    from autocalib_ros.comparison import compared
     from autocalib_ros.offline.terminal.style import painted
     from autocalib_ros.results.saved_camera import read_known_camera
 
@@ -35,8 +35,7 @@ def run(arguments: argparse.Namespace) -> int:
     result = compared(*both)
     errors = []
     if arguments.truth is not None:
-        from autocalib_ros.offline.ground_truth import read_truth
-        from autocalib_ros.offline.truth_file import errors_against_truth
+        from autocalib_ros.offline.ground_truth import errors_against_truth, read_truth
 
         truth = read_truth(arguments.truth)
         errors = [errors_against_truth(known, truth) for known in both]

@@ -28,7 +28,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Simulate, replay and compare; return the exit status."""
     from autocalib_ros.offline import outputs
     from autocalib_ros.offline.demonstration import compare, options_from, simulate_into
-    from autocalib_ros.offline.recordings.sources import open_source
+    from autocalib_ros.offline.recordings.open import open_source
 
     bag = arguments.out / 'recording'
     outputs.prepare(arguments.out, bag)

@@ -49,7 +49,7 @@ def tell_result(replayed: ReplayResult, out: Path | None, names: list[str], *, q
     from autocalib_ros.offline.terminal.style import columns_of, is_terminal, painted, state_colour
     from autocalib_ros.offline.terminal.summary import summary_lines
     from autocalib_ros.report.text import remedy, verdict
-    from autocalib_ros.results.calibration import calibration_json
+    from autocalib_ros.results.calibration_json import calibration_json
 
     result = replayed.result
     if not result:

@@ -38,7 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Replay; return the exit status."""
     options = options_of(arguments)
     lens = known_lens(arguments, options)
-    from autocalib_ros.offline.recordings.sources import open_source
+    from autocalib_ros.offline.recordings.open import open_source
     from autocalib_ros.perception.detector.detector import open_detector
 
     detector = open_detector(options.detector)

@@ -74,7 +74,8 @@ def known_lens(arguments: argparse.Namespace, options: Options) -> Camera | None
         file = camera_info_file(arguments.params_file) or None
     if file is None:
         return None
-    from autocalib_ros.lens.camera_info import camera_info, read_camera_info
+    from autocalib_ros.lens.camera_info import camera_info
+    from autocalib_ros.lens.camera_info_yaml import read_camera_info
 
     lens = read_camera_info(file)
     camera_info(lens, options.distortion_model)

@@ -10,15 +10,16 @@ from autocalib_ros.config import GateOptions, JointOptions
 from autocalib_ros.estimation.adjustment.bundle_adjustment import (
     UNMODELLED_FOCAL,
     JointFit,
-    noise_cost,
     road_support,
     solve_joint,
     with_bodies,
 )
 from autocalib_ros.estimation.adjustment.lens_prior import LensPrior, known_lens, lens_priors
+from autocalib_ros.estimation.adjustment.model_selection import noise_cost
 from autocalib_ros.estimation.adjustment.noise_model import USUAL_HEIGHT_M
 from autocalib_ros.estimation.adjustment.parameters import Setting
 from autocalib_ros.estimation.markings.markings_solution import NO_MARKINGS, fit_to_markings, sharpened, with_lens_known
+from autocalib_ros.estimation.observations.track_set import TrackSet, evenly
 from autocalib_ros.estimation.observations.two_frame_windows import Instants, Windows, find_windows
 from autocalib_ros.estimation.people.pedestrians import people
 from autocalib_ros.estimation.straight.initialisation import agreed, in_likeliest_family
@@ -48,7 +49,6 @@ from autocalib_ros.estimation.verification.identifiability import (
     with_what_can_be_told,
 )
 from autocalib_ros.evidence.snapshot import Evidence
-from autocalib_ros.geometry.great_circles import TrackSet, evenly
 from autocalib_ros.geometry.ground_plane import undirected_deg
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.results.calibration import Reason

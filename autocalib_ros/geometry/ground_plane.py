@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.results.calibration import GroundPlane
 
 BELOW_HORIZON = 0.95
 """Vehicles drive on the road: at least this share of what moves lies below the horizon."""
@@ -88,3 +90,55 @@ def angles_deg(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 def undirected_deg(one: np.ndarray, other: np.ndarray) -> float:
     """Angle between two unit vectors (3,), whichever way they point, degrees."""
     return float(np.degrees(np.arccos(min(abs(float(one @ other)), 1.0))))
+
+
+@dataclass(frozen=True)
+class Transform:
+    """Takes coordinates in the frame `child` to coordinates in the frame `parent`; metres, unit quaternion (4,)."""
+
+    parent: str
+    child: str
+    translation_m: np.ndarray
+    rotation_xyzw: np.ndarray
+
+
+@dataclass(frozen=True)
+class GroundPlane:
+    """The pose of the camera over the road: a point in the camera optical frame goes to the ground frame.
+
+    Ground frame: origin at the camera's foot point on the road, z up, x along the dominant traffic
+    direction, y left. `rotation` is ground_from_camera, shape (3, 3); `height_m` is in metres, or 1 when
+    `metric` is false: then all lengths are in units of the camera's height.
+    """
+
+    rotation: np.ndarray
+    height_m: float
+    metric: bool = True
+
+    @property
+    def translation_m(self) -> np.ndarray:
+        """The camera in the ground frame, shape (3,)."""
+        return np.array([0.0, 0.0, self.height_m])
+
+    @property
+    def rotation_xyzw(self) -> np.ndarray:
+        """The rotation as a unit quaternion x, y, z, w with w >= 0, shape (4,)."""
+        return quaternion_xyzw(self.rotation)
+
+    @property
+    def normal_in_camera(self) -> np.ndarray:
+        """Unit vector up from the road in the camera optical frame, shape (3,)."""
+        return self.rotation[2]
+
+    def transform(self, ground_frame: str, camera_frame: str, tf_parent: str) -> Transform:
+        """Return the pose with the 'ground' or the 'camera' as the parent: the same pose, told from either end."""
+        if tf_parent == 'ground':
+            return Transform(ground_frame, camera_frame, self.translation_m, self.rotation_xyzw)
+        back = self.rotation.T
+        return Transform(camera_frame, ground_frame, -back @ self.translation_m, quaternion_xyzw(back))
+
+
+def quaternion_xyzw(rotation: np.ndarray) -> np.ndarray:
+    """Return the unit quaternion x, y, z, w (w >= 0) of a rotation matrix (3, 3)."""
+    quaternion = Rotation.from_matrix(rotation).as_quat()
+    return quaternion if quaternion[3] >= 0 else -quaternion

@@ -14,7 +14,7 @@ import numpy as np
 
 from autocalib_ros.errors import InputError
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.lens.camera_info import lens_of_fields
+from autocalib_ros.lens.camera_info_yaml import lens_of_fields
 from autocalib_ros.lens.opencv_lens import OpencvLens, distorted, distortion_slopes, radii_to_the_fold
 
 NEWTON_STEPS = 12

@@ -6,11 +6,12 @@ import os
 from pathlib import Path
 
 from autocalib_ros.errors import InputError, UsageError
-from autocalib_ros.lens.camera_info import write_camera_info_yaml
-from autocalib_ros.offline.recordings.sources import Source
+from autocalib_ros.lens.camera_info_yaml import write_camera_info_yaml
+from autocalib_ros.offline.recordings.sources import Source, camera_name
 from autocalib_ros.offline.replay_recording import ReplayResult
 from autocalib_ros.report.scene import Scene
-from autocalib_ros.results.calibration import Calibration, write_calibration_json
+from autocalib_ros.results.calibration import Calibration
+from autocalib_ros.results.calibration_json import write_calibration_json
 
 CAMERA_INFO, CALIBRATION, EVIDENCE, REPORT = 'camera_info.yaml', 'calibration.json', 'evidence.npz', 'report.html'
 
@@ -27,18 +28,6 @@ def prepare(out_dir: Path, bag: Path | None = None) -> None:
         raise UsageError(f'cannot write into the folder {out_dir}')
     if bag is not None and bag.exists():
         raise UsageError(f'{bag} exists already and is not overwritten; remove it or choose another name')
-
-
-def camera_name(source: Source) -> str:
-    """Return the namespace of the image topic, else the frame of its images, else 'camera'."""
-    namespace = '_'.join(image_topic(source).strip('/').split('/')[:-1])
-    return namespace or source.camera_frame or 'camera'
-
-
-def image_topic(source: Source) -> str:
-    """Return the image topic without the suffix that image_transport gives to compressed images."""
-    compressed = source.image_type.endswith('/CompressedImage')
-    return source.topic.removesuffix('/compressed') if compressed else source.topic
 
 
 def write_outputs(out_dir: Path, replayed: ReplayResult, source: Source) -> list[str]:

@@ -12,7 +12,8 @@ import cv2
 import numpy as np
 
 from autocalib_ros.errors import InputError, UsageError
-from autocalib_ros.offline.recordings.sources import Source, open_source
+from autocalib_ros.offline.recordings.open import open_source
+from autocalib_ros.offline.recordings.sources import Source
 from autocalib_ros.offline.recordings.videos import FALLBACK_FPS
 from autocalib_ros.offline.terminal.progress import progress_bar
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.pictures.drawing import (
     GREY,
@@ -38,7 +39,7 @@ from autocalib_ros.pictures.views import (
     road_in_image,
     road_lines,
 )
-from autocalib_ros.results.calibration import Calibration, GroundPlane
+from autocalib_ros.results.calibration import Calibration
 
 FOLLOWED, HORIZON, AXES = '#ffe14d', '#ff7bd5', ('#ff5544', '#55cc55')
 """Colours: points followed now, the horizon, x and y of the ground frame."""

@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.ground import Ground
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.pictures.views import grid_lines, grid_step, road_in_image
-from autocalib_ros.results.calibration import GROUND_DISTANCES_M, Calibration, GroundPlane
+from autocalib_ros.results.calibration import GROUND_DISTANCES_M, Calibration
 
 SIDE_POINTS = 12
 """Points along each side of the image through which its field of view is drawn: a wide lens bends the sides."""

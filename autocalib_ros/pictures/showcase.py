@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from autocalib_ros.errors import InputError
+from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.lens.camera import Camera, field_of_view_deg, pixel_grid
 from autocalib_ros.pictures.drawing import bgr
 from autocalib_ros.pictures.plotted import INK, POINT, WHITE, Plotted, draw_plate, draw_scale_bar
@@ -24,7 +25,6 @@ from autocalib_ros.pictures.views import (
     resample,
     unit,
 )
-from autocalib_ros.results.calibration import GroundPlane
 from autocalib_ros.results.saved_camera import KnownCamera
 
 IMAGE_PX, VIEW_PX, GAP_PX, STRIP_PX = 1080, 508, 12, 92

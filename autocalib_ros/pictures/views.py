@@ -12,8 +12,8 @@ from functools import cached_property
 import cv2
 import numpy as np
 
+from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.lens.camera import Camera, Lens, pixel_grid
-from autocalib_ros.results.calibration import GroundPlane
 
 FARTHEST_HEIGHTS = 10.0
 """Views of the road end this many camera heights away: beyond, a pixel covers metres."""

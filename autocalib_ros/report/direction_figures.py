@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from autocalib_ros.estimation.straight.consensus import segment_orientations
+from autocalib_ros.estimation.paper.vanishing_point_voting import segment_orientations
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.lens.camera_info import rectified_matrix
 from autocalib_ros.pictures.views import great_circle

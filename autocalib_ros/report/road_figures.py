@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.ground import Ground
 from autocalib_ros.pictures.views import (
     TopView,
@@ -38,7 +39,6 @@ from autocalib_ros.report.canvas import (
     label_colour,
 )
 from autocalib_ros.report.scene import Scene
-from autocalib_ros.results.calibration import GroundPlane
 
 TOP_VIEW_PX = 1100
 CONTOURS_M = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)

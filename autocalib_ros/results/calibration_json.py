@@ -11,17 +11,19 @@ from typing import Any, NoReturn
 import numpy as np
 
 from autocalib_ros.errors import AutocalibError, InputError
+from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.results.calibration import (
     COVARIANCE_OF,
-    JSON_VERSION,
+    GROUND_DISTANCES_M,
     Calibration,
     EvidenceSummary,
-    GroundPlane,
     PaperReport,
     Reason,
+    Refusal,
     StandardDeviations,
 )
+from autocalib_ros.util.files import write_atomically
 
 MAX_BYTES = 1_000_000
 """A calibration takes a few thousand bytes."""
@@ -133,3 +135,69 @@ def _numbers(values: Any, kind: Callable[[Any], Any], count: int) -> tuple[Any, 
 
 def _no_number(name: str) -> NoReturn:
     raise ValueError(f'{name} is no number')
+
+
+JSON_VERSION = 1
+
+
+def to_json(result: Calibration | Refusal, *, accepted_at_s: float | None = None) -> dict[str, Any]:
+    """Return the document of calibration.json, version 1."""
+    evidence = result.evidence
+    document: dict[str, Any] = {
+        'version': JSON_VERSION, 'state': 'calibrated' if result else 'refused', 'grade': None,
+        'method': result.method, 'assumptions': [], 'checks': [], 'refusal': None,
+        'image_size': list(evidence.image_size),
+        'camera': None, 'camera_info': None, 'ground_from_camera': None, 'road_directions_in_camera': [],
+        'stddev': None, 'covariance': None, 'paper': None, 'newest_stamp_ns': None,
+        'evidence': {'seconds': evidence.seconds, 'frames': evidence.frames, 'tracks': evidence.tracks,
+                     'segments': evidence.segments, 'vehicles': evidence.vehicles,
+                     'people': evidence.people, 'coverage': evidence.coverage, 'accepted_at_s': accepted_at_s}}
+    if isinstance(result, Refusal):
+        document['refusal'] = _refusal_json(result)
+    else:
+        document.update(_calibration_json(result))
+    return document
+
+
+def _refusal_json(refusal: Refusal | Reason) -> dict[str, str]:
+    return {'code': refusal.code, 'message': refusal.message, 'remedy': refusal.remedy}
+
+
+def _calibration_json(result: Calibration) -> dict[str, Any]:
+    camera, info, sigma = result.camera, result.camera_info, result.stddev
+    return {
+        'grade': result.grade, 'assumptions': list(result.assumptions), 'checks': list(result.checks),
+        'refusal': _refusal_json(result.ground_refusal) if result.ground_refusal else None,
+        'camera': {'model': 'kannala_brandt', 'focal_px': camera.focal_px,
+                   'principal_point_px': list(camera.principal_point_px), 'k': list(camera.k)},
+        'camera_info': {'distortion_model': info.distortion_model, 'k': info.k, 'd': info.d, 'r': info.r,
+                        'p': info.p},
+        'ground_from_camera': None if result.ground is None else {
+            'translation_m': result.ground.translation_m.tolist(),
+            'rotation_xyzw': result.ground.rotation_xyzw.tolist(),
+            'rotation': np.asarray(result.ground.rotation).tolist()},
+        'newest_stamp_ns': result.newest_stamp_ns,
+        'road_directions_in_camera': np.asarray(result.road_directions).tolist(),
+        'stddev': {'focal_px': sigma.focal_px,
+                   'principal_point_px': None if sigma.principal_point_px is None else list(sigma.principal_point_px),
+                   'k1': sigma.k1, 'tilt_deg': sigma.tilt_deg, 'roll_deg': sigma.roll_deg,
+                   'height_m': sigma.height_m, 'k2': sigma.k2,
+                   'ground_point_m': {f'{distance:g}': value for distance, value in zip(
+                       GROUND_DISTANCES_M, sigma.ground_point_m, strict=False)}},
+        'covariance': None if result.covariance is None else {
+            'of': list(COVARIANCE_OF), 'matrix': result.covariance.tolist()},
+        'paper': None if result.paper is None else {
+            'focal_px': result.paper.focal_px, 'polynomial_k': list(result.paper.polynomial_k),
+            'straightness_px2': dict(zip(('before', 'after'), result.paper.straightness_px2, strict=True)),
+            'focal_from_vanishing_points_px': result.paper.focal_from_vanishing_points_px,
+            'translation_m': None if result.paper.translation_m is None else list(result.paper.translation_m)}}
+
+
+def calibration_json(result: Calibration | Refusal, *, accepted_at_s: float | None = None) -> str:
+    """Return the text of calibration.json in full precision."""
+    return json.dumps(to_json(result, accepted_at_s=accepted_at_s), indent=1, allow_nan=False)
+
+
+def write_calibration_json(path: Path, result: Calibration | Refusal, *, accepted_at_s: float | None = None) -> None:
+    """Write calibration.json, atomically."""
+    write_atomically(path, calibration_json(result, accepted_at_s=accepted_at_s) + '\n')

@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 
 from autocalib_ros.errors import InputError
+from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.lens.camera import Camera, scale_factors
-from autocalib_ros.lens.camera_info import read_exact_lens
 from autocalib_ros.lens.camera_info_lens import InfoLens
+from autocalib_ros.lens.camera_info_yaml import read_exact_lens
 from autocalib_ros.lens.opencv_lens import OpencvLens, nearest_camera
-from autocalib_ros.results.calibration import Calibration, GroundPlane, StandardDeviations
+from autocalib_ros.results.calibration import Calibration, StandardDeviations
 from autocalib_ros.results.calibration_json import calibration_of, read_json
 
 

@@ -24,9 +24,10 @@ from pathlib import Path
 from typing import TypeVar
 
 from autocalib_ros.errors import AutocalibError, InputError, UsageError
-from autocalib_ros.lens.camera_info import CameraInfo, camera_info_yaml, read_camera_info_fields
-from autocalib_ros.results.calibration import Calibration, to_json
-from autocalib_ros.results.calibration_json import calibration_of, read_json
+from autocalib_ros.lens.camera_info import CameraInfo
+from autocalib_ros.lens.camera_info_yaml import camera_info_yaml, read_camera_info_fields
+from autocalib_ros.results.calibration import Calibration
+from autocalib_ros.results.calibration_json import calibration_of, read_json, to_json
 from autocalib_ros.util.files import keep_as, remove_unfinished, write_atomically
 
 DEFAULT_URL = 'file://${ROS_HOME}/camera_info/${NAME}.yaml'

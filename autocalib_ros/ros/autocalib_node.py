@@ -17,7 +17,8 @@ from std_srvs.srv import Trigger
 
 from autocalib_ros.config import NodeOptions, Options
 from autocalib_ros.errors import AutocalibError
-from autocalib_ros.lens.camera_info import camera_info, read_camera_info
+from autocalib_ros.lens.camera_info import camera_info
+from autocalib_ros.lens.camera_info_yaml import read_camera_info
 from autocalib_ros.perception.detector.detector import open_detector
 from autocalib_ros.perception.images import ImageDecoder
 from autocalib_ros.results.calibration import Calibration, Refusal

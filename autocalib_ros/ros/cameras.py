@@ -17,7 +17,7 @@ import yaml
 
 from autocalib_ros.config import NodeOptions, Options, declared, flattened
 from autocalib_ros.errors import InputError, UsageError
-from autocalib_ros.lens.camera_info import plain_name
+from autocalib_ros.lens.camera_info_yaml import plain_name
 
 KEYS = ('namespace', 'image', 'camera_height', 'camera_info', 'params_file', 'parameters')
 """What may be said of a camera: its image topic is `image_raw` unless told; `camera_info` is where that goes when the

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from builtin_interfaces.msg import Time
 
 from autocalib_ros.config import NodeOptions
-from autocalib_ros.lens.camera_info import plain_name
+from autocalib_ros.lens.camera_info_yaml import plain_name
 from autocalib_ros.ros.messages import stamp_ns
 
 DEFAULT_FRAME = 'camera_optical_frame'

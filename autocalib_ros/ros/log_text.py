@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 
 from autocalib_ros.calibrator import Progress
-from autocalib_ros.results.calibration import Calibration, GroundPlane, Refusal
+from autocalib_ros.geometry.ground_plane import GroundPlane
+from autocalib_ros.results.calibration import Calibration, Refusal
 
 
 def described(result: Calibration | Refusal) -> str:

@@ -17,9 +17,9 @@ from sensor_msgs.msg import CameraInfo, RegionOfInterest
 from std_msgs.msg import Header
 
 from autocalib_ros.errors import AutocalibError
+from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.lens.camera_info import CameraInfo as CameraInfoFields
 from autocalib_ros.lens.camera_info import Readout, in_full_resolution
-from autocalib_ros.results.calibration import GroundPlane
 
 COEFFICIENTS = {'plumb_bob': 5, 'rational_polynomial': 8, 'equidistant': 4}
 """Length of D for each distortion model that consumers know (sensor_msgs/distortion_models.hpp)."""

@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from autocalib_ros.config import Options
-from autocalib_ros.evidence.snapshot import Evidence, EvidenceBuffer
+from autocalib_ros.evidence.buffer import EvidenceBuffer
+from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.report.scene import Moment, Scene, noted
 from autocalib_ros.results.calibration import Calibration, Refusal
 from autocalib_ros.ros.solver_process import NICENESS

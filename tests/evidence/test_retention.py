@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from autocalib_ros.config import BufferOptions
+from autocalib_ros.evidence.buffer import EvidenceBuffer
 from autocalib_ros.evidence.retention import ENOUGH_NEWER, headings, kinds, worth
-from autocalib_ros.evidence.snapshot import Evidence, EvidenceBuffer, Segments, Track
+from autocalib_ros.evidence.snapshot import Evidence, Segments, Track
 
 HOUR_S = 3600.0
 MAIN = ((40.0, 300.0), (1200.0, 0.0))

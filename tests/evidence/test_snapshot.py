@@ -10,6 +10,7 @@ import pytest
 
 from autocalib_ros.config import BufferOptions
 from autocalib_ros.errors import InputError
+from autocalib_ros.evidence.buffer import EvidenceBuffer
 from autocalib_ros.evidence.snapshot import (
     EDGE_ARRAYS,
     KINDS,
@@ -18,7 +19,6 @@ from autocalib_ros.evidence.snapshot import (
     STILL_LINES,
     Edges,
     Evidence,
-    EvidenceBuffer,
     Kind,
     Outlines,
     Segments,

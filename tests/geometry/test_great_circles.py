@@ -5,14 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from autocalib_ros.geometry.great_circles import (
-    Rays,
-    fit_circles,
-    fit_circles_through,
-    orthonormal_basis,
-    rays_of,
-    select_tracks,
-)
+from autocalib_ros.estimation.observations.track_set import select_tracks
+from autocalib_ros.geometry.great_circles import Rays, fit_circles, fit_circles_through, orthonormal_basis, rays_of
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.synthetic.junction import Junction, synthetic_evidence
 

@@ -12,7 +12,7 @@ import time
 from collections import Counter
 from pathlib import Path
 
-from autocalib_ros.lens.camera_info import read_camera_info
+from autocalib_ros.lens.camera_info_yaml import read_camera_info
 from autocalib_ros.results.store import Kind, Store, document
 from stored_results import calibration, stored
 

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from autocalib_ros.config import BufferOptions
-from autocalib_ros.evidence.snapshot import Evidence, EvidenceBuffer, Outlines, Track
+from autocalib_ros.evidence.buffer import EvidenceBuffer
+from autocalib_ros.evidence.snapshot import Evidence, Outlines, Track
 from autocalib_ros.offline.synthetic.junction import Junction
 from autocalib_ros.perception.silhouettes import DIRECTIONS
 

@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.lens.camera_info import camera_info
 from autocalib_ros.results.calibration import (
     COVARIANCE_OF,
     Calibration,
     EvidenceSummary,
-    GroundPlane,
     PaperReport,
     StandardDeviations,
 )

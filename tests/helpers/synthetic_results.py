@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 
 from autocalib_ros.config import BufferOptions
-from autocalib_ros.evidence.snapshot import Evidence, EvidenceBuffer, Segments, Track
+from autocalib_ros.evidence.buffer import EvidenceBuffer
+from autocalib_ros.evidence.snapshot import Evidence, Segments, Track
+from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.results.calibration import (
     Calibration,
     Figures,
-    GroundPlane,
     PaperReport,
     Reason,
     Refusal,

@@ -12,7 +12,8 @@ import yaml
 
 from autocalib_ros.errors import InputError
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.lens.camera_info import camera_info, read_camera_info, rectified_matrix, write_camera_info_yaml
+from autocalib_ros.lens.camera_info import camera_info, rectified_matrix
+from autocalib_ros.lens.camera_info_yaml import read_camera_info, write_camera_info_yaml
 
 CAMERA = Camera(1280, 720, 560.0, (639.5, 359.5))
 WIDTH, HEIGHT = 1280, 720

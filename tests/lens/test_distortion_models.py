@@ -20,10 +20,9 @@ from autocalib_ros.lens.camera_info import (
     Readout,
     camera_info,
     in_full_resolution,
-    read_camera_info,
     rectified_matrix,
-    write_camera_info_yaml,
 )
+from autocalib_ros.lens.camera_info_yaml import read_camera_info, write_camera_info_yaml
 from autocalib_ros.lens.opencv_lens import MAX_ERROR_PX, nearest_coefficients, seen_angle_rad
 
 WIDTH, HEIGHT = 1280, 720

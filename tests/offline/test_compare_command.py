@@ -10,9 +10,11 @@ import pytest
 import yaml
 
 from autocalib_ros.cli import main
-from autocalib_ros.lens.camera_info import camera_info, write_camera_info_yaml
+from autocalib_ros.geometry.ground_plane import GroundPlane
+from autocalib_ros.lens.camera_info import camera_info
+from autocalib_ros.lens.camera_info_yaml import write_camera_info_yaml
 from autocalib_ros.pictures.views import ground_to_image
-from autocalib_ros.results.calibration import GroundPlane, calibration_json, write_calibration_json
+from autocalib_ros.results.calibration_json import calibration_json, write_calibration_json
 from stored_results import calibration
 
 OURS = calibration()

@@ -9,9 +9,10 @@ import pytest
 
 from autocalib_ros.config import Options
 from autocalib_ros.errors import InputError
-from autocalib_ros.offline.demonstration import compare, options_from, read_truth
+from autocalib_ros.geometry.ground_plane import GroundPlane
+from autocalib_ros.offline.demonstration import compare, options_from
+from autocalib_ros.offline.ground_truth import read_truth
 from autocalib_ros.pictures.views import ground_to_image
-from autocalib_ros.results.calibration import GroundPlane
 
 
 @pytest.fixture

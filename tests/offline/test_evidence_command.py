@@ -13,7 +13,7 @@ import yaml
 
 from autocalib_ros.cli import main
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.lens.camera_info import read_camera_info, write_camera_info_yaml
+from autocalib_ros.lens.camera_info_yaml import read_camera_info, write_camera_info_yaml
 from autocalib_ros.offline.synthetic.junction import Junction, synthetic_evidence
 
 JUNCTION = Junction(noise_px=0.2, turning_share=0.0)

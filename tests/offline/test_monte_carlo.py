@@ -15,6 +15,7 @@ import pytest
 import autocalib_ros
 from autocalib_ros.cli import main
 from autocalib_ros.errors import InputError
+from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.benchmark.monte_carlo import (
     Run,
@@ -34,7 +35,6 @@ from autocalib_ros.results.calibration import (
     Calibration,
     EvidenceSummary,
     Figures,
-    GroundPlane,
     Reason,
     Refusal,
     StandardDeviations,

@@ -14,7 +14,7 @@ from rosbags.interfaces import QosDurability
 from autocalib_ros.errors import UsageError
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.offline import outputs
-from autocalib_ros.offline.recordings.sources import open_source
+from autocalib_ros.offline.recordings.open import open_source
 from autocalib_ros.offline.recordings.write_bag import camera_info_topic, write_bag
 
 SECOND = 1_000_000_000

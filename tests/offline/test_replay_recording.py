@@ -11,7 +11,8 @@ from autocalib_ros.calibrator import solve
 from autocalib_ros.config import GateOptions, Options
 from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.offline.recordings.sources import Frame, open_source
+from autocalib_ros.offline.recordings.open import open_source
+from autocalib_ros.offline.recordings.sources import Frame
 from autocalib_ros.offline.replay_recording import replay, solve_again
 from autocalib_ros.results.calibration import Refusal
 

@@ -12,15 +12,9 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from autocalib_ros.errors import UsageError
-from autocalib_ros.offline.simulate import (
-    Simulation,
-    SimulationOptions,
-    add_arguments,
-    options_from,
-    run,
-    write_bag,
-)
-from autocalib_ros.offline.simulate.options import SCENES
+from autocalib_ros.offline.simulate import add_arguments, options_from, run, write_bag
+from autocalib_ros.offline.simulate.options import SCENES, SimulationOptions
+from autocalib_ros.offline.simulate.simulation import Simulation
 
 # One road is quickest to draw.
 TINY = {'width_px': 160, 'height_px': 90, 'focal_px': 70.0, 'rate_hz': 5.0, 'duration_s': 0.6,

@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from autocalib_ros.offline.simulate import Simulation, SimulationOptions
+from autocalib_ros.offline.simulate.options import SimulationOptions
+from autocalib_ros.offline.simulate.simulation import Simulation
 
 SMALL = {'width_px': 320, 'height_px': 180, 'focal_px': 140.0, 'rate_hz': 5.0, 'duration_s': 4.0}
 

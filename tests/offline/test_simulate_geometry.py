@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from autocalib_ros.errors import UsageError
-from autocalib_ros.offline.simulate import Simulation, SimulationOptions
 from autocalib_ros.offline.simulate.faces import Canvas, Faces, Texture, Window
 from autocalib_ros.offline.simulate.lens import CameraPose, Lens, look
+from autocalib_ros.offline.simulate.options import SimulationOptions
+from autocalib_ros.offline.simulate.simulation import Simulation
 
 SMALL = {'width_px': 320, 'height_px': 180, 'focal_px': 140.0, 'rate_hz': 5.0, 'duration_s': 2.0}
 

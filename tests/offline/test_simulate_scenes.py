@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from autocalib_ros.errors import UsageError
-from autocalib_ros.offline.simulate import Simulation, SimulationOptions
 from autocalib_ros.offline.simulate.ground_surface import edge_distance, paint_ground
 from autocalib_ros.offline.simulate.network import Network
-from autocalib_ros.offline.simulate.options import SCENES
+from autocalib_ros.offline.simulate.options import SCENES, SimulationOptions
 from autocalib_ros.offline.simulate.palette import DAY
 from autocalib_ros.offline.simulate.roundabout import RING_RADIUS_M
 from autocalib_ros.offline.simulate.scenes import BEND_RADIUS_M, network_of
+from autocalib_ros.offline.simulate.simulation import Simulation
 from autocalib_ros.offline.simulate.traffic_flow import simulate_traffic
 from autocalib_ros.offline.simulate.vehicle_models import STEP_S, Traffic, Vehicle, VehicleState
 

@@ -7,9 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from autocalib_ros.offline.simulate import Simulation, SimulationOptions
+from autocalib_ros.offline.simulate.junctions import junction
 from autocalib_ros.offline.simulate.network import Network
-from autocalib_ros.offline.simulate.scenes import junction, network_of
+from autocalib_ros.offline.simulate.options import SimulationOptions
+from autocalib_ros.offline.simulate.scenes import network_of
+from autocalib_ros.offline.simulate.simulation import Simulation
 from autocalib_ros.offline.simulate.traffic_flow import simulate_traffic
 from autocalib_ros.offline.simulate.vehicle_models import STEP_S, Traffic, Vehicle, Wander
 

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from autocalib_ros.errors import UsageError
-from autocalib_ros.offline.simulate import Simulation, SimulationOptions
 from autocalib_ros.offline.simulate.lamps import lamps_of
+from autocalib_ros.offline.simulate.options import SimulationOptions
+from autocalib_ros.offline.simulate.simulation import Simulation
 from autocalib_ros.offline.simulate.weather import GroundView, box_of
 
 SMALL = {'width_px': 320, 'height_px': 180, 'focal_px': 140.0, 'rate_hz': 10.0, 'duration_s': 40.0, 'noise_sigma': 0.0,

@@ -13,11 +13,13 @@ import pytest
 import yaml
 
 from autocalib_ros.cli import main
+from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.lens.camera_info import rectified_matrix, write_camera_info_yaml
+from autocalib_ros.lens.camera_info import rectified_matrix
+from autocalib_ros.lens.camera_info_yaml import write_camera_info_yaml
 from autocalib_ros.offline import view_files
 from autocalib_ros.pictures.views import EMPTY_GREY, ground_to_image, image_to_ground
-from autocalib_ros.results.calibration import GroundPlane, write_calibration_json
+from autocalib_ros.results.calibration_json import write_calibration_json
 from stored_results import LOOKS_ALONG, calibration, lens_only
 
 DIP = np.radians(28.0)

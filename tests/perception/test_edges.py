@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from autocalib_ros.config import BufferOptions, Options
-from autocalib_ros.evidence.snapshot import Edges, EvidenceBuffer
+from autocalib_ros.evidence.buffer import EvidenceBuffer
+from autocalib_ros.evidence.snapshot import Edges
 from autocalib_ros.perception.edges import MAX_PER_REGION, MAX_REGIONS, EdgeFinder
 from autocalib_ros.perception.motion_mask import Region
 from autocalib_ros.perception.observer import Observer

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.results.calibration import Calibration, EvidenceSummary, GroundPlane, StandardDeviations
+from autocalib_ros.results.calibration import Calibration, EvidenceSummary, StandardDeviations
 
 
 def looking_down(dip_deg: float) -> GroundPlane:

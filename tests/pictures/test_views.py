@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.lens.camera_info import rectified_matrix
 from autocalib_ros.pictures.views import (
@@ -17,7 +18,6 @@ from autocalib_ros.pictures.views import (
     resample,
     road_lines,
 )
-from autocalib_ros.results.calibration import GroundPlane
 
 CAMERA = Camera(640, 480, 300.0, (322.0, 236.0), (0.01, 0.0, 0.0, 0.0))
 

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from matplotlib.text import Text
 
+from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.lens.camera_info import rectified_matrix
 from autocalib_ros.pictures.views import ground_to_image, image_to_ground, nice_length
 from autocalib_ros.report.lens_figures import in_undistorted, line_error_px
@@ -22,7 +23,7 @@ from autocalib_ros.report.scene import MOST_MOMENTS, Moment, noted
 from autocalib_ros.report.speed_figures import by_vehicle, pieces_on_road, speed_histogram, speeds_above
 from autocalib_ros.report.text import how_sure, needs, next_step, number_rows, verdict
 from autocalib_ros.report.traffic_figures import kept_tracks
-from autocalib_ros.results.calibration import GroundPlane, Refusal, Residuals
+from autocalib_ros.results.calibration import Refusal, Residuals
 from synthetic_results import SPEED_M_S, junction_evidence
 
 ALL = {entry.name for entry in ENTRIES}

@@ -7,11 +7,12 @@ import pytest
 
 from autocalib_ros.calibrator import solve
 from autocalib_ros.config import Options
+from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.offline.synthetic.junction import Junction, synthetic_evidence
 from autocalib_ros.pictures.views import TopView, grid_lines, grid_step, ground_to_image, image_to_ground
 from autocalib_ros.report.road_figures import place_sigma_m, traffic_on_road
 from autocalib_ros.report.scene import Scene
-from autocalib_ros.results.calibration import Calibration, GroundPlane
+from autocalib_ros.results.calibration import Calibration
 
 JUNCTION = Junction()
 TRUTH = GroundPlane(JUNCTION.camera_from_ground.T, JUNCTION.height_m)

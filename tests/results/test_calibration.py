@@ -9,18 +9,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from autocalib_ros.geometry.ground_plane import GroundPlane, quaternion_xyzw
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.results.calibration import (
-    Calibration,
-    EvidenceSummary,
-    GroundPlane,
-    Reason,
-    Refusal,
-    StandardDeviations,
-    quaternion_xyzw,
-    to_json,
-    write_calibration_json,
-)
+from autocalib_ros.results.calibration import Calibration, EvidenceSummary, Reason, Refusal, StandardDeviations
+from autocalib_ros.results.calibration_json import to_json, write_calibration_json
 
 CAMERA = Camera(1280, 720, 560.0, (639.5, 359.5))
 EVIDENCE = EvidenceSummary(image_size=(1280, 720), seconds=60.0, frames=900, tracks=300, segments=4000, vehicles=70,

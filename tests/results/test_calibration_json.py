@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from autocalib_ros.errors import InputError
-from autocalib_ros.results.calibration import Reason, Refusal, calibration_json
-from autocalib_ros.results.calibration_json import calibration_of, read_json
+from autocalib_ros.results.calibration import Reason, Refusal
+from autocalib_ros.results.calibration_json import calibration_json, calibration_of, read_json
 from stored_results import calibration, lens_only
 
 WHOLE = calibration()

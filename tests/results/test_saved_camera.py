@@ -12,8 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.lens.camera_info import rectified_matrix, write_camera_info_yaml
-from autocalib_ros.results.calibration import COVARIANCE_OF, calibration_json, write_calibration_json
+from autocalib_ros.lens.camera_info import rectified_matrix
+from autocalib_ros.lens.camera_info_yaml import write_camera_info_yaml
+from autocalib_ros.results.calibration import COVARIANCE_OF
+from autocalib_ros.results.calibration_json import calibration_json, write_calibration_json
 from autocalib_ros.results.saved_camera import KnownCamera, read_known_camera
 from autocalib_ros.results.store import document
 from stored_results import calibration, stored

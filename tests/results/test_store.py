@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 from autocalib_ros.errors import InputError, UsageError
-from autocalib_ros.lens.camera_info import camera_info_yaml, read_camera_info
+from autocalib_ros.lens.camera_info_yaml import camera_info_yaml, read_camera_info
 from autocalib_ros.results.store import Kind, Store, document, path_of
 from stored_results import calibration, lens_only, stored
 

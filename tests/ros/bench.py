@@ -13,8 +13,9 @@ from rclpy.task import Future
 from sensor_msgs.msg import Image
 from std_srvs.srv import Trigger
 
+from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.results.calibration import Calibration, GroundPlane, Refusal, StandardDeviations
+from autocalib_ros.results.calibration import Calibration, Refusal, StandardDeviations
 from autocalib_ros.ros.autocalib_node import AutocalibNode
 from autocalib_ros.ros.messages import time_message
 

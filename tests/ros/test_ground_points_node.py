@@ -9,11 +9,11 @@ import pytest
 from geometry_msgs.msg import Point32, Polygon, PolygonStamped, TransformStamped
 from sensor_msgs.msg import CameraInfo, PointCloud2
 
+from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.ground import Ground
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.lens.camera_info import camera_info
 from autocalib_ros.offline.synthetic.junction import pose
-from autocalib_ros.results.calibration import GroundPlane
 from autocalib_ros.ros import messages
 from autocalib_ros.ros.ground_points_node import GroundPointsNode
 from autocalib_ros.ros.qos import LATCHED

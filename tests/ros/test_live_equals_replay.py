@@ -15,7 +15,8 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import CameraInfo
 
-from autocalib_ros.offline.simulate import SimulationOptions, write_bag
+from autocalib_ros.offline.simulate import write_bag
+from autocalib_ros.offline.simulate.options import SimulationOptions
 from autocalib_ros.ros.messages import stamp_ns
 from bench import Bench, wait_for
 

@@ -11,9 +11,10 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, Image
 
 from autocalib_ros.calibrator import AutoCalibrator, Progress
+from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.offline.synthetic.junction import pose
 from autocalib_ros.pictures import live_overlay as live
-from autocalib_ros.results.calibration import EvidenceSummary, GroundPlane, Reason
+from autocalib_ros.results.calibration import EvidenceSummary, Reason
 from autocalib_ros.revalidation import CalibrationState
 from autocalib_ros.ros.live_pictures import GOOD, WAITING, LivePictures, caption_of, image_message
 from autocalib_ros.ros.messages import header, stamp_ns, time_message, validated

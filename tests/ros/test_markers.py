@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from visualization_msgs.msg import Marker, MarkerArray
 
+from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_evidence
-from autocalib_ros.results.calibration import COVARIANCE_OF, GroundPlane
+from autocalib_ros.results.calibration import COVARIANCE_OF
 from autocalib_ros.ros.markers import markers, no_markers
 from autocalib_ros.ros.messages import InvalidMessage, validated
 from bench import calibration, image, wait_for

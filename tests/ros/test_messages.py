@@ -12,9 +12,9 @@ from sensor_msgs.msg import CameraInfo, Image, RegionOfInterest
 from std_msgs.msg import Header
 
 from autocalib_ros.errors import InputError
+from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.lens.camera_info import ModelMisfit, camera_info
-from autocalib_ros.results.calibration import GroundPlane
 from autocalib_ros.ros.messages import (
     InvalidMessage,
     camera_info_message,

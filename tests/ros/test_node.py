@@ -15,7 +15,8 @@ from sensor_msgs.msg import CameraInfo, CompressedImage
 from autocalib_ros.calibrator import in_asked_form
 from autocalib_ros.errors import UsageError
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.lens.camera_info import camera_info, write_camera_info_yaml
+from autocalib_ros.lens.camera_info import camera_info
+from autocalib_ros.lens.camera_info_yaml import write_camera_info_yaml
 from autocalib_ros.ros.autocalib_node import AutocalibNode
 from autocalib_ros.ros.messages import stamp_ns
 from bench import PATIENCE_S, PIXELS, SIZE, Bench, calibration, image, refusal, wait_for

@@ -13,7 +13,8 @@ import pytest
 from geometry_msgs.msg import TransformStamped
 from sensor_msgs.msg import CameraInfo
 
-from autocalib_ros.lens.camera_info import camera_info, read_camera_info
+from autocalib_ros.lens.camera_info import camera_info
+from autocalib_ros.lens.camera_info_yaml import read_camera_info
 from autocalib_ros.results.store import Kind, Store, Stored
 from autocalib_ros.revalidation import CalibrationState
 from autocalib_ros.ros.messages import stamp_ns

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from autocalib_ros.calibrator import Progress
+from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.results.calibration import Calibration, EvidenceSummary, GroundPlane, Reason, StandardDeviations
+from autocalib_ros.results.calibration import Calibration, EvidenceSummary, Reason, StandardDeviations
 from autocalib_ros.ros.status import ERROR, OK, RATE_WINDOW_S, WARN, Counts, Recent, Situation, State, state_of, status
 from autocalib_ros.ros.watchdog import Silence
 

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from rclpy.serialization import deserialize_message, serialize_message
 from scipy.spatial.transform import Rotation
 
-from autocalib_ros.results.calibration import GroundPlane
+from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.ros import transforms
 from autocalib_ros.ros.messages import InvalidMessage, ground_transform_message, time_message, validated
 from autocalib_ros.ros.transforms import conflict

@@ -21,9 +21,9 @@ from autocalib_ros.estimation.adjustment.parameters import Setting, State, Steps
 from autocalib_ros.estimation.adjustment.residual_blocks import LifeRows, MotionRows, RoadRows, Rows
 from autocalib_ros.estimation.motion.planar_motion import Motion
 from autocalib_ros.estimation.motion.rigid_bodies import Shapes
+from autocalib_ros.estimation.observations.track_set import Seen, TrackSet
 from autocalib_ros.estimation.observations.vehicle_grouping import bodies
-from autocalib_ros.estimation.straight.consensus import distances2_through
-from autocalib_ros.geometry.great_circles import Seen, TrackSet, rays_of
+from autocalib_ros.geometry.great_circles import distances2_through, rays_of
 from autocalib_ros.lens.camera import Camera
 
 TIGHTENING = (8.0, 4.0, 2.0)
@@ -295,23 +295,6 @@ def _unmodelled(steps: Steps) -> np.ndarray:
     return sigma
 
 
-def noise_cost(fit: JointFit, tracks: TrackSet, *, drifting: bool) -> float:
-    """Twice the negative logarithm of how probable the residuals are with or without drift, their scale fitted.
-
-    Infinite where hardly a track is explained.
-    """
-    labels = np.where(fit.explained(), fit.labels, -2)
-    if np.count_nonzero(labels >= 0) < MIN_ROWS:
-        return np.inf
-    steps = Steps(fit.state, replace(fit.problem.setting, drifting=drifting))
-    used = labels >= 0
-    on_roads = tracks.subset(used)
-    rows = RoadRows(steps, on_roads, labels[used], Seen.through(fit.state.camera, on_roads), np.ones(len(on_roads)))
-    _, squared = rows.at(np.zeros(steps.size))
-    scale = max(float(np.median(squared)), LEAST_SCALE)
-    return float((rows.freedom * np.log(scale) - 2.0 * rows.log_density()).sum())
-
-
 def with_bodies(fit: JointFit, tracks: TrackSet) -> TrackSet:
     """Return the tracks with vehicles that are bodies on the ground of a solution."""
     rays = rays_of(fit.state.camera, tracks.pixels)
@@ -336,23 +319,6 @@ def judged_at(state: State, tracks: TrackSet, setting: Setting, covariance: np.n
     labels, _ = assign(state, Seen.through(state.camera, tracks))
     fit = _judged(Problem(state, tracks, labels, setting), state, (None, None, None), tracks)
     return replace(fit, covariance=covariance)
-
-
-def cost_at(fit: JointFit, tracks: TrackSet, scales: np.ndarray) -> float:
-    """Twice the negative logarithm of a fit's probability, for comparison between fits of the same evidence.
-
-    All at one scale for each kind of row (kinds,), with the prior and, by Laplace's approximation, the volume that
-    the evidence leaves of it.
-    """
-    problem, turning = fit.problem, fit.problem.kind > 0
-    freedom = np.concatenate([np.maximum((tracks.weights > 0).sum(axis=1) - 1, 1), problem.freedom[turning]])
-    share = np.concatenate([tracks.independence(problem.setting.vehicle_correlation), problem.share[turning]])
-    scale = np.concatenate([np.full(len(tracks), scales[0]), scales[problem.kind[turning]]])
-    squared = np.concatenate([fit.whitened2, fit.turning2])
-    deviations, prior = problem.steps.prior_gradient(fit.state.camera)
-    volume = np.linalg.slogdet(fit.information + np.diag(prior) + 1e-9 * np.eye(len(prior)))[1]
-    cost = (share / scale * freedom * bounded_loss(squared, TIGHTEST * scale)).sum()
-    return float(cost + deviations @ deviations + volume)
 
 
 def road_support(fit: JointFit, tracks: TrackSet) -> list[np.ndarray]:

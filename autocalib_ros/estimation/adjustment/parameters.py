@@ -12,7 +12,6 @@ from autocalib_ros.config import JointOptions
 from autocalib_ros.estimation.adjustment.lens_prior import LensPrior
 from autocalib_ros.estimation.motion.rigid_bodies import Bundle
 from autocalib_ros.estimation.observations.two_frame_windows import Windows, no_windows
-from autocalib_ros.estimation.straight.consensus import Directions
 from autocalib_ros.geometry.great_circles import Rays
 from autocalib_ros.lens.camera import Camera
 
@@ -167,3 +166,15 @@ def crossed(state: State, crossing_rad: float | None) -> State:
     sides = np.array([crossing_rad, crossing_rad - np.pi, -crossing_rad, np.pi - crossing_rad])
     angles[1] = sides[np.argmin(np.abs(np.angle(np.exp(1j * (sides - angles[1])))))]
     return replace(state, angles_rad=angles)
+
+
+@dataclass(frozen=True)
+class Directions:
+    """Road directions found by consensus."""
+
+    directions: np.ndarray
+    """Unit vectors in the camera frame, shape (n, 3)."""
+    labels: np.ndarray
+    """Direction of each track, -2 for none, shape (tracks,)."""
+    score: float
+    """Summed support: how many nats of coincidence the directions explain."""

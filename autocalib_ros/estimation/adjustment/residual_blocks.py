@@ -15,14 +15,9 @@ from autocalib_ros.estimation.adjustment.noise_model import on_road, whitening
 from autocalib_ros.estimation.adjustment.parameters import State, Steps, ground_up
 from autocalib_ros.estimation.motion.planar_motion import Motion, View, first_motion, settled, trust
 from autocalib_ros.estimation.motion.rigid_bodies import Bundle, Shapes, lifted
+from autocalib_ros.estimation.observations.track_set import Seen, TrackSet
 from autocalib_ros.estimation.observations.vehicle_grouping import corroborated, heading_off_deg
-from autocalib_ros.geometry.great_circles import (
-    Rays,
-    Seen,
-    TrackSet,
-    fit_circles_through,
-    rays_of,
-)
+from autocalib_ros.geometry.great_circles import Rays, fit_circles_through, rays_of
 from autocalib_ros.geometry.small_matrices import cross, dot
 
 DIFFERENCE = 1e-6

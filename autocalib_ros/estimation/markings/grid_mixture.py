@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from autocalib_ros.estimation.adjustment.covariance import cluster_covariance
 from autocalib_ros.estimation.adjustment.lens_prior import LensPrior
 from autocalib_ros.estimation.markings.road_segments import Lines, Sight
-from autocalib_ros.estimation.vehicle_edges.edge_mixture import folded, robust, student
+from autocalib_ros.geometry.robust_kernels import folded, robust, student
 from autocalib_ros.lens.camera import Camera
 
 END_PX, PAINTED_RAD = 0.4, np.radians(0.5)

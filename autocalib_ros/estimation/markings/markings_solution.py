@@ -15,10 +15,10 @@ from autocalib_ros.estimation.adjustment.parameters import Setting, State, Steps
 from autocalib_ros.estimation.markings.grid_mixture import ASKEW_RAD, Grid
 from autocalib_ros.estimation.markings.grid_search import beside_traffic, square_grids, square_grids_near
 from autocalib_ros.estimation.markings.road_segments import Lines, Sight, lines_on_road
+from autocalib_ros.estimation.observations.track_set import TrackSet
 from autocalib_ros.estimation.observations.two_frame_windows import no_windows
 from autocalib_ros.estimation.verification.gates import view_doubt
 from autocalib_ros.evidence.snapshot import Evidence
-from autocalib_ros.geometry.great_circles import TrackSet
 from autocalib_ros.geometry.ground_plane import undirected_deg
 from autocalib_ros.results.calibration import Reason
 

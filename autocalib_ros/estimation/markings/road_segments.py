@@ -9,9 +9,10 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from autocalib_ros.estimation.vehicle_edges.edge_mixture import folded
+from autocalib_ros.estimation.observations.track_set import earlier_ones, independence
 from autocalib_ros.evidence.snapshot import Evidence
-from autocalib_ros.geometry.great_circles import along_px, earlier_ones, independence, rays_of
+from autocalib_ros.geometry.great_circles import along_px, rays_of
+from autocalib_ros.geometry.robust_kernels import folded
 from autocalib_ros.lens.camera import Camera
 
 NEAR_TRAFFIC = 0.06

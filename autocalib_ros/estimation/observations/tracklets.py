@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from autocalib_ros.estimation.observations.track_set import SAMPLES, independence
 from autocalib_ros.estimation.observations.two_frame_windows import (
     INTERVAL_S,
     MIN_POINTS,
@@ -15,7 +16,6 @@ from autocalib_ros.estimation.observations.two_frame_windows import (
     members_of,
     scattered,
 )
-from autocalib_ros.geometry.great_circles import SAMPLES, independence
 
 INSTANTS = 9
 """Most instants of a life: as long as a turn at a junction takes; a longer one goes on as another."""

@@ -14,8 +14,8 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from autocalib_ros.estimation.observations.track_set import SAMPLES, earlier_ones, independence
 from autocalib_ros.evidence.snapshot import Evidence
-from autocalib_ros.geometry.great_circles import SAMPLES, earlier_ones, independence
 
 INTERVAL_S = 0.4
 """Windows begin, end and have their middle at whole multiples of this."""

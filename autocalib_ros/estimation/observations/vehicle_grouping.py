@@ -12,7 +12,7 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from autocalib_ros.geometry.great_circles import TrackSet
+from autocalib_ros.estimation.observations.track_set import TrackSet
 
 BODY_M = 4.0
 """Points of one body lie within this of a neighbour; a car is as long."""

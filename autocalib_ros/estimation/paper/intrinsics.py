@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from autocalib_ros.config import PaperOptions
+from autocalib_ros.estimation.observations.track_set import TrackSet, path_lengths
 from autocalib_ros.evidence.snapshot import Evidence
-from autocalib_ros.geometry.great_circles import TrackSet, fit_circles, path_lengths, rays_of
+from autocalib_ros.geometry.great_circles import fit_circles, rays_of
 from autocalib_ros.lens.camera import Camera, image_centre
 from autocalib_ros.results.calibration import PaperReport
 
@@ -138,10 +139,3 @@ def straightness_sweep(tracks: TrackSet, image_size: tuple[int, int], trials: np
         _, distance2, _ = fit_circles(rays, tracks.weights)
         costs.append((share * np.log1p(distance2 / TRACK_SCALE_PX**2)).sum())
     return np.array(costs)
-
-
-def focal_trials(tracks: TrackSet, image_size: tuple[int, int], count: int) -> np.ndarray:
-    """Focal lengths to try, evenly by ratio: from all points within 120 degrees to twice the diagonal."""
-    centre = Camera.equidistant(*image_size, 1.0).principal_point_px
-    farthest = np.hypot(*(tracks.pixels.reshape(-1, 2) - centre).T).max()
-    return np.geomspace(farthest / np.radians(120.0), 2.0 * np.hypot(*image_size), count)

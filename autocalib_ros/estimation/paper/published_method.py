@@ -8,7 +8,7 @@ import numpy as np
 
 from autocalib_ros.config import Options
 from autocalib_ros.estimation.paper.intrinsics import PaperIntrinsics
-from autocalib_ros.estimation.straight.consensus import Orientations, segment_orientations, voted_points
+from autocalib_ros.estimation.paper.vanishing_point_voting import Orientations, segment_orientations, voted_points
 from autocalib_ros.estimation.verification.scale import known_scale
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.ground_plane import (

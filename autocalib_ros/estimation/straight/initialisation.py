@@ -6,12 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from autocalib_ros.estimation.adjustment.bundle_adjustment import JointFit, cost_at, solve_joint
+from autocalib_ros.estimation.adjustment.bundle_adjustment import JointFit, solve_joint
 from autocalib_ros.estimation.adjustment.lens_prior import LensPrior
-from autocalib_ros.estimation.adjustment.parameters import Setting, initial_state
-from autocalib_ros.estimation.paper.intrinsics import focal_trials
-from autocalib_ros.estimation.straight.consensus import INLIER_PX, Directions, consensus_directions
-from autocalib_ros.geometry.great_circles import TrackSet
+from autocalib_ros.estimation.adjustment.model_selection import ASKED_FOR, most_probable
+from autocalib_ros.estimation.adjustment.parameters import Directions, Setting, initial_state
+from autocalib_ros.estimation.observations.track_set import TrackSet
+from autocalib_ros.estimation.straight.consensus import INLIER_PX, consensus_directions
+from autocalib_ros.lens.camera import Camera
 
 TRIALS = 14
 """Focal lengths tried as starts: steps of about 17 %, within which the joint problem converges."""
@@ -22,9 +23,6 @@ MIDDLE = 0.3
 """A radius in image diagonals at which two lenses of one field of view agree about best."""
 APART_DEG = 15.0
 """Roads that differ by less are one road seen with errors."""
-ASKED_FOR = 9.0
-"""k2 is set free, or a rarer family of lenses chosen, when that makes the traffic so much more probable: twice the
-logarithm, three sigmas."""
 
 
 def agreed(voters: TrackSet, setting: Setting, generator: np.random.Generator) -> tuple[JointFit, float] | None:
@@ -88,8 +86,8 @@ def _peaks(found: list[Directions]) -> list[int]:
     return sorted((int(index) for index in peaks), key=lambda index: -scores[index])
 
 
-def most_probable(fits: list[JointFit], tracks: TrackSet, margin: float = 0.0) -> JointFit:
-    """Choose the solution that makes the traffic most probable; the first unless it is beaten by a margin."""
-    scales = np.min([fit.scales for fit in fits], axis=0)
-    costs = [cost_at(fit, tracks, scales) + (margin if index else 0.0) for index, fit in enumerate(fits)]
-    return fits[int(np.argmin(costs))]
+def focal_trials(tracks: TrackSet, image_size: tuple[int, int], count: int) -> np.ndarray:
+    """Focal lengths to try, evenly by ratio: from all points within 120 degrees to twice the diagonal."""
+    centre = Camera.equidistant(*image_size, 1.0).principal_point_px
+    farthest = np.hypot(*(tracks.pixels.reshape(-1, 2) - centre).T).max()
+    return np.geomspace(farthest / np.radians(120.0), 2.0 * np.hypot(*image_size), count)

@@ -9,11 +9,10 @@ from scipy.spatial.transform import Rotation
 
 from autocalib_ros.config import GateOptions, JointOptions
 from autocalib_ros.estimation.adjustment.bundle_adjustment import JointFit, road_support, solve_joint
-from autocalib_ros.estimation.adjustment.parameters import State, initial_state
-from autocalib_ros.estimation.straight.consensus import Directions
+from autocalib_ros.estimation.adjustment.parameters import Directions, State, initial_state
+from autocalib_ros.estimation.observations.track_set import TrackSet, evenly
 from autocalib_ros.estimation.straight.initialisation import APART_DEG, apart
-from autocalib_ros.estimation.verification.gates import crossing_deg, is_road
-from autocalib_ros.geometry.great_circles import TrackSet, evenly, fit_circles, rays_of
+from autocalib_ros.geometry.great_circles import fit_circles, rays_of
 
 MOST_ROADS = 4
 VOTERS = 40
@@ -162,3 +161,17 @@ def main_road(fit: JointFit, tracks: TrackSet) -> tuple[np.ndarray, TrackSet]:
     angle = 0.5 * np.angle(twice.sum())
     along = fit.state.rotation @ np.array([np.cos(angle), np.sin(angle), 0.0])
     return along, tracks.subset(np.zeros(0, int))
+
+
+MIN_VEHICLES = 4
+"""Vehicles, distinct, that make a road; fewer may be one driver's whim."""
+
+
+def is_road(mask: np.ndarray, tracks: TrackSet, gate: GateOptions) -> bool:
+    """Tell whether enough tracks of enough vehicles support a direction."""
+    return mask.sum() >= gate.min_tracks_per_road and len(np.unique(tracks.vehicles[mask])) >= MIN_VEHICLES
+
+
+def crossing_deg(state: State) -> float:
+    """Angle at which the first two roads cross, 0 to 90 degrees."""
+    return float(np.degrees(np.arccos(np.clip(abs(np.cos(state.angles_rad[1])), 0.0, 1.0))))

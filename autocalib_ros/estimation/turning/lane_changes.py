@@ -14,8 +14,9 @@ from autocalib_ros.estimation.adjustment.bundle_adjustment import JointFit, solv
 from autocalib_ros.estimation.adjustment.noise_model import USUAL_HEIGHT_M
 from autocalib_ros.estimation.adjustment.parameters import State, ground_up
 from autocalib_ros.estimation.motion.planar_motion import View, first_motion, on_course, paths
+from autocalib_ros.estimation.observations.track_set import TrackSet
 from autocalib_ros.estimation.observations.two_frame_windows import Windows
-from autocalib_ros.geometry.great_circles import TrackSet, rays_of
+from autocalib_ros.geometry.great_circles import rays_of
 
 ASIDE_DEG = 1.5, 20.0
 """A window is of a change of lanes when it leads aside from the road by more than drivers wander, and less than who

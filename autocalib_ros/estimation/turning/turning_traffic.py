@@ -7,15 +7,15 @@ from dataclasses import replace
 import numpy as np
 
 from autocalib_ros.estimation.adjustment.bundle_adjustment import JointFit, solve_joint
+from autocalib_ros.estimation.adjustment.model_selection import most_probable
 from autocalib_ros.estimation.adjustment.noise_model import USUAL_HEIGHT_M
 from autocalib_ros.estimation.adjustment.parameters import Setting, State
 from autocalib_ros.estimation.motion.planar_motion import View, first_motion, on_course, sliding, turning_centres
 from autocalib_ros.estimation.motion.rigid_bodies import Bundle
+from autocalib_ros.estimation.observations.track_set import TrackSet
 from autocalib_ros.estimation.observations.tracklets import find_lives, no_lives
 from autocalib_ros.estimation.observations.two_frame_windows import Instants, Windows
-from autocalib_ros.estimation.straight.initialisation import most_probable
 from autocalib_ros.estimation.verification.consistency import differences
-from autocalib_ros.geometry.great_circles import TrackSet
 from autocalib_ros.results.calibration import Reason
 
 START_DIAGONALS = (0.35, 0.55, 0.85)

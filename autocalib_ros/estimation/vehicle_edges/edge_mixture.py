@@ -9,7 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from autocalib_ros.geometry.great_circles import independence
+from autocalib_ros.estimation.observations.track_set import independence
+from autocalib_ros.geometry.robust_kernels import folded, robust, student
 
 CORRELATION = 0.3
 """How much the errors of one vehicle's edges correlate: the same bumper is seen again and again."""
@@ -21,9 +22,6 @@ ROUNDING_RAD, ROUNDING_SIGMA_RAD = np.radians(2.5), np.radians(1.5)
 by 2.5 degrees; from hardly any to twice that is found on the road."""
 SYSTEMATIC_RAD = np.radians([0.75, 1.5])
 """What edges of all vehicles may have in common besides: the ends of bumpers rise, sides lean inwards."""
-FREEDOM, STUDENT = 4.0, 0.375
-"""Of Student's distribution about a peak, and its density in the middle for a scale of one: edges of wheels and lamps
-make long tails."""
 LARGEST_SHARE = 0.95
 """Of the edges in the peaks: some are always of neither."""
 LARGEST_TURN_RAD = np.pi / 4
@@ -151,22 +149,6 @@ class _Mixture:
         bulge = (pull @ ((self.told.rounding - lever) * off) + ROUNDING_RAD / ROUNDING_SIGMA_RAD**2) * sigma**2
         shares = sums / max(weights.sum(), sums.sum() / LARGEST_SHARE)
         return _Mixture(self.told, tuple(shares.tolist()), tuple(spreads.tolist()), float(bulge))
-
-
-def student(misses: np.ndarray, sigmas: np.ndarray) -> np.ndarray:
-    """Density of each miss by Student's distribution of these scales."""
-    apart = 1.0 + (misses / sigmas) ** 2 / FREEDOM
-    return STUDENT / sigmas / (apart * apart * np.sqrt(apart))
-
-
-def robust(misses: np.ndarray, sigmas: np.ndarray) -> np.ndarray:
-    """Weight of each miss by Student's distribution."""
-    return (FREEDOM + 1.0) / (FREEDOM + (misses / sigmas) ** 2)
-
-
-def folded(turns_rad: np.ndarray) -> np.ndarray:
-    """Bring angles of undirected edges to within a quarter of a turn of 0."""
-    return turns_rad - np.pi * np.rint(turns_rad / np.pi)
 
 
 def _highest(at: np.ndarray, values: np.ndarray) -> float:

@@ -18,9 +18,11 @@ import numpy as np
 
 from autocalib_ros.estimation.adjustment.bundle_adjustment import JointFit
 from autocalib_ros.estimation.adjustment.parameters import State, level_normal
-from autocalib_ros.estimation.vehicle_edges.edge_mixture import Turns, find_peaks, folded
+from autocalib_ros.estimation.observations.track_set import TrackSet, earlier_ones
+from autocalib_ros.estimation.vehicle_edges.edge_mixture import Turns, find_peaks
 from autocalib_ros.evidence.snapshot import Evidence
-from autocalib_ros.geometry.great_circles import TrackSet, along_px, earlier_ones, rays_of
+from autocalib_ros.geometry.great_circles import along_px, rays_of
+from autocalib_ros.geometry.robust_kernels import folded
 from autocalib_ros.geometry.small_matrices import cross, dot
 from autocalib_ros.lens.camera import Camera
 

@@ -9,17 +9,15 @@ import numpy as np
 from autocalib_ros.config import GateOptions
 from autocalib_ros.estimation.adjustment.bundle_adjustment import MIN_ROWS, JointFit, assign, road_support, solve_joint
 from autocalib_ros.estimation.adjustment.covariance import told_by_evidence
-from autocalib_ros.estimation.adjustment.parameters import State
+from autocalib_ros.estimation.observations.track_set import Seen, TrackSet, every_track
 from autocalib_ros.estimation.observations.tracklets import no_lives
+from autocalib_ros.estimation.straight.roads import MIN_VEHICLES
 from autocalib_ros.estimation.verification.consistency import differences, expected_of_halves
 from autocalib_ros.estimation.verification.ground_normal import LevelCamera, Plane, above_traffic
 from autocalib_ros.evidence.snapshot import Evidence
-from autocalib_ros.geometry.great_circles import Seen, TrackSet, every_track
 from autocalib_ros.geometry.ground_plane import BELOW_HORIZON
 from autocalib_ros.results.calibration import Reason
 
-MIN_VEHICLES = 4
-"""Vehicles, distinct, that make a road; fewer may be one driver's whim."""
 STRAIGHT_SHARE = 0.25
 """Share of vehicles that follow the roads; below it the traffic turns, and what it agrees on is a turn."""
 ONE_ROAD_SHARE, KEPT_ROAD_SHARE = 0.75, 0.5
@@ -52,16 +50,6 @@ HALVES_DEG = 1.5
 """Two halves of the evidence may always differ by so much: it is within what the program promises."""
 
 NOT_CROSS_CHECKED = 'not cross-checked in time: the earlier or the later half has too little traffic on a road'
-
-
-def is_road(mask: np.ndarray, tracks: TrackSet, gate: GateOptions) -> bool:
-    """Tell whether enough tracks of enough vehicles support a direction."""
-    return mask.sum() >= gate.min_tracks_per_road and len(np.unique(tracks.vehicles[mask])) >= MIN_VEHICLES
-
-
-def crossing_deg(state: State) -> float:
-    """Angle at which the first two roads cross, 0 to 90 degrees."""
-    return float(np.degrees(np.arccos(np.clip(abs(np.cos(state.angles_rad[1])), 0.0, 1.0))))
 
 
 def traffic_doubt(fit: JointFit, contrast: float, tracks: TrackSet) -> Reason | None:

@@ -9,10 +9,11 @@ import numpy as np
 
 from autocalib_ros.estimation.adjustment.bundle_adjustment import JointFit
 from autocalib_ros.estimation.adjustment.parameters import ALONG_X, State
-from autocalib_ros.estimation.vehicle_edges.edge_mixture import folded
+from autocalib_ros.estimation.observations.track_set import TrackSet
 from autocalib_ros.estimation.vehicle_edges.transverse_edges import SquareVehicles
-from autocalib_ros.geometry.great_circles import TrackSet, rays_of
+from autocalib_ros.geometry.great_circles import rays_of
 from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg, upward
+from autocalib_ros.geometry.robust_kernels import folded
 from autocalib_ros.lens.camera import Camera
 
 STEP_RAD = 1e-5

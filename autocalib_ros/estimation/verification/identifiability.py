@@ -7,8 +7,8 @@ from dataclasses import replace
 from autocalib_ros.estimation.adjustment.bundle_adjustment import JointFit, judged_with, solve_joint
 from autocalib_ros.estimation.adjustment.covariance import told_by_evidence
 from autocalib_ros.estimation.adjustment.lens_prior import PARAMETERS
-from autocalib_ros.estimation.straight.initialisation import ASKED_FOR, most_probable
-from autocalib_ros.geometry.great_circles import TrackSet
+from autocalib_ros.estimation.adjustment.model_selection import ASKED_FOR, most_probable
+from autocalib_ros.estimation.observations.track_set import TrackSet
 from autocalib_ros.lens.camera import Camera
 
 

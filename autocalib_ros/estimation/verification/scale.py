@@ -13,7 +13,7 @@ import numpy as np
 
 from autocalib_ros.config import GateOptions, Options, ScaleOptions
 from autocalib_ros.estimation.adjustment.noise_model import USUAL_HEIGHT_M
-from autocalib_ros.geometry.great_circles import TrackSet
+from autocalib_ros.estimation.observations.track_set import TrackSet
 from autocalib_ros.geometry.ground_plane import ground_points
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.results.calibration import Reason

@@ -18,11 +18,11 @@ from pathlib import Path
 import numpy as np
 
 from autocalib_ros.calibrator import solve
-from autocalib_ros.compare import best_turn
+from autocalib_ros.comparison import best_turn
 from autocalib_ros.config import Options
 from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.evidence.snapshot import Evidence
-from autocalib_ros.geometry.ground_plane import angles_deg, tilt_and_roll_deg
+from autocalib_ros.geometry.ground_plane import GroundPlane, angles_deg, tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera, pixel_grid
 from autocalib_ros.offline.benchmark.families import families
 from autocalib_ros.offline.benchmark.processes import in_order
@@ -30,7 +30,7 @@ from autocalib_ros.offline.ground_truth import NEAR_M, distances_error
 from autocalib_ros.offline.synthetic.junction import Junction
 from autocalib_ros.offline.terminal.progress import progress_bar
 from autocalib_ros.pictures.views import ground_to_image, image_to_ground
-from autocalib_ros.results.calibration import Calibration, GroundPlane, Refusal
+from autocalib_ros.results.calibration import Calibration, Refusal
 
 RAY_GRID = (49, 28)
 GROUND_GRID = 5

@@ -14,7 +14,7 @@ import numpy as np
 
 from autocalib_ros.calibrator import AutoCalibrator, solve
 from autocalib_ros.config import Options
-from autocalib_ros.offline.recordings.sources import open_source
+from autocalib_ros.offline.recordings.open import open_source
 
 BARE_POINTS = 300
 BARE_REPEATS = 30

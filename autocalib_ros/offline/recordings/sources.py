@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -86,44 +85,21 @@ class Source(Protocol):
         """Go through the images of the window without decoding them."""
 
 
-def open_source(path: str | Path, topic: str | None = None, start_s: float = 0.0,
-                duration_s: float | None = None) -> Source:
-    """Open a rosbag2 folder, a lone .mcap or .db3, a ROS 1 .bag or a video file.
-
-    Raises UsageError when the topic has to be chosen or is not there, InputError when the file cannot be read.
-    """
-    path, window = Path(path), Window(start_s, duration_s)
-    _check_readable(path)
-    if path.is_dir() or path.suffix.lower() in BAG_SUFFIXES:
-        from autocalib_ros.offline.recordings.bags import BagSource  # imported late: a video needs no rosbags
-        return BagSource(path, topic, window)
-    if path.suffix == '.zstd':
-        raise InputError(f'{path} is a compressed part of a recording: give the folder with its metadata.yaml,'
-                         ' or unpack it first (zstd -d)')
-    if topic is not None:
-        raise UsageError(f'{path} is a video: it has no topics to choose from')
-    from autocalib_ros.offline.recordings.videos import VideoSource
-    return VideoSource(path, window)
-
-
-def _check_readable(path: Path) -> None:
-    try:
-        if not path.exists():
-            raise InputError(f'{path} does not exist')
-        if path.is_dir():
-            return
-        if not path.is_file():
-            raise InputError(f'{path} is neither a file nor a folder')
-        with path.open('rb') as stream:
-            if not stream.read(1):
-                raise InputError(f'{path} is empty (0 bytes)')
-    except OSError as error:
-        raise InputError(f'cannot read {path}: {error.strerror or error}') from error
-
-
 def nothing_in_window(name: str, window: Window, recording_s: float | None) -> InputError:
     """Return the error of a recording that gives no image, or none in the window."""
     if window.start_s > 0:
         length = '' if recording_s is None else f', which lasts {recording_s:.1f} s'
         return InputError(f'no image {window.start_s:g} s after the start of {name}{length}')
     return InputError(f'{name} gives no image')
+
+
+def camera_name(source: Source) -> str:
+    """Return the namespace of the image topic, else the frame of its images, else 'camera'."""
+    namespace = '_'.join(image_topic(source).strip('/').split('/')[:-1])
+    return namespace or source.camera_frame or 'camera'
+
+
+def image_topic(source: Source) -> str:
+    """Return the image topic without the suffix that image_transport gives to compressed images."""
+    compressed = source.image_type.endswith('/CompressedImage')
+    return source.topic.removesuffix('/compressed') if compressed else source.topic

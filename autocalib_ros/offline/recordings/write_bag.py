@@ -15,11 +15,11 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from autocalib_ros.errors import InputError, UsageError
-from autocalib_ros.offline.outputs import camera_name, image_topic
-from autocalib_ros.offline.recordings.sources import Source, StoredImage
+from autocalib_ros.geometry.ground_plane import GroundPlane
+from autocalib_ros.offline.recordings.sources import Source, StoredImage, camera_name, image_topic
 from autocalib_ros.perception.ignore_regions import Polygons
 from autocalib_ros.perception.masked_messages import blacked_out, require_blackable
-from autocalib_ros.results.calibration import Calibration, GroundPlane
+from autocalib_ros.results.calibration import Calibration
 
 LOG = logging.getLogger(__name__)
 

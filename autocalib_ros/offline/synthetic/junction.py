@@ -10,7 +10,8 @@ from scipy.interpolate import CubicSpline
 
 from autocalib_ros.config import BufferOptions
 from autocalib_ros.errors import UsageError
-from autocalib_ros.evidence.snapshot import Evidence, EvidenceBuffer, Segments, Track
+from autocalib_ros.evidence.buffer import EvidenceBuffer
+from autocalib_ros.evidence.snapshot import Evidence, Segments, Track
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.synthetic.disturbances import Sway, background_drift_px, spoil
 from autocalib_ros.offline.synthetic.drives import (

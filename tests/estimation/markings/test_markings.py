@@ -18,16 +18,17 @@ from autocalib_ros.estimation.markings.grid_search import grid_search as marking
 from autocalib_ros.estimation.markings.grid_search import square_grids
 from autocalib_ros.estimation.markings.markings_solution import fit_to_markings, with_lens_known
 from autocalib_ros.estimation.markings.road_segments import lines_on_road
+from autocalib_ros.estimation.observations.track_set import TrackSet, select_tracks
 from autocalib_ros.estimation.verification.ground_normal import Plane
 from autocalib_ros.evidence.snapshot import Evidence
-from autocalib_ros.geometry.great_circles import TrackSet, select_tracks
-from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
+from autocalib_ros.geometry.ground_plane import GroundPlane, tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.benchmark.families import viewpoint
 from autocalib_ros.offline.benchmark.monte_carlo import distance_error
 from autocalib_ros.offline.synthetic.drives import drive_ring
 from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_evidence
-from autocalib_ros.results.calibration import Calibration, GroundPlane, Reason, to_json
+from autocalib_ros.results.calibration import Calibration, Reason
+from autocalib_ros.results.calibration_json import to_json
 from road_lines import Paint, painted_lines, post_lines, random_lines
 
 WIDTH, HEIGHT = 1280, 720

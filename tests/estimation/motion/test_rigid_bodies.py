@@ -10,9 +10,9 @@ from autocalib_ros.estimation.adjustment.lens_prior import lens_priors
 from autocalib_ros.estimation.adjustment.parameters import Setting, State, Steps
 from autocalib_ros.estimation.adjustment.residual_blocks import LifeRows
 from autocalib_ros.estimation.motion.rigid_bodies import Bundle
+from autocalib_ros.estimation.observations.track_set import SAMPLES
 from autocalib_ros.estimation.observations.tracklets import INSTANTS, Lives, find_lives, no_lives
 from autocalib_ros.estimation.observations.two_frame_windows import Instants, find_windows
-from autocalib_ros.geometry.great_circles import SAMPLES
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.benchmark.monte_carlo import evidence_of
 from autocalib_ros.offline.synthetic.junction import pose

@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from autocalib_ros.config import BufferOptions
+from autocalib_ros.estimation.observations.track_set import SAMPLES
 from autocalib_ros.estimation.observations.two_frame_windows import MIN_POINTS, find_windows, no_windows
-from autocalib_ros.evidence.snapshot import Evidence, EvidenceBuffer, Segments, Track
-from autocalib_ros.geometry.great_circles import SAMPLES
+from autocalib_ros.evidence.buffer import EvidenceBuffer
+from autocalib_ros.evidence.snapshot import Evidence, Segments, Track
 
 SIZE = (1280, 720)
 CORNERS = np.array([[0.0, 0.0], [30.0, 0.0], [0.0, 20.0], [30.0, 20.0], [15.0, 10.0], [20.0, 5.0]])

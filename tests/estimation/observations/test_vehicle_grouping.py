@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from autocalib_ros.estimation.observations.track_set import SAMPLES, TrackSet
 from autocalib_ros.estimation.observations.vehicle_grouping import ALONE, bodies, corroborated, heading_off_deg
-from autocalib_ros.geometry.great_circles import SAMPLES, TrackSet
 
 
 def moving(starts: list[tuple[float, float]], speeds: list[tuple[float, float]],

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from autocalib_ros.config import PaperOptions
+from autocalib_ros.estimation.observations.track_set import select_tracks
 from autocalib_ros.estimation.paper.intrinsics import (
     distortion_polynomial,
-    focal_trials,
     paper_intervals,
     paper_intrinsics,
     straightness_sweep,
 )
-from autocalib_ros.geometry.great_circles import select_tracks
+from autocalib_ros.estimation.straight.initialisation import focal_trials
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.synthetic.junction import Junction, synthetic_evidence
 

@@ -6,13 +6,9 @@ import numpy as np
 import pytest
 
 from autocalib_ros.config import PaperOptions
-from autocalib_ros.estimation.straight.consensus import (
-    Orientations,
-    consensus_directions,
-    segment_orientations,
-    voted_points,
-)
-from autocalib_ros.geometry.great_circles import select_tracks
+from autocalib_ros.estimation.observations.track_set import select_tracks
+from autocalib_ros.estimation.paper.vanishing_point_voting import Orientations, segment_orientations, voted_points
+from autocalib_ros.estimation.straight.consensus import consensus_directions
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_evidence
 

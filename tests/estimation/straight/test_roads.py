@@ -12,9 +12,9 @@ from autocalib_ros.config import GateOptions, JointOptions, Options
 from autocalib_ros.estimation.adjustment.bundle_adjustment import solve_joint
 from autocalib_ros.estimation.adjustment.lens_prior import lens_priors
 from autocalib_ros.estimation.adjustment.parameters import Setting, State
+from autocalib_ros.estimation.observations.track_set import select_tracks
 from autocalib_ros.estimation.verification.gates import NOT_CROSS_CHECKED, halves_doubt
 from autocalib_ros.evidence.snapshot import Evidence
-from autocalib_ros.geometry.great_circles import select_tracks
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.benchmark.families import families
 from autocalib_ros.offline.benchmark.monte_carlo import evidence_of

@@ -15,13 +15,13 @@ from autocalib_ros.estimation.adjustment.bundle_adjustment import JointFit, solv
 from autocalib_ros.estimation.adjustment.lens_prior import known_lens, lens_priors
 from autocalib_ros.estimation.adjustment.parameters import Setting, State, Steps
 from autocalib_ros.estimation.motion.rigid_bodies import Bundle
+from autocalib_ros.estimation.observations.track_set import TrackSet, select_tracks
 from autocalib_ros.estimation.observations.tracklets import Lives, find_lives
 from autocalib_ros.estimation.observations.two_frame_windows import Instants, Windows, find_windows
 from autocalib_ros.estimation.turning.turning_traffic import turning_traffic as turning
 from autocalib_ros.estimation.verification.consistency import differences, expected_of_halves
 from autocalib_ros.estimation.verification.gates import halves_doubt
 from autocalib_ros.evidence.snapshot import Evidence
-from autocalib_ros.geometry.great_circles import TrackSet, select_tracks
 from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.synthetic.drives import drive_arc

@@ -12,12 +12,12 @@ from autocalib_ros.calibrator import solve
 from autocalib_ros.config import GateOptions, JointOptions, Options
 from autocalib_ros.estimation.adjustment.parameters import State
 from autocalib_ros.estimation.estimate import Solution, find_solution
-from autocalib_ros.estimation.vehicle_edges.edge_mixture import folded
+from autocalib_ros.estimation.observations.track_set import select_tracks
 from autocalib_ros.estimation.vehicle_edges.transverse_edges import RoadEdges, SquareVehicles, square_to
 from autocalib_ros.estimation.verification.gates import plane_doubt
 from autocalib_ros.estimation.verification.ground_normal import LevelCamera, agreement
 from autocalib_ros.evidence.snapshot import Evidence
-from autocalib_ros.geometry.great_circles import select_tracks
+from autocalib_ros.geometry.robust_kernels import folded
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration

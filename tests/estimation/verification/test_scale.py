@@ -12,9 +12,9 @@ from autocalib_ros.calibrator import AutoCalibrator, solve
 from autocalib_ros.config import Options, ScaleOptions
 from autocalib_ros.errors import UsageError
 from autocalib_ros.estimation.estimate import Solution, find_solution
+from autocalib_ros.estimation.observations.track_set import SAMPLES, TrackSet, select_tracks
 from autocalib_ros.estimation.verification.scale import LEAST_VEHICLES, Scale, known_scale, trimmed_mean
 from autocalib_ros.evidence.snapshot import Evidence
-from autocalib_ros.geometry.great_circles import SAMPLES, TrackSet, select_tracks
 from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration, Reason
 

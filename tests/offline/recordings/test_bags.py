@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from autocalib_ros.errors import InputError, UsageError
-from autocalib_ros.offline.recordings.sources import open_source
+from autocalib_ros.offline.recordings.open import open_source
 
 SECOND = 1_000_000_000
 KINDS = [(False, 'NONE'), (False, 'MESSAGE'), (False, 'FILE'), (True, 'NONE'), (True, 'MESSAGE'), (True, 'FILE'),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from autocalib_ros.errors import InputError, UsageError
-from autocalib_ros.offline.recordings.sources import open_source
+from autocalib_ros.offline.recordings.open import open_source
 from autocalib_ros.offline.recordings.videos import _Clock
 
 
