@@ -9,8 +9,8 @@ import numpy as np
 
 from autocalib_ros.config import Options
 from autocalib_ros.errors import InputError
-from autocalib_ros.estimation.adjustment.noise_model import USUAL_HEIGHT_M
-from autocalib_ros.estimation.adjustment.residuals import residuals_of
+from autocalib_ros.estimation.adjustment.noise_model import DEFAULT_CAMERA_HEIGHT_M
+from autocalib_ros.estimation.adjustment.residuals import collect_residuals
 from autocalib_ros.estimation.estimate import Solution, find_solution
 from autocalib_ros.estimation.observations.selection import of_vehicles
 from autocalib_ros.estimation.observations.track_set import TrackSet, select_tracks
@@ -18,9 +18,15 @@ from autocalib_ros.estimation.paper.intrinsics import paper_intrinsics
 from autocalib_ros.estimation.paper.published_method import solve_paper
 from autocalib_ros.estimation.paper.vanishing_point_voting import segment_orientations
 from autocalib_ros.estimation.people.pedestrians import people
-from autocalib_ros.estimation.verification.ground_normal import Plane
-from autocalib_ros.estimation.verification.readiness import drift_limit_px, outlook, requirements, shortfall, unsteady
-from autocalib_ros.estimation.verification.scale import Scale, is_unusual, known_scale, scale_doubt
+from autocalib_ros.estimation.verification.ground_normal import PlaneEstimate
+from autocalib_ros.estimation.verification.readiness import (
+    check_readiness,
+    check_steady,
+    drift_limit_px,
+    outlook,
+    requirements,
+)
+from autocalib_ros.estimation.verification.scale import Scale, check_scale, is_unusual, known_scale
 from autocalib_ros.evidence.buffer import EvidenceBuffer
 from autocalib_ros.evidence.snapshot import Evidence, Kind
 from autocalib_ros.geometry.ground_plane import ground_plane, ground_points, pixels_ahead, tilt_and_roll_deg
@@ -195,9 +201,9 @@ class AutoCalibrator:
             return Progress(0.0, ('no image yet',))
         evidence, _ = of_vehicles(evidence)
         needs = requirements(evidence, gate, self._options.first_solve_s)
-        scarcest = min(need.share for need in needs)
-        missing = [need.words for need in needs if need.share < 1.0]
-        moving = unsteady(evidence, gate)
+        scarcest = min(need.fraction for need in needs)
+        missing = [need.description for need in needs if need.fraction < 1.0]
+        moving = check_steady(evidence, gate)
         if moving:
             return Progress(100.0 * scarcest, (moving.message, *missing))
         return Progress(100.0 * scarcest, tuple(missing), outlook(evidence, scarcest))
@@ -250,7 +256,7 @@ def _solved(evidence: Evidence, options: Options, lens: Camera | None) -> Calibr
         return Refusal.because(reason, options.method, evidence.summary(), figures)
 
     traffic, kept = of_vehicles(evidence)
-    reason = shortfall(traffic, options.gate)
+    reason = check_readiness(traffic, options.gate)
     if reason:
         return refused(reason)
     if options.method == 'paper':
@@ -265,11 +271,11 @@ def _solved(evidence: Evidence, options: Options, lens: Camera | None) -> Calibr
             return solution
         return _calibration(options, solution, Calibration(
             method=options.method, grade='lens', assumptions=solution.assumptions, checks=solution.checks,
-            camera=solution.fit.state.camera, ground=None, ground_refusal=solution.no_plane,
+            camera=solution.fit.state.camera, ground=None, ground_refusal=solution.plane_refusal,
             road_directions=solution.fit.state.directions, stddev=_lens_deviations(solution),
             paper=None if intrinsics is None else intrinsics.report, evidence=evidence.summary(),
             newest_stamp_ns=evidence.newest_stamp_ns,
-            figures=_figures(figures, solution, kept[tracks.indices], evidence, options))), not solution.by_lines
+            figures=_figures(figures, solution, kept[tracks.indices], evidence, options))), not solution.from_markings
 
     found = solved(traffic, kept)
     if isinstance(found, Reason):
@@ -279,7 +285,7 @@ def _solved(evidence: Evidence, options: Options, lens: Camera | None) -> Calibr
     if len(told) and by_traffic:
         drive = np.flatnonzero(~np.isin(traffic.track_vehicles, told))
         alone = traffic.without(told)
-        again = shortfall(alone, options.gate) or solved(alone, kept[drive])
+        again = check_readiness(alone, options.gate) or solved(alone, kept[drive])
         result = _preferred(result, again if isinstance(again, Reason) else again[0])
     return _counted(result, len(told))
 
@@ -289,7 +295,7 @@ def _people_in(result: Calibration, evidence: Evidence) -> np.ndarray:
     ground = result.ground
     if ground is None:
         return np.zeros(0, int)
-    height = ground.height_m if ground.metric else USUAL_HEIGHT_M
+    height = ground.height_m if ground.metric else DEFAULT_CAMERA_HEIGHT_M
     untold = evidence.selected(np.flatnonzero(evidence.track_kinds == Kind.UNKNOWN))
     return people(untold, result.camera, ground.normal_in_camera, height)
 
@@ -325,26 +331,26 @@ def _solution(evidence: Evidence, tracks: TrackSet, options: Options, lens: Came
                              height_m=height_m, lens=lens)
 
     solution = with_height(options.camera_height)
-    if options.scale_from == 'height' or isinstance(solution, Reason) or solution.no_plane:
+    if options.scale_from == 'height' or isinstance(solution, Reason) or solution.plane_refusal:
         return solution
     scale = _scale(options, solution)
-    if isinstance(scale, Reason) or not is_unusual(scale.height(*solution.plane.here)):
+    if isinstance(scale, Reason) or not is_unusual(scale.height(*solution.plane.lens_and_normal)):
         return solution
-    return with_height(scale.height(*solution.plane.here))
+    return with_height(scale.height(*solution.plane.lens_and_normal))
 
 
 def _scale(options: Options, solution: Solution) -> Scale | Reason:
-    return known_scale(options, *solution.plane.here, solution.flow)
+    return known_scale(options, *solution.plane.lens_and_normal, solution.flow)
 
 
 def _figures(figures: Figures, solution: Solution, indices: np.ndarray, evidence: Evidence,
              options: Options) -> Figures:
     """Add what became of each track (n,) by its index, and the orientations of the segments in the solved lens."""
     labels = figures.track_labels.copy()
-    labels[indices] = np.where(solution.fit.explained(), solution.fit.labels, -2)
+    labels[indices] = np.where(solution.fit.inliers(), solution.fit.labels, -2)
     found = segment_orientations(solution.fit.state.camera, evidence.segments_px, options.paper)
     return replace(figures, track_labels=labels, orientation_histogram=found.histogram,
-                   orientation_peaks_deg=found.peaks_deg, residuals=residuals_of(solution.fit))
+                   orientation_peaks_deg=found.peaks_deg, residuals=collect_residuals(solution.fit))
 
 
 def _lens_deviations(solution: Solution) -> StandardDeviations:
@@ -354,15 +360,15 @@ def _lens_deviations(solution: Solution) -> StandardDeviations:
                               k2=float(k2))
 
 
-def _height_deviation(plane: Plane, scale: Scale) -> float:
+def _height_deviation(plane: PlaneEstimate, scale: Scale) -> float:
     """Standard deviation of the height: of what is given, and of the lens and plane by which it follows."""
     told = plane.sigma(lambda camera, normal: np.array([scale.height(camera, normal)]))
     return float(np.hypot(told[0], scale.sigma))
 
 
-def _ground_deviations(plane: Plane, scale: Scale) -> tuple[float | None, ...]:
+def _ground_deviations(plane: PlaneEstimate, scale: Scale) -> tuple[float | None, ...]:
     """Standard deviation in metres of road points ahead, None where they are not in the image."""
-    camera, normal = plane.here
+    camera, normal = plane.lens_and_normal
     height = scale.height(camera, normal)
     pixels = pixels_ahead(camera, normal, height, np.array(GROUND_DISTANCES_M))
     seen = np.isfinite(pixels).all(axis=1)
@@ -374,10 +380,10 @@ def _ground_deviations(plane: Plane, scale: Scale) -> tuple[float | None, ...]:
 
     spread = np.hypot(plane.sigma(points), scale.sigma / height * points(camera, normal))
     sigmas = iter(np.hypot(*spread.reshape(-1, 2).T))
-    return tuple(float(next(sigmas)) if here else None for here in seen)
+    return tuple(float(next(sigmas)) if lens_and_normal else None for lens_and_normal in seen)
 
 
-def _covariance(plane: Plane, scale: Scale) -> np.ndarray:
+def _covariance(plane: PlaneEstimate, scale: Scale) -> np.ndarray:
     """Covariance (10, 10) of lens, tilt, roll and height, in the order of COVARIANCE_OF."""
     def published(camera: Camera, normal: np.ndarray) -> np.ndarray:
         return np.array([camera.focal_px, *camera.principal_point_px, *camera.k, *tilt_and_roll_deg(normal),
@@ -390,11 +396,11 @@ def _covariance(plane: Plane, scale: Scale) -> np.ndarray:
 
 def _calibration(options: Options, solution: Solution, lens: Calibration) -> Calibration:
     """Add the ground plane to a lens where the traffic and what tells the scale give one."""
-    plane, scale = solution.plane, solution.no_plane or _scale(options, solution)
+    plane, scale = solution.plane, solution.plane_refusal or _scale(options, solution)
     if isinstance(scale, Reason):
         return replace(lens, ground_refusal=scale)
-    height, height_sigma = scale.height(*plane.here), _height_deviation(plane, scale)
-    doubt = scale_doubt(height, height_sigma, options.gate)
+    height, height_sigma = scale.height(*plane.lens_and_normal), _height_deviation(plane, scale)
+    doubt = check_scale(height, height_sigma, options.gate)
     if doubt:
         return replace(lens, ground_refusal=doubt)
     normal = plane.normal(plane.fit.state)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from autocalib_ros.geometry.small_matrices import LAST, NEXT, cofactors, cross, dot, least_axes
+from autocalib_ros.geometry.small_matrices import LAST, NEXT, cofactors, cross, dot, smallest_eigenvectors
 from autocalib_ros.lens.camera import Camera
 
 
@@ -37,7 +37,7 @@ class Rays:
         return dot(self.bearings, normals) * self.pixel_scale(normals)
 
 
-def rays_of(camera: Camera, pixels: np.ndarray) -> Rays:
+def unproject_rays(camera: Camera, pixels: np.ndarray) -> Rays:
     """Unproject pixels (..., 2); where the lens model does not reach, the last bearing that it reaches."""
     x, y = pixels[..., 0] - camera.principal_point_px[0], pixels[..., 1] - camera.principal_point_px[1]
     radius = np.maximum(np.sqrt(x * x + y * y), 1e-9)
@@ -57,7 +57,7 @@ def rays_of(camera: Camera, pixels: np.ndarray) -> Rays:
     return rays
 
 
-def along_px(rays: Rays, camera: Camera, pixels: np.ndarray, way_px: np.ndarray) -> np.ndarray:
+def bearing_change(rays: Rays, camera: Camera, pixels: np.ndarray, way_px: np.ndarray) -> np.ndarray:
     """Change (n, 3) of the bearings of pixels (n, 2) along a way (n, 2) in the image."""
     outward = pixels - camera.principal_point_px
     outward = outward / np.maximum(np.hypot(*outward.T), 1e-9)[:, None]
@@ -77,7 +77,7 @@ def fit_circles(rays: Rays, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray
     Returns the normals (tracks, 3), the mean squared distances in px^2 (tracks,) and the scatter (tracks, 3, 3).
     """
     matrix = circle_scatter(rays, weights)
-    normals, distance2 = least_axes(matrix)
+    normals, distance2 = smallest_eigenvectors(matrix)
     return normals, np.maximum(distance2, 0.0), matrix
 
 
@@ -85,7 +85,7 @@ def circle_scatter(rays: Rays, weights: np.ndarray) -> np.ndarray:
     """Return each track's scatter (tracks, 3, 3) where its great circle makes a pixel worth what it is."""
     scale = np.ones(weights.shape)
     for _ in range(2):
-        normals, _ = least_axes(scatter(rays, weights, scale))
+        normals, _ = smallest_eigenvectors(scatter(rays, weights, scale))
         scale = rays.pixel_scale(normals[:, None])
     return scatter(rays, weights, scale)
 
@@ -113,12 +113,12 @@ def fit_circles_through(matrix: np.ndarray, directions: np.ndarray) -> tuple[np.
     return normals, np.maximum(a * cosine**2 + 2 * b * cosine * sine + c * sine**2, 0.0)
 
 
-def distances2_through(matrix: np.ndarray, directions: np.ndarray) -> np.ndarray:
+def squared_distances_through(matrix: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Mean squared pixel distance of every track (t) from its best circle through every direction (h): (h, t)."""
-    return _distances2(_forms(matrix), directions)
+    return _squared_distances(_quadratic_forms(matrix), directions)
 
 
-def _forms(matrix: np.ndarray) -> np.ndarray:
+def _quadratic_forms(matrix: np.ndarray) -> np.ndarray:
     """Quadratic forms, shape (2, 6, tracks), of a unit direction in scatter matrices S (tracks, 3, 3).
 
     Their values are the sum and the product of the eigenvalues that S has in the plane across the direction d:
@@ -128,8 +128,8 @@ def _forms(matrix: np.ndarray) -> np.ndarray:
     return np.stack([np.concatenate([diagonal.sum(axis=0) - diagonal, -rest]), np.concatenate([minors, mixed])])
 
 
-def _distances2(forms: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Lesser eigenvalue (directions, tracks) across unit directions (directions, 3), from `_forms`."""
+def _squared_distances(forms: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Lesser eigenvalue (directions, tracks) across unit directions (directions, 3), from `_quadratic_forms`."""
     products = np.concatenate([directions**2, 2.0 * directions[:, NEXT] * directions[:, LAST]], axis=1)
     total, product = products @ forms
     root = np.sqrt(np.maximum(total * total - 4.0 * product, 0.0))

@@ -9,11 +9,11 @@ from scipy.spatial.transform import Rotation
 
 from autocalib_ros.lens.camera import Camera
 
-BELOW_HORIZON = 0.95
+MIN_FRACTION_BELOW_HORIZON = 0.95
 """Vehicles drive on the road: at least this share of what moves lies below the horizon."""
 
 
-def upward(normal: np.ndarray, bearings: np.ndarray) -> tuple[np.ndarray, float]:
+def orient_upward(normal: np.ndarray, bearings: np.ndarray) -> tuple[np.ndarray, float]:
     """Turn a plane normal (3,) away from the road, and say which share of the bearings (n, 3) lies below."""
     below = bearings @ normal < 0
     return (normal, float(below.mean())) if below.mean() >= 0.5 else (-normal, float(1 - below.mean()))
@@ -87,7 +87,7 @@ def angles_deg(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return np.degrees(np.arctan2(across, (first * second).sum(axis=-1)))
 
 
-def undirected_deg(one: np.ndarray, other: np.ndarray) -> float:
+def unsigned_angle_deg(one: np.ndarray, other: np.ndarray) -> float:
     """Angle between two unit vectors (3,), whichever way they point, degrees."""
     return float(np.degrees(np.arccos(min(abs(float(one @ other)), 1.0))))
 

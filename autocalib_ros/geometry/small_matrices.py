@@ -34,7 +34,7 @@ def cofactors(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, n
             rest[NEXT] * rest[LAST] - diagonal * rest)
 
 
-def least_axes(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def smallest_eigenvectors(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Unit eigenvectors (n, 3) of the least eigenvalues of positive semidefinite matrices (n, 3, 3), and those (n,).
 
     The cofactors of S - l I, l close to the least eigenvalue, are close to a multiple of e e^T: their largest column
@@ -42,7 +42,7 @@ def least_axes(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     diagonal, rest, minors, mixed = cofactors(matrix)
     trace = diagonal.sum(axis=0)
-    shift = _least_roots(trace, minors.sum(axis=0), diagonal[0] * minors[0] + (rest[1:] * mixed[1:]).sum(axis=0))
+    shift = _smallest_roots(trace, minors.sum(axis=0), diagonal[0] * minors[0] + (rest[1:] * mixed[1:]).sum(axis=0))
     minors = minors + shift * (diagonal - trace + shift)
     mixed = mixed + shift * rest
     near = np.stack([minors[0], mixed[2], mixed[1], mixed[2], minors[1], mixed[0], mixed[1], mixed[0], minors[2]],
@@ -53,19 +53,19 @@ def least_axes(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return axes, np.einsum('ni,nij,nj->n', axes, matrix, axes)
 
 
-def _least_roots(trace: np.ndarray, minors: np.ndarray, determinant: np.ndarray) -> np.ndarray:
+def _smallest_roots(trace: np.ndarray, minors: np.ndarray, determinant: np.ndarray) -> np.ndarray:
     """Least roots (n,) of l^3 - trace l^2 + minors l - determinant, all of whose roots are real: Laguerre's method."""
     root = np.zeros(len(trace))
     for _ in range(LAGUERRE_STEPS):
         value = ((root - trace) * root + minors) * root - determinant
         slope = (3 * root - 2 * trace) * root + minors
-        bend = 6 * root - 2 * trace
-        spread = np.sqrt(np.maximum(4 * slope * slope - 6 * value * bend, 0.0))
+        second_derivative = 6 * root - 2 * trace
+        spread = np.sqrt(np.maximum(4 * slope * slope - 6 * value * second_derivative, 0.0))
         root = root - 3 * value / np.maximum(slope + spread, 1e-300)
     return root
 
 
-def inverse_factors(matrix: np.ndarray) -> np.ndarray:
+def inverse_cholesky_factors(matrix: np.ndarray) -> np.ndarray:
     """Return the inverses of the lower Cholesky factors of positive definite matrices (size, size, n), same shape."""
     factor, inverse = np.zeros((2, *matrix.shape))
     for row in range(len(matrix)):

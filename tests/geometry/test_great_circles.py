@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from autocalib_ros.estimation.observations.track_set import select_tracks
-from autocalib_ros.geometry.great_circles import Rays, fit_circles, fit_circles_through, orthonormal_basis, rays_of
+from autocalib_ros.geometry.great_circles import (
+    Rays,
+    fit_circles,
+    fit_circles_through,
+    orthonormal_basis,
+    unproject_rays,
+)
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.synthetic.junction import Junction, synthetic_evidence
 
@@ -28,19 +34,19 @@ def uniform(pixels: np.ndarray) -> np.ndarray:
 
 def test_straight_paths_lie_on_great_circles() -> None:
     pixels, _ = straight_paths()
-    _, distance2, _ = fit_circles(rays_of(CAMERA, pixels), uniform(pixels))
+    _, distance2, _ = fit_circles(unproject_rays(CAMERA, pixels), uniform(pixels))
     assert np.sqrt(distance2).max() < 1e-4  # px; the paths are exact
 
 
 def test_circles_contain_the_direction_of_travel() -> None:
     pixels, direction = straight_paths()
-    normals, _, _ = fit_circles(rays_of(CAMERA, pixels), uniform(pixels))
+    normals, _, _ = fit_circles(unproject_rays(CAMERA, pixels), uniform(pixels))
     np.testing.assert_allclose(normals @ direction, 0.0, atol=1e-6)
 
 
 def test_a_circle_through_the_true_direction_costs_nothing() -> None:
     pixels, direction = straight_paths()
-    _, _, matrix = fit_circles(rays_of(CAMERA, pixels), uniform(pixels))
+    _, _, matrix = fit_circles(unproject_rays(CAMERA, pixels), uniform(pixels))
     normals, distance2 = fit_circles_through(matrix, np.tile(direction, (len(pixels), 1)))
     assert np.sqrt(distance2).max() < 1e-4
     np.testing.assert_allclose(normals @ direction, 0.0, atol=1e-12)
@@ -49,21 +55,21 @@ def test_a_circle_through_the_true_direction_costs_nothing() -> None:
 @pytest.mark.parametrize('place', [(640.0, 360.0), (30.0, 40.0), (1200.0, 100.0)])
 def test_distances_are_observed_pixels(place: tuple[float, float]) -> None:
     # a circle through one pixel, seen from the pixel two further along the image gradient
-    rays = rays_of(CAMERA, np.array(place))
+    rays = unproject_rays(CAMERA, np.array(place))
     normal, _ = orthonormal_basis(rays.bearings)
-    slope = np.array([rays_of(CAMERA, np.array(place) + step).bearings @ normal for step in 1e-3 * np.eye(2)]) / 1e-3
+    slope = np.array([unproject_rays(CAMERA, np.array(place) + step).bearings @ normal for step in 1e-3 * np.eye(2)]) / 1e-3
     moved = np.array(place) + 2.0 * slope / np.linalg.norm(slope)
-    assert abs(rays_of(CAMERA, moved).distance_px(normal)) == pytest.approx(2.0, rel=0.01)
+    assert abs(unproject_rays(CAMERA, moved).distance_px(normal)) == pytest.approx(2.0, rel=0.01)
 
 
 def test_ray_derivatives_match_finite_differences() -> None:
     place, step = np.array([900.0, 200.0]), 1e-4
     outward = (place - CAMERA.principal_point_px) / np.linalg.norm(place - CAMERA.principal_point_px)
     around = np.array([-outward[1], outward[0]])
-    rays = rays_of(CAMERA, place)
+    rays = unproject_rays(CAMERA, place)
 
     def slope(along: np.ndarray) -> np.ndarray:
-        ahead, behind = (rays_of(CAMERA, place + sign * step * along).bearings for sign in (1, -1))
+        ahead, behind = (unproject_rays(CAMERA, place + sign * step * along).bearings for sign in (1, -1))
         return (ahead - behind) / (2 * step)
 
     np.testing.assert_allclose(rays.radial, slope(outward), atol=1e-8)
@@ -71,7 +77,7 @@ def test_ray_derivatives_match_finite_differences() -> None:
 
 
 def test_rays_stay_finite_at_the_principal_point() -> None:
-    rays = rays_of(CAMERA, np.array(CAMERA.principal_point_px))
+    rays = unproject_rays(CAMERA, np.array(CAMERA.principal_point_px))
     assert isinstance(rays, Rays) and np.isfinite(rays.distance_px(np.array([1.0, 0.0, 0.0])))
 
 

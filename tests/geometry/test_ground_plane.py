@@ -8,10 +8,10 @@ import pytest
 from autocalib_ros.geometry.ground_plane import (
     focal_from_vanishing_points,
     ground_plane,
+    orient_upward,
     paper_translation,
     rotation_from_vanishing_points,
     tilt_and_roll_deg,
-    upward,
 )
 from autocalib_ros.offline.synthetic.junction import pose
 
@@ -52,7 +52,7 @@ def test_translation_is_the_height_along_the_optical_axis() -> None:
 @pytest.mark.parametrize('sign', [1.0, -1.0])
 def test_the_normal_points_away_from_what_moves(sign: float) -> None:
     on_road = np.array([[5.0, 3.0, -8.0], [10.0, -4.0, -8.0], [20.0, 2.0, -7.0]]) @ POSE.T
-    normal, below = upward(sign * POSE[:, 2], on_road)
+    normal, below = orient_upward(sign * POSE[:, 2], on_road)
     np.testing.assert_allclose(normal, POSE[:, 2])
     assert below == 1.0
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from autocalib_ros.geometry.small_matrices import cofactors, cross, dot, inverse_factors, least_axes
+from autocalib_ros.geometry.small_matrices import cofactors, cross, dot, inverse_cholesky_factors, smallest_eigenvectors
 
 COUNT = 300
 
@@ -25,7 +25,7 @@ def scatters(least: tuple[float, float], middle: tuple[float, float]) -> np.ndar
     ((0.0, 4.0), (1e5, 9e5))])  # paths from border to border
 def test_least_axes_are_the_eigenvectors(least: tuple[float, float], middle: tuple[float, float]) -> None:
     matrix = scatters(least, middle)
-    axes, values = least_axes(matrix)
+    axes, values = smallest_eigenvectors(matrix)
     expected, vectors = np.linalg.eigh(matrix)
     np.testing.assert_allclose(values, expected[:, 0], atol=1e-8)  # px^2; rounding leaves 1e-16 of 1e6
     np.testing.assert_allclose(np.abs(dot(axes, vectors[:, :, 0])), 1.0, atol=1e-12)
@@ -45,7 +45,7 @@ def test_inverse_factors_whiten() -> None:
     root = np.random.default_rng(1).normal(size=(COUNT, 10, 10))
     covariance = root @ root.transpose(0, 2, 1) + np.eye(10)
     expected = np.linalg.inv(np.linalg.cholesky(covariance))
-    np.testing.assert_allclose(inverse_factors(covariance.transpose(1, 2, 0)).transpose(2, 0, 1), expected, atol=1e-12)
+    np.testing.assert_allclose(inverse_cholesky_factors(covariance.transpose(1, 2, 0)).transpose(2, 0, 1), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize('shapes', [((3,), (3,)), ((7, 3), (3,)), ((7, 5, 3), (7, 1, 3)), ((7, 3), (7, 3))])

@@ -14,113 +14,129 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from autocalib_ros.estimation.adjustment.covariance import cluster_covariance, correlation_within, propagate, propagated
+from autocalib_ros.estimation.adjustment.covariance import (
+    intraclass_correlation,
+    jackknife_covariance,
+    propagate_covariance,
+    propagate_sigma,
+)
 from autocalib_ros.estimation.adjustment.lens_prior import LensPrior
-from autocalib_ros.estimation.adjustment.noise_model import USUAL_HEIGHT_M
-from autocalib_ros.estimation.adjustment.parameters import Setting, State, Steps, crossed, ground_up
-from autocalib_ros.estimation.adjustment.residual_blocks import LifeRows, MotionRows, RoadRows, Rows
+from autocalib_ros.estimation.adjustment.noise_model import DEFAULT_CAMERA_HEIGHT_M
+from autocalib_ros.estimation.adjustment.parameters import (
+    AdjustmentConfig,
+    AdjustmentState,
+    Parameterisation,
+    upward_normal,
+    with_crossing_angle,
+)
+from autocalib_ros.estimation.adjustment.residual_blocks import (
+    LinearisedRows,
+    PlanarMotionBlock,
+    RigidBodyBlock,
+    StraightTrackBlock,
+)
 from autocalib_ros.estimation.motion.planar_motion import Motion
 from autocalib_ros.estimation.motion.rigid_bodies import Shapes
-from autocalib_ros.estimation.observations.track_set import Seen, TrackSet
+from autocalib_ros.estimation.observations.track_set import TrackSet, UnprojectedTracks
 from autocalib_ros.estimation.observations.vehicle_grouping import bodies
-from autocalib_ros.geometry.great_circles import distances2_through, rays_of
+from autocalib_ros.geometry.great_circles import squared_distances_through, unproject_rays
 from autocalib_ros.lens.camera import Camera
 
-TIGHTENING = (8.0, 4.0, 2.0)
-TIGHTEST = 1.0
+ROBUST_LIMIT_SCHEDULE = (8.0, 4.0, 2.0)
+FINAL_ROBUST_LIMIT = 1.0
 """Squared distance at which a row's influence has fallen to a quarter, in medians, round by round.
 
 The bulk of the tracks says what noise is; a lane change or a slow turn a few pixels beyond it is few in number
 but long in lever. From loose to tight, so that a start some per cent off still reaches the best solution; then
 until assignment, influence and state stand still.
 """
-ROUNDS = 16
+MAX_ITERATIONS = 16
 """Most rounds; a state that has not settled by then swings between two assignments of a few tracks."""
-SETTLED, SETTLED_SIGMAS = 3e-4, 3e-3
+CONVERGED_STEP, CONVERGED_STEP_SIGMAS = 3e-4, 3e-3
 """The rounds end when log f and all angles (radians), and what is counted in prior sigmas, move by less."""
-BACKTRACKS = 4
-LEAST_SCALE = 0.05
+MAX_BACKTRACKS = 4
+MIN_RESIDUAL_SCALE = 0.05
 """Traffic without noise, as tests make it, still has a spread to divide by."""
-MIN_ROWS = 4
+MIN_RESIDUAL_ROWS = 4
 """Fewer tracks on roads, and windows, do not go on with a solution: it is judged, and refused, as it stands."""
-OUTLIER_PX = 4.0
+ROAD_OUTLIER_PX = 4.0
 """A track farther than this from every road, root mean square, belongs to none."""
-NEAREST_HORIZON = 0.03
+MIN_DEPRESSION_GROUPING_RAD = 0.03
 """Least angle below the horizon at which a point is placed on the road, radians."""
-EXPLAINED = 3.0
+INLIER_MEDIANS = 3.0
 """A track is explained when its mean squared whitened distance is below so many medians."""
 UNMODELLED_FOCAL, UNMODELLED_RAD = 0.001, np.radians(0.03)
 """What no residual shows, as standard deviations of the relative focal length and of the plane: a lens is not quite of
 its family, and a road not quite a plane (its crown falls by a degree to either side)."""
-DISCRIMINATION = 5.0
+MIN_ROAD_DISTANCE_RATIO = 5.0
 """A track tells two roads apart when it is so many times farther from the one than from the other."""
 
 
-Inner = tuple[None, Motion | None, Shapes | None]
+WarmStart = tuple[None, Motion | None, Shapes | None]
 """What is solved inside the rows of each kind and goes on from step to step: motions of windows, shapes of lives."""
-KINDS = 3
+BLOCK_COUNT = 3
 """Tracks on roads, windows, lives."""
 
 
 class Problem:
     """Labelled tracks and vehicles that turn, at a state: residuals, and their derivatives by a step from there."""
 
-    def __init__(self, base: State, tracks: TrackSet, labels: np.ndarray, setting: Setting,
-                 inner: Inner = (None, None, None), seen: Seen | None = None) -> None:
-        self.steps = Steps(base, setting)
+    def __init__(self, base: AdjustmentState, tracks: TrackSet, labels: np.ndarray, config: AdjustmentConfig,
+                 warm_start: WarmStart = (None, None, None), unprojected: UnprojectedTracks | None = None) -> None:
+        self.parameters = Parameterisation(base, config)
         self.used = np.flatnonzero(labels >= 0)
         """Indices of the tracks that are on a road: the first rows; windows and lives follow."""
-        seen = seen or Seen.through(base.camera, tracks)
-        share = tracks.independence(setting.vehicle_correlation)[self.used]
-        self.kinds: list[RoadRows | MotionRows | LifeRows] = [
-            RoadRows(self.steps, tracks.subset(self.used), labels[self.used], seen.subset(self.used), share),
-            MotionRows(self.steps, inner[1])]
-        if setting.bundle is not None:
-            self.kinds.append(LifeRows(self.steps, setting.bundle, inner[2]))
-        self.kind = np.repeat(np.arange(len(self.kinds)), [len(kind.freedom) for kind in self.kinds])
+        unprojected = unprojected or UnprojectedTracks.through(base.camera, tracks)
+        vehicle_weight = tracks.kish_weight(config.vehicle_correlation)[self.used]
+        self.blocks: list[StraightTrackBlock | PlanarMotionBlock | RigidBodyBlock] = [
+            StraightTrackBlock(self.parameters, tracks.subset(self.used), labels[self.used], unprojected.subset(self.used), vehicle_weight),
+            PlanarMotionBlock(self.parameters, warm_start[1])]
+        if config.bundle is not None:
+            self.blocks.append(RigidBodyBlock(self.parameters, config.bundle, warm_start[2]))
+        self.block_of_row = np.repeat(np.arange(len(self.blocks)), [len(block_of_row.dof) for block_of_row in self.blocks])
         """Index of the kind of each row, shape (rows,)."""
-        self.freedom = np.concatenate([kind.freedom for kind in self.kinds])
-        self.share = np.concatenate([kind.share for kind in self.kinds])
+        self.dof = np.concatenate([block_of_row.dof for block_of_row in self.blocks])
+        self.vehicle_weight = np.concatenate([block_of_row.vehicle_weight for block_of_row in self.blocks])
 
     @property
-    def setting(self) -> Setting:
+    def config(self) -> AdjustmentConfig:
         """What the solution was given."""
-        return self.steps.setting
+        return self.parameters.config
 
     @property
-    def inner(self) -> Inner:
+    def warm_start(self) -> WarmStart:
         """What was solved inside each kind, to go on from."""
-        return (None, self.kinds[1].inner, self.kinds[2].inner if len(self.kinds) > 2 else None)
+        return (None, self.blocks[1].warm_start, self.blocks[2].warm_start if len(self.blocks) > 2 else None)
 
     @property
-    def owners(self) -> np.ndarray:
+    def vehicle_ids(self) -> np.ndarray:
         """Vehicle of each row, shape (rows,): those on roads and those that turn are told apart."""
-        on_roads, *turning = (kind.owners for kind in self.kinds)
-        return np.concatenate([on_roads, *(owners + on_roads.max(initial=-1) + 1 for owners in turning)])
+        on_roads, *turning = (block_of_row.vehicle_ids for block_of_row in self.blocks)
+        return np.concatenate([on_roads, *(vehicle_ids + on_roads.max(initial=-1) + 1 for vehicle_ids in turning)])
 
-    def at(self, step: np.ndarray) -> tuple[Inner, np.ndarray]:
+    def at(self, step: np.ndarray) -> tuple[WarmStart, np.ndarray]:
         """What is solved inside at a step, and the mean squared residuals there (rows,)."""
-        parts = [kind.at(step) for kind in self.kinds]
-        inner = [part[0] for part in parts] + [None]
-        return (None, inner[1], inner[2]), np.concatenate([part[1] for part in parts])
+        parts = [block_of_row.at(step) for block_of_row in self.blocks]
+        warm_start = [part[0] for part in parts] + [None]
+        return (None, warm_start[1], warm_start[2]), np.concatenate([part[1] for part in parts])
 
-    def linearised(self) -> Rows:
+    def linearise(self) -> LinearisedRows:
         """Sums over the residuals at the base and their derivatives by the parameters."""
-        parts = [kind.linearised() for kind in self.kinds]
-        return Rows(*(np.concatenate([getattr(part, name) for part in parts])
+        parts = [block_of_row.linearise() for block_of_row in self.blocks]
+        return LinearisedRows(*(np.concatenate([getattr(part, name) for part in parts])
                       for name in ('squared', 'gradient', 'curvature', 'influence')))
 
     def scales(self, squared: np.ndarray) -> np.ndarray:
         """Median of the mean squared distances (rows,) over each kind of row, 1 where there is none; (kinds,)."""
-        return np.array([max(float(np.median(squared[self.kind == kind])), LEAST_SCALE)
-                         if (self.kind == kind).any() else 1.0 for kind in range(KINDS)])
+        return np.array([max(float(np.median(squared[self.block_of_row == block_of_row])), MIN_RESIDUAL_SCALE)
+                         if (self.block_of_row == block_of_row).any() else 1.0 for block_of_row in range(BLOCK_COUNT)])
 
 
 @dataclass(frozen=True)
-class JointFit:
+class Adjustment:
     """A solved state with what its uncertainty is made of."""
 
-    state: State
+    state: AdjustmentState
     labels: np.ndarray
     """Road of each track, -2 for none, shape (tracks,)."""
     distance_px: np.ndarray
@@ -145,7 +161,7 @@ class JointFit:
     @property
     def plane_known(self) -> bool:
         """Whether anything tells how the plane lies about its first road: another road, or vehicles that turn."""
-        return len(self.state.angles_rad) > 1 or self.problem.setting.turning
+        return len(self.state.angles_rad) > 1 or self.problem.config.turning
 
     @property
     def scale(self) -> float:
@@ -153,88 +169,88 @@ class JointFit:
         return float(self.scales[0])
 
     @property
-    def crossing_held(self) -> bool:
+    def crossing_fixed(self) -> bool:
         """Whether the angle between the first two roads was held."""
-        return self.problem.setting.crossing_rad is not None and len(self.state.angles_rad) > 1
+        return self.problem.config.crossing_rad is not None and len(self.state.angles_rad) > 1
 
     @property
     def focal_sigma(self) -> float:
         """Standard deviation of the focal length, relative."""
         return float(self.sigma(lambda state: np.array([np.log(state.camera.focal_px)]))[0])
 
-    def explained(self) -> np.ndarray:
+    def inliers(self) -> np.ndarray:
         """Which tracks follow their road as closely as the bulk does, shape (tracks,)."""
-        return (self.labels >= 0) & (self.whitened2 < EXPLAINED * max(self.scale, LEAST_SCALE))
+        return (self.labels >= 0) & (self.whitened2 < INLIER_MEDIANS * max(self.scale, MIN_RESIDUAL_SCALE))
 
-    def sigma(self, function: Callable[[State], np.ndarray]) -> np.ndarray:
+    def sigma(self, function: Callable[[AdjustmentState], np.ndarray]) -> np.ndarray:
         """Standard deviation of a function of the state, shape of its result."""
-        return propagate(lambda step: function(self.problem.steps.state(step)), self.problem.steps.size,
+        return propagate_sigma(lambda step: function(self.problem.parameters.state(step)), self.problem.parameters.size,
                          self.covariance)
 
-    def covariance_of(self, function: Callable[[State], np.ndarray]) -> np.ndarray:
+    def covariance_of(self, function: Callable[[AdjustmentState], np.ndarray]) -> np.ndarray:
         """Covariance (n, n) of a function of the state with n results."""
-        return propagated(lambda step: function(self.problem.steps.state(step)), self.problem.steps.size,
+        return propagate_covariance(lambda step: function(self.problem.parameters.state(step)), self.problem.parameters.size,
                           self.covariance)
 
 
-def assign(state: State, seen: Seen, limit_px: float = OUTLIER_PX) -> tuple[np.ndarray, np.ndarray]:
+def assign_roads(state: AdjustmentState, unprojected: UnprojectedTracks, limit_px: float = ROAD_OUTLIER_PX) -> tuple[np.ndarray, np.ndarray]:
     """Give each track its nearest road (-2 beyond `limit_px`) and its mean squared distance in px^2, inf for none."""
     if not len(state.angles_rad):
-        return np.full(len(seen.matrix), -2), np.full(len(seen.matrix), np.inf)
-    distance2 = distances2_through(seen.matrix, state.directions)
+        return np.full(len(unprojected.matrix), -2), np.full(len(unprojected.matrix), np.inf)
+    distance2 = squared_distances_through(unprojected.matrix, state.directions)
     nearest = np.argmin(distance2, axis=0)
     least = distance2[nearest, np.arange(len(nearest))]
     return np.where(least < limit_px**2, nearest, -2), least
 
 
-def solve_joint(start: State, tracks: TrackSet, setting: Setting, *, refine: bool = False,
-                inner: Inner = (None, None, None)) -> JointFit:
+def adjust(start: AdjustmentState, tracks: TrackSet, config: AdjustmentConfig, *, refine: bool = False,
+                warm_start: WarmStart = (None, None, None)) -> Adjustment:
     """Alternate between assigning tracks to roads and a robust Gauss-Newton step, from a start.
 
-    With `refine` the start is a solution already, and nothing is loosened first; `inner` is what was solved inside
+    With `refine` the start is a solution already, and nothing is loosened first; `warm_start` is what was solved inside
     there, for the same windows and lives.
     """
-    state, problem = crossed(start, setting.crossing_rad), None
-    for tightness in (() if refine else TIGHTENING) + ROUNDS * (TIGHTEST,):
+    state, problem = with_crossing_angle(start, config.crossing_rad), None
+    for robust_limit in (() if refine else ROBUST_LIMIT_SCHEDULE) + MAX_ITERATIONS * (FINAL_ROBUST_LIMIT,):
         # a start may be off by more than a true track ever is: only the last rounds cut off
-        seen = Seen.through(state.camera, tracks)
-        labels, _ = assign(state, seen, OUTLIER_PX if tightness <= TIGHTEST else np.inf)
-        if not _enough(labels, setting):
+        unprojected = UnprojectedTracks.through(state.camera, tracks)
+        labels, _ = assign_roads(state, unprojected, ROAD_OUTLIER_PX if robust_limit <= FINAL_ROBUST_LIMIT else np.inf)
+        if not _enough_rows(labels, config):
             break
-        problem = Problem(state, tracks, labels, setting, inner, seen)
-        step, state, inner = _stepped(problem, tightness)
-        if tightness <= TIGHTEST and _settled(step, setting.prior):
+        problem = Problem(state, tracks, labels, config, warm_start, unprojected)
+        step, state, warm_start = _gauss_newton_step(problem, robust_limit)
+        if robust_limit <= FINAL_ROBUST_LIMIT and _converged(step, config.prior):
             break
-    return _judged(problem or Problem(state, tracks, np.zeros(len(tracks), int), setting), state, inner, tracks)
+    return _evaluate(problem or Problem(state, tracks, np.zeros(len(tracks), int), config), state, warm_start, tracks)
 
 
-def _enough(labels: np.ndarray, setting: Setting) -> bool:
-    turning = len(setting.windows) + (0 if setting.bundle is None else len(setting.bundle.lives))
-    return np.count_nonzero(labels >= 0) + turning >= MIN_ROWS
+def _enough_rows(labels: np.ndarray, config: AdjustmentConfig) -> bool:
+    turning = len(config.windows) + (0 if config.bundle is None else len(config.bundle.lives))
+    return np.count_nonzero(labels >= 0) + turning >= MIN_RESIDUAL_ROWS
 
 
-def _stepped(problem: Problem, tightness: float) -> tuple[np.ndarray, State, Inner]:
+def _gauss_newton_step(problem: Problem, robust_limit: float) -> tuple[np.ndarray, AdjustmentState, WarmStart]:
     """Take one Gauss-Newton step on the robust cost, shortened until the cost does not grow."""
-    rows, prior = problem.linearised(), problem.setting.prior
-    scale = problem.scales(rows.squared)[problem.kind]
-    share = problem.share * rows.influence / scale
-    weight = share * influence(rows.squared, tightness * scale)
-    gradient, known = problem.steps.prior_gradient(problem.steps.base.camera)
+    rows, prior = problem.linearise(), problem.config.prior
+    scale = problem.scales(rows.squared)[problem.block_of_row]
+    vehicle_weight = problem.vehicle_weight * rows.influence / scale
+    weight = vehicle_weight * influence(rows.squared, robust_limit * scale)
+    gradient, known = problem.parameters.prior_gradient(problem.parameters.base.camera)
     matrix = np.tensordot(weight, rows.curvature, 1) + np.diag(known)
     step = -np.linalg.lstsq(matrix, gradient + weight @ rows.gradient, rcond=1e-12)[0]
 
     def cost(squared: np.ndarray, camera: Camera) -> float:
         deviations = prior.deviations(camera)
-        return float((share * problem.freedom * loss(squared, tightness * scale)).sum() + deviations @ deviations)
+        return float((vehicle_weight * problem.dof * loss(squared, robust_limit * scale)).sum() + deviations @ deviations)
 
-    here = cost(rows.squared, problem.steps.base.camera)
-    for _ in range(BACKTRACKS):
-        state = problem.steps.state(step)
-        inner, squared = problem.at(step)
+    here = cost(rows.squared, problem.parameters.base.camera)
+    for _ in range(MAX_BACKTRACKS):
+        state = problem.parameters.state(step)
+        warm_start, squared = problem.at(step)
         if cost(squared, state.camera) <= here:
-            return step, state, inner
+            return step, state, warm_start
         step = step / 2
-    return np.zeros_like(step), problem.steps.base, problem.inner
+    return np.zeros_like(step), problem.parameters.base, problem.warm_start
 
 
 def influence(squared: np.ndarray, limit: float) -> np.ndarray:
@@ -253,88 +269,88 @@ def bounded_loss(squared: np.ndarray, limit: float) -> np.ndarray:
     return np.where(far, limit, loss(np.where(far, 0.0, squared), limit))
 
 
-def _settled(step: np.ndarray, prior: LensPrior) -> bool:
-    limit = np.full(len(step), SETTLED)
-    limit[:len(prior.free)][np.isfinite(prior.sigma[prior.free])] = SETTLED_SIGMAS
+def _converged(step: np.ndarray, prior: LensPrior) -> bool:
+    limit = np.full(len(step), CONVERGED_STEP)
+    limit[:len(prior.free)][np.isfinite(prior.sigma[prior.free])] = CONVERGED_STEP_SIGMAS
     return bool((np.abs(step) < limit).all())
 
 
-def _judged(last: Problem, state: State, inner: Inner, tracks: TrackSet) -> JointFit:
+def _evaluate(last: Problem, state: AdjustmentState, warm_start: WarmStart, tracks: TrackSet) -> Adjustment:
     """Measure a solution: distances, cost, covariance and information."""
-    seen = Seen.through(state.camera, tracks)
-    labels, distance2 = assign(state, seen)
-    problem = Problem(state, tracks, labels, last.setting, inner, seen) if _enough(labels, last.setting) else last
-    rows, freedom = problem.linearised(), problem.freedom
+    unprojected = UnprojectedTracks.through(state.camera, tracks)
+    labels, distance2 = assign_roads(state, unprojected)
+    problem = Problem(state, tracks, labels, last.config, warm_start, unprojected) if _enough_rows(labels, last.config) else last
+    rows, dof = problem.linearise(), problem.dof
     scales = problem.scales(rows.squared)
-    scale = scales[problem.kind]
-    limit = TIGHTEST * scale
-    shared = problem.share * rows.influence / scale
+    scale = scales[problem.block_of_row]
+    limit = FINAL_ROBUST_LIMIT * scale
+    shared = problem.vehicle_weight * rows.influence / scale
     weight = shared * influence(rows.squared, limit)
-    bend = -4.0 / limit / freedom * shared / (1.0 + rows.squared / limit) ** 3
-    _, prior = problem.steps.prior_gradient(state.camera)
-    covariance = cluster_covariance(rows.gradient, rows.curvature, weight, bend, problem.owners, prior)
-    covariance += np.diag(_unmodelled(problem.steps) ** 2)
-    road = problem.kind == 0
+    second_order = -4.0 / limit / dof * shared / (1.0 + rows.squared / limit) ** 3
+    _, prior = problem.parameters.prior_gradient(state.camera)
+    covariance = jackknife_covariance(rows.gradient, rows.curvature, weight, second_order, problem.vehicle_ids, prior)
+    covariance += np.diag(_unmodelled(problem.parameters) ** 2)
+    road = problem.block_of_row == 0
     whitened2 = np.full(len(tracks), np.inf)
     whitened2[problem.used] = rows.squared[road]
     information = np.tensordot(weight, rows.curvature, 1)
     pulls = rows.gradient[road] * np.sqrt(influence(rows.squared, limit)[road])[:, None]
     pulls = pulls / np.sqrt(np.maximum(np.diag(information), 1e-12))
-    return JointFit(
+    return Adjustment(
         state=state, labels=labels, distance_px=np.sqrt(distance2), whitened2=whitened2, turning2=rows.squared[~road],
         scales=scales, problem=problem, covariance=covariance, information=information,
         turning_information=np.tensordot(weight[~road], rows.curvature[~road], 1),
-        vehicle_correlation=correlation_within(problem.owners[road], pulls))
+        vehicle_correlation=intraclass_correlation(problem.vehicle_ids[road], pulls))
 
 
-def _unmodelled(steps: Steps) -> np.ndarray:
+def _unmodelled(parameters: Parameterisation) -> np.ndarray:
     """Standard deviation (parameters,) of each parameter that the residuals know nothing of."""
-    sigma = np.zeros(steps.size)
-    sigma[:steps.lens][steps.setting.prior.free == 0] = UNMODELLED_FOCAL
-    sigma[steps.lens:steps.lens + len(steps.axes)] = UNMODELLED_RAD
+    sigma = np.zeros(parameters.size)
+    sigma[:parameters.lens][parameters.config.prior.free == 0] = UNMODELLED_FOCAL
+    sigma[parameters.lens:parameters.lens + len(parameters.axes)] = UNMODELLED_RAD
     return sigma
 
 
-def with_bodies(fit: JointFit, tracks: TrackSet) -> TrackSet:
+def regroup_vehicles(fit: Adjustment, tracks: TrackSet) -> TrackSet:
     """Return the tracks with vehicles that are bodies on the ground of a solution."""
-    rays = rays_of(fit.state.camera, tracks.pixels)
-    up = ground_up(fit.state, fit.problem.setting, rays)
-    height = fit.problem.setting.height_m or USUAL_HEIGHT_M
-    below = np.maximum(-(rays.bearings @ up), NEAREST_HORIZON)
+    rays = unproject_rays(fit.state.camera, tracks.pixels)
+    up = upward_normal(fit.state, fit.problem.config, rays)
+    height = fit.problem.config.height_m or DEFAULT_CAMERA_HEIGHT_M
+    below = np.maximum(-(rays.bearings @ up), MIN_DEPRESSION_GROUPING_RAD)
     ground_m = height * (rays.bearings @ fit.state.rotation[:, :2]) / below[..., None]
     return replace(tracks, vehicles=bodies(tracks, ground_m))
 
 
-def judged_with(fit: JointFit, tracks: TrackSet, setting: Setting) -> JointFit:
+def evaluate_with(fit: Adjustment, tracks: TrackSet, config: AdjustmentConfig) -> Adjustment:
     """Measure the uncertainty of a solution under another setting, such as one that holds less."""
-    inner = fit.problem.inner
-    return _judged(Problem(fit.state, tracks, fit.labels, setting, inner), fit.state, inner, tracks)
+    warm_start = fit.problem.warm_start
+    return _evaluate(Problem(fit.state, tracks, fit.labels, config, warm_start), fit.state, warm_start, tracks)
 
 
-def judged_at(state: State, tracks: TrackSet, setting: Setting, covariance: np.ndarray) -> JointFit:
+def evaluate_at(state: AdjustmentState, tracks: TrackSet, config: AdjustmentConfig, covariance: np.ndarray) -> Adjustment:
     """See how tracks follow the roads of a state that was found otherwise, with the covariance that it has from there.
 
-    Its parameters are those of `Steps(state, setting)`.
+    Its parameters are those of `Parameterisation(state, setting)`.
     """
-    labels, _ = assign(state, Seen.through(state.camera, tracks))
-    fit = _judged(Problem(state, tracks, labels, setting), state, (None, None, None), tracks)
+    labels, _ = assign_roads(state, UnprojectedTracks.through(state.camera, tracks))
+    fit = _evaluate(Problem(state, tracks, labels, config), state, (None, None, None), tracks)
     return replace(fit, covariance=covariance)
 
 
-def road_support(fit: JointFit, tracks: TrackSet) -> list[np.ndarray]:
+def road_support(fit: Adjustment, tracks: TrackSet) -> list[np.ndarray]:
     """For each road, which tracks (masks, shape (tracks,)) it explains and no other road could.
 
     A second direction close to the first, or met only by short tracks, is an echo of the first; a real road's
     tracks miss the other road's circles by many times the noise.
     """
-    seen = Seen.through(fit.state.camera, tracks)
-    distance = np.sqrt(distances2_through(seen.matrix, fit.state.directions))
-    explained = fit.explained()
-    typical = float(np.median(fit.distance_px[explained])) if explained.any() else np.inf
+    unprojected = UnprojectedTracks.through(fit.state.camera, tracks)
+    distance = np.sqrt(squared_distances_through(unprojected.matrix, fit.state.directions))
+    inliers = fit.inliers()
+    typical = float(np.median(fit.distance_px[inliers])) if inliers.any() else np.inf
     support = []
     for road in range(len(distance)):
         others = np.delete(distance, road, axis=0)
         nearest_other = others.min(axis=0) if len(others) else np.full(len(tracks), np.inf)
-        apart = nearest_other > DISCRIMINATION * np.maximum(distance[road], typical)
-        support.append(explained & (fit.labels == road) & apart)
+        apart = nearest_other > MIN_ROAD_DISTANCE_RATIO * np.maximum(distance[road], typical)
+        support.append(inliers & (fit.labels == road) & apart)
     return support

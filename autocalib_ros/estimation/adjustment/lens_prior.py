@@ -17,16 +17,16 @@ from autocalib_ros.lens.camera import Camera, image_centre
 
 EQUIDISTANT = (0.0, 0.0, 0.0, 0.0)
 DISTORTION_FREE = (1 / 3, 2 / 15, 17 / 315, 62 / 2835)
-BETWEEN = (1 / 6, 1 / 30, 0.0, 0.0)
-BETWEEN_SIGMA = (1 / 6, 1 / 30)
+KANNALA_BRANDT = (1 / 6, 1 / 30, 0.0, 0.0)
+KANNALA_BRANDT_SIGMA = (1 / 6, 1 / 30)
 """Any lens between the two families, each a sigma away."""
 K2_SIGMA = 0.02
 """Standard deviation of k2 about its family: at one radian it moves an image point by 2 %, as k1 does by 3 %."""
-PRINCIPAL_POINT_SHARE = 0.01
+PRINCIPAL_POINT_SIGMA_FRACTION = 0.01
 """Standard deviation of the principal point, share of the image width, unless given in pixels."""
-LOOSE_POINT_SHARE = 0.1
+LOOSE_PRINCIPAL_POINT_SIGMA_FRACTION = 0.1
 """The same for evidence that tells the principal point: an image may be cut out of a larger one, or magnified."""
-PARAMETERS = ('focal length', 'principal point x', 'principal point y', 'k1', 'k2')
+LENS_PARAMETERS = ('focal length', 'principal point x', 'principal point y', 'k1', 'k2')
 
 
 @dataclass(frozen=True)
@@ -84,19 +84,19 @@ class LensPrior:
         """Return the centre with a focal length to start from; the prior's own where it has one."""
         return self.centre if self.focal_known else replace(self.centre, focal_px=float(focal_px))
 
-    def holding(self, names: tuple[str, ...]) -> LensPrior:
+    def with_fixed(self, names: tuple[str, ...]) -> LensPrior:
         """Return the prior with parameters held."""
-        held = np.array([name in names for name in PARAMETERS])
-        return replace(self, sigma=np.where(held, 0.0, self.sigma))
+        fixed = np.array([name in names for name in LENS_PARAMETERS])
+        return replace(self, sigma=np.where(fixed, 0.0, self.sigma))
 
-    def loosened(self) -> LensPrior:
+    def with_loose_principal_point(self) -> LensPrior:
         """Return the prior with the principal point anywhere near the middle, and k2 free, unless these are held."""
         sigma = self.sigma.copy()
-        sigma[1:3] = np.where(sigma[1:3] > 0, LOOSE_POINT_SHARE * self.centre.width, 0.0)
+        sigma[1:3] = np.where(sigma[1:3] > 0, LOOSE_PRINCIPAL_POINT_SIGMA_FRACTION * self.centre.width, 0.0)
         sigma[4] = max(sigma[4], K2_SIGMA) if sigma[3] > 0 else sigma[4]
         return replace(self, sigma=sigma)
 
-    def with_k2(self) -> LensPrior:
+    def with_free_k2(self) -> LensPrior:
         """Return the prior with k2 set free about its centre."""
         sigma = self.sigma.copy()
         sigma[4] = K2_SIGMA
@@ -112,13 +112,13 @@ def lens_priors(image_size: tuple[int, int], options: JointOptions) -> list[Lens
     """Return the families to choose from, the most usual one first."""
     width, _ = image_size
     point = options.principal_point_sigma_px
-    point = PRINCIPAL_POINT_SHARE * width if point < 0 else point
+    point = PRINCIPAL_POINT_SIGMA_FRACTION * width if point < 0 else point
     focal = options.focal_prior_px
     log_focal = options.focal_sigma_px / focal if focal > 0 else np.inf
     families = {
         'equidistant': (EQUIDISTANT, (options.k1_sigma, 0.0)),
         'distortion_free': (DISTORTION_FREE, (options.k1_sigma, 0.0)),
-        'kannala_brandt': (BETWEEN, BETWEEN_SIGMA)}
+        'kannala_brandt': (KANNALA_BRANDT, KANNALA_BRANDT_SIGMA)}
     names = families if options.lens_prior == 'auto' else [options.lens_prior]
     centre = Camera(*image_size, focal if focal > 0 else float(width), image_centre(*image_size))
     return [LensPrior(name, replace(centre, k=families[name][0]),

@@ -15,12 +15,12 @@ from autocalib_ros.estimation.observations.two_frame_windows import Windows, no_
 from autocalib_ros.geometry.great_circles import Rays
 from autocalib_ros.lens.camera import Camera
 
-ALONG_X = 0.2
+MIN_SINE_TO_X_AXIS = 0.2
 """Sine of the angle to the camera's x axis below which a road does not tell the plane of a camera without roll."""
 
 
 @dataclass(frozen=True)
-class State:
+class AdjustmentState:
     """Lens and roads: road j runs along `rotation` applied to (cos, sin, 0) of `angles_rad[j]`; the first is 0."""
 
     camera: Camera
@@ -41,7 +41,7 @@ class State:
 
 
 @dataclass(frozen=True)
-class Setting:
+class AdjustmentConfig:
     """What a solution is given besides tracks and a start."""
 
     prior: LensPrior
@@ -67,16 +67,16 @@ class Setting:
 
 
 @dataclass(frozen=True)
-class Steps:
+class Parameterisation:
     """The parameters, as steps from a base: free ones of the lens in their units, turns of the plane, road angles."""
 
-    base: State
-    setting: Setting
+    base: AdjustmentState
+    config: AdjustmentConfig
 
     @property
     def lens(self) -> int:
         """Number of free parameters of the lens; they come first."""
-        return len(self.setting.prior.free)
+        return len(self.config.prior.free)
 
     @cached_property
     def axes(self) -> np.ndarray:
@@ -84,36 +84,36 @@ class Steps:
         roads, every = len(self.base.angles_rad), np.eye(3)
         if roads == 0:
             return every[:2]  # headings in the plane mean nothing
-        return every if roads > 1 or self.setting.turning else every[1:]  # one road turns freely about itself
+        return every if roads > 1 or self.config.turning else every[1:]  # one road turns freely about itself
 
     @cached_property
     def free_angles(self) -> tuple[int, ...]:
         """Roads whose angle is free: the first is the frame, the second may be held."""
-        held = self.setting.crossing_rad is not None and len(self.base.angles_rad) > 1
-        return tuple(range(2 if held else 1, len(self.base.angles_rad)))
+        fixed = self.config.crossing_rad is not None and len(self.base.angles_rad) > 1
+        return tuple(range(2 if fixed else 1, len(self.base.angles_rad)))
 
     @property
     def size(self) -> int:
         """Number of parameters."""
         return self.lens + len(self.axes) + len(self.free_angles)
 
-    def state(self, step: np.ndarray) -> State:
+    def state(self, step: np.ndarray) -> AdjustmentState:
         """Return the state at a step (parameters,) from the base."""
         turns = self.lens + len(self.axes)
         angles = self.base.angles_rad.copy()
         angles[list(self.free_angles)] += step[turns:]
-        return State(self.camera(step[:self.lens]), self.base.rotation @ self.turned(step[self.lens:turns]), angles)
+        return AdjustmentState(self.camera(step[:self.lens]), self.base.rotation @ self.turned(step[self.lens:turns]), angles)
 
-    def to(self, state: State) -> np.ndarray:
+    def step_to(self, state: AdjustmentState) -> np.ndarray:
         """Return the step (parameters,) from the base to a state near it, as far as the parameters reach."""
         turn = Rotation.from_matrix(self.base.rotation.T @ state.rotation).as_rotvec()
         angles = np.angle(np.exp(1j * (state.angles_rad - self.base.angles_rad)))
-        return np.concatenate([self.setting.prior.step(self.base.camera, state.camera), self.axes @ turn,
+        return np.concatenate([self.config.prior.step(self.base.camera, state.camera), self.axes @ turn,
                                angles[list(self.free_angles)]])
 
     def camera(self, step: np.ndarray) -> Camera:
         """Return the lens at a step (lens,) of its own parameters."""
-        return self.setting.prior.moved(self.base.camera, step)
+        return self.config.prior.moved(self.base.camera, step)
 
     def turned(self, step: np.ndarray) -> np.ndarray:
         """Return the rotation matrix of a step (turns,) about the axes."""
@@ -122,15 +122,15 @@ class Steps:
     def prior_gradient(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
         """Gradient (parameters,) and information (parameters,) of the prior at a camera."""
         gradient, information = np.zeros(self.size), np.zeros(self.size)
-        gradient[:self.lens] = self.setting.prior.deviations(camera)
-        information[:self.lens] = self.setting.prior.information
+        gradient[:self.lens] = self.config.prior.deviations(camera)
+        information[:self.lens] = self.config.prior.information
         return gradient, information
 
 
-def ground_up(state: State, setting: Setting, rays: Rays) -> np.ndarray:
+def upward_normal(state: AdjustmentState, config: AdjustmentConfig, rays: Rays) -> np.ndarray:
     """Normal (3,) of the plane away from the traffic; where one road is all that is known, of an unrolled camera."""
     normal = state.rotation[:, 2]
-    if len(state.angles_rad) == 1 and not setting.turning:
+    if len(state.angles_rad) == 1 and not config.turning:
         normal = level_normal(state.directions[0])
     above = np.count_nonzero(rays.bearings @ normal > 0)
     return -normal if above > 0.5 * rays.bearings[..., 0].size else normal
@@ -143,11 +143,11 @@ def level_normal(along: np.ndarray) -> np.ndarray:
     """
     level = np.cross(along, [1.0, 0.0, 0.0])
     image_up = along[1] * along - [0.0, 1.0, 0.0]
-    normal = level if np.linalg.norm(level) > ALONG_X else image_up
+    normal = level if np.linalg.norm(level) > MIN_SINE_TO_X_AXIS else image_up
     return normal / max(np.linalg.norm(normal), 1e-9)
 
 
-def initial_state(camera: Camera, found: Directions) -> State:
+def initial_state(camera: Camera, found: RoadDirections) -> AdjustmentState:
     """Build the state of directions found by consensus: the first is x, the plane is that of the first two."""
     first = found.directions[0]
     second = found.directions[1] if len(found.directions) > 1 else np.roll(first, 1)
@@ -155,10 +155,10 @@ def initial_state(camera: Camera, found: Directions) -> State:
     normal /= np.linalg.norm(normal)
     rotation = np.column_stack([first, np.cross(normal, first), normal])
     inplane = found.directions @ rotation
-    return State(camera, rotation, np.arctan2(inplane[:, 1], inplane[:, 0]))
+    return AdjustmentState(camera, rotation, np.arctan2(inplane[:, 1], inplane[:, 0]))
 
 
-def crossed(state: State, crossing_rad: float | None) -> State:
+def with_crossing_angle(state: AdjustmentState, crossing_rad: float | None) -> AdjustmentState:
     """Return the state with its second road at an angle to the first, on the side where it is."""
     if crossing_rad is None or len(state.angles_rad) < 2:
         return state
@@ -169,7 +169,7 @@ def crossed(state: State, crossing_rad: float | None) -> State:
 
 
 @dataclass(frozen=True)
-class Directions:
+class RoadDirections:
     """Road directions found by consensus."""
 
     directions: np.ndarray

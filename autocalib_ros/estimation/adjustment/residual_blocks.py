@@ -11,21 +11,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from autocalib_ros.estimation.adjustment.noise_model import on_road, whitening
-from autocalib_ros.estimation.adjustment.parameters import State, Steps, ground_up
+from autocalib_ros.estimation.adjustment.noise_model import locate_on_road, whitening_matrices
+from autocalib_ros.estimation.adjustment.parameters import AdjustmentState, Parameterisation, upward_normal
 from autocalib_ros.estimation.motion.planar_motion import Motion, View, first_motion, settled, trust
 from autocalib_ros.estimation.motion.rigid_bodies import Bundle, Shapes, lifted
-from autocalib_ros.estimation.observations.track_set import Seen, TrackSet
+from autocalib_ros.estimation.observations.track_set import TrackSet, UnprojectedTracks
 from autocalib_ros.estimation.observations.vehicle_grouping import corroborated, heading_off_deg
-from autocalib_ros.geometry.great_circles import Rays, fit_circles_through, rays_of
+from autocalib_ros.geometry.great_circles import Rays, fit_circles_through, unproject_rays
 from autocalib_ros.geometry.small_matrices import cross, dot
 
-DIFFERENCE = 1e-6
+DIFFERENTIATION_STEP = 1e-6
 """Step of the parameters, in their units, by which distances are differentiated where no closed form is used."""
 
 
 @dataclass(frozen=True)
-class Rows:
+class LinearisedRows:
     """What each row tells at the base, its own unknowns solved: its residuals r and their derivatives J, in sums."""
 
     squared: np.ndarray
@@ -38,35 +38,35 @@ class Rows:
     """Weight by what speaks for a row besides its own residuals, shape (rows,)."""
 
     @classmethod
-    def of(cls, residuals: np.ndarray, slopes: np.ndarray, freedom: np.ndarray, influence: np.ndarray) -> Rows:
+    def of(cls, residuals: np.ndarray, slopes: np.ndarray, dof: np.ndarray, influence: np.ndarray) -> LinearisedRows:
         """Sum up residuals (rows, samples) and slopes (rows, samples, parameters)."""
         transposed = slopes.transpose(0, 2, 1)
-        return cls((residuals**2).sum(axis=1) / freedom, (transposed @ residuals[..., None])[..., 0],
+        return cls((residuals**2).sum(axis=1) / dof, (transposed @ residuals[..., None])[..., 0],
                    transposed @ slopes, influence)
 
 
-class RoadRows:
+class StraightTrackBlock:
     """Labelled tracks, each on a great circle through the direction of its road."""
 
-    def __init__(self, steps: Steps, tracks: TrackSet, labels: np.ndarray, seen: Seen,
-                 share: np.ndarray) -> None:
-        self._steps, self._tracks, self._labels = steps, tracks, labels
-        self.owners, self.share = tracks.vehicles, share
+    def __init__(self, parameters: Parameterisation, tracks: TrackSet, labels: np.ndarray, unprojected: UnprojectedTracks,
+                 vehicle_weight: np.ndarray) -> None:
+        self._parameters, self._tracks, self._labels = parameters, tracks, labels
+        self.vehicle_ids, self.vehicle_weight = tracks.vehicles, vehicle_weight
         self._mask = tracks.weights > 0
-        base, setting = steps.base, steps.setting
-        self.freedom = np.maximum(self._mask.sum(axis=1) - 1, 1)
+        base, config = parameters.base, parameters.config
+        self.dof = np.maximum(self._mask.sum(axis=1) - 1, 1)
         self._directions = base.directions[labels]
-        self._rays = seen.rays
-        normals, _ = fit_circles_through(seen.matrix, self._directions)
+        self._rays = unprojected.rays
+        normals, _ = fit_circles_through(unprojected.matrix, self._directions)
         self._scale = self._rays.pixel_scale(normals[:, None])
-        self._up = ground_up(base, setting, self._rays)
-        self._road = on_road(self._rays, normals, self._directions, self._up, setting.height_m)
-        self.whiten = whitening(tracks.pixels, self._mask, self._road, setting.options, drifting=setting.drifting)
+        self._up = upward_normal(base, config, self._rays)
+        self._road = locate_on_road(self._rays, normals, self._directions, self._up, config.height_m)
+        self.whiten = whitening_matrices(tracks.pixels, self._mask, self._road, config.options, drifting=config.drifting)
         self._normals = self._circles(base, self._rays)
         self._scale = self._rays.pixel_scale(self._normals[:, None])
         self._normals = self._circles(base, self._rays)
 
-    def _circles(self, state: State, rays: Rays) -> np.ndarray:
+    def _circles(self, state: AdjustmentState, rays: Rays) -> np.ndarray:
         """Normals (tracks, 3) of each track's best circle through its road's direction, in whitened distances."""
         whitened = self.whiten @ (rays.bearings * self._scale[..., None])
         normals, _ = fit_circles_through(whitened.transpose(0, 2, 1) @ whitened, state.directions[self._labels])
@@ -74,10 +74,10 @@ class RoadRows:
 
     def at(self, step: np.ndarray) -> tuple[None, np.ndarray]:
         """Mean squared whitened distance of each track from its circle, shape (tracks,); nothing to go on from."""
-        state = self._steps.state(step)
-        rays = rays_of(state.camera, self._tracks.pixels)
+        state = self._parameters.state(step)
+        rays = unproject_rays(state.camera, self._tracks.pixels)
         distance = rays.distance_px(self._circles(state, rays)[:, None])
-        return None, ((self.whiten @ distance[..., None])[..., 0]**2).sum(axis=1) / self.freedom
+        return None, ((self.whiten @ distance[..., None])[..., 0]**2).sum(axis=1) / self.dof
 
     def distances_px(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Observed pixels (n, 2), their distances from the circles (n,), and their tracks (n,), at the base."""
@@ -90,17 +90,17 @@ class RoadRows:
         diagonal = np.diagonal(self.whiten, axis1=1, axis2=2)
         return np.where(self._mask, np.log(np.where(self._mask, diagonal, 1.0)), 0.0).sum(axis=1)
 
-    def linearised(self) -> Rows:
+    def linearise(self) -> LinearisedRows:
         """Residuals at the base and their derivatives.
 
         The lens by differences of the exact residual: its gradient changes with the lens too, and that small
         term decides where the minimum lies. The roads in closed form: a direction d that moves by dd turns a
         normal n by -(n.dd) d. The circle's own angle is projected out.
         """
-        rays, normals, steps = self._rays, self._normals[:, None], self._steps
+        rays, normals, parameters = self._rays, self._normals[:, None], self._parameters
         scale = rays.pixel_scale(normals)
         here = dot(rays.bearings, normals) * scale
-        columns = [(self._distance(unit, normals) - here) / DIFFERENCE for unit in np.eye(steps.lens)]
+        columns = [(self._distance(unit, normals) - here) / DIFFERENTIATION_STEP for unit in np.eye(parameters.lens)]
         across = here * scale
         # distance over gradient: the second term is how the gradient itself turns with the normal
         pull = rays.bearings - across[..., None] * (dot(rays.radial, normals)[..., None] * rays.radial
@@ -112,59 +112,59 @@ class RoadRows:
         slopes = self.whiten @ np.stack([free, *columns], axis=-1)
         free, slopes = slopes[..., :1], slopes[..., 1:]
         along = (free * slopes).sum(axis=1, keepdims=True) / np.maximum((free * free).sum(axis=1, keepdims=True), 1e-12)
-        return Rows.of((self.whiten @ here[..., None])[..., 0], slopes - free * along, self.freedom,
-                       self._vehicles_influence(here))
+        return LinearisedRows.of((self.whiten @ here[..., None])[..., 0], slopes - free * along, self.dof,
+                       self._lane_keeping_weights(here))
 
     def _distance(self, unit: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        return rays_of(self._steps.camera(DIFFERENCE * unit), self._tracks.pixels).distance_px(normals)
+        return unproject_rays(self._parameters.camera(DIFFERENTIATION_STEP * unit), self._tracks.pixels).distance_px(normals)
 
     def _turns(self) -> list[np.ndarray]:
         """Change (tracks, 3) of each track's direction with each parameter of the roads."""
-        base = self._steps.base
-        turns = [cross(axis, base.in_plane)[self._labels] @ base.rotation.T for axis in self._steps.axes]
+        base = self._parameters.base
+        turns = [cross(axis, base.in_plane)[self._labels] @ base.rotation.T for axis in self._parameters.axes]
         sideways = cross(np.array([0.0, 0.0, 1.0]), base.in_plane)[self._labels] @ base.rotation.T
-        return turns + [sideways * (self._labels == road)[:, None] for road in self._steps.free_angles]
+        return turns + [sideways * (self._labels == road)[:, None] for road in self._parameters.free_angles]
 
-    def _vehicles_influence(self, distance_px: np.ndarray) -> np.ndarray:
+    def _lane_keeping_weights(self, distance_px: np.ndarray) -> np.ndarray:
         """Influence (tracks,) of tracks by whether their vehicles keep to their roads; 1 where nothing drifts."""
-        if not self._steps.setting.drifting:
+        if not self._parameters.config.drifting:
             return np.ones(len(self._tracks))
         side = np.where(self._normals @ self._up < 0, -1.0, 1.0)[:, None]
         off, error = heading_off_deg(side * distance_px, self._road.px_per_m, self._road.along_m, self._mask)
         return corroborated(off, error, self._tracks.vehicles, self._labels)
 
 
-class MotionRows:
+class PlanarMotionBlock:
     """Windows, each with the motion in the plane that suits it best; `motion` is one near it, None unknown."""
 
-    def __init__(self, steps: Steps, motion: Motion | None) -> None:
-        self._steps, self._windows = steps, steps.setting.windows
-        self.owners, self.share = self._windows.bodies, self._windows.share_of_body
-        self._base = view = self._view(steps.base)
-        self.inner = first_motion(view) if motion is None else settled(view, motion)
-        self._here = view.distances(self.inner)
-        self._slopes = view.slopes(self.inner, self._here)
+    def __init__(self, parameters: Parameterisation, motion: Motion | None) -> None:
+        self._parameters, self._windows = parameters, parameters.config.windows
+        self.vehicle_ids, self.vehicle_weight = self._windows.bodies, self._windows.share_of_body
+        self._base = view = self._view(parameters.base)
+        self.warm_start = first_motion(view) if motion is None else settled(view, motion)
+        self._here = view.distances(self.warm_start)
+        self._slopes = view.slopes(self.warm_start, self._here)
         self._root = np.sqrt(trust(self._here))
-        self.freedom = np.maximum(view.mask.sum(axis=1) - 2, 1)
+        self.dof = np.maximum(view.mask.sum(axis=1) - 2, 1)
 
-    def _view(self, state: State) -> View:
-        return View.of(self._windows, state.camera, state.rotation, self._steps.setting.options)
+    def _view(self, state: AdjustmentState) -> View:
+        return View.of(self._windows, state.camera, state.rotation, self._parameters.config.options)
 
     def at(self, step: np.ndarray) -> tuple[Motion, np.ndarray]:
         """Motion at a step and mean squared distances, shape (windows,)."""
-        view = self._view(self._steps.state(step))
-        motion = settled(view, self.inner)
-        return motion, ((self._root * view.distances(motion))**2).sum(axis=1) / self.freedom
+        view = self._view(self._parameters.state(step))
+        motion = settled(view, self.warm_start)
+        return motion, ((self._root * view.distances(motion))**2).sum(axis=1) / self.dof
 
-    def linearised(self) -> Rows:
+    def linearise(self) -> LinearisedRows:
         """Residuals at the base and their derivatives, by differences; the window's own motion projected out."""
-        steps = self._steps
-        columns = [(self._moved(unit) - self._here) / DIFFERENCE for unit in np.eye(steps.size)]
+        parameters = self._parameters
+        columns = [(self._distances_at(unit) - self._here) / DIFFERENTIATION_STEP for unit in np.eye(parameters.size)]
         slopes = self._root[..., None] * np.stack(columns, axis=-1)
         own = self._root[..., None] * self._slopes
         matrix = own.transpose(0, 2, 1) @ own + 1e-9 * np.eye(2)
         slopes = slopes - own @ np.linalg.solve(matrix, own.transpose(0, 2, 1) @ slopes)
-        return Rows.of(self._root * self._here, slopes, self.freedom, np.ones(len(self.freedom)))
+        return LinearisedRows.of(self._root * self._here, slopes, self.dof, np.ones(len(self.dof)))
 
     def distances_px(self) -> tuple[np.ndarray, np.ndarray]:
         """Observed pixels (n, 2) and how far each misses the motion of its window (n,), at the base."""
@@ -172,25 +172,25 @@ class MotionRows:
         distance = np.abs(self._here * self._base.sigma_px)
         return self._windows.second_px[window, point], distance[window, point]
 
-    def _moved(self, unit: np.ndarray) -> np.ndarray:
+    def _distances_at(self, unit: np.ndarray) -> np.ndarray:
         """Distances a small step away, the motions as they are."""
-        lens, turns = self._steps.lens, self._steps.lens + len(self._steps.axes)
+        lens, turns = self._parameters.lens, self._parameters.lens + len(self._parameters.axes)
         if unit[turns:].any():
             return self._here  # the angle of a road is nothing to a window
-        view = self._base.turned(self._steps.turned(DIFFERENCE * unit[lens:turns])) if unit[lens:].any() else (
-            self._view(self._steps.state(DIFFERENCE * unit)))
-        return view.distances(self.inner)
+        view = self._base.turned(self._parameters.turned(DIFFERENTIATION_STEP * unit[lens:turns])) if unit[lens:].any() else (
+            self._view(self._parameters.state(DIFFERENTIATION_STEP * unit)))
+        return view.distances(self.warm_start)
 
 
-class LifeRows:
+class RigidBodyBlock:
     """Lives of rigid bodies, each with the shape and the way that suit it best; `shapes` are near, None unknown."""
 
-    def __init__(self, steps: Steps, bundle: Bundle, shapes: Shapes | None) -> None:
-        self._steps, self._bundle, base = steps, bundle, steps.base
-        self.owners, self.share, self.freedom = bundle.lives.bodies, bundle.lives.share_of_body, bundle.freedom
-        self.inner = (bundle.begun(base.camera, base.rotation) if shapes is None
+    def __init__(self, parameters: Parameterisation, bundle: Bundle, shapes: Shapes | None) -> None:
+        self._parameters, self._bundle, base = parameters, bundle, parameters.base
+        self.vehicle_ids, self.vehicle_weight, self.dof = bundle.lives.bodies, bundle.lives.share_of_body, bundle.dof
+        self.warm_start = (bundle.begun(base.camera, base.rotation) if shapes is None
                       else bundle.settled(base.camera, base.rotation, shapes))
-        here = bundle.residuals(base.camera, base.rotation, self.inner)
+        here = bundle.residuals(base.camera, base.rotation, self.warm_start)
         self._root = np.sqrt(bundle.trust(here))[:, :, None, None]
         self._here = here
         self._follow: np.ndarray | None = None
@@ -198,29 +198,29 @@ class LifeRows:
 
     def at(self, step: np.ndarray) -> tuple[Shapes, np.ndarray]:
         """Shapes at a step and mean squared residuals, shape (lives,)."""
-        state = self._steps.state(step)
-        near = self.inner if self._follow is None else self.inner.stepped(-(self._follow @ step))
+        state = self._parameters.state(step)
+        near = self.warm_start if self._follow is None else self.warm_start.stepped(-(self._follow @ step))
         shapes = self._bundle.settled(state.camera, state.rotation, near)
         residuals = self._root * self._bundle.residuals(state.camera, state.rotation, shapes)
-        return shapes, (residuals**2).sum(axis=(1, 2, 3)) / self.freedom
+        return shapes, (residuals**2).sum(axis=(1, 2, 3)) / self.dof
 
-    def linearised(self) -> Rows:
+    def linearise(self) -> LinearisedRows:
         """Residuals at the base and their derivatives; what is unknown of each life projected out."""
-        steps, bundle, base = self._steps, self._bundle, self._steps.base
-        slopes, by_place = bundle.slopes(base.camera, base.rotation, self.inner)
-        lenses = [steps.camera(DIFFERENCE * unit) for unit in np.eye(steps.lens)]
-        columns = [change / DIFFERENCE
-                   for change in bundle.by_lens(lenses, base.camera, base.rotation, self.inner)]
-        columns += [bundle.by_turn(axis, by_place, self.inner) for axis in steps.axes]
-        columns += [np.zeros(self._here.shape)] * len(steps.free_angles)
+        parameters, bundle, base = self._parameters, self._bundle, self._parameters.base
+        slopes, by_place = bundle.slopes(base.camera, base.rotation, self.warm_start)
+        lenses = [parameters.camera(DIFFERENTIATION_STEP * unit) for unit in np.eye(parameters.lens)]
+        columns = [change / DIFFERENTIATION_STEP
+                   for change in bundle.by_lens(lenses, base.camera, base.rotation, self.warm_start)]
+        columns += [bundle.by_turn(axis, by_place, self.warm_start) for axis in parameters.axes]
+        columns += [np.zeros(self._here.shape)] * len(parameters.free_angles)
         own, here = bundle.flat(slopes, self._here)
-        shared = (self._root[..., None] * np.stack(columns, axis=-1)).reshape(len(own), -1, steps.size)
+        shared = (self._root[..., None] * np.stack(columns, axis=-1)).reshape(len(own), -1, parameters.size)
         matrix = lifted(own.transpose(0, 2, 1) @ own, np.zeros(len(own)))
         self._follow = np.linalg.solve(matrix, own.transpose(0, 2, 1) @ shared)
-        return Rows.of(here, shared - own @ self._follow, self.freedom, np.ones(len(own)))
+        return LinearisedRows.of(here, shared - own @ self._follow, self.dof, np.ones(len(own)))
 
     def distances_px(self) -> tuple[np.ndarray, np.ndarray]:
         """Observed pixels (n, 2) and how far each is from its place on the body (n,), at the base."""
-        base, lives = self._steps.base, self._bundle.lives
-        away = self._bundle.misses_px(base.camera, base.rotation, self.inner)
+        base, lives = self._parameters.base, self._bundle.lives
+        away = self._bundle.misses_px(base.camera, base.rotation, self.warm_start)
         return lives.pixels[lives.mask], np.hypot(*away[lives.mask].T)

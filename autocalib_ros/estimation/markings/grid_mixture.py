@@ -12,7 +12,7 @@ from functools import lru_cache, partial
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from autocalib_ros.estimation.adjustment.covariance import cluster_covariance
+from autocalib_ros.estimation.adjustment.covariance import jackknife_covariance
 from autocalib_ros.estimation.adjustment.lens_prior import LensPrior
 from autocalib_ros.estimation.markings.road_segments import Lines, Sight
 from autocalib_ros.geometry.robust_kernels import folded, robust, student
@@ -178,7 +178,7 @@ def settled_grid(lines: Lines, prior: LensPrior, camera: Camera, rotation: np.nd
     cost, members = mixture.cost(pose, sigmas)
     gradients, curvatures = mixture.linearised(pose, members, sigmas)
     _, known = mixture.known(pose)
-    covariance = cluster_covariance(gradients, curvatures, lines.weights, np.zeros(len(lines)), lines.groups, known)
+    covariance = jackknife_covariance(gradients, curvatures, lines.weights, np.zeros(len(lines)), lines.groups, known)
     units = np.append(np.ones(len(known) - 1), ASKEW_RAD)
     information = (np.tensordot(lines.weights, curvatures, 1) + np.diag(known + 1e-9)) * np.outer(units, units)
     return Grid(prior, pose.camera, pose.rotation, pose.askew_rad, cost, mixture.shares, members,

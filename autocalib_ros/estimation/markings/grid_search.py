@@ -20,7 +20,7 @@ from autocalib_ros.estimation.adjustment.lens_prior import LensPrior
 from autocalib_ros.estimation.markings.grid_mixture import LOWEST, Grid, settled_grid, widened_costs
 from autocalib_ros.estimation.markings.road_segments import Lines, along_lines, traffic_places, within
 from autocalib_ros.evidence.snapshot import Evidence
-from autocalib_ros.geometry.great_circles import rays_of
+from autocalib_ros.geometry.great_circles import unproject_rays
 from autocalib_ros.lens.camera import Camera
 
 NEAR_TRAFFIC_HEIGHTS = 0.5
@@ -101,7 +101,7 @@ def beside_traffic(lines: Lines, grid: Grid, evidence: Evidence) -> tuple[Lines,
 
 def _on_plane(grid: Grid, pixels: np.ndarray) -> np.ndarray:
     """Places (..., 2) of pixels (..., 2) on the plane in heights of the camera, nan where they are too far away."""
-    bearings = rays_of(grid.camera, pixels).bearings @ grid.rotation
+    bearings = unproject_rays(grid.camera, pixels).bearings @ grid.rotation
     below = np.where(bearings[..., 2] < -LOWEST, -bearings[..., 2], np.nan)
     return bearings[..., :2] / below[..., None]
 

@@ -9,17 +9,17 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from autocalib_ros.config import GateOptions
-from autocalib_ros.estimation.adjustment.bundle_adjustment import JointFit, judged_at
+from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment, evaluate_at
 from autocalib_ros.estimation.adjustment.lens_prior import LensPrior
-from autocalib_ros.estimation.adjustment.parameters import Setting, State, Steps
+from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig, AdjustmentState, Parameterisation
 from autocalib_ros.estimation.markings.grid_mixture import ASKEW_RAD, Grid
 from autocalib_ros.estimation.markings.grid_search import beside_traffic, square_grids, square_grids_near
 from autocalib_ros.estimation.markings.road_segments import Lines, Sight, lines_on_road
 from autocalib_ros.estimation.observations.track_set import TrackSet
 from autocalib_ros.estimation.observations.two_frame_windows import no_windows
-from autocalib_ros.estimation.verification.gates import view_doubt
+from autocalib_ros.estimation.verification.gates import check_markings_view
 from autocalib_ros.evidence.snapshot import Evidence
-from autocalib_ros.geometry.ground_plane import undirected_deg
+from autocalib_ros.geometry.ground_plane import unsigned_angle_deg
 from autocalib_ros.results.calibration import Reason
 
 LEAST_SHARE = 0.1
@@ -37,8 +37,8 @@ SQUARE_SIGMAS = 2.5
 """Markings are square when the angle between them differs by no more from a right one."""
 
 
-def fit_to_markings(evidence: Evidence, tracks: TrackSet, priors: list[LensPrior], setting: Setting,
-                    gate: GateOptions) -> tuple[JointFit, str] | Reason:
+def fit_to_markings(evidence: Evidence, tracks: TrackSet, priors: list[LensPrior], config: AdjustmentConfig,
+                    gate: GateOptions) -> tuple[Adjustment, str] | Reason:
     """Estimate lens and plane from the lines on the road; with what was assumed in words, or a reason why not."""
     every = lines_on_road(evidence)
     grids = square_grids(every, priors)
@@ -46,15 +46,15 @@ def fit_to_markings(evidence: Evidence, tracks: TrackSet, priors: list[LensPrior
     if isinstance(nearer, Reason):
         return nearer
     lines, best = nearer
-    state = State(best.camera, best.rotation, np.array([0.0, np.pi / 2 + best.askew_rad]))
-    fit = judged_at(state, tracks, replace(setting, prior=best.prior, crossing_rad=None), best.covariance)
+    state = AdjustmentState(best.camera, best.rotation, np.array([0.0, np.pi / 2 + best.askew_rad]))
+    fit = evaluate_at(state, tracks, replace(config, prior=best.prior, crossing_rad=None), best.covariance)
     if not fit.focal_sigma <= gate.max_sigma_focal_rel:
         return _none(f'the focal length to {min(fit.focal_sigma, 9.99):.1%}, {gate.max_sigma_focal_rel:.0%} is needed')
-    return view_doubt(fit, tracks) or (fit, _words(lines, best))
+    return check_markings_view(fit, tracks) or (fit, _words(lines, best))
 
 
-def sharpened(fit: JointFit, evidence: Evidence, tracks: TrackSet, prior: LensPrior,
-              gate: GateOptions) -> tuple[JointFit, str] | Reason:
+def sharpened(fit: Adjustment, evidence: Evidence, tracks: TrackSet, prior: LensPrior,
+              gate: GateOptions) -> tuple[Adjustment, str] | Reason:
     """Return the lens and plane near those of a solution to which the lines on the road lead, with its roads.
 
     With what was assumed in words, or a reason why not.
@@ -66,24 +66,24 @@ def sharpened(fit: JointFit, evidence: Evidence, tracks: TrackSet, prior: LensPr
     if isinstance(nearer, Reason):
         return nearer
     lines, grid = nearer
-    setting = replace(fit.problem.setting, prior=prior, windows=no_windows(), bundle=None)
+    config = replace(fit.problem.config, prior=prior, windows=no_windows(), bundle=None)
     road, normal = state.rotation[:, 0], grid.rotation[:, 2] * np.sign(state.rotation[:, 2] @ grid.rotation[:, 2])
     along = road - (road @ normal) * normal
     along /= np.linalg.norm(along)
     rotation = np.column_stack([along, np.cross(normal, along), normal])
-    there = State(grid.camera, rotation, state.angles_rad)
-    steps, lens = Steps(there, setting), len(prior.free)
-    covariance, angles = np.zeros((steps.size, steps.size)), len(steps.free_angles)
+    there = AdjustmentState(grid.camera, rotation, state.angles_rad)
+    parameters, lens = Parameterisation(there, config), len(prior.free)
+    covariance, angles = np.zeros((parameters.size, parameters.size)), len(parameters.free_angles)
     # turns about the axes of the grid, as turns about those of the roads
-    turned = block_diag(np.eye(lens), steps.axes @ rotation.T @ grid.rotation)
-    told = steps.size - angles
+    turned = block_diag(np.eye(lens), parameters.axes @ rotation.T @ grid.rotation)
+    told = parameters.size - angles
     covariance[:told, :told] = turned @ grid.covariance[:-1, :-1] @ turned.T
     if angles:
         covariance[-angles:, -angles:] = fit.covariance[-angles:, -angles:]
-    return judged_at(there, tracks, setting, covariance), _words(lines, grid)
+    return evaluate_at(there, tracks, config, covariance), _words(lines, grid)
 
 
-def _upward(fit: JointFit) -> np.ndarray:
+def _upward(fit: Adjustment) -> np.ndarray:
     """The normal (3,) of a solution, to the side where the image's top is."""
     normal = fit.state.rotation[:, 2]
     return -normal if normal[1] > 0 else normal
@@ -96,9 +96,9 @@ def _words(lines: Lines, grid: Grid) -> str:
             f'90 +- {np.degrees(ASKEW_RAD):g} degrees (tested: {tested_deg:.1f})')
 
 
-def with_lens_known(fit: JointFit) -> JointFit:
+def with_lens_known(fit: Adjustment) -> Adjustment:
     """Return a fit with the deviations that it has for somebody who knows its lens."""
-    lens, covariance = fit.problem.steps.lens, np.zeros(fit.covariance.shape)
+    lens, covariance = fit.problem.parameters.lens, np.zeros(fit.covariance.shape)
     information = np.linalg.inv(fit.covariance + LEAST_VARIANCE * np.eye(len(covariance)))
     covariance[lens:, lens:] = np.linalg.inv(information[lens:, lens:])
     return replace(fit, covariance=covariance)
@@ -136,7 +136,7 @@ def _apart_deg(lines: Lines, one: Grid, other: Grid) -> float:
     A principal point farther down is an axis that looks farther down: that is no other plane.
     """
     turn, _ = Rotation.align_vectors(*(Sight.through(grid.camera, lines.ends_px).bearings for grid in (one, other)))
-    return undirected_deg(one.rotation[:, 2], turn.apply(other.rotation[:, 2]))
+    return unsigned_angle_deg(one.rotation[:, 2], turn.apply(other.rotation[:, 2]))
 
 
 def _axes_doubt(lines: Lines, grid: Grid, least_places: int) -> Reason | None:

@@ -9,9 +9,9 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from autocalib_ros.estimation.observations.track_set import earlier_ones, independence
+from autocalib_ros.estimation.observations.track_set import count_earlier, kish_weight
 from autocalib_ros.evidence.snapshot import Evidence
-from autocalib_ros.geometry.great_circles import along_px, rays_of
+from autocalib_ros.geometry.great_circles import bearing_change, unproject_rays
 from autocalib_ros.geometry.robust_kernels import folded
 from autocalib_ros.lens.camera import Camera
 
@@ -53,7 +53,7 @@ class Lines:
     @property
     def weights(self) -> np.ndarray:
         """Shape (n,): those of one group count less each."""
-        return independence(self.groups, CORRELATION)
+        return kish_weight(self.groups, CORRELATION)
 
 
 def lines_on_road(evidence: Evidence) -> Lines:
@@ -64,7 +64,7 @@ def lines_on_road(evidence: Evidence) -> Lines:
     ends = ends[within(along_lines(ends), traffic_places(evidence), NEAR_TRAFFIC * width)]
     lines = Lines(ends, _groups(ends, width))
     best_first = lines.subset(np.argsort(-lines.lengths_px, kind='stable'))
-    return best_first.subset(np.argsort(earlier_ones(best_first.groups), kind='stable')[:MOST_LINES])
+    return best_first.subset(np.argsort(count_earlier(best_first.groups), kind='stable')[:MOST_LINES])
 
 
 def traffic_places(evidence: Evidence) -> np.ndarray:
@@ -109,8 +109,8 @@ class Sight:
     def through(cls, camera: Camera, ends_px: np.ndarray) -> Sight:
         """See lines (n, 4) through a lens."""
         middle, step = (ends_px[:, :2] + ends_px[:, 2:]) / 2, ends_px[:, 2:] - ends_px[:, :2]
-        rays = rays_of(camera, middle)
-        along = along_px(rays, camera, middle, step)
+        rays = unproject_rays(camera, middle)
+        along = bearing_change(rays, camera, middle, step)
         along /= np.maximum(np.linalg.norm(along, axis=1), 1e-12)[:, None]
         return cls(rays.bearings, along, np.cross(rays.bearings, along))
 

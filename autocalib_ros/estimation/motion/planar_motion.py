@@ -13,7 +13,7 @@ import numpy as np
 
 from autocalib_ros.config import JointOptions
 from autocalib_ros.estimation.observations.two_frame_windows import Windows
-from autocalib_ros.geometry.great_circles import Rays, rays_of
+from autocalib_ros.geometry.great_circles import Rays, unproject_rays
 from autocalib_ros.geometry.small_matrices import dot
 from autocalib_ros.lens.camera import Camera
 
@@ -69,7 +69,7 @@ class View:
     @classmethod
     def of(cls, windows: Windows, camera: Camera, camera_from_plane: np.ndarray, options: JointOptions) -> View:
         """See windows with a camera over a plane (3, 3)."""
-        rays = rays_of(camera, np.stack([windows.first_px, windows.second_px]))
+        rays = unproject_rays(camera, np.stack([windows.first_px, windows.second_px]))
         first, second = (Rays(rays.bearings[at], rays.radial[at], rays.tangential[at]) for at in (0, 1))
         way = np.hypot(*np.moveaxis(windows.second_px - windows.first_px, -1, 0))
         # a followed point drifts as a random walk; half of its variance falls on either end
@@ -172,7 +172,7 @@ def _bends(windows: Windows, camera: Camera,
 
 def paths(windows: Windows, camera: Camera, camera_from_plane: np.ndarray) -> tuple[np.ndarray, ...]:
     """Where the points of windows are on the plane, at three instants, in heights; shape (windows, points, 2) each."""
-    return tuple(_on_plane(rays_of(camera, np.nan_to_num(pixels)).bearings @ camera_from_plane)
+    return tuple(_on_plane(unproject_rays(camera, np.nan_to_num(pixels)).bearings @ camera_from_plane)
                  for pixels in (windows.first_px, windows.middle_px, windows.second_px))
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from autocalib_ros.estimation.observations.tracklets import Lives
-from autocalib_ros.geometry.great_circles import rays_of
+from autocalib_ros.geometry.great_circles import unproject_rays
 from autocalib_ros.lens.camera import Camera
 
 DIFFERENCE = 1e-6
@@ -76,7 +76,7 @@ class Bundle:
         self.whiten = factors * self.mask[..., None, :] * self.mask[..., :, None]
         seen_points, seen_instants = self.mask.any(axis=2), self.mask.any(axis=1)
         unknown = 3 * seen_points.sum(axis=1) + 3 * (seen_instants.sum(axis=1) - 1) - 1  # its size is free
-        self.freedom = np.maximum(2 * self.mask.sum(axis=(1, 2)) - unknown, 1)
+        self.dof = np.maximum(2 * self.mask.sum(axis=(1, 2)) - unknown, 1)
         self.point_freedom = np.maximum(2 * self.mask.sum(axis=2) - 3, 1)
         self.reference = np.argmax(self.mask.sum(axis=1), axis=1)
         """The instant of most points, at which the body's frame is the plane's, shape (lives,)."""
@@ -98,18 +98,18 @@ class Bundle:
         """
         shapes = self.settled(camera, camera_from_plane, shapes)
         residuals = self.residuals(camera, camera_from_plane, shapes)
-        scale = float(np.median((residuals**2).sum(axis=(1, 2, 3)) / self.freedom))
+        scale = float(np.median((residuals**2).sum(axis=(1, 2, 3)) / self.dof))
         diagonal = np.diagonal(self.whiten, axis1=-2, axis2=-1)
         density = 2.0 * np.log(np.where(self.mask, diagonal, 1.0)).sum(axis=(1, 2))
         slopes, _ = self.slopes(camera, camera_from_plane, shapes)
         slopes = slopes.reshape(len(self.lives), -1, slopes.shape[-1])
         told = np.linalg.eigvalsh(slopes.transpose(0, 2, 1) @ slopes)
         volume = np.log(np.where(told > UNTOLD * told[:, -1:], told, 1.0)).sum(axis=1)
-        return float((self.freedom * np.log(max(scale, 1e-9)) - 2.0 * density + volume).sum())
+        return float((self.dof * np.log(max(scale, 1e-9)) - 2.0 * density + volume).sum())
 
     def first_shapes(self, camera: Camera, camera_from_plane: np.ndarray) -> Shapes:
         """Place points on the road and move them as a body from instant to instant: a guess to start from."""
-        bearings = rays_of(camera, self.lives.pixels).bearings @ camera_from_plane
+        bearings = unproject_rays(camera, self.lives.pixels).bearings @ camera_from_plane
         side = float(np.sign(np.median(bearings[..., 2][self.mask]))) if self.mask.any() else 1.0
         ground = bearings[..., :2] / np.maximum(side * bearings[..., 2:], LOW)
         count, points, instants = self.mask.shape

@@ -7,16 +7,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from autocalib_ros.evidence.snapshot import Evidence
-from autocalib_ros.geometry.great_circles import Rays, circle_scatter, rays_of
+from autocalib_ros.geometry.great_circles import Rays, circle_scatter, unproject_rays
 from autocalib_ros.lens.camera import Camera
 
-SAMPLES = 10
+SAMPLES_PER_TRACK = 10
 """Points of a track that enter a fit; more of one path add correlated noise, not information."""
-MIN_LENGTH = 0.04
+MIN_DISPLACEMENT_DIAGONALS = 0.04
 """Shortest displacement of a track that says something of the lens, share of the image diagonal."""
 MAX_PATH_RATIO = 1.3
 """Largest path length / displacement of a track that may be straight, lens curvature and noise included."""
-CELLS = (8, 5)
+SELECTION_CELLS = (8, 5)
 
 
 @dataclass(frozen=True)
@@ -48,48 +48,48 @@ class TrackSet:
         return self.sample_times_s.mean(axis=1)
 
     @property
-    def share_of_vehicle(self) -> np.ndarray:
+    def vehicle_weight(self) -> np.ndarray:
         """One over the number of tracks of the same vehicle, shape (tracks,)."""
-        return independence(self.vehicles, 1.0)
+        return kish_weight(self.vehicles, 1.0)
 
-    def independence(self, correlation: float) -> np.ndarray:
+    def kish_weight(self, correlation: float) -> np.ndarray:
         """Weight (tracks,) of tracks whose errors correlate so much, 0 to 1, within a vehicle."""
-        return independence(self.vehicles, correlation)
+        return kish_weight(self.vehicles, correlation)
 
 
-def independence(owners: np.ndarray, correlation: float) -> np.ndarray:
+def kish_weight(vehicle_ids: np.ndarray, correlation: float) -> np.ndarray:
     """Weight (n,) of what belongs to owners (n,) and whose errors correlate so much, 0 to 1, within one.
 
     Kish's design effect; with a correlation of 1 all of an owner's together count as one.
     """
-    _, inverse, counts = np.unique(owners, return_inverse=True, return_counts=True)
+    _, inverse, counts = np.unique(vehicle_ids, return_inverse=True, return_counts=True)
     return 1.0 / (1.0 + (counts[inverse] - 1.0) * correlation)
 
 
 def select_tracks(evidence: Evidence, limit: int) -> TrackSet:
     """Choose tracks long enough to matter, at most `limit`, spread over image cells, headings and vehicles."""
     starts, points = evidence.track_starts, evidence.points_px
-    way, displacement = _ways(evidence)
+    way, displacement = _displacements(evidence)
     straight = path_lengths(points, starts) <= MAX_PATH_RATIO * displacement
-    candidates = np.flatnonzero(_long(evidence, displacement) & straight)
+    candidates = np.flatnonzero(_long_enough(evidence, displacement) & straight)
     candidates = candidates[np.argsort(-displacement[candidates], kind='stable')]
-    return _track_set(evidence, np.sort(candidates[_spread(evidence, candidates, way[candidates])[:limit]]))
+    return _track_set(evidence, np.sort(candidates[_selection_order(evidence, candidates, way[candidates])[:limit]]))
 
 
-def every_track(evidence: Evidence) -> TrackSet:
+def long_tracks(evidence: Evidence) -> TrackSet:
     """All tracks that are long enough, straight or not."""
-    _, displacement = _ways(evidence)
-    return _track_set(evidence, np.flatnonzero(_long(evidence, displacement)))
+    _, displacement = _displacements(evidence)
+    return _track_set(evidence, np.flatnonzero(_long_enough(evidence, displacement)))
 
 
-def _ways(evidence: Evidence) -> tuple[np.ndarray, np.ndarray]:
+def _displacements(evidence: Evidence) -> tuple[np.ndarray, np.ndarray]:
     """How far each track went: as vectors (tracks, 2) and lengths (tracks,) in pixels."""
     way = evidence.points_px[evidence.track_starts[1:] - 1] - evidence.points_px[evidence.track_starts[:-1]]
     return way, np.hypot(way[:, 0], way[:, 1])
 
 
-def _long(evidence: Evidence, displacement: np.ndarray) -> np.ndarray:
-    return displacement >= MIN_LENGTH * np.hypot(*evidence.image_size)
+def _long_enough(evidence: Evidence, displacement: np.ndarray) -> np.ndarray:
+    return displacement >= MIN_DISPLACEMENT_DIAGONALS * np.hypot(*evidence.image_size)
 
 
 def path_lengths(points: np.ndarray, starts: np.ndarray) -> np.ndarray:
@@ -100,25 +100,25 @@ def path_lengths(points: np.ndarray, starts: np.ndarray) -> np.ndarray:
     return np.diff(np.cumsum(steps)[starts])
 
 
-def _spread(evidence: Evidence, candidates: np.ndarray, way: np.ndarray) -> np.ndarray:
+def _selection_order(evidence: Evidence, candidates: np.ndarray, way: np.ndarray) -> np.ndarray:
     """Order of choice (n,) of candidates, longest first, that went `way` (n, 2).
 
     By rank within a cell and heading, vehicles in turn.
     """
     starts, vehicles = evidence.track_starts, evidence.track_vehicles[candidates]
     middle = evidence.points_px[(starts[candidates] + starts[candidates + 1]) // 2]
-    column, row = np.floor(middle / evidence.image_size * CELLS).astype(int).T
+    column, row = np.floor(middle / evidence.image_size * SELECTION_CELLS).astype(int).T
     heading = np.arctan2(way[:, 1], way[:, 0]) // (np.pi / 4)
-    rank = earlier_ones(column, row, heading) + 4 * earlier_ones(vehicles, column + CELLS[0] * row)
+    rank = count_earlier(column, row, heading) + 4 * count_earlier(vehicles, column + SELECTION_CELLS[0] * row)
     return np.argsort(rank, kind='stable')
 
 
-def evenly(count: int, limit: int) -> np.ndarray:
+def evenly_spaced(count: int, limit: int) -> np.ndarray:
     """Indices of at most `limit` out of `count`, evenly spread."""
     return np.linspace(0, max(count - 1, 0), min(limit, count)).astype(int)
 
 
-def earlier_ones(*keys: np.ndarray) -> np.ndarray:
+def count_earlier(*keys: np.ndarray) -> np.ndarray:
     """Count for each element how many before it have the same keys (n,)."""
     _, group, counts = np.unique(np.column_stack(keys), axis=0, return_inverse=True, return_counts=True)
     earlier = np.empty(len(group), int)
@@ -129,7 +129,7 @@ def earlier_ones(*keys: np.ndarray) -> np.ndarray:
 
 def _track_set(evidence: Evidence, indices: np.ndarray) -> TrackSet:
     starts, ends = evidence.track_starts[indices], evidence.track_starts[indices + 1]
-    chosen = np.round(np.linspace(0, ends - starts - 1, SAMPLES, axis=1)).astype(int)
+    chosen = np.round(np.linspace(0, ends - starts - 1, SAMPLES_PER_TRACK, axis=1)).astype(int)
     first = np.diff(chosen, axis=1, prepend=-1) > 0
     points = starts[:, None] + chosen
     return TrackSet(evidence.points_px[points], first / first.sum(axis=1, keepdims=True),
@@ -137,7 +137,7 @@ def _track_set(evidence: Evidence, indices: np.ndarray) -> TrackSet:
 
 
 @dataclass(frozen=True)
-class Seen:
+class UnprojectedTracks:
     """Tracks through one camera: what every question about their circles begins with."""
 
     rays: Rays
@@ -145,12 +145,12 @@ class Seen:
     """Scatter of each track, shape (tracks, 3, 3)."""
 
     @classmethod
-    def through(cls, camera: Camera, tracks: TrackSet) -> Seen:
+    def through(cls, camera: Camera, tracks: TrackSet) -> UnprojectedTracks:
         """Unproject tracks and sum up their scatter."""
-        rays = rays_of(camera, tracks.pixels)
+        rays = unproject_rays(camera, tracks.pixels)
         return cls(rays, circle_scatter(rays, tracks.weights))
 
-    def subset(self, keep: np.ndarray) -> Seen:
+    def subset(self, keep: np.ndarray) -> UnprojectedTracks:
         """Return the tracks that `keep`, a mask or indices, selects."""
         rays = Rays(self.rays.bearings[keep], self.rays.radial[keep], self.rays.tangential[keep])
-        return Seen(rays, self.matrix[keep])
+        return UnprojectedTracks(rays, self.matrix[keep])

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from autocalib_ros.estimation.observations.track_set import SAMPLES, independence
+from autocalib_ros.estimation.observations.track_set import SAMPLES_PER_TRACK, kish_weight
 from autocalib_ros.estimation.observations.two_frame_windows import (
     INTERVAL_S,
     MIN_POINTS,
@@ -48,12 +48,12 @@ class Lives:
     @property
     def share_of_body(self) -> np.ndarray:
         """Weight of each life among those of the same body, shape (lives,)."""
-        return independence(self.bodies, CORRELATION)
+        return kish_weight(self.bodies, CORRELATION)
 
 
 def no_lives() -> Lives:
     """Return none at all."""
-    return Lives(np.zeros((0, SAMPLES, INSTANTS, 2)), np.zeros((0, SAMPLES, INSTANTS), bool), np.zeros(0, int),
+    return Lives(np.zeros((0, SAMPLES_PER_TRACK, INSTANTS, 2)), np.zeros((0, SAMPLES_PER_TRACK, INSTANTS), bool), np.zeros(0, int),
                  np.zeros(0))
 
 
@@ -93,7 +93,7 @@ def _life(tracks: np.ndarray, when: np.ndarray, instants: Instants) -> tuple[np.
     seen = seen & when_seen
     if when_seen.sum() < LEAST_INSTANTS or (seen[chosen].sum(axis=1) < LEAST_INSTANTS).any():
         return None
-    pixels, mask = np.zeros((SAMPLES, INSTANTS, 2)), np.zeros((SAMPLES, INSTANTS), bool)
+    pixels, mask = np.zeros((SAMPLES_PER_TRACK, INSTANTS, 2)), np.zeros((SAMPLES_PER_TRACK, INSTANTS), bool)
     for place in np.flatnonzero(when_seen):
         points = np.flatnonzero(seen[chosen, place])
         pixels[points, place] = instants.at(tracks[chosen[points]], int(when[place]))

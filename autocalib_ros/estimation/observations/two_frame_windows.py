@@ -14,7 +14,7 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from autocalib_ros.estimation.observations.track_set import SAMPLES, earlier_ones, independence
+from autocalib_ros.estimation.observations.track_set import SAMPLES_PER_TRACK, count_earlier, kish_weight
 from autocalib_ros.evidence.snapshot import Evidence
 
 INTERVAL_S = 0.4
@@ -73,7 +73,7 @@ class Windows:
     @property
     def share_of_body(self) -> np.ndarray:
         """One over the number of windows of the same body, shape (windows,)."""
-        return independence(self.bodies, 1.0)
+        return kish_weight(self.bodies, 1.0)
 
     def spread(self, limit: int) -> Windows:
         """Return at most `limit` windows, bodies in turn, those of most points and farthest motion first."""
@@ -85,7 +85,7 @@ class Windows:
 def in_turn(owners: np.ndarray, best_first: np.ndarray) -> np.ndarray:
     """Order (n,) in which owners (n,) take turns, each with its best first; `best_first` is the order of merit (n,)."""
     rank = np.empty(len(owners), int)
-    rank[best_first] = earlier_ones(owners[best_first])
+    rank[best_first] = count_earlier(owners[best_first])
     return np.argsort(rank, kind='stable')
 
 
@@ -230,11 +230,11 @@ def _apart(places: np.ndarray) -> np.ndarray:
 
 def scattered(body: np.ndarray, places: np.ndarray) -> np.ndarray:
     """Choose at most SAMPLES points of a body, each as far from those before as can be."""
-    if len(body) <= SAMPLES:
+    if len(body) <= SAMPLES_PER_TRACK:
         return body
     chosen = [0]
     distance = np.hypot(*(places[body] - places[body[0]]).T)
-    while len(chosen) < SAMPLES:
+    while len(chosen) < SAMPLES_PER_TRACK:
         chosen.append(int(np.argmax(distance)))
         distance = np.minimum(distance, np.hypot(*(places[body] - places[body[chosen[-1]]]).T))
     return body[np.sort(chosen)]
@@ -242,8 +242,8 @@ def scattered(body: np.ndarray, places: np.ndarray) -> np.ndarray:
 
 def _joined(groups: list[_Group], width: int) -> Windows:
     count = len(groups)
-    first, second, middle = (np.zeros((count, SAMPLES, 2)) for _ in range(3))
-    mask, tracks = np.zeros((count, SAMPLES), bool), np.full((count, SAMPLES), -1)
+    first, second, middle = (np.zeros((count, SAMPLES_PER_TRACK, 2)) for _ in range(3))
+    mask, tracks = np.zeros((count, SAMPLES_PER_TRACK), bool), np.full((count, SAMPLES_PER_TRACK), -1)
     for row, group in enumerate(groups):
         points = len(group.tracks)
         for array, places in ((first, group.first), (second, group.second), (middle, group.middle)):

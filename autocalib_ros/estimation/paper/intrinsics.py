@@ -9,11 +9,11 @@ import numpy as np
 from autocalib_ros.config import PaperOptions
 from autocalib_ros.estimation.observations.track_set import TrackSet, path_lengths
 from autocalib_ros.evidence.snapshot import Evidence
-from autocalib_ros.geometry.great_circles import fit_circles, rays_of
+from autocalib_ros.geometry.great_circles import fit_circles, unproject_rays
 from autocalib_ros.lens.camera import Camera, image_centre
 from autocalib_ros.results.calibration import PaperReport
 
-RIM = 1.02
+RIM_MARGIN = 1.02
 """The shortest trial focal length keeps tracked points this factor inside 90 degrees, where tan flips sign."""
 TRACK_SCALE_PX = 1.0
 """Mean distance from its great circle at which a track is no longer believed to be straight."""
@@ -31,20 +31,20 @@ class PaperIntrinsics:
 
 
 @dataclass(frozen=True)
-class Interval:
+class ObservedInterval:
     """One observed interval: pixel paths (n, 2) of the tracks that the paper keeps, longest first."""
 
     paths: list[np.ndarray]
     tracks: list[int]
 
 
-def paper_intervals(evidence: Evidence, options: PaperOptions) -> list[Interval]:
+def paper_intervals(evidence: Evidence, options: PaperOptions) -> list[ObservedInterval]:
     """Apply the paper's two filters in each observed interval of `window_s` and take the longest tracks.
 
     A track is kept if it lived for `min_lifetime` of the interval and its path is at most `max_path_ratio` its
     displacement. Intervals with fewer tracks than the fullest are left out: all estimates rest on as many.
     """
-    starts, tracks, windows = _parts(evidence, options.window_s)
+    starts, tracks, windows = _split_by_interval(evidence, options.window_s)
     points, times = evidence.points_px, evidence.times_s
     first, last = starts[:-1], starts[1:] - 1
     displacement = np.hypot(*(points[last] - points[first]).T)
@@ -55,11 +55,11 @@ def paper_intervals(evidence: Evidence, options: PaperOptions) -> list[Interval]
         inside = np.flatnonzero(kept & (windows == window))
         longest.append(inside[np.argsort(-displacement[inside], kind='stable')[:options.longest]])
     fullest = max(map(len, longest), default=0)
-    return [Interval([points[starts[part]:starts[part + 1]] for part in parts], tracks[parts].tolist())
+    return [ObservedInterval([points[starts[part]:starts[part + 1]] for part in parts], tracks[parts].tolist())
             for parts in longest if len(parts) == fullest]
 
 
-def _parts(evidence: Evidence, window_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _split_by_interval(evidence: Evidence, window_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Divide tracks into parts within an interval: where each begins, with the end (parts + 1,); track and interval."""
     windows = np.floor(evidence.times_s / window_s).astype(int)
     begins = np.diff(windows, prepend=0) != 0
@@ -86,28 +86,28 @@ def paper_intrinsics(evidence: Evidence, options: PaperOptions) -> PaperIntrinsi
     median = candidates[(len(candidates) - 1) // 2]
     focal, paths = float(sweeps[median][least[median], 0]), intervals[median].paths
     camera = Camera.equidistant(*evidence.image_size, focal)
-    before = np.mean([_line_errors(path) / len(path) for path in paths])
-    after = np.mean([_line_errors(camera.undistort(path)) / len(path) for path in paths])
+    before = np.mean([_line_fit_errors(path) / len(path) for path in paths])
+    after = np.mean([_line_fit_errors(camera.undistort(path)) / len(path) for path in paths])
     report = PaperReport(focal_px=camera.focal_px, polynomial_k=distortion_polynomial(camera),
                          straightness_px2=(float(before), float(after)))
     return PaperIntrinsics(report, sweeps[median], np.array(intervals[median].tracks, int))
 
 
-def _sweep(interval: Interval, image_size: tuple[int, int], options: PaperOptions) -> np.ndarray:
+def _sweep(interval: ObservedInterval, image_size: tuple[int, int], options: PaperOptions) -> np.ndarray:
     """Trial focal lengths up to the image diagonal with their summed squared errors, shape (n, 2)."""
     centre = np.asarray(image_centre(*image_size))
     radii = [np.hypot(*(path - centre).T) for path in interval.paths]
-    lowest = RIM * max(radius.max() for radius in radii) / (np.pi / 2)
+    lowest = RIM_MARGIN * max(radius.max() for radius in radii) / (np.pi / 2)
     diagonal = float(np.hypot(*image_size))
     trials = np.linspace(max(lowest, diagonal / options.focal_steps), diagonal, options.focal_steps)
     errors = np.zeros(len(trials))
     for path, radius in zip(interval.paths, radii, strict=True):
         theta = np.maximum(radius, 1e-9) / trials[:, None]
-        errors += _line_errors((path - centre) * (np.tan(theta) / theta)[..., None])
+        errors += _line_fit_errors((path - centre) * (np.tan(theta) / theta)[..., None])
     return np.column_stack([trials, errors])
 
 
-def _line_errors(points: np.ndarray) -> np.ndarray:
+def _line_fit_errors(points: np.ndarray) -> np.ndarray:
     """Summed squared distances of points (..., n, 2) from their best line, shape (...)."""
     x, y = np.moveaxis(points - points.mean(axis=-2, keepdims=True), -1, 0)
     xx, xy, yy = (x * x).sum(-1), (x * y).sum(-1), (y * y).sum(-1)
@@ -132,10 +132,10 @@ def straightness_sweep(tracks: TrackSet, image_size: tuple[int, int], trials: np
     The cost of a track is the logarithm of its mean squared pixel distance: a turning vehicle costs little more
     than a wandering one. Tracks of one vehicle share one weight.
     """
-    share = tracks.share_of_vehicle
+    share = tracks.vehicle_weight
     costs = []
     for trial in trials:
-        rays = rays_of(Camera.equidistant(*image_size, trial), tracks.pixels)
+        rays = unproject_rays(Camera.equidistant(*image_size, trial), tracks.pixels)
         _, distance2, _ = fit_circles(rays, tracks.weights)
         costs.append((share * np.log1p(distance2 / TRACK_SCALE_PX**2)).sum())
     return np.array(costs)

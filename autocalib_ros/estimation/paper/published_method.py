@@ -8,20 +8,24 @@ import numpy as np
 
 from autocalib_ros.config import Options
 from autocalib_ros.estimation.paper.intrinsics import PaperIntrinsics
-from autocalib_ros.estimation.paper.vanishing_point_voting import Orientations, segment_orientations, voted_points
+from autocalib_ros.estimation.paper.vanishing_point_voting import (
+    SegmentOrientations,
+    segment_orientations,
+    vote_vanishing_points,
+)
 from autocalib_ros.estimation.verification.scale import known_scale
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.ground_plane import (
     focal_from_vanishing_points,
     ground_plane,
+    orient_upward,
     paper_translation,
     rotation_from_vanishing_points,
-    upward,
 )
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.results.calibration import Calibration, Figures, Reason, StandardDeviations
 
-ASSUMPTIONS = ('equidistant lens with the principal point at the image centre', 'the two roads are perpendicular',
+PAPER_ASSUMPTIONS = ('equidistant lens with the principal point at the image centre', 'the two roads are perpendicular',
                'the published method gives no uncertainty')
 
 
@@ -38,15 +42,15 @@ def solve_paper(evidence: Evidence, options: Options, intrinsics: PaperIntrinsic
     found = segment_orientations(camera, evidence.segments_px, options.paper)
     figures = replace(figures, orientation_histogram=found.histogram, orientation_peaks_deg=found.peaks_deg)
     result = Calibration(
-        method='paper', grade='lens', assumptions=ASSUMPTIONS, camera=camera, ground=None, ground_refusal=None,
+        method='paper', grade='lens', assumptions=PAPER_ASSUMPTIONS, camera=camera, ground=None, ground_refusal=None,
         road_directions=np.zeros((0, 3)), stddev=StandardDeviations(), paper=intrinsics.report,
         evidence=evidence.summary(), newest_stamp_ns=evidence.newest_stamp_ns, figures=figures)
     return _with_ground(result, found, evidence, options)
 
 
-def _with_ground(result: Calibration, found: Orientations, evidence: Evidence, options: Options) -> Calibration:
+def _with_ground(result: Calibration, found: SegmentOrientations, evidence: Evidence, options: Options) -> Calibration:
     """Add the extrinsic stage to the lens, or say why it has none."""
-    points = voted_points(found, result.camera.focal_px, options.paper)
+    points = vote_vanishing_points(found, result.camera.focal_px, options.paper)
     if len(points) < 2:
         return replace(result, ground_refusal=Reason(
             'one_direction', f'the orientation histogram of {len(evidence.segments_px)} segments has '
@@ -59,7 +63,7 @@ def _with_ground(result: Calibration, found: Orientations, evidence: Evidence, o
             'the roads are not perpendicular or the lens is wrong: use method joint'))
     rotation = rotation_from_vanishing_points(*points, focal)
     bearings, _ = result.camera.unproject(evidence.points_px)
-    normal, _ = upward(rotation[:, 2], bearings)
+    normal, _ = orient_upward(rotation[:, 2], bearings)
     report, roads = replace(result.paper, focal_from_vanishing_points_px=focal), rotation[:, :2].T
     scale = known_scale(options, result.camera, normal)
     if isinstance(scale, Reason):

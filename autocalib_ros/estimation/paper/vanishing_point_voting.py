@@ -11,16 +11,16 @@ from autocalib_ros.geometry.great_circles import orthonormal_basis
 from autocalib_ros.lens.camera import Camera
 
 HISTOGRAM_BINS = 180
-CELL_DEG = 0.5
+VOTE_CELL_DEG = 0.5
 """Side of a voting cell, in angle from the optical axis."""
-OUTERMOST_DEG = 89.5
+MAX_VANISHING_ANGLE_DEG = 89.5
 """A vanishing point at infinity is held at this angle, so that it keeps finite coordinates."""
-MAX_VOTERS = 2000
+MAX_VOTING_SEGMENTS = 2000
 """Segments of one cluster that vote; more move no maximum."""
 
 
 @dataclass(frozen=True)
-class Orientations:
+class SegmentOrientations:
     """Segments in the undistorted image, by orientation."""
 
     ends_px: np.ndarray
@@ -33,7 +33,7 @@ class Orientations:
     """Orientations of the two roads, or fewer where the histogram has no second peak."""
 
 
-def segment_orientations(camera: Camera, segments_px: np.ndarray, options: PaperOptions) -> Orientations:
+def segment_orientations(camera: Camera, segments_px: np.ndarray, options: PaperOptions) -> SegmentOrientations:
     """Run steps 7 and 8 of the paper on segments x0, y0, x1, y1 (n, 4): undistort, histogram of orientation."""
     ends = camera.undistort(segments_px.reshape(-1, 2, 2)) - np.asarray(camera.principal_point_px)
     ends = ends[np.isfinite(ends).all(axis=(1, 2))]
@@ -41,18 +41,18 @@ def segment_orientations(camera: Camera, segments_px: np.ndarray, options: Paper
     orientation = np.degrees(np.arctan2(step[:, 1], step[:, 0])) % 180.0
     counts, edges = np.histogram(orientation, bins=HISTOGRAM_BINS, range=(0.0, 180.0))
     centres = (edges[:-1] + edges[1:]) / 2
-    return Orientations(ends, orientation, np.column_stack([centres, counts]),
+    return SegmentOrientations(ends, orientation, np.column_stack([centres, counts]),
                         _peaks(centres, counts, options.min_separation_deg))
 
 
-def voted_points(found: Orientations, focal_px: float, options: PaperOptions) -> np.ndarray:
+def vote_vanishing_points(found: SegmentOrientations, focal_px: float, options: PaperOptions) -> np.ndarray:
     """Run step 9 of the paper: vanishing points (peaks, 2) in undistorted pixels about the principal point."""
-    points = [_voted_point(found.ends_px[_turn(found.orientation_deg, peak) <= options.cluster_deg], focal_px, options)
+    points = [_vote_vanishing_point(found.ends_px[_orientation_difference(found.orientation_deg, peak) <= options.cluster_deg], focal_px, options)
               for peak in found.peaks_deg]
     return np.array(points).reshape(-1, 2)
 
 
-def _turn(first_deg: np.ndarray, second_deg: float) -> np.ndarray:
+def _orientation_difference(first_deg: np.ndarray, second_deg: float) -> np.ndarray:
     """Angle between undirected orientations, 0 to 90 degrees."""
     return np.abs((first_deg - second_deg + 90.0) % 180.0 - 90.0)
 
@@ -62,22 +62,22 @@ def _peaks(centres: np.ndarray, counts: np.ndarray, separation_deg: float) -> tu
     if not counts.any():
         return ()
     first = float(centres[np.argmax(counts)])
-    apart = np.where(_turn(centres, first) >= separation_deg, counts, 0)
+    apart = np.where(_orientation_difference(centres, first) >= separation_deg, counts, 0)
     return (first, float(centres[np.argmax(apart)])) if apart.any() else (first,)
 
 
-def _voted_point(ends: np.ndarray, focal_px: float, options: PaperOptions) -> np.ndarray:
+def _vote_vanishing_point(ends: np.ndarray, focal_px: float, options: PaperOptions) -> np.ndarray:
     """Let segments (n, 2, 2) vote as infinite lines; return the vanishing point (2,).
 
     The canvas is the half sphere of viewing directions, by angle from the axis: a line is a great circle on it,
     and a point at infinity has its place on the rim.
     """
-    voters = np.linspace(0, len(ends) - 1, min(len(ends), MAX_VOTERS)).astype(int)
-    votes = _votes(ends[voters], focal_px)
+    voters = np.linspace(0, len(ends) - 1, min(len(ends), MAX_VOTING_SEGMENTS)).astype(int)
+    votes = _vote_histogram(ends[voters], focal_px)
     half = (votes.shape[0] - 1) / 2
     rows, columns = np.nonzero(votes >= options.vote_share * votes.max())
     weight = votes[rows, columns].astype(float)
-    places = np.column_stack([columns - half, rows - half]) * CELL_DEG
+    places = np.column_stack([columns - half, rows - half]) * VOTE_CELL_DEG
     # the rim's two ends of a diameter are one point at infinity: bring all to the side of the strongest
     strongest = places[np.argmax(weight)]
     places = np.where((places @ strongest < 0)[:, None], -places, places)
@@ -85,13 +85,13 @@ def _voted_point(ends: np.ndarray, focal_px: float, options: PaperOptions) -> np
     distance = max(float(np.hypot(*mean)), 1e-9)
     outward = mean / distance
     sigma = np.sqrt(weight @ ((places - mean) @ outward) ** 2 / weight.sum())
-    angle = min(distance + options.vote_sigmas * float(sigma), OUTERMOST_DEG)
+    angle = min(distance + options.vote_sigmas * float(sigma), MAX_VANISHING_ANGLE_DEG)
     return focal_px * np.tan(np.radians(angle)) * outward
 
 
-def _votes(ends: np.ndarray, focal_px: float) -> np.ndarray:
+def _vote_histogram(ends: np.ndarray, focal_px: float) -> np.ndarray:
     """Count the lines of segments (n, 2, 2) that pass each cell of the half sphere, shape (cells, cells)."""
-    half = int(round(90.0 / CELL_DEG))
+    half = int(round(90.0 / VOTE_CELL_DEG))
     votes = np.zeros((2 * half + 1, 2 * half + 1), int)
     tail, head = (np.column_stack([ends[:, i], np.full(len(ends), focal_px)]) for i in (0, 1))
     normals = np.cross(tail, head)
@@ -101,7 +101,7 @@ def _votes(ends: np.ndarray, focal_px: float) -> np.ndarray:
         points = np.cos(around) * one + np.sin(around) * other
         points *= np.where(points[:, 2:] < 0, -1.0, 1.0)
         across = np.maximum(np.hypot(points[:, 0], points[:, 1]), 1e-12)
-        angle = np.degrees(np.arctan2(across, points[:, 2])) / CELL_DEG
+        angle = np.degrees(np.arctan2(across, points[:, 2])) / VOTE_CELL_DEG
         cells = np.round(points[:, :2] * (angle / across)[:, None]).astype(int) + half
         votes.ravel()[np.unique(cells[:, 1] * votes.shape[1] + cells[:, 0])] += 1
     return votes

@@ -4,37 +4,43 @@ from __future__ import annotations
 
 import numpy as np
 
-from autocalib_ros.estimation.adjustment.parameters import Directions
+from autocalib_ros.estimation.adjustment.parameters import RoadDirections
 from autocalib_ros.estimation.observations.track_set import TrackSet
-from autocalib_ros.geometry.great_circles import _distances2, _forms, fit_circles, orthonormal_basis, rays_of
+from autocalib_ros.geometry.great_circles import (
+    _quadratic_forms,
+    _squared_distances,
+    fit_circles,
+    orthonormal_basis,
+    unproject_rays,
+)
 from autocalib_ros.geometry.small_matrices import cross
 from autocalib_ros.lens.camera import Camera
 
-HYPOTHESES = 400
-PROBES = 200
+RANSAC_HYPOTHESES = 400
+RANDOM_DIRECTIONS = 200
 """Random directions by which a track's power to tell directions apart is measured."""
-INLIER_PX = 2.0
+CONSENSUS_INLIER_PX = 2.0
 """A track supports a direction when its great circle through it stays this close, root mean square."""
-MIN_ANGLE_DEG = 30.0
+MIN_HYPOTHESIS_SEPARATION_DEG = 30.0
 """Two roads that differ by less are one road seen with errors."""
-COMPASS = np.array([(np.cos(turn), np.sin(turn)) for turn in np.arange(8) * np.pi / 4])
+SEARCH_OFFSETS = np.array([(np.cos(turn), np.sin(turn)) for turn in np.arange(8) * np.pi / 4])
 """Ways to go from a direction in search of a better one."""
 
 
 def consensus_directions(camera: Camera, tracks: TrackSet, generator: np.random.Generator,
-                         count: int = 2, inlier_px: float = INLIER_PX) -> Directions:
+                         count: int = 2, inlier_px: float = CONSENSUS_INLIER_PX) -> RoadDirections:
     """Find up to `count` directions, strongest first, that tracks' great circles share.
 
     A track counts by its surprise: minus the logarithm of the share of random directions that it would
     support. A short track that supports any direction counts for nothing.
     """
-    rays = rays_of(camera, tracks.pixels)
+    rays = unproject_rays(camera, tracks.pixels)
     normals, own, matrix = fit_circles(rays, tracks.weights)
-    probes = generator.normal(size=(PROBES, 3))
+    probes = generator.normal(size=(RANDOM_DIRECTIONS, 3))
     probes /= np.linalg.norm(probes, axis=1, keepdims=True)
-    forms = _forms(matrix)
+    forms = _quadratic_forms(matrix)
     chance = _support(forms, probes, inlier_px).mean(axis=0)
-    surprise = -np.log(np.clip(chance, 1.0 / PROBES, 1.0)) * np.sqrt(tracks.share_of_vehicle) * (own < inlier_px**2)
+    surprise = -np.log(np.clip(chance, 1.0 / RANDOM_DIRECTIONS, 1.0)) * np.sqrt(tracks.vehicle_weight) * (own < inlier_px**2)
     found: list[np.ndarray] = []
     labels = np.full(len(tracks), -2)
     score = 0.0
@@ -48,12 +54,12 @@ def consensus_directions(camera: Camera, tracks: TrackSet, generator: np.random.
         labels[(support > 0) & (left > 0)] = label
         left = np.where(support > 0, 0.0, left)
         found.append(candidate)
-    return Directions(np.array(found).reshape(-1, 3), labels, score)
+    return RoadDirections(np.array(found).reshape(-1, 3), labels, score)
 
 
 def _support(forms: np.ndarray, directions: np.ndarray, inlier_px: float) -> np.ndarray:
     """Support of every track for every direction (directions, 3), 0 to 1, shape (directions, tracks)."""
-    return np.maximum(0.0, 1.0 - _distances2(forms, directions) / inlier_px**2)
+    return np.maximum(0.0, 1.0 - _squared_distances(forms, directions) / inlier_px**2)
 
 
 def _strongest(normals: np.ndarray, forms: np.ndarray, surprise: np.ndarray, found: list[np.ndarray],
@@ -62,12 +68,12 @@ def _strongest(normals: np.ndarray, forms: np.ndarray, surprise: np.ndarray, fou
     total = surprise.sum()
     if np.count_nonzero(surprise) < 3:
         return None
-    pairs = generator.choice(len(normals), size=(HYPOTHESES, 2), p=surprise / total)
+    pairs = generator.choice(len(normals), size=(RANSAC_HYPOTHESES, 2), p=surprise / total)
     candidates = cross(normals[pairs[:, 0]], normals[pairs[:, 1]])
     size = np.linalg.norm(candidates, axis=1)
     candidates = candidates[size > 1e-3] / size[size > 1e-3, None]
     for other in found:
-        candidates = candidates[np.abs(candidates @ other) < np.cos(np.radians(MIN_ANGLE_DEG))]
+        candidates = candidates[np.abs(candidates @ other) < np.cos(np.radians(MIN_HYPOTHESIS_SEPARATION_DEG))]
     if not len(candidates):
         return None
     forms, surprise = forms[..., surprise > 0], surprise[surprise > 0]
@@ -79,14 +85,14 @@ def _refined(direction: np.ndarray, forms: np.ndarray, surprise: np.ndarray, inl
     """Climb to the local best by halving steps around the direction."""
     step = np.radians(2.0)
     best = (_support(forms, direction[None], inlier_px) @ surprise)[0]
-    ring = COMPASS @ orthonormal_basis(direction)
+    ring = SEARCH_OFFSETS @ orthonormal_basis(direction)
     while step > np.radians(0.02):
         trials = (direction + step * ring) / np.sqrt(1.0 + step * step)
         support = _support(forms, trials, inlier_px) @ surprise
         strongest = np.argmax(support)
         if support[strongest] > best:
             best, direction = support[strongest], trials[strongest]
-            ring = COMPASS @ orthonormal_basis(direction)
+            ring = SEARCH_OFFSETS @ orthonormal_basis(direction)
         else:
             step /= 2
     return direction

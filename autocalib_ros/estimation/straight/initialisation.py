@@ -6,79 +6,79 @@ from dataclasses import replace
 
 import numpy as np
 
-from autocalib_ros.estimation.adjustment.bundle_adjustment import JointFit, solve_joint
+from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment, adjust
 from autocalib_ros.estimation.adjustment.lens_prior import LensPrior
-from autocalib_ros.estimation.adjustment.model_selection import ASKED_FOR, most_probable
-from autocalib_ros.estimation.adjustment.parameters import Directions, Setting, initial_state
+from autocalib_ros.estimation.adjustment.model_selection import MODEL_SELECTION_MARGIN, select_model
+from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig, RoadDirections, initial_state
 from autocalib_ros.estimation.observations.track_set import TrackSet
-from autocalib_ros.estimation.straight.consensus import INLIER_PX, consensus_directions
+from autocalib_ros.estimation.straight.consensus import CONSENSUS_INLIER_PX, consensus_directions
 from autocalib_ros.lens.camera import Camera
 
-TRIALS = 14
+FOCAL_TRIALS = 14
 """Focal lengths tried as starts: steps of about 17 %, within which the joint problem converges."""
-STARTS = 3
-WELL_EXPLAINED, LOOSE = 0.5, 3.0
+MAX_STARTS = 3
+MIN_INLIER_FRACTION, LOOSE_INLIER_FACTOR = 0.5, 3.0
 """Below this share of explained tracks, agreement is looked for again with so many times wider limits."""
-MIDDLE = 0.3
+MATCHED_RADIUS_DIAGONALS = 0.3
 """A radius in image diagonals at which two lenses of one field of view agree about best."""
-APART_DEG = 15.0
+MIN_ROAD_SEPARATION_DEG = 15.0
 """Roads that differ by less are one road seen with errors."""
 
 
-def agreed(voters: TrackSet, setting: Setting, generator: np.random.Generator) -> tuple[JointFit, float] | None:
+def solve_from_consensus(subsample: TrackSet, config: AdjustmentConfig, generator: np.random.Generator) -> tuple[Adjustment, float] | None:
     """Solve from the directions on which the tracks agree at trial focal lengths; the most probable solution.
 
     And the contrast: how much better the best trial agreed than the middling one. None without any agreement.
     Where little is explained the agreement is looked for again less strictly: a lens that is neither centred nor
     equidistant bends long tracks by many pixels at every trial.
     """
-    fits, scores = _from_trials(voters, setting, generator, INLIER_PX)
+    fits, scores = _from_trials(subsample, config, generator, CONSENSUS_INLIER_PX)
     if not fits:
         return None
-    best = most_probable(fits, voters)
-    if best.explained().mean() < WELL_EXPLAINED:
-        best = most_probable([best, *_from_trials(voters, setting, generator, LOOSE * INLIER_PX)[0]], voters)
-    return best, np.inf if setting.prior.focal_known else float(scores.max() / max(np.median(scores), 1e-9))
+    best = select_model(fits, subsample)
+    if best.inliers().mean() < MIN_INLIER_FRACTION:
+        best = select_model([best, *_from_trials(subsample, config, generator, LOOSE_INLIER_FACTOR * CONSENSUS_INLIER_PX)[0]], subsample)
+    return best, np.inf if config.prior.focal_known else float(scores.max() / max(np.median(scores), 1e-9))
 
 
-def _from_trials(voters: TrackSet, setting: Setting, generator: np.random.Generator,
-                 inlier_px: float) -> tuple[list[JointFit], np.ndarray]:
+def _from_trials(subsample: TrackSet, config: AdjustmentConfig, generator: np.random.Generator,
+                 inlier_px: float) -> tuple[list[Adjustment], np.ndarray]:
     """Solutions from the trial focal lengths of best agreement, and the scores of all trials, shape (trials,)."""
-    prior = setting.prior
+    prior = config.prior
     size = (prior.centre.width, prior.centre.height)
-    trials = [prior.centre.focal_px] if prior.focal_known else focal_trials(voters, size, TRIALS)
-    agreed = [consensus_directions(prior.start(trial), voters, generator, inlier_px=inlier_px) for trial in trials]
-    starts = [initial_state(prior.start(trials[index]), agreed[index]) for index in _peaks(agreed)[:STARTS]]
-    fits = [solve_joint(start, voters, setting) for start in starts]
+    trials = [prior.centre.focal_px] if prior.focal_known else focal_trials(subsample, size, FOCAL_TRIALS)
+    solve_from_consensus = [consensus_directions(prior.start(trial), subsample, generator, inlier_px=inlier_px) for trial in trials]
+    starts = [initial_state(prior.start(trials[index]), solve_from_consensus[index]) for index in _peaks(solve_from_consensus)[:MAX_STARTS]]
+    fits = [adjust(start, subsample, config) for start in starts]
     # two roads that fell together describe one road twice, and its errors the better for it
-    return [fit for fit in fits if apart(fit)] or fits, np.array([item.score for item in agreed])
+    return [fit for fit in fits if roads_separated(fit)] or fits, np.array([item.score for item in solve_from_consensus])
 
 
-def apart(fit: JointFit) -> bool:
+def roads_separated(fit: Adjustment) -> bool:
     """Tell whether the roads of a solution that are next to each other in it differ."""
     turns = np.abs(np.sin(np.diff(fit.state.angles_rad)))
-    return bool(turns.min(initial=1.0) > np.sin(np.radians(APART_DEG)))
+    return bool(turns.min(initial=1.0) > np.sin(np.radians(MIN_ROAD_SEPARATION_DEG)))
 
 
-def in_likeliest_family(fit: JointFit, priors: list[LensPrior], voters: TrackSet, tracks: TrackSet) -> JointFit:
+def select_lens_family(fit: Adjustment, priors: list[LensPrior], subsample: TrackSet, tracks: TrackSet) -> Adjustment:
     """Solve for another family of lenses where that makes the traffic clearly more probable; one road cannot tell."""
     if not fit.plane_known or not priors:
         return fit
-    usual = solve_joint(fit.state, voters, fit.problem.setting, refine=True)
-    best = most_probable([usual, *(_in_family(usual, prior, voters) for prior in priors)], voters, ASKED_FOR)
-    return fit if best is usual else solve_joint(best.state, tracks, best.problem.setting)
+    usual = adjust(fit.state, subsample, fit.problem.config, refine=True)
+    best = select_model([usual, *(_solve_in_family(usual, prior, subsample) for prior in priors)], subsample, MODEL_SELECTION_MARGIN)
+    return fit if best is usual else adjust(best.state, tracks, best.problem.config)
 
 
-def _in_family(fit: JointFit, prior: LensPrior, voters: TrackSet) -> JointFit:
+def _solve_in_family(fit: Adjustment, prior: LensPrior, subsample: TrackSet) -> Adjustment:
     """Solve for a lens of another family, from the one that images the middle of the field at the same place."""
     camera = fit.state.camera
-    angle, _ = camera.angle(np.array(MIDDLE * np.hypot(camera.width, camera.height)))
+    angle, _ = camera.angle(np.array(MATCHED_RADIUS_DIAGONALS * np.hypot(camera.width, camera.height)))
     focal = camera.radius(angle) / replace(prior.centre, focal_px=1.0).radius(angle)
     start = replace(fit.state, camera=prior.start(float(focal)))
-    return solve_joint(start, voters, replace(fit.problem.setting, prior=prior))
+    return adjust(start, subsample, replace(fit.problem.config, prior=prior))
 
 
-def _peaks(found: list[Directions]) -> list[int]:
+def _peaks(found: list[RoadDirections]) -> list[int]:
     """Indices of trials whose score no neighbour beats, best first; trials without a direction never."""
     scores = np.array([item.score for item in found])
     padded = np.concatenate([[-np.inf], scores, [-np.inf]])

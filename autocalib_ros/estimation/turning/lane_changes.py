@@ -10,13 +10,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from autocalib_ros.estimation.adjustment.bundle_adjustment import JointFit, solve_joint
-from autocalib_ros.estimation.adjustment.noise_model import USUAL_HEIGHT_M
-from autocalib_ros.estimation.adjustment.parameters import State, ground_up
+from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment, adjust
+from autocalib_ros.estimation.adjustment.noise_model import DEFAULT_CAMERA_HEIGHT_M
+from autocalib_ros.estimation.adjustment.parameters import AdjustmentState, upward_normal
 from autocalib_ros.estimation.motion.planar_motion import View, first_motion, on_course, paths
 from autocalib_ros.estimation.observations.track_set import TrackSet
 from autocalib_ros.estimation.observations.two_frame_windows import Windows
-from autocalib_ros.geometry.great_circles import rays_of
+from autocalib_ros.geometry.great_circles import unproject_rays
 
 ASIDE_DEG = 1.5, 20.0
 """A window is of a change of lanes when it leads aside from the road by more than drivers wander, and less than who
@@ -26,18 +26,18 @@ MIN_VEHICLES = 8
 MOST_WINDOWS = 300
 
 
-def by_lane_changes(fit: JointFit, tracks: TrackSet, windows: Windows) -> tuple[JointFit, int] | None:
+def by_lane_changes(fit: Adjustment, tracks: TrackSet, windows: Windows) -> tuple[Adjustment, int] | None:
     """Solve again with the vehicles that leave their lanes on the one road of a solution; None where they are few.
 
     With the number of those vehicles.
     """
     if fit.plane_known or len(fit.state.angles_rad) != 1:
         return None
-    camera, road, setting = fit.state.camera, fit.state.directions[0], fit.problem.setting
-    up = ground_up(fit.state, setting, rays_of(camera, tracks.pixels))
+    camera, road, config = fit.state.camera, fit.state.directions[0], fit.problem.config
+    up = upward_normal(fit.state, config, unproject_rays(camera, tracks.pixels))
     plane = np.column_stack([road, np.cross(up, road), up])
-    view = View.of(windows, camera, plane, setting.options)
-    course, _ = on_course(windows, view, first_motion(view), camera, plane, setting.height_m or USUAL_HEIGHT_M)
+    view = View.of(windows, camera, plane, config.options)
+    course, _ = on_course(windows, view, first_motion(view), camera, plane, config.height_m or DEFAULT_CAMERA_HEIGHT_M)
     chosen = np.flatnonzero(course & ~windows.of_segments)
     first, _, second = paths(windows.subset(chosen), camera, plane)
     away = ~windows.mask[chosen]
@@ -47,5 +47,5 @@ def by_lane_changes(fit: JointFit, tracks: TrackSet, windows: Windows) -> tuple[
     vehicles = len(np.unique(windows.bodies[chosen]))
     if vehicles < MIN_VEHICLES:
         return None
-    changing = replace(setting, windows=windows.subset(chosen).spread(MOST_WINDOWS))
-    return solve_joint(State(camera, plane, np.zeros(1)), tracks, changing, refine=True), vehicles
+    changing = replace(config, windows=windows.subset(chosen).spread(MOST_WINDOWS))
+    return adjust(AdjustmentState(camera, plane, np.zeros(1)), tracks, changing, refine=True), vehicles

@@ -6,16 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from autocalib_ros.estimation.adjustment.bundle_adjustment import JointFit, solve_joint
-from autocalib_ros.estimation.adjustment.model_selection import most_probable
-from autocalib_ros.estimation.adjustment.noise_model import USUAL_HEIGHT_M
-from autocalib_ros.estimation.adjustment.parameters import Setting, State
+from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment, adjust
+from autocalib_ros.estimation.adjustment.model_selection import select_model
+from autocalib_ros.estimation.adjustment.noise_model import DEFAULT_CAMERA_HEIGHT_M
+from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig, AdjustmentState
 from autocalib_ros.estimation.motion.planar_motion import View, first_motion, on_course, sliding, turning_centres
 from autocalib_ros.estimation.motion.rigid_bodies import Bundle
 from autocalib_ros.estimation.observations.track_set import TrackSet
 from autocalib_ros.estimation.observations.tracklets import find_lives, no_lives
 from autocalib_ros.estimation.observations.two_frame_windows import Instants, Windows
-from autocalib_ros.estimation.verification.consistency import differences
+from autocalib_ros.estimation.verification.consistency import compare_solutions
 from autocalib_ros.results.calibration import Reason
 
 START_DIAGONALS = (0.35, 0.55, 0.85)
@@ -42,72 +42,72 @@ MIN_BODIES = 8
 """So many vehicles that turn, distinct, make up evidence; fewer may be one driver's whim or a wrong group each."""
 
 
-def from_turning(tracks: TrackSet, windows: Windows, setting: Setting) -> JointFit | None:
+def from_turning(tracks: TrackSet, windows: Windows, config: AdjustmentConfig) -> Adjustment | None:
     """Solve for lens and plane from the motion of vehicles alone, from several starts; None where too few turn."""
     nothing = tracks.subset(np.zeros(0, int))
-    few = replace(setting, windows=windows.spread(START_WINDOWS))
+    few = replace(config, windows=windows.spread(START_WINDOWS))
     if len(np.unique(few.windows.bodies)) < MIN_BODIES:
         return None
-    centre = setting.prior.centre
+    centre = config.prior.centre
     diagonal = np.hypot(centre.width, centre.height)
-    lenses = [setting.prior.start(diagonal * share) for share in START_DIAGONALS]
-    starts = [State(lens, _level_plane(tilt), np.zeros(0))
-              for lens in (lenses[:1] if setting.prior.focal_known else lenses) for tilt in START_TILTS_DEG]
-    best = most_probable([solve_joint(start, nothing, few) for start in starts], nothing)
+    lenses = [config.prior.start(diagonal * share) for share in START_DIAGONALS]
+    starts = [AdjustmentState(lens, _level_plane(tilt), np.zeros(0))
+              for lens in (lenses[:1] if config.prior.focal_known else lenses) for tilt in START_TILTS_DEG]
+    best = select_model([adjust(start, nothing, few) for start in starts], nothing)
     turning = with_turning(best, nothing, windows)
     return with_turning(turning, tracks, windows) if turning else None
 
 
-def with_turning(fit: JointFit, tracks: TrackSet, windows: Windows) -> JointFit | None:
+def with_turning(fit: Adjustment, tracks: TrackSet, windows: Windows) -> Adjustment | None:
     """Solve again with the vehicles that turn in the plane of a solution; None where they are too few."""
     chosen = _turning(fit, windows)
     if chosen is None:
         return None
-    return solve_joint(fit.state, tracks, replace(fit.problem.setting, windows=chosen.spread(MOST_WINDOWS)),
+    return adjust(fit.state, tracks, replace(fit.problem.config, windows=chosen.spread(MOST_WINDOWS)),
                        refine=True)
 
 
-def over_lives(fit: JointFit, tracks: TrackSet, windows: Windows,
-               instants: Instants) -> tuple[JointFit, State | None]:
+def over_lives(fit: Adjustment, tracks: TrackSet, windows: Windows,
+               instants: Instants) -> tuple[Adjustment, AdjustmentState | None]:
     """Solve a last time with those vehicles over their lives, where they are followed, and how they correlate.
 
     Windows and lives are cut from the same tracks: solutions by the one and by the other that differ by more than
     either knows mean that one of the two models is wrong. Then windows stand, which assume less, and the state that
     lives lead to comes with them.
     """
-    setting = replace(fit.problem.setting, vehicle_correlation=fit.vehicle_correlation)
-    chosen = _turning(fit, windows) if setting.turning else None
+    config = replace(fit.problem.config, vehicle_correlation=fit.vehicle_correlation)
+    chosen = _turning(fit, windows) if config.turning else None
     lives = no_lives() if chosen is None else find_lives(chosen, instants, MOST_LIVES)
     by_lives = None if chosen is None or not len(lives) else _by_lives(fit, tracks, replace(
-        setting, windows=chosen.subset(chosen.of_segments).spread(MOST_WINDOWS),
-        bundle=Bundle(lives, setting.options.noise_px, setting.options.drift_px)))
-    if by_lives is not None and not differences(fit, by_lives).beyond(APART):
+        config, windows=chosen.subset(chosen.of_segments).spread(MOST_WINDOWS),
+        bundle=Bundle(lives, config.options.noise_px, config.options.drift_px)))
+    if by_lives is not None and not compare_solutions(fit, by_lives).exceeds(APART):
         return by_lives, None
-    by_windows = solve_joint(fit.state, tracks, setting, refine=True, inner=fit.problem.inner)
+    by_windows = adjust(fit.state, tracks, config, refine=True, warm_start=fit.problem.warm_start)
     return by_windows, None if by_lives is None else by_lives.state
 
 
-def _by_lives(fit: JointFit, tracks: TrackSet, setting: Setting) -> JointFit:
+def _by_lives(fit: Adjustment, tracks: TrackSet, config: AdjustmentConfig) -> Adjustment:
     """Solve with a bundle, of points that drift or of such that do not: whichever makes them more probable."""
-    solved = solve_joint(fit.state, tracks, setting, refine=True)
-    drifting, (_, _, shapes) = solved.problem.setting.bundle, solved.problem.inner
+    solved = adjust(fit.state, tracks, config, refine=True)
+    drifting, (_, _, shapes) = solved.problem.config.bundle, solved.problem.warm_start
     if drifting is None or shapes is None:
         return solved
     steady, camera, plane = drifting.steady(), solved.state.camera, solved.state.rotation
     if steady.noise_cost(camera, plane, shapes) < drifting.noise_cost(camera, plane, shapes):
-        solved = solve_joint(solved.state, tracks, replace(setting, bundle=steady), refine=True,
-                             inner=solved.problem.inner)
+        solved = adjust(solved.state, tracks, replace(config, bundle=steady), refine=True,
+                             warm_start=solved.problem.warm_start)
     return begun_anew(solved, tracks)
 
 
-def begun_anew(fit: JointFit, tracks: TrackSet) -> JointFit:
+def begun_anew(fit: Adjustment, tracks: TrackSet) -> Adjustment:
     """Solve again with lives begun anew at a solution, where that suits any better than how it was carried there.
 
     A life has more than one shape that no small change improves. Where lives are few, a single one that was begun far
     from the solution, and is stuck in such a shape, holds the solution back by degrees.
     """
     for _ in range(BEGINNINGS):
-        bundle, (_, motion, shapes) = fit.problem.setting.bundle, fit.problem.inner
+        bundle, (_, motion, shapes) = fit.problem.config.bundle, fit.problem.warm_start
         if bundle is None or shapes is None:
             return fit
         camera, plane = fit.state.camera, fit.state.rotation
@@ -116,27 +116,27 @@ def begun_anew(fit: JointFit, tracks: TrackSet) -> JointFit:
         better = anew_cost < carried_cost - BETTER
         if not better.any():
             return fit
-        fit = solve_joint(fit.state, tracks, fit.problem.setting, refine=True,
-                          inner=(None, motion, shapes.where(better, anew)))
+        fit = adjust(fit.state, tracks, fit.problem.config, refine=True,
+                          warm_start=(None, motion, shapes.where(better, anew)))
     return fit
 
 
-def with_lives_apart(fit: JointFit, by_lives: State | None) -> JointFit:
+def with_lives_apart(fit: Adjustment, by_lives: AdjustmentState | None) -> Adjustment:
     """Widen the deviations of a solution by how far the state is that lives led to, where that was not believed."""
     if by_lives is None:
         return fit
-    step = fit.problem.steps.to(by_lives)
+    step = fit.problem.parameters.step_to(by_lives)
     return replace(fit, covariance=fit.covariance + np.outer(step, step))
 
 
-def one_centre_doubt(fit: JointFit, windows: Windows) -> Reason | None:
+def one_centre_doubt(fit: Adjustment, windows: Windows) -> Reason | None:
     """Say that all vehicles turn about one point and that this is not enough, if so.
 
     One axis for all motion tells lens and plane so weakly that noise biases them by more than the stated deviations,
     unless these are small.
     """
     sigma = fit.focal_sigma
-    rests = fit.problem.setting.turning and sigma >= ONE_CENTRE_SIGMA
+    rests = fit.problem.config.turning and sigma >= ONE_CENTRE_SIGMA
     chosen = _turning(fit, windows) if rests else None
     if chosen is None:
         return None
@@ -151,29 +151,29 @@ def one_centre_doubt(fit: JointFit, windows: Windows) -> Reason | None:
         'wait for more traffic, above all such that turns elsewhere, enters or leaves, or drives straight')
 
 
-def with_sliding(fit: JointFit, windows: Windows) -> JointFit:
+def with_sliding(fit: Adjustment, windows: Windows) -> Adjustment:
     """Widen the deviation of a focal length that rests on turning traffic by what sliding points may do to it."""
-    state, prior = fit.state, fit.problem.setting.prior
-    rests = len(state.angles_rad) < 2 and fit.problem.setting.turning and 0 in prior.free
+    state, prior = fit.state, fit.problem.config.prior
+    rests = len(state.angles_rad) < 2 and fit.problem.config.turning and 0 in prior.free
     chosen = _turning(fit, windows) if rests else None
     if chosen is None:
         return fit
-    view = View.of(chosen, state.camera, state.rotation, fit.problem.setting.options)
+    view = View.of(chosen, state.camera, state.rotation, fit.problem.config.options)
     covariance = fit.covariance.copy()
     focal = int(np.flatnonzero(prior.free == 0)[0])
     covariance[focal, focal] += (SLIDING_FOCAL * sliding(chosen, first_motion(view), state.camera, state.rotation)) ** 2
     return replace(fit, covariance=covariance)
 
 
-def _turning(fit: JointFit, windows: Windows) -> Windows | None:
+def _turning(fit: Adjustment, windows: Windows) -> Windows | None:
     """Windows of vehicles that turn in the plane of a solution; None where they are too few.
 
     Of those that turn, what they show before and after counts too, unless two roads tell more of it: whoever never
     turns may be two, side by side.
     """
     state = fit.state
-    view = View.of(windows, state.camera, state.rotation, fit.problem.setting.options)
-    height_m = fit.problem.setting.height_m or USUAL_HEIGHT_M
+    view = View.of(windows, state.camera, state.rotation, fit.problem.config.options)
+    height_m = fit.problem.config.height_m or DEFAULT_CAMERA_HEIGHT_M
     course, turning = on_course(windows, view, first_motion(view), state.camera, state.rotation, height_m)
     bodies = np.unique(windows.bodies[turning])
     if len(bodies) < MIN_BODIES:

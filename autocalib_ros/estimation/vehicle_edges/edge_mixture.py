@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from autocalib_ros.estimation.observations.track_set import independence
+from autocalib_ros.estimation.observations.track_set import kish_weight
 from autocalib_ros.geometry.robust_kernels import folded, robust, student
 
 CORRELATION = 0.3
@@ -70,7 +70,7 @@ def find_peaks(told: Turns, vehicles: np.ndarray, generator: np.random.Generator
     edges have in common.
     """
     turns = (np.arange(STEPS) / STEPS * 2 - 1) * LARGEST_TURN_RAD
-    weights, mixture = independence(vehicles, CORRELATION), _Mixture(told)
+    weights, mixture = kish_weight(vehicles, CORRELATION), _Mixture(told)
     for _ in range(ROUNDS):
         turn = _highest(turns, weights @ mixture.log_density(turns))
         mixture = mixture.maximised(turn, weights)

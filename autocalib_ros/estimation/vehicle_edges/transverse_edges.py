@@ -16,12 +16,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from autocalib_ros.estimation.adjustment.bundle_adjustment import JointFit
-from autocalib_ros.estimation.adjustment.parameters import State, level_normal
-from autocalib_ros.estimation.observations.track_set import TrackSet, earlier_ones
+from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment
+from autocalib_ros.estimation.adjustment.parameters import AdjustmentState, level_normal
+from autocalib_ros.estimation.observations.track_set import TrackSet, count_earlier
 from autocalib_ros.estimation.vehicle_edges.edge_mixture import Turns, find_peaks
 from autocalib_ros.evidence.snapshot import Evidence
-from autocalib_ros.geometry.great_circles import along_px, rays_of
+from autocalib_ros.geometry.great_circles import bearing_change, unproject_rays
 from autocalib_ros.geometry.robust_kernels import folded
 from autocalib_ros.geometry.small_matrices import cross, dot
 from autocalib_ros.lens.camera import Camera
@@ -76,9 +76,9 @@ def turns_of(camera: Camera, along: np.ndarray, across: np.ndarray, ends_px: np.
     """Return the turns about a road `along` (3,), counted from `across` (3,), of edges (n, 4)."""
     middle, step = (ends_px[:, :2] + ends_px[:, 2:]) / 2, ends_px[:, 2:] - ends_px[:, :2]
     length = np.maximum(np.hypot(*step.T), 1e-9)
-    rays, unit = rays_of(camera, middle), step / length[:, None]
-    circles = cross(rays.bearings, along_px(rays, camera, middle, unit))
-    slopes = cross(rays.bearings, along_px(rays, camera, middle, np.column_stack([-unit[:, 1], unit[:, 0]])))
+    rays, unit = unproject_rays(camera, middle), step / length[:, None]
+    circles = cross(rays.bearings, bearing_change(rays, camera, middle, unit))
+    slopes = cross(rays.bearings, bearing_change(rays, camera, middle, np.column_stack([-unit[:, 1], unit[:, 0]])))
     basis = np.stack([across, np.cross(along, across)])
     (p, q), (slope_p, slope_q) = basis @ circles.T, basis @ slopes.T
     aside2 = np.maximum(p * p + q * q, 1e-30)
@@ -113,7 +113,7 @@ class SquareVehicles:
     besides: str = ''
     """That assumption in words."""
 
-    def across(self, state: State, step_rad: float = 0.0) -> np.ndarray:
+    def across(self, state: AdjustmentState, step_rad: float = 0.0) -> np.ndarray:
         """Direction (3,) across the first road at a state near the solution, rotated about the road by a step."""
         along = state.directions[0]
         across = self.origin - (self.origin @ along) * along
@@ -123,20 +123,20 @@ class SquareVehicles:
         return np.cos(turn) * across + np.sin(turn) * np.cross(along, across)
 
     @property
-    def words(self) -> str:
+    def description(self) -> str:
         """What is assumed."""
         return (f'edges of {self.vehicles} vehicles taken as square to it{self.besides}: '
                 f'+- {np.degrees(self.step_sigma_rad):.1f} degrees about the road')
 
 
-def square_vehicles(evidence: Evidence, fit: JointFit, tracks: TrackSet,
+def square_vehicles(evidence: Evidence, fit: Adjustment, tracks: TrackSet,
                     generator: np.random.Generator) -> SquareVehicles | None:
     """Find the direction across the first road by edges of the vehicles that follow it; None where they do not tell."""
-    following = tracks.subset(fit.explained() & (fit.labels == 0))
+    following = tracks.subset(fit.inliers() & (fit.labels == 0))
     return square_to(edges_on_road(evidence, following), fit.state, generator)
 
 
-def square_to(edges: RoadEdges, state: State, generator: np.random.Generator) -> SquareVehicles | None:
+def square_to(edges: RoadEdges, state: AdjustmentState, generator: np.random.Generator) -> SquareVehicles | None:
     """Find the direction across the first road of a state by edges on its vehicles; None where they do not tell."""
     along = state.directions[0]
     # turns are counted from where a camera without roll has that direction
@@ -159,4 +159,4 @@ def _longest_in_turn(edges: RoadEdges) -> RoadEdges:
     """Keep at most `MAX_EDGES`, the longest of each vehicle first."""
     length = np.hypot(*(edges.ends_px[:, 2:] - edges.ends_px[:, :2]).T)
     edges = edges.subset(np.argsort(-length, kind='stable'))
-    return edges.subset(np.sort(np.argsort(earlier_ones(edges.vehicles), kind='stable')[:MAX_EDGES]))
+    return edges.subset(np.sort(np.argsort(count_earlier(edges.vehicles), kind='stable')[:MAX_EDGES]))

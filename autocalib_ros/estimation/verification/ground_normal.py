@@ -7,23 +7,23 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from autocalib_ros.estimation.adjustment.bundle_adjustment import JointFit
-from autocalib_ros.estimation.adjustment.parameters import ALONG_X, State
+from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment
+from autocalib_ros.estimation.adjustment.parameters import MIN_SINE_TO_X_AXIS, AdjustmentState
 from autocalib_ros.estimation.observations.track_set import TrackSet
 from autocalib_ros.estimation.vehicle_edges.transverse_edges import SquareVehicles
-from autocalib_ros.geometry.great_circles import rays_of
-from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg, upward
+from autocalib_ros.geometry.great_circles import unproject_rays
+from autocalib_ros.geometry.ground_plane import orient_upward, tilt_and_roll_deg
 from autocalib_ros.geometry.robust_kernels import folded
 from autocalib_ros.lens.camera import Camera
 
 STEP_RAD = 1e-5
-AGREE_SIGMAS = 3.0
+AGREEMENT_SIGMAS = 3.0
 """Two assumptions that differ by more contradict each other."""
 
 
-def above_traffic(normal: np.ndarray, camera: Camera, tracks: TrackSet) -> tuple[np.ndarray, float]:
+def orient_above_traffic(normal: np.ndarray, camera: Camera, tracks: TrackSet) -> tuple[np.ndarray, float]:
     """Turn a plane normal (3,) away from the traffic; and the share of the tracked points below the horizon."""
-    return upward(normal, rays_of(camera, tracks.pixels[tracks.weights > 0]).bearings)
+    return orient_upward(normal, unproject_rays(camera, tracks.pixels[tracks.weights > 0]).bearings)
 
 
 @dataclass(frozen=True)
@@ -37,27 +37,27 @@ class LevelCamera:
         """Standard deviation of the roll."""
         return float(np.radians(self.sigma_deg))
 
-    def across(self, _: State, step_rad: float = 0.0) -> np.ndarray:
+    def across(self, _: AdjustmentState, step_rad: float = 0.0) -> np.ndarray:
         """Direction (3,) in the plane, at a roll by a step: what is level in the image."""
         return np.array([np.cos(step_rad), np.sin(step_rad), 0.0])
 
-    def tells(self, state: State) -> bool:
+    def constrains_plane(self, state: AdjustmentState) -> bool:
         """Whether the road leads across the level, so that the roll tells the plane."""
         along = state.directions[0]
-        return float(np.hypot(along[1], along[2])) > ALONG_X
+        return float(np.hypot(along[1], along[2])) > MIN_SINE_TO_X_AXIS
 
     @property
-    def words(self) -> str:
+    def description(self) -> str:
         """What is assumed."""
         return f'a camera that is not rolled: roll = 0 +- {self.sigma_deg:g} degrees'
 
 
-def agreement(level: LevelCamera, square: SquareVehicles, state: State) -> tuple[SquareVehicles | None, float]:
+def combine_assumptions(level: LevelCamera, square: SquareVehicles, state: AdjustmentState) -> tuple[SquareVehicles | None, float]:
     """Join two assumptions by their variances, None where they contradict each other; and their difference in degrees.
 
     The difference is a rotation about the road, nan where the roll does not tell the plane.
     """
-    if not level.tells(state):
+    if not level.constrains_plane(state):
         return square, np.nan
     along = state.directions[0]
     across = square.across(state)
@@ -70,31 +70,31 @@ def agreement(level: LevelCamera, square: SquareVehicles, state: State) -> tuple
     sigma = level.step_sigma_rad * abs(turn(STEP_RAD) - turn(-STEP_RAD)) / (2 * STEP_RAD)
     both = float(np.hypot(sigma, square.step_sigma_rad))
     joined = replace(square, turn_rad=turn(0.0) * (square.step_sigma_rad / both) ** 2,
-                     step_sigma_rad=square.step_sigma_rad * sigma / both, besides=f', and {level.words}')
-    return joined if abs(turn(0.0)) <= AGREE_SIGMAS * both else None, float(np.degrees(abs(turn(0.0))))
+                     step_sigma_rad=square.step_sigma_rad * sigma / both, besides=f', and {level.description}')
+    return joined if abs(turn(0.0)) <= AGREEMENT_SIGMAS * both else None, float(np.degrees(abs(turn(0.0))))
 
 
 @dataclass(frozen=True)
-class Plane:
+class PlaneEstimate:
     """The upward ground normal as a function of a state, and how sure it is."""
 
-    fit: JointFit
+    fit: Adjustment
     side: float
     """1 or -1: which side of the state's plane is up."""
     assumed: LevelCamera | SquareVehicles | None = None
     """What tells the direction across the road where the traffic does not."""
-    below: float = 1.0
+    fraction_below_horizon: float = 1.0
     """Share of the tracked points below the horizon."""
 
     @classmethod
-    def of(cls, fit: JointFit, tracks: TrackSet, assumed: LevelCamera | SquareVehicles | None = None) -> Plane:
+    def of(cls, fit: Adjustment, tracks: TrackSet, assumed: LevelCamera | SquareVehicles | None = None) -> PlaneEstimate:
         """Return the plane of a solution, the side of the traffic below."""
         plane = cls(fit, 1.0, assumed)
         normal = plane.normal(fit.state)
-        up, below = above_traffic(normal, fit.state.camera, tracks)
-        return replace(plane, side=float(np.sign(normal @ up)), below=below)
+        up, fraction_below_horizon = orient_above_traffic(normal, fit.state.camera, tracks)
+        return replace(plane, side=float(np.sign(normal @ up)), fraction_below_horizon=fraction_below_horizon)
 
-    def normal(self, state: State, step_rad: float = 0.0) -> np.ndarray:
+    def normal(self, state: AdjustmentState, step_rad: float = 0.0) -> np.ndarray:
         """Upward normal (3,) in the camera frame at a state; a step of what is assumed counts where it is."""
         if self.assumed is None:
             return self.side * state.rotation[:, 2]
@@ -102,7 +102,7 @@ class Plane:
         return self.side * normal / max(float(np.linalg.norm(normal)), 1e-9)
 
     @property
-    def here(self) -> tuple[Camera, np.ndarray]:
+    def lens_and_normal(self) -> tuple[Camera, np.ndarray]:
         """Lens and upward normal (3,) of the solution."""
         return self.fit.state.camera, self.normal(self.fit.state)
 

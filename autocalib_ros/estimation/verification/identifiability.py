@@ -4,44 +4,44 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from autocalib_ros.estimation.adjustment.bundle_adjustment import JointFit, judged_with, solve_joint
-from autocalib_ros.estimation.adjustment.covariance import told_by_evidence
-from autocalib_ros.estimation.adjustment.lens_prior import PARAMETERS
-from autocalib_ros.estimation.adjustment.model_selection import ASKED_FOR, most_probable
+from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment, adjust, evaluate_with
+from autocalib_ros.estimation.adjustment.covariance import sigma_without_prior
+from autocalib_ros.estimation.adjustment.lens_prior import LENS_PARAMETERS
+from autocalib_ros.estimation.adjustment.model_selection import MODEL_SELECTION_MARGIN, select_model
 from autocalib_ros.estimation.observations.track_set import TrackSet
 from autocalib_ros.lens.camera import Camera
 
 
-def with_k2_if_asked_for(fit: JointFit, tracks: TrackSet) -> JointFit:
+def release_k2(fit: Adjustment, tracks: TrackSet) -> Adjustment:
     """Set k2 free where that makes the traffic clearly more probable; one road cannot tell."""
-    setting = fit.problem.setting
-    if setting.prior.family != 'equidistant' or setting.prior.sigma[3] <= 0 or not fit.plane_known:
+    config = fit.problem.config
+    if config.prior.family != 'equidistant' or config.prior.sigma[3] <= 0 or not fit.plane_known:
         return fit
-    bent = solve_joint(fit.state, tracks, replace(setting, prior=setting.prior.with_k2()), refine=True,
-                       inner=fit.problem.inner)
-    return most_probable([fit, bent], tracks, ASKED_FOR)
+    bent = adjust(fit.state, tracks, replace(config, prior=config.prior.with_free_k2()), refine=True,
+                       warm_start=fit.problem.warm_start)
+    return select_model([fit, bent], tracks, MODEL_SELECTION_MARGIN)
 
 
-def with_what_can_be_told(fit: JointFit, tracks: TrackSet) -> tuple[JointFit, tuple[str, ...]]:
+def fix_unidentifiable(fit: Adjustment, tracks: TrackSet) -> tuple[Adjustment, tuple[str, ...]]:
     """Hold what the evidence cannot tell; the names of what is held."""
-    setting, held = fit.problem.setting, _untold(fit)
-    if not held:
+    config, fixed = fit.problem.config, _unidentifiable(fit)
+    if not fixed:
         return fit, ()
-    at_prior = setting.prior.start(fit.state.camera.focal_px)
+    at_prior = config.prior.start(fit.state.camera.focal_px)
     camera = fit.state.camera
-    for name in held:
+    for name in fixed:
         camera = _restored(camera, at_prior, name)
-    solved = solve_joint(replace(fit.state, camera=camera), tracks,
-                         replace(setting, prior=setting.prior.holding(held)), refine=True, inner=fit.problem.inner)
-    return judged_with(solved, tracks, setting), held
+    solved = adjust(replace(fit.state, camera=camera), tracks,
+                         replace(config, prior=config.prior.with_fixed(fixed)), refine=True, warm_start=fit.problem.warm_start)
+    return evaluate_with(solved, tracks, config), fixed
 
 
-def _untold(fit: JointFit) -> tuple[str, ...]:
+def _unidentifiable(fit: Adjustment) -> tuple[str, ...]:
     """Names of the lens's parameters that the evidence alone leaves wider than their prior."""
-    prior = fit.problem.setting.prior
-    _, known = fit.problem.steps.prior_gradient(fit.state.camera)
-    left = told_by_evidence(fit.information, known)
-    names = [PARAMETERS[parameter] for parameter in prior.free]
+    prior = fit.problem.config.prior
+    _, known = fit.problem.parameters.prior_gradient(fit.state.camera)
+    left = sigma_without_prior(fit.information, known)
+    names = [LENS_PARAMETERS[parameter] for parameter in prior.free]
     return tuple(name for name, sigma, is_known in zip(names, left, known, strict=False) if is_known and sigma > 1.0)
 
 
@@ -56,9 +56,9 @@ def _restored(camera: Camera, prior: Camera, name: str) -> Camera:
     return replace(camera, **values[name])
 
 
-def lens_assumptions(fit: JointFit, held: tuple[str, ...]) -> tuple[str, ...]:
+def lens_assumptions(fit: Adjustment, fixed: tuple[str, ...]) -> tuple[str, ...]:
     """Say in words what was taken for granted of the lens."""
-    prior = fit.problem.setting.prior
+    prior = fit.problem.config.prior
     if prior.family == 'known':
         return ('the lens is as given: only the pose was solved',)
     words = {'equidistant': 'lens near equidistant: k1 = 0', 'distortion_free': 'lens free of distortion: k1 = 1/3',
@@ -70,4 +70,4 @@ def lens_assumptions(fit: JointFit, held: tuple[str, ...]) -> tuple[str, ...]:
         sigma = prior.sigma[0] * prior.centre.focal_px
         spread = f' +- {sigma:g} px' if sigma > 0 else ''
         told.append(f'focal length {prior.centre.focal_px:g} px{spread} (given)')
-    return (*told, *(f'{name} held there: the traffic cannot determine it' for name in held))
+    return (*told, *(f'{name} held there: the traffic cannot determine it' for name in fixed))

@@ -10,7 +10,7 @@ from autocalib_ros.results.calibration import Reason
 
 REFERENCE_WIDTH_PX = 1280
 """Image width for which `max_drift_px` is given; it scales with the width."""
-EARLY_S = 30.0
+MIN_RATE_TIME_S = 30.0
 """What is seen in a shorter time is one vehicle or two, and no rate."""
 NO_TRAFFIC_S = 300.0
 """After so long without traffic the rate of before says nothing of what comes."""
@@ -22,10 +22,10 @@ class Requirement:
 
     have: float
     need: float
-    words: str
+    description: str
 
     @property
-    def share(self) -> float:
+    def fraction(self) -> float:
         """Part of the need that is there, 1 where it is met."""
         return min(1.0, self.have / self.need) if self.need > 0 else 1.0
 
@@ -35,7 +35,7 @@ def drift_limit_px(image_width: int, gate: GateOptions) -> float:
     return gate.max_drift_px * image_width / REFERENCE_WIDTH_PX
 
 
-def unsteady(evidence: Evidence, gate: GateOptions) -> Reason | None:
+def check_steady(evidence: Evidence, gate: GateOptions) -> Reason | None:
     """Say how far the camera moved, where that is too far."""
     limit = drift_limit_px(evidence.image_size[0], gate)
     return None if evidence.drift_px <= limit else Reason(
@@ -43,9 +43,9 @@ def unsteady(evidence: Evidence, gate: GateOptions) -> Reason | None:
         f'{limit:.1f} px pass for standing still', 'fix the camera to something rigid and record again')
 
 
-def shortfall(evidence: Evidence, gate: GateOptions) -> Reason | None:
+def check_readiness(evidence: Evidence, gate: GateOptions) -> Reason | None:
     """Return the first reason why nothing can be estimated from the evidence, or None."""
-    moving = unsteady(evidence, gate)
+    moving = check_steady(evidence, gate)
     if moving:
         return moving
     if not evidence.track_count:
@@ -72,22 +72,22 @@ def requirements(evidence: Evidence, gate: GateOptions, first_solve_s: float) ->
             Requirement(seconds, first_solve_s, f'{seconds:.0f} s of the first {first_solve_s:g} s watched')]
 
 
-def outlook(evidence: Evidence, share: float) -> str:
-    """Say how long it takes until `share` of what is needed has become all, at the rate since the start.
+def outlook(evidence: Evidence, fraction: float) -> str:
+    """Say how long it takes until `fraction` of what is needed has become all, at the rate since the start.
 
     '' in the first moments, before anything is seen, and when nothing is missing; without traffic it says that instead.
     """
-    if share >= 1.0:
+    if fraction >= 1.0:
         return ''
     idle_s = evidence.seconds - evidence.times_s.max(initial=0.0)
     if idle_s >= NO_TRAFFIC_S:
-        return f'no traffic in the last {in_words(idle_s)}'
-    if evidence.seconds < EARLY_S or share <= 0.0:
+        return f'no traffic in the last {coarse_duration(idle_s)}'
+    if evidence.seconds < MIN_RATE_TIME_S or fraction <= 0.0:
         return ''
-    return f'about {in_words(evidence.seconds * (1.0 / share - 1.0))} more at this rate'
+    return f'about {coarse_duration(evidence.seconds * (1.0 / fraction - 1.0))} more at this rate'
 
 
-def in_words(seconds: float) -> str:
+def coarse_duration(seconds: float) -> str:
     """Return a time as coarsely as an estimate deserves."""
     for unit, length_s, most_s in (('s', 10.0, 90.0), ('min', 60.0, 5400.0), ('h', 3600.0, 172800.0)):
         if seconds < most_s:

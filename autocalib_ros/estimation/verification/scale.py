@@ -12,28 +12,28 @@ from dataclasses import dataclass
 import numpy as np
 
 from autocalib_ros.config import GateOptions, Options, ScaleOptions
-from autocalib_ros.estimation.adjustment.noise_model import USUAL_HEIGHT_M
+from autocalib_ros.estimation.adjustment.noise_model import DEFAULT_CAMERA_HEIGHT_M
 from autocalib_ros.estimation.observations.track_set import TrackSet
 from autocalib_ros.geometry.ground_plane import ground_points
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.results.calibration import Reason
 
-LIKE_USUAL = 1.25
+SIMILAR_HEIGHT_FACTOR = 1.25
 """A height within this factor of the usual one weighs near against far as that one did: nothing is solved again."""
-LEAST_BELOW = 0.03
+MIN_DEPRESSION_SCALE_SINE = 0.03
 """Least sine of the angle below the horizon of a pixel whose place on the road is believed: 33 heights away."""
-LEAST_VEHICLES = 10
+MIN_SPEED_VEHICLES = 10
 """Fewer vehicles tell neither how fast the traffic goes nor how much that varies."""
-FLOWING = 0.4
+MIN_FLOW_SPEED_FRACTION = 0.4
 """Slower than this share of the median speed is who walks or waits; vehicles that flow vary by a fifth or so."""
-TRIMMED = 0.25
+TRIM_FRACTION = 0.25
 """Share of the vehicles, slowest and fastest each, that does not count in the mean speed."""
 STEP_PX = 1e-3
-TO_SIGMA = 1.4826
+MAD_TO_SIGMA = 1.4826
 """Standard deviation over median absolute deviation, of normal errors."""
 M_S_PER_KM_H = 1 / 3.6
 
-Height = Callable[[Camera, np.ndarray], float]
+HeightFunction = Callable[[Camera, np.ndarray], float]
 """The height of the camera as a function of lens and upward normal (3,)."""
 
 
@@ -41,12 +41,12 @@ Height = Callable[[Camera, np.ndarray], float]
 class Scale:
     """Where the scale comes from, and how sure the height is where lens and plane are exact."""
 
-    height: Height
+    height: HeightFunction
     sigma: float
     """Standard deviation of the height, without that of lens and plane."""
     metric: bool
     """Whether the height is in metres."""
-    words: str
+    description: str
     derived: bool = False
     """Whether the height follows from lens and plane; otherwise it was given."""
 
@@ -55,7 +55,7 @@ class Scale:
         if not self.metric:
             return ()
         spread = '' if sigma is None else f' +- {sigma:.2g}'
-        return (f'scale by {self.words}' + (f': camera height {height:.3f}{spread} m' if self.derived else ''),)
+        return (f'scale by {self.description}' + (f': camera height {height:.3f}{spread} m' if self.derived else ''),)
 
 
 def known_scale(options: Options, camera: Camera, normal: np.ndarray, flow: TrackSet | None = None) -> Scale | Reason:
@@ -64,9 +64,9 @@ def known_scale(options: Options, camera: Camera, normal: np.ndarray, flow: Trac
     `flow` are straight tracks along the busiest road, for the scale by their speed.
     """
     if options.scale_from == 'distance':
-        return _by_distance(options.scale, camera, normal)
+        return _scale_from_distance(options.scale, camera, normal)
     if options.scale_from == 'speed' and flow is not None:
-        return _by_speed(options.scale, camera, normal, flow)
+        return _scale_from_speed(options.scale, camera, normal, flow)
     height, sigma = options.camera_height, options.camera_height_sigma
     if height > 0:
         spread = f' +- {sigma:g}' if sigma > 0 else ''
@@ -79,7 +79,7 @@ def known_scale(options: Options, camera: Camera, normal: np.ndarray, flow: Trac
         'allow_unit_scale for a plane in units of the height')
 
 
-def scale_doubt(height: float, sigma: float, gate: GateOptions) -> Reason | None:
+def check_scale(height: float, sigma: float, gate: GateOptions) -> Reason | None:
     """Say why a height with its whole standard deviation cannot be trusted, if so."""
     if sigma <= gate.max_sigma_height_rel * height:
         return None
@@ -92,17 +92,17 @@ def scale_doubt(height: float, sigma: float, gate: GateOptions) -> Reason | None
 
 def is_unusual(height_m: float) -> bool:
     """Whether a height is so far from the one that an unknown height is taken for that solving again is worth it."""
-    return abs(np.log(height_m / USUAL_HEIGHT_M)) > np.log(LIKE_USUAL)
+    return abs(np.log(height_m / DEFAULT_CAMERA_HEIGHT_M)) > np.log(SIMILAR_HEIGHT_FACTOR)
 
 
-def _by_distance(given: ScaleOptions, camera: Camera, normal: np.ndarray) -> Scale | Reason:
+def _scale_from_distance(given: ScaleOptions, camera: Camera, normal: np.ndarray) -> Scale | Reason:
     """Two pixels on the road and the metres between them."""
     pixels = np.array(given.pixels)
     bearings, valid = camera.unproject(pixels)
     below = -(bearings @ normal)
     for (u, v), sine, there in zip(given.pixels, below, valid, strict=True):
-        if not there or sine < LEAST_BELOW:
-            degrees, needed = np.degrees(np.arcsin([sine, LEAST_BELOW]))
+        if not there or sine < MIN_DEPRESSION_SCALE_SINE:
+            degrees, needed = np.degrees(np.arcsin([sine, MIN_DEPRESSION_SCALE_SINE]))
             side = 'below' if degrees > 0 else 'above'
             where = f'lies {abs(degrees):.1f} degrees {side} the horizon of the plane found' if there else (
                 'lies where the lens found shows nothing')
@@ -127,7 +127,7 @@ def _by_distance(given: ScaleOptions, camera: Camera, normal: np.ndarray) -> Sca
         f'+- {given.pixel_sigma_px:g} px (given)', derived=True)
 
 
-def _by_speed(given: ScaleOptions, camera: Camera, normal: np.ndarray, flow: TrackSet) -> Scale | Reason:
+def _scale_from_speed(given: ScaleOptions, camera: Camera, normal: np.ndarray, flow: TrackSet) -> Scale | Reason:
     """The mean speed of the traffic.
 
     A point h above the road seems to be where its ray meets the road, H / (H - h) times as far and as fast: v metres a
@@ -137,13 +137,13 @@ def _by_speed(given: ScaleOptions, camera: Camera, normal: np.ndarray, flow: Tra
     """
     tracks = _flowing(camera, normal, flow)
     vehicles = len(np.unique(tracks.vehicles))
-    if vehicles < LEAST_VEHICLES:
+    if vehicles < MIN_SPEED_VEHICLES:
         return Reason(
-            'too_few_vehicles', f'{vehicles} vehicles drive straight along the busiest road, {LEAST_VEHICLES} are '
+            'too_few_vehicles', f'{vehicles} vehicles drive straight along the busiest road, {MIN_SPEED_VEHICLES} are '
             'needed to compare their speed with the mean that was given', 'wait for more traffic, or record for longer')
     speeds = _vehicle_speeds(camera, normal, tracks)
     mean, error = trimmed_mean(speeds)
-    varying = TO_SIGMA * float(np.median(np.abs(speeds - np.median(speeds)))) / mean
+    varying = MAD_TO_SIGMA * float(np.median(np.abs(speeds - np.median(speeds)))) / mean
     above = given.speed_km_h * M_S_PER_KM_H / mean
     relative = np.linalg.norm([given.speed_sigma_km_h / given.speed_km_h, error / mean, varying**2])
     return Scale(
@@ -160,7 +160,7 @@ def _flowing(camera: Camera, normal: np.ndarray, flow: TrackSet) -> TrackSet:
     if not len(flow):
         return flow
     speeds = _vehicle_speeds(camera, normal, flow)
-    slow = np.unique(flow.vehicles)[speeds < FLOWING * np.median(speeds)]
+    slow = np.unique(flow.vehicles)[speeds < MIN_FLOW_SPEED_FRACTION * np.median(speeds)]
     return flow.subset(~np.isin(flow.vehicles, slow))
 
 
@@ -184,7 +184,7 @@ def _vehicle_speeds(camera: Camera, normal: np.ndarray, tracks: TrackSet) -> np.
 
 def trimmed_mean(values: np.ndarray) -> tuple[float, float]:
     """Mean of the middle of values (n,), and its standard deviation (Tukey & McLaughlin 1963)."""
-    cut = int(TRIMMED * len(values))
+    cut = int(TRIM_FRACTION * len(values))
     ordered = np.sort(values)
     low, high = ordered[cut], ordered[len(values) - 1 - cut]
     spread = np.clip(ordered, low, high).std(ddof=1)

@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 
 from autocalib_ros.estimation.adjustment.covariance import (
-    cluster_covariance,
-    correlation_within,
-    few_factor,
-    propagate,
-    told_by_evidence,
+    intraclass_correlation,
+    jackknife_covariance,
+    propagate_sigma,
+    sigma_without_prior,
+    small_sample_factor,
 )
 
 
 def plain(slopes: np.ndarray, residuals: np.ndarray, vehicles: np.ndarray, prior: np.ndarray) -> np.ndarray:
     """Covariance of ordinary least squares, one sample a track."""
     tracks = len(residuals)
-    return cluster_covariance(slopes * residuals[:, None], slopes[:, :, None] * slopes[:, None], np.ones(tracks),
+    return jackknife_covariance(slopes * residuals[:, None], slopes[:, :, None] * slopes[:, None], np.ones(tracks),
                               np.zeros(tracks), vehicles, prior)
 
 
@@ -36,14 +36,14 @@ def test_leaving_out_vehicles_gives_the_jackknife_of_a_mean() -> None:
     sigma2 = plain(np.ones((5, 1)), values - values.mean(), np.arange(5), np.zeros(1))[0, 0]
     left_out = np.array([np.delete(values, index).mean() for index in range(5)])
     moves = (left_out - values.mean())[:, None]
-    assert sigma2 == pytest.approx((moves**2).sum() * few_factor(moves)[0]**2)
+    assert sigma2 == pytest.approx((moves**2).sum() * small_sample_factor(moves)[0]**2)
 
 
 def test_few_vehicles_widen_deviations_as_student_does() -> None:
     many, one = np.ones((1000, 1)), np.array([[10.0], *[[0.1]] * 40])
-    assert few_factor(many)[0] == pytest.approx(1.0, abs=0.01)
-    assert few_factor(np.ones((10, 1)))[0] == pytest.approx(2.042 / 1.960, abs=1e-3)  # all alike: 30 degrees of freedom
-    assert few_factor(one)[0] > 1.5
+    assert small_sample_factor(many)[0] == pytest.approx(1.0, abs=0.01)
+    assert small_sample_factor(np.ones((10, 1)))[0] == pytest.approx(2.042 / 1.960, abs=1e-3)  # all alike: 30 degrees of freedom
+    assert small_sample_factor(one)[0] > 1.5
 
 
 def test_few_vehicles_that_agree_by_chance_are_not_believed_beyond_their_noise() -> None:
@@ -77,17 +77,17 @@ def test_correlation_is_that_of_a_shared_part() -> None:
     groups = np.repeat(np.arange(400), 5)
     pulls = np.sqrt(0.3) * np.repeat(generator.normal(size=(400, 2)), 5, axis=0)
     pulls += np.sqrt(0.7) * generator.normal(size=(2000, 2))
-    assert correlation_within(groups, pulls) == pytest.approx(0.3, abs=0.08)  # 400 groups: 3 sigma
+    assert intraclass_correlation(groups, pulls) == pytest.approx(0.3, abs=0.08)  # 400 groups: 3 sigma
 
 
 def test_evidence_that_moves_two_parameters_alike_tells_neither() -> None:
     slopes = np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 2.0]])
-    left = told_by_evidence(slopes.T @ slopes, np.zeros(3))
+    left = sigma_without_prior(slopes.T @ slopes, np.zeros(3))
     assert np.isinf(left[:2]).all()
     assert left[2] == pytest.approx(0.5)
 
 
 def test_propagation_is_linear() -> None:
     covariance = np.array([[4.0, 0.0], [0.0, 9.0]])
-    sigma = propagate(lambda step: np.array([2 * step[0], step[0] + step[1]]), 2, covariance)
+    sigma = propagate_sigma(lambda step: np.array([2 * step[0], step[0] + step[1]]), 2, covariance)
     np.testing.assert_allclose(sigma, (4.0, np.sqrt(13.0)), rtol=1e-6)

@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 
 from autocalib_ros.config import JointOptions
-from autocalib_ros.estimation.adjustment.noise_model import OnRoad, whitening
+from autocalib_ros.estimation.adjustment.noise_model import RoadPositions, whitening_matrices
 
 SAMPLES, TRACKS = 10, 4000
 OPTIONS = JointOptions()
 
 
-def place() -> tuple[np.ndarray, np.ndarray, OnRoad]:
+def place() -> tuple[np.ndarray, np.ndarray, RoadPositions]:
     """Tracks 400 px and 30 m long, from 10 px a metre to 40."""
     pixels = np.zeros((TRACKS, SAMPLES, 2))
     pixels[..., 0] = np.linspace(0, 400, SAMPLES)
     along = np.broadcast_to(np.linspace(0, 30, SAMPLES), (TRACKS, SAMPLES))
     scale = np.broadcast_to(np.linspace(10, 40, SAMPLES), (TRACKS, SAMPLES))
-    return pixels, np.ones((TRACKS, SAMPLES), bool), OnRoad(scale, along)
+    return pixels, np.ones((TRACKS, SAMPLES), bool), RoadPositions(scale, along)
 
 
 def test_noise_and_wander_come_out_white() -> None:
@@ -28,13 +28,13 @@ def test_noise_and_wander_come_out_white() -> None:
     shared = np.linalg.cholesky(np.exp(-0.5 * apart**2) + 1e-9 * np.eye(SAMPLES))
     wander = OPTIONS.wander_m * generator.normal(size=(TRACKS, SAMPLES)) @ shared.T * road.px_per_m
     distance = wander + OPTIONS.noise_px * generator.normal(size=(TRACKS, SAMPLES))
-    white = np.einsum('tij,tj->ti', whitening(pixels, mask, road, OPTIONS, drifting=False), distance)
+    white = np.einsum('tij,tj->ti', whitening_matrices(pixels, mask, road, OPTIONS, drifting=False), distance)
     np.testing.assert_allclose(white.T @ white / TRACKS, np.eye(SAMPLES), atol=0.1)  # 4000 draws: 4 sigma
 
 
 def test_drift_takes_the_weight_of_a_long_tracks_ends() -> None:
     pixels, mask, road = place()
-    steady, drifting = (whitening(pixels[:1], mask[:1], OnRoad(road.px_per_m[:1], road.along_m[:1]), OPTIONS,
+    steady, drifting = (whitening_matrices(pixels[:1], mask[:1], RoadPositions(road.px_per_m[:1], road.along_m[:1]), OPTIONS,
                                   drifting=drifting)[0] for drifting in (False, True))
     slope = np.linspace(-1.0, 1.0, SAMPLES)
     assert np.sum((drifting @ slope) ** 2) < 0.7 * np.sum((steady @ slope) ** 2)
@@ -44,7 +44,7 @@ def test_drift_takes_the_weight_of_a_long_tracks_ends() -> None:
 def test_samples_that_are_not_there_count_for_nothing(drifting: bool) -> None:
     pixels, mask, road = place()
     mask[:, 7:] = False
-    whiten = whitening(pixels, mask, road, OPTIONS, drifting=drifting)[0]
+    whiten = whitening_matrices(pixels, mask, road, OPTIONS, drifting=drifting)[0]
     assert not whiten[:, 7:].any()
     distance = np.zeros(SAMPLES)
     distance[7:] = 1e6

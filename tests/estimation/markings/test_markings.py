@@ -10,16 +10,16 @@ import pytest
 
 from autocalib_ros.calibrator import solve
 from autocalib_ros.config import GateOptions, JointOptions, Options
-from autocalib_ros.estimation.adjustment.bundle_adjustment import JointFit
+from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment
 from autocalib_ros.estimation.adjustment.lens_prior import known_lens, lens_priors
-from autocalib_ros.estimation.adjustment.parameters import Setting
-from autocalib_ros.estimation.estimate import Solution, agreed_by, find_solution
+from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig
+from autocalib_ros.estimation.estimate import Solution, find_solution, verify_with_traffic
 from autocalib_ros.estimation.markings.grid_search import grid_search as markings
 from autocalib_ros.estimation.markings.grid_search import square_grids
 from autocalib_ros.estimation.markings.markings_solution import fit_to_markings, with_lens_known
 from autocalib_ros.estimation.markings.road_segments import lines_on_road
 from autocalib_ros.estimation.observations.track_set import TrackSet, select_tracks
-from autocalib_ros.estimation.verification.ground_normal import Plane
+from autocalib_ros.estimation.verification.ground_normal import PlaneEstimate
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.ground_plane import GroundPlane, tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera
@@ -62,17 +62,17 @@ def painted(junction: Junction, paint: Paint = PAINT, seed: int = 1) -> Evidence
                                           post_lines(junction, generator, 6, paint)]))
 
 
-def told(evidence: Evidence, lens: Camera | None = None) -> tuple[JointFit, TrackSet, str] | Reason:
+def told(evidence: Evidence, lens: Camera | None = None) -> tuple[Adjustment, TrackSet, str] | Reason:
     """What the lines alone tell."""
     options = OPTIONS.joint
     tracks = select_tracks(evidence, options.max_tracks)
-    priors = [known_lens(lens)] if lens else [prior.loosened()
+    priors = [known_lens(lens)] if lens else [prior.with_loose_principal_point()
                                               for prior in lens_priors(evidence.image_size, options)]
-    found = fit_to_markings(evidence, tracks, priors, Setting(priors[0], options), GateOptions())
+    found = fit_to_markings(evidence, tracks, priors, AdjustmentConfig(priors[0], options), GateOptions())
     return found if isinstance(found, Reason) else (found[0], tracks, found[1])
 
 
-def fit_of(evidence: Evidence, lens: Camera | None = None) -> tuple[JointFit, TrackSet, str]:
+def fit_of(evidence: Evidence, lens: Camera | None = None) -> tuple[Adjustment, TrackSet, str]:
     found = told(evidence, lens)
     assert not isinstance(found, Reason), found.message
     return found
@@ -84,7 +84,7 @@ def refused(evidence: Evidence) -> str:
     return found.message
 
 
-def focal_error(fit: JointFit, junction: Junction) -> float:
+def focal_error(fit: Adjustment, junction: Junction) -> float:
     return float(np.log(fit.state.camera.focal_px / junction.camera.focal_px))
 
 
@@ -92,14 +92,14 @@ def angle_deg(one: np.ndarray, other: np.ndarray) -> float:
     return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(one, other)), one @ other)))
 
 
-def tilt_and_roll_sigmas(fit: JointFit, tracks: TrackSet, junction: Junction) -> np.ndarray:
+def tilt_and_roll_sigmas(fit: Adjustment, tracks: TrackSet, junction: Junction) -> np.ndarray:
     """How many of their own standard deviations tilt and roll are off, shape (2,)."""
-    sigmas = Plane.of(fit, tracks).sigma(lambda _, normal: tilt_and_roll_deg(normal))
+    sigmas = PlaneEstimate.of(fit, tracks).sigma(lambda _, normal: tilt_and_roll_deg(normal))
     return np.abs(np.subtract(tilt_and_roll_deg(fit.state.rotation[:, 2]),
                               tilt_and_roll_deg(junction.normal_in_camera)) / sigmas)
 
 
-def require_true(fit: JointFit, tracks: TrackSet, junction: Junction, *, focal: float = 0.02,
+def require_true(fit: Adjustment, tracks: TrackSet, junction: Junction, *, focal: float = 0.02,
                  normal_deg: float = 1.0) -> None:
     """Require a lens and a plane near the truth, and as near as they say."""
     assert abs(focal_error(fit, junction)) < min(focal, 3.0 * fit.focal_sigma)
@@ -107,7 +107,7 @@ def require_true(fit: JointFit, tracks: TrackSet, junction: Junction, *, focal: 
     up = fit.state.rotation[:, 2]
     assert angle_deg(up, junction.normal_in_camera) < normal_deg
     assert (tilt_and_roll_sigmas(fit, tracks, junction) < 3.0).all()
-    assert Plane.of(fit, tracks).worst_sigma_deg < 1.5
+    assert PlaneEstimate.of(fit, tracks).worst_sigma_deg < 1.5
     # any heading does: distances on the road are what is compared
     across = np.cross(up, [0.0, 0.0, 1.0])
     across /= np.linalg.norm(across)
@@ -142,7 +142,7 @@ def test_exact_lines_give_the_truth() -> None:
     assert angle_deg(fit.state.rotation[:, 2], JUNCTION.normal_in_camera) < 0.1
     # who knows the lens knows the plane no worse, though nothing is left of noise
     for known in (with_lens_known(fit), with_lens_known(replace(fit, covariance=0.0 * fit.covariance))):
-        assert Plane(known, 1.0).worst_sigma_deg <= Plane(fit, 1.0).worst_sigma_deg + 1e-3
+        assert PlaneEstimate(known, 1.0).worst_sigma_deg <= PlaneEstimate(fit, 1.0).worst_sigma_deg + 1e-3
 
 
 def test_half_of_the_lines_may_be_clutter() -> None:
@@ -231,24 +231,24 @@ def test_traffic_that_shows_another_plane_contradicts_lines() -> None:
     fit, tracks, _ = fit_of(seen(LONE_ROAD, lines))
     assert abs(focal_error(fit, LONE_ROAD)) < 0.05
     plane = by_traffic(driven(LONE_ROAD), tracks, fit.state.camera).plane
-    doubt = agreed_by(fit, [plane])
+    doubt = verify_with_traffic(fit, [plane])
     assert isinstance(doubt, Reason) and doubt.code == 'markings_contradicted'
     assert 'the road of the traffic and the lines along it are ' in doubt.message
     assert 'joint.road_markings' in doubt.remedy
     # one voice that contradicts outweighs another that agrees
     own, own_tracks, _ = fit_of(painted(LONE_ROAD))
-    agreeing = Plane.of(own, own_tracks)
-    assert not isinstance(agreed_by(own, [agreeing]), Reason)
-    assert agreed_by(fit, [Plane.of(fit, tracks), plane]) == doubt
+    agreeing = PlaneEstimate.of(own, own_tracks)
+    assert not isinstance(verify_with_traffic(own, [agreeing]), Reason)
+    assert verify_with_traffic(fit, [PlaneEstimate.of(fit, tracks), plane]) == doubt
 
 
 def test_lines_that_no_traffic_confirms_are_not_believed() -> None:
     fit, tracks, _ = fit_of(painted(JUNCTION))
-    doubt = agreed_by(fit, [])
+    doubt = verify_with_traffic(fit, [])
     assert isinstance(doubt, Reason) and doubt.code == 'markings_unconfirmed'
     assert 'the traffic tells nothing' in doubt.message
-    vague = Plane.of(replace(fit, covariance=fit.covariance + np.eye(len(fit.covariance))), tracks)
-    doubt = agreed_by(fit, [vague])
+    vague = PlaneEstimate.of(replace(fit, covariance=fit.covariance + np.eye(len(fit.covariance))), tracks)
+    doubt = verify_with_traffic(fit, [vague])
     assert isinstance(doubt, Reason) and doubt.code == 'markings_unconfirmed'
     assert 'degrees, 4.5 are needed' in doubt.message
 

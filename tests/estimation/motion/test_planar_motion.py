@@ -7,8 +7,8 @@ import pytest
 
 from autocalib_ros.config import JointOptions
 from autocalib_ros.estimation.adjustment.lens_prior import lens_priors
-from autocalib_ros.estimation.adjustment.parameters import Setting, State, Steps
-from autocalib_ros.estimation.adjustment.residual_blocks import MotionRows
+from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig, AdjustmentState, Parameterisation
+from autocalib_ros.estimation.adjustment.residual_blocks import PlanarMotionBlock
 from autocalib_ros.estimation.motion.planar_motion import Motion, View, first_motion, on_course, settled
 from autocalib_ros.estimation.observations.two_frame_windows import Windows
 from autocalib_ros.lens.camera import Camera
@@ -124,14 +124,14 @@ def test_residuals_change_as_their_derivatives_say() -> None:
     pixels = np.stack([turning(generator, turn) for turn in (15.0, -30.0, 40.0)])
     windows = windows_of(pixels + generator.normal(scale=0.05, size=pixels.shape))
     prior = lens_priors((1280, 720), JointOptions())[0]
-    steps = Steps(State(CAMERA, POSE, np.zeros(0)), Setting(prior, JointOptions(), windows=windows))
-    rows = MotionRows(steps, None)
-    here = rows.linearised()
-    assert here.curvature.shape == (3, steps.size, steps.size)
+    parameters = Parameterisation(AdjustmentState(CAMERA, POSE, np.zeros(0)), AdjustmentConfig(prior, JointOptions(), windows=windows))
+    rows = PlanarMotionBlock(parameters, None)
+    here = rows.linearise()
+    assert here.curvature.shape == (3, parameters.size, parameters.size)
     # log f, the principal point and k1 in their prior's sigmas, two turns of the plane
     step = np.array([1e-3, 2e-3, -2e-3, 2e-3, 4e-4, -3e-4])
     _, there = rows.at(step)
-    changed = rows.freedom * (there - here.squared)
+    changed = rows.dof * (there - here.squared)
     foretold = 2 * here.gradient @ step + np.einsum('p,rpq,q->r', step, here.curvature, step)
     assert changed == pytest.approx(foretold, rel=0.03)
 

@@ -7,10 +7,10 @@ import pytest
 
 from autocalib_ros.config import JointOptions
 from autocalib_ros.estimation.adjustment.lens_prior import lens_priors
-from autocalib_ros.estimation.adjustment.parameters import Setting, State, Steps
-from autocalib_ros.estimation.adjustment.residual_blocks import LifeRows
+from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig, AdjustmentState, Parameterisation
+from autocalib_ros.estimation.adjustment.residual_blocks import RigidBodyBlock
 from autocalib_ros.estimation.motion.rigid_bodies import Bundle
-from autocalib_ros.estimation.observations.track_set import SAMPLES
+from autocalib_ros.estimation.observations.track_set import SAMPLES_PER_TRACK
 from autocalib_ros.estimation.observations.tracklets import INSTANTS, Lives, find_lives, no_lives
 from autocalib_ros.estimation.observations.two_frame_windows import Instants, find_windows
 from autocalib_ros.lens.camera import Camera
@@ -23,7 +23,7 @@ HEIGHT_M = 8.0
 NOISE_PX = 0.3
 
 
-def life(generator: np.random.Generator, turn_deg: float, points: int = SAMPLES) -> np.ndarray:
+def life(generator: np.random.Generator, turn_deg: float, points: int = SAMPLES_PER_TRACK) -> np.ndarray:
     """Pixels (SAMPLES, INSTANTS, 2) of a car that turns by `turn_deg`."""
     heading = generator.uniform(0, 2 * np.pi) + np.radians(turn_deg) * np.linspace(0, 1, INSTANTS)
     steps = 1.5 * np.column_stack([np.cos(heading), np.sin(heading)])
@@ -59,7 +59,7 @@ def test_perfect_motion_leaves_no_residual() -> None:
 def test_noise_is_as_large_as_it_is_said_to_be() -> None:
     bundle = Bundle(noisy(np.random.default_rng(2)), NOISE_PX, 0.0)
     shapes = bundle.begun(CAMERA, POSE)
-    squared = (bundle.residuals(CAMERA, POSE, shapes)**2).sum(axis=(1, 2, 3)) / bundle.freedom
+    squared = (bundle.residuals(CAMERA, POSE, shapes)**2).sum(axis=(1, 2, 3)) / bundle.dof
     assert squared.mean() == pytest.approx(1.0, abs=0.25)
 
 
@@ -76,15 +76,15 @@ def test_a_stranger_on_the_body_is_not_believed() -> None:
 def test_residuals_change_as_their_derivatives_say() -> None:
     prior = lens_priors((1280, 720), JointOptions())[0]
     bundle = Bundle(noisy(np.random.default_rng(4), 5), NOISE_PX, 0.0)
-    steps = Steps(State(CAMERA, POSE, np.zeros(0)), Setting(prior, JointOptions(), bundle=bundle))
+    steps = Parameterisation(AdjustmentState(CAMERA, POSE, np.zeros(0)), AdjustmentConfig(prior, JointOptions(), bundle=bundle))
     shapes = bundle.begun(CAMERA, POSE)
-    rows = LifeRows(steps, bundle, shapes)
-    here = rows.linearised()
+    rows = RigidBodyBlock(steps, bundle, shapes)
+    here = rows.linearise()
     for index in range(steps.size):
         step = np.zeros(steps.size)
         step[index] = 2e-3
         _, there = rows.at(step)
-        changed = (rows.freedom * (there - here.squared)).sum()
+        changed = (rows.dof * (there - here.squared)).sum()
         foretold = (2 * here.gradient @ step + np.einsum('p,rpq,q->r', step, here.curvature, step)).sum()
         assert changed == pytest.approx(foretold, rel=0.1, abs=2e-3)
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from autocalib_ros.config import BufferOptions
-from autocalib_ros.estimation.observations.track_set import SAMPLES
+from autocalib_ros.estimation.observations.track_set import SAMPLES_PER_TRACK
 from autocalib_ros.estimation.observations.two_frame_windows import MIN_POINTS, find_windows, no_windows
 from autocalib_ros.evidence.buffer import EvidenceBuffer
 from autocalib_ros.evidence.snapshot import Evidence, Segments, Track
@@ -69,7 +69,7 @@ def test_points_seen_one_after_the_other_do_not_meet() -> None:
 def test_a_crowded_vehicle_keeps_points_that_lie_far_apart() -> None:
     grid = np.stack(np.meshgrid(np.arange(0.0, 60.0, 6.0), np.arange(0.0, 30.0, 6.0)), axis=-1).reshape(-1, 2)
     windows = find_windows(evidence_of(driving((100, 300), (120, 0), 1, points=grid)))
-    assert (windows.mask.sum(axis=1) == SAMPLES).all()
+    assert (windows.mask.sum(axis=1) == SAMPLES_PER_TRACK).all()
     spread = np.ptp(windows.first_px[0], axis=0)
     assert (spread >= [48.0, 24.0]).all()
 

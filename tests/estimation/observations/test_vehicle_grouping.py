@@ -5,17 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from autocalib_ros.estimation.observations.track_set import SAMPLES, TrackSet
+from autocalib_ros.estimation.observations.track_set import SAMPLES_PER_TRACK, TrackSet
 from autocalib_ros.estimation.observations.vehicle_grouping import ALONE, bodies, corroborated, heading_off_deg
 
 
 def moving(starts: list[tuple[float, float]], speeds: list[tuple[float, float]],
            begin_s: list[float]) -> tuple[TrackSet, np.ndarray]:
     """Tracks of 3 s with their positions on the ground in metres."""
-    times = np.array(begin_s)[:, None] + np.linspace(0.0, 3.0, SAMPLES)
+    times = np.array(begin_s)[:, None] + np.linspace(0.0, 3.0, SAMPLES_PER_TRACK)
     ground = (np.array(starts)[:, None] + np.array(speeds)[:, None] * (times - times[:, :1])[..., None])
     count = len(starts)
-    tracks = TrackSet(np.zeros((count, SAMPLES, 2)), np.full((count, SAMPLES), 1 / SAMPLES),
+    tracks = TrackSet(np.zeros((count, SAMPLES_PER_TRACK, 2)), np.full((count, SAMPLES_PER_TRACK), 1 / SAMPLES_PER_TRACK),
                       np.zeros(count, int), times, np.arange(count))
     return tracks, ground
 
@@ -42,9 +42,9 @@ def test_a_body_is_followed_from_track_to_track() -> None:
 
 
 def test_a_track_that_leaves_its_road_by_a_degree_has_a_heading_of_one_degree() -> None:
-    along = np.linspace(0.0, 20.0, SAMPLES)[None]
-    px_per_m = np.full((1, SAMPLES), 30.0)
-    off, _ = heading_off_deg(np.tan(np.radians(1.0)) * along * px_per_m, px_per_m, along, np.ones((1, SAMPLES), bool))
+    along = np.linspace(0.0, 20.0, SAMPLES_PER_TRACK)[None]
+    px_per_m = np.full((1, SAMPLES_PER_TRACK), 30.0)
+    off, _ = heading_off_deg(np.tan(np.radians(1.0)) * along * px_per_m, px_per_m, along, np.ones((1, SAMPLES_PER_TRACK), bool))
     assert off[0] == pytest.approx(1.0, rel=1e-3)
 
 

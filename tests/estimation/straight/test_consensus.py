@@ -7,7 +7,11 @@ import pytest
 
 from autocalib_ros.config import PaperOptions
 from autocalib_ros.estimation.observations.track_set import select_tracks
-from autocalib_ros.estimation.paper.vanishing_point_voting import Orientations, segment_orientations, voted_points
+from autocalib_ros.estimation.paper.vanishing_point_voting import (
+    SegmentOrientations,
+    segment_orientations,
+    vote_vanishing_points,
+)
 from autocalib_ros.estimation.straight.consensus import consensus_directions
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_evidence
@@ -57,8 +61,8 @@ def test_votes_hold_a_vanishing_point_however_far_outside(point: tuple[float, fl
     ends = lines_through(np.array(point)).reshape(-1, 2, 2)
     step = ends[:, 1] - ends[:, 0]
     orientation = np.degrees(np.arctan2(step[:, 1], step[:, 0])) % 180
-    found = Orientations(ends, orientation, np.zeros((180, 2)), (float(np.median(orientation)),))
-    voted, = voted_points(found, 700.0, PaperOptions(vote_sigmas=0.0, cluster_deg=30.0))
+    found = SegmentOrientations(ends, orientation, np.zeros((180, 2)), (float(np.median(orientation)),))
+    voted, = vote_vanishing_points(found, 700.0, PaperOptions(vote_sigmas=0.0, cluster_deg=30.0))
     truth, bearing = np.append(point, 700.0), np.append(voted, 700.0)
     error = angle_deg(truth / np.linalg.norm(truth), bearing / np.linalg.norm(bearing))
     assert error < 2.0  # degrees on the sphere of directions: four voting cells
@@ -74,4 +78,4 @@ def test_orientation_peaks_are_apart() -> None:
 
 def test_no_segments_have_no_peaks() -> None:
     found = segment_orientations(Camera(1280, 720, 560.0, (639.5, 359.5)), np.zeros((0, 4)), PaperOptions())
-    assert found.peaks_deg == () and voted_points(found, 560.0, PaperOptions()).shape == (0, 2)
+    assert found.peaks_deg == () and vote_vanishing_points(found, 560.0, PaperOptions()).shape == (0, 2)

@@ -9,11 +9,11 @@ import pytest
 
 from autocalib_ros.calibrator import solve
 from autocalib_ros.config import GateOptions, JointOptions, Options
-from autocalib_ros.estimation.adjustment.bundle_adjustment import solve_joint
+from autocalib_ros.estimation.adjustment.bundle_adjustment import adjust
 from autocalib_ros.estimation.adjustment.lens_prior import lens_priors
-from autocalib_ros.estimation.adjustment.parameters import Setting, State
+from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig, AdjustmentState
 from autocalib_ros.estimation.observations.track_set import select_tracks
-from autocalib_ros.estimation.verification.gates import NOT_CROSS_CHECKED, halves_doubt
+from autocalib_ros.estimation.verification.gates import NOT_CROSS_CHECKED, check_halves
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.benchmark.families import families
@@ -258,10 +258,10 @@ def test_standard_deviations_have_the_size_of_the_errors() -> None:
 def test_a_half_without_tracks_is_said_not_to_be_cross_checked() -> None:
     tracks = select_tracks(synthetic_evidence(Junction(), np.random.default_rng(0)), 500)
     one_vehicle = replace(tracks, vehicles=np.zeros(len(tracks), int))  # then all of it is in the earlier half
-    state = State(Junction().camera, Junction().camera_from_ground, np.array([0.0, np.pi / 2]))
+    state = AdjustmentState(Junction().camera, Junction().camera_from_ground, np.array([0.0, np.pi / 2]))
     prior = lens_priors((1280, 720), JointOptions())[0]
-    fit = solve_joint(state, one_vehicle, Setting(prior, JointOptions()))
-    assert halves_doubt(fit, one_vehicle, GateOptions()) == NOT_CROSS_CHECKED
+    fit = adjust(state, one_vehicle, AdjustmentConfig(prior, JointOptions()))
+    assert check_halves(fit, one_vehicle, GateOptions()) == NOT_CROSS_CHECKED
 
 
 def test_a_moving_camera_is_refused() -> None:

@@ -11,16 +11,16 @@ from scipy.spatial.transform import Rotation
 
 from autocalib_ros.calibrator import solve
 from autocalib_ros.config import GateOptions, JointOptions, Options
-from autocalib_ros.estimation.adjustment.bundle_adjustment import JointFit, solve_joint
+from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment, adjust
 from autocalib_ros.estimation.adjustment.lens_prior import known_lens, lens_priors
-from autocalib_ros.estimation.adjustment.parameters import Setting, State, Steps
+from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig, AdjustmentState, Parameterisation
 from autocalib_ros.estimation.motion.rigid_bodies import Bundle
 from autocalib_ros.estimation.observations.track_set import TrackSet, select_tracks
 from autocalib_ros.estimation.observations.tracklets import Lives, find_lives
 from autocalib_ros.estimation.observations.two_frame_windows import Instants, Windows, find_windows
 from autocalib_ros.estimation.turning.turning_traffic import turning_traffic as turning
-from autocalib_ros.estimation.verification.consistency import differences, expected_of_halves
-from autocalib_ros.estimation.verification.gates import halves_doubt
+from autocalib_ros.estimation.verification.consistency import compare_solutions, expected_half_differences
+from autocalib_ros.estimation.verification.gates import check_halves
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera
@@ -29,7 +29,7 @@ from autocalib_ros.offline.synthetic.junction import Junction, synthetic_evidenc
 from autocalib_ros.results.calibration import Calibration, Reason
 
 TURNING = Junction(drive=partial(drive_arc, radii_m=(12.0, 60.0)), vehicles=14, points_per_vehicle=8, noise_px=0.3)
-TRUTH = State(TURNING.camera, TURNING.camera_from_ground, np.zeros(0))
+TRUTH = AdjustmentState(TURNING.camera, TURNING.camera_from_ground, np.zeros(0))
 
 
 def evidence_of(seed: int) -> Evidence:
@@ -81,20 +81,20 @@ def test_lives_that_contradict_windows_are_not_believed(monkeypatch: pytest.Monk
     windows, fit, tracks = by_windows(evidence_of(1))
     kept, by_lives = turning.over_lives(fit, tracks, windows, Instants(evidence_of(1)))
     assert by_lives is not None
-    assert differences(kept, fit).normal_deg < 0.1
+    assert compare_solutions(kept, fit).normal_deg < 0.1
     assert turning.with_lives_apart(kept, None) is kept
     widened = turning.with_lives_apart(kept, by_lives)
-    before, after = differences(kept, kept).sigmas[1], differences(widened, widened).sigmas[1]
+    before, after = compare_solutions(kept, kept).sigmas[1], compare_solutions(widened, widened).sigmas[1]
     apart_deg = np.degrees(np.arccos(kept.state.rotation[:, 2] @ by_lives.rotation[:, 2]))
     assert apart_deg > 5.0
     assert after**2 - before**2 == pytest.approx(2 * apart_deg**2, rel=0.05)  # as if of two, each so far off
 
 
-def by_windows(evidence: Evidence) -> tuple[Windows, JointFit, TrackSet]:
+def by_windows(evidence: Evidence) -> tuple[Windows, Adjustment, TrackSet]:
     """Solve with windows alone, from the truth."""
     windows = find_windows(evidence, Instants(evidence))
     nothing = select_tracks(evidence, 500).subset(np.zeros(0, int))
-    fit = solve_joint(TRUTH, nothing, Setting(known_lens(TURNING.camera), JointOptions(), windows=windows), refine=True)
+    fit = adjust(TRUTH, nothing, AdjustmentConfig(known_lens(TURNING.camera), JointOptions(), windows=windows), refine=True)
     return windows, turning.with_turning(fit, nothing, windows) or fit, nothing
 
 
@@ -103,14 +103,14 @@ def test_a_stuck_life_is_begun_anew() -> None:
     windows, fit, nothing = by_windows(evidence)
     lives = find_lives(windows, Instants(evidence), 100)
     bundle = Bundle(lives, 0.3, 0.0)
-    setting = replace(fit.problem.setting, windows=windows.subset(np.zeros(0, int)), bundle=bundle)
-    good = solve_joint(TRUTH, nothing, setting, refine=True)
-    shapes = good.problem.inner[2]
+    config = replace(fit.problem.config, windows=windows.subset(np.zeros(0, int)), bundle=bundle)
+    good = adjust(TRUTH, nothing, config, refine=True)
+    shapes = good.problem.warm_start[2]
     assert shapes is not None
     # a body that turns the other way: nothing small leads from there to how it moved
     turns_rad = np.where(np.arange(len(lives))[:, None] < 3, -shapes.turns_rad, shapes.turns_rad)
     stuck = replace(shapes, turns_rad=turns_rad)
-    bad = solve_joint(TRUTH, nothing, setting, refine=True, inner=(None, None, stuck))
+    bad = adjust(TRUTH, nothing, config, refine=True, warm_start=(None, None, stuck))
     mended = turning.begun_anew(bad, nothing)
     assert (bad.turning2[:3] > 1.5 * good.turning2[:3]).any()
     assert (mended.turning2[:3] < 1.1 * good.turning2[:3]).all()
@@ -119,24 +119,24 @@ def test_a_stuck_life_is_begun_anew() -> None:
 def test_halves_answer_for_the_deviation_of_the_whole() -> None:
     generator = np.random.default_rng(1)
     _, fit, nothing = by_windows(slid(synthetic_evidence(TURNING, generator), generator, 8.0))
-    assert isinstance(halves_doubt(fit, nothing, GateOptions()), str)
+    assert isinstance(check_halves(fit, nothing, GateOptions()), str)
     boasting = replace(fit, covariance=1e-4 * fit.covariance)
-    doubt = halves_doubt(boasting, nothing, GateOptions())
+    doubt = check_halves(boasting, nothing, GateOptions())
     assert isinstance(doubt, Reason) and doubt.code == 'halves_disagree'
 
 
 def test_halves_that_tell_alike_differ_by_twice_the_deviation_of_the_whole() -> None:
     _, fit, _ = by_windows(evidence_of(2))
     half = replace(fit, information=0.5 * fit.information)
-    whole = differences(fit, fit).sigmas / np.sqrt(2)
-    assert expected_of_halves(fit, half, half) == pytest.approx(2 * whole, rel=1e-3)
+    whole = compare_solutions(fit, fit).sigmas / np.sqrt(2)
+    assert expected_half_differences(fit, half, half) == pytest.approx(2 * whole, rel=1e-3)
     third, rest = (replace(fit, information=share * fit.information) for share in (0.2, 0.8))
-    assert expected_of_halves(fit, third, rest)[1] == pytest.approx(2.5 * whole[1], rel=1e-3)
+    assert expected_half_differences(fit, third, rest)[1] == pytest.approx(2.5 * whole[1], rel=1e-3)
 
 
 def test_the_step_to_a_state_leads_there() -> None:
     prior = lens_priors((1280, 720), JointOptions())[0]
-    base = State(Camera(1280, 720, 560.0, (640.0, 360.0), (0.01, 0, 0, 0)), TRUTH.rotation, np.array([0.0, 1.5]))
-    steps = Steps(base, Setting(prior, JointOptions()))
+    base = AdjustmentState(Camera(1280, 720, 560.0, (640.0, 360.0), (0.01, 0, 0, 0)), TRUTH.rotation, np.array([0.0, 1.5]))
+    steps = Parameterisation(base, AdjustmentConfig(prior, JointOptions()))
     step = np.random.default_rng(0).normal(scale=0.05, size=steps.size)
-    assert steps.to(steps.state(step)) == pytest.approx(step, abs=1e-9)
+    assert steps.step_to(steps.state(step)) == pytest.approx(step, abs=1e-9)

@@ -10,12 +10,12 @@ from scipy.spatial.transform import Rotation
 
 from autocalib_ros.calibrator import solve
 from autocalib_ros.config import GateOptions, JointOptions, Options
-from autocalib_ros.estimation.adjustment.parameters import State
+from autocalib_ros.estimation.adjustment.parameters import AdjustmentState
 from autocalib_ros.estimation.estimate import Solution, find_solution
 from autocalib_ros.estimation.observations.track_set import select_tracks
 from autocalib_ros.estimation.vehicle_edges.transverse_edges import RoadEdges, SquareVehicles, square_to
-from autocalib_ros.estimation.verification.gates import plane_doubt
-from autocalib_ros.estimation.verification.ground_normal import LevelCamera, agreement
+from autocalib_ros.estimation.verification.gates import check_plane
+from autocalib_ros.estimation.verification.ground_normal import LevelCamera, combine_assumptions
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.robust_kernels import folded
 from autocalib_ros.lens.camera import Camera
@@ -66,12 +66,12 @@ def traffic(camera_from_ground: np.ndarray, generator: np.random.Generator, vehi
     return RoadEdges(np.concatenate(ends), np.concatenate(owners))
 
 
-def state_of(camera_from_ground: np.ndarray, camera: Camera = CAMERA) -> State:
+def state_of(camera_from_ground: np.ndarray, camera: Camera = CAMERA) -> AdjustmentState:
     """The state of one road along ground x, its plane turned about the road as it would be where that is unknown."""
     along = camera_from_ground[:, 0]
     helper = np.cross(along, [0.3, 0.5, 0.8])
     helper /= np.linalg.norm(helper)
-    return State(camera, np.column_stack([along, np.cross(helper, along), helper]), np.zeros(1))
+    return AdjustmentState(camera, np.column_stack([along, np.cross(helper, along), helper]), np.zeros(1))
 
 
 def error_deg(found: SquareVehicles, camera_from_ground: np.ndarray) -> float:
@@ -167,7 +167,7 @@ def test_a_level_camera_and_edges_are_joined_by_their_variances() -> None:
     state = state_of(camera_from_ground)
     square = square_to(edges, state, np.random.default_rng(0))
     assert square is not None
-    joined, apart_deg = agreement(LevelCamera(1.0), square, state)
+    joined, apart_deg = combine_assumptions(LevelCamera(1.0), square, state)
     assert joined is not None
     # along the road ahead the roll and the turn about it are nearly the same
     assert apart_deg == pytest.approx(2.0, abs=1.0)
@@ -181,7 +181,7 @@ def test_a_level_camera_that_edges_contradict_is_noticed() -> None:
     state = state_of(camera_from_ground)
     square = square_to(traffic(camera_from_ground, np.random.default_rng(5)), state, np.random.default_rng(0))
     assert square is not None
-    joined, apart_deg = agreement(LevelCamera(1.0), square, state)
+    joined, apart_deg = combine_assumptions(LevelCamera(1.0), square, state)
     assert joined is None and apart_deg > 5.0
 
 
@@ -240,8 +240,8 @@ def assumed() -> Solution:
 
 
 def test_a_plane_through_the_traffic_is_doubted(assumed: Solution) -> None:
-    assert assumed.plane.below > 0.99 and plane_doubt(assumed.plane, GateOptions()) is None
-    doubt = plane_doubt(replace(assumed.plane, below=0.8), GateOptions())
+    assert assumed.plane.fraction_below_horizon > 0.99 and check_plane(assumed.plane, GateOptions()) is None
+    doubt = check_plane(replace(assumed.plane, fraction_below_horizon=0.8), GateOptions())
     assert doubt is not None and doubt.code == 'horizon'
 
 

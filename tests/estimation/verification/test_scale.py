@@ -12,8 +12,8 @@ from autocalib_ros.calibrator import AutoCalibrator, solve
 from autocalib_ros.config import Options, ScaleOptions
 from autocalib_ros.errors import UsageError
 from autocalib_ros.estimation.estimate import Solution, find_solution
-from autocalib_ros.estimation.observations.track_set import SAMPLES, TrackSet, select_tracks
-from autocalib_ros.estimation.verification.scale import LEAST_VEHICLES, Scale, known_scale, trimmed_mean
+from autocalib_ros.estimation.observations.track_set import SAMPLES_PER_TRACK, TrackSet, select_tracks
+from autocalib_ros.estimation.verification.scale import MIN_SPEED_VEHICLES, Scale, known_scale, trimmed_mean
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration, Reason
@@ -46,12 +46,12 @@ def by_speed(km_h: float, **more: float) -> Options:
 
 def flow_of(speeds_m_s: np.ndarray, above_m: float = 0.0, junction: Junction = JUNCTION) -> TrackSet:
     """One track for each vehicle, along x of the ground, its point so far above the road."""
-    times = np.linspace(0.0, 1.5, SAMPLES)[None] * np.ones((len(speeds_m_s), 1))
+    times = np.linspace(0.0, 1.5, SAMPLES_PER_TRACK)[None] * np.ones((len(speeds_m_s), 1))
     x = 10.0 + speeds_m_s[:, None] * times
     relative = np.stack([x, np.full(x.shape, -8.0), np.full(x.shape, above_m - junction.height_m)], axis=-1)
     pixels, _ = junction.camera.project(relative @ junction.camera_from_ground.T)
     count = np.arange(len(speeds_m_s))
-    return TrackSet(pixels, np.full(times.shape, 1 / SAMPLES), count, times, count)
+    return TrackSet(pixels, np.full(times.shape, 1 / SAMPLES_PER_TRACK), count, times, count)
 
 
 def at_truth(options: Options, flow: TrackSet | None = None) -> Scale | Reason:
@@ -175,9 +175,9 @@ def test_an_unusual_height_is_solved_with_once_more() -> None:
     first = find_solution(evidence, select_tracks(evidence, 1500), options.joint, options.gate,
                           np.random.default_rng(0))
     assert isinstance(first, Solution)
-    scale = known_scale(options, *first.plane.here)
+    scale = known_scale(options, *first.plane.lens_and_normal)
     assert isinstance(scale, Scale)
-    found, given = solve(evidence, options), solve(evidence, Options(camera_height=scale.height(*first.plane.here)))
+    found, given = solve(evidence, options), solve(evidence, Options(camera_height=scale.height(*first.plane.lens_and_normal)))
     assert found.camera == given.camera != first.fit.state.camera
     assert found.ground.height_m == pytest.approx(14.0, abs=3 * found.stddev.height_m)
 
@@ -215,9 +215,9 @@ def draws() -> Iterator[tuple[np.random.Generator, Solution]]:
 
 def score(options: Options, solution: Solution) -> float:
     """Error of the height in its whole standard deviation."""
-    scale = known_scale(options, *solution.plane.here, solution.flow)
+    scale = known_scale(options, *solution.plane.lens_and_normal, solution.flow)
     assert isinstance(scale, Scale)
-    height = scale.height(*solution.plane.here)
+    height = scale.height(*solution.plane.lens_and_normal)
     told = solution.plane.sigma(lambda camera, normal: np.array([scale.height(camera, normal)]))
     return (height - JUNCTION.height_m) / float(np.hypot(told[0], scale.sigma))
 
@@ -271,11 +271,11 @@ def test_a_scale_less_sure_than_the_gate_is_refused_with_numbers(evidence: Evide
     assert '20% is needed' in reason.message and 'm +- ' in reason.message
 
 
-@pytest.mark.parametrize('count', [0, LEAST_VEHICLES - 1])
+@pytest.mark.parametrize('count', [0, MIN_SPEED_VEHICLES - 1])
 def test_too_few_vehicles_tell_no_speed(count: int) -> None:
     reason = at_truth(by_speed(36.0), flow_of(np.full(count, 10.0)))
     assert isinstance(reason, Reason) and reason.code == 'too_few_vehicles'
-    assert f'{count} vehicles' in reason.message and f'{LEAST_VEHICLES} are' in reason.message
+    assert f'{count} vehicles' in reason.message and f'{MIN_SPEED_VEHICLES} are' in reason.message
 
 
 def test_without_a_plane_there_is_no_scale() -> None:
