@@ -12,7 +12,7 @@ from autocalib_ros.errors import InputError
 from autocalib_ros.estimation.adjustment.noise_model import DEFAULT_CAMERA_HEIGHT_M
 from autocalib_ros.estimation.adjustment.residuals import collect_residuals
 from autocalib_ros.estimation.estimate import Solution, find_solution
-from autocalib_ros.estimation.observations.selection import of_vehicles
+from autocalib_ros.estimation.observations.selection import drop_pedestrians
 from autocalib_ros.estimation.observations.track_set import TrackSet, select_tracks
 from autocalib_ros.estimation.paper.intrinsics import paper_intrinsics
 from autocalib_ros.estimation.paper.published_method import solve_paper
@@ -199,7 +199,7 @@ class AutoCalibrator:
         evidence, gate = self._held(), self._options.gate
         if evidence is None:
             return Progress(0.0, ('no image yet',))
-        evidence, _ = of_vehicles(evidence)
+        evidence, _ = drop_pedestrians(evidence)
         needs = requirements(evidence, gate, self._options.first_solve_s)
         scarcest = min(need.fraction for need in needs)
         missing = [need.description for need in needs if need.fraction < 1.0]
@@ -255,7 +255,7 @@ def _solved(evidence: Evidence, options: Options, lens: Camera | None) -> Calibr
     def refused(reason: Reason) -> Refusal:
         return Refusal.because(reason, options.method, evidence.summary(), figures)
 
-    traffic, kept = of_vehicles(evidence)
+    traffic, kept = drop_pedestrians(evidence)
     reason = check_readiness(traffic, options.gate)
     if reason:
         return refused(reason)

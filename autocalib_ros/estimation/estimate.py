@@ -18,9 +18,14 @@ from autocalib_ros.estimation.adjustment.lens_prior import LensPrior, known_lens
 from autocalib_ros.estimation.adjustment.model_selection import noise_cost
 from autocalib_ros.estimation.adjustment.noise_model import DEFAULT_CAMERA_HEIGHT_M
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig
-from autocalib_ros.estimation.markings.markings_solution import NO_MARKINGS, fit_to_markings, sharpened, with_lens_known
+from autocalib_ros.estimation.markings.markings_solution import (
+    NO_MARKINGS,
+    condition_on_lens,
+    fit_to_markings,
+    refine_with_markings,
+)
 from autocalib_ros.estimation.observations.track_set import TrackSet, evenly_spaced
-from autocalib_ros.estimation.observations.two_frame_windows import Instants, Windows, find_windows
+from autocalib_ros.estimation.observations.two_frame_windows import ResampledTracks, TwoFrameWindows, find_windows
 from autocalib_ros.estimation.people.pedestrians import people
 from autocalib_ros.estimation.straight.initialisation import select_lens_family, solve_from_consensus
 from autocalib_ros.estimation.straight.roads import (
@@ -30,16 +35,16 @@ from autocalib_ros.estimation.straight.roads import (
     fix_right_angle,
     main_road,
 )
-from autocalib_ros.estimation.turning.lane_changes import by_lane_changes
+from autocalib_ros.estimation.turning.lane_changes import refine_with_lane_changes
 from autocalib_ros.estimation.turning.turning_traffic import (
-    from_turning,
-    one_centre_doubt,
-    over_lives,
-    with_lives_apart,
-    with_sliding,
-    with_turning,
+    check_turning_centres,
+    fit_turning_traffic,
+    refine_with_tracklets,
+    refine_with_turning,
+    widen_by_point_slip,
+    widen_by_tracklet_difference,
 )
-from autocalib_ros.estimation.vehicle_edges.transverse_edges import SquareVehicles, square_vehicles
+from autocalib_ros.estimation.vehicle_edges.transverse_edges import TransverseDirection, find_transverse_direction
 from autocalib_ros.estimation.verification.consistency import compare_solutions
 from autocalib_ros.estimation.verification.gates import check_halves, check_lens, check_plane, check_straight_traffic
 from autocalib_ros.estimation.verification.ground_normal import (
@@ -102,8 +107,8 @@ class _Observations:
     """What every stage of a solution is given."""
 
     tracks: TrackSet
-    windows: Windows
-    instants: Instants
+    windows: TwoFrameWindows
+    instants: ResampledTracks
     priors: list[LensPrior]
     gate: GateOptions
     evidence: Evidence
@@ -128,7 +133,7 @@ def find_solution(evidence: Evidence, tracks: TrackSet, options: JointOptions, g
                       'wait for more traffic, or record for longer')
     priors = [known_lens(lens)] if lens is not None else lens_priors(evidence.image_size, options)
     crossing = None if options.crossing_deg is None else float(np.radians(options.crossing_deg))
-    instants = Instants(evidence)
+    instants = ResampledTracks(evidence)
     traffic = _Observations(tracks, find_windows(evidence, instants), instants, priors, gate, evidence, generator)
     config = AdjustmentConfig(priors[0], options, height_m, crossing)
     found = _solve_traffic(traffic, config)
@@ -156,7 +161,7 @@ def _solve_traffic(traffic: _Observations, config: AdjustmentConfig) -> Solution
     straight = _solve_straight(traffic, config)
     if isinstance(straight, Solution) and straight.full:
         return straight
-    turned = from_turning(traffic.tracks, traffic.windows, config)
+    turned = fit_turning_traffic(traffic.tracks, traffic.windows, config)
     if turned is None:
         return straight
     fit, tracks = _select_noise_model(add_further_roads(turned, traffic.tracks, traffic.gate), traffic)
@@ -182,7 +187,7 @@ def _solve_markings(traffic: _Observations, config: AdjustmentConfig) -> Solutio
     fit, assumed = by_markings
     known = known_lens(fit.state.camera)
     straight = _solve_straight(replace(traffic, priors=[known]), replace(config, prior=known))
-    turned = from_turning(traffic.tracks, traffic.windows, replace(config, prior=known))
+    turned = fit_turning_traffic(traffic.tracks, traffic.windows, replace(config, prior=known))
     checks = verify_with_traffic(fit, [*([] if isinstance(straight, Reason) else [straight.plane]),
                              *([] if turned is None else [PlaneEstimate.of(turned, traffic.tracks)])])
     if isinstance(checks, Reason):
@@ -202,7 +207,7 @@ def _refine_with_markings(found: Solution, traffic: _Observations) -> Solution:
     """Return a solution with the lens and plane of the lines on the road, where both agree and the lines are surer."""
     config = found.fit.problem.config
     prior = _prior_for_markings(config.prior, config.options)
-    by_markings = sharpened(found.fit, traffic.evidence, traffic.tracks, prior, traffic.gate)
+    by_markings = refine_with_markings(found.fit, traffic.evidence, traffic.tracks, prior, traffic.gate)
     if isinstance(by_markings, Reason):
         return found
     fit, assumed = by_markings
@@ -226,7 +231,7 @@ def verify_with_traffic(by_markings: Adjustment, told: list[PlaneEstimate]) -> t
 
     Each that is known well enough has to agree, and one has to be.
     """
-    by_markings, checks, best_deg = with_lens_known(by_markings), [], np.inf
+    by_markings, checks, best_deg = condition_on_lens(by_markings), [], np.inf
     for plane in told:
         apart_deg, own_deg, other_deg, what = _separation(by_markings, plane)
         best_deg, sigma_deg = min(best_deg, own_deg), float(np.hypot(own_deg, other_deg))
@@ -291,20 +296,20 @@ def _refine_and_verify(fit: Adjustment, tracks: TrackSet, across: str, traffic: 
     """
     gate, options = traffic.gate, fit.problem.config.options
     if fit.plane_known:
-        fit = with_turning(fit, tracks, traffic.windows) or fit
+        fit = refine_with_turning(fit, tracks, traffic.windows) or fit
     fit = add_further_roads(fit, tracks, gate)
     fit, angle = fix_right_angle(fit, tracks, options)
     fit = release_k2(fit, tracks)
-    fit, by_lives = over_lives(fit, tracks, traffic.windows, traffic.instants)
+    fit, tracklet_state = refine_with_tracklets(fit, tracks, traffic.windows, traffic.instants)
     fit, fixed = fix_unidentifiable(fit, tracks)
     failed_check = _check_lens(fit, tracks, traffic, turned=turned) or (
-        one_centre_doubt(fit, traffic.windows) if len(fit.state.angles_rad) < 2 else None)
+        check_turning_centres(fit, traffic.windows) if len(fit.state.angles_rad) < 2 else None)
     if failed_check:
         return failed_check
     halves = check_halves(fit, tracks, gate)
     if isinstance(halves, Reason):
         return halves
-    fit = with_lives_apart(with_sliding(fit, traffic.windows), by_lives)
+    fit = widen_by_tracklet_difference(widen_by_point_slip(fit, traffic.windows), tracklet_state)
     along, flow = main_road(fit, tracks)
     assumptions = lens_assumptions(fit, fixed)
     if fit.plane_known:
@@ -334,7 +339,7 @@ def _complete_one_road(fit: Adjustment, tracks: TrackSet, traffic: _Observations
 
 def _refine_with_lane_changes(found: Solution, tracks: TrackSet, traffic: _Observations) -> Solution:
     """Return a solution of one road with the plane that vehicles tell which leave their lanes, where they tell more."""
-    changing = by_lane_changes(found.fit, tracks, traffic.windows)
+    changing = refine_with_lane_changes(found.fit, tracks, traffic.windows)
     if changing is None:
         return found
     fit, vehicles = changing
@@ -379,11 +384,11 @@ def _vehicle_tracks(fit: Adjustment, tracks: TrackSet, evidence: Evidence) -> np
 
 
 def _assumption_across_road(fit: Adjustment, tracks: TrackSet,
-             traffic: _Observations) -> tuple[LevelCamera | SquareVehicles | Reason | None, tuple[str, ...]]:
+             traffic: _Observations) -> tuple[LevelCamera | TransverseDirection | Reason | None, tuple[str, ...]]:
     """What one may assume of the direction across a lone road, a reason where that contradicts itself; and checks."""
     options = fit.problem.config.options
     level = LevelCamera(options.roll_prior_deg) if options.roll_prior_deg > 0 else None
-    square = square_vehicles(traffic.evidence, fit, tracks, traffic.generator) if options.transverse_edges else None
+    square = find_transverse_direction(traffic.evidence, fit, tracks, traffic.generator) if options.transverse_edges else None
     if level is None or square is None:
         return level or square, ()
     joined, apart_deg = combine_assumptions(level, square, fit.state)

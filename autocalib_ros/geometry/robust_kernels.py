@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 
-FREEDOM, STUDENT = 4.0, 0.375
+STUDENT_FREEDOM, STUDENT_PEAK_DENSITY = 4.0, 0.375
 """Of Student's distribution about a peak, and its density in the middle for a scale of one: edges of wheels and lamps
 make long tails."""
 
 
-def student(misses: np.ndarray, sigmas: np.ndarray) -> np.ndarray:
+def student_density(residuals: np.ndarray, sigmas: np.ndarray) -> np.ndarray:
     """Density of each miss by Student's distribution of these scales."""
-    apart = 1.0 + (misses / sigmas) ** 2 / FREEDOM
-    return STUDENT / sigmas / (apart * apart * np.sqrt(apart))
+    apart = 1.0 + (residuals / sigmas) ** 2 / STUDENT_FREEDOM
+    return STUDENT_PEAK_DENSITY / sigmas / (apart * apart * np.sqrt(apart))
 
 
-def robust(misses: np.ndarray, sigmas: np.ndarray) -> np.ndarray:
+def student_weight(residuals: np.ndarray, sigmas: np.ndarray) -> np.ndarray:
     """Weight of each miss by Student's distribution."""
-    return (FREEDOM + 1.0) / (FREEDOM + (misses / sigmas) ** 2)
+    return (STUDENT_FREEDOM + 1.0) / (STUDENT_FREEDOM + (residuals / sigmas) ** 2)
 
 
-def folded(turns_rad: np.ndarray) -> np.ndarray:
+def wrap_undirected(turns_rad: np.ndarray) -> np.ndarray:
     """Bring angles of undirected edges to within a quarter of a turn of 0."""
     return turns_rad - np.pi * np.rint(turns_rad / np.pi)

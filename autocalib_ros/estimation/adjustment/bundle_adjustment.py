@@ -35,10 +35,10 @@ from autocalib_ros.estimation.adjustment.residual_blocks import (
     RigidBodyBlock,
     StraightTrackBlock,
 )
-from autocalib_ros.estimation.motion.planar_motion import Motion
-from autocalib_ros.estimation.motion.rigid_bodies import Shapes
+from autocalib_ros.estimation.motion.planar_motion import PlanarMotion
+from autocalib_ros.estimation.motion.rigid_bodies import StructureAndMotion
 from autocalib_ros.estimation.observations.track_set import TrackSet, UnprojectedTracks
-from autocalib_ros.estimation.observations.vehicle_grouping import bodies
+from autocalib_ros.estimation.observations.vehicle_grouping import group_into_bodies
 from autocalib_ros.geometry.great_circles import squared_distances_through, unproject_rays
 from autocalib_ros.lens.camera import Camera
 
@@ -72,7 +72,7 @@ MIN_ROAD_DISTANCE_RATIO = 5.0
 """A track tells two roads apart when it is so many times farther from the one than from the other."""
 
 
-WarmStart = tuple[None, Motion | None, Shapes | None]
+WarmStart = tuple[None, PlanarMotion | None, StructureAndMotion | None]
 """What is solved inside the rows of each kind and goes on from step to step: motions of windows, shapes of lives."""
 BLOCK_COUNT = 3
 """Tracks on roads, windows, lives."""
@@ -318,7 +318,7 @@ def regroup_vehicles(fit: Adjustment, tracks: TrackSet) -> TrackSet:
     height = fit.problem.config.height_m or DEFAULT_CAMERA_HEIGHT_M
     below = np.maximum(-(rays.bearings @ up), MIN_DEPRESSION_GROUPING_RAD)
     ground_m = height * (rays.bearings @ fit.state.rotation[:, :2]) / below[..., None]
-    return replace(tracks, vehicles=bodies(tracks, ground_m))
+    return replace(tracks, vehicles=group_into_bodies(tracks, ground_m))
 
 
 def evaluate_with(fit: Adjustment, tracks: TrackSet, config: AdjustmentConfig) -> Adjustment:

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from autocalib_ros.config import JointOptions
 from autocalib_ros.estimation.adjustment.lens_prior import LensPrior
-from autocalib_ros.estimation.motion.rigid_bodies import Bundle
-from autocalib_ros.estimation.observations.two_frame_windows import Windows, no_windows
+from autocalib_ros.estimation.motion.rigid_bodies import TrackletBundle
+from autocalib_ros.estimation.observations.two_frame_windows import TwoFrameWindows, no_windows
 from autocalib_ros.geometry.great_circles import Rays
 from autocalib_ros.lens.camera import Camera
 
@@ -55,9 +55,9 @@ class AdjustmentConfig:
     together."""
     vehicle_correlation: float = 0.3
     """How much the errors of one vehicle's tracks correlate, 0 to 1: a guess until a fit has measured it."""
-    windows: Windows = field(default_factory=no_windows)
+    windows: TwoFrameWindows = field(default_factory=no_windows)
     """Vehicles that turn, each between two instants."""
-    bundle: Bundle | None = None
+    bundle: TrackletBundle | None = None
     """The same, each over its life."""
 
     @property

@@ -13,10 +13,16 @@ import numpy as np
 
 from autocalib_ros.estimation.adjustment.noise_model import locate_on_road, whitening_matrices
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentState, Parameterisation, upward_normal
-from autocalib_ros.estimation.motion.planar_motion import Motion, View, first_motion, settled, trust
-from autocalib_ros.estimation.motion.rigid_bodies import Bundle, Shapes, lifted
+from autocalib_ros.estimation.motion.planar_motion import (
+    PlanarMotion,
+    WindowRays,
+    initial_motion,
+    refined,
+    robust_weight,
+)
+from autocalib_ros.estimation.motion.rigid_bodies import StructureAndMotion, TrackletBundle, damped
 from autocalib_ros.estimation.observations.track_set import TrackSet, UnprojectedTracks
-from autocalib_ros.estimation.observations.vehicle_grouping import corroborated, heading_off_deg
+from autocalib_ros.estimation.observations.vehicle_grouping import corroboration_weights, heading_error_deg
 from autocalib_ros.geometry.great_circles import Rays, fit_circles_through, unproject_rays
 from autocalib_ros.geometry.small_matrices import cross, dot
 
@@ -130,30 +136,30 @@ class StraightTrackBlock:
         if not self._parameters.config.drifting:
             return np.ones(len(self._tracks))
         side = np.where(self._normals @ self._up < 0, -1.0, 1.0)[:, None]
-        off, error = heading_off_deg(side * distance_px, self._road.px_per_m, self._road.along_m, self._mask)
-        return corroborated(off, error, self._tracks.vehicles, self._labels)
+        off, error = heading_error_deg(side * distance_px, self._road.px_per_m, self._road.along_m, self._mask)
+        return corroboration_weights(off, error, self._tracks.vehicles, self._labels)
 
 
 class PlanarMotionBlock:
     """Windows, each with the motion in the plane that suits it best; `motion` is one near it, None unknown."""
 
-    def __init__(self, parameters: Parameterisation, motion: Motion | None) -> None:
+    def __init__(self, parameters: Parameterisation, motion: PlanarMotion | None) -> None:
         self._parameters, self._windows = parameters, parameters.config.windows
-        self.vehicle_ids, self.vehicle_weight = self._windows.bodies, self._windows.share_of_body
+        self.vehicle_ids, self.vehicle_weight = self._windows.bodies, self._windows.body_weights
         self._base = view = self._view(parameters.base)
-        self.warm_start = first_motion(view) if motion is None else settled(view, motion)
+        self.warm_start = initial_motion(view) if motion is None else refined(view, motion)
         self._here = view.distances(self.warm_start)
         self._slopes = view.slopes(self.warm_start, self._here)
-        self._root = np.sqrt(trust(self._here))
+        self._root = np.sqrt(robust_weight(self._here))
         self.dof = np.maximum(view.mask.sum(axis=1) - 2, 1)
 
-    def _view(self, state: AdjustmentState) -> View:
-        return View.of(self._windows, state.camera, state.rotation, self._parameters.config.options)
+    def _view(self, state: AdjustmentState) -> WindowRays:
+        return WindowRays.of(self._windows, state.camera, state.rotation, self._parameters.config.options)
 
-    def at(self, step: np.ndarray) -> tuple[Motion, np.ndarray]:
+    def at(self, step: np.ndarray) -> tuple[PlanarMotion, np.ndarray]:
         """Motion at a step and mean squared distances, shape (windows,)."""
         view = self._view(self._parameters.state(step))
-        motion = settled(view, self.warm_start)
+        motion = refined(view, self.warm_start)
         return motion, ((self._root * view.distances(motion))**2).sum(axis=1) / self.dof
 
     def linearise(self) -> LinearisedRows:
@@ -185,22 +191,22 @@ class PlanarMotionBlock:
 class RigidBodyBlock:
     """Lives of rigid bodies, each with the shape and the way that suit it best; `shapes` are near, None unknown."""
 
-    def __init__(self, parameters: Parameterisation, bundle: Bundle, shapes: Shapes | None) -> None:
+    def __init__(self, parameters: Parameterisation, bundle: TrackletBundle, shapes: StructureAndMotion | None) -> None:
         self._parameters, self._bundle, base = parameters, bundle, parameters.base
-        self.vehicle_ids, self.vehicle_weight, self.dof = bundle.lives.bodies, bundle.lives.share_of_body, bundle.dof
-        self.warm_start = (bundle.begun(base.camera, base.rotation) if shapes is None
-                      else bundle.settled(base.camera, base.rotation, shapes))
+        self.vehicle_ids, self.vehicle_weight, self.dof = bundle.lives.bodies, bundle.lives.body_weights, bundle.dof
+        self.warm_start = (bundle.initialised(base.camera, base.rotation) if shapes is None
+                      else bundle.refined(base.camera, base.rotation, shapes))
         here = bundle.residuals(base.camera, base.rotation, self.warm_start)
-        self._root = np.sqrt(bundle.trust(here))[:, :, None, None]
+        self._root = np.sqrt(bundle.robust_weight(here))[:, :, None, None]
         self._here = here
         self._follow: np.ndarray | None = None
         """How the unknowns of each life change with a step, shape (lives, unknowns, parameters)."""
 
-    def at(self, step: np.ndarray) -> tuple[Shapes, np.ndarray]:
+    def at(self, step: np.ndarray) -> tuple[StructureAndMotion, np.ndarray]:
         """Shapes at a step and mean squared residuals, shape (lives,)."""
         state = self._parameters.state(step)
         near = self.warm_start if self._follow is None else self.warm_start.stepped(-(self._follow @ step))
-        shapes = self._bundle.settled(state.camera, state.rotation, near)
+        shapes = self._bundle.refined(state.camera, state.rotation, near)
         residuals = self._root * self._bundle.residuals(state.camera, state.rotation, shapes)
         return shapes, (residuals**2).sum(axis=(1, 2, 3)) / self.dof
 
@@ -210,17 +216,17 @@ class RigidBodyBlock:
         slopes, by_place = bundle.slopes(base.camera, base.rotation, self.warm_start)
         lenses = [parameters.camera(DIFFERENTIATION_STEP * unit) for unit in np.eye(parameters.lens)]
         columns = [change / DIFFERENTIATION_STEP
-                   for change in bundle.by_lens(lenses, base.camera, base.rotation, self.warm_start)]
-        columns += [bundle.by_turn(axis, by_place, self.warm_start) for axis in parameters.axes]
+                   for change in bundle.residual_changes(lenses, base.camera, base.rotation, self.warm_start)]
+        columns += [bundle.rotation_jacobian(axis, by_place, self.warm_start) for axis in parameters.axes]
         columns += [np.zeros(self._here.shape)] * len(parameters.free_angles)
-        own, here = bundle.flat(slopes, self._here)
+        own, here = bundle.weighted_system(slopes, self._here)
         shared = (self._root[..., None] * np.stack(columns, axis=-1)).reshape(len(own), -1, parameters.size)
-        matrix = lifted(own.transpose(0, 2, 1) @ own, np.zeros(len(own)))
+        matrix = damped(own.transpose(0, 2, 1) @ own, np.zeros(len(own)))
         self._follow = np.linalg.solve(matrix, own.transpose(0, 2, 1) @ shared)
         return LinearisedRows.of(here, shared - own @ self._follow, self.dof, np.ones(len(own)))
 
     def distances_px(self) -> tuple[np.ndarray, np.ndarray]:
         """Observed pixels (n, 2) and how far each is from its place on the body (n,), at the base."""
         base, lives = self._parameters.base, self._bundle.lives
-        away = self._bundle.misses_px(base.camera, base.rotation, self.warm_start)
+        away = self._bundle.reprojection_errors_px(base.camera, base.rotation, self.warm_start)
         return lives.pixels[lives.mask], np.hypot(*away[lives.mask].T)

@@ -14,185 +14,185 @@ from scipy.spatial.transform import Rotation
 
 from autocalib_ros.estimation.adjustment.covariance import jackknife_covariance
 from autocalib_ros.estimation.adjustment.lens_prior import LensPrior
-from autocalib_ros.estimation.markings.road_segments import Lines, Sight
-from autocalib_ros.geometry.robust_kernels import folded, robust, student
+from autocalib_ros.estimation.markings.road_segments import ProjectedSegments, RoadSegments
+from autocalib_ros.geometry.robust_kernels import student_density, student_weight, wrap_undirected
 from autocalib_ros.lens.camera import Camera
 
-END_PX, PAINTED_RAD = 0.4, np.radians(0.5)
+LINE_END_SIGMA_PX, MARKING_SIGMA_RAD = 0.4, np.radians(0.5)
 """Standard deviation of an end of a line, across it, in the image; and of painted lines about their direction on the
 road. A scale for both is fitted."""
-ASKEW_RAD = np.radians(1.0)
+RIGHT_ANGLE_SIGMA_RAD = np.radians(1.0)
 """Standard deviation of the angle between the two directions from a right one: junctions are built to about that."""
-LEAN_RAD = np.radians(1.0)
+POST_SIGMA_RAD = np.radians(1.0)
 """Standard deviation of posts from the upright."""
-LEAST_SCALE, LARGEST_SCALE = 0.15, 2.0
-LOWEST = 0.1
+MIN_NOISE_SCALE, MAX_NOISE_SCALE = 0.15, 2.0
+MIN_DEPRESSION_SINE = 0.1
 """Sine of the angle below the horizon from which on lines are on the road: ten heights of the camera away. What is
 farther is too foreshortened to tell from what stands there."""
-ROUNDS, LAST_ROUNDS, TRIALS = 8, 40, 8
-SETTLED = 1e-5
-START_SHARES = np.array([0.35, 0.35, 0.1])[:, None]
-LEAST_SHARE, LARGEST_SHARE, LARGEST_SUM = 0.02, 0.9, 0.95
-DIFFERENCE = 1e-5
-LENSES_KEPT = 8
+ANNEALING_ROUNDS, FINAL_ROUNDS, MAX_DAMPING_TRIALS = 8, 40, 8
+CONVERGED_STEP = 1e-5
+START_FRACTIONS = np.array([0.35, 0.35, 0.1])[:, None]
+MIN_DIRECTION_FRACTION, MAX_DIRECTION_FRACTION, MAX_ALIGNED_FRACTION = 0.02, 0.9, 0.95
+GRID_DERIVATIVE_STEP = 1e-5
+LENS_CACHE_SIZE = 8
 """Lenses whose sight is kept: that of a pose, and those a step of a parameter away. Most steps leave the lens."""
 
 
 @dataclass(frozen=True)
-class Grid:
+class MarkingGrid:
     """A lens, and a plane with two directions in it, nearly square to each other, to which lines are parallel."""
 
     prior: LensPrior
     camera: Camera
     rotation: np.ndarray
     """camera_from_plane, shape (3, 3): the first direction is x, the normal, up, is z."""
-    askew_rad: float
+    skew_rad: float
     """How much more than a quarter of a turn the second direction is from the first."""
     cost: float
     """Negative logarithm of how probable the lines are, with the prior."""
-    shares: np.ndarray
+    fractions: np.ndarray
     """Of the lines along the two directions and the upright one, shape (3,)."""
-    members: np.ndarray
+    responsibilities: np.ndarray
     """Probability of each line to be along each, shape (3, n)."""
-    volume: float
+    laplace_term: float
     """Half the logarithm of the determinant of the information: what Laplace's approximation adds to the cost."""
     covariance: np.ndarray
-    """Of steps of the free parameters of the lens, turns of the plane about its axes, and `askew_rad`."""
+    """Of steps of the free parameters of the lens, turns of the plane about its axes, and `skew_rad`."""
 
     @property
-    def improbability(self) -> float:
+    def negative_log_evidence(self) -> float:
         """Negative logarithm of how probable the lines are under any lens and plane near this one."""
-        return self.cost + self.volume
+        return self.cost + self.laplace_term
 
 
-def widened_costs(lines: Lines, camera: Camera, planes: np.ndarray, widened: float) -> np.ndarray:
+def annealed_costs(lines: RoadSegments, camera: Camera, planes: np.ndarray, width_rad: float) -> np.ndarray:
     """Negative logarithm of how probable lines are with widened peaks, seen by a lens over planes (n, 3, 3); (n,)."""
-    sight, sigmas = Sight.through(camera, lines.ends_px), np.hypot(_noise_rad(lines), widened)
-    each = START_SHARES * student(sight.misses(planes.transpose(0, 2, 1)), sigmas)
-    each[:, :2] *= (planes[:, :, 2] @ sight.bearings.T < -LOWEST)[:, None]
-    return -np.log(each.sum(axis=1) + (1.0 - START_SHARES.sum()) / np.pi) @ lines.weights
+    projected, sigmas = ProjectedSegments.from_camera(camera, lines.ends_px), np.hypot(_noise_rad(lines), width_rad)
+    each = START_FRACTIONS * student_density(projected.residuals(planes.transpose(0, 2, 1)), sigmas)
+    each[:, :2] *= (planes[:, :, 2] @ projected.bearings.T < -MIN_DEPRESSION_SINE)[:, None]
+    return -np.log(each.sum(axis=1) + (1.0 - START_FRACTIONS.sum()) / np.pi) @ lines.weights
 
 
-def _noise_rad(lines: Lines) -> np.ndarray:
-    return END_PX * np.sqrt(2.0) / lines.lengths_px
+def _noise_rad(lines: RoadSegments) -> np.ndarray:
+    return LINE_END_SIGMA_PX * np.sqrt(2.0) / lines.lengths_px
 
 
 @dataclass(frozen=True)
-class _Pose:
+class _GridState:
     """What is solved for: a lens, and a plane with its two directions."""
 
     camera: Camera
     rotation: np.ndarray
-    askew_rad: float = 0.0
+    skew_rad: float = 0.0
 
     @property
     def directions(self) -> np.ndarray:
         """The two directions, and the upright one, shape (3, 3)."""
         along, across, up = self.rotation.T
-        return np.stack([along, np.cos(self.askew_rad) * across - np.sin(self.askew_rad) * along, up])
+        return np.stack([along, np.cos(self.skew_rad) * across - np.sin(self.skew_rad) * along, up])
 
-    def moved(self, step: np.ndarray, prior: LensPrior) -> _Pose:
+    def moved(self, step: np.ndarray, prior: LensPrior) -> _GridState:
         """Return the pose after a step of the lens, of turns about the axes of the plane, and of the angle."""
         lens = len(prior.free)
-        return _Pose(prior.moved(self.camera, step[:lens]),
+        return _GridState(prior.moved(self.camera, step[:lens]),
                      self.rotation @ Rotation.from_rotvec(step[lens:lens + 3]).as_matrix(),
-                     self.askew_rad + float(step[lens + 3]))
+                     self.skew_rad + float(step[lens + 3]))
 
 
-class _Mixture:
+class _GridMixture:
     """What poses make of lines, while shares and scale are fitted."""
 
-    def __init__(self, lines: Lines, prior: LensPrior) -> None:
+    def __init__(self, lines: RoadSegments, prior: LensPrior) -> None:
         self.lines, self.prior, self.weights, self._noise = lines, prior, lines.weights, _noise_rad(lines)
-        self.shares, self.scale = START_SHARES[:, 0], 1.0
-        self._through = lru_cache(maxsize=LENSES_KEPT)(partial(Sight.through, ends_px=lines.ends_px))
+        self.fractions, self.scale = START_FRACTIONS[:, 0], 1.0
+        self._through = lru_cache(maxsize=LENS_CACHE_SIZE)(partial(ProjectedSegments.from_camera, ends_px=lines.ends_px))
 
-    def misses(self, pose: _Pose) -> np.ndarray:
+    def residuals(self, pose: _GridState) -> np.ndarray:
         """Of each direction, shape (3, n)."""
-        return self._through(pose.camera).misses(pose.directions)
+        return self._through(pose.camera).residuals(pose.directions)
 
-    def sigmas(self, pose: _Pose, widened: float) -> np.ndarray:
+    def sigmas(self, pose: _GridState, width_rad: float) -> np.ndarray:
         """What is expected of them, shape (3, n)."""
-        levers = self._through(pose.camera).levers(pose.directions[:2], pose.rotation[:, 2])
-        askew = np.concatenate([PAINTED_RAD * levers, np.full((1, len(self.lines)), LEAN_RAD)])
-        return np.sqrt(self.scale**2 * (self._noise**2 + askew**2) + widened**2)
+        leverages = self._through(pose.camera).leverages(pose.directions[:2], pose.rotation[:, 2])
+        askew = np.concatenate([MARKING_SIGMA_RAD * leverages, np.full((1, len(self.lines)), POST_SIGMA_RAD)])
+        return np.sqrt(self.scale**2 * (self._noise**2 + askew**2) + width_rad**2)
 
-    def cost(self, pose: _Pose, sigmas: np.ndarray) -> tuple[float, np.ndarray]:
+    def cost(self, pose: _GridState, sigmas: np.ndarray) -> tuple[float, np.ndarray]:
         """Negative logarithm of the probability, and of each line to be along each direction, shape (3, n)."""
-        sight = self._through(pose.camera)
-        each = self.shares[:, None] * student(sight.misses(pose.directions), sigmas)
-        each[:2] *= sight.bearings @ pose.rotation[:, 2] < -LOWEST
-        density = each.sum(axis=0) + (1.0 - self.shares.sum()) / np.pi
-        known = np.append(self.prior.deviations(pose.camera), pose.askew_rad / ASKEW_RAD)
+        projected = self._through(pose.camera)
+        each = self.fractions[:, None] * student_density(projected.residuals(pose.directions), sigmas)
+        each[:2] *= projected.bearings @ pose.rotation[:, 2] < -MIN_DEPRESSION_SINE
+        density = each.sum(axis=0) + (1.0 - self.fractions.sum()) / np.pi
+        known = np.append(self.prior.deviations(pose.camera), pose.skew_rad / RIGHT_ANGLE_SIGMA_RAD)
         return float(-np.log(density) @ self.weights + 0.5 * known @ known), each / density
 
-    def fit_shares(self, members: np.ndarray) -> None:
+    def fit_fractions(self, responsibilities: np.ndarray) -> None:
         """One round of maximisation for the shares."""
-        shares = np.clip(members @ self.weights / self.weights.sum(), LEAST_SHARE, LARGEST_SHARE)
-        self.shares = shares * min(1.0, LARGEST_SUM / shares.sum())
+        fractions = np.clip(responsibilities @ self.weights / self.weights.sum(), MIN_DIRECTION_FRACTION, MAX_DIRECTION_FRACTION)
+        self.fractions = fractions * min(1.0, MAX_ALIGNED_FRACTION / fractions.sum())
 
-    def fit_scale(self, members: np.ndarray, misses: np.ndarray, sigmas: np.ndarray) -> None:
+    def fit_scale(self, responsibilities: np.ndarray, residuals: np.ndarray, sigmas: np.ndarray) -> None:
         """One round of maximisation for the scale."""
-        squared, held = (misses / sigmas) ** 2, members * self.weights
-        trusted = held * robust(misses, sigmas) * squared
+        squared, held = (residuals / sigmas) ** 2, responsibilities * self.weights
+        trusted = held * student_weight(residuals, sigmas) * squared
         self.scale *= float(np.sqrt(trusted.sum() / max(held.sum(), 1e-12)))
-        self.scale = float(np.clip(self.scale, LEAST_SCALE, LARGEST_SCALE))
+        self.scale = float(np.clip(self.scale, MIN_NOISE_SCALE, MAX_NOISE_SCALE))
 
-    def linearised(self, pose: _Pose, members: np.ndarray, sigmas: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def linearised(self, pose: _GridState, responsibilities: np.ndarray, sigmas: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Gradient (n, p) and information (n, p, p) of each line by the parameters, their weights aside."""
-        here, size = self.misses(pose), len(self.prior.free) + 4
-        slopes = np.stack([folded(self.misses(pose.moved(DIFFERENCE * unit, self.prior)) - here) / DIFFERENCE
+        here, size = self.residuals(pose), len(self.prior.free) + 4
+        slopes = np.stack([wrap_undirected(self.residuals(pose.moved(GRID_DERIVATIVE_STEP * unit, self.prior)) - here) / GRID_DERIVATIVE_STEP
                            for unit in np.eye(size)], axis=-1)
-        pull = members * robust(here, sigmas) / sigmas**2
+        pull = responsibilities * student_weight(here, sigmas) / sigmas**2
         return (((pull * here)[..., None] * slopes).sum(axis=0),
                 np.einsum('kn,kni,knj->nij', pull, slopes, slopes))
 
-    def known(self, pose: _Pose) -> tuple[np.ndarray, np.ndarray]:
+    def known(self, pose: _GridState) -> tuple[np.ndarray, np.ndarray]:
         """Gradient (p,) and information (p,) of what is known before of lens and angle."""
         lens = len(self.prior.free)
         gradient, information = np.zeros(lens + 4), np.zeros(lens + 4)
         gradient[:lens], information[:lens] = self.prior.deviations(pose.camera), self.prior.information
-        gradient[-1], information[-1] = pose.askew_rad / ASKEW_RAD**2, ASKEW_RAD**-2
+        gradient[-1], information[-1] = pose.skew_rad / RIGHT_ANGLE_SIGMA_RAD**2, RIGHT_ANGLE_SIGMA_RAD**-2
         return gradient, information
 
 
-def settled_grid(lines: Lines, prior: LensPrior, camera: Camera, rotation: np.ndarray,
-                 widening: tuple[float, ...]) -> Grid:
+def refine_grid(lines: RoadSegments, prior: LensPrior, camera: Camera, rotation: np.ndarray,
+                 widths_rad: tuple[float, ...]) -> MarkingGrid:
     """Solve from a start: shares, scale, and damped Gauss-Newton steps on the mixture's probability."""
-    mixture, pose = _Mixture(lines, prior), _Pose(camera, rotation)
-    for widened in widening:
+    mixture, pose = _GridMixture(lines, prior), _GridState(camera, rotation)
+    for width_rad in widths_rad:
         damping = 1e-3
-        for _ in range(ROUNDS if widened else LAST_ROUNDS):
-            sigmas = mixture.sigmas(pose, widened)
-            mixture.fit_shares(mixture.cost(pose, sigmas)[1])
-            if not widened:
-                mixture.fit_scale(mixture.cost(pose, sigmas)[1], mixture.misses(pose), sigmas)
-                sigmas = mixture.sigmas(pose, widened)
-            stepped = _stepped(mixture, pose, sigmas, damping)
+        for _ in range(ANNEALING_ROUNDS if width_rad else FINAL_ROUNDS):
+            sigmas = mixture.sigmas(pose, width_rad)
+            mixture.fit_fractions(mixture.cost(pose, sigmas)[1])
+            if not width_rad:
+                mixture.fit_scale(mixture.cost(pose, sigmas)[1], mixture.residuals(pose), sigmas)
+                sigmas = mixture.sigmas(pose, width_rad)
+            stepped = _damped_step(mixture, pose, sigmas, damping)
             if stepped is None:
                 break
             pose, size, damping = stepped
-            if size < SETTLED:
+            if size < CONVERGED_STEP:
                 break
     sigmas = mixture.sigmas(pose, 0.0)
-    cost, members = mixture.cost(pose, sigmas)
-    gradients, curvatures = mixture.linearised(pose, members, sigmas)
+    cost, responsibilities = mixture.cost(pose, sigmas)
+    gradients, curvatures = mixture.linearised(pose, responsibilities, sigmas)
     _, known = mixture.known(pose)
     covariance = jackknife_covariance(gradients, curvatures, lines.weights, np.zeros(len(lines)), lines.groups, known)
-    units = np.append(np.ones(len(known) - 1), ASKEW_RAD)
+    units = np.append(np.ones(len(known) - 1), RIGHT_ANGLE_SIGMA_RAD)
     information = (np.tensordot(lines.weights, curvatures, 1) + np.diag(known + 1e-9)) * np.outer(units, units)
-    return Grid(prior, pose.camera, pose.rotation, pose.askew_rad, cost, mixture.shares, members,
+    return MarkingGrid(prior, pose.camera, pose.rotation, pose.skew_rad, cost, mixture.fractions, responsibilities,
                 float(0.5 * np.linalg.slogdet(information)[1]), covariance)
 
 
-def _stepped(mixture: _Mixture, pose: _Pose, sigmas: np.ndarray, damping: float) -> tuple[_Pose, float, float] | None:
+def _damped_step(mixture: _GridMixture, pose: _GridState, sigmas: np.ndarray, damping: float) -> tuple[_GridState, float, float] | None:
     """Return the pose after a step that lowers the cost, its size and the next damping; None where none does."""
-    cost, members = mixture.cost(pose, sigmas)
-    gradients, curvatures = mixture.linearised(pose, members, sigmas)
+    cost, responsibilities = mixture.cost(pose, sigmas)
+    gradients, curvatures = mixture.linearised(pose, responsibilities, sigmas)
     pull, known = mixture.known(pose)
     gradient = mixture.weights @ gradients + pull
     information = np.tensordot(mixture.weights, curvatures, 1) + np.diag(known)
-    for _ in range(TRIALS):
+    for _ in range(MAX_DAMPING_TRIALS):
         damped = information + damping * np.diag(np.diag(information)) + 1e-9 * np.eye(len(gradient))
         step = np.clip(-np.linalg.solve(damped, gradient), -0.5, 0.5)
         there = pose.moved(step, mixture.prior)

@@ -12,9 +12,9 @@ from autocalib_ros.config import GateOptions
 from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment, evaluate_at
 from autocalib_ros.estimation.adjustment.lens_prior import LensPrior
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig, AdjustmentState, Parameterisation
-from autocalib_ros.estimation.markings.grid_mixture import ASKEW_RAD, Grid
-from autocalib_ros.estimation.markings.grid_search import beside_traffic, square_grids, square_grids_near
-from autocalib_ros.estimation.markings.road_segments import Lines, Sight, lines_on_road
+from autocalib_ros.estimation.markings.grid_mixture import RIGHT_ANGLE_SIGMA_RAD, MarkingGrid
+from autocalib_ros.estimation.markings.grid_search import find_grids, find_grids_near, keep_lines_near_traffic
+from autocalib_ros.estimation.markings.road_segments import ProjectedSegments, RoadSegments, segments_on_road
 from autocalib_ros.estimation.observations.track_set import TrackSet
 from autocalib_ros.estimation.observations.two_frame_windows import no_windows
 from autocalib_ros.estimation.verification.gates import check_markings_view
@@ -22,47 +22,47 @@ from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.ground_plane import unsigned_angle_deg
 from autocalib_ros.results.calibration import Reason
 
-LEAST_SHARE = 0.1
+MIN_ALIGNED_FRACTION = 0.1
 """Of the lines along either direction: by chance a few in a hundred are, and one road's own are along the other."""
-LEAST_PLACES, CONFIRMED_PLACES = 5, 3
+MIN_PLACES, MIN_PLACES_CONFIRMED = 5, 3
 """Places along either direction, and where the traffic tells lens and plane as well: a single stop line, or the shadow
 of a lamp post, may be askew."""
-AMBIGUOUS, AMBIGUOUS_DEG = 5.0, 3.0
+AMBIGUITY_NATS, MAX_AMBIGUITY_DEG = 5.0, 3.0
 """Another plane, so far from the best, speaks against it when its probability is no less than e to the minus this of
 the best one's; and so does another focal length that is farther away than its deviation may be."""
 NO_MARKINGS = 'no_markings'
-LEAST_VARIANCE = 1e-12
+MIN_VARIANCE = 1e-12
 """Lines without noise, as tests make them, leave parameters without any spread."""
-SQUARE_SIGMAS = 2.5
+MAX_SKEW_SIGMAS = 2.5
 """Markings are square when the angle between them differs by no more from a right one."""
 
 
 def fit_to_markings(evidence: Evidence, tracks: TrackSet, priors: list[LensPrior], config: AdjustmentConfig,
                     gate: GateOptions) -> tuple[Adjustment, str] | Reason:
     """Estimate lens and plane from the lines on the road; with what was assumed in words, or a reason why not."""
-    every = lines_on_road(evidence)
-    grids = square_grids(every, priors)
-    nearer = _undoubted(every, grids, evidence, gate, LEAST_PLACES)
+    every = segments_on_road(evidence)
+    grids = find_grids(every, priors)
+    nearer = _accepted_grid(every, grids, evidence, gate, MIN_PLACES)
     if isinstance(nearer, Reason):
         return nearer
     lines, best = nearer
-    state = AdjustmentState(best.camera, best.rotation, np.array([0.0, np.pi / 2 + best.askew_rad]))
+    state = AdjustmentState(best.camera, best.rotation, np.array([0.0, np.pi / 2 + best.skew_rad]))
     fit = evaluate_at(state, tracks, replace(config, prior=best.prior, crossing_rad=None), best.covariance)
     if not fit.focal_sigma <= gate.max_sigma_focal_rel:
-        return _none(f'the focal length to {min(fit.focal_sigma, 9.99):.1%}, {gate.max_sigma_focal_rel:.0%} is needed')
-    return check_markings_view(fit, tracks) or (fit, _words(lines, best))
+        return _no_markings(f'the focal length to {min(fit.focal_sigma, 9.99):.1%}, {gate.max_sigma_focal_rel:.0%} is needed')
+    return check_markings_view(fit, tracks) or (fit, _describe(lines, best))
 
 
-def sharpened(fit: Adjustment, evidence: Evidence, tracks: TrackSet, prior: LensPrior,
+def refine_with_markings(fit: Adjustment, evidence: Evidence, tracks: TrackSet, prior: LensPrior,
               gate: GateOptions) -> tuple[Adjustment, str] | Reason:
     """Return the lens and plane near those of a solution to which the lines on the road lead, with its roads.
 
     With what was assumed in words, or a reason why not.
     """
-    up, state = _upward(fit), fit.state
-    every = lines_on_road(evidence)
-    grids = square_grids_near(every, prior, state.camera, up)
-    nearer = _undoubted(every, grids, evidence, gate, CONFIRMED_PLACES)
+    up, state = _upward_normal(fit), fit.state
+    every = segments_on_road(evidence)
+    grids = find_grids_near(every, prior, state.camera, up)
+    nearer = _accepted_grid(every, grids, evidence, gate, MIN_PLACES_CONFIRMED)
     if isinstance(nearer, Reason):
         return nearer
     lines, grid = nearer
@@ -80,76 +80,76 @@ def sharpened(fit: Adjustment, evidence: Evidence, tracks: TrackSet, prior: Lens
     covariance[:told, :told] = turned @ grid.covariance[:-1, :-1] @ turned.T
     if angles:
         covariance[-angles:, -angles:] = fit.covariance[-angles:, -angles:]
-    return evaluate_at(there, tracks, config, covariance), _words(lines, grid)
+    return evaluate_at(there, tracks, config, covariance), _describe(lines, grid)
 
 
-def _upward(fit: Adjustment) -> np.ndarray:
+def _upward_normal(fit: Adjustment) -> np.ndarray:
     """The normal (3,) of a solution, to the side where the image's top is."""
     normal = fit.state.rotation[:, 2]
     return -normal if normal[1] > 0 else normal
 
 
-def _words(lines: Lines, grid: Grid) -> str:
-    told = grid.members[:2].max(axis=0) > 0.5
-    places, tested_deg = len(np.unique(lines.groups[told])), 90.0 + np.degrees(grid.askew_rad)
+def _describe(lines: RoadSegments, grid: MarkingGrid) -> str:
+    told = grid.responsibilities[:2].max(axis=0) > 0.5
+    places, tested_deg = len(np.unique(lines.groups[told])), 90.0 + np.degrees(grid.skew_rad)
     return (f'{told.sum()} lines in {places} places on the road taken as parallel or square to each other: '
-            f'90 +- {np.degrees(ASKEW_RAD):g} degrees (tested: {tested_deg:.1f})')
+            f'90 +- {np.degrees(RIGHT_ANGLE_SIGMA_RAD):g} degrees (tested: {tested_deg:.1f})')
 
 
-def with_lens_known(fit: Adjustment) -> Adjustment:
+def condition_on_lens(fit: Adjustment) -> Adjustment:
     """Return a fit with the deviations that it has for somebody who knows its lens."""
     lens, covariance = fit.problem.parameters.lens, np.zeros(fit.covariance.shape)
-    information = np.linalg.inv(fit.covariance + LEAST_VARIANCE * np.eye(len(covariance)))
+    information = np.linalg.inv(fit.covariance + MIN_VARIANCE * np.eye(len(covariance)))
     covariance[lens:, lens:] = np.linalg.inv(information[lens:, lens:])
     return replace(fit, covariance=covariance)
 
 
-def _undoubted(every: Lines, grids: list[Grid], evidence: Evidence, gate: GateOptions,
-               least_places: int) -> tuple[Lines, Grid] | Reason:
+def _accepted_grid(every: RoadSegments, grids: list[MarkingGrid], evidence: Evidence, gate: GateOptions,
+               min_places: int) -> tuple[RoadSegments, MarkingGrid] | Reason:
     """Return the lines beside traffic and the best grid by them, or what speaks against it."""
     if not grids:
-        return _none(f'there are {len(every)}')
-    nearer = beside_traffic(every, grids[0], evidence)
+        return _no_markings(f'there are {len(every)}')
+    nearer = keep_lines_near_traffic(every, grids[0], evidence)
     if nearer is None:
-        return _none('too few are beside the traffic')
-    return _ambiguity(every, grids, gate) or _axes_doubt(*nearer, least_places) or nearer
+        return _no_markings('too few are beside the traffic')
+    return _check_ambiguity(every, grids, gate) or _check_axes(*nearer, min_places) or nearer
 
 
-def _ambiguity(lines: Lines, grids: list[Grid], gate: GateOptions) -> Reason | None:
+def _check_ambiguity(lines: RoadSegments, grids: list[MarkingGrid], gate: GateOptions) -> Reason | None:
     """Say that another plane or lens suits the lines as well, if so."""
     best = grids[0]
     for other in grids[1:]:
-        if other.improbability > best.improbability + AMBIGUOUS:
+        if other.negative_log_evidence > best.negative_log_evidence + AMBIGUITY_NATS:
             continue
-        apart_deg = _apart_deg(lines, best, other)
-        if apart_deg > AMBIGUOUS_DEG:
-            return _none(f'they suit two planes {apart_deg:.0f} degrees apart')
+        difference_deg = _normal_difference_deg(lines, best, other)
+        if difference_deg > MAX_AMBIGUITY_DEG:
+            return _no_markings(f'they suit two planes {difference_deg:.0f} degrees apart')
         focals = sorted(grid.camera.focal_px for grid in (best, other))
         if other.prior is best.prior and np.log(focals[1] / focals[0]) > gate.max_sigma_focal_rel:
-            return _none(f'they suit two focal lengths, {focals[0]:.0f} and {focals[1]:.0f} px')
+            return _no_markings(f'they suit two focal lengths, {focals[0]:.0f} and {focals[1]:.0f} px')
     return None
 
 
-def _apart_deg(lines: Lines, one: Grid, other: Grid) -> float:
+def _normal_difference_deg(lines: RoadSegments, one: MarkingGrid, other: MarkingGrid) -> float:
     """Angle between the normals of two grids, degrees, once their rays of the lines are turned onto each other.
 
     A principal point farther down is an axis that looks farther down: that is no other plane.
     """
-    turn, _ = Rotation.align_vectors(*(Sight.through(grid.camera, lines.ends_px).bearings for grid in (one, other)))
+    turn, _ = Rotation.align_vectors(*(ProjectedSegments.from_camera(grid.camera, lines.ends_px).bearings for grid in (one, other)))
     return unsigned_angle_deg(one.rotation[:, 2], turn.apply(other.rotation[:, 2]))
 
 
-def _axes_doubt(lines: Lines, grid: Grid, least_places: int) -> Reason | None:
+def _check_axes(lines: RoadSegments, grid: MarkingGrid, min_places: int) -> Reason | None:
     """Say that too little is along either of the two directions, or that these are not square, if so."""
-    places = min(len(np.unique(lines.groups[mask])) for mask in grid.members[:2] > 0.5)
-    share = grid.shares[:2].min()
-    if share < LEAST_SHARE or places < least_places:
-        return _none(f'{share:.0%} of them, in {places} places, are along the second of two directions; '
-                     f'{LEAST_SHARE:.0%} in {least_places} places are needed')
-    if abs(grid.askew_rad) > SQUARE_SIGMAS * ASKEW_RAD:
-        return _none(f'they cross at {90 + np.degrees(grid.askew_rad):.1f} degrees, not at a right angle')
+    places = min(len(np.unique(lines.groups[mask])) for mask in grid.responsibilities[:2] > 0.5)
+    share = grid.fractions[:2].min()
+    if share < MIN_ALIGNED_FRACTION or places < min_places:
+        return _no_markings(f'{share:.0%} of them, in {places} places, are along the second of two directions; '
+                     f'{MIN_ALIGNED_FRACTION:.0%} in {min_places} places are needed')
+    if abs(grid.skew_rad) > MAX_SKEW_SIGMAS * RIGHT_ANGLE_SIGMA_RAD:
+        return _no_markings(f'they cross at {90 + np.degrees(grid.skew_rad):.1f} degrees, not at a right angle')
     return None
 
 
-def _none(why: str) -> Reason:
+def _no_markings(why: str) -> Reason:
     return Reason(NO_MARKINGS, f'lines on the road do not tell lens and plane: {why}', 'wait for more traffic')

@@ -12,52 +12,52 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from autocalib_ros.config import JointOptions
-from autocalib_ros.estimation.observations.two_frame_windows import Windows
+from autocalib_ros.estimation.observations.two_frame_windows import TwoFrameWindows
 from autocalib_ros.geometry.great_circles import Rays, unproject_rays
 from autocalib_ros.geometry.small_matrices import dot
 from autocalib_ros.lens.camera import Camera
 
-TURNS_DEG = (0.0, 2.0, 4.5, 7.5, 11.0, 15.0, 20.0, 26.0, 33.0, 42.0, 52.0, 65.0, 80.0, 100.0)
+START_TURNS_DEG = (0.0, 2.0, 4.5, 7.5, 11.0, 15.0, 20.0, 26.0, 33.0, 42.0, 52.0, 65.0, 80.0, 100.0)
 """Turns to start from, to either side: dense where most vehicles are, and never far from any."""
-DOUBTED = 2.0
+CAUCHY_SCALE = 2.0
 """A point has half its influence when it is so many standard deviations off (Cauchy): groups hold strangers."""
-SETTLING = 5
+WARM_START_ROUNDS = 5
 """Rounds in which the motion of each window is solved when lens and plane have moved a little."""
-DIFFERENCE = 1e-6
-STEERED_DEG = 5.0
+DERIVATIVE_STEP = 1e-6
+MIN_TURN_DEG = 5.0
 """Least turn in a window of a vehicle that is said to turn."""
-SLIP_DEG, SLIP_SHARE = 4.0, 0.25
+MAX_SIDE_SLIP_DEG, MAX_SIDE_SLIP_FRACTION = 4.0, 0.25
 """A wheeled vehicle turns as its path does, to so many degrees and this share: the rest is a change of curvature."""
-SURE_DEG = 2.0
+MAX_TURN_SIGMA_DEG = 2.0
 """Largest standard deviation of a window's turn: one that is mostly noise turns and moves as it suits a wrong lens
 (Neyman & Scott 1948). What is sure is told by where its points lie, not by how it seems to turn."""
-WALK_M_S = 2.5
+WALKING_SPEED_M_S = 2.5
 """Who is slower may be on foot: no rigid body, and free to turn on the spot. A head, seen where its ray meets the road,
 seems faster by a quarter at the usual height."""
-STEERED_S = 1.0
+MAX_SEGMENT_TIME_DIFFERENCE_S = 1.0
 """What windows of tracks say of a body's turning holds for segments within so long."""
-LOW = 0.02
+MIN_DEPRESSION_RAD = 0.02
 """Least angle below the horizon at which a point is placed on the road, radians."""
 
 
 @dataclass(frozen=True)
-class Motion:
+class PlanarMotion:
     """Turn about the ground normal and heading of the translation in the plane, of each window (windows,)."""
 
     turn_rad: np.ndarray
     heading_rad: np.ndarray
 
-    def moved(self, turn: np.ndarray | float, heading: np.ndarray | float) -> Motion:
+    def moved(self, turn: np.ndarray | float, heading: np.ndarray | float) -> PlanarMotion:
         """Return the motion changed by steps."""
-        return Motion(self.turn_rad + turn, self.heading_rad + heading)
+        return PlanarMotion(self.turn_rad + turn, self.heading_rad + heading)
 
-    def subset(self, keep: np.ndarray) -> Motion:
+    def subset(self, keep: np.ndarray) -> PlanarMotion:
         """Return the motion of the windows that `keep` selects."""
-        return Motion(self.turn_rad[keep], self.heading_rad[keep])
+        return PlanarMotion(self.turn_rad[keep], self.heading_rad[keep])
 
 
 @dataclass(frozen=True)
-class View:
+class WindowRays:
     """Windows as a camera over a plane sees them: bearings in the frame of the plane, z its normal."""
 
     first: Rays
@@ -67,7 +67,7 @@ class View:
     """Standard deviation of a tracked point over the window, shape (windows, points)."""
 
     @classmethod
-    def of(cls, windows: Windows, camera: Camera, camera_from_plane: np.ndarray, options: JointOptions) -> View:
+    def of(cls, windows: TwoFrameWindows, camera: Camera, camera_from_plane: np.ndarray, options: JointOptions) -> WindowRays:
         """See windows with a camera over a plane (3, 3)."""
         rays = unproject_rays(camera, np.stack([windows.first_px, windows.second_px]))
         first, second = (Rays(rays.bearings[at], rays.radial[at], rays.tangential[at]) for at in (0, 1))
@@ -76,13 +76,13 @@ class View:
         sigma = np.sqrt(options.noise_px**2 + 0.5 * options.drift_px**2 * way)
         return cls(first, second, windows.mask, sigma).turned(camera_from_plane)
 
-    def turned(self, rotation: np.ndarray) -> View:
+    def turned(self, rotation: np.ndarray) -> WindowRays:
         """Return the view in a frame that is turned, old_from_new (3, 3)."""
         first, second = (Rays(rays.bearings @ rotation, rays.radial @ rotation, rays.tangential @ rotation)
                          for rays in (self.first, self.second))
         return replace(self, first=first, second=second)
 
-    def distances(self, motion: Motion) -> np.ndarray:
+    def distances(self, motion: PlanarMotion) -> np.ndarray:
         """Signed Sampson distance of each point in standard deviations, shape (windows, points); 0 off the mask."""
         cosine, sine = np.cos(motion.turn_rad)[:, None], np.sin(motion.turn_rad)[:, None]
         along, across = np.cos(motion.heading_rad)[:, None], np.sin(motion.heading_rad)[:, None]
@@ -99,67 +99,67 @@ class View:
         apart = u * line[..., 0] + v * line[..., 1] + w * line[..., 2]
         return self.mask * apart / (np.sqrt(np.maximum(gradient2, 1e-18)) * self.sigma_px)
 
-    def slopes(self, motion: Motion, here: np.ndarray) -> np.ndarray:
+    def slopes(self, motion: PlanarMotion, here: np.ndarray) -> np.ndarray:
         """Derivatives of the distances `here` by turn and heading, shape (windows, points, 2)."""
-        return np.stack([self.distances(motion.moved(DIFFERENCE, 0.0)) - here,
-                         self.distances(motion.moved(0.0, DIFFERENCE)) - here], axis=-1) / DIFFERENCE
+        return np.stack([self.distances(motion.moved(DERIVATIVE_STEP, 0.0)) - here,
+                         self.distances(motion.moved(0.0, DERIVATIVE_STEP)) - here], axis=-1) / DERIVATIVE_STEP
 
 
-def turn_sigma(view: View, motion: Motion) -> np.ndarray:
+def turn_sigma(view: WindowRays, motion: PlanarMotion) -> np.ndarray:
     """Standard deviation of each window's turn in radians, shape (windows,)."""
     here = view.distances(motion)
-    a, b, d = _curvature(view.slopes(motion, here), trust(here))
+    a, b, d = _normal_matrix(view.slopes(motion, here), robust_weight(here))
     return np.sqrt(d / np.maximum(a * d - b * b, 1e-12))
 
 
-def _curvature(slopes: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, ...]:
+def _normal_matrix(slopes: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, ...]:
     """The three entries (windows,) of the weighted J^T J of slopes (windows, points, 2), weights (windows, points)."""
     return tuple((weight * slopes[..., i] * slopes[..., j]).sum(axis=1) for i, j in ((0, 0), (0, 1), (1, 1)))
 
 
-def on_course(windows: Windows, view: View, motion: Motion, camera: Camera, camera_from_plane: np.ndarray,
+def without_side_slip(windows: TwoFrameWindows, view: WindowRays, motion: PlanarMotion, camera: Camera, camera_from_plane: np.ndarray,
               height_m: float) -> tuple[np.ndarray, np.ndarray]:
     """Which windows show a vehicle that goes as it points, and which of them that it turns, shape (windows,) each.
 
     Two vehicles side by side that were taken for one seem to turn when one is faster, on straight paths. How far the
     path of a point turns does not depend on its height.
     """
-    before, after, bends = _bends(windows, camera, camera_from_plane)
-    path_deg, body_deg = _turns_deg(bends, motion)
-    path_sigma_deg = (bends.std(axis=1) / np.sqrt(np.maximum(windows.mask.sum(axis=1), 1))).filled(0.0)
+    before, after, point_turns_deg = _chords_and_turns(windows, camera, camera_from_plane)
+    path_deg, body_deg = _path_and_body_turns_deg(point_turns_deg, motion)
+    path_sigma_deg = (point_turns_deg.std(axis=1) / np.sqrt(np.maximum(windows.mask.sum(axis=1), 1))).filled(0.0)
     sigma_deg = np.degrees(turn_sigma(view, motion))
-    alike = np.abs(body_deg - path_deg) < SLIP_DEG + SLIP_SHARE * np.abs(path_deg) + 2.0 * sigma_deg
-    sure = sigma_deg < SURE_DEG
+    alike = np.abs(body_deg - path_deg) < MAX_SIDE_SLIP_DEG + MAX_SIDE_SLIP_FRACTION * np.abs(path_deg) + 2.0 * sigma_deg
+    sure = sigma_deg < MAX_TURN_SIGMA_DEG
     way = np.hypot(*np.moveaxis(before, -1, 0)) + np.hypot(*np.moveaxis(after, -1, 0))
-    way_m = height_m * np.ma.median(np.ma.array(way, mask=~windows.mask), axis=1).filled(0.0)
-    driven = way_m > WALK_M_S * np.nan_to_num(windows.seconds)
-    course = alike & sure & driven & ~windows.of_segments
-    turning = course & (np.abs(path_deg) > STEERED_DEG + 2.0 * path_sigma_deg)
-    for row in np.flatnonzero(windows.of_segments & sure):
-        near = (windows.bodies == windows.bodies[row]) & (np.abs(windows.times_s - windows.times_s[row]) < STEERED_S)
-        near &= ~windows.of_segments
+    path_m = height_m * np.ma.median(np.ma.array(way, mask=~windows.mask), axis=1).filled(0.0)
+    driven = path_m > WALKING_SPEED_M_S * np.nan_to_num(windows.duration_s)
+    course = alike & sure & driven & ~windows.from_segments
+    turning = course & (np.abs(path_deg) > MIN_TURN_DEG + 2.0 * path_sigma_deg)
+    for row in np.flatnonzero(windows.from_segments & sure):
+        near = (windows.bodies == windows.bodies[row]) & (np.abs(windows.times_s - windows.times_s[row]) < MAX_SEGMENT_TIME_DIFFERENCE_S)
+        near &= ~windows.from_segments
         course[row], turning[row] = (near & course).any(), (near & turning).any()
     return course, turning
 
 
-def sliding(windows: Windows, motion: Motion, camera: Camera, camera_from_plane: np.ndarray) -> float:
+def point_slip(windows: TwoFrameWindows, motion: PlanarMotion, camera: Camera, camera_from_plane: np.ndarray) -> float:
     """By what share bodies that turn seem to turn less than their paths do, 0 where they do not.
 
     Followed points slide on a body that turns: those on its outline do not turn with it.
     """
-    seen = np.flatnonzero(~windows.of_segments)
-    _, _, bends = _bends(windows.subset(seen), camera, camera_from_plane)
-    path_deg, body_deg = _turns_deg(bends, motion.subset(seen))
-    turned = np.abs(path_deg) > STEERED_DEG
+    seen = np.flatnonzero(~windows.from_segments)
+    _, _, point_turns_deg = _chords_and_turns(windows.subset(seen), camera, camera_from_plane)
+    path_deg, body_deg = _path_and_body_turns_deg(point_turns_deg, motion.subset(seen))
+    turned = np.abs(path_deg) > MIN_TURN_DEG
     return max(1.0 - float(np.median(body_deg[turned] / path_deg[turned])), 0.0) if turned.any() else 0.0
 
 
-def _turns_deg(bends: np.ma.MaskedArray, motion: Motion) -> tuple[np.ndarray, np.ndarray]:
+def _path_and_body_turns_deg(point_turns_deg: np.ma.MaskedArray, motion: PlanarMotion) -> tuple[np.ndarray, np.ndarray]:
     """How far the paths of windows turn, by the bends of their points (windows, points), and the bodies, degrees."""
-    return np.ma.median(bends, axis=1).filled(0.0), np.degrees(np.angle(np.exp(1j * motion.turn_rad)))
+    return np.ma.median(point_turns_deg, axis=1).filled(0.0), np.degrees(np.angle(np.exp(1j * motion.turn_rad)))
 
 
-def _bends(windows: Windows, camera: Camera,
+def _chords_and_turns(windows: TwoFrameWindows, camera: Camera,
            camera_from_plane: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ma.MaskedArray]:
     """Ways (windows, points, 2) on the plane to and from the middle, and how far each point's path turns, degrees."""
     first, middle, second = paths(windows, camera, camera_from_plane)
@@ -170,15 +170,15 @@ def _bends(windows: Windows, camera: Camera,
     return before, after, np.ma.array(turn, mask=~windows.mask)
 
 
-def paths(windows: Windows, camera: Camera, camera_from_plane: np.ndarray) -> tuple[np.ndarray, ...]:
+def paths(windows: TwoFrameWindows, camera: Camera, camera_from_plane: np.ndarray) -> tuple[np.ndarray, ...]:
     """Where the points of windows are on the plane, at three instants, in heights; shape (windows, points, 2) each."""
     return tuple(_on_plane(unproject_rays(camera, np.nan_to_num(pixels)).bearings @ camera_from_plane)
                  for pixels in (windows.first_px, windows.middle_px, windows.second_px))
 
 
-def turning_centres(windows: Windows, camera: Camera, camera_from_plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def turning_centres(windows: TwoFrameWindows, camera: Camera, camera_from_plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Centre (windows, 2) about which each window of tracks turns, in heights, and its distance (windows,)."""
-    seen = windows.subset(np.flatnonzero(~windows.of_segments))
+    seen = windows.subset(np.flatnonzero(~windows.from_segments))
     share = seen.mask / np.maximum(seen.mask.sum(axis=1, keepdims=True), 1)
     first, middle, second = ((share[..., None] * places).sum(axis=1)
                              for places in paths(seen, camera, camera_from_plane))
@@ -194,25 +194,25 @@ def turning_centres(windows: Windows, camera: Camera, camera_from_plane: np.ndar
 def _on_plane(bearings: np.ndarray) -> np.ndarray:
     """Where bearings (..., 3) in the frame of the plane meet it, in units of the camera's height, shape (..., 2)."""
     away = bearings[..., 2:] * (np.sign(np.median(bearings[..., 2])) if bearings.size else 1.0)
-    return bearings[..., :2] / np.maximum(away, LOW)
+    return bearings[..., :2] / np.maximum(away, MIN_DEPRESSION_RAD)
 
 
-def trust(distances: np.ndarray) -> np.ndarray:
-    """Influence of points by their distances in standard deviations: 1 at 0, a half at `DOUBTED` (Cauchy)."""
-    return 1.0 / (1.0 + (distances / DOUBTED) ** 2)
+def robust_weight(distances: np.ndarray) -> np.ndarray:
+    """Influence of points by their distances in standard deviations: 1 at 0, a half at `CAUCHY_SCALE` (Cauchy)."""
+    return 1.0 / (1.0 + (distances / CAUCHY_SCALE) ** 2)
 
 
 def point_cost(distances: np.ndarray) -> np.ndarray:
-    """Sum over each window of the loss whose derivative is `trust`, shape (windows,)."""
-    return DOUBTED**2 * np.log1p((distances / DOUBTED) ** 2).sum(axis=1)
+    """Sum over each window of the loss whose derivative is `robust_weight`, shape (windows,)."""
+    return CAUCHY_SCALE**2 * np.log1p((distances / CAUCHY_SCALE) ** 2).sum(axis=1)
 
 
-def first_motion(view: View) -> Motion:
+def initial_motion(view: WindowRays) -> PlanarMotion:
     """Find each window's motion from nothing: the best of many turns, each with its best heading in closed form."""
     count = len(view.mask)
     best = np.full(count, np.inf)
-    found = Motion(np.zeros(count), np.zeros(count))
-    for turn in np.radians([*TURNS_DEG, *(-turn for turn in TURNS_DEG[1:])]):
+    found = PlanarMotion(np.zeros(count), np.zeros(count))
+    for turn in np.radians([*START_TURNS_DEG, *(-turn for turn in START_TURNS_DEG[1:])]):
         rotated = view.first.bearings @ np.array([[np.cos(turn), np.sin(turn), 0.0],
                                                   [-np.sin(turn), np.cos(turn), 0.0], [0.0, 0.0, 1.0]])
         # b . (t x R a) = t . (R a x b)
@@ -221,23 +221,23 @@ def first_motion(view: View) -> Motion:
         size = view.mask / np.maximum(np.sqrt(x * x + y * y + (a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])**2), 1e-3)
         x, y = x * size, y * size
         heading = 0.5 * np.arctan2(2 * (x * y).sum(axis=1), (x * x - y * y).sum(axis=1)) + np.pi / 2
-        trial = Motion(np.full(count, turn), heading)
+        trial = PlanarMotion(np.full(count, turn), heading)
         cost = point_cost(view.distances(trial))
         better = cost < best
         best = np.where(better, cost, best)
-        found = Motion(np.where(better, trial.turn_rad, found.turn_rad),
+        found = PlanarMotion(np.where(better, trial.turn_rad, found.turn_rad),
                        np.where(better, trial.heading_rad, found.heading_rad))
-    return settled(view, found, 2 * SETTLING)
+    return refined(view, found, 2 * WARM_START_ROUNDS)
 
 
-def settled(view: View, motion: Motion, rounds: int = SETTLING) -> Motion:
+def refined(view: WindowRays, motion: PlanarMotion, rounds: int = WARM_START_ROUNDS) -> PlanarMotion:
     """Improve each window's motion by Levenberg-Marquardt rounds of its own."""
     damping = np.full(len(view.mask), 1e-4)
     here = view.distances(motion)
     cost = point_cost(here)
     for _ in range(rounds):
-        slopes, weight = view.slopes(motion, here), trust(here)
-        a, b, d = _curvature(slopes, weight)
+        slopes, weight = view.slopes(motion, here), robust_weight(here)
+        a, b, d = _normal_matrix(slopes, weight)
         p, q = ((weight * slopes[..., i] * here).sum(axis=1) for i in (0, 1))
         lift = damping * (a + d) + 1e-9
         a, d = a + lift, d + lift
@@ -248,7 +248,7 @@ def settled(view: View, motion: Motion, rounds: int = SETTLING) -> Motion:
         cost_there = point_cost(there)
         better = cost_there <= cost
         gain = np.max(cost - cost_there, initial=0.0, where=better)
-        motion = Motion(np.where(better, trial.turn_rad, motion.turn_rad),
+        motion = PlanarMotion(np.where(better, trial.turn_rad, motion.turn_rad),
                         np.where(better, trial.heading_rad, motion.heading_rad))
         here, cost = np.where(better[:, None], there, here), np.where(better, cost_there, cost)
         damping = np.where(better, np.maximum(damping / 10, 1e-6), np.minimum(damping * 20, 1e3))

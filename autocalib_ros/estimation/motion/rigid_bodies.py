@@ -12,57 +12,57 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from autocalib_ros.estimation.observations.tracklets import Lives
+from autocalib_ros.estimation.observations.tracklets import Tracklets
 from autocalib_ros.geometry.great_circles import unproject_rays
 from autocalib_ros.lens.camera import Camera
 
-DIFFERENCE = 1e-6
-DAMPING = 1e-4
+DERIVATIVE_STEP = 1e-6
+START_DAMPING = 1e-4
 """Of the first round, share of the diagonal."""
-DOUBTED, CREDULOUS = 2.0, 50.0
+CAUCHY_SCALE, START_CAUCHY_SCALE = 2.0, 50.0
 """A point has half its influence when it is so many standard deviations off (Cauchy): bodies hold strangers. And when a
 life is begun from a guess."""
-LOW = 0.03
+START_MIN_DEPRESSION_RAD = 0.03
 """Least angle below the horizon at which a point is placed on the road to begin with, radians."""
-UNTOLD = 1e-7
+MIN_EIGENVALUE_FRACTION = 1e-7
 """Eigenvalues below this share of the largest are of what a life does not show: unseen points, its size."""
-SETTLING, BEGINNING = 1, 12
+WARM_START_ROUNDS, COLD_START_ROUNDS = 1, 12
 """Rounds in which lives are solved when lens and plane have moved a little, and from nothing."""
 
 
 @dataclass(frozen=True)
-class Shapes:
+class StructureAndMotion:
     """What is unknown of each life, in the frame of the plane."""
 
     points: np.ndarray
     """Positions of the points at the reference instant, shape (lives, points, 3)."""
-    moves: np.ndarray
+    translations: np.ndarray
     """Translation to each instant, shape (lives, instants, 2)."""
     turns_rad: np.ndarray
     """Turn to each instant, shape (lives, instants)."""
 
-    def stepped(self, step: np.ndarray) -> Shapes:
+    def stepped(self, step: np.ndarray) -> StructureAndMotion:
         """Return the shapes moved by a step (lives, 3 points + 3 instants)."""
         lives, points, _ = self.points.shape
         poses = step[:, 3 * points:].reshape(lives, -1, 3)
-        return Shapes(self.points + step[:, :3 * points].reshape(lives, points, 3), self.moves + poses[..., :2],
+        return StructureAndMotion(self.points + step[:, :3 * points].reshape(lives, points, 3), self.translations + poses[..., :2],
                       self.turns_rad + poses[..., 2])
 
-    def subset(self, keep: np.ndarray) -> Shapes:
+    def subset(self, keep: np.ndarray) -> StructureAndMotion:
         """Return the shapes of the lives that `keep` selects."""
-        return Shapes(self.points[keep], self.moves[keep], self.turns_rad[keep])
+        return StructureAndMotion(self.points[keep], self.translations[keep], self.turns_rad[keep])
 
-    def where(self, better: np.ndarray, other: Shapes) -> Shapes:
+    def where(self, better: np.ndarray, other: StructureAndMotion) -> StructureAndMotion:
         """Return these shapes with those lives (lives,) from the other."""
-        return Shapes(np.where(better[:, None, None], other.points, self.points),
-                      np.where(better[:, None, None], other.moves, self.moves),
+        return StructureAndMotion(np.where(better[:, None, None], other.points, self.points),
+                      np.where(better[:, None, None], other.translations, self.translations),
                       np.where(better[:, None], other.turns_rad, self.turns_rad))
 
 
-class Bundle:
+class TrackletBundle:
     """Lives with what their residuals need, whatever the lens and the plane."""
 
-    def __init__(self, lives: Lives, noise_px: float, drift_px: float) -> None:
+    def __init__(self, lives: Tracklets, noise_px: float, drift_px: float) -> None:
         self.lives, self.mask, self._noise_px, self.drift_px = lives, lives.mask, noise_px, drift_px
         steps = np.hypot(*np.moveaxis(np.diff(lives.pixels, axis=2), -1, 0))
         steps = steps * (self.mask[..., 1:] & self.mask[..., :-1])
@@ -81,96 +81,96 @@ class Bundle:
         self.reference = np.argmax(self.mask.sum(axis=1), axis=1)
         """The instant of most points, at which the body's frame is the plane's, shape (lives,)."""
 
-    def subset(self, keep: np.ndarray) -> Bundle | None:
+    def subset(self, keep: np.ndarray) -> TrackletBundle | None:
         """Return the lives that `keep` selects, None where it selects none."""
         lives = self.lives.subset(keep)
-        return Bundle(lives, self._noise_px, self.drift_px) if len(lives) else None
+        return TrackletBundle(lives, self._noise_px, self.drift_px) if len(lives) else None
 
-    def steady(self) -> Bundle:
+    def without_drift(self) -> TrackletBundle:
         """Return the same lives of points that do not drift."""
-        return Bundle(self.lives, self._noise_px, 0.0)
+        return TrackletBundle(self.lives, self._noise_px, 0.0)
 
-    def noise_cost(self, camera: Camera, camera_from_plane: np.ndarray, shapes: Shapes) -> float:
+    def noise_cost(self, camera: Camera, camera_from_plane: np.ndarray, shapes: StructureAndMotion) -> float:
         """Twice the negative logarithm of how probable the residuals of shapes near their best are.
 
         The restricted likelihood (Patterson & Thompson 1971), scale fitted: shapes take up some of the noise, and
         more of the one that wanders.
         """
-        shapes = self.settled(camera, camera_from_plane, shapes)
+        shapes = self.refined(camera, camera_from_plane, shapes)
         residuals = self.residuals(camera, camera_from_plane, shapes)
         scale = float(np.median((residuals**2).sum(axis=(1, 2, 3)) / self.dof))
         diagonal = np.diagonal(self.whiten, axis1=-2, axis2=-1)
         density = 2.0 * np.log(np.where(self.mask, diagonal, 1.0)).sum(axis=(1, 2))
         slopes, _ = self.slopes(camera, camera_from_plane, shapes)
         slopes = slopes.reshape(len(self.lives), -1, slopes.shape[-1])
-        told = np.linalg.eigvalsh(slopes.transpose(0, 2, 1) @ slopes)
-        volume = np.log(np.where(told > UNTOLD * told[:, -1:], told, 1.0)).sum(axis=1)
+        eigenvalues = np.linalg.eigvalsh(slopes.transpose(0, 2, 1) @ slopes)
+        volume = np.log(np.where(eigenvalues > MIN_EIGENVALUE_FRACTION * eigenvalues[:, -1:], eigenvalues, 1.0)).sum(axis=1)
         return float((self.dof * np.log(max(scale, 1e-9)) - 2.0 * density + volume).sum())
 
-    def first_shapes(self, camera: Camera, camera_from_plane: np.ndarray) -> Shapes:
+    def initial_guess(self, camera: Camera, camera_from_plane: np.ndarray) -> StructureAndMotion:
         """Place points on the road and move them as a body from instant to instant: a guess to start from."""
         bearings = unproject_rays(camera, self.lives.pixels).bearings @ camera_from_plane
         side = float(np.sign(np.median(bearings[..., 2][self.mask]))) if self.mask.any() else 1.0
-        ground = bearings[..., :2] / np.maximum(side * bearings[..., 2:], LOW)
+        ground = bearings[..., :2] / np.maximum(side * bearings[..., 2:], START_MIN_DEPRESSION_RAD)
         count, points, instants = self.mask.shape
-        shapes = Shapes(np.zeros((count, points, 3)), np.zeros((count, instants, 2)), np.zeros((count, instants)))
+        shapes = StructureAndMotion(np.zeros((count, points, 3)), np.zeros((count, instants, 2)), np.zeros((count, instants)))
         shapes.points[..., 2] = side
-        for life in range(count):
+        for tracklet in range(count):
             placed = np.full((points, 2), np.nan)
-            for instant in sorted(np.flatnonzero(self.mask[life].any(axis=0)),
-                                  key=lambda other, near=self.reference[life]: abs(int(other) - int(near))):
-                here, seen = ground[life, :, instant], self.mask[life, :, instant]
+            for instant in sorted(np.flatnonzero(self.mask[tracklet].any(axis=0)),
+                                  key=lambda other, near=self.reference[tracklet]: abs(int(other) - int(near))):
+                here, seen = ground[tracklet, :, instant], self.mask[tracklet, :, instant]
                 known = seen & np.isfinite(placed[:, 0])
-                turn, move = _moved(placed[known], here[known]) if known.sum() >= 2 else (0.0, np.zeros(2))
-                shapes.turns_rad[life, instant], shapes.moves[life, instant] = turn, move
+                turn, move = _rigid_transform(placed[known], here[known]) if known.sum() >= 2 else (0.0, np.zeros(2))
+                shapes.turns_rad[tracklet, instant], shapes.translations[tracklet, instant] = turn, move
                 new = seen & ~known
-                placed[new] = (here[new] - move) @ _turn(turn)
-            shapes.points[life, :, :2] = np.nan_to_num(placed)
+                placed[new] = (here[new] - move) @ _rotation(turn)
+            shapes.points[tracklet, :, :2] = np.nan_to_num(placed)
         return shapes
 
-    def residuals(self, camera: Camera, camera_from_plane: np.ndarray, shapes: Shapes) -> np.ndarray:
+    def residuals(self, camera: Camera, camera_from_plane: np.ndarray, shapes: StructureAndMotion) -> np.ndarray:
         """Whitened residuals (lives, points, instants, 2)."""
-        return self.whiten @ self.misses_px(camera, camera_from_plane, shapes)
+        return self.whiten @ self.reprojection_errors_px(camera, camera_from_plane, shapes)
 
-    def misses_px(self, camera: Camera, camera_from_plane: np.ndarray, shapes: Shapes) -> np.ndarray:
+    def reprojection_errors_px(self, camera: Camera, camera_from_plane: np.ndarray, shapes: StructureAndMotion) -> np.ndarray:
         """From each observed pixel to where its point should be seen, shape (lives, points, instants, 2)."""
-        pixels, _ = camera.project(self._placed(shapes) @ camera_from_plane.T)
+        pixels, _ = camera.project(self._positions(shapes) @ camera_from_plane.T)
         return (pixels - self.lives.pixels) * self.mask[..., None]
 
-    def _placed(self, shapes: Shapes) -> np.ndarray:
+    def _positions(self, shapes: StructureAndMotion) -> np.ndarray:
         """Positions (lives, points, instants, 3) in the frame of the plane."""
         cosine, sine = np.cos(shapes.turns_rad)[:, None], np.sin(shapes.turns_rad)[:, None]
         x, y, z = (shapes.points[:, :, None, axis] for axis in range(3))
-        right, ahead = (shapes.moves[:, None, :, axis] for axis in range(2))
+        right, ahead = (shapes.translations[:, None, :, axis] for axis in range(2))
         return np.stack([cosine * x - sine * y + right, sine * x + cosine * y + ahead,
                          np.broadcast_to(z, self.mask.shape)], axis=-1)
 
-    def trust(self, residuals: np.ndarray, doubted: float = DOUBTED) -> np.ndarray:
+    def robust_weight(self, residuals: np.ndarray, cauchy_scale: float = CAUCHY_SCALE) -> np.ndarray:
         """Influence (lives, points) of points by their mean squared residuals."""
-        return 1.0 / (1.0 + self._off(residuals, doubted))
+        return 1.0 / (1.0 + self._scaled_squares(residuals, cauchy_scale))
 
-    def cost(self, residuals: np.ndarray, doubted: float = DOUBTED) -> np.ndarray:
-        """Cost (lives,) whose influence is `trust`."""
-        return (self.point_freedom * doubted**2 * np.log1p(self._off(residuals, doubted))).sum(axis=1)
+    def cost(self, residuals: np.ndarray, cauchy_scale: float = CAUCHY_SCALE) -> np.ndarray:
+        """Cost (lives,) whose influence is `robust_weight`."""
+        return (self.point_freedom * cauchy_scale**2 * np.log1p(self._scaled_squares(residuals, cauchy_scale))).sum(axis=1)
 
-    def _off(self, residuals: np.ndarray, doubted: float) -> np.ndarray:
-        return (residuals**2).sum(axis=(2, 3)) / self.point_freedom / doubted**2
+    def _scaled_squares(self, residuals: np.ndarray, cauchy_scale: float) -> np.ndarray:
+        return (residuals**2).sum(axis=(2, 3)) / self.point_freedom / cauchy_scale**2
 
-    def slopes(self, camera: Camera, camera_from_plane: np.ndarray, shapes: Shapes) -> tuple[np.ndarray, np.ndarray]:
+    def slopes(self, camera: Camera, camera_from_plane: np.ndarray, shapes: StructureAndMotion) -> tuple[np.ndarray, np.ndarray]:
         """Derivatives of the residuals by the unknowns of each life, and of the pixels by the positions.
 
         Shapes (lives, points, instants, 2, 3 points + 3 instants) and (lives, points, instants, 2, 3).
         """
-        placed = self._placed(shapes)
+        placed = self._positions(shapes)
         in_camera = placed @ camera_from_plane.T
         here, _ = camera.project(in_camera)
         # a step of a millionth of the distance, whatever the size of the body
-        by_place = np.stack([camera.project(in_camera + DIFFERENCE * axis)[0] - here for axis in camera_from_plane.T],
-                            axis=-1) / DIFFERENCE * self.mask[..., None, None]
+        by_place = np.stack([camera.project(in_camera + DERIVATIVE_STEP * axis)[0] - here for axis in camera_from_plane.T],
+                            axis=-1) / DERIVATIVE_STEP * self.mask[..., None, None]
         cosine, sine = (part[:, None, :, None] for part in (np.cos(shapes.turns_rad), np.sin(shapes.turns_rad)))
         x, y, z = np.moveaxis(by_place, -1, 0)
         by_point = self._whitened(np.stack([x * cosine + y * sine, y * cosine - x * sine, z], axis=-1))
-        about = placed[..., :2] - shapes.moves[:, None]
+        about = placed[..., :2] - shapes.translations[:, None]
         by_pose = np.stack([x, y, y * about[..., :1] - x * about[..., 1:]], axis=-1)
         lives, points, instants = self.mask.shape
         slopes = np.zeros((lives, points, instants, 2, 3 * points + 3 * instants))
@@ -187,38 +187,38 @@ class Bundle:
         lives, points, instants = self.mask.shape
         return (self.whiten @ slopes.reshape(lives, points, instants, -1)).reshape(slopes.shape)
 
-    def by_lens(self, cameras: list[Camera], camera: Camera, camera_from_plane: np.ndarray,
-                shapes: Shapes) -> list[np.ndarray]:
+    def residual_changes(self, cameras: list[Camera], camera: Camera, camera_from_plane: np.ndarray,
+                shapes: StructureAndMotion) -> list[np.ndarray]:
         """Whitened change (lives, points, instants, 2) of the residuals from one camera to each of others."""
-        in_camera = self._placed(shapes) @ camera_from_plane.T
+        in_camera = self._positions(shapes) @ camera_from_plane.T
         here, _ = camera.project(in_camera)
         return [self.whiten @ ((other.project(in_camera)[0] - here) * self.mask[..., None]) for other in cameras]
 
-    def by_turn(self, axis: np.ndarray, by_place: np.ndarray, shapes: Shapes) -> np.ndarray:
+    def rotation_jacobian(self, axis: np.ndarray, by_place: np.ndarray, shapes: StructureAndMotion) -> np.ndarray:
         """Whitened derivative (lives, points, instants, 2) by a turn of the plane about an axis (3,) of its own."""
-        lever = np.cross(axis, self._placed(shapes))
+        lever = np.cross(axis, self._positions(shapes))
         return self.whiten @ (by_place @ lever[..., None])[..., 0]
 
-    def begun(self, camera: Camera, camera_from_plane: np.ndarray) -> Shapes:
+    def initialised(self, camera: Camera, camera_from_plane: np.ndarray) -> StructureAndMotion:
         """Solve the lives from nothing: points are doubted only when heights, guessed at first, are found."""
-        shapes = self.first_shapes(camera, camera_from_plane)
-        for doubted in (CREDULOUS, DOUBTED):
-            shapes = self.settled(camera, camera_from_plane, shapes, BEGINNING, doubted)
+        shapes = self.initial_guess(camera, camera_from_plane)
+        for cauchy_scale in (START_CAUCHY_SCALE, CAUCHY_SCALE):
+            shapes = self.refined(camera, camera_from_plane, shapes, COLD_START_ROUNDS, cauchy_scale)
         return shapes
 
-    def settled(self, camera: Camera, camera_from_plane: np.ndarray, shapes: Shapes, rounds: int = SETTLING,
-                doubted: float = DOUBTED) -> Shapes:
+    def refined(self, camera: Camera, camera_from_plane: np.ndarray, shapes: StructureAndMotion, rounds: int = WARM_START_ROUNDS,
+                cauchy_scale: float = CAUCHY_SCALE) -> StructureAndMotion:
         """Improve the shapes by Levenberg-Marquardt rounds of each life's own."""
-        damping = np.full(len(self.lives), DAMPING)
+        damping = np.full(len(self.lives), START_DAMPING)
         here = self.residuals(camera, camera_from_plane, shapes)
-        cost = self.cost(here, doubted)
+        cost = self.cost(here, cauchy_scale)
         for _ in range(rounds):
             slopes, _ = self.slopes(camera, camera_from_plane, shapes)
-            own, flat = self.flat(slopes, here, doubted)
-            matrix, gradient = own.transpose(0, 2, 1) @ own, own.transpose(0, 2, 1) @ flat[..., None]
-            trial = shapes.stepped(-np.linalg.solve(lifted(matrix, damping), gradient)[..., 0])
+            own, weighted_system = self.weighted_system(slopes, here, cauchy_scale)
+            matrix, gradient = own.transpose(0, 2, 1) @ own, own.transpose(0, 2, 1) @ weighted_system[..., None]
+            trial = shapes.stepped(-np.linalg.solve(damped(matrix, damping), gradient)[..., 0])
             there = self.residuals(camera, camera_from_plane, trial)
-            cost_there = self.cost(there, doubted)
+            cost_there = self.cost(there, cauchy_scale)
             better = cost_there <= cost
             gain = np.max(cost - cost_there, initial=0.0, where=better)
             shapes = shapes.where(better, trial)
@@ -229,28 +229,28 @@ class Bundle:
                 break
         return shapes
 
-    def flat(self, slopes: np.ndarray, residuals: np.ndarray,
-             doubted: float = DOUBTED) -> tuple[np.ndarray, np.ndarray]:
+    def weighted_system(self, slopes: np.ndarray, residuals: np.ndarray,
+             cauchy_scale: float = CAUCHY_SCALE) -> tuple[np.ndarray, np.ndarray]:
         """Slopes (lives, residuals, n) and residuals (lives, residuals), each point by the root of its trust."""
-        root = np.sqrt(self.trust(residuals, doubted))[:, :, None, None]
+        root = np.sqrt(self.robust_weight(residuals, cauchy_scale))[:, :, None, None]
         count = len(self.lives)
         return ((slopes * root[..., None]).reshape(count, -1, slopes.shape[-1]), (residuals * root).reshape(count, -1))
 
 
-def lifted(matrix: np.ndarray, damping: np.ndarray) -> np.ndarray:
+def damped(matrix: np.ndarray, damping: np.ndarray) -> np.ndarray:
     """Matrices (lives, n, n) with a lifted diagonal: what is not seen, and the size of a body, stays as it is."""
     diagonal = np.einsum('lii->li', matrix)
     lift = damping[:, None] * diagonal + 1e-9 * diagonal.max(axis=1, keepdims=True, initial=0.0) + 1e-9
     return matrix + lift[:, :, None] * np.eye(matrix.shape[1])
 
 
-def _turn(angle_rad: float) -> np.ndarray:
+def _rotation(angle_rad: float) -> np.ndarray:
     return np.array([[np.cos(angle_rad), -np.sin(angle_rad)], [np.sin(angle_rad), np.cos(angle_rad)]])
 
 
-def _moved(before: np.ndarray, after: np.ndarray) -> tuple[float, np.ndarray]:
+def _rigid_transform(before: np.ndarray, after: np.ndarray) -> tuple[float, np.ndarray]:
     """Turn and translation that take points (n, 2) to others best (Kabsch 1976 in the plane)."""
     middle, other = before.mean(axis=0), after.mean(axis=0)
     first, second = before - middle, after - other
     turn = float(np.arctan2((first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]).sum(), (first * second).sum()))
-    return turn, other - _turn(turn) @ middle
+    return turn, other - _rotation(turn) @ middle

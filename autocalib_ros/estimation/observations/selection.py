@@ -7,7 +7,7 @@ import numpy as np
 from autocalib_ros.evidence.snapshot import Evidence, Kind
 
 
-def of_vehicles(evidence: Evidence) -> tuple[Evidence, np.ndarray]:
+def drop_pedestrians(evidence: Evidence) -> tuple[Evidence, np.ndarray]:
     """Return the evidence without the tracks of people, and the indices (n,) of those that are left.
 
     Who walks or cycles keeps to no lane, sways, and has nothing rigid: no model of a road or of a body is of them.

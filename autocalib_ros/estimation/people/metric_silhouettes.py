@@ -13,7 +13,7 @@ from autocalib_ros.lens.camera import Camera
 
 
 @dataclass(frozen=True)
-class Sizes:
+class SilhouetteSizes:
     """Of outlines, in metres, each of shape (n,)."""
 
     azimuth: np.ndarray
@@ -26,7 +26,7 @@ class Sizes:
     """Of what is upright there and reaches as far up in the image; deeper bodies seem higher."""
 
 
-def sizes_of(outlines_px: np.ndarray, camera: Camera, normal: np.ndarray, height_m: float) -> Sizes:
+def measure_silhouettes(outlines_px: np.ndarray, camera: Camera, normal: np.ndarray, height_m: float) -> SilhouetteSizes:
     """Measure outlines (n, OUTLINE_COLUMNS), as `Outlines.ends_px`, of what stands on the road."""
     bearings = camera.unproject(outlines_px[:, :-1].astype(float).reshape(-1, 2))[0].reshape(-1, 8, 3)
     ahead = np.array([0.0, 0.0, 1.0]) - normal[2] * normal
@@ -37,4 +37,4 @@ def sizes_of(outlines_px: np.ndarray, camera: Camera, normal: np.ndarray, height
     azimuths = np.arctan2(np.sin(turned), np.cos(turned))
     slope = z / np.maximum(np.hypot(x, y), 1e-9)
     distance = height_m / np.maximum(-slope.min(axis=1), 1e-6)
-    return Sizes(middle, distance, np.ptp(azimuths, axis=1) * distance, height_m + distance * slope.max(axis=1))
+    return SilhouetteSizes(middle, distance, np.ptp(azimuths, axis=1) * distance, height_m + distance * slope.max(axis=1))

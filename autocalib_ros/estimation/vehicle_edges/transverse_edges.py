@@ -19,32 +19,32 @@ import numpy as np
 from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentState, level_normal
 from autocalib_ros.estimation.observations.track_set import TrackSet, count_earlier
-from autocalib_ros.estimation.vehicle_edges.edge_mixture import Turns, find_peaks
+from autocalib_ros.estimation.vehicle_edges.edge_mixture import EdgeTurns, find_transverse_peak
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.great_circles import bearing_change, unproject_rays
-from autocalib_ros.geometry.robust_kernels import folded
+from autocalib_ros.geometry.robust_kernels import wrap_undirected
 from autocalib_ros.geometry.small_matrices import cross, dot
 from autocalib_ros.lens.camera import Camera
 
 MAX_EDGES = 1000
 """Edges in one estimate, the longest of each vehicle in turn."""
-BESIDE_S = 0.3
+MAX_TIME_TO_TRACK_S = 0.3
 """An edge is of the straight ride of its vehicle when it was seen during a track of it on the road, or so near to it:
 between two searches for points."""
-END_PX = 0.5
+EDGE_END_SIGMA_PX = 0.5
 """Standard deviation of an end of an edge, across it."""
-ALONG_ROAD_RAD = np.radians(20.0)
+MIN_ANGLE_TO_ROAD_RAD = np.radians(20.0)
 """An edge that leads so nearly towards the road's vanishing point runs along the vehicle."""
-LARGEST_NOISE_RAD = np.radians(5.0)
+MAX_EDGE_SIGMA_RAD = np.radians(5.0)
 """An edge whose noise leaves its turn less sure tells nothing: a short one, or one seen squarely from the side."""
-MIN_VEHICLES = 8
+MIN_PEAK_VEHICLES = 8
 """Vehicles whose edges make the peaks; of fewer, one askew or one that changes lanes counts too much."""
-MAX_SIGMA_RAD = np.radians(4.0)
+MAX_TURN_SIGMA_RAD = np.radians(4.0)
 """An estimate that is less sure is none: where there are no peaks, the resampled ones lie all over."""
 
 
 @dataclass(frozen=True)
-class RoadEdges:
+class VehicleEdges:
     """Edges on vehicles that drive along a road."""
 
     ends_px: np.ndarray
@@ -55,24 +55,24 @@ class RoadEdges:
     def __len__(self) -> int:
         return len(self.vehicles)
 
-    def subset(self, keep: np.ndarray) -> RoadEdges:
+    def subset(self, keep: np.ndarray) -> VehicleEdges:
         """Return the edges that `keep`, a mask or indices, selects."""
-        return RoadEdges(self.ends_px[keep], self.vehicles[keep])
+        return VehicleEdges(self.ends_px[keep], self.vehicles[keep])
 
 
-def edges_on_road(evidence: Evidence, tracks: TrackSet) -> RoadEdges:
+def select_vehicle_edges(evidence: Evidence, tracks: TrackSet) -> VehicleEdges:
     """Return the edges seen on vehicles while they left tracks, all of which follow one road straight."""
     keep = np.zeros(len(evidence.edges_px), bool)
     for vehicle in np.unique(tracks.vehicles):
         times = tracks.sample_times_s[tracks.vehicles == vehicle]
         edges = np.flatnonzero(evidence.edge_vehicles == vehicle)
         seen = evidence.edge_times_s[edges, None]
-        during = (seen >= times.min(axis=1) - BESIDE_S) & (seen <= times.max(axis=1) + BESIDE_S)
+        during = (seen >= times.min(axis=1) - MAX_TIME_TO_TRACK_S) & (seen <= times.max(axis=1) + MAX_TIME_TO_TRACK_S)
         keep[edges] = during.any(axis=1)
-    return RoadEdges(evidence.edges_px[keep], evidence.edge_vehicles[keep].astype(int))
+    return VehicleEdges(evidence.edges_px[keep], evidence.edge_vehicles[keep].astype(int))
 
 
-def turns_of(camera: Camera, along: np.ndarray, across: np.ndarray, ends_px: np.ndarray) -> Turns:
+def edge_turns(camera: Camera, along: np.ndarray, across: np.ndarray, ends_px: np.ndarray) -> EdgeTurns:
     """Return the turns about a road `along` (3,), counted from `across` (3,), of edges (n, 4)."""
     middle, step = (ends_px[:, :2] + ends_px[:, 2:]) / 2, ends_px[:, 2:] - ends_px[:, :2]
     length = np.maximum(np.hypot(*step.T), 1e-9)
@@ -90,20 +90,20 @@ def turns_of(camera: Camera, along: np.ndarray, across: np.ndarray, ends_px: np.
     ahead, (beside, above) = rays.bearings @ along, basis @ rays.bearings.T
     beside, above = np.cos(turns) * beside + np.sin(turns) * above, np.cos(turns) * above - np.sin(turns) * beside
     oblique = beside / np.maximum(np.hypot(ahead, beside), 1e-9)
-    return Turns(turns, np.abs(p * slope_q - q * slope_p) / aside2 * END_PX * np.sqrt(2.0) / length,
+    return EdgeTurns(turns, np.abs(p * slope_q - q * slope_p) / aside2 * EDGE_END_SIGMA_PX * np.sqrt(2.0) / length,
                  np.arccos(np.minimum(cosine, 1.0)), leverage, oblique * np.sign(above) * leverage)
 
 
 @dataclass(frozen=True)
-class SquareVehicles:
+class TransverseDirection:
     """The direction across the road of a solution, by edges of vehicles that are taken as square to it."""
 
-    edges: RoadEdges
+    edges: VehicleEdges
     weights: np.ndarray
     """How much each pulls on the direction, shape (n,)."""
     origin: np.ndarray
     """Unit vector (3,) from which turns are counted: the direction across the road at the solution, by edges alone."""
-    at_solution_rad: np.ndarray
+    reference_turns_rad: np.ndarray
     """Turns of the edges at the solution, shape (n,)."""
     step_sigma_rad: float
     """Standard deviation of the rotation about the road for a known lens."""
@@ -118,7 +118,7 @@ class SquareVehicles:
         along = state.directions[0]
         across = self.origin - (self.origin @ along) * along
         across /= np.linalg.norm(across)
-        moved = folded(turns_of(state.camera, along, across, self.edges.ends_px).turns_rad - self.at_solution_rad)
+        moved = wrap_undirected(edge_turns(state.camera, along, across, self.edges.ends_px).turns_rad - self.reference_turns_rad)
         turn = float(self.weights @ moved) / float(self.weights.sum()) + self.turn_rad + step_rad
         return np.cos(turn) * across + np.sin(turn) * np.cross(along, across)
 
@@ -129,33 +129,33 @@ class SquareVehicles:
                 f'+- {np.degrees(self.step_sigma_rad):.1f} degrees about the road')
 
 
-def square_vehicles(evidence: Evidence, fit: Adjustment, tracks: TrackSet,
-                    generator: np.random.Generator) -> SquareVehicles | None:
+def find_transverse_direction(evidence: Evidence, fit: Adjustment, tracks: TrackSet,
+                    generator: np.random.Generator) -> TransverseDirection | None:
     """Find the direction across the first road by edges of the vehicles that follow it; None where they do not tell."""
     following = tracks.subset(fit.inliers() & (fit.labels == 0))
-    return square_to(edges_on_road(evidence, following), fit.state, generator)
+    return transverse_direction_at(select_vehicle_edges(evidence, following), fit.state, generator)
 
 
-def square_to(edges: RoadEdges, state: AdjustmentState, generator: np.random.Generator) -> SquareVehicles | None:
+def transverse_direction_at(edges: VehicleEdges, state: AdjustmentState, generator: np.random.Generator) -> TransverseDirection | None:
     """Find the direction across the first road of a state by edges on its vehicles; None where they do not tell."""
     along = state.directions[0]
     # turns are counted from where a camera without roll has that direction
     level = np.cross(level_normal(along), along)
     level /= np.linalg.norm(level)
-    told = turns_of(state.camera, along, level, edges.ends_px)
-    edges = edges.subset((told.apart_rad > ALONG_ROAD_RAD) & (told.sigmas_rad < LARGEST_NOISE_RAD))
-    edges = _longest_in_turn(edges)
-    if len(np.unique(edges.vehicles)) < MIN_VEHICLES:
+    turns = edge_turns(state.camera, along, level, edges.ends_px)
+    edges = edges.subset((turns.angle_to_road_rad > MIN_ANGLE_TO_ROAD_RAD) & (turns.sigmas_rad < MAX_EDGE_SIGMA_RAD))
+    edges = _longest_round_robin(edges)
+    if len(np.unique(edges.vehicles)) < MIN_PEAK_VEHICLES:
         return None
-    peaks = find_peaks(turns_of(state.camera, along, level, edges.ends_px), edges.vehicles, generator)
-    if peaks.vehicles < MIN_VEHICLES or not peaks.sigma_rad <= MAX_SIGMA_RAD:
+    peaks = find_transverse_peak(edge_turns(state.camera, along, level, edges.ends_px), edges.vehicles, generator)
+    if peaks.vehicles < MIN_PEAK_VEHICLES or not peaks.sigma_rad <= MAX_TURN_SIGMA_RAD:
         return None
     origin = np.cos(peaks.turn_rad) * level + np.sin(peaks.turn_rad) * np.cross(along, level)
-    at_solution = turns_of(state.camera, along, origin, edges.ends_px).turns_rad
-    return SquareVehicles(edges, peaks.weights, origin, at_solution, peaks.sigma_rad, peaks.vehicles)
+    at_solution = edge_turns(state.camera, along, origin, edges.ends_px).turns_rad
+    return TransverseDirection(edges, peaks.weights, origin, at_solution, peaks.sigma_rad, peaks.vehicles)
 
 
-def _longest_in_turn(edges: RoadEdges) -> RoadEdges:
+def _longest_round_robin(edges: VehicleEdges) -> VehicleEdges:
     """Keep at most `MAX_EDGES`, the longest of each vehicle first."""
     length = np.hypot(*(edges.ends_px[:, 2:] - edges.ends_px[:, :2]).T)
     edges = edges.subset(np.argsort(-length, kind='stable'))

@@ -16,7 +16,7 @@ from autocalib_ros.estimation.adjustment.bundle_adjustment import (
 )
 from autocalib_ros.estimation.adjustment.covariance import sigma_without_prior
 from autocalib_ros.estimation.observations.track_set import TrackSet, UnprojectedTracks, long_tracks
-from autocalib_ros.estimation.observations.tracklets import no_lives
+from autocalib_ros.estimation.observations.tracklets import no_tracklets
 from autocalib_ros.estimation.straight.roads import MIN_VEHICLES_PER_ROAD
 from autocalib_ros.estimation.verification.consistency import compare_solutions, expected_half_differences
 from autocalib_ros.estimation.verification.ground_normal import LevelCamera, PlaneEstimate, orient_above_traffic
@@ -197,7 +197,7 @@ def check_plane(plane: PlaneEstimate, gate: GateOptions, *, assumed: bool = Fals
 def check_halves(fit: Adjustment, tracks: TrackSet, gate: GateOptions) -> Reason | str:
     """Solve the earlier and the later half of the vehicles; they have to agree within what they know."""
     config = replace(fit.problem.config, vehicle_correlation=fit.vehicle_correlation)
-    lives = no_lives() if config.bundle is None else config.bundle.lives
+    lives = no_tracklets() if config.bundle is None else config.bundle.lives
     early, lived, windows = _earlier_half((tracks.vehicles, tracks.times_s), (lives.bodies, lives.times_s),
                                      (config.windows.bodies, config.windows.times_s))
     fits = []

@@ -10,10 +10,10 @@ import numpy as np
 from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment
 from autocalib_ros.estimation.adjustment.parameters import MIN_SINE_TO_X_AXIS, AdjustmentState
 from autocalib_ros.estimation.observations.track_set import TrackSet
-from autocalib_ros.estimation.vehicle_edges.transverse_edges import SquareVehicles
+from autocalib_ros.estimation.vehicle_edges.transverse_edges import TransverseDirection
 from autocalib_ros.geometry.great_circles import unproject_rays
 from autocalib_ros.geometry.ground_plane import orient_upward, tilt_and_roll_deg
-from autocalib_ros.geometry.robust_kernels import folded
+from autocalib_ros.geometry.robust_kernels import wrap_undirected
 from autocalib_ros.lens.camera import Camera
 
 STEP_RAD = 1e-5
@@ -52,7 +52,7 @@ class LevelCamera:
         return f'a camera that is not rolled: roll = 0 +- {self.sigma_deg:g} degrees'
 
 
-def combine_assumptions(level: LevelCamera, square: SquareVehicles, state: AdjustmentState) -> tuple[SquareVehicles | None, float]:
+def combine_assumptions(level: LevelCamera, square: TransverseDirection, state: AdjustmentState) -> tuple[TransverseDirection | None, float]:
     """Join two assumptions by their variances, None where they contradict each other; and their difference in degrees.
 
     The difference is a rotation about the road, nan where the roll does not tell the plane.
@@ -65,7 +65,7 @@ def combine_assumptions(level: LevelCamera, square: SquareVehicles, state: Adjus
 
     def turn(roll_rad: float) -> float:
         in_plane = level.across(state, roll_rad)
-        return float(folded(np.arctan2(in_plane @ up, in_plane @ across)))
+        return float(wrap_undirected(np.arctan2(in_plane @ up, in_plane @ across)))
 
     sigma = level.step_sigma_rad * abs(turn(STEP_RAD) - turn(-STEP_RAD)) / (2 * STEP_RAD)
     both = float(np.hypot(sigma, square.step_sigma_rad))
@@ -81,13 +81,13 @@ class PlaneEstimate:
     fit: Adjustment
     side: float
     """1 or -1: which side of the state's plane is up."""
-    assumed: LevelCamera | SquareVehicles | None = None
+    assumed: LevelCamera | TransverseDirection | None = None
     """What tells the direction across the road where the traffic does not."""
     fraction_below_horizon: float = 1.0
     """Share of the tracked points below the horizon."""
 
     @classmethod
-    def of(cls, fit: Adjustment, tracks: TrackSet, assumed: LevelCamera | SquareVehicles | None = None) -> PlaneEstimate:
+    def of(cls, fit: Adjustment, tracks: TrackSet, assumed: LevelCamera | TransverseDirection | None = None) -> PlaneEstimate:
         """Return the plane of a solution, the side of the traffic below."""
         plane = cls(fit, 1.0, assumed)
         normal = plane.normal(fit.state)

@@ -14,10 +14,10 @@ from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment
 from autocalib_ros.estimation.adjustment.lens_prior import known_lens, lens_priors
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig
 from autocalib_ros.estimation.estimate import Solution, find_solution, verify_with_traffic
+from autocalib_ros.estimation.markings.grid_search import find_grids
 from autocalib_ros.estimation.markings.grid_search import grid_search as markings
-from autocalib_ros.estimation.markings.grid_search import square_grids
-from autocalib_ros.estimation.markings.markings_solution import fit_to_markings, with_lens_known
-from autocalib_ros.estimation.markings.road_segments import lines_on_road
+from autocalib_ros.estimation.markings.markings_solution import condition_on_lens, fit_to_markings
+from autocalib_ros.estimation.markings.road_segments import segments_on_road
 from autocalib_ros.estimation.observations.track_set import TrackSet, select_tracks
 from autocalib_ros.estimation.verification.ground_normal import PlaneEstimate
 from autocalib_ros.evidence.snapshot import Evidence
@@ -141,7 +141,7 @@ def test_exact_lines_give_the_truth() -> None:
     assert abs(focal_error(fit, JUNCTION)) < 2e-3
     assert angle_deg(fit.state.rotation[:, 2], JUNCTION.normal_in_camera) < 0.1
     # who knows the lens knows the plane no worse, though nothing is left of noise
-    for known in (with_lens_known(fit), with_lens_known(replace(fit, covariance=0.0 * fit.covariance))):
+    for known in (condition_on_lens(fit), condition_on_lens(replace(fit, covariance=0.0 * fit.covariance))):
         assert PlaneEstimate(known, 1.0).worst_sigma_deg <= PlaneEstimate(fit, 1.0).worst_sigma_deg + 1e-3
 
 
@@ -149,8 +149,8 @@ def test_half_of_the_lines_may_be_clutter() -> None:
     evidence = painted(JUNCTION)
     clutter = random_lines(JUNCTION, np.random.default_rng(2), len(evidence.still_lines_px))
     lines = np.concatenate([evidence.still_lines_px, clutter])
-    beside = lines_on_road(seen(JUNCTION, lines))
-    assert len(beside) > 1.15 * len(lines_on_road(evidence))  # some of it is where vehicles drive
+    beside = segments_on_road(seen(JUNCTION, lines))
+    assert len(beside) > 1.15 * len(segments_on_road(evidence))  # some of it is where vehicles drive
     fit, tracks, _ = fit_of(seen(JUNCTION, lines))
     require_true(fit, tracks, JUNCTION, focal=0.03, normal_deg=1.2)
 
@@ -159,11 +159,11 @@ def test_posts_are_told_from_the_lines_across_the_road() -> None:
     generator = np.random.default_rng(3)
     posts = post_lines(JUNCTION, generator, 30)
     evidence = seen(JUNCTION, np.concatenate([painted_lines(JUNCTION, generator), posts]))
-    lines = lines_on_road(evidence)
+    lines = segments_on_road(evidence)
     upright = (lines.ends_px[:, None] == posts).all(axis=2).any(axis=1)
     assert upright.sum() >= 8 and (~upright).sum() > 80
-    grid = square_grids(lines, [lens_priors(evidence.image_size, NEAR_EQUIDISTANT)[0]])[0]
-    along = grid.members.argmax(axis=0)
+    grid = find_grids(lines, [lens_priors(evidence.image_size, NEAR_EQUIDISTANT)[0]])[0]
+    along = grid.responsibilities.argmax(axis=0)
     assert (along[upright] == 2).mean() > 0.8
     assert (along[~upright] == 2).mean() < 0.1
     assert angle_deg(grid.rotation[:, 2], JUNCTION.normal_in_camera) < 1.0
@@ -386,7 +386,7 @@ def test_another_focal_length_that_suits_the_lines_as_well_is_a_doubt() -> None:
 
 
 def test_errors_are_within_what_is_said_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(markings, 'STARTS', 1)  # the others serve to find doubts: without them less is refused
+    monkeypatch.setattr(markings, 'MAX_GRID_STARTS', 1)  # the others serve to find doubts: without them less is refused
     ratios = []
     for seed in range(8):
         junction, evidence = drawn(seed)

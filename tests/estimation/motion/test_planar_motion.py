@@ -9,8 +9,14 @@ from autocalib_ros.config import JointOptions
 from autocalib_ros.estimation.adjustment.lens_prior import lens_priors
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig, AdjustmentState, Parameterisation
 from autocalib_ros.estimation.adjustment.residual_blocks import PlanarMotionBlock
-from autocalib_ros.estimation.motion.planar_motion import Motion, View, first_motion, on_course, settled
-from autocalib_ros.estimation.observations.two_frame_windows import Windows
+from autocalib_ros.estimation.motion.planar_motion import (
+    PlanarMotion,
+    WindowRays,
+    initial_motion,
+    refined,
+    without_side_slip,
+)
+from autocalib_ros.estimation.observations.two_frame_windows import TwoFrameWindows
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.synthetic.junction import pose
 
@@ -32,12 +38,12 @@ def window(positions: np.ndarray, headings: np.ndarray, bodies: list[np.ndarray]
     return np.concatenate(seen, axis=1)
 
 
-def windows_of(pixels: np.ndarray) -> Windows:
+def windows_of(pixels: np.ndarray) -> TwoFrameWindows:
     """Windows of pixels (windows, 3, POINTS, 2), each a body of its own."""
     count = len(pixels)
-    return Windows(first_px=pixels[:, 0], second_px=pixels[:, 2], middle_px=pixels[:, 1],
+    return TwoFrameWindows(first_px=pixels[:, 0], second_px=pixels[:, 2], middle_px=pixels[:, 1],
                    mask=np.ones((count, pixels.shape[2]), bool), bodies=np.arange(count),
-                   times_s=np.zeros(count), seconds=np.full(count, 1.6), tracks=np.zeros((count, pixels.shape[2]), int))
+                   times_s=np.zeros(count), duration_s=np.full(count, 1.6), tracks=np.zeros((count, pixels.shape[2]), int))
 
 
 def car(generator: np.random.Generator, points: int = POINTS) -> np.ndarray:
@@ -62,15 +68,15 @@ def crossing(generator: np.random.Generator) -> np.ndarray:
     return window(where, np.repeat(heading[:, None], 3, axis=1), [car(generator, POINTS // 2) for _ in range(2)])
 
 
-def view_of(windows: Windows) -> View:
-    return View.of(windows, CAMERA, POSE, JointOptions())
+def view_of(windows: TwoFrameWindows) -> WindowRays:
+    return WindowRays.of(windows, CAMERA, POSE, JointOptions())
 
 
 @pytest.mark.parametrize('turn_deg', [-70.0, -12.0, 3.0, 25.0, 90.0])
 def test_a_turning_car_obeys_the_motion_that_is_found_from_nothing(turn_deg: float) -> None:
     generator = np.random.default_rng(3)
     view = view_of(windows_of(np.stack([turning(generator, turn_deg) for _ in range(5)])))
-    motion = settled(view, first_motion(view), rounds=30)
+    motion = refined(view, initial_motion(view), rounds=30)
     assert np.degrees(motion.turn_rad) == pytest.approx(np.full(5, turn_deg), abs=0.01)
     assert np.abs(view.distances(motion)).max() < 1e-3
 
@@ -79,12 +85,12 @@ def test_the_distance_is_in_observed_pixels_over_their_standard_deviation() -> N
     generator = np.random.default_rng(4)
     windows = windows_of(turning(generator, 20.0)[None])
     view = view_of(windows)
-    motion = first_motion(view)
+    motion = initial_motion(view)
     for step in np.array([[1.0, 0.0], [0.0, 1.0]]):
         nearer = windows.second_px.copy()
         nearer[0, 0] += 0.01 * step
-        shifted = View.of(Windows(windows.first_px, nearer, windows.middle_px, windows.mask, windows.bodies,
-                                  windows.times_s, windows.seconds, windows.tracks), CAMERA, POSE, JointOptions())
+        shifted = WindowRays.of(TwoFrameWindows(windows.first_px, nearer, windows.middle_px, windows.mask, windows.bodies,
+                                  windows.times_s, windows.duration_s, windows.tracks), CAMERA, POSE, JointOptions())
         off_px = shifted.distances(motion)[0, 0] * view.sigma_px[0, 0]
         assert abs(off_px) <= 0.01 / np.sqrt(2) * 1.5  # both ends share a displacement
     assert (view.sigma_px > JointOptions().noise_px).all()
@@ -94,11 +100,11 @@ def test_settling_comes_back_from_a_motion_nearby_and_ignores_a_stranger() -> No
     generator = np.random.default_rng(5)
     windows = windows_of(turning(generator, 20.0)[None])
     view = view_of(windows)
-    true = first_motion(view)
-    back = settled(view, true.moved(0.05, -0.1), rounds=20)
+    true = initial_motion(view)
+    back = refined(view, true.moved(0.05, -0.1), rounds=20)
     assert back.turn_rad == pytest.approx(true.turn_rad, abs=1e-4)
     windows.second_px[0, 0] += [15.0, -20.0]
-    assert settled(view_of(windows), true, 20).turn_rad == pytest.approx(true.turn_rad, abs=np.radians(1.0))
+    assert refined(view_of(windows), true, 20).turn_rad == pytest.approx(true.turn_rad, abs=np.radians(1.0))
 
 
 def test_only_what_is_steered_counts_as_turning() -> None:
@@ -110,8 +116,8 @@ def test_only_what_is_steered_counts_as_turning() -> None:
     for kind, pixels in kinds.items():
         windows = windows_of(np.stack(pixels) + generator.normal(scale=0.3, size=np.shape(pixels)))
         view = view_of(windows)
-        motion = first_motion(view)
-        shares[kind] = on_course(windows, view, motion, CAMERA, POSE, HEIGHT_M)[1].mean()
+        motion = initial_motion(view)
+        shares[kind] = without_side_slip(windows, view, motion, CAMERA, POSE, HEIGHT_M)[1].mean()
         if kind == 'crossing':
             assert np.median(np.abs(np.degrees(motion.turn_rad))) > 5.0  # by their displacements they do seem to turn
     assert shares['turning'] > 0.5  # some are too small to tell
@@ -137,5 +143,5 @@ def test_residuals_change_as_their_derivatives_say() -> None:
 
 
 def test_motion_keeps_its_place_in_a_selection() -> None:
-    motion = Motion(np.array([0.1, 0.2]), np.array([1.0, 2.0]))
+    motion = PlanarMotion(np.array([0.1, 0.2]), np.array([1.0, 2.0]))
     assert motion.subset(np.array([1])).heading_rad.tolist() == [2.0]

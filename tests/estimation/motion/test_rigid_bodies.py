@@ -9,10 +9,10 @@ from autocalib_ros.config import JointOptions
 from autocalib_ros.estimation.adjustment.lens_prior import lens_priors
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig, AdjustmentState, Parameterisation
 from autocalib_ros.estimation.adjustment.residual_blocks import RigidBodyBlock
-from autocalib_ros.estimation.motion.rigid_bodies import Bundle
+from autocalib_ros.estimation.motion.rigid_bodies import TrackletBundle
 from autocalib_ros.estimation.observations.track_set import SAMPLES_PER_TRACK
-from autocalib_ros.estimation.observations.tracklets import INSTANTS, Lives, find_lives, no_lives
-from autocalib_ros.estimation.observations.two_frame_windows import Instants, find_windows
+from autocalib_ros.estimation.observations.tracklets import MAX_INSTANTS, Tracklets, find_tracklets, no_tracklets
+from autocalib_ros.estimation.observations.two_frame_windows import ResampledTracks, find_windows
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.benchmark.monte_carlo import evidence_of
 from autocalib_ros.offline.synthetic.junction import pose
@@ -25,7 +25,7 @@ NOISE_PX = 0.3
 
 def life(generator: np.random.Generator, turn_deg: float, points: int = SAMPLES_PER_TRACK) -> np.ndarray:
     """Pixels (SAMPLES, INSTANTS, 2) of a car that turns by `turn_deg`."""
-    heading = generator.uniform(0, 2 * np.pi) + np.radians(turn_deg) * np.linspace(0, 1, INSTANTS)
+    heading = generator.uniform(0, 2 * np.pi) + np.radians(turn_deg) * np.linspace(0, 1, MAX_INSTANTS)
     steps = 1.5 * np.column_stack([np.cos(heading), np.sin(heading)])
     where = generator.uniform([14.0, -5.0], [20.0, 5.0]) + np.cumsum(steps, axis=0)
     body = generator.uniform([-2.0, -0.8, 0.2], [2.0, 0.8, 1.6], (points, 3))
@@ -36,29 +36,29 @@ def life(generator: np.random.Generator, turn_deg: float, points: int = SAMPLES_
     return CAMERA.project(np.dstack([ground, up]) @ POSE.T)[0]
 
 
-def lives_of(pixels: np.ndarray) -> Lives:
+def lives_of(pixels: np.ndarray) -> Tracklets:
     count = len(pixels)
-    return Lives(pixels, np.ones(pixels.shape[:3], bool), np.arange(count), np.zeros(count))
+    return Tracklets(pixels, np.ones(pixels.shape[:3], bool), np.arange(count), np.zeros(count))
 
 
-def noisy(generator: np.random.Generator, count: int = 12) -> Lives:
+def noisy(generator: np.random.Generator, count: int = 12) -> Tracklets:
     pixels = np.stack([life(generator, turn) for turn in np.linspace(-70, 70, count)])
     return lives_of(pixels + generator.normal(scale=NOISE_PX, size=pixels.shape))
 
 
 def test_perfect_motion_leaves_no_residual() -> None:
     generator = np.random.default_rng(1)
-    bundle = Bundle(lives_of(np.stack([life(generator, turn) for turn in (-60.0, -10.0, 0.0, 25.0, 80.0)])), 0.3, 0.05)
-    shapes = bundle.settled(CAMERA, POSE, bundle.begun(CAMERA, POSE), 60)
+    bundle = TrackletBundle(lives_of(np.stack([life(generator, turn) for turn in (-60.0, -10.0, 0.0, 25.0, 80.0)])), 0.3, 0.05)
+    shapes = bundle.refined(CAMERA, POSE, bundle.initialised(CAMERA, POSE), 60)
     assert np.abs(bundle.residuals(CAMERA, POSE, shapes)).max() < 0.05
     reference = bundle.reference[0]
-    assert not shapes.moves[0, reference].any() and shapes.turns_rad[0, reference] == 0.0
+    assert not shapes.translations[0, reference].any() and shapes.turns_rad[0, reference] == 0.0
     assert np.degrees(np.ptp(shapes.turns_rad, axis=1)) == pytest.approx([60.0, 10.0, 0.0, 25.0, 80.0], abs=0.5)
 
 
 def test_noise_is_as_large_as_it_is_said_to_be() -> None:
-    bundle = Bundle(noisy(np.random.default_rng(2)), NOISE_PX, 0.0)
-    shapes = bundle.begun(CAMERA, POSE)
+    bundle = TrackletBundle(noisy(np.random.default_rng(2)), NOISE_PX, 0.0)
+    shapes = bundle.initialised(CAMERA, POSE)
     squared = (bundle.residuals(CAMERA, POSE, shapes)**2).sum(axis=(1, 2, 3)) / bundle.dof
     assert squared.mean() == pytest.approx(1.0, abs=0.25)
 
@@ -66,18 +66,18 @@ def test_noise_is_as_large_as_it_is_said_to_be() -> None:
 def test_a_stranger_on_the_body_is_not_believed() -> None:
     generator = np.random.default_rng(3)
     lives = noisy(generator, 4)
-    lives.pixels[0, 0] += np.linspace(0, 60, INSTANTS)[:, None]
-    bundle = Bundle(lives, NOISE_PX, 0.0)
-    shapes = bundle.begun(CAMERA, POSE)
-    trust = bundle.trust(bundle.residuals(CAMERA, POSE, shapes))
-    assert trust[0, 0] < 0.1 < 0.5 < np.median(trust)
+    lives.pixels[0, 0] += np.linspace(0, 60, MAX_INSTANTS)[:, None]
+    bundle = TrackletBundle(lives, NOISE_PX, 0.0)
+    shapes = bundle.initialised(CAMERA, POSE)
+    robust_weight = bundle.robust_weight(bundle.residuals(CAMERA, POSE, shapes))
+    assert robust_weight[0, 0] < 0.1 < 0.5 < np.median(robust_weight)
 
 
 def test_residuals_change_as_their_derivatives_say() -> None:
     prior = lens_priors((1280, 720), JointOptions())[0]
-    bundle = Bundle(noisy(np.random.default_rng(4), 5), NOISE_PX, 0.0)
+    bundle = TrackletBundle(noisy(np.random.default_rng(4), 5), NOISE_PX, 0.0)
     steps = Parameterisation(AdjustmentState(CAMERA, POSE, np.zeros(0)), AdjustmentConfig(prior, JointOptions(), bundle=bundle))
-    shapes = bundle.begun(CAMERA, POSE)
+    shapes = bundle.initialised(CAMERA, POSE)
     rows = RigidBodyBlock(steps, bundle, shapes)
     here = rows.linearise()
     for index in range(steps.size):
@@ -91,26 +91,26 @@ def test_residuals_change_as_their_derivatives_say() -> None:
 
 def test_the_residuals_tell_whether_points_drift() -> None:
     generator = np.random.default_rng(5)
-    steady = noisy(generator, 20)
-    walk = np.cumsum(generator.normal(scale=0.5, size=steady.pixels.shape), axis=2)
-    drifting = lives_of(steady.pixels + walk)
-    for lives, drifts in ((steady, False), (drifting, True)):
-        bundle = Bundle(lives, NOISE_PX, 0.05)
-        shapes = bundle.begun(CAMERA, POSE)
-        more_probable = bundle.noise_cost(CAMERA, POSE, shapes) < bundle.steady().noise_cost(CAMERA, POSE, shapes)
+    without_drift = noisy(generator, 20)
+    walk = np.cumsum(generator.normal(scale=0.5, size=without_drift.pixels.shape), axis=2)
+    drifting = lives_of(without_drift.pixels + walk)
+    for lives, drifts in ((without_drift, False), (drifting, True)):
+        bundle = TrackletBundle(lives, NOISE_PX, 0.05)
+        shapes = bundle.initialised(CAMERA, POSE)
+        more_probable = bundle.noise_cost(CAMERA, POSE, shapes) < bundle.without_drift().noise_cost(CAMERA, POSE, shapes)
         assert more_probable == drifts
 
 
 def test_lives_follow_the_tracks_of_a_body_and_take_bodies_in_turn() -> None:
     _, evidence = evidence_of('turning', 0, 0)
-    instants = Instants(evidence)
+    instants = ResampledTracks(evidence)
     windows = find_windows(evidence, instants)
-    lives = find_lives(windows, instants, 1000)
+    lives = find_tracklets(windows, instants, 1000)
     assert len(np.unique(lives.bodies)) > 15
     assert (lives.mask.sum(axis=(1, 2)) >= 15).all()
     times = evidence.times_s[evidence.track_starts[0]:evidence.track_starts[1]]
     assert times.min() - 1 < lives.times_s.min()
-    few = find_lives(windows, instants, 10)
+    few = find_tracklets(windows, instants, 10)
     assert len(np.unique(few.bodies)) == 10
-    assert not len(find_lives(windows.subset(np.zeros(0, int)), instants, 10))
-    assert not len(no_lives())
+    assert not len(find_tracklets(windows.subset(np.zeros(0, int)), instants, 10))
+    assert not len(no_tracklets())

@@ -8,7 +8,7 @@ import numpy as np
 
 from autocalib_ros.calibrator import solve
 from autocalib_ros.config import Options
-from autocalib_ros.estimation.observations.selection import of_vehicles
+from autocalib_ros.estimation.observations.selection import drop_pedestrians
 from autocalib_ros.evidence.snapshot import Evidence, Kind
 from autocalib_ros.offline.synthetic.junction import Junction, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration, Refusal
@@ -51,5 +51,5 @@ def test_tracks_of_vehicles_are_missing_where_most_are_of_people() -> None:
 
 def test_unknown_tracks_are_taken_for_vehicles() -> None:
     evidence = synthetic_evidence(Junction(), np.random.default_rng(3))
-    traffic, kept = of_vehicles(evidence)
+    traffic, kept = drop_pedestrians(evidence)
     assert traffic is evidence and len(kept) == evidence.track_count

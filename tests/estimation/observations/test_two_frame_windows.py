@@ -41,7 +41,7 @@ def test_points_of_one_vehicle_are_one_body_at_every_instant() -> None:
     moved = windows.second_px - windows.first_px
     assert set(np.round(moved[windows.mask][:, 0]).astype(int)) == {96, 192}
     assert np.allclose(windows.middle_px, (windows.first_px + windows.second_px) / 2)
-    assert not windows.of_segments.any()
+    assert not windows.from_segments.any()
 
 
 def test_vehicles_apart_or_of_another_way_are_other_bodies() -> None:
@@ -70,8 +70,8 @@ def test_a_crowded_vehicle_keeps_points_that_lie_far_apart() -> None:
     grid = np.stack(np.meshgrid(np.arange(0.0, 60.0, 6.0), np.arange(0.0, 30.0, 6.0)), axis=-1).reshape(-1, 2)
     windows = find_windows(evidence_of(driving((100, 300), (120, 0), 1, points=grid)))
     assert (windows.mask.sum(axis=1) == SAMPLES_PER_TRACK).all()
-    spread = np.ptp(windows.first_px[0], axis=0)
-    assert (spread >= [48.0, 24.0]).all()
+    balanced_subset = np.ptp(windows.first_px[0], axis=0)
+    assert (balanced_subset >= [48.0, 24.0]).all()
 
 
 def test_segments_of_two_frames_are_a_window_of_the_body_at_their_place() -> None:
@@ -80,18 +80,18 @@ def test_segments_of_two_frames_are_a_window_of_the_body_at_their_place() -> Non
     here = Segments(0.9, np.full(len(ends), 7), ends)
     elsewhere = replace(here, ends_px=ends + 350.0)
     windows = find_windows(evidence_of(tracks, [here, elsewhere]))
-    assert windows.of_segments.sum() == 2
-    of_tracks = windows.bodies[~windows.of_segments][0]
-    assert (windows.bodies[windows.of_segments] == of_tracks).tolist() == [True, False]
+    assert windows.from_segments.sum() == 2
+    of_tracks = windows.bodies[~windows.from_segments][0]
+    assert (windows.bodies[windows.from_segments] == of_tracks).tolist() == [True, False]
 
 
 def test_a_selection_takes_the_bodies_in_turn() -> None:
     tracks = [track for number in range(6) for track in driving((100, 300), (120, 0), number, begin_s=3.0 * number)]
     windows = find_windows(evidence_of(tracks))
-    few = windows.spread(6)
+    few = windows.balanced_subset(6)
     assert len(np.unique(few.bodies)) == 6
-    assert len(windows.spread(10_000)) == len(windows)
-    assert np.isclose(windows.share_of_body.sum(), 6.0)
+    assert len(windows.balanced_subset(10_000)) == len(windows)
+    assert np.isclose(windows.body_weights.sum(), 6.0)
 
 
 def test_a_track_of_one_point_is_no_body() -> None:

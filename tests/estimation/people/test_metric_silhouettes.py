@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from autocalib_ros.estimation.people.metric_silhouettes import sizes_of
+from autocalib_ros.estimation.people.metric_silhouettes import measure_silhouettes
 from autocalib_ros.offline.synthetic.junction import Junction, pose
 from silhouette_evidence import box, outline
 
@@ -14,7 +14,7 @@ JUNCTION = Junction(camera_from_ground=pose(32.0, 0.0, 0.0))
 
 def measured(size_m: tuple[float, float, float], place_m: tuple[float, float], heading: float):
     row = outline(JUNCTION, box(size_m, np.array(place_m), heading))
-    return sizes_of(row[None], JUNCTION.camera, JUNCTION.normal_in_camera, JUNCTION.height_m)
+    return measure_silhouettes(row[None], JUNCTION.camera, JUNCTION.normal_in_camera, JUNCTION.height_m)
 
 
 @pytest.mark.parametrize('place_m', [(12.0, 0.0), (20.0, 10.0), (18.0, -12.0), (35.0, 3.0)])

@@ -9,7 +9,7 @@ import pytest
 
 from autocalib_ros.calibrator import solve
 from autocalib_ros.config import Options
-from autocalib_ros.estimation.people.pedestrians import walkers
+from autocalib_ros.estimation.people.pedestrians import find_pedestrians
 from autocalib_ros.evidence.snapshot import Evidence, Track
 from autocalib_ros.offline.synthetic.junction import Junction, gathered, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration
@@ -76,7 +76,7 @@ def street() -> tuple[Junction, Evidence]:
 
 def test_who_walks_is_told_from_who_drives(street):
     junction, evidence = street
-    told = walkers(evidence, junction.camera, junction.normal_in_camera, junction.height_m)
+    told = find_pedestrians(evidence, junction.camera, junction.normal_in_camera, junction.height_m)
     people = np.unique(evidence.track_vehicles[evidence.track_vehicles >= FIRST_WALKER])
     assert len(people) > 20
     assert np.isin(told, people).mean() > 0.95
@@ -88,7 +88,7 @@ def test_cars_in_a_jam_are_no_people():
     junction = Junction()
     crawling = [track for number in range(20) for track in _crawler(junction, number, generator)]
     evidence = gathered(crawling, junction.image_size, 80.0)
-    told = walkers(evidence, junction.camera, junction.normal_in_camera, junction.height_m)
+    told = find_pedestrians(evidence, junction.camera, junction.normal_in_camera, junction.height_m)
     # Six points fall anywhere over a width of 1.6 m: of one car in twenty or so all fall within half of it.
     assert len(told) <= 3
 

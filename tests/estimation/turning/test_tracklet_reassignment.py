@@ -14,10 +14,10 @@ from autocalib_ros.config import GateOptions, JointOptions, Options
 from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment, adjust
 from autocalib_ros.estimation.adjustment.lens_prior import known_lens, lens_priors
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig, AdjustmentState, Parameterisation
-from autocalib_ros.estimation.motion.rigid_bodies import Bundle
+from autocalib_ros.estimation.motion.rigid_bodies import TrackletBundle
 from autocalib_ros.estimation.observations.track_set import TrackSet, select_tracks
-from autocalib_ros.estimation.observations.tracklets import Lives, find_lives
-from autocalib_ros.estimation.observations.two_frame_windows import Instants, Windows, find_windows
+from autocalib_ros.estimation.observations.tracklets import Tracklets, find_tracklets
+from autocalib_ros.estimation.observations.two_frame_windows import ResampledTracks, TwoFrameWindows, find_windows
 from autocalib_ros.estimation.turning.turning_traffic import turning_traffic as turning
 from autocalib_ros.estimation.verification.consistency import compare_solutions, expected_half_differences
 from autocalib_ros.estimation.verification.gates import check_halves
@@ -64,9 +64,9 @@ def test_few_vehicles_whose_points_slide_do_not_mislead(seed: int) -> None:
         assert sigmas_off(result) < 3.0
 
 
-def turned_lives(windows: Windows, instants: Instants, limit: int, *, by_deg: float) -> Lives:
+def turned_lives(windows: TwoFrameWindows, instants: ResampledTracks, limit: int, *, by_deg: float) -> Tracklets:
     """Find lives as a camera turned a little would see them: bodies that move in another plane."""
-    lives = find_lives(windows, instants, limit)
+    lives = find_tracklets(windows, instants, limit)
     bearings, _ = TURNING.camera.unproject(lives.pixels)
     turn = Rotation.from_rotvec(np.radians([by_deg, 0.0, 0.0])).as_matrix()
     pixels, _ = TURNING.camera.project(bearings @ turn.T)
@@ -74,35 +74,35 @@ def turned_lives(windows: Windows, instants: Instants, limit: int, *, by_deg: fl
 
 
 def test_lives_that_contradict_windows_are_not_believed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(turning, 'find_lives', partial(turned_lives, by_deg=8.0))
+    monkeypatch.setattr(turning, 'find_tracklets', partial(turned_lives, by_deg=8.0))
     result = solve(evidence_of(1), Options(camera_height=8.0), lens=TURNING.camera)
     if isinstance(result, Calibration) and result.ground is not None:
         assert sigmas_off(result) < 3.0
     windows, fit, tracks = by_windows(evidence_of(1))
-    kept, by_lives = turning.over_lives(fit, tracks, windows, Instants(evidence_of(1)))
-    assert by_lives is not None
+    kept, tracklet_state = turning.refine_with_tracklets(fit, tracks, windows, ResampledTracks(evidence_of(1)))
+    assert tracklet_state is not None
     assert compare_solutions(kept, fit).normal_deg < 0.1
-    assert turning.with_lives_apart(kept, None) is kept
-    widened = turning.with_lives_apart(kept, by_lives)
+    assert turning.widen_by_tracklet_difference(kept, None) is kept
+    widened = turning.widen_by_tracklet_difference(kept, tracklet_state)
     before, after = compare_solutions(kept, kept).sigmas[1], compare_solutions(widened, widened).sigmas[1]
-    apart_deg = np.degrees(np.arccos(kept.state.rotation[:, 2] @ by_lives.rotation[:, 2]))
+    apart_deg = np.degrees(np.arccos(kept.state.rotation[:, 2] @ tracklet_state.rotation[:, 2]))
     assert apart_deg > 5.0
     assert after**2 - before**2 == pytest.approx(2 * apart_deg**2, rel=0.05)  # as if of two, each so far off
 
 
-def by_windows(evidence: Evidence) -> tuple[Windows, Adjustment, TrackSet]:
+def by_windows(evidence: Evidence) -> tuple[TwoFrameWindows, Adjustment, TrackSet]:
     """Solve with windows alone, from the truth."""
-    windows = find_windows(evidence, Instants(evidence))
+    windows = find_windows(evidence, ResampledTracks(evidence))
     nothing = select_tracks(evidence, 500).subset(np.zeros(0, int))
     fit = adjust(TRUTH, nothing, AdjustmentConfig(known_lens(TURNING.camera), JointOptions(), windows=windows), refine=True)
-    return windows, turning.with_turning(fit, nothing, windows) or fit, nothing
+    return windows, turning.refine_with_turning(fit, nothing, windows) or fit, nothing
 
 
 def test_a_stuck_life_is_begun_anew() -> None:
     evidence = evidence_of(3)
     windows, fit, nothing = by_windows(evidence)
-    lives = find_lives(windows, Instants(evidence), 100)
-    bundle = Bundle(lives, 0.3, 0.0)
+    lives = find_tracklets(windows, ResampledTracks(evidence), 100)
+    bundle = TrackletBundle(lives, 0.3, 0.0)
     config = replace(fit.problem.config, windows=windows.subset(np.zeros(0, int)), bundle=bundle)
     good = adjust(TRUTH, nothing, config, refine=True)
     shapes = good.problem.warm_start[2]
@@ -111,7 +111,7 @@ def test_a_stuck_life_is_begun_anew() -> None:
     turns_rad = np.where(np.arange(len(lives))[:, None] < 3, -shapes.turns_rad, shapes.turns_rad)
     stuck = replace(shapes, turns_rad=turns_rad)
     bad = adjust(TRUTH, nothing, config, refine=True, warm_start=(None, None, stuck))
-    mended = turning.begun_anew(bad, nothing)
+    mended = turning.restart_tracklets(bad, nothing)
     assert (bad.turning2[:3] > 1.5 * good.turning2[:3]).any()
     assert (mended.turning2[:3] < 1.1 * good.turning2[:3]).all()
 

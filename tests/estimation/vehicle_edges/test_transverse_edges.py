@@ -13,11 +13,15 @@ from autocalib_ros.config import GateOptions, JointOptions, Options
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentState
 from autocalib_ros.estimation.estimate import Solution, find_solution
 from autocalib_ros.estimation.observations.track_set import select_tracks
-from autocalib_ros.estimation.vehicle_edges.transverse_edges import RoadEdges, SquareVehicles, square_to
+from autocalib_ros.estimation.vehicle_edges.transverse_edges import (
+    TransverseDirection,
+    VehicleEdges,
+    transverse_direction_at,
+)
 from autocalib_ros.estimation.verification.gates import check_plane
 from autocalib_ros.estimation.verification.ground_normal import LevelCamera, combine_assumptions
 from autocalib_ros.evidence.snapshot import Evidence
-from autocalib_ros.geometry.robust_kernels import folded
+from autocalib_ros.geometry.robust_kernels import wrap_undirected
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration
@@ -52,7 +56,7 @@ def box_edges(camera: Camera, camera_from_ground: np.ndarray, middle_m: np.ndarr
 
 
 def traffic(camera_from_ground: np.ndarray, generator: np.random.Generator, vehicles: int = 40, *,
-            yaw_deg: float = 0.0, clutter: float = 0.5) -> RoadEdges:
+            yaw_deg: float = 0.0, clutter: float = 0.5) -> VehicleEdges:
     """Edges of boxes that drive along ground x on three lanes, each seen a few times."""
     ends, owners = [], []
     heading = np.linalg.inv(camera_from_ground) @ [0.0, 0.0, 1.0]
@@ -63,7 +67,7 @@ def traffic(camera_from_ground: np.ndarray, generator: np.random.Generator, vehi
             found = box_edges(CAMERA, camera_from_ground, middle, generator, yaw_deg=askew, clutter=clutter)
             ends.append(found)
             owners.append(np.full(len(found), vehicle))
-    return RoadEdges(np.concatenate(ends), np.concatenate(owners))
+    return VehicleEdges(np.concatenate(ends), np.concatenate(owners))
 
 
 def state_of(camera_from_ground: np.ndarray, camera: Camera = CAMERA) -> AdjustmentState:
@@ -74,9 +78,9 @@ def state_of(camera_from_ground: np.ndarray, camera: Camera = CAMERA) -> Adjustm
     return AdjustmentState(camera, np.column_stack([along, np.cross(helper, along), helper]), np.zeros(1))
 
 
-def error_deg(found: SquareVehicles, camera_from_ground: np.ndarray) -> float:
+def error_deg(found: TransverseDirection, camera_from_ground: np.ndarray) -> float:
     across = found.across(state_of(camera_from_ground))
-    return float(np.degrees(folded(np.arctan2(across @ camera_from_ground[:, 2], across @ camera_from_ground[:, 1]))))
+    return float(np.degrees(wrap_undirected(np.arctan2(across @ camera_from_ground[:, 2], across @ camera_from_ground[:, 1]))))
 
 
 @pytest.mark.parametrize(('tilt', 'roll', 'heading'), [(30.0, 0.0, 10.0), (20.0, 4.0, 40.0), (35.0, -6.0, 75.0),
@@ -84,7 +88,7 @@ def error_deg(found: SquareVehicles, camera_from_ground: np.ndarray) -> float:
 def test_boxes_give_the_direction_across_their_road(tilt: float, roll: float, heading: float) -> None:
     camera_from_ground = pose(tilt, roll, heading)
     generator = np.random.default_rng(1)
-    found = square_to(traffic(camera_from_ground, generator), state_of(camera_from_ground), generator)
+    found = transverse_direction_at(traffic(camera_from_ground, generator), state_of(camera_from_ground), generator)
     assert found is not None
     sigma = np.degrees(found.step_sigma_rad)
     assert sigma < 1.5  # degrees: what bodies have in common, and a little for their number
@@ -98,20 +102,20 @@ def test_clutter_alone_tells_nothing(seed: int) -> None:
     boxes = traffic(camera_from_ground, generator)
     angle, middle = generator.uniform(0, np.pi, len(boxes)), boxes.ends_px[:, :2]
     half = 15.0 * np.column_stack([np.cos(angle), np.sin(angle)])
-    clutter = RoadEdges(np.hstack([middle - half, middle + half]), boxes.vehicles)
-    assert square_to(clutter, state_of(camera_from_ground), generator) is None
+    clutter = VehicleEdges(np.hstack([middle - half, middle + half]), boxes.vehicles)
+    assert transverse_direction_at(clutter, state_of(camera_from_ground), generator) is None
 
 
 def test_few_vehicles_tell_nothing() -> None:
     generator = np.random.default_rng(0)
     camera_from_ground = pose(30.0, 0.0, 20.0)
     edges = traffic(camera_from_ground, generator, vehicles=6)
-    assert square_to(edges, state_of(camera_from_ground), generator) is None
+    assert transverse_direction_at(edges, state_of(camera_from_ground), generator) is None
 
 
 def test_no_edges_tell_nothing() -> None:
-    edges = RoadEdges(np.zeros((0, 4)), np.zeros(0, int))
-    assert square_to(edges, state_of(pose(30.0, 0.0, 20.0)), np.random.default_rng(0)) is None
+    edges = VehicleEdges(np.zeros((0, 4)), np.zeros(0, int))
+    assert transverse_direction_at(edges, state_of(pose(30.0, 0.0, 20.0)), np.random.default_rng(0)) is None
 
 
 def test_one_vehicle_seen_very_often_does_not_outweigh_the_others() -> None:
@@ -121,8 +125,8 @@ def test_one_vehicle_seen_very_often_does_not_outweigh_the_others() -> None:
     leaning = camera_from_ground @ np.array([[1, 0, 0], [0, 0.990, -0.139], [0, 0.139, 0.990]])
     jam = np.concatenate([box_edges(CAMERA, leaning, np.array([14.0, 0.0]), generator, clutter=0.0)
                           for _ in range(300)])
-    edges = RoadEdges(np.vstack([many.ends_px, jam]), np.append(many.vehicles, np.full(len(jam), 999)))
-    found = square_to(edges, state_of(camera_from_ground), generator)
+    edges = VehicleEdges(np.vstack([many.ends_px, jam]), np.append(many.vehicles, np.full(len(jam), 999)))
+    found = transverse_direction_at(edges, state_of(camera_from_ground), generator)
     assert found is not None
     assert abs(error_deg(found, camera_from_ground)) < 1.5
 
@@ -132,7 +136,7 @@ def test_the_standard_deviation_covers_what_is_missed() -> None:
     for seed in range(12):
         generator = np.random.default_rng(seed)
         camera_from_ground = pose(generator.uniform(15, 40), generator.normal(scale=4), generator.uniform(-70, 70))
-        found = square_to(traffic(camera_from_ground, generator, 30), state_of(camera_from_ground), generator)
+        found = transverse_direction_at(traffic(camera_from_ground, generator, 30), state_of(camera_from_ground), generator)
         assert found is not None
         misses.append(error_deg(found, camera_from_ground) / np.degrees(found.step_sigma_rad))
     assert np.sqrt(np.mean(np.square(misses))) < 1.2
@@ -142,7 +146,7 @@ def test_the_standard_deviation_covers_what_is_missed() -> None:
 def test_the_same_edges_and_seed_give_the_same_bits() -> None:
     camera_from_ground = pose(30.0, 2.0, 25.0)
     edges = traffic(camera_from_ground, np.random.default_rng(5))
-    first, second = (square_to(edges, state_of(camera_from_ground), np.random.default_rng(0)) for _ in range(2))
+    first, second = (transverse_direction_at(edges, state_of(camera_from_ground), np.random.default_rng(0)) for _ in range(2))
     assert first is not None and second is not None
     assert first.origin.tobytes() == second.origin.tobytes() and first.step_sigma_rad == second.step_sigma_rad
 
@@ -153,7 +157,7 @@ def test_the_direction_moves_with_the_road_as_the_edges_do(axis: np.ndarray) -> 
     edges = traffic(camera_from_ground, np.random.default_rng(2))
     state = state_of(camera_from_ground)
     turned = replace(state, rotation=Rotation.from_rotvec(np.radians(2.0) * axis).as_matrix() @ state.rotation)
-    found, anew = (square_to(edges, at, np.random.default_rng(0)) for at in (state, turned))
+    found, anew = (transverse_direction_at(edges, at, np.random.default_rng(0)) for at in (state, turned))
     assert found is not None and anew is not None
     moved = found.across(turned)
     assert abs(moved @ turned.directions[0]) < 1e-9
@@ -165,7 +169,7 @@ def test_a_level_camera_and_edges_are_joined_by_their_variances() -> None:
     camera_from_ground = pose(30.0, 2.0, 5.0)
     edges = traffic(camera_from_ground, np.random.default_rng(5))
     state = state_of(camera_from_ground)
-    square = square_to(edges, state, np.random.default_rng(0))
+    square = transverse_direction_at(edges, state, np.random.default_rng(0))
     assert square is not None
     joined, apart_deg = combine_assumptions(LevelCamera(1.0), square, state)
     assert joined is not None
@@ -179,7 +183,7 @@ def test_a_level_camera_and_edges_are_joined_by_their_variances() -> None:
 def test_a_level_camera_that_edges_contradict_is_noticed() -> None:
     camera_from_ground = pose(30.0, 8.0, 5.0)
     state = state_of(camera_from_ground)
-    square = square_to(traffic(camera_from_ground, np.random.default_rng(5)), state, np.random.default_rng(0))
+    square = transverse_direction_at(traffic(camera_from_ground, np.random.default_rng(5)), state, np.random.default_rng(0))
     assert square is not None
     joined, apart_deg = combine_assumptions(LevelCamera(1.0), square, state)
     assert joined is None and apart_deg > 5.0
@@ -235,7 +239,7 @@ def assumed() -> Solution:
     evidence, options = with_boxes(ROLLED), Options(camera_height=HEIGHT_M)
     solution = find_solution(evidence, select_tracks(evidence, options.joint.max_tracks), options.joint, options.gate,
                              np.random.default_rng(0), height_m=HEIGHT_M)
-    assert isinstance(solution, Solution) and isinstance(solution.plane.assumed, SquareVehicles)
+    assert isinstance(solution, Solution) and isinstance(solution.plane.assumed, TransverseDirection)
     return solution
 
 
