@@ -28,7 +28,7 @@ from autocalib_ros.estimation.verification.readiness import (
 )
 from autocalib_ros.estimation.verification.scale import Scale, check_scale, is_unusual, known_scale
 from autocalib_ros.evidence.buffer import EvidenceBuffer
-from autocalib_ros.evidence.snapshot import Evidence, Kind
+from autocalib_ros.evidence.snapshot import Evidence, TrackKind
 from autocalib_ros.geometry.ground_plane import ground_plane, ground_points, pixels_ahead, tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.lens.camera_info import ModelMisfit
@@ -284,7 +284,7 @@ def _solved(evidence: Evidence, options: Options, lens: Camera | None) -> Calibr
     told = _people_in(result, traffic)
     if len(told) and by_traffic:
         drive = np.flatnonzero(~np.isin(traffic.track_vehicles, told))
-        alone = traffic.without(told)
+        alone = traffic.without_vehicles(told)
         again = check_readiness(alone, options.gate) or solved(alone, kept[drive])
         result = _preferred(result, again if isinstance(again, Reason) else again[0])
     return _counted(result, len(told))
@@ -296,7 +296,7 @@ def _people_in(result: Calibration, evidence: Evidence) -> np.ndarray:
     if ground is None:
         return np.zeros(0, int)
     height = ground.height_m if ground.metric else DEFAULT_CAMERA_HEIGHT_M
-    untold = evidence.selected(np.flatnonzero(evidence.track_kinds == Kind.UNKNOWN))
+    untold = evidence.select_tracks(np.flatnonzero(evidence.track_kinds == TrackKind.UNKNOWN))
     return people(untold, result.camera, ground.normal_in_camera, height)
 
 

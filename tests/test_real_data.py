@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from autocalib_ros.config import DetectorOptions, Options
-from autocalib_ros.evidence.snapshot import Kind
+from autocalib_ros.evidence.snapshot import TrackKind
 from autocalib_ros.offline.recordings.open import open_source
 from autocalib_ros.offline.replay_recording import replay
 from autocalib_ros.perception.detector.detector import open_detector
@@ -85,7 +85,7 @@ def test_evidence_by_a_real_detector_tells_people_from_vehicles() -> None:
                       Options(camera_height=8.0, first_solve_s=1e5, detector=options)).evidence
     way = np.array([np.hypot(*(track.points_px[-1] - track.points_px[0])) / np.ptp(track.times_s)
                     for track in evidence.tracks()])
-    people = evidence.track_kinds == Kind.PERSON
-    assert people.sum() > 5 and (evidence.track_kinds == Kind.VEHICLE).sum() > 50
+    people = evidence.track_kinds == TrackKind.PERSON
+    assert people.sum() > 5 and (evidence.track_kinds == TrackKind.VEHICLE).sum() > 50
     # pixels a second; who walks is slower than who drives, over the same places
     assert np.median(way[people]) < 0.6 * np.median(way[~people])

@@ -19,6 +19,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Write; return the exit status."""
-    from autocalib_ros.pictures.known_views import rectified_view
+    from autocalib_ros.pictures.known_views import rectified_renderer
 
-    return views.write(arguments, 'rectify', lambda known: rectified_view(known, arguments.balance))
+    return views.write(arguments, 'rectify', lambda known: rectified_renderer(known, arguments.balance))

@@ -30,9 +30,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Write; return the exit status."""
-    from autocalib_ros.pictures.known_views import from_above, top_view_of
+    from autocalib_ros.pictures.known_views import choose_top_view, top_view_renderer
 
     def view_of(known: KnownCamera) -> View:
-        view = top_view_of(known, arguments.px_per_m, arguments.x, arguments.y)
-        return from_above(known, view, grid=arguments.grid, scale_bar=arguments.scale_bar)
+        view = choose_top_view(known, arguments.px_per_m, arguments.x, arguments.y)
+        return top_view_renderer(known, view, grid=arguments.grid, scale_bar=arguments.scale_bar)
     return views.write(arguments, 'topview', view_of)

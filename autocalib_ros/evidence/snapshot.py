@@ -19,7 +19,7 @@ COVERAGE_CELLS = (16, 9)
 """Columns and rows of the grid in which coverage of the image is counted."""
 
 
-class Kind(IntEnum):
+class TrackKind(IntEnum):
     """What a track is of, by the class that a detector saw."""
 
     UNKNOWN = 0
@@ -37,7 +37,7 @@ class Track:
     """Seconds since the first image, shape (n,), increasing."""
     points_px: np.ndarray
     """Shape (n, 2)."""
-    kind: Kind = Kind.UNKNOWN
+    kind: TrackKind = TrackKind.UNKNOWN
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ class Evidence:
     still_lines_px: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))
     """Straight lines of the road and around it, without the traffic, x0, y0, x1, y1, shape (lines, 4)."""
     track_kinds: np.ndarray = field(default_factory=lambda: np.zeros(0, np.uint8))
-    """`Kind` of each track, uint8, shape (tracks,); all unknown where it is not given."""
+    """`TrackKind` of each track, uint8, shape (tracks,); all unknown where it is not given."""
 
     def __post_init__(self) -> None:
         if not len(self.track_kinds):
@@ -136,7 +136,7 @@ class Evidence:
         """Return one track."""
         part = slice(self.track_starts[index], self.track_starts[index + 1])
         return Track(int(self.track_vehicles[index]), self.times_s[part], self.points_px[part],
-                     Kind(self.track_kinds[index]))
+                     TrackKind(self.track_kinds[index]))
 
     def tracks(self) -> Iterator[Track]:
         """Iterate over all tracks."""
@@ -153,22 +153,22 @@ class Evidence:
 
     def summary(self) -> EvidenceSummary:
         """Return the counts that a result carries."""
-        people = self.track_kinds == Kind.PERSON
+        people = self.track_kinds == TrackKind.PERSON
         return EvidenceSummary(
             image_size=self.image_size, seconds=self.seconds, frames=self.frames, tracks=self.track_count,
             segments=len(self.segments_px), coverage=self.coverage,
             vehicles=len(np.unique(self.track_vehicles[~people])), people=len(np.unique(self.track_vehicles[people])))
 
-    def selected(self, keep: np.ndarray) -> Evidence:
+    def select_tracks(self, keep: np.ndarray) -> Evidence:
         """Return the evidence with only the tracks whose indices are in `keep`; segments and edges unchanged."""
         return replace(self, **_track_arrays([self.track(index) for index in keep]))
 
-    def without(self, vehicles: np.ndarray) -> Evidence:
+    def without_vehicles(self, vehicles: np.ndarray) -> Evidence:
         """Return the evidence without all that is of these vehicles (n,)."""
-        tracks, segments, edges, outlines = (~np.isin(owners, vehicles) for owners in (
+        tracks, segments, edges, outlines = (~np.isin(vehicle_ids, vehicles) for vehicle_ids in (
             self.track_vehicles, self.segment_vehicles, self.edge_vehicles, self.outline_vehicles))
         return replace(
-            self.selected(np.flatnonzero(tracks)), segments_px=self.segments_px[segments],
+            self.select_tracks(np.flatnonzero(tracks)), segments_px=self.segments_px[segments],
             segment_vehicles=self.segment_vehicles[segments], segment_times_s=self.segment_times_s[segments],
             edges_px=self.edges_px[edges], edge_vehicles=self.edge_vehicles[edges],
             edge_times_s=self.edge_times_s[edges], outlines_px=self.outlines_px[outlines],
@@ -180,9 +180,9 @@ class Evidence:
         if len(self.outlines_px):
             arrays |= {name: getattr(self, name) for name in OUTLINE_ARRAYS}
         if len(self.still_lines_px):
-            arrays[STILL_LINES] = self.still_lines_px
+            arrays[STILL_LINES_PX] = self.still_lines_px
         if self.track_kinds.any():
-            arrays[KINDS] = self.track_kinds
+            arrays[TRACK_KINDS] = self.track_kinds
         path = Path(path)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -206,10 +206,10 @@ class Evidence:
                 evidence = cls(image_size=(width, height), first_stamp_ns=first, newest_stamp_ns=newest,
                                frames=int(data['frames']), drift_px=float(data['drift_px']),
                                **{name: data[name] for name in ARRAYS},
-                               **{name: data[name] for name in (*EDGE_ARRAYS, *OUTLINE_ARRAYS, STILL_LINES, KINDS)
+                               **{name: data[name] for name in (*EDGE_ARRAYS, *OUTLINE_ARRAYS, STILL_LINES_PX, TRACK_KINDS)
                                   if name in data})
             _require_consistent(evidence)
-        except UNREADABLE as error:
+        except LOAD_ERRORS as error:
             reason = ' '.join(str(error).split())
             raise InputError(f'{path} is not a file of saved evidence (.npz): {reason}') from error
         return evidence
@@ -221,13 +221,13 @@ EDGE_ARRAYS = ('edges_px', 'edge_vehicles', 'edge_times_s')
 """Files written before edges were gathered have none of them."""
 OUTLINE_ARRAYS = ('outlines_px', 'outline_vehicles', 'outline_times_s')
 """Only in files of evidence that was gathered without a detector; older ones have none of them."""
-STILL_LINES = 'still_lines_px'
+STILL_LINES_PX = 'still_lines_px'
 """Files of little evidence, and those written before they were looked for, have none."""
-KINDS = 'track_kinds'
+TRACK_KINDS = 'track_kinds'
 """Only in files of evidence that was gathered with a detector."""
 
 
-UNREADABLE = (OSError, LookupError, ValueError, TypeError, AttributeError, EOFError, OverflowError, MemoryError,
+LOAD_ERRORS = (OSError, LookupError, ValueError, TypeError, AttributeError, EOFError, OverflowError, MemoryError,
               NotImplementedError, RuntimeError, zipfile.BadZipFile, zlib.error)
 """What NumPy and zipfile raise at files that are damaged, encrypted, or of another kind."""
 
@@ -239,16 +239,16 @@ def _require_consistent(evidence: Evidence) -> None:
               'track_vehicles': (tracks,), 'segments_px': (len(evidence.segments_px), 4),
               'segment_vehicles': (len(evidence.segments_px),), 'segment_times_s': (len(evidence.segments_px),),
               'edges_px': (len(evidence.edges_px), 4), 'edge_vehicles': (len(evidence.edges_px),),
-              'edge_times_s': (len(evidence.edges_px),), STILL_LINES: (len(evidence.still_lines_px), 4),
-              'outlines_px': (len(evidence.outlines_px), OUTLINE_COLUMNS), KINDS: (tracks,),
+              'edge_times_s': (len(evidence.edges_px),), STILL_LINES_PX: (len(evidence.still_lines_px), 4),
+              'outlines_px': (len(evidence.outlines_px), OUTLINE_COLUMNS), TRACK_KINDS: (tracks,),
               'outline_vehicles': (len(evidence.outlines_px),), 'outline_times_s': (len(evidence.outlines_px),)}
     for name, shape in shapes.items():
         array = getattr(evidence, name)
-        kinds = 'iu' if name in ('track_starts', KINDS) or name.endswith('vehicles') else 'f'
+        kinds = 'iu' if name in ('track_starts', TRACK_KINDS) or name.endswith('vehicles') else 'f'
         if array.shape != shape or array.dtype.kind not in kinds or not np.isfinite(array).all():
             raise ValueError(f'{name} of {array.dtype} {array.shape} does not fit the rest')
-    if not np.isin(evidence.track_kinds, list(Kind)).all():
-        raise ValueError(f'{KINDS} holds other kinds than {", ".join(f"{kind:d} ({kind.name})" for kind in Kind)}')
+    if not np.isin(evidence.track_kinds, list(TrackKind)).all():
+        raise ValueError(f'{TRACK_KINDS} holds other kinds than {", ".join(f"{kind:d} ({kind.name})" for kind in TrackKind)}')
     starts = evidence.track_starts
     if starts[0] != 0 or starts[-1] != points or (np.diff(starts) < 1).any():
         raise ValueError('track_starts does not divide points_px into tracks')

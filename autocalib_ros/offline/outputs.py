@@ -9,7 +9,7 @@ from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.lens.camera_info_yaml import write_camera_info_yaml
 from autocalib_ros.offline.recordings.sources import Source, camera_name
 from autocalib_ros.offline.replay_recording import ReplayResult
-from autocalib_ros.report.scene import Scene
+from autocalib_ros.report.scene import ReportScene
 from autocalib_ros.results.calibration import Calibration
 from autocalib_ros.results.calibration_json import write_calibration_json
 
@@ -48,7 +48,7 @@ def write_result(out_dir: Path, replayed: ReplayResult, source_name: str, name_o
     else:
         _remove(out_dir / CAMERA_INFO)
     write_calibration_json(out_dir / CALIBRATION, result, accepted_at_s=replayed.accepted_at_s)
-    write_report(out_dir / REPORT, Scene(
+    write_report(out_dir / REPORT, ReportScene(
         result=result, evidence=replayed.evidence, background=replayed.background, options=replayed.options,
         source=source_name, accepted_at_s=replayed.accepted_at_s, moments=replayed.moments))
     return ([CAMERA_INFO] if result else []) + [CALIBRATION, REPORT]

@@ -14,7 +14,7 @@ from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.recordings.sources import Source
 from autocalib_ros.perception.detector.detector import VehicleDetector
-from autocalib_ros.report.scene import Moment, noted
+from autocalib_ros.report.scene import SolutionSnapshot, append_snapshot
 from autocalib_ros.results.calibration import Calibration, Refusal
 
 SETTLING = 2.0
@@ -36,7 +36,7 @@ class ReplayResult:
     """The road without its traffic, BGR uint8."""
     frames: int
     options: Options = field(default_factory=Options)
-    moments: tuple[Moment, ...] = ()
+    moments: tuple[SolutionSnapshot, ...] = ()
     """What the solutions on the way said, and the last."""
 
 
@@ -51,7 +51,7 @@ def replay(source: Source, options: Options, on_progress: Callable[[int, str], N
     tell = on_progress or (lambda done, note: None)
     calibrator, accepted_at_s, count, note, fitting = AutoCalibrator(options, detector), None, 0, '', None
     latest: Calibration | Refusal | None = None
-    moments: tuple[Moment, ...] = ()
+    moments: tuple[SolutionSnapshot, ...] = ()
     again_s = 0.0
     for count, frame in enumerate(source.frames(), start=1):
         fitting = _fitting(lens, (frame.image.shape[1], frame.image.shape[0]))
@@ -60,7 +60,7 @@ def replay(source: Source, options: Options, on_progress: Callable[[int, str], N
         if due is not None and due.seconds >= again_s:
             tell(count, 'solving')
             tried = solve(due, options, lens=fitting)
-            moments = noted(moments, tried)
+            moments = append_snapshot(moments, tried)
             if tried and accepted_at_s is None:  # a live run would have been accepted then
                 accepted_at_s = due.seconds
             latest = tried if tried or accepted_at_s is None else latest
@@ -78,7 +78,7 @@ def replay(source: Source, options: Options, on_progress: Callable[[int, str], N
         accepted_at_s = evidence.seconds
     return ReplayResult(result=result, evidence=evidence, accepted_at_s=accepted_at_s,
                         background=calibrator.background(), frames=count, options=options,
-                        moments=noted(moments, result))
+                        moments=append_snapshot(moments, result))
 
 
 def _note(calibrator: AutoCalibrator, latest: Calibration | Refusal | None, accepted_at_s: float | None) -> str:

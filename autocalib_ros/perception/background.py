@@ -5,18 +5,18 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-SAMPLES = 9
+MAX_SAMPLES = 9
 FIRST_INTERVAL_S = 1.0
-LONGEST_INTERVAL_S = 600.0
-"""Light, dirt and new paint: what is older than `SAMPLES` of these is no longer how the road looks."""
-LEAST_SAMPLES = 5
+MAX_INTERVAL_S = 600.0
+"""Light, dirt and new paint: what is older than `MAX_SAMPLES` of these is no longer how the road looks."""
+MIN_SAMPLES = 5
 """Of fewer images the median shows what drove by as well."""
 
 
 class Background:
     """Keeps a few images as JPEG; whenever it is full, every second one goes and the interval doubles.
 
-    From `LONGEST_INTERVAL_S` on, the oldest goes instead.
+    From `MAX_INTERVAL_S` on, the oldest goes instead.
     """
 
     def __init__(self) -> None:
@@ -28,7 +28,7 @@ class Background:
         """Look at a grey or BGR uint8 image; few are kept."""
         if time_s < self._next_s:
             return
-        if len(self._samples) == SAMPLES:
+        if len(self._samples) == MAX_SAMPLES:
             self._thin()
         ok, encoded = cv2.imencode('.jpg', image, [cv2.IMWRITE_JPEG_QUALITY, 92])
         if ok:
@@ -36,7 +36,7 @@ class Background:
         self._next_s = time_s + self._interval_s
 
     def _thin(self) -> None:
-        if 2 * self._interval_s > LONGEST_INTERVAL_S:
+        if 2 * self._interval_s > MAX_INTERVAL_S:
             self._samples = self._samples[1:]
             return
         self._samples = self._samples[::2]
@@ -60,7 +60,7 @@ class Background:
 
     def grey(self) -> np.ndarray | None:
         """Return the median image in grey, uint8 (H, W), or None before it is free of traffic."""
-        return self._median(cv2.IMREAD_GRAYSCALE) if len(self._samples) >= LEAST_SAMPLES else None
+        return self._median(cv2.IMREAD_GRAYSCALE) if len(self._samples) >= MIN_SAMPLES else None
 
     def _median(self, flags: int) -> np.ndarray:
         return median([cv2.imdecode(encoded, flags) for _, encoded in self._samples])

@@ -10,21 +10,21 @@ from dataclasses import dataclass
 import numpy as np
 
 from autocalib_ros.config import DetectorOptions
-from autocalib_ros.evidence.snapshot import Kind
+from autocalib_ros.evidence.snapshot import TrackKind
 from autocalib_ros.perception.detector.detector import Detections, VehicleDetector
 from autocalib_ros.perception.klt_tracker import PointTracker
 from autocalib_ros.perception.motion_mask import Region
 
-LEAST_IOU = 0.3
+MIN_IOU = 0.3
 """A box is that of a detection when they share so much of their union (Bewley et al. 2016)."""
-UNSEEN_S = 1.0
+MAX_UNSEEN_S = 1.0
 """A box that was not detected for so long is given up: detectors miss a vehicle now and then."""
-MOVING_SHARE = 0.2
+MIN_MOVING_FRACTION = 0.2
 """Least share of a box that differs from the background: a vehicle fills most of its box, and what passes behind a
 parked one little."""
-MOVING_PER_S = 0.1
+MIN_SPEED_PER_S = 0.1
 """A box moves when the points on it go so far in a second, share of its longer side."""
-CARRIERS = 3
+MIN_POINTS_PER_BOX = 3
 """So many points tell how a vehicle moves; fewer may hold on to something else."""
 
 
@@ -40,7 +40,7 @@ class _Box:
     """Of the points on it, 0 where there are too few."""
 
 
-class DetectedVehicles:
+class DetectorTracks:
     """Follows the boxes of one stream of images; the detector may be shared, one image at a time."""
 
     def __init__(self, detector: VehicleDetector, options: DetectorOptions) -> None:
@@ -55,63 +55,63 @@ class DetectedVehicles:
 
         `image` (H, W) or (H, W, 3) is `reduction` times as large as the tracked one.
         """
-        points, owners = tracker.positions()
-        self._carry(owners, tracker.steps(), time_s)
+        points, vehicle_ids = tracker.positions()
+        self._propagate(vehicle_ids, tracker.steps(), time_s)
         # the image nearest to the time that is due: stamps jitter
         if time_s + 0.5 * min(time_s - self._time_s, self._every_s) >= self._detected_s + self._every_s:
             found = self._detector.detect(image)
-            self._match(found, found.edges_px / reduction, points + 0.5, owners, time_s)
+            self._associate(found, found.edges_px / reduction, points + 0.5, vehicle_ids, time_s)
             self._detected_s = time_s
-            self._forget(owners)
+            self._drop_stale_votes(vehicle_ids)
         self._time_s = time_s
 
     def regions(self, moving: list[Region], shape: tuple[int, int],
-                avoided: np.ndarray | None = None) -> tuple[list[Region], np.ndarray]:
+                excluded: np.ndarray | None = None) -> tuple[list[Region], np.ndarray]:
         """Return what moves of each box, nearest first, and the vehicles (n,), given what moves in the image (H, W).
 
-        No region reaches to where an image (H, W) is `avoided`, not 0.
+        No region reaches to where an image (H, W) is `excluded`, not 0.
         """
         differs = np.zeros(shape, np.uint8)
         for region in moving:
             height, width = region.mask.shape
             differs[region.y:region.y + height, region.x:region.x + width] |= region.mask
         found, free = [], np.full(shape, 255, np.uint8)
-        if avoided is not None:
-            free[avoided > 0] = 0
+        if excluded is not None:
+            free[excluded > 0] = 0
         # A person stands before the vehicle that its box overlaps; of two vehicles the lower one is nearer.
-        for box in sorted(self._boxes, key=lambda box: (self.kind(box.vehicle) is not Kind.PERSON, -box.edges_px[3])):
-            left, top, right, bottom = _inside(box.edges_px, shape)
+        for box in sorted(self._boxes, key=lambda box: (self.kind(box.vehicle) is not TrackKind.PERSON, -box.edges_px[3])):
+            left, top, right, bottom = _pixel_bounds(box.edges_px, shape)
             if right <= left or bottom <= top:
                 continue
             own = free[top:bottom, left:right]
             mask = differs[top:bottom, left:right] & own
-            if np.count_nonzero(mask) < MOVING_SHARE * mask.size:
-                if box.speed_px_s < MOVING_PER_S * max(right - left, bottom - top):
+            if np.count_nonzero(mask) < MIN_MOVING_FRACTION * mask.size:
+                if box.speed_px_s < MIN_SPEED_PER_S * max(right - left, bottom - top):
                     continue
                 mask = own.copy()
             own[:] = 0
             found.append((Region(left, top, mask), box.vehicle))
         return [region for region, _ in found], np.array([vehicle for _, vehicle in found], int)
 
-    def kind(self, vehicle: int) -> Kind:
+    def kind(self, vehicle: int) -> TrackKind:
         """What most detections of a vehicle say that it is."""
         votes = self._votes.get(vehicle)
-        return Kind.UNKNOWN if votes is None else Kind.PERSON if votes < 0 else Kind.VEHICLE
+        return TrackKind.UNKNOWN if votes is None else TrackKind.PERSON if votes < 0 else TrackKind.VEHICLE
 
-    def _carry(self, owners: np.ndarray, steps: np.ndarray, time_s: float) -> None:
+    def _propagate(self, vehicle_ids: np.ndarray, steps: np.ndarray, time_s: float) -> None:
         """Move each box by the median step (n, 2) of the points on its vehicle since the image before."""
         for box in self._boxes:
-            mine = steps[owners == box.vehicle]
+            mine = steps[vehicle_ids == box.vehicle]
             box.speed_px_s = 0.0
-            if len(mine) >= CARRIERS:
+            if len(mine) >= MIN_POINTS_PER_BOX:
                 step = np.median(mine, axis=0)
                 box.edges_px = box.edges_px + np.tile(step, 2)
                 box.speed_px_s = float(np.hypot(*step) / max(time_s - self._time_s, 1e-3))
 
-    def _match(self, found: Detections, edges_px: np.ndarray, points: np.ndarray, owners: np.ndarray,
+    def _associate(self, found: Detections, edges_px: np.ndarray, points: np.ndarray, vehicle_ids: np.ndarray,
                time_s: float) -> None:
         """Give each detection its box: the one that overlaps it most, else that of the points in it, else a new one."""
-        matched = _pairs(edges_px, np.array([box.edges_px for box in self._boxes]).reshape(-1, 4))
+        matched = _greedy_iou_matches(edges_px, np.array([box.edges_px for box in self._boxes]).reshape(-1, 4))
         taken = {self._boxes[index].vehicle for index in matched.values()}
         unseen = [box for index, box in enumerate(self._boxes) if index not in matched.values()]
         fresh: list[_Box] = []
@@ -119,31 +119,31 @@ class DetectedVehicles:
             if row in matched:
                 vehicle = self._boxes[matched[row]].vehicle
             else:
-                vehicle = _owner_inside(edges, points, owners, taken) or self._new_vehicle()
+                vehicle = _vehicle_of_points(edges, points, vehicle_ids, taken) or self._new_vehicle()
             taken.add(vehicle)
             speed = self._boxes[matched[row]].speed_px_s if row in matched else 0.0
             fresh.append(_Box(vehicle, edges, time_s, speed))
             self._votes[vehicle] = self._votes.get(vehicle, 0.0) + found.scores[row] * (-1 if found.people[row] else 1)
         self._boxes = fresh + [box for box in unseen
-                               if box.vehicle not in taken and time_s - box.seen_s <= UNSEEN_S]
+                               if box.vehicle not in taken and time_s - box.seen_s <= MAX_UNSEEN_S]
 
     def _new_vehicle(self) -> int:
         self._vehicles += 1
         return self._vehicles
 
-    def _forget(self, owners: np.ndarray) -> None:
+    def _drop_stale_votes(self, vehicle_ids: np.ndarray) -> None:
         """Forget what vehicles are that have neither a box nor a point left."""
-        alive = {box.vehicle for box in self._boxes} | set(owners.tolist())
+        alive = {box.vehicle for box in self._boxes} | set(vehicle_ids.tolist())
         self._votes = {vehicle: votes for vehicle, votes in self._votes.items() if vehicle in alive}
 
 
-def _pairs(detected: np.ndarray, known: np.ndarray) -> dict[int, int]:
+def _greedy_iou_matches(detected: np.ndarray, known: np.ndarray) -> dict[int, int]:
     """Pair detections (n, 4) with boxes (m, 4), best overlap first."""
     overlap = _ious(detected, known)
     pairs: dict[int, int] = {}
     order = np.argsort(-overlap.ravel(), kind='stable')
     for row, column in zip(*np.unravel_index(order, overlap.shape), strict=True):
-        if overlap[row, column] < LEAST_IOU:
+        if overlap[row, column] < MIN_IOU:
             break
         if row not in pairs and column not in pairs.values():
             pairs[int(row)] = int(column)
@@ -159,14 +159,14 @@ def _ious(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return shared / np.maximum(areas[0][:, None] + areas[1][None] - shared, 1e-9)
 
 
-def _owner_inside(edges: np.ndarray, points: np.ndarray, owners: np.ndarray, taken: set[int]) -> int:
+def _vehicle_of_points(edges: np.ndarray, points: np.ndarray, vehicle_ids: np.ndarray, taken: set[int]) -> int:
     """Return the vehicle of most points (n, 2) inside a box, those taken apart; 0 where there is none."""
     inside = ((points >= edges[:2]) & (points < edges[2:])).all(axis=1)
-    votes = np.bincount(np.array([owner for owner in owners[inside].tolist() if owner not in taken], int), minlength=1)
+    votes = np.bincount(np.array([owner for owner in vehicle_ids[inside].tolist() if owner not in taken], int), minlength=1)
     return int(votes.argmax())
 
 
-def _inside(edges: np.ndarray, shape: tuple[int, int]) -> tuple[int, int, int, int]:
+def _pixel_bounds(edges: np.ndarray, shape: tuple[int, int]) -> tuple[int, int, int, int]:
     """Whole pixels that a box covers of an image (height, width)."""
     left, top = np.maximum(np.floor(edges[:2]), 0).astype(int)
     right, bottom = np.minimum(np.ceil(edges[2:]), shape[::-1]).astype(int)

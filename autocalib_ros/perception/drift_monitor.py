@@ -8,26 +8,26 @@ import cv2
 import numpy as np
 
 WIDTH_PX = 640
-POINTS = 80
+MAX_CORNERS = 80
 INTERVAL_S = 0.5
-MIN_POINTS = 8
+MIN_BACKGROUND_CORNERS = 8
 """Fewer background points say nothing: rain, darkness, a covered lens."""
-ROUND_TRIP_PX = 0.5
-QUANTILES = (0.05, 0.95)
+MAX_ROUND_TRIP_PX = 0.5
+DRIFT_QUANTILES = (0.05, 0.95)
 """Drift is the span between these quantiles of the offsets: one passing lorry is not a moving camera."""
-LAMPS = 0.97
+LAMP_QUANTILE = 0.97
 """Share of an image at night that is neither a lamp nor its glare."""
-HIDDEN_S = 10.0
+MAX_OCCLUSION_S = 10.0
 """Nothing that passes hides the background for longer."""
-AWAY_PX = 12
+MASK_MARGIN_PX = 12
 """A corner is so far from what is ignored, whose border stands still however the camera moves: half a window."""
-COARSE_S = 300.0
+COARSE_INTERVAL_S = 300.0
 """Of what lies farther back than memory one median in so long is kept: slow drift is seen, and the memory is small."""
-MAX_COARSE = 8640
+MAX_COARSE_SAMPLES = 8640
 """A month of medians."""
 
 
-class Stillness:
+class DriftMonitor:
     """Follows strong corners of the background from a reference image into later ones.
 
     Remembers `memory_s` closely, and by medians back to the time that `compare_since` names. Corners are taken only
@@ -36,15 +36,15 @@ class Stillness:
 
     def __init__(self, memory_s: float, ignored: np.ndarray | None = None) -> None:
         self._memory_s, self._ignored = memory_s, ignored
-        self._coarse: deque[tuple[float, float, float]] = deque(maxlen=MAX_COARSE)
-        self._coarse_due_s = COARSE_S
+        self._coarse: deque[tuple[float, float, float]] = deque(maxlen=MAX_COARSE_SAMPLES)
+        self._coarse_due_s = COARSE_INTERVAL_S
         self._reference: np.ndarray | None = None
         self._recent: np.ndarray | None = None
         self._found_s = 0.0
         self.lost_s = -np.inf
         """When the background was last lost from sight: nothing tells how the camera stood before."""
         self._corners = np.zeros((0, 1, 2), np.float32)
-        self._base = np.zeros(2)
+        self._base_offset = np.zeros(2)
         self._offsets: deque[tuple[float, float, float]] = deque(maxlen=4096)
         self._next_s = 0.0
         self._factor = 1.0
@@ -59,17 +59,17 @@ class Stillness:
         reduced = cv2.resize(grey, size, interpolation=cv2.INTER_AREA) if self._factor > 1 else grey
         offset = self._offset(self._reference, self._corners, reduced)
         if offset is None:
-            self._lose(reduced, time_s)
+            self._replace_reference(reduced, time_s)
             return
         self._recent, self._found_s = reduced.copy(), time_s
-        self._offsets.append((time_s, *(self._base + offset)))
+        self._offsets.append((time_s, *(self._base_offset + offset)))
         while self._offsets[0][0] < time_s - self._memory_s:
             self._offsets.popleft()
         if time_s >= self._coarse_due_s:
-            self._coarse.append((time_s, *self._position(time_s - COARSE_S)))
-            self._coarse_due_s = time_s + COARSE_S
+            self._coarse.append((time_s, *self._position(time_s - COARSE_INTERVAL_S)))
+            self._coarse_due_s = time_s + COARSE_INTERVAL_S
 
-    def _lose(self, reduced: np.ndarray, time_s: float) -> None:
+    def _replace_reference(self, reduced: np.ndarray, time_s: float) -> None:
         """Take a new reference where the last one is of no more use.
 
         Light and shadow change slowly: the image in which it was last found still leads to the new one. Where that
@@ -77,11 +77,11 @@ class Stillness:
         """
         step = self._offset(self._recent, self._corners_of(self._recent), reduced)
         if step is None and self._reference is not None:
-            if time_s - self._found_s < HIDDEN_S:
+            if time_s - self._found_s < MAX_OCCLUSION_S:
                 return
             self.lost_s = time_s
         if self._offsets:
-            self._base = np.array(self._offsets[-1][1:]) + (0.0 if step is None else step)
+            self._base_offset = np.array(self._offsets[-1][1:]) + (0.0 if step is None else step)
         self._reference = self._recent = reduced.copy()
         self._corners, self._found_s = self._corners_of(reduced), time_s
 
@@ -90,7 +90,7 @@ class Stillness:
         if image is None or self._ignored is None:
             return _corners(image)
         ignored = cv2.resize(self._ignored, image.shape[::-1], interpolation=cv2.INTER_NEAREST)
-        near = cv2.dilate(ignored, np.ones((2 * AWAY_PX + 1, 2 * AWAY_PX + 1), np.uint8))
+        near = cv2.dilate(ignored, np.ones((2 * MASK_MARGIN_PX + 1, 2 * MASK_MARGIN_PX + 1), np.uint8))
         return _corners(image, (near == 0).astype(np.uint8))
 
     def compare_since(self, time_s: float) -> None:
@@ -106,13 +106,13 @@ class Stillness:
     @staticmethod
     def _offset(before: np.ndarray | None, corners: np.ndarray, after: np.ndarray) -> np.ndarray | None:
         """Return the median motion of the background (2,) from one image to another; None when it is lost."""
-        if before is None or len(corners) < MIN_POINTS or before.shape != after.shape:
+        if before is None or len(corners) < MIN_BACKGROUND_CORNERS or before.shape != after.shape:
             return None
         found, forward, _ = cv2.calcOpticalFlowPyrLK(before, after, corners, None)
         back, backward, _ = cv2.calcOpticalFlowPyrLK(after, before, found, None)
         miss = np.hypot(*(back - corners)[:, 0].T)
-        good = (forward.ravel() == 1) & (backward.ravel() == 1) & (miss < ROUND_TRIP_PX)
-        if good.sum() < max(MIN_POINTS, len(corners) // 3):
+        good = (forward.ravel() == 1) & (backward.ravel() == 1) & (miss < MAX_ROUND_TRIP_PX)
+        if good.sum() < max(MIN_BACKGROUND_CORNERS, len(corners) // 3):
             return None
         return np.median((found - corners)[good, 0], axis=0).astype(float)
 
@@ -121,7 +121,7 @@ class Stillness:
         """Largest span of the background's position within memory, pixels of the image as given."""
         if len(self._offsets) < 2:
             return 0.0
-        spans = [np.diff(np.quantile(np.array(self._offsets)[:, 1:], QUANTILES, axis=0), axis=0)[0]]
+        spans = [np.diff(np.quantile(np.array(self._offsets)[:, 1:], DRIFT_QUANTILES, axis=0), axis=0)[0]]
         if len(self._coarse) > 1:
             spans.append(np.ptp(np.array(self._coarse)[:, 1:], axis=0))
         return float(max(np.hypot(*span) for span in spans) * self._factor)
@@ -135,6 +135,6 @@ def _corners(image: np.ndarray | None, where: np.ndarray | None = None) -> np.nd
     """
     found = None
     if image is not None:
-        dimmed = np.minimum(image, np.uint8(np.quantile(image[::2, ::2], LAMPS)))
-        found = cv2.goodFeaturesToTrack(dimmed, POINTS, 0.02, max(8, image.shape[1] // 20), mask=where)
+        dimmed = np.minimum(image, np.uint8(np.quantile(image[::2, ::2], LAMP_QUANTILE)))
+        found = cv2.goodFeaturesToTrack(dimmed, MAX_CORNERS, 0.02, max(8, image.shape[1] // 20), mask=where)
     return np.zeros((0, 1, 2), np.float32) if found is None else found

@@ -9,19 +9,19 @@ import numpy as np
 
 from autocalib_ros.perception.motion_mask import Region
 
-LEAST_LENGTH = 0.012
+MIN_EDGE_LENGTH = 0.012
 """Shortest edge, share of the image width; below, its direction is hardly known."""
-LEAST_LENGTH_PX = 10.0
-FINE_SIDE_PX = 96
+MIN_EDGE_LENGTH_PX = 10.0
+FULL_RESOLUTION_SIDE_PX = 96
 """Regions beyond this side are searched at half size, beyond twice this at a quarter: large edges lose nothing."""
 MAX_REGIONS = 8
 """Regions looked at in one image, largest first; smaller ones have hardly an edge."""
-MAX_PER_REGION = 24
-SAMPLES = 7
+MAX_EDGES_PER_REGION = 24
+SAMPLES_PER_EDGE = 7
 """Points along an edge at which it is checked."""
-ASIDE_PX = 2.0
+CONTRAST_OFFSET_PX = 2.0
 """How far beside an edge its contrast is taken."""
-STILL_CONTRAST = 0.5
+MIN_CONTRAST_CHANGE = 0.5
 """An edge whose contrast differed by less than this share of it, at the same place in an earlier image, stands
 still: a lane marking or a kerb that shows beside the vehicle."""
 EARLIER_IMAGES = 2
@@ -43,21 +43,21 @@ class EdgeFinder:
 
     def _in_region(self, grey: np.ndarray, region: Region) -> np.ndarray:
         height, width = region.mask.shape
-        least = max(LEAST_LENGTH_PX, LEAST_LENGTH * grey.shape[1])
+        least = max(MIN_EDGE_LENGTH_PX, MIN_EDGE_LENGTH * grey.shape[1])
         if max(height, width) < least:
             return np.zeros((0, 4))
-        edges = self._lines(grey[region.y:region.y + height, region.x:region.x + width])
+        edges = self._detect_lines(grey[region.y:region.y + height, region.x:region.x + width])
         length = np.hypot(edges[:, 2] - edges[:, 0], edges[:, 3] - edges[:, 1])
-        on_edge, _ = _along(edges)
-        edges = edges[(length >= least) & (_at(region.mask, on_edge) > 0).all(axis=1)] + [region.x, region.y] * 2
-        edges = edges[self._moves(grey, edges)]
+        on_edge, _ = _sample_points(edges)
+        edges = edges[(length >= least) & (_nearest_pixels(region.mask, on_edge) > 0).all(axis=1)] + [region.x, region.y] * 2
+        edges = edges[self._is_moving(grey, edges)]
         length = np.hypot(edges[:, 2] - edges[:, 0], edges[:, 3] - edges[:, 1])
-        return edges[np.argsort(-length, kind='stable')[:MAX_PER_REGION]]
+        return edges[np.argsort(-length, kind='stable')[:MAX_EDGES_PER_REGION]]
 
-    def _lines(self, crop: np.ndarray) -> np.ndarray:
+    def _detect_lines(self, crop: np.ndarray) -> np.ndarray:
         """Line segments (n, 4) in pixels of a crop (h, w)."""
         height, width = crop.shape
-        halvings = 0 if max(height, width) <= FINE_SIDE_PX else 1 if max(height, width) <= 2 * FINE_SIDE_PX else 2
+        halvings = 0 if max(height, width) <= FULL_RESOLUTION_SIDE_PX else 1 if max(height, width) <= 2 * FULL_RESOLUTION_SIDE_PX else 2
         size = (max(1, width >> halvings), max(1, height >> halvings))
         found = self._detector.detect(
             cv2.resize(crop, size, interpolation=cv2.INTER_AREA) if halvings else np.ascontiguousarray(crop))[0]
@@ -65,16 +65,16 @@ class EdgeFinder:
             return np.zeros((0, 4))
         return (found.reshape(-1, 4).astype(float) + 0.5) * ([width / size[0], height / size[1]] * 2) - 0.5
 
-    def _moves(self, grey: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    def _is_moving(self, grey: np.ndarray, edges: np.ndarray) -> np.ndarray:
         """Say which edges (n, 4) were not there in the earlier images, shape (n,)."""
         now = _contrast(grey, edges)
         changes = [np.abs(_contrast(image, edges) - now) for image in self._earlier]
-        return np.min(changes, axis=0) > STILL_CONTRAST * np.abs(now)
+        return np.min(changes, axis=0) > MIN_CONTRAST_CHANGE * np.abs(now)
 
 
-def _along(edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _sample_points(edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Points along edges (n, 4), shape (n, SAMPLES, 2), and the edges' unit normals (n, 2)."""
-    share = (np.arange(SAMPLES) + 0.5) / SAMPLES
+    share = (np.arange(SAMPLES_PER_EDGE) + 0.5) / SAMPLES_PER_EDGE
     step = edges[:, 2:] - edges[:, :2]
     normals = np.column_stack([-step[:, 1], step[:, 0]]) / np.maximum(np.hypot(*step.T), 1e-9)[:, None]
     return edges[:, None, :2] + share[:, None] * step[:, None], normals
@@ -82,12 +82,12 @@ def _along(edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _contrast(image: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """Mean difference of grey levels between the two sides of edges (n, 4), shape (n,)."""
-    points, normals = _along(edges)
-    aside = ASIDE_PX * normals[:, None]
-    return (_at(image, points + aside).astype(float) - _at(image, points - aside)).mean(axis=1)
+    points, normals = _sample_points(edges)
+    aside = CONTRAST_OFFSET_PX * normals[:, None]
+    return (_nearest_pixels(image, points + aside).astype(float) - _nearest_pixels(image, points - aside)).mean(axis=1)
 
 
-def _at(image: np.ndarray, points: np.ndarray) -> np.ndarray:
+def _nearest_pixels(image: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Values of an image (H, W) at the pixels nearest to points (..., 2), clipped to it."""
     height, width = image.shape
     columns, rows = np.round(points).astype(int).T

@@ -11,83 +11,83 @@ from enum import Enum
 import cv2
 import numpy as np
 
-VIEW_WIDTH = 64
+COMPARISON_WIDTH_PX = 64
 """Width at which two pictures are compared as views: finer than lorries, coarser than noise."""
-ALIKE = 0.3
+MIN_VIEW_CORRELATION = 0.3
 """Least correlation between two pictures of one view: what drives through leaves much more, another view none."""
-GONE = 0.5
+VIEW_CHANGE_RATIO = 0.5
 """Another view changes most pixels by as much as they differ among themselves, at least by this share of it. What
 drives changes few, however bright it is: the rest of a dark or foggy road stays, though its correlation is lost."""
-HIDDEN_S = 2.0
+MAX_SHUTTER_S = 2.0
 """A shutter is open again after this; what is seen then is the view."""
-FLAT_LEVELS = 1.0
+MIN_SPREAD_LEVELS = 1.0
 """Spread, in grey levels, below which a picture shows nothing that could be found again."""
-LEAP_LEVELS = 6.0
+LEVEL_SHIFT_THRESHOLD = 6.0
 """Half of the picture changed by more than this at once: the light, the gain or the offset leapt, for the motion mask
 calls moving what changes by ten levels, and nothing that drives covers half of the picture from one image to the next.
 """
-FIELD_MEDIAN = 15
+OFFSET_MEDIAN_PX = 15
 """Side of the median, in pixels of the reduced picture, that tells the camera's own change from that of traffic."""
 
 
-class Seen(Enum):
+class FrameStatus(Enum):
     """What a picture is beside the last one used."""
 
     NEW = 'the same view, later'
     REPEATED = 'the same picture again'
     HIDDEN = 'another view, for a moment'
-    LEAPT = 'a view whose grey levels have nothing to do with those before'
+    LEVEL_SHIFT = 'a view whose grey levels have nothing to do with those before'
 
 
-class View:
+class FrameGate:
     """Compares the pictures of one stream; what is `REPEATED` or `HIDDEN` is not to be used."""
 
-    def __init__(self, repeated_levels: float, leap_levels: float = np.inf, flat_levels: float = FLAT_LEVELS) -> None:
-        self._repeated_levels, self._leap_levels, self._flat_levels = repeated_levels, leap_levels, flat_levels
+    def __init__(self, max_repeat_difference: float, level_shift_threshold: float = np.inf, min_spread_levels: float = MIN_SPREAD_LEVELS) -> None:
+        self._max_repeat_difference, self._level_shift_threshold, self._min_spread_levels = max_repeat_difference, level_shift_threshold, min_spread_levels
         self._last: np.ndarray | None = None
         self._before = np.zeros((0, 0), np.float32)
         self._last_s = 0.0
 
-    def judge(self, picture: np.ndarray, time_s: float) -> Seen:
+    def classify(self, picture: np.ndarray, time_s: float) -> FrameStatus:
         """Compare a reduced grey picture (h, w), of any type, with the last one used."""
-        now = _coarse(picture)
-        seen = Seen.NEW if self._last is None else self._compare(picture, now, time_s)
-        if seen is not Seen.HIDDEN:
+        now = _downsampled(picture)
+        seen = FrameStatus.NEW if self._last is None else self._compare(picture, now, time_s)
+        if seen is not FrameStatus.HIDDEN:
             self._last_s = time_s
-        if seen in (Seen.NEW, Seen.LEAPT):
+        if seen in (FrameStatus.NEW, FrameStatus.LEVEL_SHIFT):
             self._last, self._before = picture, now
         return seen
 
-    def _compare(self, picture: np.ndarray, now: np.ndarray, time_s: float) -> Seen:
-        if cv2.absdiff(self._last, picture).max() <= self._repeated_levels:
-            return Seen.REPEATED
+    def _compare(self, picture: np.ndarray, now: np.ndarray, time_s: float) -> FrameStatus:
+        if cv2.absdiff(self._last, picture).max() <= self._max_repeat_difference:
+            return FrameStatus.REPEATED
         before, change = self._before, now - self._before
-        spread = _spread(before)
-        gone = GONE * spread if spread >= self._flat_levels else np.inf
+        spread = _robust_spread(before)
+        gone = VIEW_CHANGE_RATIO * spread if spread >= self._min_spread_levels else np.inf
         # a spread is at most three times the median change: where that is small, as mostly, nothing else need be known
-        if 2 * np.count_nonzero(np.abs(change) > min(self._leap_levels, gone / 3)) < change.size:
-            return Seen.NEW
-        if _spread(change) > gone and _correlation(before, now) < ALIKE:
-            return Seen.HIDDEN if time_s - self._last_s <= HIDDEN_S else Seen.LEAPT
-        return Seen.LEAPT if np.median(np.abs(change)) > self._leap_levels else Seen.NEW
+        if 2 * np.count_nonzero(np.abs(change) > min(self._level_shift_threshold, gone / 3)) < change.size:
+            return FrameStatus.NEW
+        if _robust_spread(change) > gone and _correlation(before, now) < MIN_VIEW_CORRELATION:
+            return FrameStatus.HIDDEN if time_s - self._last_s <= MAX_SHUTTER_S else FrameStatus.LEVEL_SHIFT
+        return FrameStatus.LEVEL_SHIFT if np.median(np.abs(change)) > self._level_shift_threshold else FrameStatus.NEW
 
 
-def levelled(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+def match_grey_levels(before: np.ndarray, after: np.ndarray) -> np.ndarray:
     """Give a grey uint8 image (H, W) the offset, slowly varying over the image, of a later one of the same view."""
-    change = np.clip(_coarse(after) - _coarse(before) + 128.0, 0, 255).astype(np.uint8)
-    field = cv2.medianBlur(change, FIELD_MEDIAN).astype(np.float32) - 128.0
+    change = np.clip(_downsampled(after) - _downsampled(before) + 128.0, 0, 255).astype(np.uint8)
+    field = cv2.medianBlur(change, OFFSET_MEDIAN_PX).astype(np.float32) - 128.0
     return np.clip(before + cv2.resize(field, before.shape[::-1]) + 0.5, 0, 255).astype(np.uint8)
 
 
-def _coarse(picture: np.ndarray) -> np.ndarray:
-    """Reduce a picture (h, w) to `VIEW_WIDTH`, float32."""
+def _downsampled(picture: np.ndarray) -> np.ndarray:
+    """Reduce a picture (h, w) to `COMPARISON_WIDTH_PX`, float32."""
     height, width = picture.shape
-    columns = min(VIEW_WIDTH, width)
+    columns = min(COMPARISON_WIDTH_PX, width)
     size = (columns, max(1, height * columns // width))
     return cv2.resize(picture, size, interpolation=cv2.INTER_AREA).astype(np.float32)
 
 
-def _spread(picture: np.ndarray) -> float:
+def _robust_spread(picture: np.ndarray) -> float:
     """Standard deviation of most of a picture, by the median of the deviations from its median."""
     return 1.4826 * float(np.median(np.abs(picture - np.median(picture))))
 

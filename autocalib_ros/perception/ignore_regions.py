@@ -23,11 +23,11 @@ def black_out(image: np.ndarray, polygons: Polygons) -> np.ndarray:
     """Return an image (H, W) or (H, W, 3), of the full size, with the polygons black: a copy, itself without any."""
     if not polygons:
         return image
-    return cv2.bitwise_and(image, image, mask=_shown(polygons, image.shape[1::-1]))
+    return cv2.bitwise_and(image, image, mask=_visible_mask(polygons, image.shape[1::-1]))
 
 
 @lru_cache(maxsize=8)
-def _shown(polygons: Polygons, size: tuple[int, int]) -> np.ndarray:
+def _visible_mask(polygons: Polygons, size: tuple[int, int]) -> np.ndarray:
     """Return 255 where an image of `size` (width, height) is shown, 0 elsewhere, uint8 (H, W)."""
     return np.where(ignored_mask(polygons, size), 0, 255).astype(np.uint8)
 
@@ -44,7 +44,7 @@ def ignored_mask(polygons: Polygons, size: tuple[int, int]) -> np.ndarray:
     return inside
 
 
-def require_seen(polygons: Polygons, size: tuple[int, int]) -> None:
+def require_polygons_inside(polygons: Polygons, size: tuple[int, int]) -> None:
     """Raise UsageError when a polygon lies wholly outside images of `size` (width, height)."""
     for number, polygon in enumerate(polygons, start=1):
         if not ignored_mask((polygon,), size).any():
@@ -52,7 +52,7 @@ def require_seen(polygons: Polygons, size: tuple[int, int]) -> None:
                              f'{size[0]}x{size[1]}: give pixels of the full image as the camera sends it')
 
 
-class Ignored:
+class IgnoreMask:
     """The regions in pixels of the tracked image, for those who look for points and edges."""
 
     def __init__(self, polygons: Polygons, full_size: tuple[int, int], tracked_size: tuple[int, int]) -> None:

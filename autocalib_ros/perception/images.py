@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from autocalib_ros.errors import InputError
-from autocalib_ros.perception.intensity_normalisation import Stretch
+from autocalib_ros.perception.intensity_normalisation import IntensityNormaliser
 
 LOG = logging.getLogger(__name__)
 
@@ -25,7 +25,7 @@ COLOUR_CODES = {
     'bayer_gbrg': cv2.COLOR_BayerGR2BGR, 'bayer_grbg': cv2.COLOR_BayerGB2BGR,
 }
 CHANNELS = {'rgb': 3, 'bgr': 3, 'rgba': 4, 'bgra': 4}
-PACKED = {
+PACKED_ENCODINGS = {
     **{f'{order}{bits}': (order, bits) for order in COLOUR_CODES for bits in (8, 16)},
     '8UC1': ('mono', 8), '8UC3': ('bgr', 8), '8UC4': ('bgra', 8), '16UC1': ('mono', 16), '16UC3': ('bgr', 16),
     '16SC1': ('mono', 16), '32FC1': ('mono', 32),
@@ -36,13 +36,13 @@ Sensors of 10, 12 or 14 bits come in 16, at either end of them. Allied Vision's 
 and 12 bits 16SC1; thermal drivers send temperatures as 32FC1 or 16SC1, with or without NaN. Formats packed below a byte
 boundary (Mono10p, BayerRG12Packed) are unpacked by their drivers.
 """
-NUMBERS = {'16SC1': 'i2', '32FC1': 'f4'}
+NUMBER_FORMATS = {'16SC1': 'i2', '32FC1': 'f4'}
 """Kinds of number that are not unsigned."""
-YUV422 = {
+YUV422_ENCODINGS = {
     'yuv422': cv2.COLOR_YUV2BGR_UYVY, 'uyvy': cv2.COLOR_YUV2BGR_UYVY,
     'yuv422_yuy2': cv2.COLOR_YUV2BGR_YUY2, 'yuyv': cv2.COLOR_YUV2BGR_YUY2,
 }
-ASSUMED = {'8UC1': 'mono8', '8UC3': 'bgr8', '8UC4': 'bgra8', '16UC3': 'bgr16'}
+ASSUMED_ENCODINGS = {'8UC1': 'mono8', '8UC3': 'bgr8', '8UC4': 'bgra8', '16UC3': 'bgr16'}
 """Encodings that do not say what they mean, and what they are taken for."""
 BT601 = np.array([[1.164, 2.018, 0.0, -16 * 1.164 - 128 * 2.018],
                   [1.164, -0.391, -0.813, -16 * 1.164 + 128 * (0.391 + 0.813)],
@@ -56,8 +56,8 @@ class ImageDecoder:
     """Decodes the images of one stream; remembers only how dark and bright its images of more than 8 bits are."""
 
     def __init__(self) -> None:
-        self._stretch = Stretch()
-        self._told: set[str] = set()
+        self._normaliser = IntensityNormaliser()
+        self._warned: set[str] = set()
 
     def decode(self, message: Any) -> np.ndarray:
         """Return a sensor_msgs Image or CompressedImage as grey or BGR uint8; never changes the message.
@@ -73,28 +73,28 @@ class ImageDecoder:
             raise InputError(f"image of encoding '{what}' cannot be converted: {_first_line(error)}") from error
 
     def _raw(self, message: Any) -> np.ndarray:
-        encoding = known_encoding(message.encoding)
+        encoding = canonical_encoding(message.encoding)
         if message.width < 1 or message.height < 1:
             raise InputError(f"image of encoding '{encoding}' has no pixels: {message.width} x {message.height}")
-        if encoding in ASSUMED:
-            self._tell_once(encoding)
-        if encoding in PACKED:
+        if encoding in ASSUMED_ENCODINGS:
+            self._warn_once(encoding)
+        if encoding in PACKED_ENCODINGS:
             return self._packed(message, encoding)
-        if encoding in YUV422:
-            pixels = rows_of(message, 2 * message.width, 1).reshape(message.height, message.width, 2)
-            return cv2.cvtColor(np.ascontiguousarray(pixels), YUV422[encoding])
-        if encoding in PLANAR:
-            return PLANAR[encoding](message)
+        if encoding in YUV422_ENCODINGS:
+            pixels = image_rows(message, 2 * message.width, 1).reshape(message.height, message.width, 2)
+            return cv2.cvtColor(np.ascontiguousarray(pixels), YUV422_ENCODINGS[encoding])
+        if encoding in PLANAR_ENCODINGS:
+            return PLANAR_ENCODINGS[encoding](message)
         raise InputError(f"image encoding '{encoding}' is not supported")
 
     def _packed(self, message: Any, encoding: str) -> np.ndarray:
-        order, bits = PACKED[encoding]
+        order, bits = PACKED_ENCODINGS[encoding]
         channels = CHANNELS.get(order, 1)
-        rows = rows_of(message, message.width * channels * bits // 8, 1)
+        rows = image_rows(message, message.width * channels * bits // 8, 1)
         if bits > 8:
-            numbers = NUMBERS.get(encoding, f'u{bits // 8}')
+            numbers = NUMBER_FORMATS.get(encoding, f'u{bits // 8}')
             rows = np.ascontiguousarray(rows).view(('>' if message.is_bigendian else '<') + numbers)
-            rows = self._stretch.to_8_bit(rows, message.encoding, _stamp_s(message))
+            rows = self._normaliser.to_8_bit(rows, message.encoding, _stamp_s(message))
         pixels = rows.reshape(message.height, message.width, channels) if channels > 1 else rows
         code = COLOUR_CODES[order]
         pixels = np.ascontiguousarray(pixels)
@@ -104,22 +104,22 @@ class ImageDecoder:
         said = str(message.format)
         if 'compressedDepth' in said:
             raise InputError(f"compressed image of format '{said}' holds depths, not a picture")
-        image = decompressed(np.frombuffer(message.data, np.uint8), said)
+        image = decompress(np.frombuffer(message.data, np.uint8), said)
         if image.dtype == np.uint16:
-            image = self._stretch.to_8_bit(image, said, _stamp_s(message))
+            image = self._normaliser.to_8_bit(image, said, _stamp_s(message))
         # image_transport compresses a raw Bayer mosaic as it is: grey, with its pattern in the format
         pattern = said.split(';')[0].rstrip('168')
         if image.ndim == 2 and pattern.startswith('bayer_') and pattern in COLOUR_CODES:
             return cv2.cvtColor(image, COLOUR_CODES[pattern])
         return image
 
-    def _tell_once(self, encoding: str) -> None:
-        if encoding not in self._told:
-            self._told.add(encoding)
-            LOG.warning("image encoding '%s' does not name its colours; taken for %s", encoding, ASSUMED[encoding])
+    def _warn_once(self, encoding: str) -> None:
+        if encoding not in self._warned:
+            self._warned.add(encoding)
+            LOG.warning("image encoding '%s' does not name its colours; taken for %s", encoding, ASSUMED_ENCODINGS[encoding])
 
 
-def rows_of(message: Any, row_bytes: int, planes: float) -> np.ndarray:
+def image_rows(message: Any, row_bytes: int, planes: float) -> np.ndarray:
     """Return the image's rows without their padding, a view of shape (rows, row_bytes), after checking lengths.
 
     `planes` is the number of rows in units of the image's height.
@@ -135,21 +135,21 @@ def rows_of(message: Any, row_bytes: int, planes: float) -> np.ndarray:
     return data[:expected].reshape(rows, message.step)[:, :row_bytes]
 
 
-def known_encoding(encoding: str) -> str:
+def canonical_encoding(encoding: str) -> str:
     """Return the name of an encoding as it stands here: some drivers write NV12 or YUV420 in capitals."""
     lower = encoding.lower()
-    return lower if encoding not in PACKED and (lower in YUV422 or lower in PLANAR or lower in PACKED) else encoding
+    return lower if encoding not in PACKED_ENCODINGS and (lower in YUV422_ENCODINGS or lower in PLANAR_ENCODINGS or lower in PACKED_ENCODINGS) else encoding
 
 
 def _nv21(message: Any) -> np.ndarray:
     """Y at full size, then V and U in turns at half the height and width."""
-    rows = rows_of(LumaStep(message, 1.5), message.width, 1.5)
+    rows = image_rows(PlanarMessage(message, 1.5), message.width, 1.5)
     return cv2.cvtColor(np.ascontiguousarray(rows), cv2.COLOR_YUV2BGR_NV21)
 
 
 def _nv12(message: Any) -> np.ndarray:
     """Y at full size, then U and V in turns: Isaac ROS and the drivers of D-Robotics boards publish it."""
-    rows = rows_of(LumaStep(message, 1.5), message.width, 1.5)
+    rows = image_rows(PlanarMessage(message, 1.5), message.width, 1.5)
     return cv2.cvtColor(np.ascontiguousarray(rows), cv2.COLOR_YUV2BGR_NV12)
 
 
@@ -158,12 +158,12 @@ def _yuv420(message: Any) -> np.ndarray:
 
     TI's robotics SDK and nodes around libcamera-vid publish it.
     """
-    message = LumaStep(message, 1.5)
+    message = PlanarMessage(message, 1.5)
     height, width, step = message.height, message.width, message.step
     if height % 2 or width % 2 or step % 2:
         raise InputError(f"image of encoding '{message.encoding}' needs an even size and step, found {width} x {height}"
                          f' and {step}')
-    rows = rows_of(message, width, 1.5)
+    rows = image_rows(message, width, 1.5)
     chroma = np.frombuffer(message.data, np.uint8)[step * height:step * height * 3 // 2].reshape(height, step // 2)
     half = np.ascontiguousarray(chroma[:, :width // 2]).reshape(height // 2, width)
     return cv2.cvtColor(np.concatenate([rows[:height], half]), cv2.COLOR_YUV2BGR_I420)
@@ -171,20 +171,20 @@ def _yuv420(message: Any) -> np.ndarray:
 
 def _nv24(message: Any) -> np.ndarray:
     """Y at full size, then U and V in turns at full size: OpenCV has no conversion of its own."""
-    message = LumaStep(message, 3)
+    message = PlanarMessage(message, 3)
     height, width, step = message.height, message.width, message.step
-    rows_of(message, width, 3)
+    image_rows(message, width, 3)
     data = np.frombuffer(message.data, np.uint8)
     luma = data[:step * height].reshape(height, step)[:, :width, None]
     chroma = data[step * height:3 * step * height].reshape(height, 2 * step)[:, :2 * width].reshape(height, width, 2)
     return cv2.transform(np.concatenate([luma, chroma], axis=2), BT601)
 
 
-PLANAR: dict[str, Callable[[Any], np.ndarray]] = {
+PLANAR_ENCODINGS: dict[str, Callable[[Any], np.ndarray]] = {
     'nv12': _nv12, 'nv21': _nv21, 'nv24': _nv24, 'yuv420': _yuv420}
 
 
-class LumaStep:
+class PlanarMessage:
     """A planar message whose step is that of its luma plane.
 
     Drivers disagree: some give the bytes of a luma row, some those of a whole pixel row of all planes; the length
@@ -198,7 +198,7 @@ class LumaStep:
         self.step = message.width if tight else message.step
 
 
-def decompressed(data: np.ndarray, said: str) -> np.ndarray:
+def decompress(data: np.ndarray, said: str) -> np.ndarray:
     """Return the image of a JPEG or PNG, bytes (n,), that is `said` to be of some format; InputError or cv2.error."""
     _check_container(data, said)
     # the pixels as the sensor delivered them: a turn asked for by EXIF would change the camera's geometry

@@ -4,25 +4,25 @@ from __future__ import annotations
 
 import numpy as np
 
-from autocalib_ros.perception.frame_gate import Seen, View
+from autocalib_ros.perception.frame_gate import FrameGate, FrameStatus
 
 PERCENTILES = (1.0, 99.0)
-EASE_S = 20.0
+TIME_CONSTANT_S = 20.0
 """Time constant, twice in a row, with which the limits go to the percentiles of the present: a bus, hot and near,
 passes in 5 s and moves them by a fifth of a grey level per image; after another weather they have settled in a minute.
 """
-LEAST_SPAN, LEAST_FLOAT_SPAN = 16.0, 0.1
+MIN_SPAN, MIN_FLOAT_SPAN = 16.0, 0.1
 """Counts, or kelvins: an image flatter than this (a lens cap, a dark start) fixes no limits."""
-LARGEST = 1e9
+MAX_ABSOLUTE_VALUE = 1e9
 """Beyond any temperature or count, and small enough to be squared."""
-CLIPPED_SHARE, CLIPPED_S = 0.25, 2.0
+CLIPPED_FRACTION, CLIPPED_S = 0.25, 2.0
 """Where so much of the image has been outside the limits for so long, new ones are taken at once."""
 SAMPLES_PER_SIDE = 128
-USUAL_STEP_S = 0.1
+DEFAULT_INTERVAL_S = 0.1
 """Taken for the time between two images whose stamps do not tell."""
 
 
-class Stretch:
+class IntensityNormaliser:
     """Percentile stretch of one stream; shifting right by 8 alone would leave a 12-bit camera black.
 
     What all pixels gain or lose from one image to the next, as by the drift of a thermal core or its shutter, moves
@@ -32,65 +32,65 @@ class Stretch:
     def __init__(self) -> None:
         self._encoding = ''
         self._stamp_s: float | None = None
-        self._restart()
+        self._reset()
 
-    def _restart(self) -> None:
-        self._limits = self._aim = np.zeros(2)
-        self._last: np.ndarray | None = None
-        self._time_s = self._fitting_s = 0.0
-        self._view: View | None = None
+    def _reset(self) -> None:
+        self._limits = self._target_limits = np.zeros(2)
+        self._last_samples: np.ndarray | None = None
+        self._time_s = self._last_within_limits_s = 0.0
+        self._frame_gate: FrameGate | None = None
 
     def to_8_bit(self, image: np.ndarray, encoding: str, stamp_s: float | None = None) -> np.ndarray:
         """Return an image of any shape and number type as uint8, black where it holds no number.
 
         `stamp_s` is its time, None where unknown.
         """
-        self._least, self._quantum = LEAST_SPAN, 1.0
+        self._min_span, self._quantum = MIN_SPAN, 1.0
         if image.dtype.kind == 'f':
-            self._least, self._quantum = LEAST_FLOAT_SPAN, 0.0
-            image = np.clip(image.astype(np.float32), -LARGEST, LARGEST)
-        self._follow(image, encoding, stamp_s)
+            self._min_span, self._quantum = MIN_FLOAT_SPAN, 0.0
+            image = np.clip(image.astype(np.float32), -MAX_ABSOLUTE_VALUE, MAX_ABSOLUTE_VALUE)
+        self._update_limits(image, encoding, stamp_s)
         low, high = self._limits
-        scale = 255.0 / max(high - low, self._least)
+        scale = 255.0 / max(high - low, self._min_span)
         if image.dtype.kind == 'f':
             image = np.where(np.isnan(image), np.float32(low), image)
         return np.clip((image - np.float32(low)) * np.float32(scale) + np.float32(0.5), 0, 255).astype(np.uint8)
 
-    def _follow(self, image: np.ndarray, encoding: str, stamp_s: float | None) -> None:
+    def _update_limits(self, image: np.ndarray, encoding: str, stamp_s: float | None) -> None:
         every_y, every_x = (max(1, side // SAMPLES_PER_SIDE) for side in image.shape[:2])
         samples = image[::every_y, ::every_x].reshape(-(-image.shape[0] // every_y), -1).astype(np.float32)
         if np.isnan(samples).any():
             known = samples[~np.isnan(samples)]
             samples = np.where(np.isnan(samples), np.median(known) if len(known) else np.float32(0), samples)
-        if encoding != self._encoding or (self._last is not None and self._last.shape != samples.shape):
-            self._restart()
+        if encoding != self._encoding or (self._last_samples is not None and self._last_samples.shape != samples.shape):
+            self._reset()
         step_s = self._step_s(stamp_s)
         self._encoding, self._stamp_s, self._time_s = encoding, stamp_s, self._time_s + step_s
-        self._view = self._view or View(repeated_levels=0.0, flat_levels=self._least / 4)
-        seen = self._view.judge(samples, self._time_s)
-        if seen in (Seen.REPEATED, Seen.HIDDEN):
-            self._fitting_s += step_s
+        self._frame_gate = self._frame_gate or FrameGate(max_repeat_difference=0.0, min_spread_levels=self._min_span / 4)
+        seen = self._frame_gate.classify(samples, self._time_s)
+        if seen in (FrameStatus.REPEATED, FrameStatus.HIDDEN):
+            self._last_within_limits_s += step_s
             return
         now = np.percentile(samples, PERCENTILES)
-        unset = self._limits[1] - self._limits[0] < self._least
-        if unset or seen is Seen.LEAPT or self._last is None or self._outgrown(samples):
-            self._limits = self._aim = now
+        unset = self._limits[1] - self._limits[0] < self._min_span
+        if unset or seen is FrameStatus.LEVEL_SHIFT or self._last_samples is None or self._clipped_too_long(samples):
+            self._limits = self._target_limits = now
         else:
-            common, share = _common_change(self._last, samples, self._quantum), 1 - np.exp(-step_s / EASE_S)
-            self._aim = self._aim + common + share * (now - self._aim - common)
-            self._limits = self._limits + common + share * (self._aim - self._limits - common)
-        self._last = samples
+            common, share = _common_change(self._last_samples, samples, self._quantum), 1 - np.exp(-step_s / TIME_CONSTANT_S)
+            self._target_limits = self._target_limits + common + share * (now - self._target_limits - common)
+            self._limits = self._limits + common + share * (self._target_limits - self._limits - common)
+        self._last_samples = samples
 
     def _step_s(self, stamp_s: float | None) -> float:
         step_s = 0.0 if stamp_s is None or self._stamp_s is None else stamp_s - self._stamp_s
-        return step_s if step_s > 0 else USUAL_STEP_S
+        return step_s if step_s > 0 else DEFAULT_INTERVAL_S
 
-    def _outgrown(self, samples: np.ndarray) -> bool:
+    def _clipped_too_long(self, samples: np.ndarray) -> bool:
         """Say whether much of the image has been outside the limits for a while."""
         outside = (samples < self._limits[0]) | (samples > self._limits[1])
-        if outside.mean() < CLIPPED_SHARE:
-            self._fitting_s = self._time_s
-        return self._time_s - self._fitting_s > CLIPPED_S
+        if outside.mean() < CLIPPED_FRACTION:
+            self._last_within_limits_s = self._time_s
+        return self._time_s - self._last_within_limits_s > CLIPPED_S
 
 
 def _common_change(before: np.ndarray, now: np.ndarray, quantum: float) -> float:

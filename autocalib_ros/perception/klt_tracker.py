@@ -7,29 +7,29 @@ import numpy as np
 
 from autocalib_ros.config import TrackingOptions
 from autocalib_ros.evidence.snapshot import Track
-from autocalib_ros.perception.frame_gate import levelled
+from autocalib_ros.perception.frame_gate import match_grey_levels
 
-CAPACITY = 256
+MAX_TRACK_SAMPLES = 256
 """Images of one track at the most; a longer one is finished and goes on as a new one."""
-MIN_POINTS = 6
+MIN_TRACK_SAMPLES = 6
 MIN_DISPLACEMENT = 0.02
 """Shortest displacement of a track worth keeping, share of the image width."""
-STILL_S = 1.0
-STILL_PX = 1.5
-"""A point that moved less than this in `STILL_S` stands still: its track ends."""
+STATIONARY_S = 1.0
+STATIONARY_PX = 1.5
+"""A point that moved less than this in `STATIONARY_S` stands still: its track ends."""
 MAX_GAP_S = 1.0
 """Across a longer gap between two images nothing is followed."""
-GAP_STEPS = 2.3
+GAP_INTERVALS = 2.3
 """A gap is so many times the interval before: points are then looked for where their speed will have taken them."""
-GAP_SHARE = 0.25
-"""Across a gap a point arrives within this share of its way, or `TURN_PX`, of where it is looked for: in a second a
+GAP_TOLERANCE = 0.25
+"""Across a gap a point arrives within this share of its way, or `MAX_TURN_PX`, of where it is looked for: in a second a
 vehicle at 10 m/s that brakes hard misses that place by a fifth of the way.
 """
-TURN_PX = 3.0
-TURN_SHARE = 0.6
-SHORTEST_STEP, LONGEST_STEP = 0.3, 2.3
-"""A step goes on from the one before, faster than `TURN_PX`, when it leaves its line by no more than `TURN_PX` or
-`TURN_SHARE` of it, and is not much below half nor above twice as long: so much an image that came late or was lost
+MAX_TURN_PX = 3.0
+MAX_TURN_FRACTION = 0.6
+MIN_STEP_RATIO, MAX_STEP_RATIO = 0.3, 2.3
+"""A step goes on from the one before, faster than `MAX_TURN_PX`, when it leaves its line by no more than `MAX_TURN_PX` or
+`MAX_TURN_FRACTION` of it, and is not much below half nor above twice as long: so much an image that came late or was lost
 does to it. A point that stops dead holds on to what hides the vehicle; one that jumps has found something else.
 """
 
@@ -37,15 +37,15 @@ does to it. A point that stops dead holds on to what hides the vehicle; one that
 class PointTracker:
     """Follows points from image to image and hands out finished tracks, in pixels of the tracked image.
 
-    A point ends where the image (H, W) `avoided` is not 0.
+    A point ends where the image (H, W) `excluded` is not 0.
     """
 
-    def __init__(self, options: TrackingOptions, avoided: np.ndarray | None = None) -> None:
-        self._options, self._avoided = options, avoided
+    def __init__(self, options: TrackingOptions, excluded: np.ndarray | None = None) -> None:
+        self._options, self._excluded = options, excluded
         self._grey: np.ndarray | None = None
         self._time_s = self._interval_s = 0.0
         slots = options.max_points
-        self._history = np.zeros((slots, CAPACITY, 3))
+        self._history = np.zeros((slots, MAX_TRACK_SAMPLES, 3))
         self._count = np.zeros(slots, int)
         self._vehicle = np.zeros(slots, int)
         self._step = np.zeros((slots, 2))
@@ -55,11 +55,11 @@ class PointTracker:
         finished: list[Track] = []
         if self._grey is not None:
             interval_s = time_s - self._time_s
-            gap = interval_s > GAP_STEPS * self._interval_s > 0
+            gap = interval_s > GAP_INTERVALS * self._interval_s > 0
             if not 0 < interval_s <= MAX_GAP_S:
                 finished = self.finish_all()
             else:
-                before = levelled(self._grey, grey) if gap else self._grey
+                before = match_grey_levels(self._grey, grey) if gap else self._grey
                 finished = self._follow(before, grey, time_s, interval_s / self._interval_s if gap else 1.0)
             self._interval_s = self._interval_s if gap else interval_s
         self._grey, self._time_s = grey, time_s
@@ -70,27 +70,27 @@ class PointTracker:
         active = np.flatnonzero(self._count)
         if not len(active):
             return []
-        start, foreseen = self._newest(active), steps * self._step[active]
-        found, followed = self._flow(before, after, start, start + foreseen)
+        start, predicted = self._current_positions(active), steps * self._step[active]
+        found, followed = self._flow(before, after, start, start + predicted)
         step = found - start
         known = self._count[active] > 1
-        followed &= known & _arrived(foreseen, step) if steps > 1 else ~(known & _jumped(foreseen, step))
+        followed &= known & _near_prediction(predicted, step) if steps > 1 else ~(known & _is_discontinuous(predicted, step))
         kept = active[followed]
         self._history[kept, self._count[kept]] = np.column_stack([np.full(len(kept), time_s), found[followed]])
         self._count[kept] += 1
         self._step[kept] = step[followed] / steps
-        ended = np.concatenate([active[~followed], kept[self._still(kept, time_s)]])
+        ended = np.concatenate([active[~followed], kept[self._is_stationary(kept, time_s)]])
         finished = self._finish(ended)
-        return finished + self._restart(np.flatnonzero(self._count == CAPACITY))
+        return finished + self._restart_full(np.flatnonzero(self._count == MAX_TRACK_SAMPLES))
 
     def _flow(self, before: np.ndarray, after: np.ndarray, start: np.ndarray,
               guess: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Follow forwards from a guess, then back at full resolution; both have to agree."""
         side = self._options.window_px
         criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.02)
-        origin = _points(start)
+        origin = _as_opencv_points(start)
         found, forward, _ = cv2.calcOpticalFlowPyrLK(
-            before, after, origin, _points(guess), winSize=(side, side),
+            before, after, origin, _as_opencv_points(guess), winSize=(side, side),
             maxLevel=self._options.pyramid_levels, criteria=criteria, flags=cv2.OPTFLOW_USE_INITIAL_FLOW)
         back, backward, _ = cv2.calcOpticalFlowPyrLK(
             after, before, found, origin.copy(), winSize=(side, side), maxLevel=0, criteria=criteria,
@@ -99,30 +99,30 @@ class PointTracker:
         found = found[:, 0].astype(float)
         margin, (height, width) = side / 2, after.shape
         inside = ((found >= margin) & (found < [width - margin, height - margin])).all(axis=1)
-        if self._avoided is not None:
+        if self._excluded is not None:
             columns, rows = np.round(np.clip(found, 0, [width - 1, height - 1])).astype(int).T
-            inside &= self._avoided[rows, columns] == 0
+            inside &= self._excluded[rows, columns] == 0
         good = (forward.ravel() == 1) & (backward.ravel() == 1) & (miss <= self._options.round_trip_px) & inside
         return found, good
 
-    def _newest(self, slots: np.ndarray) -> np.ndarray:
+    def _current_positions(self, slots: np.ndarray) -> np.ndarray:
         return self._history[slots, self._count[slots] - 1, 1:]
 
-    def _still(self, slots: np.ndarray, time_s: float) -> np.ndarray:
-        """Which of the points have moved less than `STILL_PX` in the last `STILL_S`, shape of `slots`."""
+    def _is_stationary(self, slots: np.ndarray, time_s: float) -> np.ndarray:
+        """Which of the points have moved less than `STATIONARY_PX` in the last `STATIONARY_S`, shape of `slots`."""
         if not len(slots):
             return np.zeros(0, bool)
         times = self._history[slots, :, 0]
-        filled = np.arange(CAPACITY) < self._count[slots, None]
-        earlier = ((times <= time_s - STILL_S) & filled).sum(axis=1) - 1
+        filled = np.arange(MAX_TRACK_SAMPLES) < self._count[slots, None]
+        earlier = ((times <= time_s - STATIONARY_S) & filled).sum(axis=1) - 1
         old_enough = earlier >= 0
         then = self._history[slots, np.maximum(earlier, 0), 1:]
-        return old_enough & (np.hypot(*(self._newest(slots) - then).T) < STILL_PX)
+        return old_enough & (np.hypot(*(self._current_positions(slots) - then).T) < STATIONARY_PX)
 
     def positions(self) -> tuple[np.ndarray, np.ndarray]:
         """Return where the followed points are now (n, 2) and their vehicles (n,)."""
         active = np.flatnonzero(self._count)
-        return self._newest(active), self._vehicle[active]
+        return self._current_positions(active), self._vehicle[active]
 
     def steps(self) -> np.ndarray:
         """Return how far the followed points came since the image before, (n, 2) as `positions`."""
@@ -167,10 +167,10 @@ class PointTracker:
         self._count[slots] = 0
         return tracks
 
-    def _restart(self, slots: np.ndarray) -> list[Track]:
+    def _restart_full(self, slots: np.ndarray) -> list[Track]:
         """Finish tracks that are full; their points are followed on."""
         tracks = self._tracks(slots)
-        self._history[slots, 0] = self._history[slots, CAPACITY - 1]
+        self._history[slots, 0] = self._history[slots, MAX_TRACK_SAMPLES - 1]
         self._count[slots] = 1
         return tracks
 
@@ -182,31 +182,31 @@ class PointTracker:
         """Thin a point's path to samples spread evenly along it; None when it is too short to say anything."""
         path = self._history[slot, :self._count[slot]]
         width = self._grey.shape[1] if self._grey is not None else 1
-        if len(path) < MIN_POINTS or np.hypot(*(path[-1, 1:] - path[0, 1:])) < MIN_DISPLACEMENT * width:
+        if len(path) < MIN_TRACK_SAMPLES or np.hypot(*(path[-1, 1:] - path[0, 1:])) < MIN_DISPLACEMENT * width:
             return None
         along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path[:, 1:], axis=0).T))])
         wanted = np.linspace(0.0, along[-1], min(self._options.max_samples, len(path)))
         chosen = np.unique(np.searchsorted(along, wanted - 1e-9))
-        if len(chosen) < MIN_POINTS:
+        if len(chosen) < MIN_TRACK_SAMPLES:
             return None
         return Track(int(self._vehicle[slot]), path[chosen, 0].copy(), path[chosen, 1:].copy())
 
 
-def _arrived(foreseen: np.ndarray, step: np.ndarray) -> np.ndarray:
+def _near_prediction(predicted: np.ndarray, step: np.ndarray) -> np.ndarray:
     """Say which steps (n, 2) across a gap end near where they were foreseen to (n, 2), shape (n,)."""
-    return np.hypot(*(step - foreseen).T) <= np.maximum(TURN_PX, GAP_SHARE * np.hypot(*foreseen.T))
+    return np.hypot(*(step - predicted).T) <= np.maximum(MAX_TURN_PX, GAP_TOLERANCE * np.hypot(*predicted.T))
 
 
-def _jumped(before: np.ndarray, now: np.ndarray) -> np.ndarray:
+def _is_discontinuous(before: np.ndarray, now: np.ndarray) -> np.ndarray:
     """Say which steps (n, 2) do not go on from the steps before (n, 2), shape (n,)."""
     speed = np.maximum(np.hypot(*before.T), 1e-9)
     along = (before * now).sum(axis=1) / speed
     aside = np.abs(before[:, 0] * now[:, 1] - before[:, 1] * now[:, 0]) / speed
-    astray = aside > np.maximum(TURN_PX, TURN_SHARE * speed)
-    uneven = (along < SHORTEST_STEP * speed) | (along > np.maximum(LONGEST_STEP * speed, speed + TURN_PX))
-    return (speed > TURN_PX) & (astray | uneven)
+    astray = aside > np.maximum(MAX_TURN_PX, MAX_TURN_FRACTION * speed)
+    uneven = (along < MIN_STEP_RATIO * speed) | (along > np.maximum(MAX_STEP_RATIO * speed, speed + MAX_TURN_PX))
+    return (speed > MAX_TURN_PX) & (astray | uneven)
 
 
-def _points(points_px: np.ndarray) -> np.ndarray:
+def _as_opencv_points(points_px: np.ndarray) -> np.ndarray:
     """Return points (n, 2) in the layout that OpenCV writes into, (n, 1, 2) float32."""
     return np.ascontiguousarray(points_px, np.float32).reshape(-1, 1, 2)

@@ -11,14 +11,14 @@ from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.perception.ignore_regions import Polygons, ignored_mask
 from autocalib_ros.perception.images import (
     CHANNELS,
-    NUMBERS,
-    PACKED,
-    PLANAR,
-    YUV422,
-    LumaStep,
-    decompressed,
-    known_encoding,
-    rows_of,
+    NUMBER_FORMATS,
+    PACKED_ENCODINGS,
+    PLANAR_ENCODINGS,
+    YUV422_ENCODINGS,
+    PlanarMessage,
+    canonical_encoding,
+    decompress,
+    image_rows,
 )
 
 BLACK_LUMA, NO_CHROMA = 16, 128
@@ -26,11 +26,11 @@ BLACK_LUMA, NO_CHROMA = 16, 128
 JPEG_QUALITY = 95
 
 
-def require_blackable(message: Any) -> None:
-    """Raise UsageError unless `blacked_out` knows the kind of a sensor_msgs Image or CompressedImage."""
+def require_maskable(message: Any) -> None:
+    """Raise UsageError unless `mask_message` knows the kind of a sensor_msgs Image or CompressedImage."""
     if hasattr(message, 'encoding'):
-        encoding = known_encoding(message.encoding)
-        known, kind = encoding in PACKED or encoding in YUV422 or encoding in PLANAR, f"encoding '{encoding}'"
+        encoding = canonical_encoding(message.encoding)
+        known, kind = encoding in PACKED_ENCODINGS or encoding in YUV422_ENCODINGS or encoding in PLANAR_ENCODINGS, f"encoding '{encoding}'"
     else:
         known, kind = 'compressedDepth' not in str(message.format), f"format '{message.format}'"
     if not known:
@@ -38,30 +38,30 @@ def require_blackable(message: Any) -> None:
                          'leave the regions out')
 
 
-def blacked_out(message: Any, polygons: Polygons) -> np.ndarray:
+def mask_message(message: Any, polygons: Polygons) -> np.ndarray:
     """Return the data (n,) uint8 of an Image or CompressedImage with the polygons black; never changes the message.
 
     InputError where the image is broken. What has more than 8 bits gets the darkest value of the rest: zero among
     counts of 6000 would take all contrast from whoever stretches them.
     """
     if not hasattr(message, 'encoding'):
-        return _compressed(message, polygons)
+        return _mask_compressed(message, polygons)
     data, pixels = np.frombuffer(message.data, np.uint8).copy(), message.width * message.height
     if not 0 < pixels <= len(data):
         raise InputError(f"image of encoding '{message.encoding}' and {message.width} x {message.height} pixels has "
                          f'{len(data)} bytes')
-    mask, encoding = ignored_mask(polygons, (message.width, message.height)), known_encoding(message.encoding)
-    if encoding in PACKED:
-        _blacken_packed(_Copy(message, data), mask, encoding)
-    elif encoding in YUV422:
-        _blacken_422(rows_of(_Copy(message, data), 2 * message.width, 1), mask,
-                     luma_first=YUV422[encoding] == cv2.COLOR_YUV2BGR_YUY2)
+    mask, encoding = ignored_mask(polygons, (message.width, message.height)), canonical_encoding(message.encoding)
+    if encoding in PACKED_ENCODINGS:
+        _mask_packed(_MessageCopy(message, data), mask, encoding)
+    elif encoding in YUV422_ENCODINGS:
+        _mask_yuv422(image_rows(_MessageCopy(message, data), 2 * message.width, 1), mask,
+                     luma_first=YUV422_ENCODINGS[encoding] == cv2.COLOR_YUV2BGR_YUY2)
     else:
-        _blacken_planar(_Copy(message, data), mask, encoding)
+        _mask_planar(_MessageCopy(message, data), mask, encoding)
     return data
 
 
-class _Copy:
+class _MessageCopy:
     """A message with other data."""
 
     def __init__(self, message: Any, data: np.ndarray) -> None:
@@ -69,16 +69,16 @@ class _Copy:
         self.step, self.is_bigendian, self.data = message.step, message.is_bigendian, data
 
 
-def _blacken_packed(message: Any, mask: np.ndarray, encoding: str) -> None:
-    order, bits = PACKED[encoding]
+def _mask_packed(message: Any, mask: np.ndarray, encoding: str) -> None:
+    order, bits = PACKED_ENCODINGS[encoding]
     channels = CHANNELS.get(order, 1)
-    rows = rows_of(message, message.width * channels * bits // 8, 1)
-    numbers = NUMBERS.get(encoding, f'u{bits // 8}')
+    rows = image_rows(message, message.width * channels * bits // 8, 1)
+    numbers = NUMBER_FORMATS.get(encoding, f'u{bits // 8}')
     values = np.ascontiguousarray(rows).view(('>' if message.is_bigendian else '<') + numbers)
-    rows[:] = _darkened(values.reshape(*mask.shape, channels), mask).reshape(len(rows), -1).view(np.uint8)
+    rows[:] = _with_dark_mask(values.reshape(*mask.shape, channels), mask).reshape(len(rows), -1).view(np.uint8)
 
 
-def _darkened(values: np.ndarray, mask: np.ndarray) -> np.ndarray:
+def _with_dark_mask(values: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """Return a copy of values (h, w, channels), of which the first three are colours, dark in the mask (h, w)."""
     dark, rest = values.copy(), values[~mask][:, :3]
     rest = rest[np.isfinite(rest)] if values.dtype.kind == 'f' else rest
@@ -86,7 +86,7 @@ def _darkened(values: np.ndarray, mask: np.ndarray) -> np.ndarray:
     return dark
 
 
-def _blacken_422(rows: np.ndarray, mask: np.ndarray, *, luma_first: bool) -> None:
+def _mask_yuv422(rows: np.ndarray, mask: np.ndarray, *, luma_first: bool) -> None:
     """Two pixels share a chroma: where one is black, both lose their colour."""
     pairs = mask.copy()
     even = mask.shape[1] // 2 * 2
@@ -95,11 +95,11 @@ def _blacken_422(rows: np.ndarray, mask: np.ndarray, *, luma_first: bool) -> Non
     luma[mask], chroma[pairs] = BLACK_LUMA, NO_CHROMA
 
 
-def _blacken_planar(message: Any, mask: np.ndarray, encoding: str) -> None:
+def _mask_planar(message: Any, mask: np.ndarray, encoding: str) -> None:
     planes = 3 if encoding == 'nv24' else 1.5
-    message = LumaStep(message, planes)
+    message = PlanarMessage(message, planes)
     height, width, step = message.height, message.width, message.step
-    rows_of(message, width, planes)[:height][mask] = BLACK_LUMA
+    image_rows(message, width, planes)[:height][mask] = BLACK_LUMA
     chroma = message.data[step * height:int(step * height * planes)]
     if encoding == 'nv24':
         chroma.reshape(height, 2 * step)[:, :2 * width][np.repeat(mask, 2, axis=1)] = NO_CHROMA
@@ -114,15 +114,15 @@ def _blacken_planar(message: Any, mask: np.ndarray, encoding: str) -> None:
         chroma.reshape(height // 2, step)[:, :width][np.repeat(half, 2, axis=1)] = NO_CHROMA
 
 
-def _compressed(message: Any, polygons: Polygons) -> np.ndarray:
+def _mask_compressed(message: Any, polygons: Polygons) -> np.ndarray:
     data = np.frombuffer(message.data, np.uint8)
     try:
-        image = decompressed(data, str(message.format))
+        image = decompress(data, str(message.format))
     except cv2.error as error:  # a size that no memory holds
         raise InputError(f"compressed image of format '{message.format}', {len(data)} bytes, cannot be decoded"
                          ) from error
     mask = ignored_mask(polygons, image.shape[1::-1])
-    dark = _darkened(image.reshape(*mask.shape, -1), mask).reshape(image.shape)
+    dark = _with_dark_mask(image.reshape(*mask.shape, -1), mask).reshape(image.shape)
     if data[0] == 0xff:
         return cv2.imencode('.jpg', dark, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].ravel()
     return cv2.imencode('.png', dark, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].ravel()

@@ -12,7 +12,7 @@ import numpy as np
 
 from autocalib_ros.config import MotionOptions
 
-VARIANCE_THRESHOLD = 25.0
+MOG2_VARIANCE_THRESHOLD = 25.0
 """Squared distance, in variances of the background, beyond which a pixel is moving: five sigmas."""
 
 
@@ -32,7 +32,7 @@ class MotionMask:
     def __init__(self, options: MotionOptions) -> None:
         self._options = options
         self._subtractor = cv2.createBackgroundSubtractorMOG2(
-            varThreshold=VARIANCE_THRESHOLD, detectShadows=False)
+            varThreshold=MOG2_VARIANCE_THRESHOLD, detectShadows=False)
         self._mask: np.ndarray | None = None
         self._size = (0, 0)
         self._newest_s = 0.0
@@ -61,7 +61,7 @@ class MotionMask:
         return [self._region(labels == label, stats[label]) for label in large]
 
     @property
-    def grown_px(self) -> tuple[float, float]:
+    def dilation_px(self) -> tuple[float, float]:
         """By how many pixels of the tracked image, along x and y, regions are larger than what moves, on each side."""
         return (0.0, 0.0) if self._mask is None else tuple(np.divide(self._size, self._mask.shape[::-1]).tolist())
 
@@ -78,14 +78,14 @@ class MotionMask:
         return Region(left, top, cv2.resize(part, (right - left, bottom - top), interpolation=cv2.INTER_NEAREST))
 
 
-def without(regions: list[Region], avoided: np.ndarray | None) -> list[Region]:
-    """Return what is left of regions where an image (H, W) is `avoided`, not 0; all of them without such an image."""
-    if avoided is None:
+def exclude_pixels(regions: list[Region], excluded: np.ndarray | None) -> list[Region]:
+    """Return what is left of regions where an image (H, W) is `excluded`, not 0; all of them without such an image."""
+    if excluded is None:
         return regions
     left = []
     for region in regions:
         height, width = region.mask.shape
-        part = avoided[region.y:region.y + height, region.x:region.x + width]
+        part = excluded[region.y:region.y + height, region.x:region.x + width]
         mask = np.where(part > 0, np.uint8(0), region.mask)
         left += [Region(region.x, region.y, mask)] if mask.any() else []
     return left

@@ -8,29 +8,29 @@ import cv2
 import numpy as np
 
 from autocalib_ros.config import Options
-from autocalib_ros.evidence.snapshot import Edges, Kind, Outlines, Segments, Track
+from autocalib_ros.evidence.snapshot import Edges, Outlines, Segments, Track, TrackKind
 from autocalib_ros.perception.background import Background
 from autocalib_ros.perception.detector.detector import VehicleDetector
-from autocalib_ros.perception.detector_tracks import DetectedVehicles
-from autocalib_ros.perception.drift_monitor import Stillness
+from autocalib_ros.perception.detector_tracks import DetectorTracks
+from autocalib_ros.perception.drift_monitor import DriftMonitor
 from autocalib_ros.perception.edges import EdgeFinder
-from autocalib_ros.perception.frame_gate import LEAP_LEVELS, Seen, View
-from autocalib_ros.perception.ignore_regions import Ignored, black_out, require_seen
+from autocalib_ros.perception.frame_gate import LEVEL_SHIFT_THRESHOLD, FrameGate, FrameStatus
+from autocalib_ros.perception.ignore_regions import IgnoreMask, black_out, require_polygons_inside
 from autocalib_ros.perception.klt_tracker import PointTracker
-from autocalib_ros.perception.line_segments import StillLines
-from autocalib_ros.perception.motion_mask import MotionMask, Region, without
+from autocalib_ros.perception.line_segments import LineSegmentDetector
+from autocalib_ros.perception.motion_mask import MotionMask, Region, exclude_pixels
 from autocalib_ros.perception.segments import Keypoints, find_keypoints, match_segments
 from autocalib_ros.perception.silhouettes import outlines_of
 
-MASK_EVERY = 2
+MOTION_MASK_PERIOD = 2
 """Images between two updates of the background: traffic needs no finer step in time."""
-EDGES_EVERY = 2
+EDGE_SEARCH_PERIOD = 2
 """Searches for points between two for edges: they cost as much, and a vehicle's edges are much the same after."""
 
 
-REPEATED_LEVELS = 4
+MAX_REPEAT_DIFFERENCE = 4
 """A reduced image that differs from the last one used by no more than this anywhere is the same picture again."""
-REPEATED_WIDTH_PX = 320
+GATE_WIDTH_PX = 320
 
 
 @dataclass(frozen=True)
@@ -54,19 +54,19 @@ class Observer:
         self._image_size = image_size
         self._reduction = max(1.0, image_size[0] / options.max_image_width)
         self._polygons = options.ignored_polygons
-        require_seen(self._polygons, image_size)
-        ignored = Ignored(self._polygons, image_size, self._tracked_size)
+        require_polygons_inside(self._polygons, image_size)
+        ignored = IgnoreMask(self._polygons, image_size, self._tracked_size)
         self._ignored = ignored.near(0)
-        self._avoided = ignored.near(options.tracking.window_px)
+        self._excluded = ignored.near(options.tracking.window_px)
         self._motion = MotionMask(options.motion)
-        self._detected = None if detector is None else DetectedVehicles(detector, options.detector)
-        self._tracker = PointTracker(options.tracking, self._avoided)
-        self._stillness = Stillness(options.buffer.seconds, self._ignored)
+        self._detector_tracks = None if detector is None else DetectorTracks(detector, options.detector)
+        self._tracker = PointTracker(options.tracking, self._excluded)
+        self._drift_monitor = DriftMonitor(options.buffer.seconds, self._ignored)
         self._background = Background()
-        self._still_lines = StillLines(self._avoided)
+        self._line_detector = LineSegmentDetector(self._excluded)
         self._sift = cv2.SIFT_create(contrastThreshold=0.03)
         self._keypoints: Keypoints | None = None
-        self._view = View(REPEATED_LEVELS, LEAP_LEVELS)
+        self._frame_gate = FrameGate(MAX_REPEAT_DIFFERENCE, LEVEL_SHIFT_THRESHOLD)
         self._frames = 0
         self._vehicles = 0
         self._edge_finder = EdgeFinder()
@@ -76,23 +76,23 @@ class Observer:
         """Take a grey (H, W) or BGR (H, W, 3) uint8 image."""
         image = black_out(image, self._polygons)
         grey = self._tracked_image(image)
-        seen = self._view.judge(_reduced(grey, self._ignored), time_s)
-        if seen in (Seen.REPEATED, Seen.HIDDEN):
+        seen = self._frame_gate.classify(_downsampled(grey, self._ignored), time_s)
+        if seen in (FrameStatus.REPEATED, FrameStatus.HIDDEN):
             return Observations([], None, None)
-        ended = self._look_anew() if seen is Seen.LEAPT else []
+        ended = self._reset_appearance() if seen is FrameStatus.LEVEL_SHIFT else []
         self._background.update(image, time_s)
-        tracks = [self._full_size(track) for track in (*ended, *self._tracker.follow(grey, time_s))]
+        tracks = [self._to_full_size(track) for track in (*ended, *self._tracker.follow(grey, time_s))]
         detect = self._frames % self._options.tracking.detect_every == 0
-        if detect or self._frames % MASK_EVERY == 0:
+        if detect or self._frames % MOTION_MASK_PERIOD == 0:
             self._motion.update(grey, time_s)
-        if self._detected is not None:
-            self._detected.follow(image, time_s, self._tracker, self._reduction)
+        if self._detector_tracks is not None:
+            self._detector_tracks.follow(image, time_s, self._tracker, self._reduction)
         segments, edges, outlines = self._detect(grey, time_s) if detect else (None, None, None)
-        self._stillness.update(grey, time_s)
+        self._drift_monitor.update(grey, time_s)
         self._frames += 1
         return Observations(tracks, segments, edges, outlines)
 
-    def _look_anew(self) -> list[Track]:
+    def _reset_appearance(self) -> list[Track]:
         """Forget all that rests on earlier grey levels; return the tracks that so end."""
         self._motion, self._edge_finder, self._keypoints = MotionMask(self._options.motion), EdgeFinder(), None
         return self._tracker.finish_all()
@@ -110,56 +110,56 @@ class Observer:
 
     def _detect(self, grey: np.ndarray, time_s: float) -> tuple[Segments | None, Edges | None, Outlines | None]:
         """Look into the moving regions for edges and keypoints, which start tracks, and matched are segments."""
-        regions, vehicles, people = self._moving(grey.shape)
-        outlines = self._outlines_of(regions, vehicles, grey.shape, time_s)
+        regions, vehicles, people = self._moving_regions(grey.shape)
+        outlines = self._find_outlines(regions, vehicles, grey.shape, time_s)
         keypoints = find_keypoints(grey, regions, self._sift)
         of_keypoint, of_person = vehicles[keypoints.regions], people[keypoints.regions]
         order = np.lexsort((-keypoints.responses, of_person))  # the strongest first, and people last
         self._tracker.add_points(keypoints.points_px[order], of_keypoint[order])
         keypoints, of_keypoint = keypoints.subset(~of_person), of_keypoint[~of_person]
-        edges = self._edges_of(grey, [region for region, person in zip(regions, people, strict=True) if not person],
+        edges = self._find_edges(grey, [region for region, person in zip(regions, people, strict=True) if not person],
                                vehicles[~people], time_s)
         before, self._keypoints = self._keypoints, keypoints
         if before is None:
             return None, edges, outlines
         ends, matched = match_segments(before, keypoints, grey.shape[1])
-        segments = Segments(time_s, of_keypoint[matched], self._full_pixels(ends.reshape(-1, 2)).reshape(-1, 4))
+        segments = Segments(time_s, of_keypoint[matched], self._to_full_pixels(ends.reshape(-1, 2)).reshape(-1, 4))
         return segments, edges, outlines
 
-    def _moving(self, shape: tuple[int, int]) -> tuple[list[Region], np.ndarray, np.ndarray]:
+    def _moving_regions(self, shape: tuple[int, int]) -> tuple[list[Region], np.ndarray, np.ndarray]:
         """What moves: regions, the vehicle of each (n,), and whether that is known as a person (n,)."""
-        regions = without(self._motion.regions(), self._avoided)
-        if self._detected is None:
-            return regions, self._vehicles_of(regions), np.zeros(len(regions), bool)
-        regions, vehicles = self._detected.regions(regions, shape, self._avoided)
-        return regions, vehicles, np.array([self._detected.kind(one) is Kind.PERSON for one in vehicles], bool)
+        regions = exclude_pixels(self._motion.regions(), self._excluded)
+        if self._detector_tracks is None:
+            return regions, self._assign_vehicles(regions), np.zeros(len(regions), bool)
+        regions, vehicles = self._detector_tracks.regions(regions, shape, self._excluded)
+        return regions, vehicles, np.array([self._detector_tracks.kind(one) is TrackKind.PERSON for one in vehicles], bool)
 
-    def _edges_of(self, grey: np.ndarray, regions: list[Region], vehicles: np.ndarray, time_s: float) -> Edges | None:
-        """Look for straight edges in every `EDGES_EVERY`th image with regions."""
+    def _find_edges(self, grey: np.ndarray, regions: list[Region], vehicles: np.ndarray, time_s: float) -> Edges | None:
+        """Look for straight edges in every `EDGE_SEARCH_PERIOD`th image with regions."""
         self._detections += 1
-        if self._detections % EDGES_EVERY:
+        if self._detections % EDGE_SEARCH_PERIOD:
             return None
         ends, of_edge = self._edge_finder.find(grey, regions)
-        return Edges(time_s, vehicles[of_edge], self._full_pixels(ends.reshape(-1, 2)).reshape(-1, 4))
+        return Edges(time_s, vehicles[of_edge], self._to_full_pixels(ends.reshape(-1, 2)).reshape(-1, 4))
 
-    def _outlines_of(self, regions: list[Region], vehicles: np.ndarray, shape: tuple[int, int],
+    def _find_outlines(self, regions: list[Region], vehicles: np.ndarray, shape: tuple[int, int],
                      time_s: float) -> Outlines | None:
         """Outline what moves; a detector tells cyclists by itself."""
-        if self._detected is not None or not regions:
+        if self._detector_tracks is not None or not regions:
             return None
-        return Outlines(time_s, vehicles, outlines_of(regions, self._motion.grown_px, shape, self._reduction,
-                                                      self._avoided))
+        return Outlines(time_s, vehicles, outlines_of(regions, self._motion.dilation_px, shape, self._reduction,
+                                                      self._excluded))
 
-    def _vehicles_of(self, regions: list[Region]) -> np.ndarray:
+    def _assign_vehicles(self, regions: list[Region]) -> np.ndarray:
         """Give each region (n,) the vehicle that most points followed inside it belong to, or a new one."""
-        points, owners = self._tracker.positions()
+        points, vehicle_ids = self._tracker.positions()
         columns, rows = np.round(points).astype(int).T
         vehicles = np.zeros(len(regions), int)
         for index, region in enumerate(regions):
             height, width = region.mask.shape
             x, y = columns - region.x, rows - region.y
             near = np.flatnonzero((x >= 0) & (y >= 0) & (x < width) & (y < height))
-            inside = owners[near[region.mask[y[near], x[near]] > 0]]
+            inside = vehicle_ids[near[region.mask[y[near], x[near]] > 0]]
             if len(inside):
                 vehicles[index] = np.bincount(inside).argmax()
             else:
@@ -169,25 +169,25 @@ class Observer:
 
     def unfinished(self) -> list[Track]:
         """Return the tracks so far of what is still followed."""
-        return [self._full_size(track) for track in self._tracker.unfinished()]
+        return [self._to_full_size(track) for track in self._tracker.unfinished()]
 
     def followed(self, steps: int) -> np.ndarray:
         """Return where what is followed now was in the last images, pixels (n, steps, 2), newest last."""
-        return self._full_pixels(self._tracker.tails(steps))
+        return self._to_full_pixels(self._tracker.tails(steps))
 
     @property
     def drift_px(self) -> float:
         """How far the background has moved, pixels of the full image."""
-        return self._stillness.drift_px * self._reduction
+        return self._drift_monitor.drift_px * self._reduction
 
     @property
     def lost_s(self) -> float:
         """When the background was last lost from sight, minus infinity where never."""
-        return self._stillness.lost_s
+        return self._drift_monitor.lost_s
 
     def compare_since(self, time_s: float) -> None:
         """Let `drift_px` go back to `time_s`, that of the oldest evidence, where that is before `buffer.seconds`."""
-        self._stillness.compare_since(time_s)
+        self._drift_monitor.compare_since(time_s)
 
     def forget_view_before(self, time_s: float) -> None:
         """Let the background begin at `time_s` at the earliest: the camera stood otherwise before."""
@@ -196,32 +196,32 @@ class Observer:
     def still_lines(self) -> np.ndarray:
         """Return straight lines of the background, pixels of the full image, x0, y0, x1, y1, shape (n, 4)."""
         times = self._background.times_s
-        if not self._still_lines.up_to_date(times):
+        if not self._line_detector.is_current(times):
             grey = self._background.grey()
-            self._still_lines.find(None if grey is None else self._tracked_image(grey), times)
-        return self._full_pixels(self._still_lines.lines_px.reshape(-1, 2)).reshape(-1, 4)
+            self._line_detector.find(None if grey is None else self._tracked_image(grey), times)
+        return self._to_full_pixels(self._line_detector.lines_px.reshape(-1, 2)).reshape(-1, 4)
 
     def background(self) -> np.ndarray | None:
         """Return the road without its traffic, BGR uint8 (H, W, 3)."""
         image = self._background.image()
         return None if image is None else black_out(image, self._polygons)  # JPEG rings at the border
 
-    def _full_size(self, track: Track) -> Track:
-        kind = Kind.UNKNOWN if self._detected is None else self._detected.kind(track.vehicle)
-        return Track(track.vehicle, track.times_s, self._full_pixels(track.points_px), kind)
+    def _to_full_size(self, track: Track) -> Track:
+        kind = TrackKind.UNKNOWN if self._detector_tracks is None else self._detector_tracks.kind(track.vehicle)
+        return Track(track.vehicle, track.times_s, self._to_full_pixels(track.points_px), kind)
 
-    def _full_pixels(self, points_px: np.ndarray) -> np.ndarray:
+    def _to_full_pixels(self, points_px: np.ndarray) -> np.ndarray:
         """Bring pixels (n, 2) of the tracked image to the full one; pixel centres lie at whole numbers."""
         return (points_px + 0.5) * self._reduction - 0.5 if self._reduction > 1 else points_px
 
 
-def _reduced(grey: np.ndarray, ignored: np.ndarray | None) -> np.ndarray:
-    """Reduce a grey image (H, W) to `REPEATED_WIDTH_PX`: where noise is weak and a moving vehicle is not.
+def _downsampled(grey: np.ndarray, ignored: np.ndarray | None) -> np.ndarray:
+    """Reduce a grey image (H, W) to `GATE_WIDTH_PX`: where noise is weak and a moving vehicle is not.
 
     What is `ignored`, not 0 in (H, W), gets the mean of the rest: it neither repeats nor hides anything.
     """
     if ignored is not None and not ignored.all():
         grey = np.where(ignored > 0, np.uint8(grey[ignored == 0].mean()), grey)
     height, width = grey.shape
-    columns = min(REPEATED_WIDTH_PX, width)
+    columns = min(GATE_WIDTH_PX, width)
     return cv2.resize(grey, (columns, max(1, height * columns // width)), interpolation=cv2.INTER_AREA)

@@ -9,13 +9,13 @@ import numpy as np
 
 from autocalib_ros.perception.motion_mask import Region
 
-RATIO = 0.75
+LOWE_RATIO = 0.75
 """A match counts when its distance is below this share of the second best's (Lowe 2004)."""
-FINE_SIDE_PX = 48
+FULL_RESOLUTION_SIDE_PX = 48
 """Regions beyond this side are searched at half size: their finest texture is noise, and costs most."""
-MAX_PER_REGION = 60
-MIN_LENGTH_PX = 5.0
-MAX_LENGTH = 0.2
+MAX_KEYPOINTS_PER_REGION = 60
+MIN_SEGMENT_LENGTH_PX = 5.0
+MAX_SEGMENT_LENGTH = 0.2
 """Longest plausible motion between two masked frames, share of the image width."""
 
 
@@ -54,7 +54,7 @@ def _region_keypoints(grey: np.ndarray, region: Region,
     height, width = region.mask.shape
     crop = grey[region.y:region.y + height, region.x:region.x + width]
     mask = region.mask
-    coarse = max(height, width) > FINE_SIDE_PX
+    coarse = max(height, width) > FULL_RESOLUTION_SIDE_PX
     if coarse:
         size = (max(1, width // 2), max(1, height // 2))
         crop = cv2.resize(crop, size, interpolation=cv2.INTER_AREA)
@@ -63,7 +63,7 @@ def _region_keypoints(grey: np.ndarray, region: Region,
     if descriptors is None or not len(found):
         return np.zeros((0, 2)), np.zeros(0), np.zeros((0, 128))
     responses = np.array([keypoint.response for keypoint in found])
-    best = np.argsort(-responses, kind='stable')[:MAX_PER_REGION]
+    best = np.argsort(-responses, kind='stable')[:MAX_KEYPOINTS_PER_REGION]
     points = np.array([found[index].pt for index in best])
     if coarse:
         points = (points + 0.5) * [width / size[0], height / size[1]] - 0.5
@@ -75,11 +75,11 @@ def match_segments(before: Keypoints, after: Keypoints, image_width: int) -> tup
     if len(before.points_px) < 2 or len(after.points_px) < 2:
         return np.zeros((0, 4)), np.zeros(0, int)
     pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(after.descriptors, before.descriptors, k=2)
-    good = [(m.queryIdx, m.trainIdx) for m, second in pairs if m.distance < RATIO * second.distance]
+    good = [(m.queryIdx, m.trainIdx) for m, second in pairs if m.distance < LOWE_RATIO * second.distance]
     if not good:
         return np.zeros((0, 4)), np.zeros(0, int)
     query, train = np.array(good).T
     ends = np.hstack([before.points_px[train], after.points_px[query]])
     length = np.hypot(ends[:, 2] - ends[:, 0], ends[:, 3] - ends[:, 1])
-    keep = (length >= MIN_LENGTH_PX) & (length <= MAX_LENGTH * image_width)
+    keep = (length >= MIN_SEGMENT_LENGTH_PX) & (length <= MAX_SEGMENT_LENGTH * image_width)
     return ends[keep], query[keep]

@@ -15,21 +15,21 @@ INK, PAPER, GREY = '#1c2733', '#ffffff', '#9aa5ae'
 ROAD_COLOURS = ('#0077bb', '#ee7733', '#009988', '#cc3377', '#ddaa33')
 """One for each road direction; told apart with every common form of colour blindness."""
 FONT = cv2.FONT_HERSHEY_SIMPLEX
-LETTER_SHARE = 0.032
-LEAST_LETTER_PX, MOST_LETTER_PX = 13.0, 34.0
+TEXT_HEIGHT_FRACTION = 0.032
+MIN_TEXT_HEIGHT_PX, MAX_TEXT_HEIGHT_PX = 13.0, 34.0
 """Height of a line of text, as a share of the picture's height, and at which it is still read, or large enough."""
-FONT_PX = 30.0
+FONT_HEIGHT_PX = 30.0
 """Height of a line of OpenCV's font at the scale 1, from the top of an l to the foot of a g."""
-STROKE_SHARE = 0.055
+STROKE_FRACTION = 0.055
 """Width of the strokes of letters, as a share of their line's height."""
-CAPTION_SHARE = 0.4
+CAPTION_FRACTION = 0.4
 """The most of a picture's height that the caption may take."""
 PANEL_OPACITY = 0.9
-LINE_SHARE = 0.002
+LINE_FRACTION = 0.002
 """Width of a line, as a share of the picture's height."""
 FRACTION_BITS = 4
 """OpenCV takes points in whole numbers of 1/16 px."""
-FARTHEST_PX = 30000
+MAX_COORDINATE_PX = 30000
 """Beyond this OpenCV's whole numbers would overflow."""
 
 
@@ -38,21 +38,21 @@ def bgr(colour: str) -> tuple[int, int, int]:
     return int(colour[5:7], 16), int(colour[3:5], 16), int(colour[1:3], 16)
 
 
-def letter_px(height: int) -> float:
+def text_height_px(height: int) -> float:
     """Return the height of a line of text in a picture of a height."""
-    return min(max(LETTER_SHARE * height, LEAST_LETTER_PX), MOST_LETTER_PX)
+    return min(max(TEXT_HEIGHT_FRACTION * height, MIN_TEXT_HEIGHT_PX), MAX_TEXT_HEIGHT_PX)
 
 
 def line_px(height: int) -> int:
     """Return the width of a line that is seen in a picture of a height."""
-    return max(1, round(LINE_SHARE * height))
+    return max(1, round(LINE_FRACTION * height))
 
 
 def draw_paths(picture: np.ndarray, paths: Sequence[np.ndarray] | np.ndarray, colour: str | int, width_px: int) -> None:
     """Draw polylines, each (n, 2), smoothly; in a mask the colour is a number."""
     if not len(paths):
         return
-    steps = [_steps(path) for path in paths] if isinstance(paths, (list, tuple)) else list(_steps(paths))
+    steps = [_fixed_point(path) for path in paths] if isinstance(paths, (list, tuple)) else list(_fixed_point(paths))
     cv2.polylines(picture, steps, False, bgr(colour) if isinstance(colour, str) else colour, width_px, cv2.LINE_AA,
                   FRACTION_BITS)
 
@@ -62,50 +62,50 @@ def draw_dots(picture: np.ndarray, points_px: np.ndarray, colour: str, width_px:
     draw_paths(picture, np.repeat(points_px[:, None], 2, axis=1), colour, width_px)
 
 
-def _steps(path: np.ndarray) -> np.ndarray:
-    near = np.clip(path, -FARTHEST_PX, FARTHEST_PX)
+def _fixed_point(path: np.ndarray) -> np.ndarray:
+    near = np.clip(path, -MAX_COORDINATE_PX, MAX_COORDINATE_PX)
     return np.round(near * (1 << FRACTION_BITS)).astype(np.int32)
 
 
-def text_size(text: str, letter: float) -> tuple[int, int]:
+def text_size(text: str, text_height: float) -> tuple[int, int]:
     """Return the width of a text in pixels, and the height of its line."""
-    (width, _), _ = cv2.getTextSize(text, FONT, letter / FONT_PX, stroke_px(letter))
-    return width, round(letter)
+    (width, _), _ = cv2.getTextSize(text, FONT, text_height / FONT_HEIGHT_PX, stroke_px(text_height))
+    return width, round(text_height)
 
 
-def stroke_px(letter: float) -> int:
+def stroke_px(text_height: float) -> int:
     """Return how thick letters are."""
-    return max(1, round(STROKE_SHARE * letter))
+    return max(1, round(STROKE_FRACTION * text_height))
 
 
-def draw_text(picture: np.ndarray, text: str, left: float, top: float, letter: float, colour: str) -> None:
+def draw_text(picture: np.ndarray, text: str, left: float, top: float, text_height: float, colour: str) -> None:
     """Write one line whose upper left corner is given; OpenCV's font knows ASCII alone."""
     plain = text.encode('ascii', 'replace').decode()
-    cv2.putText(picture, plain, (round(left), round(top + 0.75 * letter)), FONT, letter / FONT_PX, bgr(colour),
-                stroke_px(letter), cv2.LINE_AA)
+    cv2.putText(picture, plain, (round(left), round(top + 0.75 * text_height)), FONT, text_height / FONT_HEIGHT_PX, bgr(colour),
+                stroke_px(text_height), cv2.LINE_AA)
 
 
-def wrapped(text: str, letter: float, width_px: float, most: int) -> list[str]:
+def wrap_text(text: str, text_height: float, width_px: float, most: int) -> list[str]:
     """Break a text into at most so many lines that fit into a width; what does not fit is left out, with '...'."""
     lines: list[str] = []
     line = ''
     for word in text.split():
         longer = f'{line} {word}'.strip()
-        if line and text_size(longer, letter)[0] > width_px:
+        if line and text_size(longer, text_height)[0] > width_px:
             lines.append(line)
             longer = word
         line = longer
     lines.append(line)
     if len(lines) > most:
         lines = [*lines[:most - 1], f'{lines[most - 1]} ...']
-    return [shortened(line, letter, width_px) for line in lines]
+    return [truncate_text(line, text_height, width_px) for line in lines]
 
 
-def shortened(line: str, letter: float, width_px: float) -> str:
+def truncate_text(line: str, text_height: float, width_px: float) -> str:
     """Return as much of a line as fits into a width."""
-    if text_size(line, letter)[0] <= width_px:
+    if text_size(line, text_height)[0] <= width_px:
         return line
-    while line and text_size(f'{line} ...', letter)[0] > width_px:
+    while line and text_size(f'{line} ...', text_height)[0] > width_px:
         line = line[:-1]
     return f'{line} ...'
 
@@ -130,10 +130,10 @@ class Overlay:
         mask[max(top, 0):max(bottom, 0), max(left, 0):max(right, 0)] = 255
         self._cover(mask, np.array(bgr(colour), np.uint8), opacity)
 
-    def add_text(self, text: str, left: float, top: float, letter: float, colour: str) -> None:
+    def add_text(self, text: str, left: float, top: float, text_height: float, colour: str) -> None:
         """Add one line of text."""
         written = np.zeros_like(self._ink)
-        draw_text(written, text, left, top, letter, PAPER)
+        draw_text(written, text, left, top, text_height, PAPER)
         self._cover(written[..., 0], np.array(bgr(colour), np.uint8), 1.0)
 
     def _cover(self, mask: np.ndarray, colour: np.ndarray, opacity: float) -> None:
@@ -142,7 +142,7 @@ class Overlay:
         self._ink[rows, columns] = np.round(self._ink[rows, columns] * (1 - share) + colour * share)
         self._clear[rows, columns] = np.round(self._clear[rows, columns] * (1 - share))
 
-    def laid_over(self, image: np.ndarray) -> np.ndarray:
+    def composite(self, image: np.ndarray) -> np.ndarray:
         """Return an image of its size, grey or BGR, with this laid over it."""
         colour = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if image.ndim == 2 else image
         picture = cv2.multiply(colour, self._clear, scale=1 / 255)
@@ -161,28 +161,28 @@ class Caption:
 
 def caption_panel(caption: Caption, height: int, width: int) -> np.ndarray:
     """Return the words for the upper left corner of a picture of a size, no larger than they need, BGR."""
-    letter = letter_px(height)
-    margin, leading = round(0.5 * letter), round(1.15 * letter)
+    text_height = text_height_px(height)
+    margin, leading = round(0.5 * text_height), round(1.15 * text_height)
     room = width - 2 * margin
-    most = max(1, int((CAPTION_SHARE * height - 2 * margin) / leading) - 1)
-    text = wrapped(caption.text, letter, room, most) if caption.text else []
-    lines = [shortened(caption.title, letter, room), *text]
-    widest = max(text_size(line, letter)[0] for line in lines)
+    most = max(1, int((CAPTION_FRACTION * height - 2 * margin) / leading) - 1)
+    text = wrap_text(caption.text, text_height, room, most) if caption.text else []
+    lines = [truncate_text(caption.title, text_height, room), *text]
+    widest = max(text_size(line, text_height)[0] for line in lines)
     panel = np.empty((2 * margin + leading * len(lines), min(widest + 2 * margin, width), 3), np.uint8)
     panel[:] = bgr(INK)
     for number, line in enumerate(lines):
-        draw_text(panel, line, margin, margin + number * leading, letter, PAPER if number else caption.colour)
+        draw_text(panel, line, margin, margin + number * leading, text_height, PAPER if number else caption.colour)
     return panel[:height]
 
 
-def lay_panel(picture: np.ndarray, panel: np.ndarray) -> None:
+def draw_panel(picture: np.ndarray, panel: np.ndarray) -> None:
     """Lay a panel over the upper left corner of a picture, which shines through a little."""
     rows, columns = panel.shape[:2]
     corner = picture[:rows, :columns]
     cv2.addWeighted(panel, PANEL_OPACITY, corner, 1 - PANEL_OPACITY, 0, corner)
 
 
-class Lookup:
+class RemapTable:
     """A view of the images of one camera, in the form in which OpenCV makes it fastest."""
 
     def __init__(self, sources: np.ndarray, empty_grey: int) -> None:

@@ -8,8 +8,8 @@ import numpy as np
 
 from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.lens.camera_info import rectified_matrix
-from autocalib_ros.pictures.plotted import Plotted, draw_metre_grid, draw_scale_bar
-from autocalib_ros.pictures.views import FARTHEST_HEIGHTS, TopView, rectified_sources, resample, unit
+from autocalib_ros.pictures.plotted import PlotOverlay, draw_metre_grid, draw_scale_bar
+from autocalib_ros.pictures.views import MAX_DISTANCE_HEIGHTS, TopView, length_unit, rectification_map, resample
 from autocalib_ros.results.saved_camera import KnownCamera
 
 LONGEST_PX = 1000
@@ -17,7 +17,7 @@ LONGEST_PX = 1000
 MAX_SIDE_PX = 16384
 
 
-def rectified_view(known: KnownCamera, balance: float | None) -> Callable[[np.ndarray], np.ndarray]:
+def rectified_renderer(known: KnownCamera, balance: float | None) -> Callable[[np.ndarray], np.ndarray]:
     """Return what undistorts images; without a balance as the P of the file says, or else as 0 does.
 
     InputError where the lens leaves a part of the image empty, so that nothing tells how large the view would be.
@@ -30,11 +30,11 @@ def rectified_view(known: KnownCamera, balance: float | None) -> Callable[[np.nd
     if not np.isfinite(matrix).all():
         raise InputError('the distortion folds back before the border of the image, so that a view without distortion'
                          ' has no size: give a calibration that was taken with the pattern near the borders too')
-    sources = rectified_sources(known, matrix)
+    sources = rectification_map(known, matrix)
     return lambda image: resample(image, sources)
 
 
-def top_view_of(known: KnownCamera, px_per_m: float | None = None, x_m: tuple[float, float] | None = None,
+def choose_top_view(known: KnownCamera, px_per_m: float | None = None, x_m: tuple[float, float] | None = None,
                 y_m: tuple[float, float] | None = None) -> TopView:
     """Return the road from above: the ranges of x and y that are asked for, elsewhere what the image shows.
 
@@ -49,7 +49,7 @@ def top_view_of(known: KnownCamera, px_per_m: float | None = None, x_m: tuple[fl
         raise UsageError(f'--px-per-m is more than 0, got {px_per_m:g}')
     shown = TopView.of_image(known.lens, known.ground, LONGEST_PX)
     if shown is None and (x_m is None or y_m is None):
-        raise InputError(f'the image shows no road nearer than {FARTHEST_HEIGHTS:g} times the height of the camera:'
+        raise InputError(f'the image shows no road nearer than {MAX_DISTANCE_HEIGHTS:g} times the height of the camera:'
                          ' say where to look by --x and --y')
     spans = np.array([span or (shown.low_m[axis], shown.high_m[axis]) for axis, span in enumerate((x_m, y_m))])
     longest = LONGEST_PX if px_per_m is None else px_per_m * float((spans[:, 1] - spans[:, 0]).max())
@@ -59,10 +59,10 @@ def top_view_of(known: KnownCamera, px_per_m: float | None = None, x_m: tuple[fl
     return TopView.between(spans[:, 0], spans[:, 1], round(longest))
 
 
-def from_above(known: KnownCamera, view: TopView, *, grid: bool, scale_bar: bool) -> Callable[[np.ndarray], np.ndarray]:
+def top_view_renderer(known: KnownCamera, view: TopView, *, grid: bool, scale_bar: bool) -> Callable[[np.ndarray], np.ndarray]:
     """Return what makes a view of images, with what is to be drawn over it."""
     sources = view.sources(known.lens, known.ground)
     drawings = [draw for draw, wanted in ((draw_metre_grid, grid), (draw_scale_bar, scale_bar)) if wanted]
-    overlay = Plotted.drawn(view.columns, view.rows, lambda axes: [
-        draw(axes, view, unit(known.ground)) for draw in drawings])
-    return lambda image: overlay.over(resample(image, sources))
+    overlay = PlotOverlay.render(view.columns, view.rows, lambda axes: [
+        draw(axes, view, length_unit(known.ground)) for draw in drawings])
+    return lambda image: overlay.composite(resample(image, sources))

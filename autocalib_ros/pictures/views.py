@@ -15,18 +15,18 @@ import numpy as np
 from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.lens.camera import Camera, Lens, pixel_grid
 
-FARTHEST_HEIGHTS = 10.0
+MAX_DISTANCE_HEIGHTS = 10.0
 """Views of the road end this many camera heights away: beyond, a pixel covers metres."""
-NOWHERE_PX = -1e4
+OUTSIDE_PX = -1e4
 """Where a view's pixel lies that the lens does not see."""
 EMPTY_GREY = 224
 BAND_ROWS = 64
 """Rows of a table that are worked out at a time: a whole one of a large image would take a gigabyte."""
-CIRCLE_POINTS = 361
+GREAT_CIRCLE_POINTS = 361
 GRID_CELLS = 8
 """Cells of a grid on the road to each side of its middle."""
 GRID_STEP_HEIGHTS = 0.8
-SEEN_PIXELS = 64
+SAMPLES_PER_SIDE = 64
 """Pixels along each side of the image that tell how much of the road it shows."""
 
 
@@ -45,16 +45,16 @@ def image_to_ground(camera: Camera, ground: GroundPlane, pixels: np.ndarray) -> 
     return rays[..., :2] * (-ground.height_m / down)[..., None]
 
 
-def near_on_road(camera: Camera, ground: GroundPlane, pixels: np.ndarray,
-                 heights: float = FARTHEST_HEIGHTS) -> np.ndarray:
+def nearby_road_points(camera: Camera, ground: GroundPlane, pixels: np.ndarray,
+                 heights: float = MAX_DISTANCE_HEIGHTS) -> np.ndarray:
     """Return the points (m, 2) on the road of those pixels (n, 2) that show it within so many camera heights."""
     points = image_to_ground(camera, ground, pixels)
     return points[np.hypot(*points.T) < heights * ground.height_m]
 
 
-def road_in_image(camera: Camera, ground: GroundPlane) -> np.ndarray:
+def visible_road(camera: Camera, ground: GroundPlane) -> np.ndarray:
     """Return points (m, 2) of the road that is in the image and near, as dense as the image shows them."""
-    return near_on_road(camera, ground, pixel_grid(camera, SEEN_PIXELS, SEEN_PIXELS))
+    return nearby_road_points(camera, ground, pixel_grid(camera, SAMPLES_PER_SIDE, SAMPLES_PER_SIDE))
 
 
 def resample(picture: np.ndarray, sources: np.ndarray) -> np.ndarray:
@@ -62,7 +62,7 @@ def resample(picture: np.ndarray, sources: np.ndarray) -> np.ndarray:
     return cv2.remap(picture, sources, None, cv2.INTER_LINEAR, borderValue=(EMPTY_GREY,) * 3)
 
 
-def rectified_sources(camera: Lens, matrix: np.ndarray) -> np.ndarray:
+def rectification_map(camera: Lens, matrix: np.ndarray) -> np.ndarray:
     """Return the view of a distortion-free camera of a matrix (3, 3) and the size of the image, float32."""
     view = np.empty((camera.height, camera.width, 2), np.float32)
     to_bearing = np.linalg.inv(matrix).T
@@ -70,7 +70,7 @@ def rectified_sources(camera: Lens, matrix: np.ndarray) -> np.ndarray:
         band = view[top:top + BAND_ROWS]
         x, y = np.meshgrid(np.arange(camera.width), np.arange(top, top + len(band)))
         sources, valid = camera.project(np.stack([x, y, np.ones_like(x)], axis=-1) @ to_bearing)
-        band[:] = np.where(valid[..., None], sources, NOWHERE_PX)
+        band[:] = np.where(valid[..., None], sources, OUTSIDE_PX)
     return view
 
 
@@ -96,7 +96,7 @@ class TopView:
     @classmethod
     def of_image(cls, camera: Camera, ground: GroundPlane, longest_px: int) -> TopView | None:
         """Show all of the road that is in the image and near; None where it shows none."""
-        points = road_in_image(camera, ground)
+        points = visible_road(camera, ground)
         return cls.between(points.min(axis=0), points.max(axis=0), longest_px) if len(points) > 1 else None
 
     @classmethod
@@ -120,7 +120,7 @@ class TopView:
 
     def sources(self, camera: Camera, ground: GroundPlane) -> np.ndarray:
         """Return the view as a table, float32."""
-        return np.nan_to_num(ground_to_image(camera, ground, self._points_m), nan=NOWHERE_PX).astype(np.float32)
+        return np.nan_to_num(ground_to_image(camera, ground, self._points_m), nan=OUTSIDE_PX).astype(np.float32)
 
     def pixels(self, points_m: np.ndarray) -> np.ndarray:
         """Return where points (..., 2) of the road lie in the view, pixels (..., 2)."""
@@ -128,7 +128,7 @@ class TopView:
         return np.stack([x, (self.high_m[1] - points_m[..., 1]) * self.px_per_m - 0.5], axis=-1)
 
 
-def great_circle(camera: Camera, normal: np.ndarray) -> list[np.ndarray]:
+def project_great_circle(camera: Camera, normal: np.ndarray) -> list[np.ndarray]:
     """Return the visible arcs of the great circle with that normal, as polylines in pixels near the image.
 
     With the road's normal it is the horizon.
@@ -136,19 +136,19 @@ def great_circle(camera: Camera, normal: np.ndarray) -> list[np.ndarray]:
     normal = normal / np.linalg.norm(normal)
     side = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
     side /= np.linalg.norm(side)
-    angles = np.linspace(0, 2 * np.pi, CIRCLE_POINTS)[:, None]
+    angles = np.linspace(0, 2 * np.pi, GREAT_CIRCLE_POINTS)[:, None]
     pixels, valid = camera.project(np.cos(angles) * side + np.sin(angles) * np.cross(normal, side))
-    return _near_image(camera, np.where(valid[:, None], pixels, np.nan), beyond=1.0)
+    return _parts_near_image(camera, np.where(valid[:, None], pixels, np.nan), beyond=1.0)
 
 
-def road_lines(camera: Camera, ground: GroundPlane, lines_m: list[np.ndarray]) -> list[np.ndarray]:
+def project_road_lines(camera: Camera, ground: GroundPlane, lines_m: list[np.ndarray]) -> list[np.ndarray]:
     """Return lines (n, 3) in the ground frame as polylines in pixels in or near the image."""
-    return [part for line in lines_m for part in _near_image(camera, ground_to_image(camera, ground, line), beyond=0.2)]
+    return [part for line in lines_m for part in _parts_near_image(camera, ground_to_image(camera, ground, line), beyond=0.2)]
 
 
 def grid_step(ground: GroundPlane) -> float:
     """Return the side of a grid's squares that suits the camera's height, a round length."""
-    return nice_length(GRID_STEP_HEIGHTS * ground.height_m)
+    return round_length(GRID_STEP_HEIGHTS * ground.height_m)
 
 
 def grid_lines(middle_m: np.ndarray, step_m: float) -> list[np.ndarray]:
@@ -165,7 +165,7 @@ def grid_lines(middle_m: np.ndarray, step_m: float) -> list[np.ndarray]:
     return lines
 
 
-def _near_image(camera: Camera, pixels: np.ndarray, *, beyond: float) -> list[np.ndarray]:
+def _parts_near_image(camera: Camera, pixels: np.ndarray, *, beyond: float) -> list[np.ndarray]:
     """Split a polyline (n, 2) into the parts that lie in the image or `beyond` it by that share of its size."""
     size = np.array([camera.width, camera.height])
     near = (np.isfinite(pixels) & (pixels > -beyond * size) & (pixels < (1 + beyond) * size)).all(axis=1)
@@ -173,20 +173,20 @@ def _near_image(camera: Camera, pixels: np.ndarray, *, beyond: float) -> list[np
     return [pixels[begin:end] for begin, end in zip(edges[::2], edges[1::2], strict=True) if end - begin > 1]
 
 
-def nice_length(length: float) -> float:
+def round_length(length: float) -> float:
     """Return 1, 2 or 5 times a power of ten, the largest not above `length`."""
     power = 10.0 ** np.floor(np.log10(length))
     return float(max(factor * power for factor in (1, 2, 5) if factor * power <= length * (1 + 1e-9)))
 
 
-def unit(ground: GroundPlane) -> str:
+def length_unit(ground: GroundPlane) -> str:
     """Return the unit of lengths on the road."""
     return 'm' if ground.metric else 'camera heights'
 
 
-def length_words(length: float, ground: GroundPlane) -> str:
+def format_length(length: float, ground: GroundPlane) -> str:
     """Return a length on the road with its unit."""
-    return f'{length:g} {unit(ground).removesuffix("s") if length == 1 else unit(ground)}'
+    return f'{length:g} {length_unit(ground).removesuffix("s") if length == 1 else length_unit(ground)}'
 
 
 def in_image(camera: Lens, pixels: np.ndarray) -> np.ndarray:

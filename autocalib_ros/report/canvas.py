@@ -16,7 +16,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 
 from autocalib_ros.pictures.drawing import ROAD_COLOURS
-from autocalib_ros.report.scene import NOT_USED, REJECTED, Scene
+from autocalib_ros.report.scene import NOT_USED, REJECTED, ReportScene
 
 WIDTH_IN, DPI = 7.0, 160
 """Letters stay readable on a telephone that shows a figure a third as wide as it is."""
@@ -28,10 +28,10 @@ BAR_IN, BAR_ROOM_IN = 0.16, 0.75
 """Thickness of a scale of colours, and room for it with its letters."""
 PNG_EFFORT, JPEG_QUALITY = 3, 85
 """More effort takes three times as long to save a tenth of the size."""
-INK, MUTED, PAPER, WHITE = '#1c2733', '#8a97a3', '#e9edf0', '#ffffff'
+INK, MUTED_COLOUR, PANEL_COLOUR, WHITE = '#1c2733', '#8a97a3', '#e9edf0', '#ffffff'
 OTHER_COLOURS = {NOT_USED: '#8a97a3', REJECTED: '#222222'}
 LEGEND_LINE = 2.5
-TURNING = '#7733aa'
+TURNING_COLOUR = '#7733aa'
 """What is known of vehicles that turn."""
 HALO = [withStroke(linewidth=3, foreground=WHITE)]
 """Around letters that stand in a picture."""
@@ -55,12 +55,12 @@ def chart(height_in: float = 3.6, rows: int = 1) -> tuple[Figure, list[Axes]]:
                            top=1 - EDGE_IN / height_in, hspace=0.12)
     for axes in panels:
         axes.spines[['top', 'right']].set_visible(False)
-        axes.grid(color=PAPER)
+        axes.grid(color=PANEL_COLOUR)
         axes.set_axisbelow(True)
     return figure, panels
 
 
-def image_axes(scene: Scene, *, margin: float = 0.0, picture: np.ndarray | None = None,
+def image_axes(scene: ReportScene, *, margin: float = 0.0, picture: np.ndarray | None = None,
                fade: float = 0.25) -> tuple[Figure, Axes]:
     """Return a figure that shows the road, lightened by `fade`, in pixel coordinates.
 
@@ -68,14 +68,14 @@ def image_axes(scene: Scene, *, margin: float = 0.0, picture: np.ndarray | None 
     """
     width, height = scene.evidence.image_size
     shown_w, shown_h = width * (1 + 2 * margin), height * (1 + 2 * margin)
-    figure = Figure(figsize=(WIDTH_IN, WIDTH_IN * shown_h / shown_w), dpi=DPI, facecolor=PAPER)
+    figure = Figure(figsize=(WIDTH_IN, WIDTH_IN * shown_h / shown_w), dpi=DPI, facecolor=PANEL_COLOUR)
     axes = figure.add_axes((0, 0, 1, 1))
     picture = scene.background if picture is None else picture
-    axes.set_facecolor(PAPER)
+    axes.set_facecolor(PANEL_COLOUR)
     if picture is not None:
         axes.imshow(faded_rgb(picture, fade), interpolation='bilinear')
     elif margin:
-        axes.plot(*np.array([[0, 0], [width, 0], [width, height], [0, height], [0, 0]]).T - 0.5, color=MUTED)
+        axes.plot(*np.array([[0, 0], [width, 0], [width, height], [0, height], [0, 0]]).T - 0.5, color=MUTED_COLOUR)
     axes.set(xlim=(-0.5 - margin * width, width - 0.5 + margin * width),
              ylim=(height - 0.5 + margin * height, -0.5 - margin * height), aspect='equal')
     axes.set_axis_off()
@@ -88,7 +88,7 @@ def faded_rgb(picture: np.ndarray, fade: float) -> np.ndarray:
     return (rgb * (1 - fade) + 255 * fade).astype(np.uint8)
 
 
-def draw_paths(axes: Axes, paths: Sequence[np.ndarray], colour: str, label: str | None = None, *,
+def plot_paths(axes: Axes, paths: Sequence[np.ndarray], colour: str, label: str | None = None, *,
                width: float = 1.1, alpha: float = 0.8) -> None:
     """Draw polylines (n, 2), with one entry in the legend."""
     if len(paths):
@@ -106,7 +106,7 @@ def draw_legend(axes: Axes, place: str = 'upper right') -> None:
             handle.set(linewidth=max(handle.get_linewidth(), LEGEND_LINE), alpha=1)
 
 
-def rendered(figure: Figure) -> np.ndarray:
+def render_bgr(figure: Figure) -> np.ndarray:
     """Return a figure as a BGR picture."""
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
@@ -123,13 +123,13 @@ def jpeg(picture: np.ndarray) -> bytes:
     return cv2.imencode('.jpg', picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
 
 
-def cell_map(scene: Scene, values: np.ma.MaskedArray, scale: Normalize, label: str) -> Figure:
+def cell_map(scene: ReportScene, values: np.ma.MaskedArray, scale: Normalize, label: str) -> Figure:
     """Return a figure that shows a number for each cell (rows, columns) of the image, where it is not masked."""
     width, height = scene.evidence.image_size
     height_in = WIDTH_IN * height / width + BAR_ROOM_IN
     figure = Figure(figsize=(WIDTH_IN, height_in), dpi=DPI)
     axes = figure.add_axes((0, BAR_ROOM_IN / height_in, 1, 1 - BAR_ROOM_IN / height_in))
-    axes.set_facecolor(PAPER)
+    axes.set_facecolor(PANEL_COLOUR)
     if scene.background is not None:
         axes.imshow(faded_rgb(scene.background, 0.25), interpolation='bilinear')
     rows, columns = values.shape

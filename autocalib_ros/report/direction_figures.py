@@ -9,18 +9,27 @@ from matplotlib.figure import Figure
 from autocalib_ros.estimation.paper.vanishing_point_voting import segment_orientations
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.lens.camera_info import rectified_matrix
-from autocalib_ros.pictures.views import great_circle
-from autocalib_ros.report.canvas import INK, MUTED, WHITE, chart, draw_legend, draw_paths, image_axes, road_colour
-from autocalib_ros.report.scene import Scene
+from autocalib_ros.pictures.views import project_great_circle
+from autocalib_ros.report.canvas import (
+    INK,
+    MUTED_COLOUR,
+    WHITE,
+    chart,
+    draw_legend,
+    image_axes,
+    plot_paths,
+    road_colour,
+)
+from autocalib_ros.report.scene import ReportScene
 
-HORIZON = '#aa3377'
+HORIZON_COLOUR = '#aa3377'
 MARGIN = 0.35
 """Share of the image shown around it, where vanishing points may lie."""
-MOST_SEGMENTS = 2500
+MAX_SEGMENTS = 2500
 """Segments drawn of a cluster: more hide each other."""
 
 
-def orientation_histogram(scene: Scene) -> Figure | None:
+def orientation_histogram(scene: ReportScene) -> Figure | None:
     """Draw how many segments run in each orientation, and the two peaks with their clusters."""
     figures = scene.result.figures
     counts, half = figures.orientation_histogram, scene.options.paper.cluster_deg
@@ -28,9 +37,9 @@ def orientation_histogram(scene: Scene) -> Figure | None:
         return None
     figure, (axes,) = chart(3.2)
     width = np.median(np.diff(counts[:, 0])) if len(counts) > 1 else 1.0
-    colours = np.full(len(counts), MUTED, object)
+    colours = np.full(len(counts), MUTED_COLOUR, object)
     for index, peak in enumerate(figures.orientation_peaks_deg):
-        near = turn_deg(counts[:, 0], peak) <= half
+        near = orientation_difference_deg(counts[:, 0], peak) <= half
         colours[near] = road_colour(index)
         axes.plot([], [], 's', color=road_colour(index), label=f'cluster {index + 1}: {peak:.0f} ± {half:g} degrees')
     axes.bar(counts[:, 0], counts[:, 1], width=width, color=list(colours))
@@ -42,7 +51,7 @@ def orientation_histogram(scene: Scene) -> Figure | None:
     return figure
 
 
-def clusters(scene: Scene) -> Figure | None:
+def clusters(scene: ReportScene) -> Figure | None:
     """Draw the segments of the two clusters where they are in the undistorted image."""
     peaks, calibration = scene.result.figures.orientation_peaks_deg, scene.calibration
     if calibration is None or not peaks or not len(scene.evidence.segments_px):
@@ -55,19 +64,19 @@ def clusters(scene: Scene) -> Figure | None:
     ends = found.ends_px * (matrix[[0, 1], [0, 1]] / calibration.camera.focal_px) + matrix[:2, 2]
     figure, axes = undistorted_axes(scene)
     for index, peak in enumerate(peaks):
-        near = ends[turn_deg(found.orientation_deg, peak) <= scene.options.paper.cluster_deg]
-        shown = near[np.linspace(0, len(near) - 1, min(len(near), MOST_SEGMENTS)).astype(int)]
-        draw_paths(axes, list(shown), road_colour(index), f'cluster {index + 1}: {len(near)} segments')
+        near = ends[orientation_difference_deg(found.orientation_deg, peak) <= scene.options.paper.cluster_deg]
+        shown = near[np.linspace(0, len(near) - 1, min(len(near), MAX_SEGMENTS)).astype(int)]
+        plot_paths(axes, list(shown), road_colour(index), f'cluster {index + 1}: {len(near)} segments')
     draw_legend(axes)
     return figure
 
 
-def turn_deg(orientations_deg: np.ndarray, peak_deg: float) -> np.ndarray:
+def orientation_difference_deg(orientations_deg: np.ndarray, peak_deg: float) -> np.ndarray:
     """Return the angle between undirected orientations, 0 to 90 degrees."""
     return np.abs((orientations_deg - peak_deg + 90.0) % 180.0 - 90.0)
 
 
-def directions(scene: Scene) -> Figure | None:
+def directions(scene: ReportScene) -> Figure | None:
     """Draw the horizon, the vanishing directions and the lines that run to them, in the distorted image."""
     if scene.calibration is None:
         return None
@@ -78,7 +87,7 @@ def directions(scene: Scene) -> Figure | None:
     for index, direction in enumerate(scene.calibration.road_directions):
         _draw_direction(axes, camera, direction, index)
     if ground is not None:
-        draw_paths(axes, great_circle(camera, ground.normal_in_camera), HORIZON, 'horizon', width=2.5)
+        plot_paths(axes, project_great_circle(camera, ground.normal_in_camera), HORIZON_COLOUR, 'horizon', width=2.5)
     draw_legend(axes)
     return figure
 
@@ -92,8 +101,8 @@ def _draw_direction(axes: Axes, camera: Camera, direction: np.ndarray, index: in
     for bearing in bearings:
         normal = np.cross(direction, bearing)
         if np.linalg.norm(normal) > 0.05:
-            lines += great_circle(camera, normal)
-    draw_paths(axes, lines, road_colour(index), f'lines along road {index + 1}', width=0.7, alpha=0.6)
+            lines += project_great_circle(camera, normal)
+    plot_paths(axes, lines, road_colour(index), f'lines along road {index + 1}', width=0.7, alpha=0.6)
     ends, valid = camera.project(np.array([direction, -np.asarray(direction)]))
     size = np.array([camera.width, camera.height])
     ends = ends[valid & (np.abs(ends / size - 0.5) < 0.5 + MARGIN).all(axis=1)]

@@ -8,25 +8,25 @@ from matplotlib.figure import Figure
 
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.lens.camera_info import rectified_matrix
-from autocalib_ros.pictures.views import rectified_sources, resample
+from autocalib_ros.pictures.views import rectification_map, resample
 from autocalib_ros.report.canvas import (
     INK,
-    MUTED,
+    MUTED_COLOUR,
     chart,
     draw_legend,
-    draw_paths,
     image_axes,
     label_colour,
+    plot_paths,
     road_colour,
 )
-from autocalib_ros.report.scene import Scene
+from autocalib_ros.report.scene import ReportScene
 from autocalib_ros.results.calibration import Calibration
 
-LEAST_ERROR_PX = 1e-3
+MIN_ERROR_PX = 1e-3
 """Below this a track counts as straight; it keeps the logarithmic axes finite."""
 
 
-def undistorted(scene: Scene) -> Figure | None:
+def undistorted(scene: ReportScene) -> Figure | None:
     """Show the road as a distortion-free camera would see it, with the kept tracks, which are straight there."""
     if scene.calibration is None or (scene.background is None and not scene.groups()):
         return None
@@ -35,16 +35,16 @@ def undistorted(scene: Scene) -> Figure | None:
     figure, axes = undistorted_axes(scene)
     for name, label, tracks in scene.groups():
         paths = [in_undistorted(camera, matrix, path) for path in tracks]
-        draw_paths(axes, paths, label_colour(label), name, alpha=0.6, width=0.8)
+        plot_paths(axes, paths, label_colour(label), name, alpha=0.6, width=0.8)
     draw_legend(axes)
     return figure
 
 
-def undistorted_axes(scene: Scene) -> tuple[Figure, Axes]:
+def undistorted_axes(scene: ReportScene) -> tuple[Figure, Axes]:
     """Return a figure that shows the undistorted image, in its pixels."""
     camera, picture = scene.calibration.camera, scene.background
     if picture is not None:
-        picture = resample(picture, rectified_sources(camera, rectified_matrix(camera)))
+        picture = resample(picture, rectification_map(camera, rectified_matrix(camera)))
     return image_axes(scene, picture=picture)
 
 
@@ -56,7 +56,7 @@ def in_undistorted(camera: Camera, matrix: np.ndarray, pixels: np.ndarray) -> np
     return flat * matrix[[0, 1], [0, 1]] + matrix[:2, 2]
 
 
-def straightness(scene: Scene) -> Figure | None:
+def straightness(scene: ReportScene) -> Figure | None:
     """Compare how far each kept track strays from its line before and after undistortion."""
     if scene.calibration is None or not scene.roads:
         return None
@@ -65,7 +65,7 @@ def straightness(scene: Scene) -> Figure | None:
     for label in scene.roads:
         errors = np.array([(line_error_px(path), line_error_px(camera.undistort(path)))
                            for path in scene.paths(label)]).reshape(-1, 2)
-        errors = np.maximum(errors[np.isfinite(errors).all(axis=1)], LEAST_ERROR_PX)
+        errors = np.maximum(errors[np.isfinite(errors).all(axis=1)], MIN_ERROR_PX)
         if len(errors):
             before, after = np.median(errors, axis=0)
             ends.append(errors)
@@ -74,7 +74,7 @@ def straightness(scene: Scene) -> Figure | None:
     if not ends:
         return None
     span = [np.concatenate(ends).min(), np.concatenate(ends).max()]
-    axes.plot(span, span, color=MUTED, linewidth=1, label='no change')
+    axes.plot(span, span, color=MUTED_COLOUR, linewidth=1, label='no change')
     axes.set_ylim(top=span[1] * 12)  # room for the legend
     axes.set_xlabel('distance from a straight line before undistortion, px (root mean square)', color=INK)
     axes.set_ylabel('after undistortion, px', color=INK)
@@ -89,7 +89,7 @@ def line_error_px(points: np.ndarray) -> float:
     return float(np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[-1] / np.sqrt(len(points)))
 
 
-def focal_sweep(scene: Scene) -> Figure | None:
+def focal_sweep(scene: ReportScene) -> Figure | None:
     """Draw the straightness error over trial focal lengths, with what was chosen."""
     sweep = scene.result.figures.focal_sweep_px
     sweep = sweep[np.isfinite(sweep).all(axis=1)] if len(sweep) else sweep

@@ -23,8 +23,8 @@ from autocalib_ros.report import (
     speed_figures,
     traffic_figures,
 )
-from autocalib_ros.report.canvas import STYLE, jpeg, png, rendered
-from autocalib_ros.report.scene import Scene
+from autocalib_ros.report.canvas import STYLE, jpeg, png, render_bgr
+from autocalib_ros.report.scene import ReportScene
 from autocalib_ros.report.text import file_rows, how_sure, needs, next_step, number_rows, verdict
 from autocalib_ros.results.calibration import Calibration, Refusal
 from autocalib_ros.util.files import write_atomically
@@ -43,9 +43,9 @@ class _Entry:
     chapter: str
     title: str
     caption: str
-    draw: Callable[[Scene], Figure | None]
+    draw: Callable[[ReportScene], Figure | None]
     wide: bool = True
-    more: Callable[[Scene], str] | None = None
+    more: Callable[[ReportScene], str] | None = None
     """What depends on the scene is said after the caption."""
 
 
@@ -57,11 +57,11 @@ ENTRIES = (
     _Entry('top_view', ROAD, 'The road from above',
            'The image spread out on the ground plane. Lanes should be straight and of even width; known lengths, such'
            ' as lane markings, can be checked against the scale. What stands above the road is drawn out, away from'
-           ' the camera.', road_figures.top_view, more=road_figures.told_of_places),
+           ' the camera.', road_figures.top_view, more=road_figures.accuracy_note),
     _Entry('speeds', ROAD, 'Vehicles in metres',
            'The trajectories on the ground plane, coloured by speed. Where nobody brakes one lane should have one speed'
            ' along its whole way: if all seem to slow down or to speed up with the distance, the plane is tilted.',
-           speed_figures.speeds_above, wide=False, more=speed_figures.told_of_speeds),
+           speed_figures.speeds_above, wide=False, more=speed_figures.speed_note),
     _Entry('speed_histogram', ROAD, 'Speeds',
            'Are these the speeds of this road? They grow and shrink with what was given as the scale. Each metre of the'
            ' way counts alike, so that waiting does not count; who follows no road turns, cycles or walks.',
@@ -74,7 +74,7 @@ ENTRIES = (
            ' points, as bodies that move in the plane.', traffic_figures.kept_tracks),
     _Entry('coverage', TRAFFIC, 'Coverage of the image',
            'Where trajectories crossed the image. A lens is best known where traffic was, above all near the borders.',
-           traffic_figures.coverage, more=traffic_figures.told_of_coverage),
+           traffic_figures.coverage, more=traffic_figures.coverage_note),
     _Entry('undistorted', LENS, 'Undistorted image',
            'The image as a lens without distortion would show it. Kerbs, lane markings and the trajectories should be'
            ' straight.', lens_figures.undistorted),
@@ -124,7 +124,7 @@ class _Drawn:
         return base64.b64encode(self.shown).decode()
 
 
-def write_report(path: Path, scene: Scene, figures: Path | None = None) -> None:
+def write_report(path: Path, scene: ReportScene, figures: Path | None = None) -> None:
     """Write the page to `path` and its figures into a folder, `figures` beside it; earlier ones there are removed."""
     folder = figures or path.parent / 'figures'
     _clear(folder)  # before seconds of drawing: it may not be possible to write there
@@ -134,11 +134,11 @@ def write_report(path: Path, scene: Scene, figures: Path | None = None) -> None:
     write_atomically(path, _page(scene, drawn))
 
 
-def _drawn(entry: _Entry, scene: Scene) -> _Drawn | None:
+def _drawn(entry: _Entry, scene: ReportScene) -> _Drawn | None:
     figure = entry.draw(scene)
     if figure is None:
         return None
-    picture = rendered(figure)
+    picture = render_bgr(figure)
     whole = png(picture)
     caption = ' '.join(filter(None, [entry.caption, entry.more(scene) if entry.more else '']))
     photograph = jpeg(picture)
@@ -162,7 +162,7 @@ def _write_figures(folder: Path, pictures: dict[str, bytes]) -> None:
         raise InputError(f'cannot write {folder}: {error.strerror or error}') from error
 
 
-def _page(scene: Scene, drawn: list[_Drawn]) -> str:
+def _page(scene: ReportScene, drawn: list[_Drawn]) -> str:
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     template = environment.from_string(
         (files('autocalib_ros.report') / 'templates' / 'report.html.j2').read_text(encoding='utf-8'))

@@ -10,17 +10,17 @@ from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.ground import Ground
 from autocalib_ros.pictures.views import (
     TopView,
+    format_length,
     grid_lines,
     grid_step,
     ground_to_image,
     image_to_ground,
     in_image,
-    length_words,
-    near_on_road,
-    nice_length,
+    length_unit,
+    nearby_road_points,
+    project_road_lines,
     resample,
-    road_lines,
-    unit,
+    round_length,
 )
 from autocalib_ros.report.canvas import (
     BELOW_IN,
@@ -29,35 +29,35 @@ from autocalib_ros.report.canvas import (
     HALO,
     INK,
     LEFT_IN,
-    PAPER,
+    PANEL_COLOUR,
     WHITE,
     WIDTH_IN,
     draw_legend,
-    draw_paths,
     faded_rgb,
     image_axes,
     label_colour,
+    plot_paths,
 )
-from autocalib_ros.report.scene import Scene
+from autocalib_ros.report.scene import ReportScene
 
 TOP_VIEW_PX = 1100
 CONTOURS_M = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
-MOST_CONTOURS = 5
+MAX_CONTOURS = 5
 CONTOUR_SAMPLES = 90
 """Along the longer side of the top view, where the standard deviation is computed."""
-GRID, CONTOUR = '#117733', '#aa0044'
+GRID_COLOUR, CONTOUR_COLOUR = '#117733', '#aa0044'
 X_AXIS, Y_AXIS = '#cc3311', '#0055aa'
-LETTERS_SHARE = 0.06
+LABEL_SPACING_FRACTION = 0.06
 """Of the image's width: least distance between two marks in it."""
 
 
-def ground_grid(scene: Scene) -> Figure | None:
+def ground_grid(scene: ReportScene) -> Figure | None:
     """Draw a grid of equal squares on the road over the distorted image, with its metres along two lines."""
     calibration = scene.calibration
     if calibration is None or calibration.ground is None:
         return None
     camera, ground = calibration.camera, calibration.ground
-    points = traffic_on_road(scene)
+    points = tracked_road_points(scene)
     if not len(points):
         view = TopView.of_image(camera, ground, 2)
         if view is None:
@@ -66,27 +66,27 @@ def ground_grid(scene: Scene) -> Figure | None:
     step = grid_step(ground)
     middle = np.round(np.median(points, axis=0) / step) * step
     figure, axes = image_axes(scene, fade=0.15)
-    lines = road_lines(camera, ground, grid_lines(middle, step))
-    draw_paths(axes, lines, WHITE, width=2.0, alpha=0.5)
-    draw_paths(axes, lines, GRID, f'squares of {length_words(step, ground)}', width=0.9, alpha=0.9)
+    lines = project_road_lines(camera, ground, grid_lines(middle, step))
+    plot_paths(axes, lines, WHITE, width=2.0, alpha=0.5)
+    plot_paths(axes, lines, GRID_COLOUR, f'squares of {format_length(step, ground)}', width=0.9, alpha=0.9)
     taken: list[np.ndarray] = []
     for index, name in enumerate(('x: along the main traffic', 'y: to its left')):
         colour = (X_AXIS, Y_AXIS)[index]
         arm = np.linspace([*middle, 0], [*(middle + step * np.eye(2)[index]), 0], 20)
-        draw_paths(axes, road_lines(camera, ground, [arm]), colour, f'{name}, {unit(ground)}', width=4)
+        plot_paths(axes, project_road_lines(camera, ground, [arm]), colour, f'{name}, {length_unit(ground)}', width=4)
         _mark(axes, scene, middle, index, step, colour, taken)
     draw_legend(axes)
     return figure
 
 
-def _mark(axes: Axes, scene: Scene, middle: np.ndarray, index: int, step: float, colour: str,
+def _mark(axes: Axes, scene: ReportScene, middle: np.ndarray, index: int, step: float, colour: str,
           taken: list[np.ndarray]) -> None:
     """Write the coordinate where the grid crosses one of its middle lines, nearest first, where there is room."""
     camera, ground = scene.calibration.camera, scene.calibration.ground
     for offset in sorted(np.arange(-8, 9), key=abs):
         place = middle + offset * step * np.eye(2)[index]
         (pixel,) = ground_to_image(camera, ground, np.array([[*place, 0.0]]))
-        room = LETTERS_SHARE * camera.width
+        room = LABEL_SPACING_FRACTION * camera.width
         low, high = np.array([0.5, 0.3]) * room, np.array([camera.width, camera.height]) - np.array([0.5, 0.3]) * room
         inside = np.isfinite(pixel).all() and (pixel > low).all() and (pixel < high).all()
         if not inside or any(np.hypot(*(pixel - other)) < room for other in taken):
@@ -96,25 +96,25 @@ def _mark(axes: Axes, scene: Scene, middle: np.ndarray, index: int, step: float,
                   bbox={'boxstyle': 'square,pad=0.1', 'facecolor': WHITE, 'edgecolor': 'none', 'alpha': 0.8})
 
 
-def traffic_on_road(scene: Scene) -> np.ndarray:
+def tracked_road_points(scene: ReportScene) -> np.ndarray:
     """Return tracked points on the road that are not too far away, shape (n, 2)."""
-    return near_on_road(scene.calibration.camera, scene.calibration.ground, scene.evidence.points_px)
+    return nearby_road_points(scene.calibration.camera, scene.calibration.ground, scene.evidence.points_px)
 
 
-def top_view(scene: Scene) -> Figure | None:
+def top_view(scene: ReportScene) -> Figure | None:
     """Show the road from above, the main traffic to the right, with a scale and how sure places on it are."""
     if scene.calibration is None or scene.calibration.ground is None:
         return None
     camera, ground = scene.calibration.camera, scene.calibration.ground
-    view = TopView.around(traffic_on_road(scene), ground, TOP_VIEW_PX) or TopView.of_image(camera, ground, TOP_VIEW_PX)
+    view = TopView.around(tracked_road_points(scene), ground, TOP_VIEW_PX) or TopView.of_image(camera, ground, TOP_VIEW_PX)
     if view is None:
         return None
-    figure, axes = plan(view, ground)
+    figure, axes = ground_axes(view, ground)
     if scene.background is not None:
         axes.imshow(faded_rgb(resample(scene.background, view.sources(camera, ground)), 0.1),
                     extent=(view.low_m[0], view.high_m[0], view.low_m[1], view.high_m[1]), interpolation='bilinear')
     for _, label, tracks in scene.groups():
-        draw_paths(axes, [image_to_ground(camera, ground, path) for path in tracks], label_colour(label), width=0.7,
+        plot_paths(axes, [image_to_ground(camera, ground, path) for path in tracks], label_colour(label), width=0.7,
                    alpha=0.35)
     _draw_contours(axes, scene, view)
     _draw_scale(axes, view, ground)
@@ -124,7 +124,7 @@ def top_view(scene: Scene) -> Figure | None:
     return figure
 
 
-def plan(view: TopView, ground: GroundPlane, below_in: float = 0.0) -> tuple[Figure, Axes]:
+def ground_axes(view: TopView, ground: GroundPlane, below_in: float = 0.0) -> tuple[Figure, Axes]:
     """Return a figure with axes of the ground frame, with `below_in` inches of room under it."""
     (low_x, low_y), (high_x, high_y) = view.low_m, view.high_m
     width_in = WIDTH_IN - LEFT_IN - EDGE_IN
@@ -133,14 +133,14 @@ def plan(view: TopView, ground: GroundPlane, below_in: float = 0.0) -> tuple[Fig
     figure = Figure(figsize=(WIDTH_IN, height_in), dpi=DPI)
     axes = figure.add_axes((LEFT_IN / WIDTH_IN, (BELOW_IN + below_in) / height_in, width_in / WIDTH_IN,
                             shown_in / height_in))
-    axes.set_facecolor(PAPER)
+    axes.set_facecolor(PANEL_COLOUR)
     axes.set(xlim=(low_x, high_x), ylim=(low_y, high_y), aspect='equal')
-    axes.set_xlabel(f'x, along the main traffic, {unit(ground)}', color=INK)
-    axes.set_ylabel(f'y, {unit(ground)}', color=INK)
+    axes.set_xlabel(f'x, along the main traffic, {length_unit(ground)}', color=INK)
+    axes.set_ylabel(f'y, {length_unit(ground)}', color=INK)
     return figure, axes
 
 
-def place_sigma_m(scene: Scene, points_m: np.ndarray) -> np.ndarray | None:
+def position_sigma_m(scene: ReportScene, points_m: np.ndarray) -> np.ndarray | None:
     """Return one sigma in metres of places (n, 2) on the road, nan outside the image; None where it is not told."""
     calibration = scene.calibration
     if not calibration.ground.metric or calibration.covariance is None:
@@ -152,38 +152,38 @@ def place_sigma_m(scene: Scene, points_m: np.ndarray) -> np.ndarray | None:
     return None if sigma is None else np.where(inside, sigma, np.nan)
 
 
-def told_of_places(scene: Scene) -> str:
+def accuracy_note(scene: ReportScene) -> str:
     """Say what the contours are, or that there are none."""
     if scene.calibration.ground.metric and scene.calibration.covariance is not None:
         return 'Dashed lines: how sure a place on the road is, by lens, pose and scale together.'
     return 'How sure places are is not told for this result.'
 
 
-def _draw_contours(axes: Axes, scene: Scene, view: TopView) -> None:
+def _draw_contours(axes: Axes, scene: ReportScene, view: TopView) -> None:
     """Draw where a place on the road is known to so many metres."""
     size = np.array([view.columns, view.rows])
     x, y = (np.linspace(view.low_m[axis], view.high_m[axis], count)
             for axis, count in enumerate(np.maximum(CONTOUR_SAMPLES * size // size.max(), 2)))
-    sigma = place_sigma_m(scene, np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
+    sigma = position_sigma_m(scene, np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
     if sigma is None or not np.isfinite(sigma).any():
         return
     low, high = np.nanquantile(sigma, [0.01, 0.99])
-    levels = [level for level in CONTOURS_M if low < level < high][-MOST_CONTOURS:]
+    levels = [level for level in CONTOURS_M if low < level < high][-MAX_CONTOURS:]
     if not levels:
         return
-    lines = axes.contour(x, y, np.ma.masked_invalid(sigma.reshape(len(y), len(x))), levels=levels, colors=CONTOUR,
+    lines = axes.contour(x, y, np.ma.masked_invalid(sigma.reshape(len(y), len(x))), levels=levels, colors=CONTOUR_COLOUR,
                          linewidths=1.4, linestyles='dashed')
     for letters in axes.clabel(lines, fmt='± %g m', fontsize=9, inline=False):
         letters.set_path_effects(HALO)
-    axes.plot([], [], '--', color=CONTOUR, linewidth=1.4, label='a place is known to (1 sigma)')
+    axes.plot([], [], '--', color=CONTOUR_COLOUR, linewidth=1.4, label='a place is known to (1 sigma)')
 
 
 def _draw_scale(axes: Axes, view: TopView, ground: GroundPlane) -> None:
     low, high = np.array(view.low_m), np.array(view.high_m)
-    length = nice_length(0.2 * (high[0] - low[0]))
+    length = round_length(0.2 * (high[0] - low[0]))
     begin = low + 0.04 * (high - low)
     axes.plot([begin[0], begin[0] + length], [begin[1]] * 2, color=WHITE, linewidth=7, solid_capstyle='butt')
     axes.plot([begin[0], begin[0] + length], [begin[1]] * 2, color=INK, linewidth=4, solid_capstyle='butt')
-    axes.text(begin[0], begin[1] + 0.025 * (high[1] - low[1]), length_words(length, ground), va='bottom', color=INK,
+    axes.text(begin[0], begin[1] + 0.025 * (high[1] - low[1]), format_length(length, ground), va='bottom', color=INK,
               bbox={'boxstyle': 'round,pad=0.2', 'facecolor': WHITE, 'edgecolor': 'none',
                                             'alpha': 0.8})

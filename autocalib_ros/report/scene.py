@@ -13,11 +13,11 @@ from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
 from autocalib_ros.results.calibration import Calibration, Refusal
 
 NOT_USED, REJECTED = -1, -2
-MOST_MOMENTS = 64
+MAX_SNAPSHOTS = 64
 
 
 @dataclass(frozen=True)
-class Moment:
+class SolutionSnapshot:
     """What a solution said when it was tried."""
 
     seconds: float
@@ -30,7 +30,7 @@ class Moment:
     """Of the refusal, '' for a calibration."""
 
     @classmethod
-    def of(cls, result: Calibration | Refusal) -> Moment:
+    def of(cls, result: Calibration | Refusal) -> SolutionSnapshot:
         """Take down what a result says."""
         seconds = result.evidence.seconds
         if isinstance(result, Refusal):
@@ -40,15 +40,15 @@ class Moment:
         return cls(seconds, result.camera.focal_px, sigma.focal_px, tilt, sigma.tilt_deg)
 
 
-def noted(moments: tuple[Moment, ...], result: Calibration | Refusal) -> tuple[Moment, ...]:
+def append_snapshot(moments: tuple[SolutionSnapshot, ...], result: Calibration | Refusal) -> tuple[SolutionSnapshot, ...]:
     """Add a result to those before; of many every second one goes, and of two at one time the older."""
-    latest = Moment.of(result)
+    latest = SolutionSnapshot.of(result)
     kept = tuple(moment for moment in moments if moment.seconds < latest.seconds)
-    return (*(kept if len(kept) < MOST_MOMENTS else kept[::2]), latest)
+    return (*(kept if len(kept) < MAX_SNAPSHOTS else kept[::2]), latest)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scene:
+class ReportScene:
     """What a report is about."""
 
     result: Calibration | Refusal
@@ -60,7 +60,7 @@ class Scene:
     source: str
     """Name of the recording or of the camera."""
     accepted_at_s: float | None = None
-    moments: tuple[Moment, ...] = ()
+    moments: tuple[SolutionSnapshot, ...] = ()
 
     @property
     def calibration(self) -> Calibration | None:
@@ -92,8 +92,8 @@ class Scene:
     @property
     def turning_px(self) -> np.ndarray:
         """Points of vehicles that turn which the solution rests on, pixels (n, 2)."""
-        told = self.result.figures.residuals
-        return told.points_px[told.roads < 0]
+        found = self.result.figures.residuals
+        return found.points_px[found.roads < 0]
 
     def groups(self) -> list[tuple[str, int, list[np.ndarray]]]:
         """Name, label and tracks of what follows each road; all as not used where none is known to follow any."""

@@ -6,11 +6,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from autocalib_ros.report.canvas import INK, MUTED, chart, draw_legend, road_colour
-from autocalib_ros.report.scene import Moment, Scene
+from autocalib_ros.report.canvas import INK, MUTED_COLOUR, chart, draw_legend, road_colour
+from autocalib_ros.report.scene import ReportScene, SolutionSnapshot
 
 
-def settling(scene: Scene) -> Figure | None:
+def settling(scene: ReportScene) -> Figure | None:
     """Draw focal length and tilt of the solutions that were tried on the way, with one sigma."""
     found = [moment for moment in scene.moments if moment.focal_px is not None]
     if len(scene.moments) < 2 or not found:
@@ -31,11 +31,11 @@ def _draw(axes: Axes, rows: list[tuple[float, float, float | None]], label: str,
     known = np.array([np.nan if sigma is None else sigma for sigma in sigmas])
     axes.errorbar(seconds, values, np.nan_to_num(known), fmt='o-', color=colour, capsize=4, linewidth=1.2,
                   label='accepted, ± 1 sigma' if np.isfinite(known).any() else 'accepted')
-    axes.axhline(values[-1], color=MUTED, linewidth=0.8)
+    axes.axhline(values[-1], color=MUTED_COLOUR, linewidth=0.8)
     axes.set_ylabel(label, color=INK)
 
 
-def _draw_refusals(panels: list[Axes], moments: tuple[Moment, ...]) -> None:
+def _draw_refusals(panels: list[Axes], moments: tuple[SolutionSnapshot, ...]) -> None:
     refused = [moment.seconds for moment in moments if moment.focal_px is None]
     for axes in panels:
         axes.set_xlim(0, 1.05 * moments[-1].seconds)

@@ -10,24 +10,24 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from autocalib_ros.pictures.views import FARTHEST_HEIGHTS, TopView, image_to_ground, nice_length
+from autocalib_ros.pictures.views import MAX_DISTANCE_HEIGHTS, TopView, image_to_ground, round_length
 from autocalib_ros.report.canvas import BAR_ROOM_IN, INK, chart, colour_bar, draw_legend, label_colour
-from autocalib_ros.report.road_figures import TOP_VIEW_PX, plan
-from autocalib_ros.report.scene import NOT_USED, Scene
+from autocalib_ros.report.road_figures import TOP_VIEW_PX, ground_axes
+from autocalib_ros.report.scene import NOT_USED, ReportScene
 
 KM_H = 3.6
-PIECE_S = 0.5
+CHORD_S = 0.5
 """Speeds are of the chord over so long: noise hardly lengthens it, a bend hardly shortens it."""
-LEAST_S = 1.0
+MIN_TRACK_S = 1.0
 """A track that was seen on the road for a shorter time tells no speed."""
-FASTEST = 0.98
+SCALE_QUANTILE = 0.98
 """Share of the pieces, and of the vehicles, that the scales reach to."""
-LEAST_BINS = 15
+MIN_BINS = 15
 
 
 @dataclass(frozen=True)
-class Pieces:
-    """Tracks on the ground plane in pieces of `PIECE_S`."""
+class TrackPieces:
+    """Tracks on the ground plane in pieces of `CHORD_S`."""
 
     points: list[np.ndarray]
     """Of each piece, shape (n, 2), metres, or heights of the camera."""
@@ -39,13 +39,13 @@ class Pieces:
     """Index of the track in the evidence, shape (pieces,)."""
 
 
-def point_height(scene: Scene) -> float:
+def point_height(scene: ReportScene) -> float:
     """Return the share of the camera's height at which tracked points are taken to be."""
     ground = scene.calibration.ground
     return min(scene.options.scale.point_height_m / ground.height_m, 0.5) if ground.metric else 0.0
 
 
-def pieces_on_road(scene: Scene) -> Pieces | None:
+def track_pieces_on_road(scene: ReportScene) -> TrackPieces | None:
     """Lay the tracks on the plane in which tracked points are, and tell their speeds; None where there are none."""
     if scene.calibration is None or scene.calibration.ground is None:
         return None
@@ -55,11 +55,11 @@ def pieces_on_road(scene: Scene) -> Pieces | None:
     points, times, tracks = [], [], []
     for index in range(evidence.track_count):
         part = slice(evidence.track_starts[index], evidence.track_starts[index + 1])
-        near = np.hypot(*everywhere[part].T) < FARTHEST_HEIGHTS * ground.height_m
+        near = np.hypot(*everywhere[part].T) < MAX_DISTANCE_HEIGHTS * ground.height_m
         way, times_s = everywhere[part][near], evidence.times_s[part][near]
-        if len(way) < 2 or times_s[-1] - times_s[0] < LEAST_S:
+        if len(way) < 2 or times_s[-1] - times_s[0] < MIN_TRACK_S:
             continue
-        ends = np.linspace(times_s[0], times_s[-1], int((times_s[-1] - times_s[0]) / PIECE_S) + 1)
+        ends = np.linspace(times_s[0], times_s[-1], int((times_s[-1] - times_s[0]) / CHORD_S) + 1)
         at = np.unique(np.searchsorted(times_s, ends).clip(max=len(way) - 1))
         for begin, end in zip(at[:-1], at[1:], strict=True):
             points.append(way[begin:end + 1])
@@ -69,10 +69,10 @@ def pieces_on_road(scene: Scene) -> Pieces | None:
         return None
     lengths = np.array([np.hypot(*(piece[-1] - piece[0])) for piece in points])
     speeds = lengths / np.array(times) * (KM_H if ground.metric else 1.0)
-    return Pieces(points, lengths, speeds, np.array(tracks))
+    return TrackPieces(points, lengths, speeds, np.array(tracks))
 
 
-def by_vehicle(scene: Scene, pieces: Pieces) -> tuple[np.ndarray, np.ndarray]:
+def vehicle_speeds(scene: ReportScene, pieces: TrackPieces) -> tuple[np.ndarray, np.ndarray]:
     """Return the speed (vehicles,) of each vehicle, and the road (vehicles,) of most of its tracks.
 
     As loops along the way would count: each metre weighs alike, so that waiting does not count.
@@ -89,32 +89,32 @@ def by_vehicle(scene: Scene, pieces: Pieces) -> tuple[np.ndarray, np.ndarray]:
     return speeds, roads
 
 
-def speeds_above(scene: Scene) -> Figure | None:
+def speeds_above(scene: ReportScene) -> Figure | None:
     """Draw the tracks from above, coloured by speed."""
-    pieces = pieces_on_road(scene)
+    pieces = track_pieces_on_road(scene)
     if pieces is None:
         return None
     ground = scene.calibration.ground
     view = TopView.around(np.concatenate(pieces.points), ground, TOP_VIEW_PX)
-    figure, axes = plan(view, ground, below_in=BAR_ROOM_IN)
+    figure, axes = ground_axes(view, ground, below_in=BAR_ROOM_IN)
     lines = LineCollection(pieces.points, array=pieces.speeds, cmap='viridis', linewidths=0.9, alpha=0.8,
-                           norm=Normalize(0, max(np.quantile(pieces.speeds, FASTEST), 1e-3)))
+                           norm=Normalize(0, max(np.quantile(pieces.speeds, SCALE_QUANTILE), 1e-3)))
     axes.add_collection(lines, autolim=False)
     colour_bar(figure, lines, f'speed, {speed_unit(scene)}', exceeded=True)
     return figure
 
 
-def speed_histogram(scene: Scene) -> Figure | None:
+def speed_histogram(scene: ReportScene) -> Figure | None:
     """Draw how many vehicles went how fast on each road."""
-    pieces = pieces_on_road(scene)
+    pieces = track_pieces_on_road(scene)
     if pieces is None:
         return None
-    speeds, roads = by_vehicle(scene, pieces)
+    speeds, roads = vehicle_speeds(scene, pieces)
     named = scene.roads if scene.result.method == 'joint' else range(0)  # the published method tells no roads apart
     roads = roads if named else np.full(len(roads), NOT_USED)
     figure, (axes,) = chart(3.2)
-    fastest = max(1.2 * np.quantile(speeds, FASTEST), 1e-3)
-    bin_width = nice_length(fastest / LEAST_BINS)
+    fastest = max(1.2 * np.quantile(speeds, SCALE_QUANTILE), 1e-3)
+    bin_width = round_length(fastest / MIN_BINS)
     edges = bin_width * np.arange(np.ceil(fastest / bin_width) + 1)
     digits = 0 if scene.calibration.ground.metric else 2
     most = 1
@@ -135,12 +135,12 @@ def speed_histogram(scene: Scene) -> Figure | None:
     return figure
 
 
-def speed_unit(scene: Scene) -> str:
+def speed_unit(scene: ReportScene) -> str:
     """Return the unit of speeds."""
     return 'km/h' if scene.calibration.ground.metric else 'camera heights a second'
 
 
-def told_of_speeds(scene: Scene) -> str:
+def speed_note(scene: ReportScene) -> str:
     """Say what the speeds rest on."""
     ground, given = scene.calibration.ground, scene.options.scale
     if not ground.metric:

@@ -16,7 +16,7 @@ from autocalib_ros.results.calibration import GROUND_DISTANCES_M, Calibration, R
 
 
 @dataclass(frozen=True)
-class Row:
+class TableRow:
     """One number with its name, its standard deviation and what it means; all as text."""
 
     name: str
@@ -60,73 +60,73 @@ def _sentence(text: str) -> str:
     return text if not text or text[-1] in '.!?' else text + '.'
 
 
-def number_rows(result: Calibration | Refusal, accepted_at_s: float | None = None) -> list[Row]:
+def number_rows(result: Calibration | Refusal, accepted_at_s: float | None = None) -> list[TableRow]:
     """List what is known: the lens, the ground plane, the evidence."""
     rows = [] if isinstance(result, Refusal) else [*_lens_rows(result), *_ground_rows(result), *_paper_rows(result)]
     return rows + _evidence_rows(result, accepted_at_s)
 
 
-def _lens_rows(result: Calibration) -> list[Row]:
+def _lens_rows(result: Calibration) -> list[TableRow]:
     camera, sigma = result.camera, result.stddev
     cx, cy = camera.principal_point_px
     point = '' if sigma.principal_point_px is None else '{:.2f}, {:.2f}'.format(*sigma.principal_point_px)
     across, down = field_of_view_deg(camera)
-    coefficients = [Row(f'k{index}', f'{value:.5f}', _number(sigma.k1, 5) if index == 1 else '')
+    coefficients = [TableRow(f'k{index}', f'{value:.5f}', _number(sigma.k1, 5) if index == 1 else '')
                     for index, value in enumerate(camera.k, start=1)]
-    return [Row('focal length', f'{camera.focal_px:.2f} px', _number(sigma.focal_px, 2)),
-            Row('principal point', f'{cx:.2f}, {cy:.2f} px', point),
+    return [TableRow('focal length', f'{camera.focal_px:.2f} px', _number(sigma.focal_px, 2)),
+            TableRow('principal point', f'{cx:.2f}, {cy:.2f} px', point),
             *[row for row, value in zip(coefficients, camera.k, strict=True) if value or row.name == 'k1'],
-            Row('field of view', f'{across:.1f} x {down:.1f} degrees', note='between the middles of opposite borders')]
+            TableRow('field of view', f'{across:.1f} x {down:.1f} degrees', note='between the middles of opposite borders')]
 
 
-def _ground_rows(result: Calibration) -> list[Row]:
+def _ground_rows(result: Calibration) -> list[TableRow]:
     if result.ground is None:
         return []
     down, roll = tilt_and_roll_deg(result.ground.normal_in_camera)
     height = f'{result.ground.height_m:.2f} m' if result.ground.metric else '1 (unit)'
     note = next((text for text in result.assumptions if text.startswith('scale by ')), '')
-    return [Row('camera height', height, _number(result.stddev.height_m, 2), note),
-            Row('looks down by', f'{down:.2f} degrees', _number(result.stddev.tilt_deg, 2)),
-            Row('rolled by', f'{roll:.2f} degrees', _number(result.stddev.roll_deg, 2)),
-            *[Row(f'road {distance:g} m ahead', 'on the road', f'{sigma:.2f} m', 'of where a pixel meets it')
+    return [TableRow('camera height', height, _number(result.stddev.height_m, 2), note),
+            TableRow('looks down by', f'{down:.2f} degrees', _number(result.stddev.tilt_deg, 2)),
+            TableRow('rolled by', f'{roll:.2f} degrees', _number(result.stddev.roll_deg, 2)),
+            *[TableRow(f'road {distance:g} m ahead', 'on the road', f'{sigma:.2f} m', 'of where a pixel meets it')
               for distance, sigma in zip(GROUND_DISTANCES_M, result.stddev.ground_point_m, strict=False)
               if sigma is not None]]
 
 
-def _paper_rows(result: Calibration) -> list[Row]:
+def _paper_rows(result: Calibration) -> list[TableRow]:
     if result.paper is None:
         return []
     before, after = result.paper.straightness_px2
-    return [Row("the paper's focal length", f'{result.paper.focal_px:.1f} px', note='Jain & Saunier, for comparison'),
-            Row("the paper's polynomial", ', '.join(f'{value:.4f}' for value in result.paper.polynomial_k),
+    return [TableRow("the paper's focal length", f'{result.paper.focal_px:.1f} px', note='Jain & Saunier, for comparison'),
+            TableRow("the paper's polynomial", ', '.join(f'{value:.4f}' for value in result.paper.polynomial_k),
                 note='k1, k2, k3 of x_u / x_d - 1; distorted to undistorted'),
-            Row('straightness', f'{before:.3g} before, {after:.3g} after, px²', note='mean squared line-fit error')]
+            TableRow('straightness', f'{before:.3g} before, {after:.3g} after, px²', note='mean squared line-fit error')]
 
 
-def file_rows(result: Calibration | Refusal, evidence: Evidence) -> list[Row]:
+def file_rows(result: Calibration | Refusal, evidence: Evidence) -> list[TableRow]:
     """List what programs read in the files, and how the solution was made."""
-    rows = [Row('background moved by', f'{evidence.drift_px:.2f} px', note='at most'), Row('method', result.method)]
+    rows = [TableRow('background moved by', f'{evidence.drift_px:.2f} px', note='at most'), TableRow('method', result.method)]
     if isinstance(result, Refusal):
         return rows
-    rows.append(Row('grade', result.grade))
+    rows.append(TableRow('grade', result.grade))
     residuals = result.figures.residuals
     if len(residuals.distance_px):
-        rows.append(Row('residual', f'{np.median(residuals.distance_px):.2f} px', note='median of all points used'))
-    rows += [Row(f'direction of road {index}', _list(direction, 4), note='in the camera: x right, y down, z forward')
+        rows.append(TableRow('residual', f'{np.median(residuals.distance_px):.2f} px', note='median of all points used'))
+    rows += [TableRow(f'direction of road {index}', _list(direction, 4), note='in the camera: x right, y down, z forward')
              for index, direction in enumerate(result.road_directions, start=1)]
     info = result.camera_info
-    rows += [Row('distortion_model', info.distortion_model), Row('camera_info K', _list(info.k, 2)),
-             Row('camera_info D', _list(info.d, 6)), Row('camera_info P', _list(info.p, 2))]
+    rows += [TableRow('distortion_model', info.distortion_model), TableRow('camera_info K', _list(info.k, 2)),
+             TableRow('camera_info D', _list(info.d, 6)), TableRow('camera_info P', _list(info.p, 2))]
     if result.ground is not None:
-        rows += [Row('ground_from_camera', f'{_list(result.ground.rotation_xyzw, 6)}', note='quaternion x, y, z, w'),
-                 Row('camera in the ground frame', f'{_list(result.ground.translation_m, 3)}'
+        rows += [TableRow('ground_from_camera', f'{_list(result.ground.rotation_xyzw, 6)}', note='quaternion x, y, z, w'),
+                 TableRow('camera in the ground frame', f'{_list(result.ground.translation_m, 3)}'
                      + (' m' if result.ground.metric else ''))]
     paper = result.paper
     if paper is not None and paper.focal_from_vanishing_points_px is not None:
-        rows.append(Row("the paper's f_new", f'{paper.focal_from_vanishing_points_px:.1f} px',
+        rows.append(TableRow("the paper's f_new", f'{paper.focal_from_vanishing_points_px:.1f} px',
                         note='by its two vanishing points'))
     if paper is not None and paper.translation_m is not None:
-        rows.append(Row("the paper's t", _list(paper.translation_m, 3)))
+        rows.append(TableRow("the paper's t", _list(paper.translation_m, 3)))
     return rows
 
 
@@ -134,14 +134,14 @@ def _list(values: Iterable[float], digits: int) -> str:
     return ', '.join(f'{value:.{digits}f}' for value in values)
 
 
-def _evidence_rows(result: Calibration | Refusal, accepted_at_s: float | None) -> list[Row]:
+def _evidence_rows(result: Calibration | Refusal, accepted_at_s: float | None) -> list[TableRow]:
     evidence = result.evidence
     people = f' and {evidence.people} people' if evidence.people else ''
-    rows = [Row('recording', f'{evidence.seconds:.1f} s, {evidence.frames} images'),
-            Row('traffic', f'{evidence.tracks} tracks of {evidence.vehicles} vehicles{people}, '
+    rows = [TableRow('recording', f'{evidence.seconds:.1f} s, {evidence.frames} images'),
+            TableRow('traffic', f'{evidence.tracks} tracks of {evidence.vehicles} vehicles{people}, '
                            f'{evidence.segments} segments'),
-            Row('coverage', f'{100 * evidence.coverage:.0f} % of the image')]
-    return rows + ([] if accepted_at_s is None else [Row('accepted after', f'{accepted_at_s:.1f} s')])
+            TableRow('coverage', f'{100 * evidence.coverage:.0f} % of the image')]
+    return rows + ([] if accepted_at_s is None else [TableRow('accepted after', f'{accepted_at_s:.1f} s')])
 
 
 def _number(value: float | None, digits: int) -> str:
@@ -161,8 +161,8 @@ def how_sure(result: Calibration | Refusal) -> str:
         parts.append(f'focal length ± {100 * sigma.focal_px / result.camera.focal_px:.2g} %')
     if sigma.tilt_deg is not None and sigma.roll_deg is not None:
         parts.append(f'tilt ± {sigma.tilt_deg:.2f} and roll ± {sigma.roll_deg:.2f} degrees')
-    places = [f'± {told:.2f} m at {distance:g} m' for distance, told in zip(
-        GROUND_DISTANCES_M, sigma.ground_point_m, strict=False) if told is not None]
+    places = [f'± {sigma_m:.2f} m at {distance:g} m' for distance, sigma_m in zip(
+        GROUND_DISTANCES_M, sigma.ground_point_m, strict=False) if sigma_m is not None]
     parts += [f'a place on the road {", ".join(places)}'] if places else []
     return _sentence(_capital('; '.join(parts))) + ' (One standard deviation: two results in three are closer.)'
 
@@ -183,7 +183,7 @@ def next_step(result: Calibration | Refusal) -> str:
 
 
 @dataclass(frozen=True)
-class Need:
+class Requirement:
     """One thing that a calibration needs, what was found of it, and whether that was enough."""
 
     name: str
@@ -192,7 +192,7 @@ class Need:
     met: bool
 
 
-CODES = {
+MISSING_BY_CODE = {
     'camera_moving': 'a camera that stands still', 'no_motion': 'traffic', 'too_few_tracks': 'tracks that are long',
     'poor_coverage': 'traffic in enough of the image', 'one_direction': 'traffic in two directions, or that turns',
     'no_direction': 'tracks along a common direction', 'no_agreement': 'agreement of the traffic',
@@ -202,21 +202,21 @@ CODES = {
 """What was missing, by the code of the refusal."""
 
 
-def needs(result: Calibration | Refusal, evidence: Evidence, gate: GateOptions) -> list[Need]:
+def needs(result: Calibration | Refusal, evidence: Evidence, gate: GateOptions) -> list[Requirement]:
     """List what a calibration needs of the traffic and what stopped this one; nothing where nothing is missing."""
     refusal = result if isinstance(result, Refusal) else result.ground_refusal
     if refusal is None:
         return []
     limit = drift_limit_px(evidence.image_size[0], gate)
     counted = (
-        (('camera_moving',), Need('the camera stands still', f'the background moved by {evidence.drift_px:.1f} px',
+        (('camera_moving',), Requirement('the camera stands still', f'the background moved by {evidence.drift_px:.1f} px',
                                   f'{limit:.1f} px at the most', evidence.drift_px <= limit)),
-        (('no_motion', 'too_few_tracks'), Need('tracks of moving traffic', f'{evidence.track_count}',
+        (('no_motion', 'too_few_tracks'), Requirement('tracks of moving traffic', f'{evidence.track_count}',
                                                f'{gate.min_tracks} or more', evidence.track_count >= gate.min_tracks)),
-        (('poor_coverage',), Need('image crossed by traffic', f'{100 * evidence.coverage:.0f} %',
+        (('poor_coverage',), Requirement('image crossed by traffic', f'{100 * evidence.coverage:.0f} %',
                                   f'{100 * gate.min_coverage:.0f} % or more', evidence.coverage >= gate.min_coverage)))
     rows = [need for _, need in counted]
     if any(refusal.code in codes and not need.met for codes, need in counted):
         return rows
-    return [*rows, Need(CODES.get(refusal.code, refusal.code.replace('_', ' ')), _sentence(_capital(refusal.message)),
+    return [*rows, Requirement(MISSING_BY_CODE.get(refusal.code, refusal.code.replace('_', ' ')), _sentence(_capital(refusal.message)),
                         '', False)]

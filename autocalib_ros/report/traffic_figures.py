@@ -7,17 +7,17 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
 from autocalib_ros.evidence.snapshot import COVERAGE_CELLS
-from autocalib_ros.report.canvas import TURNING, cell_map, draw_legend, draw_paths, image_axes, label_colour
-from autocalib_ros.report.scene import NOT_USED, REJECTED, Scene
+from autocalib_ros.report.canvas import TURNING_COLOUR, cell_map, draw_legend, image_axes, label_colour, plot_paths
+from autocalib_ros.report.scene import NOT_USED, REJECTED, ReportScene
 
 
-def all_tracks(scene: Scene) -> Figure | None:
+def all_tracks(scene: ReportScene) -> Figure | None:
     """Draw every trajectory over the road; the road alone where there is none."""
     if scene.background is None and not scene.evidence.track_count:
         return None
     figure, axes = image_axes(scene)
     paths = [track.points_px for track in scene.evidence.tracks()]
-    draw_paths(axes, paths, '#3355bb', f'{len(paths)} trajectories', width=0.9, alpha=0.55)
+    plot_paths(axes, paths, '#3355bb', f'{len(paths)} trajectories', width=0.9, alpha=0.55)
     if paths:
         ends = np.array([path[-1] for path in paths])
         axes.plot(*ends.T, '.', color='#1b2f77', markersize=2.5, label='where each ends')
@@ -25,23 +25,23 @@ def all_tracks(scene: Scene) -> Figure | None:
     return figure
 
 
-def kept_tracks(scene: Scene) -> Figure | None:
+def kept_tracks(scene: ReportScene) -> Figure | None:
     """Draw the trajectories in the colour of their road, and what turns; None when nothing was kept."""
     if not scene.roads and not len(scene.turning_px):
         return None
     figure, axes = image_axes(scene)
     for label in (NOT_USED, REJECTED, *scene.roads):
         paths, used = scene.paths(label), label >= 0
-        draw_paths(axes, paths, label_colour(label),
+        plot_paths(axes, paths, label_colour(label),
                    f'{scene.road_name(label)}: {len(paths)}', width=1.0 if used else 0.7, alpha=0.7 if used else 0.5)
     if len(scene.turning_px):
-        axes.plot(*scene.turning_px.T, '.', color=TURNING, markersize=2,
+        axes.plot(*scene.turning_px.T, '.', color=TURNING_COLOUR, markersize=2,
                   label=f'on vehicles that turn: {len(scene.turning_px)} points')
     draw_legend(axes)
     return figure
 
 
-def coverage(scene: Scene) -> Figure | None:
+def coverage(scene: ReportScene) -> Figure | None:
     """Colour the cells of the image by how many tracks have crossed each; cells without any stay as they are."""
     evidence = scene.evidence
     if not evidence.track_count:
@@ -55,7 +55,7 @@ def coverage(scene: Scene) -> Figure | None:
     return cell_map(scene, np.ma.masked_equal(counts, 0), LogNorm(1, max(counts.max(), 10)), 'trajectories in a cell')
 
 
-def told_of_coverage(scene: Scene) -> str:
+def coverage_note(scene: ReportScene) -> str:
     """Say how much of the image is covered, and how much has to be."""
     least = scene.options.gate.min_coverage
     return f'Here {100 * scene.evidence.coverage:.0f} % of the image; {100 * least:.0f} % is the least.'

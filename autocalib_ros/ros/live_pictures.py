@@ -27,7 +27,7 @@ from autocalib_ros.calibrator import Progress
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.perception.ignore_regions import Polygons, black_out
 from autocalib_ros.pictures.drawing import Caption
-from autocalib_ros.pictures.live_overlay import DebugPicture, JudgedTracks, RectifiedPicture, TopPicture
+from autocalib_ros.pictures.live_overlay import DebugPicture, LabelledTracks, RectifiedPicture, TopPicture
 from autocalib_ros.results.calibration import Calibration, Refusal
 from autocalib_ros.revalidation import CalibrationState
 from autocalib_ros.ros import messages
@@ -67,7 +67,7 @@ class LivePictures:
         self._shot: _Shot | None = None
         self._closed = False
         self._due_s = 0.0
-        self._judged: JudgedTracks | None = None
+        self._judged: LabelledTracks | None = None
         self._debug = _Kept(DebugPicture)
         self._top = _Kept(TopPicture.of)
         self._rectified = _Kept(RectifiedPicture)
@@ -93,7 +93,7 @@ class LivePictures:
     def solution_found(self, result: Calibration | Refusal, evidence: Evidence) -> None:
         """Show from now on what became of the tracks in a solution; a refusal says nothing of them."""
         if isinstance(result, Calibration):
-            self._judged = JudgedTracks(evidence.image_size, evidence.points_px, evidence.track_starts,
+            self._judged = LabelledTracks(evidence.image_size, evidence.points_px, evidence.track_starts,
                                         result.figures.track_labels)
 
     def forget(self) -> None:

@@ -9,8 +9,8 @@ from geometry_msgs.msg import Point
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-from autocalib_ros.pictures.road import Ellipse, Grid, ellipses, enlargement, field_of_view
-from autocalib_ros.pictures.views import length_words
+from autocalib_ros.pictures.road import ErrorEllipse, GroundGrid, enlargement, error_ellipses, view_frustum
+from autocalib_ros.pictures.views import format_length
 from autocalib_ros.results.calibration import Calibration
 from autocalib_ros.ros.log_text import described_numbers
 
@@ -34,11 +34,11 @@ def markers(result: Calibration, ground_frame: str) -> MarkerArray:
     They carry no stamp, which RViz takes for "now": they hold until they are replaced.
     """
     camera, ground = result.camera, result.ground
-    shown, unit_m = ellipses(result), ground.height_m
-    grid = Grid.of(camera, ground)
+    shown, unit_m = error_ellipses(result), ground.height_m
+    grid = GroundGrid.of(camera, ground)
     made = [] if grid is None else [
         _lines('grid', [line[[0, -1]] for line in grid.lines_m], GRID, 0.5 * LINE_SHARE * unit_m)]
-    made.append(_lines('field_of_view', field_of_view(camera, ground), FIELD, LINE_SHARE * unit_m))
+    made.append(_lines('field_of_view', view_frustum(camera, ground), FIELD, LINE_SHARE * unit_m))
     made += _uncertainty(shown, unit_m)
     made.append(_text('state', 0, _words(result, grid, shown), ground.translation_m + [0, 0, 0.5 * unit_m], unit_m))
     for marker in made:
@@ -47,7 +47,7 @@ def markers(result: Calibration, ground_frame: str) -> MarkerArray:
     return MarkerArray(markers=[*no_markers().markers, *made])
 
 
-def _uncertainty(shown: Sequence[Ellipse], unit_m: float) -> Iterator[Marker]:
+def _uncertainty(shown: Sequence[ErrorEllipse], unit_m: float) -> Iterator[Marker]:
     """Yield an ellipse and its words for each distance."""
     factor = enlargement(list(shown))
     for number, ellipse in enumerate(shown):
@@ -61,10 +61,10 @@ def _uncertainty(shown: Sequence[Ellipse], unit_m: float) -> Iterator[Marker]:
                     unit_m)
 
 
-def _words(result: Calibration, grid: Grid | None, shown: Sequence[Ellipse]) -> str:
+def _words(result: Calibration, grid: GroundGrid | None, shown: Sequence[ErrorEllipse]) -> str:
     lines = [f'grade {result.grade}', *described_numbers(result)]
     if grid is not None:
-        lines.append(f'squares of {length_words(grid.step_m, result.ground)}')
+        lines.append(f'squares of {format_length(grid.step_m, result.ground)}')
     factor = enlargement(list(shown))
     if shown:
         lines.append('ellipses: one sigma of a road point' + (f', enlarged {factor} times' if factor > 1 else ''))

@@ -16,7 +16,7 @@ import numpy as np
 from autocalib_ros.config import Options
 from autocalib_ros.evidence.buffer import EvidenceBuffer
 from autocalib_ros.evidence.snapshot import Evidence
-from autocalib_ros.report.scene import Moment, Scene, noted
+from autocalib_ros.report.scene import ReportScene, SolutionSnapshot, append_snapshot
 from autocalib_ros.results.calibration import Calibration, Refusal
 from autocalib_ros.ros.solver_process import NICENESS
 from autocalib_ros.util.threads import use_one_thread_for_linear_algebra
@@ -41,9 +41,9 @@ class Reports:
     def __init__(self, tell: Callable[[str, bool], None]) -> None:
         self._tell = tell
         self._changed = threading.Condition()
-        self._moments: tuple[Moment, ...] = ()
+        self._moments: tuple[SolutionSnapshot, ...] = ()
         self._rests: tuple[Calibration, Evidence] | None = None
-        self._next: tuple[Place, Scene] | None = None
+        self._next: tuple[Place, ReportScene] | None = None
         self._thread: threading.Thread | None = None
         self._process: BaseProcess | None = None
         self._closed = False
@@ -51,7 +51,7 @@ class Reports:
     def solved(self, result: Calibration | Refusal) -> None:
         """Take down what a solution says."""
         with self._changed:
-            self._moments = noted(self._moments, result)
+            self._moments = append_snapshot(self._moments, result)
 
     def rests_on(self, result: Calibration, evidence: Evidence | None) -> None:
         """Keep the evidence of the calibration that is in force from now on."""
@@ -64,7 +64,7 @@ class Reports:
             self._moments, self._rests = (), None
 
     def scene(self, result: Calibration, seen: tuple[Evidence | None, np.ndarray | None], options: Options,
-              source: str) -> Scene:
+              source: str) -> ReportScene:
         """Put together what a report of a calibration shows, with what is `seen` now."""
         evidence, background = seen
         with self._changed:
@@ -73,10 +73,10 @@ class Reports:
             moments = self._moments
         if evidence is None or evidence.image_size != result.evidence.image_size:
             evidence, background = _nothing_seen(result, options), None
-        return Scene(result=result, evidence=evidence, background=background, options=options, source=source,
+        return ReportScene(result=result, evidence=evidence, background=background, options=options, source=source,
                      moments=moments)
 
-    def write(self, place: Place, scene: Scene) -> None:
+    def write(self, place: Place, scene: ReportScene) -> None:
         """Write a report soon."""
         with self._changed:
             if self._closed:
@@ -129,7 +129,7 @@ class Reports:
         return fault
 
 
-def _write(pipe: Connection, place: Place, scene: Scene) -> None:
+def _write(pipe: Connection, place: Place, scene: ReportScene) -> None:
     """Draw and write, behind everything else on the machine, and say what failed."""
     os.nice(NICENESS)
     use_one_thread_for_linear_algebra()

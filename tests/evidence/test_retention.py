@@ -9,7 +9,7 @@ import pytest
 
 from autocalib_ros.config import BufferOptions
 from autocalib_ros.evidence.buffer import EvidenceBuffer
-from autocalib_ros.evidence.retention import ENOUGH_NEWER, headings, kinds, worth
+from autocalib_ros.evidence.retention import REPLACING_VEHICLES, cell_heading_bins, headings, novelty
 from autocalib_ros.evidence.snapshot import Evidence, Segments, Track
 
 HOUR_S = 3600.0
@@ -108,14 +108,14 @@ def test_a_lone_point_is_worth_less_than_a_vehicle() -> None:
 def test_what_is_old_stays_until_enough_newer_replace_it() -> None:
     buffer = EvidenceBuffer(BufferOptions())
     filled(buffer, [drive(0, 0.0, MAIN), drive(1, 10.0, SIDE)], 8000)
-    for number in range(2, ENOUGH_NEWER + 2):
+    for number in range(2, REPLACING_VEHICLES + 2):
         buffer.forget_replaced(4 * HOUR_S)
         assert np.unique(snapshot(buffer).track_vehicles).tolist()[:2] == [0, 1]
         filled(buffer, [drive(number, 5 * HOUR_S + 60.0 * number, MAIN)], 8000)
     buffer.forget_replaced(4 * HOUR_S)
     evidence = snapshot(buffer)
     for owners in (evidence.track_vehicles, evidence.segment_vehicles):
-        assert np.unique(owners).tolist() == list(range(1, ENOUGH_NEWER + 2))
+        assert np.unique(owners).tolist() == list(range(1, REPLACING_VEHICLES + 2))
 
 
 def test_what_is_young_stays_however_many_there_are() -> None:
@@ -153,11 +153,11 @@ def test_what_is_held_keeps_its_order() -> None:
 def test_worth_is_counted_as_its_definition_says(seed: int) -> None:
     generator = np.random.default_rng(seed)
     vehicles = generator.integers(0, 8, 60)
-    newest, of_kind = generator.permutation(8).astype(float), generator.integers(0, 5, 60)
-    found = worth(vehicles, newest, of_kind)
+    newest, bins = generator.permutation(8).astype(float), generator.integers(0, 5, 60)
+    found = novelty(vehicles, newest, bins)
     for vehicle in np.unique(vehicles):
         rows = np.flatnonzero(vehicles == vehicle)
-        newer = [len({other for other in vehicles[of_kind == of_kind[row]] if newest[other] > newest[vehicle]})
+        newer = [len({other for other in vehicles[bins == bins[row]] if newest[other] > newest[vehicle]})
                  for row in rows]
         assert found[vehicle] == pytest.approx(np.mean([1 / (1 + count) for count in newer]) * min(1, len(rows) / 3))
 
@@ -165,6 +165,6 @@ def test_worth_is_counted_as_its_definition_says(seed: int) -> None:
 def test_kinds_tell_places_and_headings_apart() -> None:
     middles = np.array([[0.0, 0.0], [10.0, 5.0], [800.0, 400.0], [0.0, 0.0], [0.0, 0.0]])
     ways = np.array([[9.0, 0.5], [9.0, -0.5], [9.0, 0.0], [-9.0, 0.5], [-9.0, -0.5]])
-    found = kinds(middles, headings(ways))
+    found = cell_heading_bins(middles, headings(ways))
     assert found[0] == found[1] and found[3] == found[4]
     assert len(set(found)) == 3

@@ -13,16 +13,16 @@ from autocalib_ros.errors import InputError
 from autocalib_ros.evidence.buffer import EvidenceBuffer
 from autocalib_ros.evidence.snapshot import (
     EDGE_ARRAYS,
-    KINDS,
     OUTLINE_ARRAYS,
     OUTLINE_COLUMNS,
-    STILL_LINES,
+    STILL_LINES_PX,
+    TRACK_KINDS,
     Edges,
     Evidence,
-    Kind,
     Outlines,
     Segments,
     Track,
+    TrackKind,
 )
 
 
@@ -59,7 +59,7 @@ def test_a_snapshot_survives_its_file_to_the_last_bit(tmp_path: Path) -> None:
         np.testing.assert_array_equal(getattr(after, name), getattr(before, name), err_msg=name)
 
 
-def of_kinds(*kinds: Kind) -> Evidence:
+def of_kinds(*kinds: TrackKind) -> Evidence:
     buffer = EvidenceBuffer(BufferOptions())
     for index, kind in enumerate(kinds):
         one = track(index, 5.0 + index)
@@ -68,28 +68,28 @@ def of_kinds(*kinds: Kind) -> Evidence:
 
 
 def test_kinds_of_tracks_survive_their_file(tmp_path: Path) -> None:
-    of_kinds(Kind.PERSON, Kind.VEHICLE, Kind.UNKNOWN).save(tmp_path / 'evidence.npz')
+    of_kinds(TrackKind.PERSON, TrackKind.VEHICLE, TrackKind.UNKNOWN).save(tmp_path / 'evidence.npz')
     after = Evidence.load(tmp_path / 'evidence.npz')
-    assert [one.kind for one in after.tracks()] == [Kind.PERSON, Kind.VEHICLE, Kind.UNKNOWN]
-    assert after.selected(np.array([1])).track_kinds.tolist() == [Kind.VEHICLE]
+    assert [one.kind for one in after.tracks()] == [TrackKind.PERSON, TrackKind.VEHICLE, TrackKind.UNKNOWN]
+    assert after.select_tracks(np.array([1])).track_kinds.tolist() == [TrackKind.VEHICLE]
     assert after.summary().vehicles == 2
 
 
 def test_without_a_detector_a_file_is_what_it_was_before_there_were_kinds(tmp_path: Path) -> None:
-    of_kinds(Kind.UNKNOWN, Kind.UNKNOWN).save(tmp_path / 'evidence.npz')
+    of_kinds(TrackKind.UNKNOWN, TrackKind.UNKNOWN).save(tmp_path / 'evidence.npz')
     with np.load(tmp_path / 'evidence.npz') as data:
-        assert KINDS not in data.files
-    assert Evidence.load(tmp_path / 'evidence.npz').track_kinds.tolist() == [Kind.UNKNOWN] * 2
+        assert TRACK_KINDS not in data.files
+    assert Evidence.load(tmp_path / 'evidence.npz').track_kinds.tolist() == [TrackKind.UNKNOWN] * 2
 
 
 @pytest.mark.parametrize('kinds', [[1], [1, 3], [1.0, 2.0]])
 def test_kinds_that_do_not_fit_are_an_input_error(tmp_path: Path, kinds: list) -> None:
     path = tmp_path / 'evidence.npz'
-    of_kinds(Kind.PERSON, Kind.VEHICLE).save(path)
+    of_kinds(TrackKind.PERSON, TrackKind.VEHICLE).save(path)
     with np.load(path) as data:
         arrays = {name: data[name] for name in data.files}
-    np.savez(path, **{**arrays, KINDS: np.array(kinds)})
-    with pytest.raises(InputError, match=KINDS):
+    np.savez(path, **{**arrays, TRACK_KINDS: np.array(kinds)})
+    with pytest.raises(InputError, match=TRACK_KINDS):
         Evidence.load(path)
 
 
@@ -159,7 +159,7 @@ def test_evidence_without_a_vehicle_has_nothing_of_it() -> None:
     buffer.add_segments(segments(5.0, 4))
     buffer.add_edges(Edges(5.0, np.array([3, 2]), np.arange(8.0).reshape(2, 4)))
     buffer.add_outlines(outlines(5.0, [2, 1, 2]))
-    left = snapshot(buffer).without(np.array([2, 7]))
+    left = snapshot(buffer).without_vehicles(np.array([2, 7]))
     assert left.track_vehicles.tolist() == [1, 3] and len(left.points_px) == len(left.times_s) == 20
     assert left.segment_vehicles.tolist() == [0, 1, 3] and len(left.segments_px) == len(left.segment_times_s) == 3
     assert left.edge_vehicles.tolist() == [3] and left.edges_px.tolist() == [[0.0, 1.0, 2.0, 3.0]]
@@ -168,7 +168,7 @@ def test_evidence_without_a_vehicle_has_nothing_of_it() -> None:
 
 def with_lines(count: int) -> Evidence:
     lines = np.random.default_rng(0).uniform(0, 360, (count, 4))
-    return replace(of_kinds(Kind.UNKNOWN, Kind.VEHICLE), still_lines_px=lines)
+    return replace(of_kinds(TrackKind.UNKNOWN, TrackKind.VEHICLE), still_lines_px=lines)
 
 
 def test_still_lines_survive_their_file_to_the_last_bit(tmp_path: Path) -> None:
@@ -177,13 +177,13 @@ def test_still_lines_survive_their_file_to_the_last_bit(tmp_path: Path) -> None:
     after = Evidence.load(tmp_path / 'evidence.npz')
     np.testing.assert_array_equal(after.still_lines_px, before.still_lines_px)
     # what is chosen of the tracks has no bearing on what stands still
-    np.testing.assert_array_equal(after.selected(np.array([1])).still_lines_px, before.still_lines_px)
+    np.testing.assert_array_equal(after.select_tracks(np.array([1])).still_lines_px, before.still_lines_px)
 
 
 def test_without_still_lines_a_file_is_what_it_was_before_they_were_looked_for(tmp_path: Path) -> None:
     with_lines(0).save(tmp_path / 'evidence.npz')
     with np.load(tmp_path / 'evidence.npz') as data:
-        assert STILL_LINES not in data.files
+        assert STILL_LINES_PX not in data.files
     assert Evidence.load(tmp_path / 'evidence.npz').still_lines_px.shape == (0, 4)
 
 
@@ -195,7 +195,7 @@ def test_still_lines_that_are_none_are_an_input_error(tmp_path: Path, lines: np.
     with_lines(3).save(path)
     with np.load(path) as data:
         arrays = {name: data[name] for name in data.files}
-    np.savez(path, **{**arrays, STILL_LINES: lines})
+    np.savez(path, **{**arrays, STILL_LINES_PX: lines})
     with pytest.raises(InputError, match='not a file of saved evidence'):
         Evidence.load(path)
 

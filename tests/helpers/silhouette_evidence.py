@@ -10,7 +10,7 @@ from autocalib_ros.config import BufferOptions
 from autocalib_ros.evidence.buffer import EvidenceBuffer
 from autocalib_ros.evidence.snapshot import Evidence, Outlines, Track
 from autocalib_ros.offline.synthetic.junction import Junction
-from autocalib_ros.perception.silhouettes import DIRECTIONS
+from autocalib_ros.perception.silhouettes import EXTREME_DIRECTIONS
 
 RIDER_M, CAR_M = (1.75, 0.6, 1.75), (4.3, 1.75, 1.45)
 GAP_PX = 100.0
@@ -33,7 +33,7 @@ def projected(junction: Junction, points_m: np.ndarray) -> tuple[np.ndarray, np.
 def outline(junction: Junction, corners_m: np.ndarray) -> np.ndarray:
     """Outline, as a row of `Outlines.ends_px`, of a body with corners (n, 3)."""
     pixels, _ = projected(junction, corners_m)
-    return np.append(pixels[(pixels @ DIRECTIONS.T).argmax(axis=0)], GAP_PX)
+    return np.append(pixels[(pixels @ EXTREME_DIRECTIONS.T).argmax(axis=0)], GAP_PX)
 
 
 def driven(junction: Junction, number: int, start_s: float, size_m: tuple[float, float, float], start_m: np.ndarray,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from autocalib_ros.perception.background import LEAST_SAMPLES, LONGEST_INTERVAL_S, SAMPLES, Background, median
+from autocalib_ros.perception.background import MAX_INTERVAL_S, MAX_SAMPLES, MIN_SAMPLES, Background, median
 
 JPEG = 3
 """Levels by which flat grey comes back otherwise."""
@@ -29,7 +29,7 @@ def test_colours_have_medians_of_their_own() -> None:
     np.testing.assert_array_equal(median(list(images)), np.sort(images, axis=0)[2])
 
 
-@pytest.mark.parametrize(('count', 'there'), [(LEAST_SAMPLES - 1, False), (LEAST_SAMPLES, True)])
+@pytest.mark.parametrize(('count', 'there'), [(MIN_SAMPLES - 1, False), (MIN_SAMPLES, True)])
 def test_there_is_no_grey_before_traffic_is_outvoted(count: int, there: bool) -> None:
     background = Background()
     assert background.grey() is None and background.image() is None
@@ -51,18 +51,18 @@ def test_images_between_the_intervals_are_not_kept() -> None:
 
 def test_the_interval_grows_until_the_longest_and_no_more_images_are_held() -> None:
     background, image, gaps = Background(), flat(90), []
-    step_s, seconds = 8.0, 6 * SAMPLES * LONGEST_INTERVAL_S
+    step_s, seconds = 8.0, 6 * MAX_SAMPLES * MAX_INTERVAL_S
     for time_s in np.arange(0.0, seconds, step_s):
         background.update(image, float(time_s))
-        assert len(background.times_s) <= SAMPLES
+        assert len(background.times_s) <= MAX_SAMPLES
         gaps.append(np.diff(background.times_s).max(initial=0.0))
     # it has doubled from one second, and doubles no more where that would be longer than the longest
-    assert LONGEST_INTERVAL_S / 2 < gaps[-1]
-    assert max(gaps) <= LONGEST_INTERVAL_S
-    assert len(background.times_s) == SAMPLES
+    assert MAX_INTERVAL_S / 2 < gaps[-1]
+    assert max(gaps) <= MAX_INTERVAL_S
+    assert len(background.times_s) == MAX_SAMPLES
     # nothing is left of what the road looked like long ago
-    assert background.times_s[0] > seconds - (SAMPLES + 1) * LONGEST_INTERVAL_S
-    assert background.times_s[-1] > seconds - LONGEST_INTERVAL_S - step_s
+    assert background.times_s[0] > seconds - (MAX_SAMPLES + 1) * MAX_INTERVAL_S
+    assert background.times_s[-1] > seconds - MAX_INTERVAL_S - step_s
 
 
 def test_what_was_before_a_bump_is_forgotten_and_images_come_faster_again() -> None:

@@ -8,9 +8,9 @@ import pytest
 
 from autocalib_ros.calibrator import AutoCalibrator
 from autocalib_ros.config import DetectorOptions, Options
-from autocalib_ros.evidence.snapshot import Kind, Track
+from autocalib_ros.evidence.snapshot import Track, TrackKind
 from autocalib_ros.perception.detector.detector import Detections
-from autocalib_ros.perception.detector_tracks import DetectedVehicles
+from autocalib_ros.perception.detector_tracks import DetectorTracks
 from autocalib_ros.perception.klt_tracker import PointTracker
 from autocalib_ros.perception.motion_mask import Region
 from autocalib_ros.perception.observer import Observer
@@ -117,8 +117,8 @@ def test_a_parked_car_starts_no_tracks() -> None:
 def test_people_are_told_and_leave_neither_segments_nor_edges() -> None:
     tracks, segments, edges = watched(World([(20, 100), (500, 250)], [40.0, -40.0], people=(1,)), 5.0)
     kinds = {track.kind for track in tracks if track.vehicle in owners(tracks, 250)}
-    assert kinds == {Kind.PERSON}
-    assert {track.kind for track in tracks if track.vehicle in owners(tracks, 100)} == {Kind.VEHICLE}
+    assert kinds == {TrackKind.PERSON}
+    assert {track.kind for track in tracks if track.vehicle in owners(tracks, 100)} == {TrackKind.VEHICLE}
     ends = np.concatenate([lines.ends_px for lines in (*segments, *edges)])
     assert len(ends) > 50 and (ends[:, 1] < 170).all()
 
@@ -132,7 +132,7 @@ def test_boxes_of_a_wide_image_are_those_of_the_tracked_one() -> None:
 @pytest.mark.parametrize('rate_hz', [5.0, 15.0, 30.0, 60.0])
 def test_detections_come_by_time_and_not_by_count(rate_hz: float) -> None:
     world = World([(20, 100)], [40.0])
-    vehicles, tracker = DetectedVehicles(world, DetectorOptions(every_s=0.2)), PointTracker(Options().tracking)
+    vehicles, tracker = DetectorTracks(world, DetectorOptions(every_s=0.2)), PointTracker(Options().tracking)
     image = world.image(0.0)
     jitter = np.random.default_rng(0).uniform(-0.2, 0.2, int(10 * rate_hz)) / rate_hz
     for index, late in enumerate(jitter):
@@ -140,7 +140,7 @@ def test_detections_come_by_time_and_not_by_count(rate_hz: float) -> None:
     assert world.calls == pytest.approx(50, abs=2)
 
 
-def at(world: World, time_s: float, vehicles: DetectedVehicles, tracker: PointTracker) -> list[int]:
+def at(world: World, time_s: float, vehicles: DetectorTracks, tracker: PointTracker) -> list[int]:
     """Show an instant; return the vehicles that move, those lowest in the image first."""
     image = world.image(time_s)
     tracker.follow(image, time_s)
@@ -150,7 +150,7 @@ def at(world: World, time_s: float, vehicles: DetectedVehicles, tracker: PointTr
 
 def test_between_detections_a_box_goes_with_its_points() -> None:
     world = World([(20, 100)], [60.0])
-    vehicles, tracker = DetectedVehicles(world, DetectorOptions(every_s=5.0)), PointTracker(Options().tracking)
+    vehicles, tracker = DetectorTracks(world, DetectorOptions(every_s=5.0)), PointTracker(Options().tracking)
     vehicle, = at(world, 0.0, vehicles, tracker)
     x, y = np.meshgrid(np.arange(30, 90, 12.0), np.arange(110, 140, 12.0))
     tracker.add_points(np.column_stack([x.ravel(), y.ravel()]), np.full(x.size, vehicle))
@@ -163,7 +163,7 @@ def test_between_detections_a_box_goes_with_its_points() -> None:
 
 def test_of_two_boxes_the_nearer_has_what_both_cover() -> None:
     world = World([(100, 100), (120, 130)], [0.0, 0.0])
-    vehicles, tracker = DetectedVehicles(world, DetectorOptions()), PointTracker(Options().tracking)
+    vehicles, tracker = DetectorTracks(world, DetectorOptions()), PointTracker(Options().tracking)
     at(world, 0.0, vehicles, tracker)
     (near, far), _ = vehicles.regions([Region(0, 0, np.full(SIZE, 255, np.uint8))], SIZE)
     assert (near.mask > 0).all() and near.y == 130
@@ -179,8 +179,8 @@ def test_evidence_by_a_detector_knows_kinds_and_says_so_when_solved() -> None:
         calibrator.add_image(index * 100_000_000, image)
     evidence = calibrator.snapshot()
     assert evidence is not None
-    assert {Kind.VEHICLE, Kind.PERSON} <= set(evidence.track_kinds.tolist())
-    of_people = int((evidence.track_kinds == Kind.PERSON).sum())
+    assert {TrackKind.VEHICLE, TrackKind.PERSON} <= set(evidence.track_kinds.tolist())
+    of_people = int((evidence.track_kinds == TrackKind.PERSON).sum())
     assert evidence.summary().vehicles == len(set(evidence.track_vehicles[
-        evidence.track_kinds == Kind.VEHICLE].tolist()))
+        evidence.track_kinds == TrackKind.VEHICLE].tolist()))
     assert f'{evidence.track_count - of_people} of' in str(calibrator.progress())

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from autocalib_ros.perception.drift_monitor import Stillness
+from autocalib_ros.perception.drift_monitor import DriftMonitor
 
 WIDTH, HEIGHT = 640, 360
 LIMIT_PX = 1.5
@@ -25,7 +25,7 @@ def _street(generator: np.random.Generator) -> np.ndarray:
 def _night(seconds: float, turned_px: float = 0.0) -> float:
     """Drift in pixels found in a street where queues of lamps creep on, the camera turned at half time."""
     generator = np.random.default_rng(0)
-    street, stillness = _street(generator), Stillness(600.0)
+    street, stillness = _street(generator), DriftMonitor(600.0)
     for time_s in np.arange(0.0, seconds, 0.5):
         shift = turned_px * (time_s > seconds / 2)
         scene = cv2.warpAffine(street, np.float32([[1, 0, shift], [0, 1, 0]]), (WIDTH, HEIGHT),

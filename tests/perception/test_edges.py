@@ -9,7 +9,7 @@ import pytest
 from autocalib_ros.config import BufferOptions, Options
 from autocalib_ros.evidence.buffer import EvidenceBuffer
 from autocalib_ros.evidence.snapshot import Edges
-from autocalib_ros.perception.edges import MAX_PER_REGION, MAX_REGIONS, EdgeFinder
+from autocalib_ros.perception.edges import MAX_EDGES_PER_REGION, MAX_REGIONS, EdgeFinder
 from autocalib_ros.perception.motion_mask import Region
 from autocalib_ros.perception.observer import Observer
 
@@ -93,8 +93,8 @@ def test_regions_and_edges_of_one_image_are_bounded() -> None:
     regions = [Region(60 * index, 100, np.full((500, 300), 255, np.uint8)) for index in range(16)]
     finder.find(np.full((720, 1280), 128, np.uint8), [])
     edges, labels = finder.find(lines, regions)
-    assert 0 < len(edges) <= MAX_REGIONS * MAX_PER_REGION
-    assert np.bincount(labels).max() <= MAX_PER_REGION and labels.max() < MAX_REGIONS
+    assert 0 < len(edges) <= MAX_REGIONS * MAX_EDGES_PER_REGION
+    assert np.bincount(labels).max() <= MAX_EDGES_PER_REGION and labels.max() < MAX_REGIONS
 
 
 @pytest.mark.parametrize('width', [1280, 320])

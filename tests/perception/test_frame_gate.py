@@ -10,9 +10,9 @@ import pytest
 
 from autocalib_ros.config import Options, TrackingOptions
 from autocalib_ros.evidence.snapshot import Track
-from autocalib_ros.perception.frame_gate import LEAP_LEVELS, Seen, View, levelled
+from autocalib_ros.perception.frame_gate import LEVEL_SHIFT_THRESHOLD, FrameGate, FrameStatus, match_grey_levels
 from autocalib_ros.perception.images import ImageDecoder
-from autocalib_ros.perception.klt_tracker import PointTracker, _arrived
+from autocalib_ros.perception.klt_tracker import PointTracker, _near_prediction
 from autocalib_ros.perception.observer import Observer
 
 HEIGHT, WIDTH = 240, 480
@@ -132,24 +132,24 @@ def test_the_road_keeps_its_grey_levels(shows, offset) -> None:
 
 
 def test_pictures_of_the_shutter_are_hidden_and_repeated_ones_repeated() -> None:
-    view = View(4.0, LEAP_LEVELS)
-    seen = [view.judge(cv2.resize(image, (320, 160)), index / RATE_HZ)
+    view = FrameGate(4.0, LEVEL_SHIFT_THRESHOLD)
+    seen = [view.classify(cv2.resize(image, (320, 160)), index / RATE_HZ)
             for index, image in enumerate(pictures(8, 'flat', 0.0))]
-    assert [seen[index] for index in range(*SHUT)] == [Seen.HIDDEN] * (SHUT[1] - SHUT[0])
-    assert set(seen[:SHUT[0]] + seen[SHUT[1]:]) == {Seen.NEW}
+    assert [seen[index] for index in range(*SHUT)] == [FrameStatus.HIDDEN] * (SHUT[1] - SHUT[0])
+    assert set(seen[:SHUT[0]] + seen[SHUT[1]:]) == {FrameStatus.NEW}
 
 
 def test_another_view_that_lasts_is_taken_after_two_seconds() -> None:
-    view, there, elsewhere = View(4.0, LEAP_LEVELS), *(128 + 40 * texture(seed, (90, 160), 8.0) for seed in (5, 6))
-    seen = [view.judge((there if index < 10 else elsewhere) + index % 2 * 5, 0.2 * index) for index in range(30)]
-    assert seen[1:10] == [Seen.NEW] * 9
-    assert set(seen[10:19]) == {Seen.HIDDEN} and Seen.LEAPT in seen[19:22] and set(seen[23:]) == {Seen.NEW}
+    view, there, elsewhere = FrameGate(4.0, LEVEL_SHIFT_THRESHOLD), *(128 + 40 * texture(seed, (90, 160), 8.0) for seed in (5, 6))
+    seen = [view.classify((there if index < 10 else elsewhere) + index % 2 * 5, 0.2 * index) for index in range(30)]
+    assert seen[1:10] == [FrameStatus.NEW] * 9
+    assert set(seen[10:19]) == {FrameStatus.HIDDEN} and FrameStatus.LEVEL_SHIFT in seen[19:22] and set(seen[23:]) == {FrameStatus.NEW}
 
 
 def test_what_follows_a_flat_start_is_taken_at_once() -> None:
-    view = View(4.0, LEAP_LEVELS)
-    view.judge(np.full((90, 160), 70.0), 0.0)
-    assert view.judge(128 + 40 * texture(5, (90, 160), 8.0), 0.1) is Seen.LEAPT
+    view = FrameGate(4.0, LEVEL_SHIFT_THRESHOLD)
+    view.classify(np.full((90, 160), 70.0), 0.0)
+    assert view.classify(128 + 40 * texture(5, (90, 160), 8.0), 0.1) is FrameStatus.LEVEL_SHIFT
 
 
 def test_levelling_takes_offset_and_pattern_away_but_not_traffic() -> None:
@@ -157,7 +157,7 @@ def test_levelling_takes_offset_and_pattern_away_but_not_traffic() -> None:
     bowl = 6 * texture(3, (HEIGHT, WIDTH), 60.0) + 10
     after = road + bowl
     after[100:150, 200:280] += 60
-    change = levelled(road.astype(np.uint8), after.astype(np.uint8)) - road
+    change = match_grey_levels(road.astype(np.uint8), after.astype(np.uint8)) - road
     assert np.abs(change - bowl).max() < 5
 
 
@@ -184,17 +184,17 @@ def test_points_are_found_again_across_a_freeze(frozen) -> None:
 def test_a_point_far_from_where_it_was_foreseen_is_given_up() -> None:
     foreseen = np.array([[40.0, 0.0]] * 4 + [[0.0, 0.0]])
     found = np.array([[42.0, 3.0], [31.0, 0.0], [29.0, 0.0], [40.0, 12.0], [2.0, 0.0]])
-    assert _arrived(foreseen, found).tolist() == [True, True, False, False, True]
+    assert _near_prediction(foreseen, found).tolist() == [True, True, False, False, True]
 
 
 @pytest.mark.parametrize('dark', [0.0, 2.0])
 def test_a_bright_vehicle_on_a_road_that_shows_little_hides_nothing(dark):
     # all that correlates is the vehicle, which is elsewhere in each picture
     road = dark + np.random.default_rng(0).normal(0.0, 2.0, (180, 320)).clip(0.0)
-    view = View(repeated_levels=0.0)
+    view = FrameGate(max_repeat_difference=0.0)
     seen = []
     for column in range(0, 240, 40):
         picture = road.copy()
         picture[80:140, column:column + 60] = 230.0
-        seen.append(view.judge(picture.astype(np.uint8), column / 200.0))
-    assert set(seen) == {Seen.NEW}
+        seen.append(view.classify(picture.astype(np.uint8), column / 200.0))
+    assert set(seen) == {FrameStatus.NEW}

@@ -13,7 +13,7 @@ from autocalib_ros.config import Options
 from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.perception.ignore_regions import black_out, ignored_mask
 from autocalib_ros.perception.images import ImageDecoder
-from autocalib_ros.perception.masked_messages import blacked_out, require_blackable
+from autocalib_ros.perception.masked_messages import mask_message, require_maskable
 from autocalib_ros.perception.observer import Observer
 
 HEIGHT, WIDTH = 200, 400
@@ -156,7 +156,7 @@ KINDS = [('mono8', 16, 12), ('bgr8', 48, 12), ('rgba8', 64, 12), ('8UC4', 64, 12
 @pytest.mark.parametrize(('encoding', 'row_bytes', 'rows'), KINDS)
 def test_images_of_every_encoding_are_black_there_and_nowhere_else(encoding, row_bytes, rows, is_bigendian) -> None:
     before = message(encoding, row_bytes, rows, is_bigendian=is_bigendian)
-    after = SimpleNamespace(**{**vars(before), 'data': blacked_out(before, SMALL)})
+    after = SimpleNamespace(**{**vars(before), 'data': mask_message(before, SMALL)})
     assert before.data.min() >= 60 and len(after.data) == len(before.data)
     was, now = ImageDecoder().decode(before).astype(int), ImageDecoder().decode(after).astype(int)
     inside = np.zeros((ROWS, COLUMNS), bool)
@@ -177,7 +177,7 @@ def test_temperatures_get_the_coldest_of_the_rest() -> None:
     kelvin[0, 0], kelvin[4, 5] = np.nan, 250.0
     msg = SimpleNamespace(encoding='32FC1', width=COLUMNS, height=ROWS, step=4 * COLUMNS, is_bigendian=0,
                           data=kelvin.ravel().view(np.uint8))
-    after = blacked_out(msg, SMALL).view('<f4').reshape(ROWS, COLUMNS)
+    after = mask_message(msg, SMALL).view('<f4').reshape(ROWS, COLUMNS)
     assert (after[3:7, 4:10] == np.nanmin(np.delete(kelvin, 4, axis=0))).all() or after[4, 5] >= 280
     assert np.isnan(after[0, 0]) and np.array_equal(after[8:], kelvin[8:])
 
@@ -185,7 +185,7 @@ def test_temperatures_get_the_coldest_of_the_rest() -> None:
 @pytest.mark.parametrize(('kind', 'worst'), [('.jpg', 40), ('.png', 0)])
 def test_compressed_images_are_compressed_again(kind, worst) -> None:
     picture = np.full((ROWS, COLUMNS, 3), 150, np.uint8)
-    after = blacked_out(SimpleNamespace(format='x', data=cv2.imencode(kind, picture)[1].ravel()), SMALL)
+    after = mask_message(SimpleNamespace(format='x', data=cv2.imencode(kind, picture)[1].ravel()), SMALL)
     image = ImageDecoder().decode(SimpleNamespace(format='x', data=after)).astype(int)
     assert image[3:7, 4:10].max() <= worst  # JPEG rings at the border of a block
     assert np.abs(image[10:] - 150).max() <= worst
@@ -194,21 +194,21 @@ def test_compressed_images_are_compressed_again(kind, worst) -> None:
 def test_16_bits_stay_16_bits() -> None:
     counts = np.full((ROWS, COLUMNS), 6400, np.uint16)
     counts[1, 1] = 6000
-    after = blacked_out(SimpleNamespace(format='mono16; png', data=cv2.imencode('.png', counts)[1].ravel()), SMALL)
+    after = mask_message(SimpleNamespace(format='mono16; png', data=cv2.imencode('.png', counts)[1].ravel()), SMALL)
     image = cv2.imdecode(after, cv2.IMREAD_UNCHANGED)
     assert image.dtype == np.uint16 and (image[3:7, 4:10] == 6000).all() and image[9, 9] == 6400
 
 
 def test_what_cannot_be_made_black_is_told() -> None:
     with pytest.raises(UsageError, match="'ignore_regions' cannot be made black in images of encoding 'h264'"):
-        require_blackable(SimpleNamespace(encoding='h264'))
+        require_maskable(SimpleNamespace(encoding='h264'))
     with pytest.raises(UsageError, match='16UC1; compressedDepth'):
-        require_blackable(SimpleNamespace(format='16UC1; compressedDepth png'))
+        require_maskable(SimpleNamespace(format='16UC1; compressedDepth png'))
     with pytest.raises(InputError, match='16 x 12 pixels has 100 bytes'):
-        blacked_out(SimpleNamespace(**{**vars(message('bgr8', 48, 12)), 'data': bytes(100)}), SMALL)
+        mask_message(SimpleNamespace(**{**vars(message('bgr8', 48, 12)), 'data': bytes(100)}), SMALL)
 
 
 def test_a_size_that_the_data_cannot_have_is_told_before_it_takes_memory() -> None:
     with pytest.raises(InputError, match='4294967295 x 4294967295 pixels has 768 bytes'):
-        blacked_out(SimpleNamespace(**{**vars(message('mono16', 32, 12, padding=32)), 'width': 2**32 - 1,
+        mask_message(SimpleNamespace(**{**vars(message('mono16', 32, 12, padding=32)), 'width': 2**32 - 1,
                                        'height': 2**32 - 1}), SMALL)

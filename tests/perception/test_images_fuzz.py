@@ -10,10 +10,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from autocalib_ros.errors import InputError
-from autocalib_ros.perception.images import PACKED, PLANAR, YUV422, ImageDecoder
+from autocalib_ros.perception.images import PACKED_ENCODINGS, PLANAR_ENCODINGS, YUV422_ENCODINGS, ImageDecoder
 
-ENCODINGS = [*PACKED, *YUV422, *PLANAR]
-NUMBERS = st.one_of(st.integers(0, 40), st.sampled_from([2**16, 2**31, 2**32 - 1]))
+ENCODINGS = [*PACKED_ENCODINGS, *YUV422_ENCODINGS, *PLANAR_ENCODINGS]
+NUMBER_FORMATS = st.one_of(st.integers(0, 40), st.sampled_from([2**16, 2**31, 2**32 - 1]))
 """Sizes and steps as any bits of a uint32 may be."""
 PIXELS = np.random.default_rng(0).integers(0, 256, 20 * 40 * 40, np.uint8)
 PIXELS.flags.writeable = False
@@ -24,11 +24,11 @@ FILES = [cv2.imencode(kind, PIXELS[:1200].reshape(20, 20, 3))[1].tobytes() for k
 def mutations(draw) -> SimpleNamespace:
     """Draw a whole image of any encoding, of which some fields are then changed."""
     encoding, width, height = draw(st.sampled_from(ENCODINGS)), draw(st.integers(1, 20)), draw(st.integers(1, 20))
-    step = width * (PACKED[encoding][1] // 8 * 4 if encoding in PACKED else 2)
+    step = width * (PACKED_ENCODINGS[encoding][1] // 8 * 4 if encoding in PACKED_ENCODINGS else 2)
     whole = {'encoding': encoding, 'width': width, 'height': height, 'step': step, 'length': 3 * step * height,
              'is_bigendian': 0}
-    changes = {'encoding': st.one_of(st.sampled_from(ENCODINGS), st.text(max_size=12)), 'width': NUMBERS,
-               'height': NUMBERS, 'step': NUMBERS, 'length': st.integers(0, len(PIXELS)),
+    changes = {'encoding': st.one_of(st.sampled_from(ENCODINGS), st.text(max_size=12)), 'width': NUMBER_FORMATS,
+               'height': NUMBER_FORMATS, 'step': NUMBER_FORMATS, 'length': st.integers(0, len(PIXELS)),
                'is_bigendian': st.integers(0, 255)}
     for name in draw(st.sets(st.sampled_from(sorted(changes)), max_size=3)):
         whole[name] = draw(changes[name])

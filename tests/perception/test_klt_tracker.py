@@ -8,7 +8,7 @@ import pytest
 
 from autocalib_ros.config import TrackingOptions
 from autocalib_ros.evidence.snapshot import Track
-from autocalib_ros.perception.klt_tracker import PointTracker, _jumped
+from autocalib_ros.perception.klt_tracker import PointTracker, _is_discontinuous
 
 SIZE = (160, 320)
 
@@ -113,7 +113,7 @@ def test_uneven_steps_along_one_line_are_followed() -> None:
 def test_a_point_thrown_off_its_line_is_given_up() -> None:
     before = np.array([[10.0, 0.0]] * 6)
     now = np.array([[12.0, 1.0], [5.0, 0.0], [20.0, 1.0], [0.0, 0.0], [8.0, 9.0], [-8.0, 0.0]])
-    assert _jumped(before, now).tolist() == [False, False, False, True, True, True]
+    assert _is_discontinuous(before, now).tolist() == [False, False, False, True, True, True]
 
 
 def test_tails_are_where_points_were_of_late_newest_last() -> None:

@@ -10,8 +10,8 @@ import pytest
 
 from autocalib_ros.calibrator import AutoCalibrator
 from autocalib_ros.config import Options
-from autocalib_ros.perception.background import LEAST_SAMPLES
-from autocalib_ros.perception.line_segments import LEAST_LENGTH, MOST_LINES, StillLines
+from autocalib_ros.perception.background import MIN_SAMPLES
+from autocalib_ros.perception.line_segments import MAX_LINES, MIN_LINE_LENGTH, LineSegmentDetector
 from autocalib_ros.perception.observer import Observer
 
 WIDTH, HEIGHT = 640, 360
@@ -80,7 +80,7 @@ def test_every_stripe_is_found_where_it_is_and_nothing_of_what_passes() -> None:
     found = np.array([misses(lines, side[None]).min() for side in sides])
     assert len(sides) == 12 and (found < WITHIN_PX).sum() >= 10  # OpenCV 4.6 leaves out one
     # the rectangle alone has edges there, as the single image shows
-    finder = StillLines(None)
+    finder = LineSegmentDetector(None)
     finder.find(picture(car_x=300.0), (0.0,))
     alone = finder.lines_px[:, 1::2].mean(axis=1)
     assert (alone < CAR_ROWS[1] + 5).any()
@@ -91,7 +91,7 @@ def test_the_longest_come_first_and_short_ones_not_at_all() -> None:
     lines = watched(Options()).still_lines()
     length = np.hypot(lines[:, 2] - lines[:, 0], lines[:, 3] - lines[:, 1])
     assert (np.diff(length) <= 1e-9).all()
-    assert length.min() >= LEAST_LENGTH * WIDTH
+    assert length.min() >= MIN_LINE_LENGTH * WIDTH
 
 
 def test_no_line_touches_what_is_ignored() -> None:
@@ -106,7 +106,7 @@ def test_no_line_touches_what_is_ignored() -> None:
 def test_a_mask_leaves_out_lines_that_only_cross_it() -> None:
     mask = np.zeros((HEIGHT, WIDTH), np.uint8)
     mask[280:290] = 255
-    finder = StillLines(mask)
+    finder = LineSegmentDetector(mask)
     finder.find(picture(), (0.0,))
     assert len(finder.lines_px) and not ((finder.lines_px[:, 1::2].min(axis=1) < 280)
                                          & (finder.lines_px[:, 1::2].max(axis=1) > 290)).any()
@@ -120,13 +120,13 @@ def test_wide_images_are_reduced_and_lines_come_in_pixels_of_the_full_size() -> 
 
 def test_colour_is_as_good_as_grey() -> None:
     observer = Observer(Options(), (WIDTH, HEIGHT))
-    for index in range(LEAST_SAMPLES):
+    for index in range(MIN_SAMPLES):
         observer.observe(cv2.cvtColor(picture(seed=index), cv2.COLOR_GRAY2BGR), float(index))
     lines = observer.still_lines()
     assert len(lines) >= 12 and misses(lines, edges()).max() < WITHIN_PX
 
 
-@pytest.mark.parametrize('count', [0, 1, LEAST_SAMPLES - 1])
+@pytest.mark.parametrize('count', [0, 1, MIN_SAMPLES - 1])
 def test_there_are_no_lines_of_too_few_images(count: int) -> None:
     observer = Observer(Options(), (WIDTH, HEIGHT))
     for index in range(count):
@@ -135,28 +135,28 @@ def test_there_are_no_lines_of_too_few_images(count: int) -> None:
 
 
 def test_a_flat_image_has_no_lines() -> None:
-    finder = StillLines(None)
+    finder = LineSegmentDetector(None)
     finder.find(np.full((HEIGHT, WIDTH), 90, np.uint8), (0.0,))
-    assert finder.lines_px.shape == (0, 4) and finder.up_to_date((0.0,))
+    assert finder.lines_px.shape == (0, 4) and finder.is_current((0.0,))
 
 
 def test_lines_are_looked_for_anew_only_where_the_background_has_changed() -> None:
-    finder = StillLines(None)
-    assert not finder.up_to_date(())
+    finder = LineSegmentDetector(None)
+    assert not finder.is_current(())
     finder.find(picture(), (0.0, 1.0))
-    assert finder.up_to_date((0.0, 1.0)) and not finder.up_to_date((0.0, 2.0))
+    assert finder.is_current((0.0, 1.0)) and not finder.is_current((0.0, 2.0))
     before = finder.lines_px
     finder.find(None, (0.0, 2.0))
     assert len(before) and finder.lines_px.shape == (0, 4)
 
 
 def test_no_more_lines_are_held_than_allowed() -> None:
-    finder, rows = StillLines(None), np.zeros((1000, 1000), np.uint8)
+    finder, rows = LineSegmentDetector(None), np.zeros((1000, 1000), np.uint8)
     for y in range(0, 1000, 12):
         for x in range(0, 1000, 40):
             rows[y:y + 6, x:x + 28] = 200
     finder.find(rows, (0.0,))
-    assert len(finder.lines_px) == MOST_LINES
+    assert len(finder.lines_px) == MAX_LINES
 
 
 @pytest.fixture(scope='module')
@@ -178,7 +178,7 @@ def test_after_a_bump_the_old_lines_are_gone(bumped: AutoCalibrator) -> None:
 
 def test_the_snapshot_brings_the_lines() -> None:
     calibrator = AutoCalibrator(Options())
-    for index in range(LEAST_SAMPLES):
+    for index in range(MIN_SAMPLES):
         assert calibrator.snapshot() is None or calibrator.snapshot().still_lines_px.shape == (0, 4)
         calibrator.add_image(10**9 * index, picture(seed=index))
     lines = calibrator.snapshot().still_lines_px

@@ -8,7 +8,7 @@ import pytest
 
 from autocalib_ros.config import MotionOptions, Options
 from autocalib_ros.perception.background import Background
-from autocalib_ros.perception.drift_monitor import Stillness
+from autocalib_ros.perception.drift_monitor import DriftMonitor
 from autocalib_ros.perception.motion_mask import MotionMask
 from autocalib_ros.perception.observer import Observer
 
@@ -107,7 +107,7 @@ def test_a_wide_image_is_tracked_reduced_and_reported_in_full_pixels() -> None:
 
 @pytest.mark.parametrize('shift', [(0.0, 0.0), (4.0, -3.0)])
 def test_stillness_measures_how_far_the_background_moved(shift: tuple[float, float]) -> None:
-    stillness = Stillness(600.0)
+    stillness = DriftMonitor(600.0)
     for index in range(60):
         share = float(index >= 30)
         moved = cv2.warpAffine(ROAD, np.array([[1.0, 0, share * shift[0]], [0, 1.0, share * shift[1]]]), SIZE[::-1],
@@ -123,7 +123,7 @@ def road_moved(shift: tuple[float, float]) -> np.ndarray:
 
 
 def test_slow_drift_is_seen_as_far_back_as_evidence_goes() -> None:
-    stillness = Stillness(600.0)
+    stillness = DriftMonitor(600.0)
     for time_s in range(0, 36_000, 30):
         stillness.update(road_moved((5.0 * time_s / 36_000, 0.0)), float(time_s))
     assert stillness.drift_px == pytest.approx(5.0, abs=0.5)
@@ -132,7 +132,7 @@ def test_slow_drift_is_seen_as_far_back_as_evidence_goes() -> None:
 
 
 def test_what_hides_the_view_for_a_moment_is_no_loss() -> None:
-    stillness = Stillness(600.0)
+    stillness = DriftMonitor(600.0)
     for index in range(60):
         hidden = 20 <= index < 28
         stillness.update(np.full(SIZE, 80, np.uint8) if hidden else road_moved((0.0, 0.0)), float(index))
@@ -140,7 +140,7 @@ def test_what_hides_the_view_for_a_moment_is_no_loss() -> None:
 
 
 def test_another_scene_is_a_loss() -> None:
-    stillness = Stillness(600.0)
+    stillness = DriftMonitor(600.0)
     for index in range(60):
         view = road_moved((0.0, 0.0))
         stillness.update(view if index < 30 else np.ascontiguousarray(view[::-1, ::-1]), float(index))

@@ -72,9 +72,9 @@ def test_the_outline_of_a_moving_block_is_its_own_to_a_pixel_of_the_mask() -> No
     motion = MotionMask(MotionOptions())
     for index in range(50):
         motion.update(scene(0.1 * index), 0.1 * index)
-    [ends] = outlines_of(motion.regions(), motion.grown_px, SHAPE, 1.0)
+    [ends] = outlines_of(motion.regions(), motion.dilation_px, SHAPE, 1.0)
     left = round(100 + 45 * 2.9)
-    assert motion.grown_px == (2.0, 2.0)
+    assert motion.dilation_px == (2.0, 2.0)
     np.testing.assert_allclose(ends[:4], [left, 120, left + 60, 210], atol=3)
 
 

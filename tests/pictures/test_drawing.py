@@ -14,10 +14,10 @@ from autocalib_ros.pictures.drawing import (
     draw_dots,
     draw_paths,
     draw_text,
-    letter_px,
-    shortened,
+    text_height_px,
     text_size,
-    wrapped,
+    truncate_text,
+    wrap_text,
 )
 
 SIZES = [(320, 240), (640, 360), (1280, 720), (1920, 1080)]
@@ -37,21 +37,21 @@ def test_words_stay_inside_their_panel_and_the_panel_in_the_picture(size, text):
 
 
 def test_letters_are_read_in_small_pictures_and_no_larger_than_needed_in_large_ones():
-    assert letter_px(240) == letter_px(360) == 13.0
-    assert 20 < letter_px(720) < letter_px(1080) <= letter_px(4000) == 34.0
+    assert text_height_px(240) == text_height_px(360) == 13.0
+    assert 20 < text_height_px(720) < text_height_px(1080) <= text_height_px(4000) == 34.0
 
 
 def test_lines_break_between_words_and_fit():
-    lines = wrapped(LONG, 15.0, 300.0, 100)
+    lines = wrap_text(LONG, 15.0, 300.0, 100)
     assert ' '.join(lines) == ' '.join(LONG.split())
     assert max(text_size(line, 15.0)[0] for line in lines) <= 300
 
 
 def test_what_finds_no_room_ends_in_dots():
-    lines = wrapped(LONG, 15.0, 300.0, 3)
+    lines = wrap_text(LONG, 15.0, 300.0, 3)
     assert len(lines) == 3 and lines[-1].endswith(' ...')
     assert text_size(lines[-1], 15.0)[0] <= 300
-    assert text_size(shortened('x' * 200, 15.0, 100.0), 15.0)[0] <= 100
+    assert text_size(truncate_text('x' * 200, 15.0, 100.0), 15.0)[0] <= 100
 
 
 def test_a_path_is_drawn_where_it_is_said_to_be():
@@ -79,8 +79,8 @@ def test_an_overlay_covers_as_much_as_it_is_told_to():
     overlay.add_box(10, 5, 30, 25, PAPER, 0.5)
     overlay.add_box(10, 5, 20, 25, GREY, 1.0)
     image = np.full((40, 60, 3), 100, np.uint8)
-    picture = overlay.laid_over(image)
-    assert (image == 100).all() and (picture == overlay.laid_over(image[..., 0])).all()
+    picture = overlay.composite(image)
+    assert (image == 100).all() and (picture == overlay.composite(image[..., 0])).all()
     assert picture[10, 25] == pytest.approx(177.5, abs=1)  # halfway between 100 and 255, rounded twice
     assert tuple(picture[10, 15]) == bgr(GREY)
     assert (picture[30:] == 100).all() and (picture[:, 30:] == 100).all()

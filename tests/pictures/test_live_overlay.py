@@ -7,15 +7,15 @@ import pytest
 from autocalib_ros.lens.camera_info import camera_info
 from autocalib_ros.pictures.drawing import Caption, bgr
 from autocalib_ros.pictures.live_overlay import (
-    FOLLOWED,
-    HORIZON,
-    MOST_PATHS,
+    HORIZON_COLOUR,
+    MAX_PATHS,
+    TRACKED_COLOUR,
     DebugPicture,
-    JudgedTracks,
+    LabelledTracks,
     RectifiedPicture,
     TopPicture,
 )
-from autocalib_ros.pictures.road import Grid
+from autocalib_ros.pictures.road import GroundGrid
 from autocalib_ros.pictures.views import ground_to_image, image_to_ground
 
 SIZE = (640, 480)
@@ -104,7 +104,7 @@ def test_rectified_is_grey_or_coloured_as_the_image_is(calibrated):
 
 def test_the_horizon_is_drawn_where_the_road_ends(camera, ground, calibrated):
     picture = DebugPicture(SIZE, calibrated, None).draw(BLACK, NOTHING, WORDS)
-    like = (np.abs(picture.astype(int) - bgr(HORIZON)) < 30).all(axis=2)
+    like = (np.abs(picture.astype(int) - bgr(HORIZON_COLOUR)) < 30).all(axis=2)
     like[:60, :200] = like[-60:] = False  # words
     columns = np.flatnonzero(like.any(axis=0))
     rows = np.array([np.flatnonzero(like[:, column]).mean() for column in columns])
@@ -115,7 +115,7 @@ def test_the_horizon_is_drawn_where_the_road_ends(camera, ground, calibrated):
 
 def test_the_grid_is_on_the_road(camera, ground, calibrated):
     picture = DebugPicture(SIZE, calibrated, None).draw(BLACK, NOTHING, WORDS)
-    grid = Grid.of(camera, ground)
+    grid = GroundGrid.of(camera, ground)
     corners, insides = (ground_to_image(camera, ground, np.array(
         [[*(grid.middle_m + grid.step_m * (np.array(place) + shift)), 0.0]
          for place in ((-1, 0), (-1, 1), (-1, -1), (0, -1))])) for shift in (0.0, 0.5))
@@ -129,34 +129,34 @@ def test_what_is_followed_is_drawn_with_its_tail(calibrated):
     tail = np.column_stack([np.linspace(200, 260, 16), np.full(16, 300.0)])
     picture = DebugPicture(SIZE, None, None).draw(BLACK, tail[None], WORDS)
     # smooth lines are a little fainter than their colour
-    assert picture[300, [230, 260]] == pytest.approx(np.array([bgr(FOLLOWED)] * 2), abs=30)
+    assert picture[300, [230, 260]] == pytest.approx(np.array([bgr(TRACKED_COLOUR)] * 2), abs=30)
     assert not picture[290:310, :190].any()
 
 
 def test_tracks_have_the_colour_of_their_road_and_too_many_are_thinned():
-    paths = [np.array([[0.0, 100.0 + row], [600.0, 100.0 + row]]) for row in range(3 * MOST_PATHS)]
-    judged = JudgedTracks(SIZE, np.concatenate(paths), 2 * np.arange(len(paths) + 1),
-                          np.repeat([0, -1, -2], MOST_PATHS))
-    picture = DebugPicture(SIZE, None, judged).draw(BLACK, NOTHING, WORDS)
-    blue, red = picture[100 + MOST_PATHS // 2, 300, 0], picture[100 + MOST_PATHS // 2, 300, 2]
+    paths = [np.array([[0.0, 100.0 + row], [600.0, 100.0 + row]]) for row in range(3 * MAX_PATHS)]
+    labelled_tracks = LabelledTracks(SIZE, np.concatenate(paths), 2 * np.arange(len(paths) + 1),
+                          np.repeat([0, -1, -2], MAX_PATHS))
+    picture = DebugPicture(SIZE, None, labelled_tracks).draw(BLACK, NOTHING, WORDS)
+    blue, red = picture[100 + MAX_PATHS // 2, 300, 0], picture[100 + MAX_PATHS // 2, 300, 2]
     assert blue > 80 and red < 30
-    assert not picture[100 + MOST_PATHS + 10, 300].any()
-    grey = picture[105 + 2 * MOST_PATHS, 300]
+    assert not picture[100 + MAX_PATHS + 10, 300].any()
+    grey = picture[105 + 2 * MAX_PATHS, 300]
     assert grey.min() > 60 and int(grey.max()) - int(grey.min()) < 20
-    assert len(JudgedTracks(SIZE, np.concatenate(paths), judged.starts, np.zeros(len(paths), int)).of(0)) <= MOST_PATHS
+    assert len(LabelledTracks(SIZE, np.concatenate(paths), labelled_tracks.starts, np.zeros(len(paths), int)).of(0)) <= MAX_PATHS
 
 
 def test_tracks_of_another_image_size_are_left_out():
-    judged = JudgedTracks((1280, 720), np.array([[0.0, 200.0], [600.0, 200.0]]), np.array([0, 2]), np.array([0]))
-    assert not DebugPicture(SIZE, None, judged).draw(BLACK, NOTHING, WORDS)[200].any()
+    labelled_tracks = LabelledTracks((1280, 720), np.array([[0.0, 200.0], [600.0, 200.0]]), np.array([0, 2]), np.array([0]))
+    assert not DebugPicture(SIZE, None, labelled_tracks).draw(BLACK, NOTHING, WORDS)[200].any()
 
 
 @pytest.mark.parametrize('size', [(320, 240), (640, 360), (1920, 1080)])
 def test_the_legend_stays_in_the_picture(size):
     width, height = size
     labels = np.arange(-2, 6)
-    judged = JudgedTracks(size, np.tile([[5.0, 60.0]], (16, 1)), 2 * np.arange(9), labels)
-    picture = DebugPicture(size, None, judged).draw(np.zeros((height, width, 3), np.uint8), NOTHING, Caption(''))
+    labelled_tracks = LabelledTracks(size, np.tile([[5.0, 60.0]], (16, 1)), 2 * np.arange(9), labels)
+    picture = DebugPicture(size, None, labelled_tracks).draw(np.zeros((height, width, 3), np.uint8), NOTHING, Caption(''))
     legend = picture[height // 2:]
     assert (legend[:, [0, -1]] == legend[:, [0]]).all() and (legend[-1] == legend[-1, 0]).all()
     assert (legend.max(axis=2) > 200).any()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.pictures.road import Grid, ellipses, enlargement, field_of_view
+from autocalib_ros.pictures.road import GroundGrid, enlargement, error_ellipses, view_frustum
 from autocalib_ros.results.calibration import COVARIANCE_OF, GROUND_DISTANCES_M
 
 HEIGHT_SIGMA_M = 0.1
@@ -20,7 +20,7 @@ def with_height_unsure(calibration):
 
 
 def test_an_unsure_height_makes_ellipses_along_the_ray_that_grow_with_distance(camera, ground, with_height_unsure):
-    found = ellipses(with_height_unsure(camera, ground))
+    found = error_ellipses(with_height_unsure(camera, ground))
     assert [ellipse.distance_m for ellipse in found] == [10.0, 20.0, 40.0] == list(GROUND_DISTANCES_M)
     for ellipse in found:
         expected = ellipse.distance_m * HEIGHT_SIGMA_M / 8.0  # similar triangles
@@ -32,16 +32,16 @@ def test_an_unsure_height_makes_ellipses_along_the_ray_that_grow_with_distance(c
 
 
 def test_distances_that_are_not_in_the_image_have_no_ellipse(camera, with_height_unsure, looking_down):
-    assert [ellipse.distance_m for ellipse in ellipses(with_height_unsure(camera, looking_down(70.0)))] == [10.0]
+    assert [ellipse.distance_m for ellipse in error_ellipses(with_height_unsure(camera, looking_down(70.0)))] == [10.0]
 
 
 def test_without_covariance_or_metres_there_are_no_ellipses(camera, ground, calibrated, lens_only, with_height_unsure):
-    unit = replace(with_height_unsure(camera, ground), ground=replace(ground, metric=False))
-    assert ellipses(calibrated) == ellipses(lens_only) == ellipses(unit) == []
+    length_unit = replace(with_height_unsure(camera, ground), ground=replace(ground, metric=False))
+    assert error_ellipses(calibrated) == error_ellipses(lens_only) == error_ellipses(length_unit) == []
 
 
 def test_ellipses_are_enlarged_until_they_are_seen_and_no_more(camera, ground, with_height_unsure):
-    shown = ellipses(with_height_unsure(camera, ground))
+    shown = error_ellipses(with_height_unsure(camera, ground))
     assert enlargement(shown) == 5  # 1.25 % of the distance: 10 times would be more than a tenth
     assert enlargement([]) == 1
 
@@ -50,7 +50,7 @@ def test_ellipses_are_enlarged_until_they_are_seen_and_no_more(camera, ground, w
 def test_the_field_of_view_goes_through_the_corners_of_the_image(ground, focal_px):
     """At 140 px the corners are more than 90 degrees from the axis."""
     camera = Camera(640, 480, focal_px, (322.0, 236.0))
-    lines = field_of_view(camera, ground)
+    lines = view_frustum(camera, ground)
     rays, around = lines[:4], lines[-1]
     ends = np.array([ray[1] - ray[0] for ray in rays])
     pixels, valid = camera.project(ends @ ground.rotation)
@@ -61,4 +61,4 @@ def test_the_field_of_view_goes_through_the_corners_of_the_image(ground, focal_p
 
 
 def test_no_grid_where_no_road_is_seen(camera, looking_down):
-    assert Grid.of(camera, looking_down(-80.0)) is None
+    assert GroundGrid.of(camera, looking_down(-80.0)) is None

@@ -9,14 +9,14 @@ from autocalib_ros.lens.camera_info import rectified_matrix
 from autocalib_ros.pictures.views import (
     EMPTY_GREY,
     TopView,
-    great_circle,
     grid_lines,
     grid_step,
     ground_to_image,
     image_to_ground,
-    rectified_sources,
+    project_great_circle,
+    project_road_lines,
+    rectification_map,
     resample,
-    road_lines,
 )
 
 CAMERA = Camera(640, 480, 300.0, (322.0, 236.0), (0.01, 0.0, 0.0, 0.0))
@@ -73,7 +73,7 @@ def test_what_the_lens_does_not_see_is_empty(ground):
 def test_undistorted_the_lines_of_the_road_are_straight(ground):
     matrix = rectified_matrix(CAMERA)
     line = np.column_stack([np.full(30, 9.0), np.linspace(-4, 4, 30), np.zeros(30)])
-    sources = rectified_sources(CAMERA, matrix)
+    sources = rectification_map(CAMERA, matrix)
     found = [np.unravel_index(np.argmin(np.hypot(*(sources - pixel).T).T), sources.shape[:2])
              for pixel in ground_to_image(CAMERA, ground, line)]
     columns, rows = np.array(found, float)[:, ::-1].T
@@ -82,7 +82,7 @@ def test_undistorted_the_lines_of_the_road_are_straight(ground):
 
 
 def test_the_horizon_is_where_the_road_ends(ground):
-    horizon = np.concatenate(great_circle(CAMERA, ground.normal_in_camera))
+    horizon = np.concatenate(project_great_circle(CAMERA, ground.normal_in_camera))
     inside = horizon[(horizon >= 0).all(axis=1) & (horizon[:, 0] < 640)]
     assert len(inside) > 10
     assert np.isfinite(image_to_ground(CAMERA, ground, inside + [0.0, 2.0])).all()
@@ -91,7 +91,7 @@ def test_the_horizon_is_where_the_road_ends(ground):
 
 def test_lines_of_the_grid_lie_a_step_apart_on_the_road(ground):
     step = grid_step(ground)
-    parts = road_lines(CAMERA, ground, grid_lines(np.array([15.0, 0.0]), step))
+    parts = project_road_lines(CAMERA, ground, grid_lines(np.array([15.0, 0.0]), step))
     points = np.concatenate([image_to_ground(CAMERA, ground, part) for part in parts])
     off = np.abs(points / step - np.round(points / step)).min(axis=1)
     assert step == 5.0

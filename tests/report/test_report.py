@@ -15,12 +15,12 @@ from matplotlib.text import Text
 
 from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.lens.camera_info import rectified_matrix
-from autocalib_ros.pictures.views import ground_to_image, image_to_ground, nice_length
+from autocalib_ros.pictures.views import ground_to_image, image_to_ground, round_length
 from autocalib_ros.report.lens_figures import in_undistorted, line_error_px
 from autocalib_ros.report.page import ENTRIES, write_report
-from autocalib_ros.report.road_figures import told_of_places, top_view
-from autocalib_ros.report.scene import MOST_MOMENTS, Moment, noted
-from autocalib_ros.report.speed_figures import by_vehicle, pieces_on_road, speed_histogram, speeds_above
+from autocalib_ros.report.road_figures import accuracy_note, top_view
+from autocalib_ros.report.scene import MAX_SNAPSHOTS, SolutionSnapshot, append_snapshot
+from autocalib_ros.report.speed_figures import speed_histogram, speeds_above, track_pieces_on_road, vehicle_speeds
 from autocalib_ros.report.text import how_sure, needs, next_step, number_rows, verdict
 from autocalib_ros.report.traffic_figures import kept_tracks
 from autocalib_ros.results.calibration import Refusal, Residuals
@@ -109,7 +109,7 @@ def test_the_paper_s_method_shows_the_tracks_it_kept_and_knows_no_sigma(full):
     told = replace(full.result.figures, track_labels=np.full(full.evidence.track_count, -1), residuals=Residuals())
     paper = replace(full, result=replace(full.result, method='paper', covariance=None, stddev=sigmas, figures=told))
     assert 'tells no uncertainty' in how_sure(paper.result)
-    assert 'is not told' in told_of_places(paper)
+    assert 'is not told' in accuracy_note(paper)
     assert len(paper.paths(0)) == len(told.paper_tracks) > 0
     assert drawn(paper) == ALL - {'residuals', 'residual_map'}
 
@@ -138,13 +138,13 @@ def test_without_a_scale_nothing_is_in_metres(full, background):
 
 
 def test_a_restored_calibration_without_traffic_shows_the_ground(full):
-    nothing = full.evidence.selected(np.zeros(0, int))
+    nothing = full.evidence.select_tracks(np.zeros(0, int))
     assert {'ground_grid', 'top_view', 'undistorted', 'directions'} <= drawn(
         replace(full, evidence=nothing, moments=()))
 
 
 def test_no_traffic_at_all_still_gives_a_page(tmp_path, refused):
-    nothing = refused.evidence.selected(np.zeros(0, int))
+    nothing = refused.evidence.select_tracks(np.zeros(0, int))
     write_report(tmp_path / 'report.html', replace(refused, evidence=nothing, background=None))
     assert 'Not calibrated' in text_of(tmp_path / 'report.html')
     assert figures(tmp_path / 'report.html') == set()
@@ -189,30 +189,30 @@ def test_what_is_missing_of_a_ground_plane_is_told_and_nothing_of_a_whole_calibr
 def test_the_speed_of_points_above_the_road_is_that_of_their_vehicles(full):
     given = full.options.scale.point_height_m
     scene = replace(full, evidence=junction_evidence(above_m=given))
-    speeds, roads = by_vehicle(scene, pieces_on_road(scene))
+    speeds, roads = vehicle_speeds(scene, track_pieces_on_road(scene))
     # exact but for pieces of half a second that begin at samples
     assert speeds == pytest.approx(np.full(len(speeds), 3.6 * SPEED_M_S), rel=1e-6)
     assert set(roads) <= {-1, 0, 1} and {0, 1} <= set(roads)
 
 
 def test_points_on_the_road_itself_look_slower_by_their_height(full):
-    speeds, _ = by_vehicle(full, pieces_on_road(full))
+    speeds, _ = vehicle_speeds(full, track_pieces_on_road(full))
     share = 1 - full.options.scale.point_height_m / full.result.ground.height_m
     assert speeds == pytest.approx(np.full(len(speeds), 3.6 * SPEED_M_S * share), rel=1e-6)
 
 
 def test_moments_are_few_and_the_newest_is_among_them(full):
     moments = ()
-    for second in range(10 * MOST_MOMENTS):
+    for second in range(10 * MAX_SNAPSHOTS):
         summary = replace(full.result.evidence, seconds=float(second))
-        moments = noted(moments, replace(full.result, evidence=summary))
-        assert len(moments) <= MOST_MOMENTS + 1 and moments[-1].seconds == second
+        moments = append_snapshot(moments, replace(full.result, evidence=summary))
+        assert len(moments) <= MAX_SNAPSHOTS + 1 and moments[-1].seconds == second
     assert moments[0].seconds == 0.0
 
 
 def test_moments_of_an_earlier_time_go_when_time_begins_anew(full):
     early = replace(full.result, evidence=replace(full.result.evidence, seconds=5.0))
-    assert noted((Moment(60.0), Moment(70.0)), early) == (Moment.of(early),)
+    assert append_snapshot((SolutionSnapshot(60.0), SolutionSnapshot(70.0)), early) == (SolutionSnapshot.of(early),)
 
 
 def test_a_plane_without_scale_is_not_given_in_metres(full):
@@ -239,4 +239,4 @@ def test_exact_tracks_are_straight_in_the_undistorted_picture(full):
 
 @pytest.mark.parametrize(('length', 'nice'), [(0.7, 0.5), (1.0, 1.0), (3.9, 2.0), (64.0, 50.0), (10.0, 10.0)])
 def test_scales_have_round_lengths(length, nice):
-    assert nice_length(length) == pytest.approx(nice)
+    assert round_length(length) == pytest.approx(nice)

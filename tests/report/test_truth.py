@@ -10,8 +10,8 @@ from autocalib_ros.config import Options
 from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.offline.synthetic.junction import Junction, synthetic_evidence
 from autocalib_ros.pictures.views import TopView, grid_lines, grid_step, ground_to_image, image_to_ground
-from autocalib_ros.report.road_figures import place_sigma_m, traffic_on_road
-from autocalib_ros.report.scene import Scene
+from autocalib_ros.report.road_figures import position_sigma_m, tracked_road_points
+from autocalib_ros.report.scene import ReportScene
 from autocalib_ros.results.calibration import Calibration
 
 JUNCTION = Junction()
@@ -21,12 +21,12 @@ SIGMAS = 3.0
 
 
 @pytest.fixture(scope='module', params=[0, 1])
-def scene(request) -> Scene:
+def scene(request) -> ReportScene:
     """Return what a report is about, solved from traffic whose truth is known."""
     evidence, options = synthetic_evidence(JUNCTION, np.random.default_rng(request.param)), Options(camera_height=8.0)
     result = solve(evidence, options)
     assert isinstance(result, Calibration) and result.grade == 'full'
-    return Scene(result=result, evidence=evidence, background=None, options=options, source='made up')
+    return ReportScene(result=result, evidence=evidence, background=None, options=options, source='made up')
 
 
 def ahead(ground: GroundPlane) -> float:
@@ -35,7 +35,7 @@ def ahead(ground: GroundPlane) -> float:
     return float(np.arctan2(y, x))
 
 
-def errors_m(scene: Scene, points_m: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+def errors_m(scene: ReportScene, points_m: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     """How far places (n, 2) are from what pixels (n, 2) show in truth; headings are chosen, so that they agree."""
     turn = ahead(scene.calibration.ground) - ahead(TRUTH)
     rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
@@ -49,17 +49,17 @@ def inside(pixels: np.ndarray) -> np.ndarray:
 
 def test_corners_of_the_grid_lie_where_the_truth_has_them(scene):
     calibration = scene.calibration
-    lines = np.concatenate(grid_lines(np.median(traffic_on_road(scene), axis=0), grid_step(calibration.ground)))
+    lines = np.concatenate(grid_lines(np.median(tracked_road_points(scene), axis=0), grid_step(calibration.ground)))
     pixels = ground_to_image(calibration.camera, calibration.ground, lines)
     near = inside(np.nan_to_num(pixels, nan=-1.0)) & (np.hypot(*lines[:, :2].T) < 50.0)
     assert near.sum() > 1000
-    sigma = place_sigma_m(scene, lines[near, :2])
+    sigma = position_sigma_m(scene, lines[near, :2])
     assert (errors_m(scene, lines[near, :2], pixels[near]) < SIGMAS * sigma).all()
 
 
 def test_the_top_view_shows_places_where_the_truth_has_them(scene):
     calibration = scene.calibration
-    view = TopView.around(traffic_on_road(scene), calibration.ground, 100)
+    view = TopView.around(tracked_road_points(scene), calibration.ground, 100)
     sources = view.sources(calibration.camera, calibration.ground).astype(float).reshape(-1, 2)
     columns, rows = np.meshgrid(np.arange(view.columns), np.arange(view.rows))
     x = view.low_m[0] + (columns + 0.5) / view.px_per_m
@@ -67,7 +67,7 @@ def test_the_top_view_shows_places_where_the_truth_has_them(scene):
     places = np.stack([x, y], axis=-1).reshape(-1, 2)
     near = inside(sources) & (np.hypot(*places.T) < 50.0)
     assert near.sum() > 500
-    sigma = place_sigma_m(scene, places[near])
+    sigma = position_sigma_m(scene, places[near])
     # the table holds single precision, a millionth of the image
     assert (errors_m(scene, places[near], sources[near]) < SIGMAS * sigma + 1e-3).all()
 
@@ -76,8 +76,8 @@ def test_sigma_of_places_is_that_of_the_numbers_told(scene):
     told = scene.result.stddev.ground_point_m
     heading = ahead(scene.calibration.ground)
     places = np.array([[np.cos(heading), np.sin(heading)]]) * np.array([[10.0], [20.0], [40.0]])
-    assert place_sigma_m(scene, places) == pytest.approx(np.array(told, float), rel=0.1, nan_ok=True)
+    assert position_sigma_m(scene, places) == pytest.approx(np.array(told, float), rel=0.1, nan_ok=True)
 
 
 def test_outside_the_image_no_sigma_is_told(scene):
-    assert np.isnan(place_sigma_m(scene, np.array([[-100.0, 0.0], [0.0, 0.0]]))).all()
+    assert np.isnan(position_sigma_m(scene, np.array([[-100.0, 0.0], [0.0, 0.0]]))).all()

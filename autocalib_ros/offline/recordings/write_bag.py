@@ -18,7 +18,7 @@ from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.offline.recordings.sources import Source, StoredImage, camera_name, image_topic
 from autocalib_ros.perception.ignore_regions import Polygons
-from autocalib_ros.perception.masked_messages import blacked_out, require_blackable
+from autocalib_ros.perception.masked_messages import mask_message, require_maskable
 from autocalib_ros.results.calibration import Calibration
 
 LOG = logging.getLogger(__name__)
@@ -88,9 +88,9 @@ class _Recording:
             return cdr
         kind = self._source.image_type
         message = self._store.deserialize_cdr(cdr, kind)
-        require_blackable(message)
+        require_maskable(message)
         try:
-            black = blacked_out(message, self._ignored)
+            black = mask_message(message, self._ignored)
         except InputError:
             self._broken += 1
             return None

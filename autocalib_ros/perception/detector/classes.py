@@ -16,19 +16,19 @@ PEOPLE_NAMES = frozenset((
 
 
 @dataclass(frozen=True)
-class Classes:
+class ClassIds:
     """Numbers of a model's classes of vehicles and of people, cyclists among them."""
 
     vehicles: tuple[int, ...]
     people: tuple[int, ...]
 
 
-COCO_80 = Classes(vehicles=(2, 3, 5, 7), people=(0, 1))
-COCO_91 = Classes(vehicles=(3, 4, 6, 8), people=(1, 2))
+COCO_80 = ClassIds(vehicles=(2, 3, 5, 7), people=(0, 1))
+COCO_91 = ClassIds(vehicles=(3, 4, 6, 8), people=(1, 2))
 """COCO's own numbers, with gaps, which TensorFlow's and DETR's models keep."""
 
 
-def chosen_classes(options: DetectorOptions, names: Mapping[int, str], layout: str, count: int | None) -> Classes:
+def chosen_classes(options: DetectorOptions, names: Mapping[int, str], layout: str, count: int | None) -> ClassIds:
     """Choose by the options, else by the names in the model, else COCO; UsageError where none of them tells.
 
     `count` is the number of classes, None where the layout does not tell it.
@@ -39,9 +39,9 @@ def chosen_classes(options: DetectorOptions, names: Mapping[int, str], layout: s
         if count is not None and highest >= count:
             raise UsageError(f"class {highest} of 'detector.class_ids' is not in the model, whose classes are numbered "
                              f'0 to {count - 1}')
-        return Classes(vehicles, people)
+        return ClassIds(vehicles, people)
     if names:
-        return _by_name(names)
+        return _classes_by_name(names)
     if layout == 'tf_od' or (layout == 'detr' and count in (90, 91)):
         return COCO_91
     if layout != 'detection_output' and count in (80, None):
@@ -50,10 +50,10 @@ def chosen_classes(options: DetectorOptions, names: Mapping[int, str], layout: s
                      "'detector.class_ids' to the numbers of those that are vehicles")
 
 
-def _by_name(names: Mapping[int, str]) -> Classes:
+def _classes_by_name(names: Mapping[int, str]) -> ClassIds:
     words = {number: name.strip().lower() for number, name in names.items()}
     vehicles = tuple(number for number, word in sorted(words.items()) if word in VEHICLE_NAMES)
     if not vehicles:
         raise UsageError(f"none of the model's classes is known as a vehicle ({', '.join(words.values())[:300]}): set "
                          "'detector.class_ids' to the numbers of those that are")
-    return Classes(vehicles, tuple(number for number, word in sorted(words.items()) if word in PEOPLE_NAMES))
+    return ClassIds(vehicles, tuple(number for number, word in sorted(words.items()) if word in PEOPLE_NAMES))

@@ -15,7 +15,7 @@ import numpy as np
 Outputs = Mapping[str, np.ndarray]
 Size = tuple[int, int]
 YOLOX_STRIDES = (8, 16, 32)
-DETR_WITH_NONE = 92
+DETR_CLASSES_WITH_BACKGROUND = 92
 """DETR's own models end with a class for nothing and share out probability among classes; its successors do not."""
 
 
@@ -41,14 +41,14 @@ class Boxes:
 Decode = Callable[[Outputs, Size, int | None, float], Boxes]
 
 
-def without_doubles(boxes: Boxes, iou: float) -> Boxes:
+def non_maximum_suppression(boxes: Boxes, iou: float) -> Boxes:
     """Drop boxes that overlap a better one by more than `iou`, whatever their classes: a van is a car or a truck."""
     left_top, right_bottom = boxes.edges_px[:, :2], boxes.edges_px[:, 2:]
     kept = cv2.dnn.NMSBoxes(np.hstack([left_top, right_bottom - left_top]).tolist(), boxes.scores.tolist(), 0.0, iou)
     return boxes.subset(np.array(kept, int).ravel())
 
 
-def yolox_centres(size: Size) -> np.ndarray:
+def yolox_grid(size: Size) -> np.ndarray:
     """Corner of each cell in cells, and its stride in pixels, shape (cells, 3), in YOLOX's order."""
     width, height = size
     levels = []
@@ -58,90 +58,90 @@ def yolox_centres(size: Size) -> np.ndarray:
     return np.concatenate(levels).astype(float)
 
 
-def yolox(outputs: Outputs, size: Size, count: int | None, least: float) -> Boxes:
+def yolox(outputs: Outputs, size: Size, count: int | None, min_score: float) -> Boxes:
     """Rows of offsets within cells of a grid, logarithms of sizes, objectness, classes: [1, A, 5 + C]."""
-    rows = _only(outputs, 3)[0]
-    likely = rows[:, 4] >= least
-    rows, cells = rows[likely].astype(float), yolox_centres(size)[likely]
+    rows = _output_of_rank(outputs, 3)[0]
+    likely = rows[:, 4] >= min_score
+    rows, cells = rows[likely].astype(float), yolox_grid(size)[likely]
     stride = cells[:, 2:]
     with np.errstate(over='ignore'):  # sizes beyond all bounds are those of another layout
         sizes = np.exp(rows[:, 2:4]) * stride
-    return _with_objectness(_from_centres((rows[:, :2] + cells[:, :2]) * stride, sizes), rows, count, least)
+    return _with_objectness(_edges_from_centres((rows[:, :2] + cells[:, :2]) * stride, sizes), rows, count, min_score)
 
 
-def yolov5(outputs: Outputs, size: Size, count: int | None, least: float) -> Boxes:
+def yolov5(outputs: Outputs, size: Size, count: int | None, min_score: float) -> Boxes:
     """Rows of centre, size, objectness, classes: [1, rows, 5 + C]."""
-    rows = _only(outputs, 3)[0]
-    rows = rows[rows[:, 4] >= least].astype(float)
-    return _with_objectness(_from_centres(rows[:, :2], rows[:, 2:4]), rows, count, least)
+    rows = _output_of_rank(outputs, 3)[0]
+    rows = rows[rows[:, 4] >= min_score].astype(float)
+    return _with_objectness(_edges_from_centres(rows[:, :2], rows[:, 2:4]), rows, count, min_score)
 
 
-def yolov8(outputs: Outputs, size: Size, count: int | None, least: float) -> Boxes:
+def yolov8(outputs: Outputs, size: Size, count: int | None, min_score: float) -> Boxes:
     """Columns of centre, size, classes: [1, 4 + C, A]; masks may follow the classes."""
-    rows = _only(outputs, 3)[0].T
-    return _best(_from_centres(rows[:, :2], rows[:, 2:4]), rows[:, 4:None if count is None else 4 + count], least)
+    rows = _output_of_rank(outputs, 3)[0].T
+    return _best_class(_edges_from_centres(rows[:, :2], rows[:, 2:4]), rows[:, 4:None if count is None else 4 + count], min_score)
 
 
-def end_to_end(outputs: Outputs, size: Size, count: int | None, least: float) -> Boxes:
+def end_to_end(outputs: Outputs, size: Size, count: int | None, min_score: float) -> Boxes:
     """Rows of edges, score, class: [1, 300, 6]."""
-    rows = _only(outputs, 3)[0]
-    return _above(Boxes(rows[:, :4], rows[:, 4], rows[:, 5]), least)
+    rows = _output_of_rank(outputs, 3)[0]
+    return _above_score(Boxes(rows[:, :4], rows[:, 4], rows[:, 5]), min_score)
 
 
-def yolov7_end2end(outputs: Outputs, size: Size, count: int | None, least: float) -> Boxes:
+def yolov7_end2end(outputs: Outputs, size: Size, count: int | None, min_score: float) -> Boxes:
     """Rows of image, edges, class, score: [n, 7]."""
-    rows = _only(outputs, 2)
-    return _above(Boxes(rows[:, 1:5], rows[:, 6], rows[:, 5]), least)
+    rows = _output_of_rank(outputs, 2)
+    return _above_score(Boxes(rows[:, 1:5], rows[:, 6], rows[:, 5]), min_score)
 
 
-def yolov3(outputs: Outputs, size: Size, count: int | None, least: float) -> Boxes:
+def yolov3(outputs: Outputs, size: Size, count: int | None, min_score: float) -> Boxes:
     """Edges, y first: [1, M, 4]; scores [1, C, M]; and what is left, as image, class, box: [n, 3] or [1, n, 3]."""
     picked = next(array for array in outputs.values() if array.dtype.kind in 'iu').reshape(-1, 3)
     edges, scores = boxes_and_classes({name: array for name, array in outputs.items() if array.dtype.kind == 'f'})
     picked = picked[(picked >= 0).all(axis=1)]
-    return _above(Boxes(edges[picked[:, 2]][:, [1, 0, 3, 2]], scores[picked[:, 1], picked[:, 2]], picked[:, 1]), least)
+    return _above_score(Boxes(edges[picked[:, 2]][:, [1, 0, 3, 2]], scores[picked[:, 1], picked[:, 2]], picked[:, 1]), min_score)
 
 
-def yolo_nas(outputs: Outputs, size: Size, count: int | None, least: float) -> Boxes:
+def yolo_nas(outputs: Outputs, size: Size, count: int | None, min_score: float) -> Boxes:
     """Edges [1, A, 4] and probabilities [1, A, C]."""
     edges, scores = boxes_and_classes(outputs)
-    return _best(edges, scores, least)
+    return _best_class(edges, scores, min_score)
 
 
-def rtdetr(outputs: Outputs, size: Size, count: int | None, least: float) -> Boxes:
+def rtdetr(outputs: Outputs, size: Size, count: int | None, min_score: float) -> Boxes:
     """Labels [1, Q], boxes by edges [1, Q, 4] in pixels of the size that is fed in, scores [1, Q]."""
-    return _above(Boxes(outputs['boxes'][0], outputs['scores'][0], outputs['labels'][0]), least)
+    return _above_score(Boxes(outputs['boxes'][0], outputs['scores'][0], outputs['labels'][0]), min_score)
 
 
-def ultralytics_rtdetr(outputs: Outputs, size: Size, count: int | None, least: float) -> Boxes:
+def ultralytics_rtdetr(outputs: Outputs, size: Size, count: int | None, min_score: float) -> Boxes:
     """Rows of centre and size as shares of the input, probabilities: [1, 300, 4 + C]."""
-    rows = _only(outputs, 3)[0]
-    return _best(_from_centres(rows[:, :2] * size, rows[:, 2:4] * size), rows[:, 4:], least)
+    rows = _output_of_rank(outputs, 3)[0]
+    return _best_class(_edges_from_centres(rows[:, :2] * size, rows[:, 2:4] * size), rows[:, 4:], min_score)
 
 
-def detr(outputs: Outputs, size: Size, count: int | None, least: float) -> Boxes:
+def detr(outputs: Outputs, size: Size, count: int | None, min_score: float) -> Boxes:
     """Centre and size as shares of the input [1, Q, 4] and logits [1, Q, K]."""
     centres, logits = boxes_and_classes(outputs)
     logits = logits.astype(float)
-    if logits.shape[1] == DETR_WITH_NONE:
+    if logits.shape[1] == DETR_CLASSES_WITH_BACKGROUND:
         raised = np.exp(logits - logits.max(axis=1, keepdims=True))
         scores = (raised / raised.sum(axis=1, keepdims=True))[:, :-1]
     else:
         scores = 1.0 / (1.0 + np.exp(-logits))
-    return _best(_from_centres(centres[:, :2] * size, centres[:, 2:] * size), scores, least)
+    return _best_class(_edges_from_centres(centres[:, :2] * size, centres[:, 2:] * size), scores, min_score)
 
 
-def tf_od(outputs: Outputs, size: Size, count: int | None, least: float) -> Boxes:
+def tf_od(outputs: Outputs, size: Size, count: int | None, min_score: float) -> Boxes:
     """TensorFlow's object detection: edges, y first, as shares of the input."""
     edges = outputs['detection_boxes'][0][:, [1, 0, 3, 2]]
-    return _above(Boxes(edges * (size + size), outputs['detection_scores'][0], outputs['detection_classes'][0]), least)
+    return _above_score(Boxes(edges * (size + size), outputs['detection_scores'][0], outputs['detection_classes'][0]), min_score)
 
 
-def detection_output(outputs: Outputs, size: Size, count: int | None, least: float) -> Boxes:
+def detection_output(outputs: Outputs, size: Size, count: int | None, min_score: float) -> Boxes:
     """Rows of image, class, score, edges as shares of the input, up to an image below zero: [1, 1, N, 7]."""
-    rows = _only(outputs, 4)[0, 0]
+    rows = _output_of_rank(outputs, 4)[0, 0]
     rows = rows[:int(np.argmax(rows[:, 0] < 0))] if (rows[:, 0] < 0).any() else rows
-    return _above(Boxes(rows[:, 3:] * (size + size), rows[:, 2], rows[:, 1]), least)
+    return _above_score(Boxes(rows[:, 3:] * (size + size), rows[:, 2], rows[:, 1]), min_score)
 
 
 def boxes_and_classes(outputs: Outputs) -> tuple[np.ndarray, np.ndarray]:
@@ -151,27 +151,27 @@ def boxes_and_classes(outputs: Outputs) -> tuple[np.ndarray, np.ndarray]:
     return both[first][0], both[1 - first][0]
 
 
-def _only(outputs: Outputs, dimensions: int) -> np.ndarray:
+def _output_of_rank(outputs: Outputs, dimensions: int) -> np.ndarray:
     """Return the output of so many dimensions; others, masks and heads for training, say no boxes."""
     return next(array for array in outputs.values() if array.ndim == dimensions)
 
 
-def _from_centres(centres: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+def _edges_from_centres(centres: np.ndarray, sizes: np.ndarray) -> np.ndarray:
     return np.hstack([centres - 0.5 * sizes, centres + 0.5 * sizes])
 
 
-def _with_objectness(edges: np.ndarray, rows: np.ndarray, count: int | None, least: float) -> Boxes:
+def _with_objectness(edges: np.ndarray, rows: np.ndarray, count: int | None, min_score: float) -> Boxes:
     """Boxes whose score is that of an object times that of the best class."""
-    return _best(edges, rows[:, 4:5] * rows[:, 5:None if count is None else 5 + count], least)
+    return _best_class(edges, rows[:, 4:5] * rows[:, 5:None if count is None else 5 + count], min_score)
 
 
-def _best(edges: np.ndarray, scores: np.ndarray, least: float) -> Boxes:
+def _best_class(edges: np.ndarray, scores: np.ndarray, min_score: float) -> Boxes:
     """Boxes of the best class each, of scores (n, C)."""
-    keep = np.flatnonzero(scores.max(axis=1, initial=0.0) >= least)
+    keep = np.flatnonzero(scores.max(axis=1, initial=0.0) >= min_score)
     classes = scores[keep].argmax(axis=1) if len(keep) else np.zeros(0, int)
-    return _above(Boxes(edges[keep], scores[keep, classes], classes), least)
+    return _above_score(Boxes(edges[keep], scores[keep, classes], classes), min_score)
 
 
-def _above(boxes: Boxes, least: float) -> Boxes:
-    kept = boxes.subset(boxes.scores >= least)
+def _above_score(boxes: Boxes, min_score: float) -> Boxes:
+    kept = boxes.subset(boxes.scores >= min_score)
     return Boxes(kept.edges_px.astype(float), kept.scores.astype(float), np.round(kept.classes).astype(int))

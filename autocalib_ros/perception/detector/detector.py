@@ -12,16 +12,16 @@ import numpy as np
 from autocalib_ros.config import DetectorOptions
 from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.perception.detector.classes import chosen_classes
-from autocalib_ros.perception.detector.decoding import without_doubles
-from autocalib_ros.perception.detector.layouts import LAYOUTS, Seen, class_count, layout_of
-from autocalib_ros.perception.detector.preprocessing import PAD_LEVEL, Colours, Placement, placed, tensor
+from autocalib_ros.perception.detector.decoding import non_maximum_suppression
+from autocalib_ros.perception.detector.layouts import LAYOUTS, ModelProbe, count_classes, detect_layout
+from autocalib_ros.perception.detector.preprocessing import PAD_LEVEL, ColourFormat, Placement, place_in_input, tensor
 from autocalib_ros.perception.detector.session import open_session
 
-NATIVE_PX = 1280
+MAX_INPUT_PX = 1280
 """Longest side of the input of a model that takes any size: beyond, time grows and little is found."""
 TRIAL_SIZE = (640, 384)
 """Width and height of the grey image for such a model; not square, so that the two cannot be mistaken."""
-KINDS = {'tensor(float)': np.float32, 'tensor(float16)': np.float16, 'tensor(uint8)': np.uint8}
+INPUT_DTYPES = {'tensor(float)': np.float32, 'tensor(float16)': np.float16, 'tensor(uint8)': np.uint8}
 
 
 @dataclass(frozen=True)
@@ -46,25 +46,25 @@ class VehicleDetector:
 
     def __init__(self, session: Any, options: DetectorOptions) -> None:
         self._session, self._options = session, options
-        self._picture, self._image_size_input = _inputs(session)
-        shape = self._picture.shape
+        self._image_input, self._size_input = _inputs(session)
+        shape = self._image_input.shape
         self._channels_last = shape[-1] == 3 and shape[1] != 3
         height, width = shape[1:3] if self._channels_last else shape[2:]
         self._model_size = tuple(side if isinstance(side, int) and side > 0 else None for side in (width, height))
         if options.input_size and None not in self._model_size:
             raise UsageError(f"'detector.input_size' is for a model that takes any size; this one takes "
                              f'{self._model_size[0]}x{self._model_size[1]}: leave it out')
-        seen = self._seen()
-        self.layout = layout_of(seen) if options.layout == 'auto' else options.layout
-        as_usual = LAYOUTS[self.layout]
-        self._nms, self._decode = not as_usual.own_nms, as_usual.decode
-        self._mode = as_usual.resize_mode if options.resize_mode == 'auto' else options.resize_mode
-        self._colours = Colours(
-            order=as_usual.channel_order if options.channel_order == 'auto' else options.channel_order,
-            white=options.input_scale or as_usual.input_scale,
-            imagenet=as_usual.imagenet if options.mean_std == 'auto' else options.mean_std == 'imagenet')
+        seen = self._probe()
+        self.layout = detect_layout(seen) if options.layout == 'auto' else options.layout
+        defaults = LAYOUTS[self.layout]
+        self._nms, self._decode = not defaults.needs_no_nms, defaults.decode
+        self._mode = defaults.resize_mode if options.resize_mode == 'auto' else options.resize_mode
+        self._colours = ColourFormat(
+            order=defaults.channel_order if options.channel_order == 'auto' else options.channel_order,
+            white=options.input_scale or defaults.input_scale,
+            imagenet=defaults.imagenet if options.mean_std == 'auto' else options.mean_std == 'imagenet')
         self._require_readable(seen)
-        self._count = class_count(self.layout, seen)
+        self._count = count_classes(self.layout, seen)
         self._classes = chosen_classes(options, seen.names, self.layout, self._count)
 
     def __str__(self) -> str:
@@ -77,7 +77,7 @@ class VehicleDetector:
     def detect(self, image: np.ndarray) -> Detections:
         """Find vehicles and people in a grey (H, W) or BGR (H, W, 3) image, uint8, best first."""
         size = (image.shape[1], image.shape[0])
-        placement = placed(size, self._model_size, self._mode, self._options.input_size or NATIVE_PX)
+        placement = place_in_input(size, self._model_size, self._mode, self._options.input_size or MAX_INPUT_PX)
         try:
             outputs = self._run(image, placement)
         except Exception as error:  # onnxruntime has a class of its own for each reason, none with a common root
@@ -88,28 +88,28 @@ class VehicleDetector:
                              & np.isfinite(boxes.edges_px).all(axis=1))
         boxes = boxes.subset(np.argsort(-boxes.scores, kind='stable'))
         if self._nms:
-            boxes = without_doubles(boxes, self._options.nms_iou)
-        edges = np.clip(placement.in_image(boxes.edges_px), 0.0, size + size)
+            boxes = non_maximum_suppression(boxes, self._options.nms_iou)
+        edges = np.clip(placement.to_image(boxes.edges_px), 0.0, size + size)
         seen = (edges[:, 2:] - edges[:, :2] > 1.0).all(axis=1)
         return Detections(edges[seen], boxes.scores[seen], np.isin(boxes.classes[seen], self._classes.people))
 
     def _run(self, image: np.ndarray, placement: Placement) -> dict[str, np.ndarray]:
         """Outputs by name for an image; a model that asks for the image's size is given that of its input."""
-        feed = {self._picture.name: tensor(image, placement, self._colours, KINDS[self._picture.type],
+        feed = {self._image_input.name: tensor(image, placement, self._colours, INPUT_DTYPES[self._image_input.type],
                                            channels_last=self._channels_last)}
-        if self._image_size_input is not None:
+        if self._size_input is not None:
             # D-FINE and RT-DETR take whole numbers, width first; YOLOv3 fractions, height first
-            whole = 'int' in self._image_size_input.type
-            kind = np.int32 if 'int32' in self._image_size_input.type else np.int64 if whole else np.float32
-            feed[self._image_size_input.name] = np.array([placement.input_size[::1 if whole else -1]], kind)
+            whole = 'int' in self._size_input.type
+            kind = np.int32 if 'int32' in self._size_input.type else np.int64 if whole else np.float32
+            feed[self._size_input.name] = np.array([placement.input_size[::1 if whole else -1]], kind)
         names = [output.name.partition(':')[0] for output in self._session.get_outputs()]
         return dict(zip(names, map(np.asarray, self._session.run(None, feed)), strict=True))
 
-    def _seen(self) -> Seen:
+    def _probe(self) -> ModelProbe:
         """Show the model a grey image and collect what it says of itself."""
         longest = self._options.input_size or max(TRIAL_SIZE)
-        placement = placed(TRIAL_SIZE, self._model_size, 'stretch', longest)
-        self._colours = Colours('rgb', 1.0, imagenet=False)
+        placement = place_in_input(TRIAL_SIZE, self._model_size, 'stretch', longest)
+        self._colours = ColourFormat('rgb', 1.0, imagenet=False)
         grey = np.full((placement.image_size[1], placement.image_size[0]), PAD_LEVEL, np.uint8)
         meta = dict(self._session.get_modelmeta().custom_metadata_map)
         said = '; '.join(f'{what} {", ".join(f"{port.name} {port.shape}" for port in ports)}' for what, ports in (
@@ -120,11 +120,11 @@ class VehicleDetector:
             raise UsageError(f'the detector failed on a grey image of {placement.input_size[0]}x'
                              f'{placement.input_size[1]} ({said}): {" ".join(str(error).split())[:300]}') from error
         given = ', '.join(f'{name} {list(array.shape)}' for name, array in outputs.items())
-        return Seen(inputs=len(self._session.get_inputs()), outputs=outputs, size=placement.input_size,
+        return ModelProbe(inputs=len(self._session.get_inputs()), outputs=outputs, size=placement.input_size,
                     names=_names(meta), end_to_end=str(meta.get('end2end', '')).lower() == 'true',
                     shapes=f'{said}; for {placement.input_size[0]}x{placement.input_size[1]} it gave {given}')
 
-    def _require_readable(self, seen: Seen) -> None:
+    def _require_readable(self, seen: ModelProbe) -> None:
         """Raise UsageError unless the layout, which may have been asked for, reads what the grey image gave."""
         try:
             self._decode(seen.outputs, seen.size, None, 0.0)
@@ -136,7 +136,7 @@ class VehicleDetector:
 def _inputs(session: Any) -> tuple[Any, Any]:
     """Return the model's input for the picture, and that for its size or None; UsageError at anything else."""
     ports = session.get_inputs()
-    pictures = [port for port in ports if len(port.shape) == 4 and port.type in KINDS]
+    pictures = [port for port in ports if len(port.shape) == 4 and port.type in INPUT_DTYPES]
     sizes = [port for port in ports if len(port.shape) == 2 and port.shape[-1] == 2]
     if len(pictures) != 1 or len(pictures) + len(sizes) != len(ports) or 3 not in (
             pictures[0].shape[1], pictures[0].shape[3]):

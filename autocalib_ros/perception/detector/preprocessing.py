@@ -11,7 +11,7 @@ PAD_LEVEL = 114
 """Grey of what is padded, as the YOLO family was trained with."""
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 """Of red, green and blue, as shares of white."""
-STEP_PX = 32
+SIZE_MULTIPLE_PX = 32
 """Detectors take sizes in multiples of this."""
 
 
@@ -26,12 +26,12 @@ class Placement:
     factor: tuple[float, float]
     offset: tuple[int, int]
 
-    def in_image(self, edges_px: np.ndarray) -> np.ndarray:
+    def to_image(self, edges_px: np.ndarray) -> np.ndarray:
         """Bring edges (n, 4) of boxes in the input back to the image."""
         return (edges_px - self.offset * 2) / (self.factor * 2)
 
 
-def placed(image_size: tuple[int, int], model_size: tuple[int | None, int | None], mode: str,
+def place_in_input(image_size: tuple[int, int], model_size: tuple[int | None, int | None], mode: str,
            longest: int) -> Placement:
     """Place an image of (width, height); a model that takes any size gets the image's, up to `longest`.
 
@@ -39,7 +39,7 @@ def placed(image_size: tuple[int, int], model_size: tuple[int | None, int | None
     """
     width, height = image_size
     free = min(1.0, longest / max(image_size))
-    room = [fixed or int(np.ceil(round(side * free) / STEP_PX)) * STEP_PX
+    room = [fixed or int(np.ceil(round(side * free) / SIZE_MULTIPLE_PX)) * SIZE_MULTIPLE_PX
             for side, fixed in zip(image_size, model_size, strict=True)]
     factors = [min(1.0, space / side, 1.0 if fixed else free)
                for space, side, fixed in zip(room, image_size, model_size, strict=True)]
@@ -51,7 +51,7 @@ def placed(image_size: tuple[int, int], model_size: tuple[int | None, int | None
 
 
 @dataclass(frozen=True)
-class Colours:
+class ColourFormat:
     """What a model takes for colours."""
 
     order: str
@@ -62,7 +62,7 @@ class Colours:
     """Normalised by ImageNet's mean and standard deviation."""
 
 
-def tensor(image: np.ndarray, placement: Placement, colours: Colours, kind: np.dtype, *,
+def tensor(image: np.ndarray, placement: Placement, colours: ColourFormat, kind: np.dtype, *,
            channels_last: bool) -> np.ndarray:
     """Turn a grey (H, W) or BGR (H, W, 3) image, uint8, into the input [1, 3, h, w], or [1, h, w, 3]."""
     if placement.image_size != (image.shape[1], image.shape[0]):

@@ -9,7 +9,7 @@ import numpy as np
 from autocalib_ros.calibrator import solve
 from autocalib_ros.config import Options
 from autocalib_ros.estimation.observations.selection import drop_pedestrians
-from autocalib_ros.evidence.snapshot import Evidence, Kind
+from autocalib_ros.evidence.snapshot import Evidence, TrackKind
 from autocalib_ros.offline.synthetic.junction import Junction, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration, Refusal
 
@@ -25,7 +25,7 @@ def with_people(evidence: Evidence, count: int, generator: np.random.Generator) 
         times_s=np.concatenate([np.tile(0.4 * np.arange(samples), count), evidence.times_s]),
         track_starts=np.concatenate([samples * np.arange(count), evidence.track_starts + samples * count]),
         track_vehicles=np.concatenate([100000 + np.arange(count), evidence.track_vehicles]),
-        track_kinds=np.concatenate([np.full(count, Kind.PERSON), np.full(evidence.track_count, Kind.VEHICLE)]
+        track_kinds=np.concatenate([np.full(count, TrackKind.PERSON), np.full(evidence.track_count, TrackKind.VEHICLE)]
                                    ).astype(np.uint8))
 
 
@@ -42,7 +42,7 @@ def test_people_change_nothing_of_the_lens_and_the_plane_nor_of_what_became_of_e
 
 def test_tracks_of_vehicles_are_missing_where_most_are_of_people() -> None:
     evidence = synthetic_evidence(Junction(), np.random.default_rng(3))
-    kinds = np.where(np.arange(evidence.track_count) < 10, Kind.VEHICLE, Kind.PERSON).astype(np.uint8)
+    kinds = np.where(np.arange(evidence.track_count) < 10, TrackKind.VEHICLE, TrackKind.PERSON).astype(np.uint8)
     refused = solve(replace(evidence, track_kinds=kinds), Options(camera_height=8.0))
     assert isinstance(refused, Refusal) and refused.code == 'too_few_tracks'
     assert refused.message.startswith('10 tracks of the 40 needed')

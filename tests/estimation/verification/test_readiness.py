@@ -52,7 +52,7 @@ def test_nothing_is_foretold_when_nothing_is_missing() -> None:
 @pytest.mark.parametrize(('seconds', 'description'), [(290.0, ''), (720.0, 'no traffic in the last 12 min'),
                                                 (4 * 3600.0, 'no traffic in the last 4 h')])
 def test_without_any_traffic_that_is_said(seconds: float, description: str) -> None:
-    nothing = replace(evidence_after(seconds, 0.0).selected(np.zeros(0, int)))
+    nothing = replace(evidence_after(seconds, 0.0).select_tracks(np.zeros(0, int)))
     assert told(nothing) == description
 
 
