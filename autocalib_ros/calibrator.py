@@ -43,28 +43,28 @@ from autocalib_ros.results.calibration import (
     StandardDeviations,
 )
 
-REORDERED_NS = 1_000_000_000
+MAX_REORDERING_NS = 1_000_000_000
 """Images overtake each other by less than this on any transport; a longer step back is another time."""
-LEAP_NS = 24 * 3600 * 1_000_000_000
+CLOCK_JUMP_NS = 24 * 3600 * 1_000_000_000
 """No camera pauses for longer than a day: a longer step forward is a clock that was set."""
-FORGET_EVERY_S = 10.0
+FORGET_PERIOD_S = 10.0
 """Seconds of recording between two looks for evidence that is old; each costs milliseconds."""
-TAIL_STEPS = 16
+TRAIL_FRAMES = 16
 """Images through which the way of a point is shown: a second at 15 Hz."""
 
 
-class Intake(Enum):
+class FrameStatus(Enum):
     """What became of an image; all but `USED` and `LATE` begin the evidence anew."""
 
     FIRST = 'the first image'
     USED = 'used'
     LATE = 'late: its time stamp is not newer than that of an image before'
-    STEPPED = 'the time stamps stepped'
+    TIME_JUMPED = 'the time stamps stepped'
     RESIZED = 'the image size changed'
 
 
 @dataclass(frozen=True)
-class Progress:
+class CalibrationProgress:
     """How far the evidence has come: 0 to 100, what is missing and how long it will take, in an installer's words."""
 
     percent: float
@@ -88,21 +88,21 @@ class AutoCalibrator:
         self._detector = detector or open_detector(options.detector)
         self._observer: Observer | None = None
 
-    def add_image(self, stamp_ns: int, image: np.ndarray) -> Intake:
+    def add_image(self, stamp_ns: int, image: np.ndarray) -> FrameStatus:
         """Take one image: grey (H, W) or BGR (H, W, 3), uint8; it is not kept nor changed.
 
-        An image whose stamp repeats or steps back by less than `REORDERED_NS` is late and left out; a stamp that
-        steps back further (a clock that was set, a recording that begins again) or forward by `LEAP_NS`, or a new
+        An image whose stamp repeats or steps back by less than `MAX_REORDERING_NS` is late and left out; a stamp that
+        steps back further (a clock that was set, a recording that begins again) or forward by `CLOCK_JUMP_NS`, or a new
         image size starts the evidence anew. UsageError where a pixel of scale.distance_px lies outside the image.
         """
         if image.dtype != np.uint8 or image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
             raise InputError(f'an image is grey (H, W) or BGR (H, W, 3) in 8 bits, got {image.dtype} {image.shape}')
         size = (image.shape[1], image.shape[0])
-        intake = self._intake(stamp_ns, size)
-        if intake is Intake.LATE:
-            return intake
-        if intake is not Intake.USED:
-            self._begin(stamp_ns, size)
+        frame_status = self._frame_status(stamp_ns, size)
+        if frame_status is FrameStatus.LATE:
+            return frame_status
+        if frame_status is not FrameStatus.USED:
+            self._restart(stamp_ns, size)
         time_s = (stamp_ns - self._first_stamp_ns) * 1e-9
         observed = self._observer.observe(image, time_s)
         for track in observed.tracks:
@@ -118,30 +118,30 @@ class AutoCalibrator:
             self._forget(time_s)
         self._newest_stamp_ns = stamp_ns
         self._frames += 1
-        return intake
+        return frame_status
 
-    def _intake(self, stamp_ns: int, size: tuple[int, int]) -> Intake:
+    def _frame_status(self, stamp_ns: int, size: tuple[int, int]) -> FrameStatus:
         if self._observer is None:
-            return Intake.FIRST
+            return FrameStatus.FIRST
         if size != self._size:
-            return Intake.RESIZED
+            return FrameStatus.RESIZED
         step_ns = stamp_ns - self._newest_stamp_ns
-        if not -REORDERED_NS < step_ns < LEAP_NS:
-            return Intake.STEPPED
-        return Intake.USED if step_ns > 0 else Intake.LATE
+        if not -MAX_REORDERING_NS < step_ns < CLOCK_JUMP_NS:
+            return FrameStatus.TIME_JUMPED
+        return FrameStatus.USED if step_ns > 0 else FrameStatus.LATE
 
     def change(self, options: Options) -> None:
-        """Take other options, which may differ in what `config.may_change` says; a solution is due at once."""
+        """Take other options, which may differ in what `config.is_reconfigurable` says; a solution is due at once."""
         self._options = options
         if self._observer is not None:
-            self._begin_due()
+            self._reset_schedule()
 
     def _forget(self, time_s: float) -> None:
         """Drop old evidence that newer replaces, and all that is old once the camera has, or may have, moved.
 
         It counts as moved until nothing is held any more from before.
         """
-        self._forget_s = time_s + FORGET_EVERY_S
+        self._forget_s = time_s + FORGET_PERIOD_S
         memory_s = self._options.buffer.seconds
         if self._observer.drift_px > drift_limit_px(self._size[0], self._options.gate):
             self._moved_s = time_s
@@ -153,20 +153,20 @@ class AutoCalibrator:
             self._buffer.forget_replaced(time_s - memory_s)
         self._observer.compare_since(min(self._buffer.oldest_s, time_s - memory_s))
 
-    def _begin(self, stamp_ns: int, size: tuple[int, int]) -> None:
+    def _restart(self, stamp_ns: int, size: tuple[int, int]) -> None:
         self._options.scale.require_inside(*size)
         self._observer = Observer(self._options, size, self._detector)
         self._buffer = EvidenceBuffer(self._options.buffer)
         self._size, self._first_stamp_ns, self._newest_stamp_ns = size, stamp_ns, stamp_ns - 1
         self._frames = 0
         self._tracks_seen = 0
-        self._forget_s, self._moved_s = FORGET_EVERY_S, -np.inf
-        self._begin_due()
+        self._forget_s, self._moved_s = FORGET_PERIOD_S, -np.inf
+        self._reset_schedule()
 
-    def _begin_due(self) -> None:
+    def _reset_schedule(self) -> None:
         self._due_s, self._due_tracks = self._options.first_solve_s, float(self._options.gate.min_tracks)
 
-    def take_due(self) -> Evidence | None:
+    def snapshot_if_due(self) -> Evidence | None:
         """Return a snapshot when a new solution is worth trying now, else None.
 
         Depends on the images and their stamps alone, so that a live run and a replay solve the same evidence.
@@ -176,17 +176,17 @@ class AutoCalibrator:
         time_s = (self._newest_stamp_ns - self._first_stamp_ns) * 1e-9
         if time_s < self._due_s or self._tracks_seen < self._due_tracks:
             return None
-        held = max(self._buffer.track_count, self._options.gate.min_tracks)
-        self._due_tracks = self._tracks_seen + (self._options.solve_growth - 1.0) * held
+        track_count = max(self._buffer.track_count, self._options.gate.min_tracks)
+        self._due_tracks = self._tracks_seen + (self._options.solve_growth - 1.0) * track_count
         self._due_s = time_s + self._options.solve_interval_s
         return self.snapshot()
 
     def snapshot(self) -> Evidence | None:
         """Freeze the evidence so far; None before the first image."""
-        evidence = self._held()
+        evidence = self._buffered_evidence()
         return evidence and replace(evidence, still_lines_px=self._observer.still_lines())
 
-    def _held(self) -> Evidence | None:
+    def _buffered_evidence(self) -> Evidence | None:
         """Freeze what the buffer holds."""
         if self._observer is None:
             return None
@@ -194,21 +194,21 @@ class AutoCalibrator:
             image_size=self._size, first_stamp_ns=self._first_stamp_ns, newest_stamp_ns=self._newest_stamp_ns,
             frames=self._frames, drift_px=self._observer.drift_px, unfinished=self._observer.unfinished())
 
-    def progress(self) -> Progress:
+    def progress(self) -> CalibrationProgress:
         """Say how much of the evidence that a solution needs is there."""
-        evidence, gate = self._held(), self._options.gate
+        evidence, gate = self._buffered_evidence(), self._options.gate
         if evidence is None:
-            return Progress(0.0, ('no image yet',))
+            return CalibrationProgress(0.0, ('no image yet',))
         evidence, _ = drop_pedestrians(evidence)
         needs = requirements(evidence, gate, self._options.first_solve_s)
         scarcest = min(need.fraction for need in needs)
         missing = [need.description for need in needs if need.fraction < 1.0]
         moving = check_steady(evidence, gate)
         if moving:
-            return Progress(100.0 * scarcest, (moving.message, *missing))
-        return Progress(100.0 * scarcest, tuple(missing), outlook(evidence, scarcest))
+            return CalibrationProgress(100.0 * scarcest, (moving.message, *missing))
+        return CalibrationProgress(100.0 * scarcest, tuple(missing), outlook(evidence, scarcest))
 
-    def followed(self, steps: int = TAIL_STEPS) -> np.ndarray:
+    def followed(self, steps: int = TRAIL_FRAMES) -> np.ndarray:
         """Return where the points followed now were in the last images, pixels (n, steps, 2), for people to look at."""
         return np.zeros((0, steps, 2)) if self._observer is None else self._observer.followed(steps)
 
@@ -223,11 +223,11 @@ def solve(evidence: Evidence, options: Options, *, lens: Camera | None = None) -
     With a known `lens`, of the size of the images, only the pose is solved; the published method knows no such thing.
     UsageError where a pixel of scale.distance_px lies outside the image.
     """
-    result = _solved(evidence, options, lens)
-    return in_asked_form(result, options) if isinstance(result, Calibration) else result
+    result = _solve(evidence, options, lens)
+    return with_requested_model(result, options) if isinstance(result, Calibration) else result
 
 
-def in_asked_form(result: Calibration, options: Options) -> Calibration | Refusal:
+def with_requested_model(result: Calibration, options: Options) -> Calibration | Refusal:
     """Have camera_info say the lens as the options ask for; a refusal where that would be too far from it.
 
     Nothing is published in another model then: who asked for one may read no other, and would not notice.
@@ -236,7 +236,7 @@ def in_asked_form(result: Calibration, options: Options) -> Calibration | Refusa
     try:
         info = asked.camera_info
     except ModelMisfit as misfit:
-        return Refusal.because(Reason('distortion_model', misfit.message, misfit.remedy), result.method,
+        return Refusal.from_reason(Reason('distortion_model', misfit.message, misfit.remedy), result.method,
                                result.evidence, result.figures)
     if info.distortion_model == 'equidistant':
         return asked
@@ -244,7 +244,7 @@ def in_asked_form(result: Calibration, options: Options) -> Calibration | Refusa
                                                   f'{info.error_px:.2g} px anywhere in the image'))
 
 
-def _solved(evidence: Evidence, options: Options, lens: Camera | None) -> Calibration | Refusal:
+def _solve(evidence: Evidence, options: Options, lens: Camera | None) -> Calibration | Refusal:
     options.scale.require_inside(*evidence.image_size)
     intrinsics = paper_intrinsics(evidence, options.paper)
     figures = Figures(
@@ -253,7 +253,7 @@ def _solved(evidence: Evidence, options: Options, lens: Camera | None) -> Calibr
         paper_tracks=np.zeros(0, int) if intrinsics is None else intrinsics.tracks)
 
     def refused(reason: Reason) -> Refusal:
-        return Refusal.because(reason, options.method, evidence.summary(), figures)
+        return Refusal.from_reason(reason, options.method, evidence.summary(), figures)
 
     traffic, kept = drop_pedestrians(evidence)
     reason = check_readiness(traffic, options.gate)
@@ -272,7 +272,7 @@ def _solved(evidence: Evidence, options: Options, lens: Camera | None) -> Calibr
         return _calibration(options, solution, Calibration(
             method=options.method, grade='lens', assumptions=solution.assumptions, checks=solution.checks,
             camera=solution.fit.state.camera, ground=None, ground_refusal=solution.plane_refusal,
-            road_directions=solution.fit.state.directions, stddev=_lens_deviations(solution),
+            road_directions=solution.fit.state.directions, stddev=_lens_stddev(solution),
             paper=None if intrinsics is None else intrinsics.report, evidence=evidence.summary(),
             newest_stamp_ns=evidence.newest_stamp_ns,
             figures=_figures(figures, solution, kept[tracks.indices], evidence, options))), not solution.from_markings
@@ -281,47 +281,47 @@ def _solved(evidence: Evidence, options: Options, lens: Camera | None) -> Calibr
     if isinstance(found, Reason):
         return refused(found)
     result, by_traffic = found
-    told = _people_in(result, traffic)
+    told = _find_pedestrians(result, traffic)
     if len(told) and by_traffic:
         drive = np.flatnonzero(~np.isin(traffic.track_vehicles, told))
-        alone = traffic.without_vehicles(told)
-        again = check_readiness(alone, options.gate) or solved(alone, kept[drive])
-        result = _preferred(result, again if isinstance(again, Reason) else again[0])
-    return _counted(result, len(told))
+        vehicles_only = traffic.without_vehicles(told)
+        again = check_readiness(vehicles_only, options.gate) or solved(vehicles_only, kept[drive])
+        result = _choose_solution(result, again if isinstance(again, Reason) else again[0])
+    return _count_pedestrians(result, len(told))
 
 
-def _people_in(result: Calibration, evidence: Evidence) -> np.ndarray:
+def _find_pedestrians(result: Calibration, evidence: Evidence) -> np.ndarray:
     """Numbers (n,) of who walks or cycles, where lens and plane tell them and no detector did."""
     ground = result.ground
     if ground is None:
         return np.zeros(0, int)
     height = ground.height_m if ground.metric else DEFAULT_CAMERA_HEIGHT_M
-    untold = evidence.select_tracks(np.flatnonzero(evidence.track_kinds == TrackKind.UNKNOWN))
-    return people(untold, result.camera, ground.normal_in_camera, height)
+    unclassified = evidence.select_tracks(np.flatnonzero(evidence.track_kinds == TrackKind.UNKNOWN))
+    return people(unclassified, result.camera, ground.normal_in_camera, height)
 
 
-def _preferred(of_all: Calibration, of_vehicles_alone: Calibration | Reason) -> Calibration:
+def _choose_solution(of_all: Calibration, of_vehicles_only: Calibration | Reason) -> Calibration:
     """Choose the solution of vehicles alone wherever it has a ground plane that is no lesser one.
 
     Where it has none, too few vehicles are left: that says nothing against the plane of all, on which people walk too
     and which was doubted like any other.
     """
-    if isinstance(of_vehicles_alone, Reason):
-        lacking = of_vehicles_alone.message
-    elif of_vehicles_alone.ground_refusal is not None:
-        lacking = of_vehicles_alone.ground_refusal.message
-    elif of_all.grade == 'full' and of_vehicles_alone.grade != 'full':
-        lacking = f'the grade is {of_vehicles_alone.grade}'
+    if isinstance(of_vehicles_only, Reason):
+        lacking = of_vehicles_only.message
+    elif of_vehicles_only.ground_refusal is not None:
+        lacking = of_vehicles_only.ground_refusal.message
+    elif of_all.grade == 'full' and of_vehicles_only.grade != 'full':
+        lacking = f'the grade is {of_vehicles_only.grade}'
     else:
-        return of_vehicles_alone
+        return of_vehicles_only
     return replace(of_all, checks=(*of_all.checks, f'the plane is of people too: without them, {lacking}'))
 
 
-def _counted(result: Calibration, people_told: int) -> Calibration:
+def _count_pedestrians(result: Calibration, pedestrian_count: int) -> Calibration:
     """Count people apart from the vehicles."""
     seen = result.evidence
-    return replace(result, evidence=replace(seen, vehicles=seen.vehicles - people_told,
-                                            people=seen.people + people_told))
+    return replace(result, evidence=replace(seen, vehicles=seen.vehicles - pedestrian_count,
+                                            people=seen.people + pedestrian_count))
 
 
 def _solution(evidence: Evidence, tracks: TrackSet, options: Options, lens: Camera | None) -> Solution | Reason:
@@ -353,20 +353,20 @@ def _figures(figures: Figures, solution: Solution, indices: np.ndarray, evidence
                    orientation_peaks_deg=found.peaks_deg, residuals=collect_residuals(solution.fit))
 
 
-def _lens_deviations(solution: Solution) -> StandardDeviations:
+def _lens_stddev(solution: Solution) -> StandardDeviations:
     focal, cx, cy, k1, k2 = solution.fit.sigma(lambda state: np.array(
         [state.camera.focal_px, *state.camera.principal_point_px, *state.camera.k[:2]]))
     return StandardDeviations(focal_px=float(focal), principal_point_px=(float(cx), float(cy)), k1=float(k1),
                               k2=float(k2))
 
 
-def _height_deviation(plane: PlaneEstimate, scale: Scale) -> float:
+def _height_stddev(plane: PlaneEstimate, scale: Scale) -> float:
     """Standard deviation of the height: of what is given, and of the lens and plane by which it follows."""
     told = plane.sigma(lambda camera, normal: np.array([scale.height(camera, normal)]))
     return float(np.hypot(told[0], scale.sigma))
 
 
-def _ground_deviations(plane: PlaneEstimate, scale: Scale) -> tuple[float | None, ...]:
+def _ground_point_stddev(plane: PlaneEstimate, scale: Scale) -> tuple[float | None, ...]:
     """Standard deviation in metres of road points ahead, None where they are not in the image."""
     camera, normal = plane.lens_and_normal
     height = scale.height(camera, normal)
@@ -399,10 +399,10 @@ def _calibration(options: Options, solution: Solution, lens: Calibration) -> Cal
     plane, scale = solution.plane, solution.plane_refusal or _scale(options, solution)
     if isinstance(scale, Reason):
         return replace(lens, ground_refusal=scale)
-    height, height_sigma = scale.height(*plane.lens_and_normal), _height_deviation(plane, scale)
-    doubt = check_scale(height, height_sigma, options.gate)
-    if doubt:
-        return replace(lens, ground_refusal=doubt)
+    height, height_sigma = scale.height(*plane.lens_and_normal), _height_stddev(plane, scale)
+    implausible = check_scale(height, height_sigma, options.gate)
+    if implausible:
+        return replace(lens, ground_refusal=implausible)
     normal = plane.normal(plane.fit.state)
     tilt, roll = plane.sigma(lambda _, normal: tilt_and_roll_deg(normal))
     grade = 'unit_scale' if not scale.metric else 'assumed' if solution.assumed else 'full'
@@ -412,4 +412,4 @@ def _calibration(options: Options, solution: Solution, lens: Calibration) -> Cal
         covariance=_covariance(plane, scale) if scale.metric else None,
         stddev=replace(lens.stddev, tilt_deg=float(tilt), roll_deg=float(roll),
                        height_m=height_sigma if scale.metric and height_sigma > 0 else None,
-                       ground_point_m=_ground_deviations(plane, scale) if scale.metric else ()))
+                       ground_point_m=_ground_point_stddev(plane, scale) if scale.metric else ()))

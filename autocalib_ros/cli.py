@@ -22,7 +22,7 @@ from autocalib_ros.commands import replay_command as replay
 from autocalib_ros.commands import simulate_command as simulate
 from autocalib_ros.commands import topview_command as topview
 from autocalib_ros.errors import AutocalibError, UsageError
-from autocalib_ros.util.threads import use_one_thread_for_linear_algebra
+from autocalib_ros.util.threads import limit_blas_threads
 
 COMMANDS = {'replay': replay, 'evidence': evidence, 'compare': compare, 'rectify': rectify, 'topview': topview,
             'picture': picture, 'simulate': simulate, 'demo': demo, 'benchmark': benchmark}
@@ -30,7 +30,7 @@ COMMANDS = {'replay': replay, 'evidence': evidence, 'compare': compare, 'rectify
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; return 0 calibrated or done, 3 refused, 2 wrong usage or unreadable input, 130 interrupted."""
-    use_one_thread_for_linear_algebra()
+    limit_blas_threads()
     _silence_libraries()
     _speak_to_any_terminal()
     try:

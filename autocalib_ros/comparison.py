@@ -16,18 +16,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from autocalib_ros.geometry.ground_plane import GroundPlane, angles_deg, pixels_ahead, tilt_and_roll_deg
-from autocalib_ros.ground import SHARE_OF_SIGMA, Ground
+from autocalib_ros.ground import PERTURBATION_SIGMAS, Ground
 from autocalib_ros.lens.camera import Camera, pixel_grid
 from autocalib_ros.results.calibration import GROUND_DISTANCES_M
-from autocalib_ros.results.saved_camera import KnownCamera
+from autocalib_ros.results.saved_camera import SavedCamera
 
-GRID = (49, 28)
+COMPARISON_GRID = (49, 28)
 """Pixels across and down at which two lenses are compared, borders included."""
-TWO_COEFFICIENTS = 2
+COMPARABLE_COEFFICIENTS = 2
 """More than k1 and k2 trade against each other, so that k1 of such a lens is no number by itself."""
 
 
-def compared(first: KnownCamera, second: KnownCamera) -> Comparison:
+def compare_calibrations(first: SavedCamera, second: SavedCamera) -> Comparison:
     """Compare B, `second`, with A, `first`; UsageError where their images are of different shapes."""
     notes = []
     if (first.width, first.height) != (second.width, second.height):
@@ -35,35 +35,35 @@ def compared(first: KnownCamera, second: KnownCamera) -> Comparison:
         second = second.scaled_to(first.width, first.height)
     stated = first.stddev.focal_px is not None, second.stddev.focal_px is not None
     notes += [f'{name} states no standard deviations and is taken as exact'
-              for name, told, other in zip('AB', stated, stated[::-1], strict=True) if not told and other]
+              for name, has_sigma, other in zip('AB', stated, stated[::-1], strict=True) if not has_sigma and other]
     both = first.ground is not None and second.ground is not None
     metric = both and first.ground.metric and second.ground.metric
     ahead = pixels_ahead(first.lens, first.ground.normal_in_camera, first.ground.height_m,
                          np.array(GROUND_DISTANCES_M)) if metric else np.zeros((0, 2))
-    grid = pixel_grid(first, *GRID)
-    sides = _Side.of(first, np.vstack([grid, ahead])), _Side.of(second, np.vstack([grid, ahead]))
-    everywhere = sides[0].part(slice(len(grid))), sides[1].part(slice(len(grid)))
+    grid = pixel_grid(first, *COMPARISON_GRID)
+    sides = _PerturbedRays.of(first, np.vstack([grid, ahead])), _PerturbedRays.of(second, np.vstack([grid, ahead]))
+    everywhere = sides[0].subset(slice(len(grid))), sides[1].subset(slice(len(grid)))
     lens, lens_notes = _lens_differences(first, second)
     pose, pose_notes = _pose_differences(first, second)
     road, road_notes = _road_differences(*sides, ahead) if metric else ((), [])
     return Comparison(
-        lens=lens, lens_px=lenses_apart_px(first, second), rays=_ray_difference(*everywhere, grid, turned=False),
-        rays_turned=_ray_difference(*everywhere, grid, turned=True),
-        turned_deg=_angle_deg(best_turn(everywhere[0].here.rays, everywhere[1].here.rays)), pose=pose,
-        normal_deg=_between_deg(first.ground, second.ground) if both else None, road=road, stated=stated,
+        lens=lens, lens_px=max_lens_difference_px(first, second), rays=_ray_difference(*everywhere, grid, aligned=False),
+        rays_aligned=_ray_difference(*everywhere, grid, aligned=True),
+        alignment_deg=_rotation_angle_deg(best_rotation(everywhere[0].nominal.rays, everywhere[1].nominal.rays)), pose=pose,
+        normal_deg=_normal_angle_deg(first.ground, second.ground) if both else None, road=road, stated=stated,
         notes=(*notes, *lens_notes, *pose_notes, *road_notes))
 
 
-def lenses_apart_px(first: KnownCamera | Camera, second: KnownCamera | Camera) -> float:
+def max_lens_difference_px(first: SavedCamera | Camera, second: SavedCamera | Camera) -> float:
     """Return how far apart at the most two lenses of one image size image the same direction, pixels."""
-    pixels = pixel_grid(first, *GRID)
+    pixels = pixel_grid(first, *COMPARISON_GRID)
     bearings, reached = first.unproject(pixels)
     seen, valid = second.project(np.where(reached[:, None], bearings, [0.0, 0.0, 1.0]))
-    apart = np.hypot(*(seen - pixels).T)[reached & valid]
-    return float(apart.max()) if len(apart) else math.inf
+    difference = np.hypot(*(seen - pixels).T)[reached & valid]
+    return float(difference.max()) if len(difference) else math.inf
 
 
-def _lens_differences(first: KnownCamera, second: KnownCamera) -> tuple[tuple[Difference, ...], list[str]]:
+def _lens_differences(first: SavedCamera, second: SavedCamera) -> tuple[tuple[Difference, ...], list[str]]:
     points = [known.stddev.principal_point_px or (None, None) for known in (first, second)]
     found = [_difference('focal length', 'px', first.focal_px, second.focal_px,
                          first.stddev.focal_px, second.stddev.focal_px)]
@@ -72,14 +72,14 @@ def _lens_differences(first: KnownCamera, second: KnownCamera) -> tuple[tuple[Di
               for index, axis in enumerate('xy')]
     if first.k is None or second.k is None:
         return tuple(found), ['k1 and k2 are not compared: a lens is not near to Kannala-Brandt, see the rays']
-    if any(first.k[TWO_COEFFICIENTS:]) or any(second.k[TWO_COEFFICIENTS:]):
+    if any(first.k[COMPARABLE_COEFFICIENTS:]) or any(second.k[COMPARABLE_COEFFICIENTS:]):
         return tuple(found), ['k1 and k2 are not compared: a lens has more coefficients than these, see the rays']
     found += [_difference('k1', '', first.k[0], second.k[0], first.stddev.k1, second.stddev.k1),
               _difference('k2', '', first.k[1], second.k[1], first.stddev.k2, second.stddev.k2)]
     return tuple(found), []
 
 
-def _pose_differences(first: KnownCamera, second: KnownCamera) -> tuple[tuple[Difference, ...], list[str]]:
+def _pose_differences(first: SavedCamera, second: SavedCamera) -> tuple[tuple[Difference, ...], list[str]]:
     missing = [name for name, known in (('A', first), ('B', second)) if known.ground is None]
     if missing:
         return (), [f'poses are not compared: {" and ".join(missing)} {"holds" if len(missing) == 1 else "hold"}'
@@ -102,22 +102,22 @@ def _difference(name: str, unit: str, first: float, second: float, *sigmas: floa
 
 
 @dataclass(frozen=True)
-class _View:
+class _PixelRays:
     """Unit rays (n, 3) of pixels, nan where the lens does not reach, and the pose where there is one."""
 
     rays: np.ndarray
     ground: GroundPlane | None
 
     @classmethod
-    def of(cls, lens: KnownCamera | Camera, ground: GroundPlane | None, pixels: np.ndarray) -> _View:
+    def of(cls, lens: SavedCamera | Camera, ground: GroundPlane | None, pixels: np.ndarray) -> _PixelRays:
         there = np.isfinite(pixels).all(axis=1)
         bearings, valid = lens.unproject(np.where(there[:, None], pixels, 0.0))
         return cls(np.where((there & valid)[:, None], bearings, np.nan), ground)
 
-    def part(self, which: slice | np.ndarray) -> _View:
-        return _View(self.rays[which], self.ground)
+    def subset(self, which: slice | np.ndarray) -> _PixelRays:
+        return _PixelRays(self.rays[which], self.ground)
 
-    def places(self) -> np.ndarray:
+    def ground_points(self) -> np.ndarray:
         """Where the rays meet the road in the ground frame, x + iy (n,); nan at and above the horizon."""
         rays = self.rays @ self.ground.rotation.T
         down = np.where(rays[:, 2] < -1e-6, rays[:, 2], np.nan)
@@ -125,49 +125,49 @@ class _View:
 
 
 @dataclass(frozen=True)
-class _Side:
+class _PerturbedRays:
     """What A or B makes of pixels."""
 
-    here: _View
-    nearby: list[_View] | None
+    nominal: _PixelRays
+    perturbed: list[_PixelRays] | None
     """And a little to both sides along each axis of its covariance; none where it is exact, None where it states
     deviations without a covariance."""
 
     @classmethod
-    def of(cls, known: KnownCamera, pixels: np.ndarray) -> _Side:
-        here = _View.of(known, known.ground, pixels)
+    def of(cls, known: SavedCamera, pixels: np.ndarray) -> _PerturbedRays:
+        nominal = _PixelRays.of(known, known.ground, pixels)
         if known.covariance is None or known.ground is None:
-            return cls(here, [] if known.stddev.focal_px is None else None)
+            return cls(nominal, [] if known.stddev.focal_px is None else None)
         ground = Ground(lens=known.lens, rotation=known.ground.rotation, camera_m=known.ground.translation_m,
                         covariance=known.covariance)
-        return cls(here, [_View.of(lens, GroundPlane(rotation, float(camera_m[2])), pixels)
-                          for lens, rotation, camera_m in ground.deviants])
+        return cls(nominal, [_PixelRays.of(lens, GroundPlane(rotation, float(camera_m[2])), pixels)
+                          for lens, rotation, camera_m in ground.perturbations])
 
-    def part(self, which: slice | np.ndarray) -> _Side:
-        return _Side(self.here.part(which),
-                     None if self.nearby is None else [view.part(which) for view in self.nearby])
+    def subset(self, which: slice | np.ndarray) -> _PerturbedRays:
+        return _PerturbedRays(self.nominal.subset(which),
+                     None if self.perturbed is None else [view.subset(which) for view in self.perturbed])
 
 
-def _ray_difference(first: _Side, second: _Side, pixels: np.ndarray, *, turned: bool) -> RayDifference:
-    def apart(one: _View, other: _View) -> np.ndarray:
-        return (other.rays @ best_turn(one.rays, other.rays).T if turned else other.rays) - one.rays
+def _ray_difference(first: _PerturbedRays, second: _PerturbedRays, pixels: np.ndarray, *, aligned: bool) -> RayDifference:
+    def difference(one: _PixelRays, other: _PixelRays) -> np.ndarray:
+        return (other.rays @ best_rotation(one.rays, other.rays).T if aligned else other.rays) - one.rays
 
-    chords = np.linalg.norm(apart(first.here, second.here), axis=1)
+    chords = np.linalg.norm(difference(first.nominal, second.nominal), axis=1)
     seen = np.isfinite(chords)
     if not seen.any():
         return RayDifference(math.nan, math.inf, (math.nan, math.nan), None)
     angles_deg = np.degrees(2 * np.arcsin(np.clip(np.where(seen, chords, 0.0) / 2, 0, 1)))
     worst = int(np.argmax(angles_deg))
-    sigma = _sigma(first, second, lambda one, other: apart(one, other)[worst])
+    sigma = _sigma(first, second, lambda one, other: difference(one, other)[worst])
     return RayDifference(float(angles_deg[seen].mean()), float(angles_deg[worst]), tuple(map(float, pixels[worst])),
                          None if sigma is None else math.degrees(sigma))
 
 
-def _road_differences(first: _Side, second: _Side,
+def _road_differences(first: _PerturbedRays, second: _PerturbedRays,
                       ahead: np.ndarray) -> tuple[tuple[RoadDifference, ...], list[str]]:
     """Compare where the pixels `ahead` (m, 2), the last of both sides, meet the road; nan is not in the image."""
     far, count = max(GROUND_DISTANCES_M), len(ahead)
-    near = np.logical_and(*(np.abs(side.here.places()) <= far for side in (first, second)))  # nan is not near
+    near = np.logical_and(*(np.abs(side.nominal.ground_points()) <= far for side in (first, second)))  # nan is not near
     near[-count:] = False
     if np.count_nonzero(near) < 2:
         return (), [f'the road is not compared: hardly a pixel shows it within {far:g} m in both']
@@ -177,30 +177,30 @@ def _road_differences(first: _Side, second: _Side,
             notes.append(f'{distance:g} m straight ahead is not in the image')
             continue
 
-        def apart(one: _View, other: _View, index: int = index - count) -> np.ndarray:
-            ones, others = one.places(), other.places()
+        def difference(one: _PixelRays, other: _PixelRays, index: int = index - count) -> np.ndarray:
+            ones, others = one.ground_points(), other.ground_points()
             between = (ones * np.conj(others))[near]
             heading = np.nansum(between / np.abs(between))
             gap = others[index] * heading / np.abs(heading) - ones[index]
             return np.array([gap.real, gap.imag])
-        apart_m = float(np.hypot(*apart(first.here, second.here)))
-        found.append(RoadDifference(distance, tuple(map(float, pixel)), math.inf if math.isnan(apart_m) else apart_m,
-                                    _sigma(first, second, apart)))
+        separation_m = float(np.hypot(*difference(first.nominal, second.nominal)))
+        found.append(RoadDifference(distance, tuple(map(float, pixel)), math.inf if math.isnan(separation_m) else separation_m,
+                                    _sigma(first, second, difference)))
     return tuple(found), notes
 
 
-def _sigma(first: _Side, second: _Side, apart: Callable[[_View, _View], np.ndarray]) -> float | None:
-    """Return one sigma of the length of `apart` of the two (n,), by the covariances of both; None where not known."""
-    if first.nearby is None or second.nearby is None:
+def _sigma(first: _PerturbedRays, second: _PerturbedRays, difference: Callable[[_PixelRays, _PixelRays], np.ndarray]) -> float | None:
+    """Return one sigma of the length of `difference` of the two (n,), by the covariances of both; None where not known."""
+    if first.perturbed is None or second.perturbed is None:
         return None
-    moves = [apart(view, second.here) for view in first.nearby] + [apart(first.here, view) for view in second.nearby]
+    moves = [difference(view, second.nominal) for view in first.perturbed] + [difference(first.nominal, view) for view in second.perturbed]
     if not moves:
         return None
-    steps = (np.array(moves[::2]) - np.array(moves[1::2])) / (2 * SHARE_OF_SIGMA)
+    steps = (np.array(moves[::2]) - np.array(moves[1::2])) / (2 * PERTURBATION_SIGMAS)
     return float(np.sqrt((steps**2).sum()))
 
 
-def best_turn(ones: np.ndarray, others: np.ndarray) -> np.ndarray:
+def best_rotation(ones: np.ndarray, others: np.ndarray) -> np.ndarray:
     """Return the rotation (3, 3) that brings rays `others` (n, 3) nearest to `ones`, in the least-squares sense."""
     both = np.isfinite(ones).all(axis=1) & np.isfinite(others).all(axis=1)
     if not both.any():
@@ -209,21 +209,21 @@ def best_turn(ones: np.ndarray, others: np.ndarray) -> np.ndarray:
     return left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
 
 
-def _angle_deg(turn: np.ndarray) -> float:
+def _rotation_angle_deg(turn: np.ndarray) -> float:
     """Return the angle of a rotation (3, 3)."""
     off = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
     return float(np.degrees(np.arctan2(np.linalg.norm(off), np.trace(turn) - 1.0)))
 
 
-def _between_deg(first: GroundPlane, second: GroundPlane) -> float:
+def _normal_angle_deg(first: GroundPlane, second: GroundPlane) -> float:
     return float(angles_deg(first.normal_in_camera, second.normal_in_camera))
 
 
-AGREES_SIGMAS = 3.0
+AGREEMENT_SIGMAS = 3.0
 """Two calibrations of one camera are farther apart than this in one number out of 400."""
-SAME_LENS_PX = 0.5
+SAME_LENS_TOLERANCE_PX = 0.5
 """Two lenses that image every direction closer together than this serve every consumer alike."""
-SAME_NUMBER = 1e-9
+EQUAL_RTOL = 1e-9
 """Numbers relatively closer than this are one number."""
 
 
@@ -245,7 +245,7 @@ class Difference:
     @property
     def sigmas(self) -> float | None:
         """How many combined sigmas that is."""
-        return _in_sigmas(abs(self.difference), self.sigma, max(abs(self.first), abs(self.second)))
+        return _sigma_count(abs(self.difference), self.sigma, max(abs(self.first), abs(self.second)))
 
 
 @dataclass(frozen=True)
@@ -260,7 +260,7 @@ class RayDifference:
     @property
     def sigmas(self) -> float | None:
         """How many combined sigmas the largest is."""
-        return _in_sigmas(self.largest_deg, self.sigma_deg, 1.0)
+        return _sigma_count(self.largest_deg, self.sigma_deg, 1.0)
 
 
 @dataclass(frozen=True)
@@ -269,13 +269,13 @@ class RoadDifference:
 
     distance_m: float
     pixel: tuple[float, float]
-    apart_m: float
+    separation_m: float
     sigma_m: float | None
 
     @property
     def sigmas(self) -> float | None:
         """How many combined sigmas that is."""
-        return _in_sigmas(self.apart_m, self.sigma_m, self.distance_m)
+        return _sigma_count(self.separation_m, self.sigma_m, self.distance_m)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -287,9 +287,9 @@ class Comparison:
     lens_px: float
     """Largest distance between the images of one direction in the two lenses."""
     rays: RayDifference
-    rays_turned: RayDifference
+    rays_aligned: RayDifference
     """After the best rotation between the two."""
-    turned_deg: float
+    alignment_deg: float
     """The angle of that rotation."""
     pose: tuple[Difference, ...] = ()
     """Tilt, roll, and height where both are in metres."""
@@ -304,21 +304,21 @@ class Comparison:
     @property
     def same_lens(self) -> bool:
         """Whether the lenses serve every consumer alike, whatever their numbers."""
-        return self.lens_px <= SAME_LENS_PX
+        return self.lens_px <= SAME_LENS_TOLERANCE_PX
 
-    def judged(self) -> list[tuple[str, float | None]]:
+    def terms(self) -> list[tuple[str, float | None]]:
         """Return what the verdict goes by, with how many sigmas each is; None where nothing tells."""
         lens = [*((item.name, item.sigmas) for item in self.lens)]
-        if self.rays_turned.sigma_deg is not None:
-            lens.append(('the shape of the lens', self.rays_turned.sigmas))
+        if self.rays_aligned.sigma_deg is not None:
+            lens.append(('the shape of the lens', self.rays_aligned.sigmas))
         return ([] if self.same_lens else lens) + [(item.name, item.sigmas) for item in self.pose] + [
             (f'the road {item.distance_m:g} m ahead', item.sigmas) for item in self.road if item.sigma_m is not None]
 
     @property
     def agrees(self) -> bool | None:
         """Whether everything is within AGREES_SIGMAS; None where nothing tells."""
-        sigmas = [sigmas for _, sigmas in self.judged()]
-        if any(value is not None and value > AGREES_SIGMAS for value in sigmas):
+        sigmas = [sigmas for _, sigmas in self.terms()]
+        if any(value is not None and value > AGREEMENT_SIGMAS for value in sigmas):
             return False
         return None if None in sigmas else True
 
@@ -329,21 +329,21 @@ class Comparison:
             return (f'Whether {what.lower()} agree cannot be told: neither states standard deviations, and the lenses'
                     f' are up to {self.lens_px:.3g} px apart.')
         if self.agrees:
-            largest, sigmas = max(self.judged(), key=lambda pair: pair[1], default=('', 0.0))
+            largest, sigmas = max(self.terms(), key=lambda pair: pair[1], default=('', 0.0))
             far = f'; farthest apart is {largest}, {sigmas:.1f} sigmas' if largest else (
                 f': up to {self.lens_px:.2g} px apart')
-            return f'{what} agree within {AGREES_SIGMAS:g} combined sigmas{far}.'
-        beyond = [f'{name} ({_sigmas_words(sigmas)})' for name, sigmas in self.judged()
-                  if sigmas is not None and sigmas > AGREES_SIGMAS]
+            return f'{what} agree within {AGREEMENT_SIGMAS:g} combined sigmas{far}.'
+        beyond = [f'{name} ({_sigmas_words(sigmas)})' for name, sigmas in self.terms()
+                  if sigmas is not None and sigmas > AGREEMENT_SIGMAS]
         return f'{what} differ in {_listed(beyond)}.'
 
 
-def _in_sigmas(apart: float, sigma: float | None, size: float) -> float | None:
-    if apart <= SAME_NUMBER * size:
+def _sigma_count(difference: float, sigma: float | None, size: float) -> float | None:
+    if difference <= EQUAL_RTOL * size:
         return 0.0
     if sigma is None:
         return None
-    return apart / sigma if sigma > 0 else math.inf
+    return difference / sigma if sigma > 0 else math.inf
 
 
 def _sigmas_words(sigmas: float) -> str:

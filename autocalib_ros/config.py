@@ -22,16 +22,16 @@ def option(default: Any, doc: str, *, low: float | None = None, high: float | No
     return field(default=default, metadata={'doc': doc, 'low': low, 'high': high, 'choices': choices})
 
 
-class _Checked:
+class _Validated:
     """Checks every field against its declared type, range and choices."""
 
     def __post_init__(self) -> None:
         for item in dataclasses.fields(self):  # type: ignore[arg-type]
             if 'doc' in item.metadata:
-                object.__setattr__(self, item.name, _checked(item, getattr(self, item.name)))
+                object.__setattr__(self, item.name, _validated(item, getattr(self, item.name)))
 
 
-def _checked(item: dataclasses.Field, value: Any) -> Any:
+def _validated(item: dataclasses.Field, value: Any) -> Any:
     """Return the value of `item` in its declared type, or say what would be accepted."""
     kind, meta = type(item.default), item.metadata
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
@@ -47,7 +47,7 @@ def _checked(item: dataclasses.Field, value: Any) -> Any:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrackingOptions(_Checked):
+class TrackingOptions(_Validated):
     """Points on moving objects, followed by pyramidal Lucas-Kanade optical flow."""
 
     max_points: int = option(200, 'points followed at once', low=20, high=5000)
@@ -60,7 +60,7 @@ class TrackingOptions(_Checked):
 
 
 @dataclass(frozen=True, kw_only=True)
-class MotionOptions(_Checked):
+class MotionOptions(_Validated):
     """Vehicle mask by motion: what differs from a slowly learned background."""
 
     width_px: int = option(320, 'width at which motion is looked for', low=80, high=1920)
@@ -69,7 +69,7 @@ class MotionOptions(_Checked):
 
 
 @dataclass(frozen=True, kw_only=True)
-class DetectorOptions(_Checked):
+class DetectorOptions(_Validated):
     """Vehicles by a detector in ONNX; auto goes by what the model says of itself, whatever else is set wins."""
 
     model: str = option('', "ONNX file of the detector; '' is none: vehicles are what moves")
@@ -120,7 +120,7 @@ class DetectorOptions(_Checked):
 
 
 @dataclass(frozen=True, kw_only=True)
-class BufferOptions(_Checked):
+class BufferOptions(_Validated):
     """The buffer of evidence, bounded in number."""
 
     seconds: float = option(
@@ -137,7 +137,7 @@ class BufferOptions(_Checked):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PaperOptions(_Checked):
+class PaperOptions(_Validated):
     """Constants of Jain & Saunier's method as published."""
 
     window_s: float = option(6.0, 'observed interval that a track has to fill', low=1, high=600)
@@ -152,7 +152,7 @@ class PaperOptions(_Checked):
 
 
 @dataclass(frozen=True, kw_only=True)
-class JointOptions(_Checked):
+class JointOptions(_Validated):
     """The robust method."""
 
     max_tracks: int = option(1500, 'tracks in one solution, spread over image, roads and time', low=20, high=10000)
@@ -202,12 +202,12 @@ class JointOptions(_Checked):
         return angle if 10.0 <= angle <= 170.0 else None
 
 
-PIXEL_SIGMAS_APART = 10.0
+MIN_PIXEL_SEPARATION_SIGMAS = 10.0
 """Pixels that bound a known length are at least so many of their standard deviations apart."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class ScaleOptions(_Checked):
+class ScaleOptions(_Validated):
     """What tells the scale of the ground plane when scale_from is not height."""
 
     distance_px: str = option('', 'two pixels of the full image on the road a known distance apart, as text: '
@@ -226,7 +226,7 @@ class ScaleOptions(_Checked):
         pixels = self.pixels
         super().__post_init__()
         apart = math.dist(*pixels) if pixels else math.inf
-        if apart < max(PIXEL_SIGMAS_APART * self.pixel_sigma_px, 1.0):
+        if apart < max(MIN_PIXEL_SEPARATION_SIGMAS * self.pixel_sigma_px, 1.0):
             raise UsageError(f"the pixels of 'scale.distance_px' are {apart:.1f} px apart, which tells no scale when "
                              f'each is known to {self.pixel_sigma_px:g} px: take two that are far from each other')
 
@@ -251,7 +251,7 @@ class ScaleOptions(_Checked):
 
 
 @dataclass(frozen=True, kw_only=True)
-class GateOptions(_Checked):
+class GateOptions(_Validated):
     """What has to hold before a calibration is accepted."""
 
     min_tracks: int = option(40, 'tracks needed', low=4, high=100000)
@@ -265,7 +265,7 @@ class GateOptions(_Checked):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(_Checked):
+class Options(_Validated):
     """All that the core is told from outside."""
 
     method: str = option('joint', "'joint' is the robust method, 'paper' the published one", choices=('joint', 'paper'))
@@ -336,7 +336,7 @@ class Options(_Checked):
 
 
 @dataclass(frozen=True, kw_only=True)
-class NodeOptions(_Checked):
+class NodeOptions(_Validated):
     """What only the live node needs; the replay accepts these names in a shared file and ignores them."""
 
     image_transport: str = option('raw', 'image topic: sensor_msgs/Image or CompressedImage on <image>/compressed',
@@ -366,7 +366,7 @@ class NodeOptions(_Checked):
     idle_solve_s: float = option(3.0, 'when no image came for this long, what is left is solved', low=0.1)
 
 
-LARGEST_PIXEL = 1e5
+MAX_PIXEL_COORDINATE = 1e5
 """No image has a pixel beyond."""
 
 
@@ -376,26 +376,26 @@ def _polygon(text: str) -> tuple[tuple[float, float], ...]:
         numbers = [float(word) for word in text.replace(',', ' ').split()]
     except ValueError:
         numbers = []
-    if len(numbers) < 6 or len(numbers) % 2 or not all(abs(number) <= LARGEST_PIXEL for number in numbers):
+    if len(numbers) < 6 or len(numbers) % 2 or not all(abs(number) <= MAX_PIXEL_COORDINATE for number in numbers):
         raise UsageError("option 'ignore_regions' is polygons of at least three pixels u v each, with ; between them, "
                          f"'0 0 200 0 0 150; 900 0 1279 0 1279 90' for example; got {text.strip()!r} for a polygon")
     return tuple(zip(numbers[::2], numbers[1::2], strict=True))
 
 
-MAY_CHANGE = ('method', 'scale_from', 'camera_height', 'camera_height_sigma', 'allow_unit_scale', 'random_seed',
+RECONFIGURABLE = ('method', 'scale_from', 'camera_height', 'camera_height_sigma', 'allow_unit_scale', 'random_seed',
               'first_solve_s', 'solve_growth', 'solve_interval_s', 'paper', 'joint', 'scale', 'gate',
               'camera_info_mode', 'debug_rate_hz', 'idle_solve_s')
 """Options, and groups of them, that are read anew at each solution or publication, so that they may change while a
 node runs; all others shape the evidence from the first image on, or name what others rely on."""
 
 
-def may_change(name: str) -> bool:
+def is_reconfigurable(name: str) -> bool:
     """Say whether an option, by its full name, may change while a node runs."""
-    return name in MAY_CHANGE or name.partition('.')[0] in MAY_CHANGE
+    return name in RECONFIGURABLE or name.partition('.')[0] in RECONFIGURABLE
 
 
 @dataclass(frozen=True)
-class Declared:
+class OptionSpec:
     """One option by its full name, as the node's parameters and the documented YAML need it."""
 
     name: str
@@ -406,45 +406,45 @@ class Declared:
     choices: tuple[str, ...]
 
 
-def declared(options: Any, prefix: str = '') -> Iterator[Declared]:
+def walk_options(options: Any, prefix: str = '') -> Iterator[OptionSpec]:
     """Walk an option dataclass instance, yielding each option with its present value as the default."""
     for item in dataclasses.fields(options):
         value = getattr(options, item.name)
         if dataclasses.is_dataclass(value):
-            yield from declared(value, f'{prefix}{item.name}.')
+            yield from walk_options(value, f'{prefix}{item.name}.')
         else:
             meta = item.metadata
-            yield Declared(prefix + item.name, value, meta['doc'], meta['low'], meta['high'], meta['choices'])
+            yield OptionSpec(prefix + item.name, value, meta['doc'], meta['low'], meta['high'], meta['choices'])
 
 
-def with_values(options: Any, values: Mapping[str, Any]) -> Any:
+def with_overrides(options: Any, values: Mapping[str, Any]) -> Any:
     """Return `options` with the values given by full name, or raise UsageError at an unknown name."""
-    names = [item.name for item in declared(options)]
+    names = [item.name for item in walk_options(options)]
     for name in values:
         if name not in names:
             near = get_close_matches(name, names, n=1)
             hint = f"; did you mean '{near[0]}'?" if near else '; see config/autocalib.yaml for all names'
             raise UsageError(f"unknown option '{name}'{hint}")
-    return _replaced(options, values, '')
+    return _replace_nested(options, values, '')
 
 
-def _replaced(options: Any, values: Mapping[str, Any], prefix: str) -> Any:
+def _replace_nested(options: Any, values: Mapping[str, Any], prefix: str) -> Any:
     changes: dict[str, Any] = {}
     for item in dataclasses.fields(options):
         name, value = prefix + item.name, getattr(options, item.name)
         if dataclasses.is_dataclass(value):
-            changes[item.name] = _replaced(value, values, name + '.')
+            changes[item.name] = _replace_nested(value, values, name + '.')
         elif name in values:
             changes[item.name] = values[name]
     return dataclasses.replace(options, **changes)
 
 
-def flattened(tree: Mapping[str, Any], prefix: str = '') -> dict[str, Any]:
+def flatten(tree: Mapping[str, Any], prefix: str = '') -> dict[str, Any]:
     """Turn a nested mapping, as YAML gives it, into values by full name."""
     flat: dict[str, Any] = {}
     for key, value in tree.items():
         if isinstance(value, Mapping):
-            flat.update(flattened(value, f'{prefix}{key}.'))
+            flat.update(flatten(value, f'{prefix}{key}.'))
         else:
             flat[f'{prefix}{key}'] = value
     return flat

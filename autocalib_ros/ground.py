@@ -22,17 +22,17 @@ from scipy.spatial.transform import Rotation
 
 from autocalib_ros.errors import InputError
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.lens.camera_info_lens import InfoLens, attribute
+from autocalib_ros.lens.camera_info_lens import CameraInfoLens, message_field
 from autocalib_ros.results.calibration import Calibration
-from autocalib_ros.results.calibration_json import calibration_of, read_json
+from autocalib_ros.results.calibration_json import calibration_from_json, read_json
 
-HORIZON_PX = 1.0
+MIN_HORIZON_DISTANCE_PX = 1.0
 """A pixel nearer than this to the horizon, or to where the plane asked for vanishes, is on it: the next one shows no
 ground at all, so that nothing is known of its distance."""
-SLOPE_STEP_PX = 1e-3
-SHARE_OF_SIGMA = 0.01
+DIFFERENCE_STEP_PX = 1e-3
+PERTURBATION_SIGMAS = 0.01
 """How far lens and pose are moved to see what depends on them: where everything is still linear."""
-UNIT_TOLERANCE = 1e-3
+QUATERNION_TOLERANCE = 1e-3
 """A quaternion farther from unit length is not one."""
 
 
@@ -63,7 +63,7 @@ class GroundPoints:
 class Ground:
     """A lens over a plane."""
 
-    lens: Camera | InfoLens
+    lens: Camera | CameraInfoLens
     rotation: np.ndarray
     """ground_from_camera, shape (3, 3)."""
     camera_m: np.ndarray
@@ -71,7 +71,7 @@ class Ground:
     ground_frame: str = ''
     camera_frame: str = ''
     covariance: np.ndarray | None = None
-    """Of `calibration.COVARIANCE_OF`, shape (10, 10); None where it is not known."""
+    """Of `calibration.COVARIANCE_PARAMETERS`, shape (10, 10); None where it is not known."""
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.camera_m).all() and np.isfinite(self.rotation).all() and self.camera_m[2] > 0):
@@ -91,15 +91,15 @@ class Ground:
         if (parent == camera) == (child == camera):
             raise InputError(f"the transform joins '{parent}' and '{child}', and one of the two should be the camera's"
                              f" frame '{camera}': take the ground transform of this camera, or say camera_frame")
-        rotation, translation = _rigid(ground_transform.transform)
+        rotation, translation = _parse_transform(ground_transform.transform)
         if parent == camera:
             rotation, translation = rotation.T, -rotation.T @ translation
         try:
-            lens = InfoLens.of(camera_info, rectified=rectified)
+            lens = CameraInfoLens.of(camera_info, rectified=rectified)
         except InputError as error:
             raise InputError(f'camera_info: {error}') from error
         if rectified:
-            rotation = rotation @ np.array([float(value) for value in attribute(camera_info, 'r')]).reshape(3, 3).T
+            rotation = rotation @ np.array([float(value) for value in message_field(camera_info, 'r')]).reshape(3, 3).T
         return cls(lens=lens, rotation=rotation, camera_m=translation, camera_frame=camera,
                    ground_frame=child if parent == camera else parent)
 
@@ -116,7 +116,7 @@ class Ground:
     @classmethod
     def from_document(cls, document: Mapping[str, Any]) -> Ground:
         """Build from the document of calibration.json."""
-        return cls.of(calibration_of(document))
+        return cls.of(calibration_from_json(document))
 
     @classmethod
     def of(cls, result: Calibration) -> Ground:
@@ -139,19 +139,19 @@ class Ground:
         pixels = np.asarray(pixels, float).reshape(-1, 2)
         numbers = np.isfinite(pixels).all(axis=1)
         pixels = np.where(numbers[:, None], pixels, 0.0)
-        near = pixels + SLOPE_STEP_PX * np.array([[[0, 0]], [[1, 0]], [[0, 1]]])  # (3, n, 2): the pixel, right, below
+        near = pixels + DIFFERENCE_STEP_PX * np.array([[[0, 0]], [[1, 0]], [[0, 1]]])  # (3, n, 2): the pixel, right, below
         bearings, seen = self.lens.unproject(near.reshape(-1, 2))
         rays = bearings.reshape(3, -1, 3) @ self.rotation.T
         with np.errstate(all='ignore'):  # what is not valid may be anything, and is left out
             reach = (height_m - self.camera_m[2]) / rays[..., 2]
-            slope = np.hypot(*(rays[1:, :, 2] - rays[0, :, 2])) / SLOPE_STEP_PX
+            slope = np.hypot(*(rays[1:, :, 2] - rays[0, :, 2])) / DIFFERENCE_STEP_PX
             valid = numbers & seen.reshape(3, -1).all(axis=0) & (reach[0] > 0)
-            valid &= np.abs(rays[0, :, 2]) > HORIZON_PX * slope
+            valid &= np.abs(rays[0, :, 2]) > MIN_HORIZON_DISTANCE_PX * slope
             places = np.where(valid[:, None], reach[..., None] * rays + self.camera_m, np.nan)
         points = np.column_stack([places[0, :, :2], np.where(valid, height_m, np.nan)])
-        by_pixel = (places[1:, :, :2] - places[0, :, :2]) * (pixel_sigma_px / SLOPE_STEP_PX)
-        noise = _squares(by_pixel) if pixel_sigma_px > 0 else None
-        return GroundPoints(points_m=points, valid=valid, covariance_m2=self._spread(pixels, height_m, valid),
+        by_pixel = (places[1:, :, :2] - places[0, :, :2]) * (pixel_sigma_px / DIFFERENCE_STEP_PX)
+        noise = _outer_product_sum(by_pixel) if pixel_sigma_px > 0 else None
+        return GroundPoints(points_m=points, valid=valid, covariance_m2=self._calibration_covariance(pixels, height_m, valid),
                             noise_m2=noise)
 
     def pixels(self, points_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -167,10 +167,10 @@ class Ground:
         return np.where((there & valid)[:, None], pixels, np.nan), there & valid
 
     @cached_property
-    def deviants(self) -> list[tuple[Camera, np.ndarray, np.ndarray]] | None:
+    def perturbations(self) -> list[tuple[Camera, np.ndarray, np.ndarray]] | None:
         """Lens, pose and place of the camera on both sides of this one along each axis of the covariance.
 
-        Each is `SHARE_OF_SIGMA` away; None where the covariance is not known.
+        Each is `PERTURBATION_SIGMAS` away; None where the covariance is not known.
         """
         if self.covariance is None or not isinstance(self.lens, Camera):
             return None
@@ -178,10 +178,10 @@ class Ground:
         scale = np.sqrt(np.maximum(np.diag(self.covariance), 1e-300))
         values, vectors = np.linalg.eigh(self.covariance / np.outer(scale, scale))
         axes = (scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))).T[values > 1e-12]
-        return [self._at(sign * SHARE_OF_SIGMA * axis) for axis in axes for sign in (1.0, -1.0)]
+        return [self._perturbed(sign * PERTURBATION_SIGMAS * axis) for axis in axes for sign in (1.0, -1.0)]
 
-    def _at(self, step: np.ndarray) -> tuple[Camera, np.ndarray, np.ndarray]:
-        """Lens, ground_from_camera and place of the camera at a step (10,) of `calibration.COVARIANCE_OF`.
+    def _perturbed(self, step: np.ndarray) -> tuple[Camera, np.ndarray, np.ndarray]:
+        """Lens, ground_from_camera and place of the camera at a step (10,) of `calibration.COVARIANCE_PARAMETERS`.
 
         The ground frame stays below where the optical axis points to: its heading is chosen, not measured.
         """
@@ -193,40 +193,40 @@ class Ground:
         tilt, roll = np.arcsin(np.clip(-normal[2], -1, 1)), np.arctan2(-normal[0], -normal[1])
         tilt, roll = tilt + np.radians(step[7]), roll + np.radians(step[8])
         up = -np.array([np.cos(tilt) * np.sin(roll), np.cos(tilt) * np.cos(roll), np.sin(tilt)])
-        in_road = self.rotation @ _ahead(normal)
-        return lens, in_road @ _ahead(up).T, self.camera_m + [0.0, 0.0, step[9]]
+        in_road = self.rotation @ _ground_axes(normal)
+        return lens, in_road @ _ground_axes(up).T, self.camera_m + [0.0, 0.0, step[9]]
 
-    def _spread(self, pixels: np.ndarray, height_m: float | np.ndarray, valid: np.ndarray) -> np.ndarray | None:
+    def _calibration_covariance(self, pixels: np.ndarray, height_m: float | np.ndarray, valid: np.ndarray) -> np.ndarray | None:
         """Covariance (n, 2, 2) of the places of pixels that the calibration leaves, nan where they are not valid."""
-        moved = self.deviants
+        moved = self.perturbations
         if moved is None:
             return None
         with np.errstate(all='ignore'):  # what is not valid may be anything, and is left out
             places = [((height_m - camera_m[2]) / rays[:, 2])[:, None] * rays[:, :2]
                       for lens, rotation, camera_m in moved for rays in [lens.unproject(pixels)[0] @ rotation.T]]
             sides = np.reshape(places, (len(places) // 2, 2, len(pixels), 2))
-            spread = _squares((sides[:, 0] - sides[:, 1]) / (2 * SHARE_OF_SIGMA))
+            spread = _outer_product_sum((sides[:, 0] - sides[:, 1]) / (2 * PERTURBATION_SIGMAS))
         spread[~valid] = np.nan
         return spread
 
 
-def _squares(moves: np.ndarray) -> np.ndarray:
+def _outer_product_sum(moves: np.ndarray) -> np.ndarray:
     """Covariance (n, 2, 2) of what independent causes of one sigma each move by `moves` (causes, n, 2)."""
     return np.einsum('ani,anj->nij', moves, moves)
 
 
-def _ahead(normal: np.ndarray) -> np.ndarray:
+def _ground_axes(normal: np.ndarray) -> np.ndarray:
     """Columns (3, 3), camera frame: where the optical axis points to on the ground, to the left of it, and up."""
     ahead = np.array([0.0, 0.0, 1.0]) - normal[2] * normal
     ahead /= max(float(np.linalg.norm(ahead)), 1e-9)
     return np.column_stack([ahead, np.cross(normal, ahead), normal])
 
 
-def _rigid(transform: Any) -> tuple[np.ndarray, np.ndarray]:
+def _parse_transform(transform: Any) -> tuple[np.ndarray, np.ndarray]:
     """Rotation (3, 3) and translation (3,) of an object with the attributes of geometry_msgs/Transform."""
     turn, shift = transform.rotation, transform.translation
     quaternion = np.array([float(turn.x), float(turn.y), float(turn.z), float(turn.w)])
-    if not abs(np.linalg.norm(quaternion) - 1.0) < UNIT_TOLERANCE:
+    if not abs(np.linalg.norm(quaternion) - 1.0) < QUATERNION_TOLERANCE:
         raise InputError(f'the rotation of the transform has the length {np.linalg.norm(quaternion):.6g}, expected 1:'
                          ' it is no rotation, so its sender is at fault')
     return Rotation.from_quat(quaternion).as_matrix(), np.array([float(shift.x), float(shift.y), float(shift.z)])

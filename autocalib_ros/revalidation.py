@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass, replace
 from enum import Enum
 
-from autocalib_ros.comparison import AGREES_SIGMAS, SAME_LENS_PX, SAME_NUMBER, lenses_apart_px
+from autocalib_ros.comparison import AGREEMENT_SIGMAS, EQUAL_RTOL, SAME_LENS_TOLERANCE_PX, max_lens_difference_px
 from autocalib_ros.config import Options
 from autocalib_ros.errors import UsageError
 from autocalib_ros.estimation.verification.scale import Scale, known_scale
@@ -40,14 +40,14 @@ class Decision:
     """What is in force after a new solution, and why."""
 
     state: CalibrationState
-    in_force: Calibration
+    calibration: Calibration
     words: str = ''
     """For the log; '' where there is nothing to tell but the solution itself."""
     contradicted: bool = False
     """Whether the calibration before was wrong for this camera, all of it."""
 
 
-def decided(state: CalibrationState, before: Calibration | None, fresh: Calibration) -> Decision:
+def reconcile(state: CalibrationState, before: Calibration | None, fresh: Calibration) -> Decision:
     """Say what a new solution makes of the calibration in force.
 
     One of this run is replaced by the newer, unless that has lost the plane. One of an earlier run is confirmed where
@@ -61,76 +61,76 @@ def decided(state: CalibrationState, before: Calibration | None, fresh: Calibrat
         loses = before.ground is not None and fresh.ground is None
         return Decision(state, before, 'the calibration before stays: the new one has no ground plane') if loses else (
             Decision(state, fresh))
-    unlike = [*_unlike_lens(before, fresh), *_unlike_plane(before, fresh)]
-    if unlike:
-        told = ', '.join(filter(None, unlike))
+    differences = [*_lens_differences(before, fresh), *_plane_differences(before, fresh)]
+    if differences:
+        found = ', '.join(filter(None, differences))
         return Decision(CalibrationState.CALIBRATED, fresh, contradicted=True, words=(
-            f'the earlier calibration does not hold any more and is replaced: {told}' if told else 'the earlier '
+            f'the earlier calibration does not hold any more and is replaced: {found}' if found else 'the earlier '
             'calibration is replaced: without standard deviations nothing tells whether it still holds'))
     if before.ground is not None and fresh.ground is None:
         why = f': {fresh.ground_refusal.message}' if fresh.ground_refusal else ''
         return Decision(state, before, f'the traffic confirms the earlier lens; its ground plane is not verified{why}')
-    if _as_sure(fresh, before):
+    if _at_least_as_precise(fresh, before):
         return Decision(CalibrationState.CALIBRATED, fresh, 'the earlier calibration is confirmed, and replaced by '
                         'one as sure')
     return Decision(CalibrationState.VERIFIED, before, '' if state is CalibrationState.VERIFIED else
                     'the traffic confirms the earlier calibration, which is surer and stays in force')
 
 
-def _unlike_lens(before: Calibration, fresh: Calibration) -> list[str | None]:
+def _lens_differences(before: Calibration, fresh: Calibration) -> list[str | None]:
     """Name what differs beyond its deviations; None stands for what has none."""
-    if lenses_apart_px(before.camera, fresh.camera) <= SAME_LENS_PX:
+    if max_lens_difference_px(before.camera, fresh.camera) <= SAME_LENS_TOLERANCE_PX:
         return []
-    return _unlike(_lens_numbers(before), _lens_numbers(fresh))
+    return _differences(_lens_estimates(before), _lens_estimates(fresh))
 
 
-def _unlike_plane(before: Calibration, fresh: Calibration) -> list[str | None]:
+def _plane_differences(before: Calibration, fresh: Calibration) -> list[str | None]:
     if before.ground is None or fresh.ground is None:
         return []
     if before.ground.metric != fresh.ground.metric:
         return ['the ground plane is in metres' if fresh.ground.metric else 'the ground plane is not in metres']
-    return _unlike(_plane_numbers(before.ground, before.stddev), _plane_numbers(fresh.ground, fresh.stddev))
+    return _differences(_plane_estimates(before.ground, before.stddev), _plane_estimates(fresh.ground, fresh.stddev))
 
 
 @dataclass(frozen=True)
-class _Number:
+class _Estimate:
     name: str
     value: float
     sigma: float | None
     unit: str = ''
 
 
-def _lens_numbers(result: Calibration) -> list[_Number]:
+def _lens_estimates(result: Calibration) -> list[_Estimate]:
     camera, sigma = result.camera, result.stddev
     point = sigma.principal_point_px or (None, None)
-    return [_Number('focal length', camera.focal_px, sigma.focal_px, ' px'),
-            _Number('principal point x', camera.principal_point_px[0], point[0], ' px'),
-            _Number('principal point y', camera.principal_point_px[1], point[1], ' px'),
-            _Number('k1', camera.k[0], sigma.k1), _Number('k2', camera.k[1], sigma.k2)]
+    return [_Estimate('focal length', camera.focal_px, sigma.focal_px, ' px'),
+            _Estimate('principal point x', camera.principal_point_px[0], point[0], ' px'),
+            _Estimate('principal point y', camera.principal_point_px[1], point[1], ' px'),
+            _Estimate('k1', camera.k[0], sigma.k1), _Estimate('k2', camera.k[1], sigma.k2)]
 
 
-def _plane_numbers(ground: GroundPlane, sigma: StandardDeviations) -> list[_Number]:
+def _plane_estimates(ground: GroundPlane, sigma: StandardDeviations) -> list[_Estimate]:
     tilt, roll = tilt_and_roll_deg(ground.normal_in_camera)
     # a height that was given has no deviation: it is exact
-    return [_Number('tilt', float(tilt), sigma.tilt_deg, ' deg'), _Number('roll', float(roll), sigma.roll_deg, ' deg'),
-            _Number('height', ground.height_m, sigma.height_m or 0.0, ' m')]
+    return [_Estimate('tilt', float(tilt), sigma.tilt_deg, ' deg'), _Estimate('roll', float(roll), sigma.roll_deg, ' deg'),
+            _Estimate('height', ground.height_m, sigma.height_m or 0.0, ' m')]
 
 
-def _unlike(before: list[_Number], fresh: list[_Number]) -> list[str | None]:
-    told: list[str | None] = []
+def _differences(before: list[_Estimate], fresh: list[_Estimate]) -> list[str | None]:
+    found: list[str | None] = []
     for old, new in zip(before, fresh, strict=True):
-        apart = abs(new.value - old.value)
-        if apart <= SAME_NUMBER * abs(old.value):
+        difference = abs(new.value - old.value)
+        if difference <= EQUAL_RTOL * abs(old.value):
             continue
         if old.sigma is None or new.sigma is None:
-            told.append(None)
-        elif apart > AGREES_SIGMAS * math.hypot(old.sigma, new.sigma):
-            told.append(f'{old.name} {old.value:.4g} +- {old.sigma:.2g}{old.unit} was kept, {new.value:.4g} +- '
+            found.append(None)
+        elif difference > AGREEMENT_SIGMAS * math.hypot(old.sigma, new.sigma):
+            found.append(f'{old.name} {old.value:.4g} +- {old.sigma:.2g}{old.unit} was kept, {new.value:.4g} +- '
                         f'{new.sigma:.2g}{new.unit} was found')
-    return told
+    return found
 
 
-def _as_sure(fresh: Calibration, before: Calibration) -> bool:
+def _at_least_as_precise(fresh: Calibration, before: Calibration) -> bool:
     """Whether a solution gives as much as the other, as surely, or a ground plane where that has none."""
     if before.ground is None and fresh.ground is not None:
         return True
@@ -138,10 +138,10 @@ def _as_sure(fresh: Calibration, before: Calibration) -> bool:
     if before.ground is not None:
         sigmas += [(fresh.stddev.tilt_deg, before.stddev.tilt_deg), (fresh.stddev.roll_deg, before.stddev.roll_deg)]
     return (_rank(fresh.grade) >= _rank(before.grade)
-            and all(_or_none(new) <= _or_none(old) for new, old in sigmas))
+            and all(_sigma_or_inf(new) <= _sigma_or_inf(old) for new, old in sigmas))
 
 
-def _or_none(sigma: float | None) -> float:
+def _sigma_or_inf(sigma: float | None) -> float:
     return math.inf if sigma is None else sigma
 
 
@@ -149,7 +149,7 @@ def _rank(grade: str) -> int:
     return GRADES.index(grade) if grade in GRADES else -1
 
 
-def with_what_is_given(kept: Calibration, options: Options, lens: Camera | None) -> Calibration:
+def with_current_options(kept: Calibration, options: Options, lens: Camera | None) -> Calibration:
     """Return a kept calibration under the options of today; UsageError where it does not fit them.
 
     The plane takes the scale that is given now, where that needs no traffic; otherwise it keeps its own. A lens
@@ -159,7 +159,7 @@ def with_what_is_given(kept: Calibration, options: Options, lens: Camera | None)
     if any(getattr(kept, name) != value for name, value in form.items()):
         kept = replace(kept, **form)
     size = kept.evidence.image_size
-    if lens is not None and lenses_apart_px(lens.scaled_to(*size), kept.camera) > SAME_LENS_PX:
+    if lens is not None and max_lens_difference_px(lens.scaled_to(*size), kept.camera) > SAME_LENS_TOLERANCE_PX:
         raise UsageError("its lens is not that of 'camera_info_file': it is left out")
     given_now = options.camera_height > 0 or options.scale_from == 'distance'
     if kept.ground is None or not given_now:
@@ -174,7 +174,7 @@ def with_what_is_given(kept: Calibration, options: Options, lens: Camera | None)
 
 def _scaled(kept: Calibration, ground: GroundPlane, scale: Scale) -> Calibration:
     height = scale.height(kept.camera, ground.normal_in_camera)
-    if ground.metric and abs(height - ground.height_m) <= SAME_NUMBER * height:
+    if ground.metric and abs(height - ground.height_m) <= EQUAL_RTOL * height:
         return kept
     words = tuple(text for text in kept.assumptions if not text.startswith('scale by '))
     return replace(

@@ -22,9 +22,9 @@ ARGUMENTS = (
 
 def generate_launch_description() -> LaunchDescription:
     """Declare the arguments and start the node with those that were given."""
-    declared = [DeclareLaunchArgument(name, default_value=default, description=text)
+    walk_options = [DeclareLaunchArgument(name, default_value=default, description=text)
                 for name, default, text in ARGUMENTS]
-    return LaunchDescription([*declared, OpaqueFunction(function=start_node)])
+    return LaunchDescription([*walk_options, OpaqueFunction(function=start_node)])
 
 
 def start_node(context: LaunchContext) -> list[Node]:

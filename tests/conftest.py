@@ -4,10 +4,10 @@ import os
 
 import pytest
 
-from autocalib_ros.util.threads import use_one_thread_for_linear_algebra
+from autocalib_ros.util.threads import limit_blas_threads
 from stored_results import quick_folder
 
-use_one_thread_for_linear_algebra()
+limit_blas_threads()
 os.environ.pop('FORCE_COLOR', None)  # some test machines set it, and messages are compared as they are
 
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from autocalib_ros.calibrator import LEAP_NS, AutoCalibrator, Intake, Progress
+from autocalib_ros.calibrator import CLOCK_JUMP_NS, AutoCalibrator, CalibrationProgress, FrameStatus
 from autocalib_ros.config import BufferOptions, GateOptions, Options
 from autocalib_ros.errors import InputError
 
@@ -34,7 +34,7 @@ def fed(count: int, interval_ns: int = 100_000_000) -> AutoCalibrator:
 
 def test_nothing_is_known_before_the_first_image() -> None:
     calibrator = AutoCalibrator(OPTIONS)
-    assert calibrator.snapshot() is None and calibrator.take_due() is None and calibrator.background() is None
+    assert calibrator.snapshot() is None and calibrator.snapshot_if_due() is None and calibrator.background() is None
     assert calibrator.progress().percent == 0.0
 
 
@@ -90,36 +90,36 @@ def test_a_repeated_or_late_stamp_is_left_out(stamp_ns: int) -> None:
 
 
 @pytest.mark.parametrize(('stamp_ns', 'size', 'expected'), [
-    (1_000_000_000, (180, 320), Intake.USED),
-    (900_000_000, (180, 320), Intake.LATE),  # the stamp of the image before
-    (1, (180, 320), Intake.LATE),
-    (-100_000_000, (180, 320), Intake.STEPPED),
-    (800_000_000 + LEAP_NS, (180, 320), Intake.USED),
-    (900_000_000 + LEAP_NS, (180, 320), Intake.STEPPED),
-    (1_000_000_000, (240, 320), Intake.RESIZED),
+    (1_000_000_000, (180, 320), FrameStatus.USED),
+    (900_000_000, (180, 320), FrameStatus.LATE),  # the stamp of the image before
+    (1, (180, 320), FrameStatus.LATE),
+    (-100_000_000, (180, 320), FrameStatus.TIME_JUMPED),
+    (800_000_000 + CLOCK_JUMP_NS, (180, 320), FrameStatus.USED),
+    (900_000_000 + CLOCK_JUMP_NS, (180, 320), FrameStatus.TIME_JUMPED),
+    (1_000_000_000, (240, 320), FrameStatus.RESIZED),
 ])
-def test_what_became_of_an_image_is_told(stamp_ns: int, size: tuple[int, int], expected: Intake) -> None:
+def test_what_became_of_an_image_is_told(stamp_ns: int, size: tuple[int, int], expected: FrameStatus) -> None:
     assert fed(10).add_image(stamp_ns, image(30, size)) is expected
 
 
 def test_first_image_is_told() -> None:
-    assert AutoCalibrator(OPTIONS).add_image(0, image(0)) is Intake.FIRST
+    assert AutoCalibrator(OPTIONS).add_image(0, image(0)) is FrameStatus.FIRST
 
 
 def test_clock_that_was_set_does_not_count_as_time_watched() -> None:
     calibrator = fed(10)
     for index in range(5):
-        calibrator.add_image(50 * 365 * LEAP_NS + index * 100_000_000, image(index))
+        calibrator.add_image(50 * 365 * CLOCK_JUMP_NS + index * 100_000_000, image(index))
     evidence = calibrator.snapshot()
     assert evidence is not None and (evidence.frames, round(evidence.seconds, 1)) == (5, 0.4)
 
 
 def test_other_options_make_a_solution_due() -> None:
     calibrator = fed(150)
-    assert calibrator.take_due() is not None
-    assert calibrator.take_due() is None
+    assert calibrator.snapshot_if_due() is not None
+    assert calibrator.snapshot_if_due() is None
     calibrator.change(replace(OPTIONS, camera_height=9.0))
-    assert calibrator.take_due() is not None
+    assert calibrator.snapshot_if_due() is not None
 
 
 @pytest.mark.parametrize('picture', [np.zeros((10, 10), np.uint16), np.zeros((10, 10, 4), np.uint8),
@@ -134,7 +134,7 @@ def test_a_solution_is_due_when_there_are_time_and_tracks() -> None:
     due = []
     for index in range(150):
         calibrator.add_image(index * 100_000_000, image(index))
-        if calibrator.take_due() is not None:
+        if calibrator.snapshot_if_due() is not None:
             due.append(index)
     assert due and due[0] >= 20  # first_solve_s
     assert all(later - earlier >= 10 for earlier, later in zip(due, due[1:], strict=False))  # solve_interval_s
@@ -196,6 +196,6 @@ def test_evidence_is_forgotten_when_the_camera_may_look_elsewhere() -> None:
 
 
 def test_progress_reads_as_one_line() -> None:
-    assert str(Progress(42.4, ('17 of 40 tracks',), 'about 6 min more at this rate')) == (
+    assert str(CalibrationProgress(42.4, ('17 of 40 tracks',), 'about 6 min more at this rate')) == (
         '42 %: 17 of 40 tracks, about 6 min more at this rate')
-    assert str(Progress(100.0, ())) == '100 %'
+    assert str(CalibrationProgress(100.0, ())) == '100 %'

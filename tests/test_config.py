@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import pytest
 
-from autocalib_ros.config import NodeOptions, Options, ScaleOptions, declared, flattened, with_values
+from autocalib_ros.config import NodeOptions, Options, ScaleOptions, flatten, walk_options, with_overrides
 from autocalib_ros.errors import UsageError
 
 
 def test_a_nested_option_is_set_by_its_full_name() -> None:
-    assert with_values(Options(), {'tracking.max_points': 77}).tracking.max_points == 77
+    assert with_overrides(Options(), {'tracking.max_points': 77}).tracking.max_points == 77
 
 
 def test_setting_one_option_leaves_the_others() -> None:
-    changed = with_values(Options(), {'gate.min_tracks': 50})
-    assert with_values(changed, {'gate.min_tracks': Options().gate.min_tracks}) == Options()
+    changed = with_overrides(Options(), {'gate.min_tracks': 50})
+    assert with_overrides(changed, {'gate.min_tracks': Options().gate.min_tracks}) == Options()
 
 
 def test_an_unknown_option_names_its_nearest_neighbour() -> None:
     with pytest.raises(UsageError, match=r"unknown option 'tracking.max_point'.*'tracking.max_points'"):
-        with_values(Options(), {'tracking.max_point': 5})
+        with_overrides(Options(), {'tracking.max_point': 5})
 
 
 @pytest.mark.parametrize(('name', 'value', 'says'), [
@@ -32,11 +32,11 @@ def test_an_unknown_option_names_its_nearest_neighbour() -> None:
 ])
 def test_a_value_out_of_range_says_what_is_expected(name: str, value: object, says: str) -> None:
     with pytest.raises(UsageError, match=says):
-        with_values(Options(), {name: value})
+        with_overrides(Options(), {name: value})
 
 
 def test_a_whole_number_is_taken_for_a_float() -> None:
-    height = with_values(Options(), {'camera_height': 8}).camera_height
+    height = with_overrides(Options(), {'camera_height': 8}).camera_height
     assert isinstance(height, float) and height == 8.0
 
 
@@ -66,7 +66,7 @@ PIXELS = '412 530 888 530'
 def test_a_scale_is_told_by_one_source_and_whole(values: dict[str, object], says: str) -> None:
     more = {'scale.pixel_sigma_px': 2.0} if '418' in str(values) else {}
     with pytest.raises(UsageError, match=says):
-        with_values(Options(), {**values, **more})
+        with_overrides(Options(), {**values, **more})
 
 
 @pytest.mark.parametrize('text', [PIXELS, '412, 530, 888, 530', ' 412.0  530 8.88e2,530 '])
@@ -83,13 +83,13 @@ def test_pixels_reach_to_the_border_of_the_image() -> None:
 
 @pytest.mark.parametrize('options', [Options(), NodeOptions()])
 def test_every_option_has_a_description(options: object) -> None:
-    assert all(item.doc for item in declared(options))
+    assert all(item.doc for item in walk_options(options))
 
 
 def test_names_of_core_and_node_do_not_collide() -> None:
-    core, node = ({item.name for item in declared(options)} for options in (Options(), NodeOptions()))
+    core, node = ({item.name for item in walk_options(options)} for options in (Options(), NodeOptions()))
     assert not core & node
 
 
 def test_nested_mappings_become_full_names() -> None:
-    assert flattened({'a': 1, 'b': {'c': 2, 'd': {'e': 3}}}) == {'a': 1, 'b.c': 2, 'b.d.e': 3}
+    assert flatten({'a': 1, 'b': {'c': 2, 'd': {'e': 3}}}) == {'a': 1, 'b.c': 2, 'b.d.e': 3}

@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 import yaml
 
-from autocalib_ros.config import Declared, NodeOptions, Options, declared, flattened
+from autocalib_ros.config import NodeOptions, Options, OptionSpec, flatten, walk_options
 
 FILE = Path(__file__).parent.parent / 'config' / 'autocalib.yaml'
-OPTIONS = [*declared(Options()), *declared(NodeOptions())]
+OPTIONS = [*walk_options(Options()), *walk_options(NodeOptions())]
 
 
 @pytest.fixture(scope='module')
@@ -18,7 +18,7 @@ def text() -> str:
 
 @pytest.fixture(scope='module')
 def values(text) -> dict:
-    return flattened(yaml.safe_load(text)['/**']['ros__parameters'])
+    return flatten(yaml.safe_load(text)['/**']['ros__parameters'])
 
 
 def prose(text: str) -> str:
@@ -31,18 +31,18 @@ def test_file_lists_exactly_the_options(values):
 
 
 @pytest.mark.parametrize('item', OPTIONS, ids=lambda item: item.name)
-def test_file_gives_the_default_in_its_type(item: Declared, values):
+def test_file_gives_the_default_in_its_type(item: OptionSpec, values):
     assert (type(values[item.name]), values[item.name]) == (type(item.default), item.default)
 
 
 @pytest.mark.parametrize('item', OPTIONS, ids=lambda item: item.name)
-def test_file_describes_the_option_and_its_choices(item: Declared, text):
+def test_file_describes_the_option_and_its_choices(item: OptionSpec, text):
     doc = item.doc[0].upper() + item.doc[1:]
     choices = f'. One of: {", ".join(item.choices)}.' if item.choices else '.'
     assert f'{doc}{choices}' in prose(text)
 
 
 @pytest.mark.parametrize('item', [item for item in OPTIONS if item.low is not None], ids=lambda item: item.name)
-def test_file_gives_the_range_of_the_option(item: Declared, text):
+def test_file_gives_the_range_of_the_option(item: OptionSpec, text):
     permitted = f'At least {item.low}.' if item.high is None else f'{item.low} to {item.high}.'
     assert f'{item.doc[1:]}. {permitted}' in prose(text)

@@ -15,7 +15,7 @@ import pytest
 from autocalib_ros.calibrator import solve
 from autocalib_ros.cli import main
 from autocalib_ros.commands.replay_command import DEFAULT_OUT
-from autocalib_ros.config import Declared, NodeOptions, Options, declared
+from autocalib_ros.config import NodeOptions, Options, OptionSpec, walk_options
 from autocalib_ros.offline.synthetic.junction import Junction, synthetic_evidence
 from autocalib_ros.results.calibration_json import write_calibration_json
 from autocalib_ros.ros.status import Counts, Situation, status
@@ -49,8 +49,8 @@ def table_row(name: str) -> str:
     return rows[0]
 
 
-@pytest.mark.parametrize('item', list(declared(NodeOptions())), ids=lambda item: item.name)
-def test_every_option_of_the_node_stands_in_the_table_with_its_default_and_choices(item: Declared):
+@pytest.mark.parametrize('item', list(walk_options(NodeOptions())), ids=lambda item: item.name)
+def test_every_option_of_the_node_stands_in_the_table_with_its_default_and_choices(item: OptionSpec):
     default = str(item.default).lower() if isinstance(item.default, bool) else str(item.default) or "`''`"
     choices = f'; one of {", ".join(item.choices)}' if item.choices else ''
     assert table_row(item.name) == f'| `{item.name}` | {default} | {item.doc}{choices} |'

@@ -13,7 +13,7 @@ from autocalib_ros.errors import UsageError
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_evidence
 from autocalib_ros.results.calibration import Reason, StandardDeviations
-from autocalib_ros.revalidation import CalibrationState, decided, with_what_is_given
+from autocalib_ros.revalidation import CalibrationState, reconcile, with_current_options
 from stored_results import SIZE, calibration, lens_only
 
 NONE, RESTORED, VERIFIED, CALIBRATED = CalibrationState
@@ -23,26 +23,26 @@ VAGUE = calibration(302.0, tilt_deg=12.5, sigmas=3.0)
 
 
 def test_first_solution_is_taken():
-    decision = decided(NONE, None, KEPT)
-    assert (decision.state, decision.in_force, decision.words) == (CALIBRATED, KEPT, '')
+    decision = reconcile(NONE, None, KEPT)
+    assert (decision.state, decision.calibration, decision.words) == (CALIBRATED, KEPT, '')
 
 
 def test_solution_of_this_run_is_replaced_by_the_newer_whatever_it_says():
     newer = calibration(400.0, sigmas=9.0)
-    assert decided(CALIBRATED, KEPT, newer).in_force is newer
+    assert reconcile(CALIBRATED, KEPT, newer).calibration is newer
 
 
 @pytest.mark.parametrize('state', [RESTORED, VERIFIED])
 def test_vague_solution_that_agrees_confirms_the_kept_one_which_stays(state):
-    decision = decided(state, KEPT, VAGUE)
-    assert (decision.state, decision.in_force, decision.contradicted) == (VERIFIED, KEPT, False)
+    decision = reconcile(state, KEPT, VAGUE)
+    assert (decision.state, decision.calibration, decision.contradicted) == (VERIFIED, KEPT, False)
     assert bool(decision.words) == (state is RESTORED)
 
 
 def test_solution_that_agrees_and_is_as_sure_takes_over():
     fresh = calibration(300.5, tilt_deg=12.4)
-    decision = decided(RESTORED, KEPT, fresh)
-    assert (decision.state, decision.in_force, decision.contradicted) == (CALIBRATED, fresh, False)
+    decision = reconcile(RESTORED, KEPT, fresh)
+    assert (decision.state, decision.calibration, decision.contradicted) == (CALIBRATED, fresh, False)
     assert 'is confirmed' in decision.words
 
 
@@ -54,45 +54,45 @@ def test_solution_that_agrees_and_is_as_sure_takes_over():
     (replace(VAGUE, camera=replace(VAGUE.camera, principal_point_px=(340.0, 179.5))), 'principal point x'),
 ])
 def test_solution_that_does_not_agree_replaces_the_kept_one(fresh, told):
-    decision = decided(RESTORED, KEPT, fresh)
-    assert (decision.state, decision.in_force, decision.contradicted) == (CALIBRATED, fresh, True)
+    decision = reconcile(RESTORED, KEPT, fresh)
+    assert (decision.state, decision.calibration, decision.contradicted) == (CALIBRATED, fresh, True)
     assert told in decision.words
 
 
 def test_difference_counts_by_both_deviations():
     # 4 px apart: 4 sigmas of the kept one alone, 2.8 of both together
     agrees, differs = (calibration(304.0, sigmas=sigmas) for sigmas in (1.0, 0.5))
-    assert not decided(RESTORED, KEPT, agrees).contradicted
-    assert decided(RESTORED, KEPT, differs).contradicted
+    assert not reconcile(RESTORED, KEPT, agrees).contradicted
+    assert reconcile(RESTORED, KEPT, differs).contradicted
 
 
 def test_lens_alone_confirms_the_lens_and_leaves_the_plane_unverified():
     fresh = replace(lens_only(VAGUE), ground_refusal=Reason('one_direction', 'one road only.', 'wait'))
-    decision = decided(RESTORED, KEPT, fresh)
-    assert (decision.state, decision.in_force) == (RESTORED, KEPT)
+    decision = reconcile(RESTORED, KEPT, fresh)
+    assert (decision.state, decision.calibration) == (RESTORED, KEPT)
     assert 'confirms the earlier lens' in decision.words and 'one road only.' in decision.words
 
 
 def test_other_lens_without_a_plane_replaces_lens_and_plane():
     fresh = lens_only(calibration(320.0))
-    decision = decided(RESTORED, KEPT, fresh)
-    assert (decision.state, decision.in_force, decision.contradicted) == (CALIBRATED, fresh, True)
+    decision = reconcile(RESTORED, KEPT, fresh)
+    assert (decision.state, decision.calibration, decision.contradicted) == (CALIBRATED, fresh, True)
 
 
 def test_plane_is_taken_where_none_was_kept():
-    decision = decided(RESTORED, lens_only(KEPT), VAGUE)
-    assert (decision.state, decision.in_force, decision.contradicted) == (CALIBRATED, VAGUE, False)
+    decision = reconcile(RESTORED, lens_only(KEPT), VAGUE)
+    assert (decision.state, decision.calibration, decision.contradicted) == (CALIBRATED, VAGUE, False)
 
 
 def test_same_lens_needs_no_deviations():
     given = replace(KEPT, stddev=replace(KEPT.stddev, focal_px=0.0, principal_point_px=(0.0, 0.0), k1=0.0, k2=0.0))
-    assert decided(RESTORED, given, given).state is CALIBRATED
+    assert reconcile(RESTORED, given, given).state is CALIBRATED
 
 
 def test_without_deviations_the_newer_is_taken():
     published = replace(calibration(310.0), stddev=StandardDeviations())
-    decision = decided(RESTORED, KEPT, published)
-    assert (decision.state, decision.in_force) == (CALIBRATED, published)
+    decision = reconcile(RESTORED, KEPT, published)
+    assert (decision.state, decision.calibration) == (CALIBRATED, published)
     assert 'without standard deviations' in decision.words
 
 
@@ -105,12 +105,12 @@ def test_solutions_of_one_camera_agree_and_of_a_turned_one_do_not():
 
     kept, again, turned = seen(32.0, 1), seen(32.0, 2), seen(37.0, 3)
     assert kept and again and turned
-    assert not decided(RESTORED, kept, again).contradicted
-    assert decided(RESTORED, kept, turned).contradicted
+    assert not reconcile(RESTORED, kept, again).contradicted
+    assert reconcile(RESTORED, kept, turned).contradicted
 
 
 def test_height_that_is_given_now_scales_the_kept_plane():
-    scaled = with_what_is_given(KEPT, Options(camera_height=16.2, camera_height_sigma=0.4), None)
+    scaled = with_current_options(KEPT, Options(camera_height=16.2, camera_height_sigma=0.4), None)
     assert (scaled.ground.height_m, scaled.stddev.height_m, scaled.stddev.ground_point_m) == (16.2, 0.4, ())
     np.testing.assert_array_equal(scaled.ground.rotation, KEPT.ground.rotation)
     assert scaled.assumptions == ('square pixels', 'scale by the camera height of 16.2 +- 0.4 m (given)')
@@ -120,12 +120,12 @@ def test_height_that_is_given_now_scales_the_kept_plane():
 @pytest.mark.parametrize('options', [Options(), Options(camera_height=8.1), Options(scale_from='speed', scale=replace(
     Options().scale, speed_km_h=50.0))])
 def test_kept_plane_keeps_its_scale_when_nothing_else_is_given(options):
-    assert with_what_is_given(KEPT, options, None) is KEPT
+    assert with_current_options(KEPT, options, None) is KEPT
 
 
 def test_distance_that_is_given_now_scales_the_kept_plane():
     scale = replace(Options().scale, distance_px='250 300 400 310', distance_m=5.0)
-    scaled = with_what_is_given(KEPT, Options(scale_from='distance', scale=scale), None)
+    scaled = with_current_options(KEPT, Options(scale_from='distance', scale=scale), None)
     bearings, _ = KEPT.camera.unproject(np.array(scale.pixels))
     rays = bearings @ scaled.ground.rotation.T
     points = -rays / rays[:, 2:] * scaled.ground.height_m
@@ -134,19 +134,19 @@ def test_distance_that_is_given_now_scales_the_kept_plane():
 
 def test_distance_between_pixels_off_the_kept_road_takes_the_plane_away():
     scale = replace(Options().scale, distance_px='250 3 400 310', distance_m=5.0)
-    lens = with_what_is_given(KEPT, Options(scale_from='distance', scale=scale), None)
+    lens = with_current_options(KEPT, Options(scale_from='distance', scale=scale), None)
     assert (lens.grade, lens.ground, lens.ground_refusal.code) == ('lens', None, 'scale_off_road')
 
 
 def test_plane_in_heights_becomes_metres_when_the_height_is_given():
     unit = replace(KEPT, grade='unit_scale', ground=replace(KEPT.ground, height_m=1.0, metric=False))
-    scaled = with_what_is_given(unit, Options(camera_height=7.0), None)
+    scaled = with_current_options(unit, Options(camera_height=7.0), None)
     assert (scaled.ground.height_m, scaled.ground.metric, scaled.grade) == (7.0, True, 'assumed')
 
 
 def test_lens_that_is_given_now_has_to_be_the_kept_one():
     double = replace(KEPT.camera, width=2 * SIZE[0], height=2 * SIZE[1], focal_px=600.0,
                      principal_point_px=tuple(2 * x + 0.5 for x in KEPT.camera.principal_point_px))
-    assert with_what_is_given(KEPT, Options(), double) is KEPT
+    assert with_current_options(KEPT, Options(), double) is KEPT
     with pytest.raises(UsageError, match='camera_info_file'):
-        with_what_is_given(KEPT, Options(), Camera.equidistant(*SIZE, 320.0))
+        with_current_options(KEPT, Options(), Camera.equidistant(*SIZE, 320.0))

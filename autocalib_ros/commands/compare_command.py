@@ -27,12 +27,12 @@ def run(arguments: argparse.Namespace) -> int:
     import sys
 
     from autocalib_ros.commands.comparison_table import comparison_document, comparison_lines, truth_lines
-    from autocalib_ros.comparison import compared
+    from autocalib_ros.comparison import compare_calibrations
     from autocalib_ros.offline.terminal.style import painted
-    from autocalib_ros.results.saved_camera import read_known_camera
+    from autocalib_ros.results.saved_camera import read_saved_camera
 
-    both = [read_known_camera(path) for path in (arguments.first, arguments.second)]
-    result = compared(*both)
+    both = [read_saved_camera(path) for path in (arguments.first, arguments.second)]
+    result = compare_calibrations(*both)
     errors = []
     if arguments.truth is not None:
         from autocalib_ros.offline.ground_truth import errors_against_truth, read_truth

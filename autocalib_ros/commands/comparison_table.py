@@ -20,11 +20,11 @@ def comparison_lines(result: Comparison) -> list[str]:
     rows += [_row(item) for item in (*result.lens, *result.pose)]
     if result.normal_deg is not None:
         rows.append(('ground normal', '', '', f'{result.normal_deg:.2f} deg apart', ''))
-    for name, rays in (('rays, lens alone', result.rays), ('rays, best turned', result.rays_turned)):
+    for name, rays in (('rays, lens alone', result.rays), ('rays, best turned', result.rays_aligned)):
         rows.append((name, '', '', f'up to {rays.largest_deg:.2f} deg, mean {rays.mean_deg:.2f}', _count(rays.sigmas)))
-    rows += [(f'road {item.distance_m:g} m ahead', '', '', f'{item.apart_m:.2f} m apart', _count(item.sigmas))
+    rows += [(f'road {item.distance_m:g} m ahead', '', '', f'{item.separation_m:.2f} m apart', _count(item.sigmas))
              for item in result.road]
-    turned = (f'rays, best turned: after a rotation of B by {result.turned_deg:.2f} degrees, which lenses trade against'
+    turned = (f'rays, best turned: after a rotation of B by {result.alignment_deg:.2f} degrees, which lenses trade against'
               ' the principal point')
     road = ['road: where one pixel meets it; the foot of the camera is one point, and headings are turned to fit']
     return [*aligned(rows), turned, *(road if result.road else []), *result.notes]
@@ -53,7 +53,7 @@ def comparison_document(result: Comparison) -> dict[str, Any]:
         'agrees': result.agrees, 'verdict': result.verdict(),
         'lens': [counted(item) for item in result.lens], 'lens_px': _finite(result.lens_px),
         'focal_percent': 100 * result.lens[0].difference / result.lens[0].first,
-        'rays': counted(result.rays), 'rays_turned': counted(result.rays_turned), 'turned_deg': result.turned_deg,
+        'rays': counted(result.rays), 'rays_turned': counted(result.rays_aligned), 'turned_deg': result.alignment_deg,
         'pose': [counted(item) for item in result.pose], 'normal_deg': result.normal_deg,
         'road': [counted(item) for item in result.road], 'stated': list(result.stated), 'notes': list(result.notes)}
 

@@ -9,7 +9,7 @@ from autocalib_ros.commands import view_options as views
 
 if TYPE_CHECKING:
     from autocalib_ros.offline.view_files import View
-    from autocalib_ros.results.saved_camera import KnownCamera
+    from autocalib_ros.results.saved_camera import SavedCamera
 
 HELP = 'show the road from above, from an image or video'
 DESCRIPTION = ('Show the road from above, from an image or video, with a saved calibration of the camera; x of the '
@@ -32,7 +32,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Write; return the exit status."""
     from autocalib_ros.pictures.known_views import choose_top_view, top_view_renderer
 
-    def view_of(known: KnownCamera) -> View:
+    def view_of(known: SavedCamera) -> View:
         view = choose_top_view(known, arguments.px_per_m, arguments.x, arguments.y)
         return top_view_renderer(known, view, grid=arguments.grid, scale_bar=arguments.scale_bar)
     return views.write(arguments, 'topview', view_of)

@@ -13,7 +13,7 @@ from autocalib_ros.commands.compare_command import FILES
 if TYPE_CHECKING:
     from autocalib_ros.offline.view_files import View
     from autocalib_ros.perception.ignore_regions import Polygons
-    from autocalib_ros.results.saved_camera import KnownCamera
+    from autocalib_ros.results.saved_camera import SavedCamera
 
 
 def add_files(parser: argparse.ArgumentParser, calibration: str = FILES) -> None:
@@ -30,16 +30,16 @@ def add_files(parser: argparse.ArgumentParser, calibration: str = FILES) -> None
     parser.add_argument('--quiet', action='store_true', help='no progress, and not what was written')
 
 
-def write(arguments: argparse.Namespace, label: str, view_of: Callable[[KnownCamera], View]) -> int:
+def write(arguments: argparse.Namespace, label: str, view_of: Callable[[SavedCamera], View]) -> int:
     """Write what `view_of` makes of the camera in images of the source's size; return the exit status."""
     import numpy as np
 
     from autocalib_ros.errors import AutocalibError
     from autocalib_ros.offline.view_files import Part, write_view
     from autocalib_ros.perception.ignore_regions import black_out
-    from autocalib_ros.results.saved_camera import read_known_camera
+    from autocalib_ros.results.saved_camera import read_saved_camera
 
-    known = read_known_camera(arguments.calibration)
+    known = read_saved_camera(arguments.calibration)
     ignored = _ignored(arguments.params_file)
 
     def view_for(width: int, height: int) -> View:

@@ -47,7 +47,7 @@ def unproject_rays(camera: Camera, pixels: np.ndarray) -> Rays:
     share = 1.0 / (1.0 + half * half)
     sine, cosine = 2.0 * half * share, (1.0 - half * half) * share
     x, y = x / radius, y / radius
-    outward = 1.0 / np.maximum(camera.radius_slope(theta), 1e-3 * camera.focal_px)
+    outward = 1.0 / np.maximum(camera.radius_derivative(theta), 1e-3 * camera.focal_px)
     around = sine / radius
     rays = Rays(*(np.empty((*radius.shape, 3)) for _ in range(3)))
     rays.bearings[..., 0], rays.bearings[..., 1], rays.bearings[..., 2] = sine * x, sine * y, cosine

@@ -20,9 +20,9 @@ import numpy as np
 
 from autocalib_ros.errors import UsageError
 
-NEWTON_STEPS = 20
+MAX_ANGLE_ITERATIONS = 20
 """Most: Newton's iteration doubles its digits, so that four or five are the rule."""
-ANGLES_RAD = np.linspace(0.0, np.pi, 721)
+MONOTONICITY_GRID_RAD = np.linspace(0.0, np.pi, 721)
 """Where it is looked for that r(theta) falls."""
 
 
@@ -79,14 +79,14 @@ class Camera:
 
     def radius(self, theta_rad: np.ndarray) -> np.ndarray:
         """Return the image radius in pixels of the angles `theta_rad`."""
-        return self.focal_px * theta_rad * _series(self.k, theta_rad * theta_rad)
+        return self.focal_px * theta_rad * _power_series(self.k, theta_rad * theta_rad)
 
-    def radius_slope(self, theta_rad: np.ndarray) -> np.ndarray:
+    def radius_derivative(self, theta_rad: np.ndarray) -> np.ndarray:
         """Return dr/dtheta in pixels per radian."""
-        return self.focal_px * _series(self._slope_k, theta_rad * theta_rad)
+        return self.focal_px * _power_series(self._derivative_k, theta_rad * theta_rad)
 
     @property
-    def _slope_k(self) -> tuple[float, float, float, float]:
+    def _derivative_k(self) -> tuple[float, float, float, float]:
         """Coefficients of dr/dtheta."""
         k1, k2, k3, k4 = self.k
         return 3 * k1, 5 * k2, 7 * k3, 9 * k4
@@ -96,8 +96,8 @@ class Camera:
         """Largest theta up to which r(theta) grows: beyond it the model folds back on itself."""
         if not any(self.k):
             return float(np.pi)
-        falling = np.flatnonzero(self.radius_slope(ANGLES_RAD) <= 0)
-        return float(ANGLES_RAD[falling[0] - 1]) if len(falling) else float(np.pi)
+        falling = np.flatnonzero(self.radius_derivative(MONOTONICITY_GRID_RAD) <= 0)
+        return float(MONOTONICITY_GRID_RAD[falling[0] - 1]) if len(falling) else float(np.pi)
 
     def project(self, bearings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Project bearings (..., 3), of any length, to pixels (..., 2); and say where that is valid (...)."""
@@ -124,15 +124,15 @@ class Camera:
         limit = self.max_angle_rad
         theta = np.clip(radius, 0.0, limit)
         if any(self.k):
-            for _ in range(NEWTON_STEPS):
+            for _ in range(MAX_ANGLE_ITERATIONS):
                 before, t2 = theta, theta * theta
-                error = theta * _series(self.k, t2) - radius
-                theta = theta - error / np.maximum(_series(self._slope_k, t2), 1e-3)
+                error = theta * _power_series(self.k, t2) - radius
+                theta = theta - error / np.maximum(_power_series(self._derivative_k, t2), 1e-3)
                 theta = np.minimum(np.maximum(theta, 0.0), limit)
                 # the digits double with a step; where the model does not reach, the angle stays at its limit
                 if np.abs(theta - before).max(initial=0.0) < 1e-8:
                     break
-        return theta, np.abs(theta * _series(self.k, theta * theta) - radius) < 1e-6
+        return theta, np.abs(theta * _power_series(self.k, theta * theta) - radius) < 1e-6
 
     def undistort(self, pixels: np.ndarray, focal_px: float | None = None) -> np.ndarray:
         """Map pixels (..., 2) to those of a distortion-free camera with the same principal point.
@@ -156,7 +156,7 @@ def scale_factors(calibrated: tuple[int, int], images: tuple[int, int]) -> tuple
     return across, down
 
 
-def _series(k: tuple[float, ...], t2: np.ndarray) -> np.ndarray:
+def _power_series(k: tuple[float, ...], t2: np.ndarray) -> np.ndarray:
     """Return 1 + k1 t2 + k2 t2^2 + ..., shape of `t2`; coefficients of 0 at the end cost nothing."""
     order = max((power for power, factor in enumerate(k, 1) if factor), default=0)
     if not order:

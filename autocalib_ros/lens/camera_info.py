@@ -10,18 +10,18 @@ import numpy as np
 from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.lens.camera import Camera, Lens
 from autocalib_ros.lens.opencv_lens import (
-    MAX_ERROR_PX,
-    MAX_SLOPE_ANGLE_RAD,
-    nearest_coefficients,
-    seen_angle_rad,
+    MAX_MODEL_ERROR_PX,
+    MAX_PINHOLE_ANGLE_RAD,
+    fit_opencv_coefficients,
+    max_visible_angle_rad,
 )
 
-EQUIDISTANT_FLOOR = 1e-9
+EQUIDISTANT_K1_FLOOR = 1e-9
 """image_proc and image_geometry take an all-zero D for "no distortion" whatever the model is called."""
 RECTIFIED_LIMIT_DEG = 80.0
 """A distortion-free image ends at this angle from the axis at the latest: at 90 it would be infinitely large, and
 already here its border is magnified 33 times as much as its middle."""
-MODELS = {'plumb_bob': (4, 5), 'rational_polynomial': (8,), 'equidistant': (0, 1, 2, 3, 4), 'fisheye': (0, 1, 2, 3, 4)}
+DISTORTION_MODELS = {'plumb_bob': (4, 5), 'rational_polynomial': (8,), 'equidistant': (0, 1, 2, 3, 4), 'fisheye': (0, 1, 2, 3, 4)}
 """The distortion models that are read, and how many coefficients each may have."""
 
 
@@ -75,8 +75,8 @@ def camera_info(camera: Camera, distortion_model: str = 'auto', rectified_balanc
     """
     model = 'equidistant' if distortion_model == 'auto' else distortion_model
     coefficients, error_px = _coefficients(camera, model)
-    if not error_px <= MAX_ERROR_PX:
-        raise _misfit(camera, model, error_px)
+    if not error_px <= MAX_MODEL_ERROR_PX:
+        raise _model_misfit(camera, model, error_px)
     rectified = rectified_matrix(camera, rectified_balance)
     return CameraInfo(
         width=camera.width, height=camera.height, distortion_model=model,
@@ -85,21 +85,21 @@ def camera_info(camera: Camera, distortion_model: str = 'auto', rectified_balanc
         p=[float(value) for value in np.hstack([rectified, np.zeros((3, 1))]).ravel()], error_px=error_px)
 
 
-def in_full_resolution(info: CameraInfo, readout: Readout) -> CameraInfo:
+def to_full_resolution(info: CameraInfo, readout: Readout) -> CameraInfo:
     """Return what was calibrated in the pixels of binned or cut-out images in those of the whole sensor.
 
     image_geometry goes back by subtracting the offset and dividing by the binning, and so is right in the image to the
     last digit. InputError where images of such a readout would have another size than those of the calibration.
     """
-    doubt = readout_doubt(readout, (info.width, info.height))
-    if doubt:
-        raise InputError(f'{doubt}: its binning and region of interest are not theirs and are left out')
+    mismatch = check_readout(readout, (info.width, info.height))
+    if mismatch:
+        raise InputError(f'{mismatch}: its binning and region of interest are not theirs and are left out')
     return replace(info, width=readout.width, height=readout.height,
-                   k=_unbinned(info.k, 3, readout.bins, readout.offset),
-                   p=_unbinned(info.p, 4, readout.bins, readout.offset))
+                   k=_to_full_resolution(info.k, 3, readout.bins, readout.offset),
+                   p=_to_full_resolution(info.p, 4, readout.bins, readout.offset))
 
 
-def readout_doubt(readout: Readout, image_size: tuple[int, int]) -> str:
+def check_readout(readout: Readout, image_size: tuple[int, int]) -> str:
     """Say why images of a size (width, height) are not of a readout, '' where they may be."""
     (across, down), (width, height) = readout.bins, image_size
     window = readout.window[0] or readout.width, readout.window[1] or readout.height
@@ -113,7 +113,7 @@ def readout_doubt(readout: Readout, image_size: tuple[int, int]) -> str:
     return ''
 
 
-def _unbinned(matrix: list[float], columns: int, binning: tuple[int, int], offset: tuple[int, int]) -> list[float]:
+def _to_full_resolution(matrix: list[float], columns: int, binning: tuple[int, int], offset: tuple[int, int]) -> list[float]:
     """Return K or P for the whole sensor."""
     rows = np.array(matrix).reshape(3, columns) * np.array([[binning[0]], [binning[1]], [1]])
     rows[:2, 2] += offset
@@ -124,26 +124,26 @@ def _coefficients(camera: Camera, model: str) -> tuple[list[float], float]:
     """Return D in a model, and by how many pixels it misses the lens at the most."""
     if model == 'equidistant':
         coefficients = [float(value) for value in camera.k]
-        if not any(abs(value) >= EQUIDISTANT_FLOOR for value in coefficients):
-            coefficients[0] = EQUIDISTANT_FLOOR
+        if not any(abs(value) >= EQUIDISTANT_K1_FLOOR for value in coefficients):
+            coefficients[0] = EQUIDISTANT_K1_FLOOR
         return coefficients, 0.0
-    fitted, error_px = nearest_coefficients(camera, rational=model == 'rational_polynomial')
-    return list(fitted[:MODELS[model][-1]]), error_px
+    fitted, error_px = fit_opencv_coefficients(camera, rational=model == 'rational_polynomial')
+    return list(fitted[:DISTORTION_MODELS[model][-1]]), error_px
 
 
-def _misfit(camera: Camera, model: str, error_px: float) -> ModelMisfit:
+def _model_misfit(camera: Camera, model: str, error_px: float) -> ModelMisfit:
     """Say how far a model is from the lens, and which model to choose."""
-    angle_deg = float(np.degrees(seen_angle_rad(camera)))
+    angle_deg = float(np.degrees(max_visible_angle_rad(camera)))
     if np.isfinite(error_px):
         message = (f'{model} would be off by up to {error_px:.3g} px, as the lens sees {angle_deg:.0f} degrees from its'
-                   f' axis; {MAX_ERROR_PX:g} px is the most that is allowed.')
+                   f' axis; {MAX_MODEL_ERROR_PX:g} px is the most that is allowed.')
     else:
         message = (f'The lens sees {angle_deg:.1f} degrees from its axis, and {model} ends before'
-                   f' {np.degrees(MAX_SLOPE_ANGLE_RAD):.0f}.')
+                   f' {np.degrees(MAX_PINHOLE_ANGLE_RAD):.0f}.')
     others = 'equidistant, which is exact'
     if model == 'plumb_bob':
-        rational_px = nearest_coefficients(camera, rational=True)[1]
-        if rational_px <= MAX_ERROR_PX:
+        rational_px = fit_opencv_coefficients(camera, rational=True)[1]
+        if rational_px <= MAX_MODEL_ERROR_PX:
             others = f'rational_polynomial, which is off by {rational_px:.2g} px at the most, or {others}'
     return ModelMisfit(message, f'Set distortion_model to {others}.')
 
@@ -155,29 +155,29 @@ def rectified_matrix(camera: Lens, balance: float = 0.0) -> np.ndarray:
     border decides. At 1 it holds all that the lens shows: the smallest one around that border. Between them the matrix
     is interpolated, as OpenCV does. Border points beyond RECTIFIED_LIMIT_DEG are brought in to it.
     """
-    left, right, top, bottom = _undistorted_borders(camera)
-    filled = _view(camera, left.max(), right.min(), top.max(), bottom.min(), max)
-    whole = _view(camera, left.min(), right.max(), top.min(), bottom.max(), min)
+    left, right, top, bottom = _normalised_borders(camera)
+    filled = _matrix_for_rectangle(camera, left.max(), right.min(), top.max(), bottom.min(), max)
+    whole = _matrix_for_rectangle(camera, left.min(), right.max(), top.min(), bottom.max(), min)
     return (1.0 - balance) * filled + balance * whole
 
 
-def _undistorted_borders(camera: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _normalised_borders(camera: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return the slopes x of the left and right border's pixels and y of the upper and lower border's, each (n,)."""
     width, height = camera.width, camera.height
     across, down = np.linspace(0, width - 1, 257), np.linspace(0, height - 1, 257)
     limit = np.radians(RECTIFIED_LIMIT_DEG)
 
-    def slopes(x: np.ndarray | float, y: np.ndarray | float) -> np.ndarray:
+    def normalised(x: np.ndarray | float, y: np.ndarray | float) -> np.ndarray:
         bearings, _ = camera.unproject(np.stack(np.broadcast_arrays(x, y), axis=-1))
         from_axis = np.hypot(bearings[:, 0], bearings[:, 1])
         theta = np.minimum(np.arctan2(from_axis, bearings[:, 2]), limit)
         return np.tan(theta)[:, None] * bearings[:, :2] / np.maximum(from_axis, 1e-12)[:, None]
 
-    return (slopes(0.0, down)[:, 0], slopes(width - 1.0, down)[:, 0],
-            slopes(across, 0.0)[:, 1], slopes(across, height - 1.0)[:, 1])
+    return (normalised(0.0, down)[:, 0], normalised(width - 1.0, down)[:, 0],
+            normalised(across, 0.0)[:, 1], normalised(across, height - 1.0)[:, 1])
 
 
-def _view(camera: Lens, left: float, right: float, top: float, bottom: float,
+def _matrix_for_rectangle(camera: Lens, left: float, right: float, top: float, bottom: float,
           choose: Callable[[float, float], float]) -> np.ndarray:
     """Return the K with square pixels that shows a rectangle of slopes in its middle, one of its sides exactly."""
     width, height = camera.width, camera.height

@@ -14,18 +14,18 @@ import numpy as np
 
 from autocalib_ros.errors import InputError
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.lens.camera_info_yaml import lens_of_fields
-from autocalib_ros.lens.opencv_lens import OpencvLens, distorted, distortion_slopes, radii_to_the_fold
+from autocalib_ros.lens.camera_info_yaml import lens_from_fields
+from autocalib_ros.lens.opencv_lens import OpencvLens, distort, distortion_jacobian, invertible_radii
 
-NEWTON_STEPS = 12
+MAX_UNDISTORT_ITERATIONS = 12
 """Most: from the table of radii four or five steps reach the last digit."""
-SOLVED = 1e-10
+UNDISTORT_TOLERANCE = 1e-10
 """A slope counts as found when it is imaged so near to what was asked for, in focal lengths: below 1e-6 px."""
-FIELDS = ('width', 'height', 'distortion_model', 'k', 'd')
+LENS_FIELDS = ('width', 'height', 'distortion_model', 'k', 'd')
 
 
 @dataclass(frozen=True)
-class InfoLens:
+class CameraInfoLens:
     """A lens in pixels of delivered images: full resolution less the `offset_px`, divided by the `binning`."""
 
     full: OpencvLens
@@ -33,21 +33,21 @@ class InfoLens:
     offset_px: tuple[int, int] = (0, 0)
 
     @classmethod
-    def of(cls, info: Any, *, rectified: bool = False) -> InfoLens:
+    def of(cls, info: Any, *, rectified: bool = False) -> CameraInfoLens:
         """Read an object with the attributes of a CameraInfo, K and D of ROS 1 too; InputError where it is no lens.
 
         The `rectified` lens is that of image_proc's image_rect: P, without distortion.
         """
-        fields = {name: attribute(info, name) for name in FIELDS}
+        fields = {name: message_field(info, name) for name in LENS_FIELDS}
         if rectified:
-            projection = _numbers(attribute(info, 'p'))
+            projection = _numbers(message_field(info, 'p'))
             if len(projection) != 12 or not (projection[0] > 0 and projection[5] > 0):
                 raise InputError("its 'p' holds no projection: rectified images come with 12 numbers, focal lengths"
                                  ' above 0 among them; take the image that is not rectified, or calibrate')
             fields |= {'k': [*projection[0:3], *projection[4:7], *projection[8:11]], 'distortion_model': 'plumb_bob',
                        'd': [0.0] * 5}
-        region = attribute(info, 'roi')
-        return cls(lens_of_fields({name: value if isinstance(value, (str, int)) else _numbers(value)
+        region = message_field(info, 'roi')
+        return cls(lens_from_fields({name: value if isinstance(value, (str, int)) else _numbers(value)
                                    for name, value in fields.items()}),
                    (max(int(info.binning_x), 1), max(int(info.binning_y), 1)),
                    (int(region.x_offset), int(region.y_offset)))
@@ -59,8 +59,8 @@ class InfoLens:
         return Camera(self.full.width, self.full.height, 1.0, (0.0, 0.0), (k1, k2, k3, k4))
 
     @cached_property
-    def _table(self) -> tuple[np.ndarray, np.ndarray]:
-        return radii_to_the_fold(self.full.coefficients)
+    def _radial_table(self) -> tuple[np.ndarray, np.ndarray]:
+        return invertible_radii(self.full.coefficients)
 
     def project(self, bearings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Project bearings (n, 3), of any length, to pixels (n, 2), nan where invalid; and say where valid (n,)."""
@@ -68,8 +68,8 @@ class InfoLens:
             ideal, valid = self._polynomial.project(bearings)
         else:
             ahead = bearings[:, 2] > 0
-            slopes = bearings[:, :2] / np.where(ahead, bearings[:, 2], np.nan)[:, None]
-            ideal, valid = distorted(slopes, self.full.coefficients), ahead & self._before_the_fold(slopes)
+            normalised = bearings[:, :2] / np.where(ahead, bearings[:, 2], np.nan)[:, None]
+            ideal, valid = distort(normalised, self.full.coefficients), ahead & self._in_invertible_range(normalised)
         matrix = self.full.matrix
         full = ideal @ matrix[:2, :2].T + matrix[:2, 2]
         return np.where(valid[:, None], (full - self.offset_px) / self.binning, np.nan), valid
@@ -81,34 +81,34 @@ class InfoLens:
         if self.full.equidistant:
             bearings, valid = self._polynomial.unproject(ideal)
         else:
-            slopes, valid = self._slopes(ideal)
-            bearings = np.column_stack([slopes, np.ones(len(slopes))])
+            normalised, valid = self._undistort(ideal)
+            bearings = np.column_stack([normalised, np.ones(len(normalised))])
             bearings /= np.linalg.norm(bearings, axis=1)[:, None]
         return np.where(valid[:, None], bearings, np.nan), valid
 
-    def _slopes(self, ideal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _undistort(self, ideal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Invert the distortion by Newton's method from the radial table; and where that succeeds."""
-        radius, imaged = self._table
+        radius, imaged = self._radial_table
         length = np.hypot(*ideal.T)
         ideal = np.where(length[:, None] < imaged[-1], ideal, np.nan)
-        slopes = ideal * (np.interp(length, imaged, radius) / np.maximum(length, 1e-12))[:, None]
+        normalised = ideal * (np.interp(length, imaged, radius) / np.maximum(length, 1e-12))[:, None]
         with np.errstate(all='ignore'):  # near the fold not all converge, and those are refused below
-            for _ in range(NEWTON_STEPS):
-                error = distorted(slopes, self.full.coefficients) - ideal
-                xx, xy, yy = distortion_slopes(slopes, self.full.coefficients)
+            for _ in range(MAX_UNDISTORT_ITERATIONS):
+                error = distort(normalised, self.full.coefficients) - ideal
+                xx, xy, yy = distortion_jacobian(normalised, self.full.coefficients)
                 determinant = xx * yy - xy * xy
                 step = np.stack([yy * error[:, 0] - xy * error[:, 1], xx * error[:, 1] - xy * error[:, 0]], axis=1)
-                slopes = slopes - step / determinant[:, None]
-                if not (np.abs(error) > SOLVED).any():
+                normalised = normalised - step / determinant[:, None]
+                if not (np.abs(error) > UNDISTORT_TOLERANCE).any():
                     break
-            reached = np.hypot(*(distorted(slopes, self.full.coefficients) - ideal).T) < SOLVED
-            return slopes, reached & (determinant > 0) & self._before_the_fold(slopes)
+            reached = np.hypot(*(distort(normalised, self.full.coefficients) - ideal).T) < UNDISTORT_TOLERANCE
+            return normalised, reached & (determinant > 0) & self._in_invertible_range(normalised)
 
-    def _before_the_fold(self, slopes: np.ndarray) -> np.ndarray:
-        return np.hypot(*slopes.T) < self._table[0][-1]
+    def _in_invertible_range(self, normalised: np.ndarray) -> np.ndarray:
+        return np.hypot(*normalised.T) < self._radial_table[0][-1]
 
 
-def attribute(message: Any, name: str) -> Any:
+def message_field(message: Any, name: str) -> Any:
     """Return a field of a message; ROS 1 writes matrices in upper case."""
     return getattr(message, name if hasattr(message, name) else name.upper())
 

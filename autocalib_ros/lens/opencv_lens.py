@@ -19,22 +19,22 @@ import numpy as np
 from autocalib_ros.errors import InputError
 from autocalib_ros.lens.camera import Camera
 
-MAX_ERROR_PX = 0.5
+MAX_MODEL_ERROR_PX = 0.5
 """As much as the position of a tracked point is good for: more would spoil the pose."""
-LEAST_DISC = 0.25
+MIN_FISHEYE_COVERAGE = 0.25
 """Least share of the image that a fisheye shows."""
-LEAST_FIELD_DEG = 1.0
-GRID = 41
+MIN_FIELD_OF_VIEW_DEG = 1.0
+COMPARISON_GRID_SIDE = 41
 """Pixels along each side of the grid on which two lenses are compared, borders included."""
-MAX_SLOPE_ANGLE_RAD = np.radians(89.0)
-RADIUS_STEPS = 8192
-TANGENTIAL_STEPS = 20
+MAX_PINHOLE_ANGLE_RAD = np.radians(89.0)
+RADIAL_TABLE_SIZE = 8192
+TANGENTIAL_ITERATIONS = 20
 """Fixed-point steps: the tangential terms are small, and each step is closer by their share."""
-REACHED_PX = 0.05
+INVERSION_TOLERANCE_PX = 0.05
 """A pixel counts as reached when the bearing found for it is imaged this near to it."""
-FIELD_STEPS = 400
+RADIAL_FIT_SAMPLES = 400
 """Angles, from the axis to the farthest corner, on which a model is fitted to a lens; four times as many check it."""
-REFITS = 20
+MAX_LAWSON_ITERATIONS = 20
 """Fits, each weighted by the errors of the one before: a dozen bring the largest error near to its least."""
 
 
@@ -51,64 +51,64 @@ class OpencvLens:
     """k1 to k4 of an equidistant lens, otherwise k1, k2, p1, p2, k3, k4, k5, k6."""
 
     @property
-    def square(self) -> bool:
+    def has_square_pixels(self) -> bool:
         """Whether pixels are square and not skewed, as those of a Camera."""
         return self.matrix[0, 0] == self.matrix[1, 1] and self.matrix[0, 1] == 0.0
 
     def grid(self) -> np.ndarray:
         """Return pixels all over the image, shape (n, 2)."""
-        across, down = np.linspace(0, self.width - 1, GRID), np.linspace(0, self.height - 1, GRID)
+        across, down = np.linspace(0, self.width - 1, COMPARISON_GRID_SIDE), np.linspace(0, self.height - 1, COMPARISON_GRID_SIDE)
         return np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
 
-    def bearings_near(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def unproject_and_reproject(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return bearings (n, 3), exactly where they are imaged (n, 2), and whether that is at `pixels` (n, 2)."""
         ideal = np.linalg.solve(self.matrix, np.column_stack([pixels, np.ones(len(pixels))]).T).T[:, :2]
         if self.equidistant:
             bearings, valid = _camera(self, 1.0, np.zeros(2), self.coefficients).unproject(ideal)
             return bearings, pixels, valid
-        slopes = undistorted(ideal, self.coefficients)
-        imaged = distorted(slopes, self.coefficients) @ self.matrix[:2, :2].T + self.matrix[:2, 2]
-        near = np.hypot(*(imaged - pixels).T) < REACHED_PX
-        return np.column_stack([slopes, np.ones(len(slopes))]), imaged, near
+        normalised = undistort(ideal, self.coefficients)
+        imaged = distort(normalised, self.coefficients) @ self.matrix[:2, :2].T + self.matrix[:2, 2]
+        near = np.hypot(*(imaged - pixels).T) < INVERSION_TOLERANCE_PX
+        return np.column_stack([normalised, np.ones(len(normalised))]), imaged, near
 
 
-def nearest_camera(lens: OpencvLens) -> Camera:
+def fit_kannala_brandt(lens: OpencvLens) -> Camera:
     """Return the Kannala-Brandt camera that images the field of the lens's image as the lens does.
 
     An equidistant lens with square pixels is one itself; any other is fitted. Raises InputError where the lens leaves
     the image empty, and where the fit misses by more than MAX_ERROR_PX.
     """
-    bearings, imaged, reached = lens.bearings_near(lens.grid())
-    _require_reach(lens, float(reached.mean()))
-    _require_field(bearings[reached])
-    if lens.equidistant and lens.square:
+    bearings, imaged, invertible = lens.unproject_and_reproject(lens.grid())
+    _require_coverage(lens, float(invertible.mean()))
+    _require_field_of_view(bearings[invertible])
+    if lens.equidistant and lens.has_square_pixels:
         return _camera(lens, lens.matrix[0, 0], lens.matrix[:2, 2], lens.coefficients)
-    camera = _fitted(lens, bearings[reached], imaged[reached])
-    pixels, valid = camera.project(bearings[reached])
-    error_px = np.where(valid, np.hypot(*(pixels - imaged[reached]).T), np.inf).max()
-    if not error_px <= MAX_ERROR_PX:
+    camera = _fit_camera(lens, bearings[invertible], imaged[invertible])
+    pixels, valid = camera.project(bearings[invertible])
+    error_px = np.where(valid, np.hypot(*(pixels - imaged[invertible]).T), np.inf).max()
+    if not error_px <= MAX_MODEL_ERROR_PX:
         raise InputError(f'the nearest Kannala-Brandt lens misses this one by up to {error_px:.2f} px, and more than'
-                         f' {MAX_ERROR_PX:g} px would spoil the pose; {_cause(lens)}, or leave the file out')
+                         f' {MAX_MODEL_ERROR_PX:g} px would spoil the pose; {_misfit_cause(lens)}, or leave the file out')
     return camera
 
 
-def _require_reach(lens: OpencvLens, share: float) -> None:
+def _require_coverage(lens: OpencvLens, share: float) -> None:
     """Raise InputError unless enough of the image is reached; a fisheye's picture may be a disc in the middle."""
-    if share < (LEAST_DISC if lens.equidistant else 1.0):
+    if share < (MIN_FISHEYE_COVERAGE if lens.equidistant else 1.0):
         raise InputError(f'its distortion folds back and leaves {100 * (1 - share):.0f} % of the image empty;'
                          ' calibrate the camera anew, with the pattern near the borders too or with a fisheye model')
 
 
-def _require_field(bearings: np.ndarray) -> None:
+def _require_field_of_view(bearings: np.ndarray) -> None:
     """Raise InputError when bearings from all over the image are nearly one: the numbers are not of a camera."""
     one, other = bearings[[0, -1]] / np.linalg.norm(bearings[[0, -1]], axis=1)[:, None]
     field_deg = np.degrees(np.arctan2(np.linalg.norm(np.cross(one, other)), one @ other))
-    if field_deg < LEAST_FIELD_DEG:
+    if field_deg < MIN_FIELD_OF_VIEW_DEG:
         raise InputError(f'its lens sees {field_deg:.1g} degrees from corner to corner, which cannot be meant;'
                          ' calibrate the camera anew, or leave the file out')
 
 
-def _cause(lens: OpencvLens) -> str:
+def _misfit_cause(lens: OpencvLens) -> str:
     """Say what a Camera does not have, and how to calibrate so that it is not needed."""
     (fx, skew, _), (_, fy, _), _ = lens.matrix
     causes = {f'two focal lengths, {fx:.1f} and {fy:.1f} px (--fix-aspect-ratio)': fx != fy,
@@ -126,7 +126,7 @@ def _camera(lens: OpencvLens, focal_px: float, principal_point_px: np.ndarray, k
     return Camera(lens.width, lens.height, float(focal_px), (cx, cy), (k1, k2, k3, k4))
 
 
-def _fitted(lens: OpencvLens, bearings: np.ndarray, imaged: np.ndarray) -> Camera:
+def _fit_camera(lens: OpencvLens, bearings: np.ndarray, imaged: np.ndarray) -> Camera:
     """Solve for principal point and f, f k1 to f k4: the pixels are linear in them, so there is no iteration."""
     across = np.hypot(bearings[:, 0], bearings[:, 1])
     powers = np.arctan2(across, bearings[:, 2])[:, None] ** [1, 3, 5, 7, 9]
@@ -138,35 +138,35 @@ def _fitted(lens: OpencvLens, bearings: np.ndarray, imaged: np.ndarray) -> Camer
     return _camera(lens, solution[2], solution[:2], solution[3:] / solution[2])
 
 
-def nearest_coefficients(camera: Camera, *, rational: bool) -> tuple[tuple[float, ...], float]:
+def fit_opencv_coefficients(camera: Camera, *, rational: bool) -> tuple[tuple[float, ...], float]:
     """Return k1, k2, p1, p2, k3 to k6 of the OpenCV lens with the camera's K that comes nearest to it, and its error.
 
     The error is the largest distance in pixels between the images of one bearing in the two lenses, over the whole
-    image; infinite where the image shows bearings at `MAX_SLOPE_ANGLE_RAD` from the axis or more, which have no slopes
+    image; infinite where the image shows bearings at `MAX_PINHOLE_ANGLE_RAD` from the axis or more, which have no slopes
     to speak of. Without `rational`, k4 to k6 are 0.
     """
-    field_rad = seen_angle_rad(camera)
-    if not field_rad < MAX_SLOPE_ANGLE_RAD:
+    field_rad = max_visible_angle_rad(camera)
+    if not field_rad < MAX_PINHOLE_ANGLE_RAD:
         return (0.0,) * 8, np.inf
-    slopes, radii = _radial_samples(camera, field_rad, FIELD_STEPS)
-    checked = _radial_samples(camera, field_rad, 4 * FIELD_STEPS)
-    weights, denominator = np.ones(FIELD_STEPS), np.ones(FIELD_STEPS)
+    normalised, radii = _radial_samples(camera, field_rad, RADIAL_FIT_SAMPLES)
+    checked = _radial_samples(camera, field_rad, 4 * RADIAL_FIT_SAMPLES)
+    weights, denominator = np.ones(RADIAL_FIT_SAMPLES), np.ones(RADIAL_FIT_SAMPLES)
     best, least_px = (0.0,) * 8, np.inf
-    for _ in range(REFITS):
-        coefficients = _radial_fit(slopes, radii, np.sqrt(weights) / denominator, rational=rational)
+    for _ in range(MAX_LAWSON_ITERATIONS):
+        coefficients = _radial_fit(normalised, radii, np.sqrt(weights) / denominator, rational=rational)
         error_px = camera.focal_px * _radial_error(*checked, coefficients).max()
         if error_px < least_px:
             best, least_px = coefficients, float(error_px)
-        denominator = _denominator(slopes * slopes, coefficients)
+        denominator = _denominator(normalised * normalised, coefficients)
         # Lawson's weights: they turn the least sum of squares into the least largest error
-        weights = weights * _radial_error(slopes, radii, coefficients)
+        weights = weights * _radial_error(normalised, radii, coefficients)
         if not np.isfinite(weights).all() or not weights.any():
             break
         weights = np.maximum(weights / weights.mean(), 1e-12)
     return best, least_px
 
 
-def seen_angle_rad(camera: Camera) -> float:
+def max_visible_angle_rad(camera: Camera) -> float:
     """Return the largest angle from the axis that the image shows: of a corner, or of the edge of a fisheye's disc."""
     corners = np.array([(x, y) for x in (0, camera.width - 1) for y in (0, camera.height - 1)], float)
     return float(camera.angle(np.hypot(*(corners - camera.principal_point_px).T).max())[0])
@@ -178,55 +178,55 @@ def _radial_samples(camera: Camera, field_rad: float, steps: int) -> tuple[np.nd
     return np.tan(theta), camera.radius(theta) / camera.focal_px
 
 
-def _radial_fit(slopes: np.ndarray, radii: np.ndarray, weights: np.ndarray, *, rational: bool) -> tuple[float, ...]:
+def _radial_fit(normalised: np.ndarray, radii: np.ndarray, weights: np.ndarray, *, rational: bool) -> tuple[float, ...]:
     """Fit r (1 + k1 r^2 + ...) = radius (1 + k4 r^2 + ...), which is linear in the coefficients, shape (n,) each."""
-    unit = slopes[-1]  # slopes of a wide lens to the seventh power would leave the digits of a double
+    unit = normalised[-1]  # slopes of a wide lens to the seventh power would leave the digits of a double
     exponents = np.array([2, 4, 6])
-    powers = (slopes[:, None] / unit) ** exponents
-    columns = np.hstack([slopes[:, None] * powers, *([-radii[:, None] * powers] if rational else [])])
-    solution = np.linalg.lstsq(columns * weights[:, None], (radii - slopes) * weights, rcond=None)[0]
+    powers = (normalised[:, None] / unit) ** exponents
+    columns = np.hstack([normalised[:, None] * powers, *([-radii[:, None] * powers] if rational else [])])
+    solution = np.linalg.lstsq(columns * weights[:, None], (radii - normalised) * weights, rcond=None)[0]
     scaled = solution.reshape(-1, 3) / unit ** exponents
     k1, k2, k3, *others = (float(value) for value in scaled.ravel())
     return (k1, k2, 0.0, 0.0, k3, *(others or (0.0,) * 3))
 
 
-def _radial_error(slopes: np.ndarray, radii: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
+def _radial_error(normalised: np.ndarray, radii: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
     """Return by how much each radius is missed, in focal lengths; infinite where the model has a pole on the way."""
-    r2 = slopes * slopes
+    r2 = normalised * normalised
     if not (_denominator(r2, coefficients) > 0).all():
-        return np.full_like(slopes, np.inf)
-    return np.abs(slopes * _radial(r2, coefficients) - radii)
+        return np.full_like(normalised, np.inf)
+    return np.abs(normalised * _radial(r2, coefficients) - radii)
 
 
-def distorted(slopes: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
+def distort(normalised: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
     """Return x', y' of slopes x, y, shape (n, 2)."""
-    return slopes * _radial(np.sum(slopes * slopes, axis=1), coefficients)[:, None] + _tangential(slopes, coefficients)
+    return normalised * _radial(np.sum(normalised * normalised, axis=1), coefficients)[:, None] + _tangential(normalised, coefficients)
 
 
-def undistorted(ideal: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
-    """Invert `distorted` as well as it can be: beyond the radius where the model folds back, nothing is right."""
-    radius, imaged = radii_to_the_fold(coefficients)
-    slopes = np.zeros_like(ideal)
-    for _ in range(TANGENTIAL_STEPS):
-        target = ideal - _tangential(slopes, coefficients)
+def undistort(ideal: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
+    """Invert `distort` as well as it can be: beyond the radius where the model folds back, nothing is right."""
+    radius, imaged = invertible_radii(coefficients)
+    normalised = np.zeros_like(ideal)
+    for _ in range(TANGENTIAL_ITERATIONS):
+        target = ideal - _tangential(normalised, coefficients)
         length = np.hypot(*target.T)
-        slopes = target * (np.interp(length, imaged, radius) / np.maximum(length, 1e-12))[:, None]
-    return slopes
+        normalised = target * (np.interp(length, imaged, radius) / np.maximum(length, 1e-12))[:, None]
+    return normalised
 
 
-def radii_to_the_fold(coefficients: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
+def invertible_radii(coefficients: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Return slopes' lengths (n,) and where they are imaged (n,), both growing, as far as the model can be inverted."""
-    radius = np.tan(np.linspace(0.0, MAX_SLOPE_ANGLE_RAD, RADIUS_STEPS))
+    radius = np.tan(np.linspace(0.0, MAX_PINHOLE_ANGLE_RAD, RADIAL_TABLE_SIZE))
     imaged = radius * _radial(radius * radius, coefficients)
     folds = np.flatnonzero(~(np.diff(imaged) > 0))
-    last = folds[0] + 1 if len(folds) else RADIUS_STEPS
+    last = folds[0] + 1 if len(folds) else RADIAL_TABLE_SIZE
     return radius[:last], imaged[:last]
 
 
-def distortion_slopes(slopes: np.ndarray, coefficients: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return dx'/dx, dx'/dy = dy'/dx and dy'/dy of `distorted` at slopes (n, 2), each (n,)."""
+def distortion_jacobian(normalised: np.ndarray, coefficients: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return dx'/dx, dx'/dy = dy'/dx and dy'/dy of `distort` at slopes (n, 2), each (n,)."""
     k1, k2, p1, p2, k3, k4, k5, k6 = coefficients
-    x, y = slopes.T
+    x, y = normalised.T
     r2 = x * x + y * y
     radial, below = _radial(r2, coefficients), _denominator(r2, coefficients)
     growth = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3) - radial * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / below
@@ -245,8 +245,8 @@ def _denominator(r2: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
     return 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
 
 
-def _tangential(slopes: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
+def _tangential(normalised: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
     p1, p2 = coefficients[2:4]
-    x, y = slopes.T
+    x, y = normalised.T
     r2 = x * x + y * y
     return np.column_stack([2 * p1 * x * y + p2 * (r2 + 2 * x * x), p1 * (r2 + 2 * y * y) + 2 * p2 * x * y])

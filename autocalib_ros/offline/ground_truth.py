@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from autocalib_ros.comparison import compared
+from autocalib_ros.comparison import compare_calibrations
 from autocalib_ros.errors import InputError
 from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.pictures.views import image_to_ground
-from autocalib_ros.results.saved_camera import KnownCamera
+from autocalib_ros.results.saved_camera import SavedCamera
 
 NEAR_M = 40.0
 """Distances are compared between points of the road this near to the camera."""
@@ -62,7 +62,7 @@ TRUE_LENSES = ('equidistant', 'kannala_brandt')
 """Models of a truth.json that are read; both are the one of camera.py."""
 
 
-def true_camera(truth: dict[str, Any]) -> KnownCamera:
+def true_camera(truth: dict[str, Any]) -> SavedCamera:
     """Return the lens and pose of a truth.json; InputError where it holds none."""
     try:
         lens, pose = truth['lens'], truth['camera']
@@ -73,14 +73,14 @@ def true_camera(truth: dict[str, Any]) -> KnownCamera:
         ground = GroundPlane(np.array(pose['R_world_from_camera'], float).reshape(3, 3), float(pose['height']))
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f'the truth is none of a simulation ({type(error).__name__}: {error})') from error
-    return KnownCamera(width=camera.width, height=camera.height, lens=camera, matrix=camera.matrix, k=camera.k,
+    return SavedCamera(width=camera.width, height=camera.height, lens=camera, matrix=camera.matrix, k=camera.k,
                        ground=ground)
 
 
-def errors_against_truth(known: KnownCamera, truth: dict[str, Any]) -> dict[str, float | None]:
+def errors_against_truth(known: SavedCamera, truth: dict[str, Any]) -> dict[str, float | None]:
     """Return how far a camera is from the truth, by name with the unit; None for what it does not hold."""
     true = true_camera(truth)
-    result = compared(true, known)
+    result = compare_calibrations(true, known)
     scaled = known.scaled_to(true.width, true.height)
     pose = {item.name: item.difference for item in result.pose}
     metric = known.ground is not None and known.ground.metric
@@ -88,7 +88,7 @@ def errors_against_truth(known: KnownCamera, truth: dict[str, Any]) -> dict[str,
         'focal length, %': 100 * result.lens[0].difference / result.lens[0].first,
         'principal point, px': math.hypot(result.lens[1].difference, result.lens[2].difference),
         'rays, largest, deg': result.rays.largest_deg,
-        'rays, best turned, largest, deg': result.rays_turned.largest_deg,
+        'rays, best turned, largest, deg': result.rays_aligned.largest_deg,
         'ground normal, deg': result.normal_deg, 'tilt, deg': pose.get('tilt'), 'roll, deg': pose.get('roll'),
         'height, m': pose.get('height'),
         f'distances within {NEAR_M:g} m, median, %':

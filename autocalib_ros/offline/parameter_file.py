@@ -8,11 +8,11 @@ from typing import Any
 
 import yaml
 
-from autocalib_ros.config import NodeOptions, Options, declared, flattened, with_values
+from autocalib_ros.config import NodeOptions, Options, flatten, walk_options, with_overrides
 from autocalib_ros.errors import InputError, UsageError
 
 WILDCARDS = ('*', '**')
-OF_ROS = ('use_sim_time', 'start_type_description_service')
+ROS_PARAMETERS = ('use_sim_time', 'start_type_description_service')
 OVERRIDES_OF_ROS = 'qos_overrides.'
 
 
@@ -38,7 +38,7 @@ def _values(path: Path) -> dict[str, Any]:
         raise InputError(f'{path} is not YAML: {" ".join(str(error).split())}') from error
     values: dict[str, Any] = {}
     for section in _chosen(path, _sections(tree)):
-        values.update(flattened(section))
+        values.update(flatten(section))
     return values
 
 
@@ -67,8 +67,8 @@ def _chosen(path: Path, sections: dict[str, Mapping[str, Any]]) -> list[Mapping[
 
 
 def _only_for_nodes(name: str) -> bool:
-    node_names = {item.name for item in declared(NodeOptions())}
-    return name in node_names or name in OF_ROS or name.startswith(OVERRIDES_OF_ROS)
+    node_names = {item.name for item in walk_options(NodeOptions())}
+    return name in node_names or name in ROS_PARAMETERS or name.startswith(OVERRIDES_OF_ROS)
 
 
 def parse_assignments(assignments: list[str]) -> dict[str, Any]:
@@ -87,8 +87,8 @@ def parse_assignments(assignments: list[str]) -> dict[str, Any]:
 
 def options_with(options: Options, values: Mapping[str, Any]) -> Options:
     """Return `options` with values by full name; YAML takes `1e-05`, without a point, for text."""
-    floats = {item.name for item in declared(options) if isinstance(item.default, float)}
-    return with_values(options, {name: _as_float(value) if name in floats else value
+    floats = {item.name for item in walk_options(options) if isinstance(item.default, float)}
+    return with_overrides(options, {name: _as_float(value) if name in floats else value
                                  for name, value in values.items()})
 
 

@@ -56,7 +56,7 @@ def replay(source: Source, options: Options, on_progress: Callable[[int, str], N
     for count, frame in enumerate(source.frames(), start=1):
         fitting = _fitting(lens, (frame.image.shape[1], frame.image.shape[0]))
         calibrator.add_image(frame.stamp_ns, frame.image)
-        due = calibrator.take_due()
+        due = calibrator.snapshot_if_due()
         if due is not None and due.seconds >= again_s:
             tell(count, 'solving')
             tried = solve(due, options, lens=fitting)

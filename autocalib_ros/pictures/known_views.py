@@ -10,14 +10,14 @@ from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.lens.camera_info import rectified_matrix
 from autocalib_ros.pictures.plotted import PlotOverlay, draw_metre_grid, draw_scale_bar
 from autocalib_ros.pictures.views import MAX_DISTANCE_HEIGHTS, TopView, length_unit, rectification_map, resample
-from autocalib_ros.results.saved_camera import KnownCamera
+from autocalib_ros.results.saved_camera import SavedCamera
 
 LONGEST_PX = 1000
 """Longer side of a view from above for which no scale is given."""
 MAX_SIDE_PX = 16384
 
 
-def rectified_renderer(known: KnownCamera, balance: float | None) -> Callable[[np.ndarray], np.ndarray]:
+def rectified_renderer(known: SavedCamera, balance: float | None) -> Callable[[np.ndarray], np.ndarray]:
     """Return what undistorts images; without a balance as the P of the file says, or else as 0 does.
 
     InputError where the lens leaves a part of the image empty, so that nothing tells how large the view would be.
@@ -34,7 +34,7 @@ def rectified_renderer(known: KnownCamera, balance: float | None) -> Callable[[n
     return lambda image: resample(image, sources)
 
 
-def choose_top_view(known: KnownCamera, px_per_m: float | None = None, x_m: tuple[float, float] | None = None,
+def choose_top_view(known: SavedCamera, px_per_m: float | None = None, x_m: tuple[float, float] | None = None,
                 y_m: tuple[float, float] | None = None) -> TopView:
     """Return the road from above: the ranges of x and y that are asked for, elsewhere what the image shows.
 
@@ -59,7 +59,7 @@ def choose_top_view(known: KnownCamera, px_per_m: float | None = None, x_m: tupl
     return TopView.between(spans[:, 0], spans[:, 1], round(longest))
 
 
-def top_view_renderer(known: KnownCamera, view: TopView, *, grid: bool, scale_bar: bool) -> Callable[[np.ndarray], np.ndarray]:
+def top_view_renderer(known: SavedCamera, view: TopView, *, grid: bool, scale_bar: bool) -> Callable[[np.ndarray], np.ndarray]:
     """Return what makes a view of images, with what is to be drawn over it."""
     sources = view.sources(known.lens, known.ground)
     drawings = [draw for draw, wanted in ((draw_metre_grid, grid), (draw_scale_bar, scale_bar)) if wanted]

@@ -25,7 +25,7 @@ from autocalib_ros.pictures.views import (
     project_great_circle,
     resample,
 )
-from autocalib_ros.results.saved_camera import KnownCamera
+from autocalib_ros.results.saved_camera import SavedCamera
 
 IMAGE_PX, VIEW_PX, GAP_PX, STRIP_PX = 1080, 508, 12, 92
 """Widths of the image, of the view from above and of the gap between them; height of the captions below."""
@@ -40,7 +40,7 @@ SPAN_HEIGHTS = 5.5
 SAMPLES_PER_SIDE = 48
 
 
-def showcase(known: KnownCamera, image: np.ndarray) -> np.ndarray:
+def showcase(known: SavedCamera, image: np.ndarray) -> np.ndarray:
     """Return the picture, BGR uint8, of a camera with a plane and one of its images, BGR uint8 (H, W, 3).
 
     InputError where there is no plane, or no road nearby in the image.
@@ -90,14 +90,14 @@ def _view(camera: Camera, ground: GroundPlane, rows: int) -> TopView:
     return TopView((float(low[0]), float(low[1])), float(px_per_m), VIEW_PX, rows)
 
 
-def _from_above(known: KnownCamera, ground: GroundPlane, image: np.ndarray, view: TopView) -> np.ndarray:
+def _from_above(known: SavedCamera, ground: GroundPlane, image: np.ndarray, view: TopView) -> np.ndarray:
     """Return the view of the image, in the colour of the page where that does not reach."""
     sources = view.sources(known.lens, ground)
     seen = ((sources >= 0) & (sources <= [known.width - 1, known.height - 1])).all(axis=-1)
     return np.where(seen[..., None], resample(image, sources), np.array(bgr(PLATE_COLOUR), np.uint8))
 
 
-def _clipped_to_both(known: KnownCamera, ground: GroundPlane, view: TopView, lines: list[np.ndarray]) -> list[np.ndarray]:
+def _clipped_to_both(known: SavedCamera, ground: GroundPlane, view: TopView, lines: list[np.ndarray]) -> list[np.ndarray]:
     """Return lines (n, 3) on the road with nan where they are not in the image and in the view from above."""
     low, high = np.array(view.low_m), np.array(view.high_m)
     return [np.where((in_image(known, ground_to_image(known.lens, ground, line))
@@ -123,7 +123,7 @@ def _name_horizon(axes: Axes, camera: Camera, ground: GroundPlane) -> None:
               va='center_baseline')
 
 
-def _captions(axes: Axes, known: KnownCamera, step: float, rows: int) -> None:
+def _captions(axes: Axes, known: SavedCamera, step: float, rows: int) -> None:
     sigma = known.stddev
     tilt = float(np.degrees(np.arcsin(np.clip(-known.ground.normal_in_camera[2], -1, 1))))
     height = f' from {known.ground.height_m:.1f} m' if known.ground.metric else ''

@@ -13,7 +13,7 @@ from autocalib_ros.lens.camera_info import CameraInfo, camera_info
 
 GROUND_DISTANCES_M = (10.0, 20.0, 40.0)
 """Distances from the camera's foot at which the accuracy on the road is told."""
-COVARIANCE_OF = ('focal_px', 'principal_point_x_px', 'principal_point_y_px', 'k1', 'k2', 'k3', 'k4', 'tilt_deg',
+COVARIANCE_PARAMETERS = ('focal_px', 'principal_point_x_px', 'principal_point_y_px', 'k1', 'k2', 'k3', 'k4', 'tilt_deg',
                  'roll_deg', 'height_m')
 """Rows and columns of the covariance."""
 
@@ -115,7 +115,7 @@ class Refusal:
         return False
 
     @classmethod
-    def because(cls, reason: Reason, method: str, evidence: EvidenceSummary, figures: Figures) -> Refusal:
+    def from_reason(cls, reason: Reason, method: str, evidence: EvidenceSummary, figures: Figures) -> Refusal:
         """Make a refusal of a reason."""
         return cls(code=reason.code, message=reason.message, remedy=reason.remedy, method=method, evidence=evidence,
                    figures=figures)
@@ -141,7 +141,7 @@ class Calibration:
     """Unit vectors in the camera optical frame, shape (n, 3)."""
     stddev: StandardDeviations
     covariance: np.ndarray | None = field(default=None, compare=False, repr=False)
-    """Of `COVARIANCE_OF`, shape (10, 10), where there is a ground plane in metres and it is estimated."""
+    """Of `COVARIANCE_PARAMETERS`, shape (10, 10), where there is a ground plane in metres and it is estimated."""
     paper: PaperReport | None
     evidence: EvidenceSummary
     newest_stamp_ns: int

@@ -14,7 +14,7 @@ from autocalib_ros.errors import AutocalibError, InputError
 from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.results.calibration import (
-    COVARIANCE_OF,
+    COVARIANCE_PARAMETERS,
     GROUND_DISTANCES_M,
     Calibration,
     EvidenceSummary,
@@ -25,7 +25,7 @@ from autocalib_ros.results.calibration import (
 )
 from autocalib_ros.util.files import write_atomically
 
-MAX_BYTES = 1_000_000
+MAX_JSON_BYTES = 1_000_000
 """A calibration takes a few thousand bytes."""
 ROTATION_TOLERANCE = 1e-6
 """How far the columns of a rotation may be from unit length and right angles."""
@@ -35,13 +35,13 @@ def read_json(path: Path) -> Mapping[str, Any]:
     """Return the document in a file; InputError where it is not there, too long, or no JSON object."""
     try:
         with path.open('rb') as stream:
-            text = stream.read(MAX_BYTES + 1)
+            text = stream.read(MAX_JSON_BYTES + 1)
     except OSError as error:
         raise InputError(f'cannot read {path}: {error.strerror or error}') from error
-    if len(text) > MAX_BYTES:
-        raise InputError(f'{path}: it is longer than {MAX_BYTES} bytes, so it is no calibration')
+    if len(text) > MAX_JSON_BYTES:
+        raise InputError(f'{path}: it is longer than {MAX_JSON_BYTES} bytes, so it is no calibration')
     try:
-        document = json.loads(text, parse_constant=_no_number)
+        document = json.loads(text, parse_constant=_reject_constant)
     except (ValueError, RecursionError) as error:
         raise InputError(f'{path}: it is not JSON ({error})') from error
     if not isinstance(document, Mapping):
@@ -49,28 +49,28 @@ def read_json(path: Path) -> Mapping[str, Any]:
     return document
 
 
-def calibration_of(document: Mapping[str, Any]) -> Calibration:
+def calibration_from_json(document: Mapping[str, Any]) -> Calibration:
     """Return the calibration of a document of calibration.json; InputError says what is wrong with it."""
     if document.get('version') != JSON_VERSION:
         raise InputError(f'its version is {reprlib.repr(document.get("version"))}, and only {JSON_VERSION} is read')
     if document.get('state') != 'calibrated':
-        raise InputError(f'its state is {reprlib.repr(document.get("state"))}: it holds no calibration{_why(document)}')
+        raise InputError(f'its state is {reprlib.repr(document.get("state"))}: it holds no calibration{_refusal_text(document)}')
     try:
-        return _calibration(document)
+        return _parse_calibration(document)
     except AutocalibError as error:
         raise InputError(str(error)) from error
     except (KeyError, TypeError, ValueError, IndexError, OverflowError, AttributeError) as error:
         raise InputError(f'it is no whole calibration.json ({type(error).__name__}: {error})') from error
 
 
-def _why(document: Mapping[str, Any]) -> str:
+def _refusal_text(document: Mapping[str, Any]) -> str:
     """Return the reason of a refusal in brackets, '' where none is given."""
     refusal = document.get('refusal')
     return f' ({refusal["code"]}: {refusal["message"]})' if isinstance(refusal, Mapping) and {
         'code', 'message'} <= refusal.keys() else ''
 
 
-def _calibration(document: Mapping[str, Any]) -> Calibration:
+def _parse_calibration(document: Mapping[str, Any]) -> Calibration:
     width, height = _numbers(document['image_size'], int, 2)
     lens, evidence, paper = document['camera'], document['evidence'], document['paper']
     camera = Camera(width, height, float(lens['focal_px']), _numbers(lens['principal_point_px'], float, 2),
@@ -79,18 +79,18 @@ def _calibration(document: Mapping[str, Any]) -> Calibration:
     return Calibration(
         method=str(document['method']), grade=grade, assumptions=tuple(map(str, document['assumptions'])),
         checks=tuple(map(str, document['checks'])), camera=camera,
-        ground=None if pose is None else _ground(pose, metric=grade != 'unit_scale'),
+        ground=None if pose is None else _parse_ground(pose, metric=grade != 'unit_scale'),
         ground_refusal=None if reason is None else Reason(*(str(reason[name]) for name in Reason.__dataclass_fields__)),
         road_directions=np.array(document['road_directions_in_camera'], float).reshape(-1, 3),
-        stddev=_deviations(document['stddev']), paper=None if paper is None else _paper(paper),
+        stddev=_parse_stddev(document['stddev']), paper=None if paper is None else _parse_paper(paper),
         evidence=EvidenceSummary(
             image_size=(width, height), seconds=float(evidence['seconds']), frames=int(evidence['frames']),
             tracks=int(evidence['tracks']), segments=int(evidence['segments']), vehicles=int(evidence['vehicles']),
             coverage=float(evidence['coverage']), people=int(evidence.get('people', 0))),
-        newest_stamp_ns=int(document['newest_stamp_ns']), covariance=_covariance(document.get('covariance')))
+        newest_stamp_ns=int(document['newest_stamp_ns']), covariance=_parse_covariance(document.get('covariance')))
 
 
-def _ground(pose: Mapping[str, Any], *, metric: bool) -> GroundPlane:
+def _parse_ground(pose: Mapping[str, Any], *, metric: bool) -> GroundPlane:
     rotation = np.array(pose['rotation'], float).reshape(3, 3)
     height = _numbers(pose['translation_m'], float, 3)[2]
     if not np.abs(rotation @ rotation.T - np.eye(3)).max() <= ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
@@ -100,30 +100,30 @@ def _ground(pose: Mapping[str, Any], *, metric: bool) -> GroundPlane:
     return GroundPlane(rotation, height, metric)
 
 
-def _deviations(sigma: Mapping[str, Any]) -> StandardDeviations:
+def _parse_stddev(sigma: Mapping[str, Any]) -> StandardDeviations:
     point = sigma['principal_point_px']
     return StandardDeviations(
-        **{name: _known(sigma[name]) for name in ('focal_px', 'k1', 'k2', 'tilt_deg', 'roll_deg', 'height_m')},
+        **{name: _optional_float(sigma[name]) for name in ('focal_px', 'k1', 'k2', 'tilt_deg', 'roll_deg', 'height_m')},
         principal_point_px=None if point is None else _numbers(point, float, 2),
-        ground_point_m=tuple(_known(value) for value in sigma['ground_point_m'].values()))
+        ground_point_m=tuple(_optional_float(value) for value in sigma['ground_point_m'].values()))
 
 
-def _covariance(told: Mapping[str, Any] | None) -> np.ndarray | None:
-    if told is None or told['of'] != list(COVARIANCE_OF):
+def _parse_covariance(entry: Mapping[str, Any] | None) -> np.ndarray | None:
+    if entry is None or entry['of'] != list(COVARIANCE_PARAMETERS):
         return None
-    return np.array(told['matrix'], float).reshape(2 * (len(COVARIANCE_OF),))
+    return np.array(entry['matrix'], float).reshape(2 * (len(COVARIANCE_PARAMETERS),))
 
 
-def _paper(paper: Mapping[str, Any]) -> PaperReport:
+def _parse_paper(paper: Mapping[str, Any]) -> PaperReport:
     straightness, translation = paper['straightness_px2'], paper['translation_m']
     return PaperReport(
         focal_px=float(paper['focal_px']), polynomial_k=_numbers(paper['polynomial_k'], float, 3),
         straightness_px2=(float(straightness['before']), float(straightness['after'])),
-        focal_from_vanishing_points_px=_known(paper['focal_from_vanishing_points_px']),
+        focal_from_vanishing_points_px=_optional_float(paper['focal_from_vanishing_points_px']),
         translation_m=None if translation is None else _numbers(translation, float, 3))
 
 
-def _known(value: Any) -> float | None:
+def _optional_float(value: Any) -> float | None:
     return None if value is None else float(value)
 
 
@@ -133,7 +133,7 @@ def _numbers(values: Any, kind: Callable[[Any], Any], count: int) -> tuple[Any, 
     return tuple(kind(value) for value in values)
 
 
-def _no_number(name: str) -> NoReturn:
+def _reject_constant(name: str) -> NoReturn:
     raise ValueError(f'{name} is no number')
 
 
@@ -185,7 +185,7 @@ def _calibration_json(result: Calibration) -> dict[str, Any]:
                    'ground_point_m': {f'{distance:g}': value for distance, value in zip(
                        GROUND_DISTANCES_M, sigma.ground_point_m, strict=False)}},
         'covariance': None if result.covariance is None else {
-            'of': list(COVARIANCE_OF), 'matrix': result.covariance.tolist()},
+            'of': list(COVARIANCE_PARAMETERS), 'matrix': result.covariance.tolist()},
         'paper': None if result.paper is None else {
             'focal_px': result.paper.focal_px, 'polynomial_k': list(result.paper.polynomial_k),
             'straightness_px2': dict(zip(('before', 'after'), result.paper.straightness_px2, strict=True)),

@@ -15,20 +15,20 @@ import numpy as np
 from autocalib_ros.errors import InputError
 from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.lens.camera import Camera, scale_factors
-from autocalib_ros.lens.camera_info_lens import InfoLens
+from autocalib_ros.lens.camera_info_lens import CameraInfoLens
 from autocalib_ros.lens.camera_info_yaml import read_exact_lens
-from autocalib_ros.lens.opencv_lens import OpencvLens, nearest_camera
+from autocalib_ros.lens.opencv_lens import OpencvLens, fit_kannala_brandt
 from autocalib_ros.results.calibration import Calibration, StandardDeviations
-from autocalib_ros.results.calibration_json import calibration_of, read_json
+from autocalib_ros.results.calibration_json import calibration_from_json, read_json
 
 
 @dataclass(frozen=True, kw_only=True)
-class KnownCamera:
+class SavedCamera:
     """A lens in images of a size, and what else is known; lengths in pixels unless named otherwise."""
 
     width: int
     height: int
-    lens: Camera | InfoLens
+    lens: Camera | CameraInfoLens
     """Exact both ways."""
     matrix: np.ndarray
     """K, shape (3, 3)."""
@@ -39,23 +39,23 @@ class KnownCamera:
     ground: GroundPlane | None = None
     stddev: StandardDeviations = field(default_factory=StandardDeviations)
     covariance: np.ndarray | None = None
-    """Of `calibration.COVARIANCE_OF`, shape (10, 10)."""
+    """Of `calibration.COVARIANCE_PARAMETERS`, shape (10, 10)."""
 
     @classmethod
-    def of(cls, result: Calibration, rectified: np.ndarray | None = None) -> KnownCamera:
+    def of(cls, result: Calibration, rectified: np.ndarray | None = None) -> SavedCamera:
         """Return what a calibration tells."""
         camera = result.camera
         return cls(width=camera.width, height=camera.height, lens=camera, matrix=camera.matrix, k=camera.k,
                    rectified=rectified, ground=result.ground, stddev=result.stddev, covariance=result.covariance)
 
     @classmethod
-    def of_lens(cls, lens: OpencvLens, rectified: np.ndarray | None = None) -> KnownCamera:
+    def from_opencv_lens(cls, lens: OpencvLens, rectified: np.ndarray | None = None) -> SavedCamera:
         """Return what a camera_info tells: no pose, and no deviations."""
         try:
-            camera = nearest_camera(lens)
+            camera = fit_kannala_brandt(lens)
         except InputError:  # then there is no such lens; it is told by its rays all the same
             camera = None
-        return cls(width=lens.width, height=lens.height, lens=InfoLens(lens), matrix=lens.matrix,
+        return cls(width=lens.width, height=lens.height, lens=CameraInfoLens(lens), matrix=lens.matrix,
                    k=None if camera is None else camera.k, rectified=rectified)
 
     @property
@@ -78,7 +78,7 @@ class KnownCamera:
         bearings, valid = self.lens.unproject(np.reshape(pixels, (-1, 2)))
         return bearings.reshape(*pixels.shape[:-1], 3), valid.reshape(pixels.shape[:-1])
 
-    def scaled_to(self, width: int, height: int) -> KnownCamera:
+    def scaled_to(self, width: int, height: int) -> SavedCamera:
         """Return the same for images of another size; UsageError where these are of another shape."""
         if (width, height) == (self.width, self.height):
             return self
@@ -87,7 +87,7 @@ class KnownCamera:
         scale = np.array([[across, 0, (across - 1) / 2], [0, down, (down - 1) / 2], [0, 0, 1]])
         matrix, focal = scale @ self.matrix, np.sqrt(across * down)
         lens = (self.lens.scaled_to(width, height) if isinstance(self.lens, Camera) else
-                InfoLens(replace(self.lens.full, width=width, height=height, matrix=matrix)))
+                CameraInfoLens(replace(self.lens.full, width=width, height=height, matrix=matrix)))
         units = np.array([focal, across, down, *[1.0] * 7])
         point = self.stddev.principal_point_px
         stddev = replace(
@@ -100,19 +100,19 @@ class KnownCamera:
             covariance=None if self.covariance is None else self.covariance * np.outer(units, units))
 
 
-def read_known_camera(path: Path) -> KnownCamera:
+def read_saved_camera(path: Path) -> SavedCamera:
     """Read any of the files; InputError says what is wrong with it and what was expected."""
     if path.suffix.lower() != '.json':
-        return KnownCamera.of_lens(*read_exact_lens(path))
+        return SavedCamera.from_opencv_lens(*read_exact_lens(path))
     document = read_json(path)
     try:
-        return KnownCamera.of(calibration_of(document), _rectified(document))
+        return SavedCamera.of(calibration_from_json(document), _rectified_projection(document))
     except InputError as error:
         raise InputError(f'{path}: {error}; give a calibration.json, NAME.autocalib.json or camera_info.yaml'
                          ) from error
 
 
-def _rectified(document: Mapping[str, Any]) -> np.ndarray | None:
+def _rectified_projection(document: Mapping[str, Any]) -> np.ndarray | None:
     """Return P of the document's camera_info, whose R is identity; None where it does not hold one."""
     try:
         projection = np.array(document['camera_info']['p'], float).reshape(3, 4)

@@ -22,9 +22,9 @@ from autocalib_ros.lens.camera_info_yaml import read_camera_info
 from autocalib_ros.perception.detector.detector import open_detector
 from autocalib_ros.perception.images import ImageDecoder
 from autocalib_ros.results.calibration import Calibration, Refusal
-from autocalib_ros.results.store import Store, Stored, path_of
-from autocalib_ros.revalidation import CalibrationState, with_what_is_given
-from autocalib_ros.ros.declared_parameters import options_of
+from autocalib_ros.results.store import Store, StoredCalibration, resolve_url
+from autocalib_ros.revalidation import CalibrationState, with_current_options
+from autocalib_ros.ros.declared_parameters import declare_parameters
 from autocalib_ros.ros.diagnostics import Diagnostics
 from autocalib_ros.ros.driver_info import DriverInfo
 from autocalib_ros.ros.driver_upload import DriverUpload
@@ -32,18 +32,18 @@ from autocalib_ros.ros.headers import DEFAULT_FRAME, Headers
 from autocalib_ros.ros.image_input import ImageInput
 from autocalib_ros.ros.live_parameters import LiveParameters
 from autocalib_ros.ros.live_pictures import LivePictures
-from autocalib_ros.ros.log_text import described, described_progress
-from autocalib_ros.ros.publication import InForce, Published
-from autocalib_ros.ros.report_writer import Place, Reports
+from autocalib_ros.ros.log_text import describe, describe_progress
+from autocalib_ros.ros.publication import CalibrationPublisher, Published
+from autocalib_ros.ros.report_writer import ReportPaths, ReportWriter
 from autocalib_ros.ros.solver_process import SolverProcess
-from autocalib_ros.ros.status import Counts, Recent, Situation
-from autocalib_ros.ros.store_writer import Keeper
-from autocalib_ros.ros.worker import Pipeline, Result, Solve
+from autocalib_ros.ros.status import Counts, RateCounter, Situation
+from autocalib_ros.ros.store_writer import StoreWriter
+from autocalib_ros.ros.worker import CalibrationWorker, Result, Solve
 
-TELL_PROGRESS_S = 10.0
-REPEAT_S = 60.0
+PROGRESS_LOG_PERIOD_S = 10.0
+LOG_REPEAT_PERIOD_S = 60.0
 """Real seconds between two lines of progress, and before an unchanged complaint is repeated."""
-CLOSE_S = 4.0
+SHUTDOWN_S = 4.0
 """Launch kills a node 5 s after the interrupt: by then it should have ended by itself."""
 
 
@@ -52,7 +52,7 @@ class AutocalibNode(Node):
 
     def __init__(self, *, solve: Solve | None = None, **node_arguments: Any) -> None:
         super().__init__('autocalib', automatically_declare_parameters_from_overrides=True, **node_arguments)
-        self.options, self.node_options = options_of(self)
+        self.options, self.node_options = declare_parameters(self)
         lens_file = self.node_options.camera_info_file
         self._lens = read_camera_info(lens_file) if lens_file else None
         if self._lens is not None:
@@ -60,21 +60,21 @@ class AutocalibNode(Node):
         detector = open_detector(self.options.detector)
         self._headers = Headers(self.node_options, self.get_namespace(), self.get_logger().warning,
                                 lambda: self.get_clock().now().nanoseconds)
-        self._said: dict[str, float] = {}
+        self._logged_at: dict[str, float] = {}
         self._unreadable = self._withdrawn = ''
-        self._recent = Recent()
+        self._recent = RateCounter()
         self._driver = DriverInfo(self, self.node_options)
-        self._store = self._store_of('')
-        self.keeper = Keeper(lambda fault: self.get_logger().error(f'the calibration was not saved: {fault}'))
-        self._reports = Reports(lambda text, good: self._say(text, good=good))
+        self._store = self._open_store('')
+        self.store_writer = StoreWriter(lambda fault: self.get_logger().error(f'the calibration was not saved: {fault}'))
+        self._reports = ReportWriter(lambda text, good: self._say(text, good=good))
         self._upload = DriverUpload(self, self._say) if self.node_options.upload_to_driver else None
-        self.in_force = InForce(self, self.options, self.node_options, self._headers, driver=self._driver,
-                                taken=self._hand_on, withdrawn=self._hold_back)
-        self._pictures = LivePictures(self, self.node_options.debug_rate_hz, self.in_force, self._headers,
+        self.publication = CalibrationPublisher(self, self.options, self.node_options, self._headers, driver=self._driver,
+                                taken=self._on_accepted, withdrawn=self._on_withdrawn)
+        self._pictures = LivePictures(self, self.node_options.debug_rate_hz, self.publication, self._headers,
                                       ignored=self.options.ignored_polygons, failed=self.failed,
-                                      progress=lambda: self._pipeline.progress)
+                                      progress=lambda: self._worker.progress)
         solver = SolverProcess()
-        self._pipeline = Pipeline(self.options, idle_solve_s=self.node_options.idle_solve_s,
+        self._worker = CalibrationWorker(self.options, idle_solve_s=self.node_options.idle_solve_s,
                                   decode=ImageDecoder().decode, solve=solve or solver, listener=self,
                                   viewer=self._pictures, lens=self._lens, detector=detector,
                                   stop_solving=solver.close)
@@ -85,72 +85,72 @@ class AutocalibNode(Node):
         self.create_service(Trigger, '~/save', self._on_save, callback_group=MutuallyExclusiveCallbackGroup())
         self.create_service(Trigger, '~/reset', self._on_reset, callback_group=MutuallyExclusiveCallbackGroup())
         self._input = ImageInput(self, self.node_options, self._on_image)
-        self._live = LiveParameters(self, self.options, self.node_options, self._change,
-                                    lambda: self.in_force.image_size)
+        self._live_parameters = LiveParameters(self, self.options, self.node_options, self._change,
+                                    lambda: self.publication.image_size)
         self._diagnostics = Diagnostics(self, self._situation, lambda: self._headers.camera_name(
-            self.in_force.image_frame or DEFAULT_FRAME))
-        self.create_timer(TELL_PROGRESS_S, self._tell_progress, clock=Clock(clock_type=ClockType.STEADY_TIME))
+            self.publication.image_frame or DEFAULT_FRAME))
+        self.create_timer(PROGRESS_LOG_PERIOD_S, self._log_progress, clock=Clock(clock_type=ClockType.STEADY_TIME))
         if detector is not None:
             self.get_logger().info(f'vehicles by a {detector}')
         self.get_logger().info(f'waiting for images on {self._input.topic}')
 
     def close(self) -> None:
         """Stop the threads; to be called once before the node is destroyed."""
-        deadline = time.monotonic() + CLOSE_S
-        if not self.keeper.close(CLOSE_S / 2):
+        deadline = time.monotonic() + SHUTDOWN_S
+        if not self.store_writer.close(SHUTDOWN_S / 2):
             self.get_logger().warning('a calibration was still being written at shutdown and is abandoned')
         self._reports.close()
-        if not self._pipeline.close(deadline - time.monotonic()):
+        if not self._worker.close(deadline - time.monotonic()):
             self.get_logger().warning('a solution was still running at shutdown and is abandoned')
         self._pictures.close(max(0.0, deadline - time.monotonic()))
-        self.get_logger().info(f'shut down: {self._pipeline.counters}')
+        self.get_logger().info(f'shut down: {self._worker.counters}')
 
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
         """Refuse in words that help: rclpy turns a wrong type down before it asks any callback."""
-        return self._live.refusal(parameter_list) or super().set_parameters_atomically(parameter_list)
+        return self._live_parameters.refusal(parameter_list) or super().set_parameters_atomically(parameter_list)
 
     def _change(self, options: Options, node_options: NodeOptions) -> None:
         """Take other options: what rests on them is solved anew."""
         self.options, self.node_options = options, node_options
-        self.in_force.change(options, node_options)
+        self.publication.change(options, node_options)
         self._pictures.rate_hz = node_options.debug_rate_hz
-        self._pipeline.change(options, node_options.idle_solve_s)
+        self._worker.change(options, node_options.idle_solve_s)
 
     def _on_image(self, message: Any) -> None:
         """Keep the image for the perception thread and give it its camera_info; nothing here takes long."""
         frame_id = self._headers.frame_id(message.header.frame_id)
-        self._pipeline.offer(self._headers.stamp_ns(message.header.stamp), message)
-        foreign = self.in_force.image_came(message, frame_id)
+        self._worker.offer(self._headers.stamp_ns(message.header.stamp), message)
+        foreign = self.publication.on_image(message, frame_id)
         if foreign is not None:
             self.get_logger().warning(f"the restored calibration is of the frame '{foreign.image_frame}', and images "
                                       f"are of '{frame_id}': it is withdrawn and collecting goes on")
         if self._store is None:
-            store = self._store = self._store_of(frame_id)
-            self.keeper.run(lambda: self._restore(store))
+            store = self._store = self._open_store(frame_id)
+            self.store_writer.run(lambda: self._restore(store))
 
     async def _on_calibrate(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        if not self._pipeline.counters.used:
+        if not self._worker.counters.used:
             response.success, response.message = False, f'no image yet on {self._input.topic}'
             return response
-        result = await self._awaited(self._pipeline.solve_now())
+        result = await self._wrap_future(self._worker.solve_now())
         response.success = isinstance(result, Calibration)
         response.message = ('no solution: a reset came in between, no image came since it, or see the log of the node'
-                            if result is None else described(result))
+                            if result is None else describe(result))
         return response
 
     async def _on_save(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        published, state, store = self.in_force.published, self.in_force.state, self._store
+        published, state, store = self.publication.published, self.publication.state, self._store
         if published is None or store is None:
             response.success = False
-            response.message = f'nothing to save: no calibration yet; {described_progress(self._pipeline.progress)}'
+            response.message = f'nothing to save: no calibration yet; {describe_progress(self._worker.progress)}'
             return response
-        stored = self._stored(published)
-        error = await self._awaited(self.keeper.run(lambda: store.save(stored, replace_foreign=True)))
-        if error is None and self.in_force.published is published:
-            self.keeper.withdraw()  # the same would be written once more
+        stored = self._to_stored(published)
+        error = await self._wrap_future(self.store_writer.run(lambda: store.save(stored, replace_foreign=True)))
+        if error is None and self.publication.published is published:
+            self.store_writer.withdraw()  # the same would be written once more
         response.success = error is None
         response.message = (f'not saved: {error}' if error else
-                            f'saved the {state.value} calibration to {store.path} and {store.beside}; '
+                            f'saved the {state.value} calibration to {store.path} and {store.json_path}; '
                             f'the report follows in {store.report}')
         if error is None:
             self._report(published, store)
@@ -162,15 +162,15 @@ class AutocalibNode(Node):
 
         def go_on(looked: concurrent.futures.Future) -> None:
             scene = self._reports.scene(published.result, looked.result(), self.options, source)
-            self._reports.write(Place(store.report, store.figures), scene)
+            self._reports.write(ReportPaths(store.report, store.figures), scene)
 
-        self._pipeline.look().add_done_callback(go_on)
+        self._worker.request_snapshot().add_done_callback(go_on)
 
     def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Forget the evidence and withdraw the calibration; what is stored stays until the next is saved."""
-        self._pipeline.reset()
+        self._worker.reset()
         self._pictures.forget()
-        was = self.in_force.withdraw()
+        was = self.publication.withdraw()
         self._reports.forget()
         response.success = True
         response.message = 'the evidence is forgotten' + (
@@ -179,7 +179,7 @@ class AutocalibNode(Node):
         self.get_logger().info(f'reset: {response.message}')
         return response
 
-    def _awaited(self, running: concurrent.futures.Future) -> Future:
+    def _wrap_future(self, running: concurrent.futures.Future) -> Future:
         """Return what another thread works out, to be awaited; that thread wakes the executor for it."""
         executor = self.executor
         awaited = Future(executor=executor)
@@ -194,80 +194,80 @@ class AutocalibNode(Node):
 
     def _situation(self) -> Situation:
         """Return what is known now, for diagnostics."""
-        published = self.in_force.published
-        counts = Counts(**vars(self._pipeline.counters), lost=self._input.lost)
-        unsaved = f'the calibration is not saved: {self.keeper.fault}' if self.keeper.fault else ''
+        published = self.publication.published
+        counts = Counts(**vars(self._worker.counters), lost=self._input.lost)
+        unsaved = f'the calibration is not saved: {self.store_writer.fault}' if self.store_writer.fault else ''
         return Situation(
             topic=self._input.topic, counts=counts, rates_hz=self._recent.rates_hz(time.monotonic(), counts),
             result=None if published is None else published.result,
-            restored=self.in_force.state is CalibrationState.RESTORED, progress=self._pipeline.progress,
+            restored=self.publication.state is CalibrationState.RESTORED, progress=self._worker.progress,
             image_age_s=self._input.age_s, encoding=self._input.encoding, silence=self._input.silence,
-            unreadable=self._unreadable, errors=tuple(filter(None, [self._withdrawn, self.in_force.conflict])),
-            warnings=tuple(filter(None, [self._rivals(), self._driver.doubt(self.in_force.image_size),
-                                         self._input.crowd, unsaved])))
+            unreadable=self._unreadable, errors=tuple(filter(None, [self._withdrawn, self.publication.conflict])),
+            warnings=tuple(filter(None, [self._other_publishers(), self._driver.check(self.publication.image_size),
+                                         self._input.several_publishers, unsaved])))
 
-    def _rivals(self) -> str:
+    def _other_publishers(self) -> str:
         """Say who else publishes where our camera_info goes: two authorities on one lens."""
-        topic = self.in_force.topic
+        topic = self.publication.topic
         if self.count_publishers(topic) < 2:
             return ''
         names = {f'{info.node_namespace.rstrip("/")}/{info.node_name}' for info in
                  self.get_publishers_info_by_topic(topic)} - {self.get_fully_qualified_name()}
         words = (f'{", ".join(sorted(names)) or "a node of the same name"} publishes {topic} too: remap one of them, '
                  '-r ~/camera_info:=... here')
-        self._say_seldom('rivals', words, error=False)
+        self._log_throttled('rivals', words, error=False)
         return words
 
-    def _tell_progress(self) -> None:
-        if (self.in_force.state in (CalibrationState.NONE, CalibrationState.RESTORED)
-                and self._pipeline.counters.used):
-            self.get_logger().info(described_progress(self._pipeline.progress))
+    def _log_progress(self) -> None:
+        if (self.publication.state in (CalibrationState.NONE, CalibrationState.RESTORED)
+                and self._worker.counters.used):
+            self.get_logger().info(describe_progress(self._worker.progress))
 
-    def _store_of(self, image_frame: str) -> Store | None:
+    def _open_store(self, image_frame: str) -> Store | None:
         """Return where the calibration is kept; None while that is named after a frame that is not known yet."""
         url, name = self.node_options.camera_info_url, self._headers.camera_name(image_frame)
-        path = path_of(url, name or 'camera')
-        return Store(path) if name or path == path_of(url, 'another') else None
+        path = resolve_url(url, name or 'camera')
+        return Store(path) if name or path == resolve_url(url, 'another') else None
 
     def _restore(self, store: Store) -> None:
         """Publish what an earlier run kept, as not yet verified."""
-        store.tidy()
+        store.remove_leftovers()
         found = store.load()
         self._say(found.note, good=False)
         if found.stored is None:
             self.get_logger().info(f'no stored calibration at {store.path}')
             return
         try:
-            restored = with_what_is_given(found.stored.calibration, self.options, self._lens)
-            self.in_force.restore(restored, found.stored.image_frame)
+            restored = with_current_options(found.stored.calibration, self.options, self._lens)
+            self.publication.restore(restored, found.stored.image_frame)
         except AutocalibError as error:
             self.get_logger().warning(f'the calibration of {store.path} is not restored: {error}')
             return
-        self.get_logger().info(f'restored from {store.path}, not yet verified: {described(restored)}')
+        self.get_logger().info(f'restored from {store.path}, not yet verified: {describe(restored)}')
 
-    def _stored(self, published: Published) -> Stored:
-        return Stored(published.result, published.fields, self._headers.camera_name(published.image_frame),
+    def _to_stored(self, published: Published) -> StoredCalibration:
+        return StoredCalibration(published.result, published.fields, self._headers.camera_name(published.image_frame),
                       published.image_frame)
 
-    def _hand_on(self, published: Published, save: bool) -> None:
+    def _on_accepted(self, published: Published, save: bool) -> None:
         """Give a calibration that this run's traffic vouches for to the store and the driver, where that is wanted."""
         if save:
-            self._reports.rests_on(published.result, self._pipeline.told_of)
+            self._reports.set_evidence(published.result, self._worker.reported_evidence)
         if save and self.node_options.autosave and self._store is not None:
-            self.keeper.offer(self._store, self._stored(published))
+            self.store_writer.offer(self._store, self._to_stored(published))
         if self._upload is not None:
-            self._upload.offer(self.in_force.camera_info(published))
+            self._upload.offer(self.publication.camera_info(published))
 
-    def _hold_back(self) -> None:
+    def _on_withdrawn(self) -> None:
         """Keep what is withdrawn from the store and the driver, where it has not gone there yet."""
-        self.keeper.withdraw()
+        self.store_writer.withdraw()
         if self._upload is not None:
             self._upload.withdraw()
 
-    def image_taken(self, width: int, height: int) -> None:
+    def image_accepted(self, width: int, height: int) -> None:
         """Withdraw the calibration of another image size: the lens was calibrated in its pixels."""
         self._unreadable = ''
-        withdrawn = self.in_force.image_decoded(width, height)
+        withdrawn = self.publication.on_image_size(width, height)
         if withdrawn is not None:
             state, published = withdrawn
             old_width, old_height = published.result.evidence.image_size
@@ -275,34 +275,34 @@ class AutocalibNode(Node):
                                f'{width}x{height}: it is withdrawn')
             self.get_logger().warning(f'{self._withdrawn} and collecting starts anew')
 
-    def began_anew(self, why: str) -> None:
+    def on_evidence_reset(self, why: str) -> None:
         """Log that the evidence so far was dropped; a calibration from it stays in force until one is as sure."""
         self._pictures.forget()
-        self.in_force.began_anew()
-        self._say_seldom(f'anew {why}', f'{why}: the evidence is collected anew', error=False)
+        self.publication.on_evidence_reset()
+        self._log_throttled(f'anew {why}', f'{why}: the evidence is collected anew', error=False)
 
     def image_unreadable(self, error: AutocalibError) -> None:
         """Log an image that could not be used."""
         self._unreadable = str(error)
-        self._say_seldom('unreadable', f'image left out: {error} ({self._pipeline.counters})')
+        self._log_throttled('unreadable', f'image left out: {error} ({self._worker.counters})')
 
     def failed(self, error: Exception) -> None:
         """Log a fault of the program itself, for a bug report."""
-        self._say_seldom(f'fault {type(error).__name__}', ''.join(traceback.format_exception(error)).rstrip())
+        self._log_throttled(f'fault {type(error).__name__}', ''.join(traceback.format_exception(error)).rstrip())
 
     def solved(self, result: Result) -> None:
         """Publish a calibration, unless what is in force tells more; a refusal changes nothing."""
         self._reports.solved(result)
         if isinstance(result, Refusal):
-            self._say_seldom(f'refusal {result.code}', described(result), error=False)
+            self._log_throttled(f'refusal {result.code}', describe(result), error=False)
             return
-        decision = self.in_force.solved(result)
+        decision = self.publication.solved(result)
         if decision is None:
             return
         self._withdrawn = ''
-        self._said = {}
+        self._logged_at = {}
         self._say(decision.words, good=not decision.contradicted)
-        self.get_logger().info(described(result))
+        self.get_logger().info(describe(result))
 
     def _say(self, text: str, *, good: bool) -> None:
         """Log a line as information or as a warning; '' is nothing to say."""
@@ -312,12 +312,12 @@ class AutocalibNode(Node):
         elif text:
             self.get_logger().warning(text)
 
-    def _say_seldom(self, topic: str, text: str, *, error: bool = True) -> None:
+    def _log_throttled(self, topic: str, text: str, *, error: bool = True) -> None:
         """Log a line unless the same was said less than REPEAT_S ago."""
         now = time.monotonic()
-        if now - self._said.get(topic, -REPEAT_S) < REPEAT_S:
+        if now - self._logged_at.get(topic, -LOG_REPEAT_PERIOD_S) < LOG_REPEAT_PERIOD_S:
             return
-        self._said[topic] = now
+        self._logged_at[topic] = now
         # rclpy allows one severity for each place in the code.
         if error:
             self.get_logger().error(text)

@@ -1,7 +1,7 @@
 """Many cameras from one file: one node each, and nothing that two of them would share by mistake. Needs no ROS.
 
 config/cameras.yaml is an example. `defaults` holds for every camera; each has a `namespace` of its own, and as it
-needs them the other `KEYS`.
+needs them the other `CAMERA_KEYS`.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from typing import Any
 
 import yaml
 
-from autocalib_ros.config import NodeOptions, Options, declared, flattened
+from autocalib_ros.config import NodeOptions, Options, flatten, walk_options
 from autocalib_ros.errors import InputError, UsageError
-from autocalib_ros.lens.camera_info_yaml import plain_name
+from autocalib_ros.lens.camera_info_yaml import sanitised_name
 
-KEYS = ('namespace', 'image', 'camera_height', 'camera_info', 'params_file', 'parameters')
+CAMERA_KEYS = ('namespace', 'image', 'camera_height', 'camera_info', 'params_file', 'parameters')
 """What may be said of a camera: its image topic is `image_raw` unless told; `camera_info` is where that goes when the
 driver publishes none; `params_file` is relative to the file; `parameters` are options by name."""
 NODE_NAME = 'autocalib'
@@ -63,7 +63,7 @@ def camera_nodes(tree: Any, folder: Path) -> list[CameraNode]:
         name = camera.get('namespace')
         if not isinstance(name, str) or not NAMESPACE.fullmatch(name):
             raise UsageError(f"camera {number} has the namespace {name!r}: give it one of its own, 'cam{number}' say")
-    _require_apart(cameras)
+    _require_unique(cameras)
     return [_node(camera, folder) for camera in cameras]
 
 
@@ -71,11 +71,11 @@ def _camera(given: Any, where: str) -> dict[str, Any]:
     """Return one camera's entries, its parameters by full name."""
     if not isinstance(given, Mapping):
         raise UsageError(f'{where} is {given!r}, not names with values such as namespace: cam1')
-    _require_known(given, KEYS)
+    _require_known(given, CAMERA_KEYS)
     parameters = given.get('parameters') or {}
     if not isinstance(parameters, Mapping):
         raise UsageError(f"'parameters' of {where} are {parameters!r}, not names with values")
-    return {**given, 'parameters': flattened(parameters)}
+    return {**given, 'parameters': flatten(parameters)}
 
 
 def _require_known(given: Mapping[str, Any], known: tuple[str, ...]) -> None:
@@ -86,9 +86,9 @@ def _require_known(given: Mapping[str, Any], known: tuple[str, ...]) -> None:
                                                            f'one of {", ".join(known)}'))
 
 
-def _require_apart(cameras: list[dict[str, Any]]) -> None:
+def _require_unique(cameras: list[dict[str, Any]]) -> None:
     """Raise UsageError where two cameras share what tells cameras apart."""
-    for what, of_camera in SEPARATE.items():
+    for what, of_camera in UNIQUE_BY.items():
         seen: dict[str, str] = {}
         for camera in cameras:
             value = of_camera(camera)
@@ -99,14 +99,14 @@ def _require_apart(cameras: list[dict[str, Any]]) -> None:
 
 
 def _name(camera: dict[str, Any]) -> str:
-    return plain_name(camera['parameters'].get('camera_name') or camera['namespace'].strip('/'))
+    return sanitised_name(camera['parameters'].get('camera_name') or camera['namespace'].strip('/'))
 
 
 def _resolved(camera: dict[str, Any], topic: str) -> str:
     return topic if topic.startswith('/') else f"/{camera['namespace'].strip('/')}/{topic}"
 
 
-SEPARATE = {
+UNIQUE_BY = {
     'namespace': lambda camera: camera['namespace'].strip('/'),
     'name for frames and files': _name,
     'ground frame': lambda camera: camera['parameters'].get('ground_frame') or f'{_name(camera)}_ground',
@@ -120,7 +120,7 @@ def _node(camera: dict[str, Any], folder: Path) -> CameraNode:
     values = camera['parameters']
     if 'camera_height' in camera:
         values = {**values, 'camera_height': camera['camera_height']}
-    floats = {item.name for options in (Options(), NodeOptions()) for item in declared(options)
+    floats = {item.name for options in (Options(), NodeOptions()) for item in walk_options(options)
               if isinstance(item.default, float)}
     # ROS refuses 8 where 8.0 is meant; in a file of our own it is plain what is meant.
     values = {name: float(value) if name in floats and type(value) is int else value for name, value in values.items()}

@@ -28,7 +28,7 @@ from autocalib_ros.ros.messages import header, validated
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 """The calibration, however long ago it was published; without transient local it would never come."""
-SAY_AGAIN_S = 10.0
+WARN_PERIOD_S = 10.0
 
 
 class GroundPointsNode(Node):
@@ -54,7 +54,7 @@ class GroundPointsNode(Node):
     def _on_pixels(self, message: PolygonStamped) -> None:
         if self._info is None or self._transform is None:
             missing = 'camera_info' if self._info is None else 'ground_transform'
-            self._complain(f'pixels are left out: no {missing} yet on {self.resolve_topic_name(missing)}')
+            self._warn(f'pixels are left out: no {missing} yet on {self.resolve_topic_name(missing)}')
             return
         try:
             # A calibration may be replaced at any time. To build from it takes less time than to see whether it was.
@@ -64,14 +64,14 @@ class GroundPointsNode(Node):
                 raise InputError(f"their frame is '{message.header.frame_id}' and that of the calibration"
                                  f" '{self._info.header.frame_id}': send them with the header of the image")
         except InputError as error:
-            self._complain(f'pixels are left out: {error}')
+            self._warn(f'pixels are left out: {error}')
             return
         given = np.array([(point.x, point.y, point.z) for point in message.polygon.points]).reshape(-1, 3)
         found = ground.points(given[:, :2], height_m=given[:, 2])
         self._points.publish(validated(cloud(found.points_m, header(message.header.stamp, ground.ground_frame))))
 
-    def _complain(self, text: str) -> None:
-        self.get_logger().warning(text, throttle_duration_sec=SAY_AGAIN_S)
+    def _warn(self, text: str) -> None:
+        self.get_logger().warning(text, throttle_duration_sec=WARN_PERIOD_S)
 
 
 def cloud(points_m: np.ndarray, cloud_header: Header) -> PointCloud2:

@@ -7,11 +7,11 @@ from collections.abc import Callable
 from builtin_interfaces.msg import Time
 
 from autocalib_ros.config import NodeOptions
-from autocalib_ros.lens.camera_info_yaml import plain_name
+from autocalib_ros.lens.camera_info_yaml import sanitised_name
 from autocalib_ros.ros.messages import stamp_ns
 
 DEFAULT_FRAME = 'camera_optical_frame'
-SAME_STAMPS = 30
+MAX_REPEATED_STAMPS = 30
 """A clock that gives so many images in a row one stamp stands still, or counts whole seconds: it tells no time."""
 
 
@@ -27,18 +27,18 @@ class Headers:
     def stamp_ns(self, stamp: Time) -> int:
         """Return the time of an image in nanoseconds.
 
-        That is the time of receipt when the driver sets none, and for good once it gave `SAME_STAMPS` images one.
+        That is the time of receipt when the driver sets none, and for good once it gave `MAX_REPEATED_STAMPS` images one.
         """
         given_ns = stamp_ns(stamp)
         if not given_ns:
             self._warn_once('images carry no time stamp: the time of receipt is used')
             return self._now_ns()
-        if self._repeats < SAME_STAMPS:
+        if self._repeats < MAX_REPEATED_STAMPS:
             self._repeats = self._repeats + 1 if given_ns == self._given_ns else 1
             self._given_ns = given_ns
-        if self._repeats < SAME_STAMPS:
+        if self._repeats < MAX_REPEATED_STAMPS:
             return given_ns
-        self._warn_once(f'{SAME_STAMPS} images in a row carry one time stamp: the time of receipt is used from now on')
+        self._warn_once(f'{MAX_REPEATED_STAMPS} images in a row carry one time stamp: the time of receipt is used from now on')
         return self._now_ns()
 
     def frame_id(self, given: str) -> str:
@@ -60,7 +60,7 @@ class Headers:
 
         '' when it is named after a frame that is not known yet.
         """
-        return plain_name(self._options.camera_name or self._namespace or image_frame)
+        return sanitised_name(self._options.camera_name or self._namespace or image_frame)
 
     def ground_frame(self, image_frame: str) -> str:
         """Return the frame of the ground plane; it holds the camera's name, so that two cameras do not collide."""

@@ -14,18 +14,18 @@ from rclpy.subscription import Subscription
 from sensor_msgs.msg import CompressedImage, Image
 
 from autocalib_ros.config import NodeOptions
-from autocalib_ros.ros.watchdog import Offer, Silence, topic_beside, why_silent
+from autocalib_ros.ros.watchdog import NoImageDiagnosis, PublisherOffer, diagnose, other_transport_topic
 
-DEPTH = 10
+QUEUE_DEPTH = 10
 """Images that DDS keeps while this process has no processor: a third of a second at 30 Hz.
 
 One is usual, so that a slow callback sees no old image; this one takes a tenth of a millisecond, and evidence goes by
 stamps, so that age costs nothing. Side by side on a machine with four times more to do than it can, of 900 images of
 1280x720 at 30 Hz a queue of 1 got 23, of 5 180 and of 10 348, which were 50, 180 and 340 ms old at the median.
 """
-POLL_S = 1.0
-SILENCE_S = 5.0
-REMIND_S = 60.0
+PUBLISHER_POLL_S = 1.0
+NO_IMAGE_TIMEOUT_S = 5.0
+NO_IMAGE_REMINDER_S = 60.0
 """Real seconds between two looks at the publishers, without an image before that is told, and told again."""
 RELIABILITY = {'reliable': ReliabilityPolicy.RELIABLE, 'best_effort': ReliabilityPolicy.BEST_EFFORT}
 
@@ -39,9 +39,9 @@ class ImageInput:
         self._type = CompressedImage if compressed else Image
         # The image topic is resolved first: a remapping of `image` has to move its compressed form along.
         self.topic = node.resolve_topic_name('image') + ('/compressed' if compressed else '')
-        self.silence: Silence | None = None
-        """Why no image has come for `SILENCE_S`; None while images come."""
-        self.offers: list[Offer] = []
+        self.silence: NoImageDiagnosis | None = None
+        """Why no image has come for `NO_IMAGE_TIMEOUT_S`; None while images come."""
+        self.offers: list[PublisherOffer] = []
         """What publishers offered at the last look."""
         self.lost = 0
         """Images that DDS says it lost before they came here."""
@@ -49,35 +49,35 @@ class ImageInput:
         """What the newest image says it is."""
         self._subscription: Subscription | None = None
         self._reliability: ReliabilityPolicy | None = None
-        self._heard = time.monotonic()
-        self._came = False
-        self._told: tuple[str, float] | None = None
-        self._fixed = RELIABILITY.get(options.image_reliability)
-        if self._fixed is not None:
-            self._subscribe(self._fixed)
-        node.create_timer(POLL_S, self._watch, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._last_image = time.monotonic()
+        self._any_image = False
+        self._last_warning: tuple[str, float] | None = None
+        self._requested = RELIABILITY.get(options.image_reliability)
+        if self._requested is not None:
+            self._subscribe(self._requested)
+        node.create_timer(PUBLISHER_POLL_S, self._check_publishers, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     @property
     def age_s(self) -> float | None:
         """Seconds since the newest image came; None before the first."""
-        return time.monotonic() - self._heard if self._came else None
+        return time.monotonic() - self._last_image if self._any_image else None
 
     @property
-    def crowd(self) -> str:
+    def several_publishers(self) -> str:
         """Say that several publishers share the topic, '' where they do not: nothing tells their images apart."""
         names = sorted(offer.node for offer in self.offers if offer.type_name == self._type_name())
         return '' if len(names) < 2 else (f'{len(names)} publishers share {self.topic} ({", ".join(names)}): images of '
                                           'two cameras cannot be told apart')
 
-    def _watch(self) -> None:
+    def _check_publishers(self) -> None:
         publishers = self._node.get_publishers_info_by_topic(self.topic)
         self.offers = [_offer(publisher) for publisher in publishers]
-        wanted = self._fixed or self._matching(self.offers)
+        wanted = self._requested or self._compatible_reliability(self.offers)
         if wanted is not None and wanted != self._reliability:
             self._subscribe(wanted)
-        self._tell_silence()
+        self._warn_no_image()
 
-    def _matching(self, offers: list[Offer]) -> ReliabilityPolicy | None:
+    def _compatible_reliability(self, offers: list[PublisherOffer]) -> ReliabilityPolicy | None:
         """Return what connects to all publishers; None while there is none.
 
         Best effort connects to everything but loses half of the large images, and
@@ -92,7 +92,7 @@ class ImageInput:
         if self._subscription is not None:
             self._node.destroy_subscription(self._subscription)
         self._reliability = reliability
-        profile = QoSProfile(depth=DEPTH, history=HistoryPolicy.KEEP_LAST, reliability=reliability)
+        profile = QoSProfile(depth=QUEUE_DEPTH, history=HistoryPolicy.KEEP_LAST, reliability=reliability)
         events = SubscriptionEventCallbacks(incompatible_qos=self._on_incompatible, message_lost=self._on_lost)
         self._subscription = self._node.create_subscription(
             self._type, self.topic, self._take, profile, event_callbacks=events)
@@ -101,9 +101,9 @@ class ImageInput:
     def _on_incompatible(self, event: Any) -> None:
         """Tell it: with image_reliability auto the next look at the publishers mends it, else a person has to."""
         policy = qos_policy_name_from_kind(event.last_policy_kind)
-        if self._fixed is None:
+        if self._requested is None:
             self._node.get_logger().info(f'a publisher of {self.topic} offers another {policy}: it is matched within '
-                                         f'{POLL_S:g} s')
+                                         f'{PUBLISHER_POLL_S:g} s')
         else:
             self._node.get_logger().warning(f'a publisher of {self.topic} offers less {policy} than this node asks '
                                             'for, and nothing comes from it: set image_reliability:=auto')
@@ -112,29 +112,29 @@ class ImageInput:
         self.lost += event.total_count_change
 
     def _take(self, message: Any) -> None:
-        self._heard, self._came, self._told, self.silence = time.monotonic(), True, None, None
+        self._last_image, self._any_image, self._last_warning, self.silence = time.monotonic(), True, None, None
         self.encoding = message.encoding if self._type is Image else message.format
         self._on_image(message)
 
-    def _tell_silence(self) -> None:
+    def _warn_no_image(self) -> None:
         """Find out why nothing comes; log it, and again when the reason changes or much time has gone."""
         now = time.monotonic()
-        if now - self._heard < SILENCE_S:
+        if now - self._last_image < NO_IMAGE_TIMEOUT_S:
             return
-        beside = self._node.get_publishers_info_by_topic(topic_beside(self.topic, self._type_name()))
-        self.silence = why_silent(
+        other_offers = self._node.get_publishers_info_by_topic(other_transport_topic(self.topic, self._type_name()))
+        self.silence = diagnose(
             self.topic, self._type_name(), self.offers, asks_reliable=self._reliability == ReliabilityPolicy.RELIABLE,
-            beside=[_offer(publisher) for publisher in beside])
-        words, told_at = self._told or ('', -REMIND_S)
-        if words == self.silence.words and now - told_at < REMIND_S:
+            other_offers=[_offer(publisher) for publisher in other_offers])
+        words, warned_at = self._last_warning or ('', -NO_IMAGE_REMINDER_S)
+        if words == self.silence.words and now - warned_at < NO_IMAGE_REMINDER_S:
             return
-        self._told = self.silence.words, now
-        self._node.get_logger().warning(f'no image for {now - self._heard:.0f} s: {self.silence.words}')
+        self._last_warning = self.silence.words, now
+        self._node.get_logger().warning(f'no image for {now - self._last_image:.0f} s: {self.silence.words}')
 
     def _type_name(self) -> str:
         return f'sensor_msgs/msg/{self._type.__name__}'
 
 
-def _offer(publisher: Any) -> Offer:
+def _offer(publisher: Any) -> PublisherOffer:
     name = f'{publisher.node_namespace.rstrip("/")}/{publisher.node_name}'
-    return Offer(name, publisher.topic_type, publisher.qos_profile.reliability == ReliabilityPolicy.RELIABLE)
+    return PublisherOffer(name, publisher.topic_type, publisher.qos_profile.reliability == ReliabilityPolicy.RELIABLE)

@@ -9,9 +9,9 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from autocalib_ros.config import NodeOptions, Options, declared, may_change, with_values
+from autocalib_ros.config import NodeOptions, Options, is_reconfigurable, walk_options, with_overrides
 from autocalib_ros.errors import UsageError
-from autocalib_ros.ros.declared_parameters import refuse_wrong_type, unknown
+from autocalib_ros.ros.declared_parameters import require_float, unknown_parameter
 
 Changed = Callable[[Options, NodeOptions], None]
 
@@ -30,7 +30,7 @@ class LiveParameters:
         """Return why these cannot be set, all at once; None where they can."""
         foreign = [parameter.name for parameter in parameters if not self._node.has_parameter(parameter.name)]
         if foreign:
-            return SetParametersResult(successful=False, reason=unknown(foreign[0]))
+            return SetParametersResult(successful=False, reason=unknown_parameter(foreign[0]))
         result = self._check(parameters)
         return None if result.successful else result
 
@@ -57,17 +57,17 @@ def changed_options(options: Options, node_options: NodeOptions,
 
     UsageError for what cannot change while the node runs, or cannot be used.
     """
-    core, of_node = ({item.name: item for item in declared(group)} for group in (options, node_options))
+    core, of_node = ({item.name: item for item in walk_options(group)} for group in (options, node_options))
     for name, value in values.items():
         item = core.get(name) or of_node.get(name)
         if item is None:
             continue
-        refuse_wrong_type(item, value)
-        if not may_change(name) and value != item.default:
+        require_float(item, value)
+        if not is_reconfigurable(name) and value != item.default:
             raise UsageError(f"'{name}' cannot change while the node runs, what it holds rests on it: start the node "
                              f'with -p {name}:={value}')
-    return (with_values(options, {name: value for name, value in values.items() if name in core}),
-            with_values(node_options, {name: value for name, value in values.items() if name in of_node}))
+    return (with_overrides(options, {name: value for name, value in values.items() if name in core}),
+            with_overrides(node_options, {name: value for name, value in values.items() if name in of_node}))
 
 
 def _values(parameters: list[Parameter]) -> dict[str, Any]:

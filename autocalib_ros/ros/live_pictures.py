@@ -23,7 +23,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
-from autocalib_ros.calibrator import Progress
+from autocalib_ros.calibrator import CalibrationProgress
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.perception.ignore_regions import Polygons, black_out
 from autocalib_ros.pictures.drawing import Caption
@@ -32,15 +32,15 @@ from autocalib_ros.results.calibration import Calibration, Refusal
 from autocalib_ros.revalidation import CalibrationState
 from autocalib_ros.ros import messages
 from autocalib_ros.ros.headers import Headers
-from autocalib_ros.ros.log_text import described_numbers
-from autocalib_ros.ros.publication import InForce, Published
+from autocalib_ros.ros.log_text import describe_numbers
+from autocalib_ros.ros.publication import CalibrationPublisher, Published
 
-GOOD, WAITING = '#7ee08a', '#ffd166'
+VERIFIED_COLOUR, WAITING_COLOUR = '#7ee08a', '#ffd166'
 """Colours of the state, where a calibration is vouched for and where it is not."""
 
 
 @dataclass(frozen=True)
-class _Shot:
+class _PendingImage:
     """An image to be shown, with what was followed in it, if somebody asked for that."""
 
     header: Header
@@ -56,28 +56,28 @@ class LivePictures:
     program.
     """
 
-    def __init__(self, node: Node, rate_hz: float, in_force: InForce, headers: Headers, *, ignored: Polygons,
-                 progress: Callable[[], Progress | None], failed: Callable[[Exception], None]) -> None:
+    def __init__(self, node: Node, rate_hz: float, publication: CalibrationPublisher, headers: Headers, *, ignored: Polygons,
+                 progress: Callable[[], CalibrationProgress | None], failed: Callable[[Exception], None]) -> None:
         self.rate_hz, self._ignored = rate_hz, ignored
-        self._in_force, self._headers, self._progress, self._failed = in_force, headers, progress, failed
+        self._publication, self._headers, self._progress, self._failed = publication, headers, progress, failed
         self._debug_image = _picture_publisher(node, '~/debug_image')
         self._top_view = _picture_publisher(node, '~/top_view')
         self._image_rect = _picture_publisher(node, '~/image_rect')
         self._changed = threading.Condition()
-        self._shot: _Shot | None = None
+        self._pending: _PendingImage | None = None
         self._closed = False
         self._due_s = 0.0
-        self._judged: LabelledTracks | None = None
-        self._debug = _Kept(DebugPicture)
-        self._top = _Kept(TopPicture.of)
-        self._rectified = _Kept(RectifiedPicture)
+        self._labelled_tracks: LabelledTracks | None = None
+        self._debug = _Cached(DebugPicture)
+        self._top = _Cached(TopPicture.of)
+        self._rectified = _Cached(RectifiedPicture)
         self._thread = threading.Thread(target=self._run, name='pictures', daemon=True)
         self._thread.start()
 
     def image_used(self, message: Any, image: np.ndarray, followed: Callable[[], np.ndarray]) -> None:
         """Take an image, grey or BGR, where somebody looks and it is time; it is not changed, nor copied here."""
         debug = self._debug_image.get_subscription_count() > 0
-        views = self._in_force.published is not None and (
+        views = self._publication.published is not None and (
             self._top_view.get_subscription_count() > 0 or self._image_rect.get_subscription_count() > 0)
         now = time.monotonic()
         if not (debug or views) or now < self._due_s:
@@ -85,21 +85,21 @@ class LivePictures:
         # in step with the images, whatever their rate, and at once after a pause
         self._due_s = max(self._due_s, now - 0.5 / self.rate_hz) + 1 / self.rate_hz
         image_header = messages.header(message.header.stamp, self._headers.frame_id(message.header.frame_id))
-        shot = _Shot(image_header, image, followed() if debug else None)
+        pending = _PendingImage(image_header, image, followed() if debug else None)
         with self._changed:
-            self._shot = shot
+            self._pending = pending
             self._changed.notify_all()
 
     def solution_found(self, result: Calibration | Refusal, evidence: Evidence) -> None:
         """Show from now on what became of the tracks in a solution; a refusal says nothing of them."""
         if isinstance(result, Calibration):
-            self._judged = LabelledTracks(evidence.image_size, evidence.points_px, evidence.track_starts,
+            self._labelled_tracks = LabelledTracks(evidence.image_size, evidence.points_px, evidence.track_starts,
                                         result.figures.track_labels)
 
     def forget(self) -> None:
         """Show nothing of an earlier solution, nor an image from before."""
         with self._changed:
-            self._judged = self._shot = None
+            self._labelled_tracks = self._pending = None
 
     def close(self, timeout_s: float) -> None:
         """Stop drawing."""
@@ -111,36 +111,36 @@ class LivePictures:
     def _run(self) -> None:
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._closed or self._shot is not None)
+                self._changed.wait_for(lambda: self._closed or self._pending is not None)
                 if self._closed:
                     return
-                shot, self._shot = self._shot, None
+                pending, self._pending = self._pending, None
             try:
-                self._show(shot)
+                self._show(pending)
             except Exception as error:  # pictures are the least of what the node does
                 if not self._closed:
                     self._failed(error)
 
-    def _show(self, shot: _Shot) -> None:
+    def _show(self, pending: _PendingImage) -> None:
         """Draw what somebody looks at."""
-        image = black_out(shot.image, self._ignored)  # all pictures begin here, and nowhere else
+        image = black_out(pending.image, self._ignored)  # all pictures begin here, and nowhere else
         height, width = image.shape[:2]
-        published, state = self._in_force.published, self._in_force.state
+        published, state = self._publication.published, self._publication.state
         if published is not None and published.result.evidence.image_size != (width, height):
             published = None
         result = None if published is None else published.result
-        if shot.followed_px is not None:
-            picture = self._debug.of((width, height), result, self._judged)
+        if pending.followed_px is not None:
+            picture = self._debug.of((width, height), result, self._labelled_tracks)
             caption = caption_of(state, result, self._progress())
-            self._publish(self._debug_image, picture.draw(image, shot.followed_px, caption), shot.header)
+            self._publish(self._debug_image, picture.draw(image, pending.followed_px, caption), pending.header)
         if result is None:
             return
         if self._image_rect.get_subscription_count():
-            self._publish(self._image_rect, self._rectified.of(result).draw(image), shot.header)
+            self._publish(self._image_rect, self._rectified.of(result).draw(image), pending.header)
         if self._top_view.get_subscription_count() and published.transform is not None:
-            self._show_from_above(published, image, shot.header)
+            self._draw_top_view(published, image, pending.header)
 
-    def _show_from_above(self, published: Published, image: np.ndarray, image_header: Header) -> None:
+    def _draw_top_view(self, published: Published, image: np.ndarray, image_header: Header) -> None:
         picture = self._top.of(published.result)
         if picture is not None:
             ground_frame = self._headers.ground_frame(image_header.frame_id)
@@ -150,7 +150,7 @@ class LivePictures:
         publisher.publish(messages.validated(image_message(picture, picture_header)))
 
 
-class _Kept:
+class _Cached:
     """Makes something of values, and keeps it until they are others; values are told apart by identity."""
 
     def __init__(self, make: Callable[..., Any]) -> None:
@@ -168,18 +168,18 @@ class _Kept:
         return self._made
 
 
-def caption_of(state: CalibrationState, result: Calibration | None, progress: Progress | None) -> Caption:
+def caption_of(state: CalibrationState, result: Calibration | None, progress: CalibrationProgress | None) -> Caption:
     """Return the state in words: what is in force, or how far the evidence has come and what is missing."""
     if result is None or state is CalibrationState.NONE:
-        return Caption(*_collecting(progress), WAITING)
-    numbers = ', '.join(described_numbers(result))
+        return Caption(*_collecting(progress), WAITING_COLOUR)
+    numbers = ', '.join(describe_numbers(result))
     if state is CalibrationState.RESTORED:
         title, missing = _collecting(progress)
-        return Caption(f'RESTORED, not yet verified, grade {result.grade}', f'{numbers}; {title}: {missing}', WAITING)
-    return Caption(f'CALIBRATED, grade {result.grade}', numbers, GOOD)
+        return Caption(f'RESTORED, not yet verified, grade {result.grade}', f'{numbers}; {title}: {missing}', WAITING_COLOUR)
+    return Caption(f'CALIBRATED, grade {result.grade}', numbers, VERIFIED_COLOUR)
 
 
-def _collecting(progress: Progress | None) -> tuple[str, str]:
+def _collecting(progress: CalibrationProgress | None) -> tuple[str, str]:
     """Return how far the evidence has come, and what is missing."""
     if progress is None:
         return 'COLLECTING', ''

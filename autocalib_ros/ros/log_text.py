@@ -4,36 +4,36 @@ from __future__ import annotations
 
 import math
 
-from autocalib_ros.calibrator import Progress
+from autocalib_ros.calibrator import CalibrationProgress
 from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.results.calibration import Calibration, Refusal
 
 
-def described(result: Calibration | Refusal) -> str:
+def describe(result: Calibration | Refusal) -> str:
     """Return a result in one line."""
-    return described_refusal(result) if isinstance(result, Refusal) else described_calibration(result)
+    return describe_refusal(result) if isinstance(result, Refusal) else describe_calibration(result)
 
 
-def described_refusal(refusal: Refusal) -> str:
+def describe_refusal(refusal: Refusal) -> str:
     """Return why there is no calibration, and what helps."""
     return _one_line(f'refused ({refusal.code}): {refusal.message} Remedy: {refusal.remedy}')
 
 
-def described_calibration(result: Calibration) -> str:
+def describe_calibration(result: Calibration) -> str:
     """Return focal length, tilt and height with their sigma, the grade and what was assumed."""
     assumptions = '; '.join(result.assumptions) or 'none'
-    numbers = ', '.join(described_numbers(result))
+    numbers = ', '.join(describe_numbers(result))
     return _one_line(f'calibrated, grade {result.grade}: {numbers}; assumptions: {assumptions}')
 
 
-def described_numbers(result: Calibration) -> list[str]:
+def describe_numbers(result: Calibration) -> list[str]:
     """Return focal length, tilt and height with their sigma, or why there is no plane."""
     sigma = result.stddev
-    parts = [f'focal length {result.camera.focal_px:.2f} px{_sigma(sigma.focal_px)}']
+    parts = [f'focal length {result.camera.focal_px:.2f} px{_sigma_text(sigma.focal_px)}']
     if result.ground is not None:
         unit = 'm' if result.ground.metric else '(units of the camera height)'
-        parts += [f'tilt {tilt_deg(result.ground):.2f} deg{_sigma(sigma.tilt_deg)}',
-                  f'height {result.ground.height_m:g} {unit}{_sigma(sigma.height_m)}']
+        parts += [f'tilt {tilt_deg(result.ground):.2f} deg{_sigma_text(sigma.tilt_deg)}',
+                  f'height {result.ground.height_m:g} {unit}{_sigma_text(sigma.height_m)}']
     elif result.ground_refusal is not None:
         parts.append(f'no ground plane ({result.ground_refusal.code}): {result.ground_refusal.message}')
     info = result.camera_info
@@ -42,7 +42,7 @@ def described_numbers(result: Calibration) -> list[str]:
     return parts
 
 
-def described_progress(progress: Progress | None) -> str:
+def describe_progress(progress: CalibrationProgress | None) -> str:
     """Return how far the evidence has come, what is missing and how long that will take."""
     return 'collecting' if progress is None else _one_line(f'collecting: {progress}')
 
@@ -52,7 +52,7 @@ def tilt_deg(ground: GroundPlane) -> float:
     return math.degrees(math.asin(max(-1.0, min(1.0, -float(ground.normal_in_camera[2])))))
 
 
-def _sigma(value: float | None) -> str:
+def _sigma_text(value: float | None) -> str:
     return '' if value is None else f' (sigma {value:.3g})'
 
 

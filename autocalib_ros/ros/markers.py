@@ -12,14 +12,14 @@ from visualization_msgs.msg import Marker, MarkerArray
 from autocalib_ros.pictures.road import ErrorEllipse, GroundGrid, enlargement, error_ellipses, view_frustum
 from autocalib_ros.pictures.views import format_length
 from autocalib_ros.results.calibration import Calibration
-from autocalib_ros.ros.log_text import described_numbers
+from autocalib_ros.ros.log_text import describe_numbers
 
-LINE_SHARE = 0.005
-LETTER_SHARE = 0.06
+LINE_WIDTH_HEIGHTS = 0.005
+LETTER_HEIGHT_HEIGHTS = 0.06
 """Width of lines and height of letters, units of the camera's height."""
-ABOVE_ROAD_SHARE = 0.003
+LIFT_HEIGHTS = 0.003
 """Ellipses are drawn so far above the grid, units of the camera's height, or both would flicker."""
-GRID, FIELD, SURE, WORDS = (0.8, 0.8, 0.8, 0.6), (1.0, 0.88, 0.3, 1.0), (1.0, 0.48, 0.84, 1.0), (1.0, 1.0, 1.0, 1.0)
+GRID_COLOUR, FIELD_OF_VIEW_COLOUR, UNCERTAINTY_COLOUR, TEXT_COLOUR = (0.8, 0.8, 0.8, 0.6), (1.0, 0.88, 0.3, 1.0), (1.0, 0.48, 0.84, 1.0), (1.0, 1.0, 1.0, 1.0)
 """Colours: red, green, blue, opacity."""
 
 
@@ -37,8 +37,8 @@ def markers(result: Calibration, ground_frame: str) -> MarkerArray:
     shown, unit_m = error_ellipses(result), ground.height_m
     grid = GroundGrid.of(camera, ground)
     made = [] if grid is None else [
-        _lines('grid', [line[[0, -1]] for line in grid.lines_m], GRID, 0.5 * LINE_SHARE * unit_m)]
-    made.append(_lines('field_of_view', view_frustum(camera, ground), FIELD, LINE_SHARE * unit_m))
+        _lines('grid', [line[[0, -1]] for line in grid.lines_m], GRID_COLOUR, 0.5 * LINE_WIDTH_HEIGHTS * unit_m)]
+    made.append(_lines('field_of_view', view_frustum(camera, ground), FIELD_OF_VIEW_COLOUR, LINE_WIDTH_HEIGHTS * unit_m))
     made += _uncertainty(shown, unit_m)
     made.append(_text('state', 0, _words(result, grid, shown), ground.translation_m + [0, 0, 0.5 * unit_m], unit_m))
     for marker in made:
@@ -51,18 +51,18 @@ def _uncertainty(shown: Sequence[ErrorEllipse], unit_m: float) -> Iterator[Marke
     """Yield an ellipse and its words for each distance."""
     factor = enlargement(list(shown))
     for number, ellipse in enumerate(shown):
-        outline = np.pad(ellipse.outline(factor), ((0, 0), (0, 1)), constant_values=ABOVE_ROAD_SHARE * unit_m)
-        marker = _marker('uncertainty', number, Marker.LINE_STRIP, SURE)
-        marker.scale.x = 2 * LINE_SHARE * unit_m
+        outline = np.pad(ellipse.outline(factor), ((0, 0), (0, 1)), constant_values=LIFT_HEIGHTS * unit_m)
+        marker = _marker('uncertainty', number, Marker.LINE_STRIP, UNCERTAINTY_COLOUR)
+        marker.scale.x = 2 * LINE_WIDTH_HEIGHTS * unit_m
         marker.points = _points(outline)
         yield marker
-        place = np.array([*ellipse.centre_m, LETTER_SHARE * unit_m])
+        place = np.array([*ellipse.centre_m, LETTER_HEIGHT_HEIGHTS * unit_m])
         yield _text('uncertainty_text', number, f'{ellipse.distance_m:g} m: sigma {ellipse.sigma_m:.2g} m', place,
                     unit_m)
 
 
 def _words(result: Calibration, grid: GroundGrid | None, shown: Sequence[ErrorEllipse]) -> str:
-    lines = [f'grade {result.grade}', *described_numbers(result)]
+    lines = [f'grade {result.grade}', *describe_numbers(result)]
     if grid is not None:
         lines.append(f'squares of {format_length(grid.step_m, result.ground)}')
     factor = enlargement(list(shown))
@@ -81,8 +81,8 @@ def _lines(namespace: str, lines: Sequence[np.ndarray], colour: tuple[float, ...
 
 
 def _text(namespace: str, number: int, text: str, place_m: np.ndarray, unit_m: float) -> Marker:
-    marker = _marker(namespace, number, Marker.TEXT_VIEW_FACING, WORDS)
-    marker.scale.z = float(LETTER_SHARE * unit_m)
+    marker = _marker(namespace, number, Marker.TEXT_VIEW_FACING, TEXT_COLOUR)
+    marker.scale.z = float(LETTER_HEIGHT_HEIGHTS * unit_m)
     marker.pose.position = _points(place_m[None])[0]
     marker.text = text
     return marker

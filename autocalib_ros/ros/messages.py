@@ -19,12 +19,12 @@ from std_msgs.msg import Header
 from autocalib_ros.errors import AutocalibError
 from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.lens.camera_info import CameraInfo as CameraInfoFields
-from autocalib_ros.lens.camera_info import Readout, in_full_resolution
+from autocalib_ros.lens.camera_info import Readout, to_full_resolution
 
-COEFFICIENTS = {'plumb_bob': 5, 'rational_polynomial': 8, 'equidistant': 4}
+COEFFICIENT_COUNT = {'plumb_bob': 5, 'rational_polynomial': 8, 'equidistant': 4}
 """Length of D for each distortion model that consumers know (sensor_msgs/distortion_models.hpp)."""
 INTEGER_BITS = {'int8': 8, 'uint8': 8, 'int16': 16, 'uint16': 16, 'int32': 32, 'uint32': 32, 'int64': 64, 'uint64': 64}
-UNIT_TOLERANCE = 1e-6
+TF2_QUATERNION_TOLERANCE = 1e-6
 """tf2 refuses quaternions whose length is farther from 1 than this."""
 Message = TypeVar('Message')
 
@@ -58,7 +58,7 @@ def camera_info_message(fields: CameraInfoFields, stamp: Time, frame_id: str,
     """
     operation: dict[str, Any] = {}
     if driver is not None:
-        fields = in_full_resolution(fields, readout(driver))
+        fields = to_full_resolution(fields, readout(driver))
         roi = driver.roi
         operation = {'binning_x': driver.binning_x, 'binning_y': driver.binning_y, 'roi': RegionOfInterest(
             x_offset=roi.x_offset, y_offset=roi.y_offset, height=roi.height, width=roi.width,
@@ -91,7 +91,7 @@ def validated(message: Message) -> Message:
     """Return the message unchanged, or raise InvalidMessage naming the field that must not be published."""
     name = type(message).__name__
     _check_fields(message, name)
-    check = MEANING.get(name)
+    check = SEMANTIC_CHECKS.get(name)
     if check is not None:
         check(message)
     return message
@@ -147,7 +147,7 @@ def _check_camera_info(info: CameraInfo) -> None:
     path = 'CameraInfo'
     _check_frame(info.header.frame_id, f'{path}.header.frame_id')
     _require(info.width > 0 and info.height > 0, path, f'has the size {info.width}x{info.height}')
-    length = COEFFICIENTS.get(info.distortion_model)
+    length = COEFFICIENT_COUNT.get(info.distortion_model)
     _require(length is not None, f'{path}.distortion_model', f'is {info.distortion_model!r}')
     _require(len(info.d) == length, f'{path}.d', f'holds {len(info.d)} numbers, not {length}')
     # image_proc passes an image through unrectified when D is all zero, whatever the model.
@@ -166,7 +166,7 @@ def _check_transform(stamped: TransformStamped) -> None:
     _require(stamped.header.frame_id != stamped.child_frame_id, path, 'joins a frame with itself')
     q = stamped.transform.rotation
     norm = math.sqrt(q.x ** 2 + q.y ** 2 + q.z ** 2 + q.w ** 2)
-    _require(abs(norm - 1) < UNIT_TOLERANCE, f'{path}.transform.rotation', f'has the length {norm}')
+    _require(abs(norm - 1) < TF2_QUATERNION_TOLERANCE, f'{path}.transform.rotation', f'has the length {norm}')
 
 
 def _check_transforms(message: Any) -> None:
@@ -185,6 +185,6 @@ def _require(holds: bool, path: str, what: str) -> None:
         raise InvalidMessage(f'{path} {what}')
 
 
-MEANING: dict[str, Callable[[Any], None]] = {
+SEMANTIC_CHECKS: dict[str, Callable[[Any], None]] = {
     'CameraInfo': _check_camera_info, 'TransformStamped': _check_transform, 'TFMessage': _check_transforms}
 """What a message has to mean beyond the types of its fields."""

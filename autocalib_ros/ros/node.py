@@ -14,7 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
 from autocalib_ros.errors import AutocalibError, UsageError
-from autocalib_ros.util.threads import use_one_thread_for_linear_algebra
+from autocalib_ros.util.threads import limit_blas_threads
 
 if TYPE_CHECKING:
     from autocalib_ros.ros.autocalib_node import AutocalibNode
@@ -27,7 +27,7 @@ WRONG_USAGE = 2
 
 def main(args: list[str] | None = None) -> int:
     """Run the node until it is interrupted; return the exit status: 0, or 2 for wrong usage."""
-    use_one_thread_for_linear_algebra()
+    limit_blas_threads()
     try:
         import rclpy  # noqa: F401
         import sensor_msgs.msg  # noqa: F401

@@ -17,13 +17,13 @@ from autocalib_ros.config import NodeOptions, Options
 from autocalib_ros.errors import InputError
 from autocalib_ros.lens.camera_info import CameraInfo as CameraInfoFields
 from autocalib_ros.results.calibration import Calibration
-from autocalib_ros.revalidation import CalibrationState, Decision, decided
+from autocalib_ros.revalidation import CalibrationState, Decision, reconcile
 from autocalib_ros.ros import messages
 from autocalib_ros.ros.driver_info import DriverInfo
 from autocalib_ros.ros.headers import DEFAULT_FRAME, Headers
 from autocalib_ros.ros.markers import markers, no_markers
 from autocalib_ros.ros.qos import latched_publisher
-from autocalib_ros.ros.transforms import Transforms
+from autocalib_ros.ros.transforms import GroundTransformPublisher
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Published:
     """The same for people to look at."""
 
 
-class InForce:
+class CalibrationPublisher:
     """Publishes one calibration at a time, latched and image by image; safe in any thread.
 
     `taken(published, save)` is told of each calibration that the traffic of this run vouches for, and whether it is
@@ -60,7 +60,7 @@ class InForce:
         """Of the newest image that was decoded."""
         self._camera_info = latched_publisher(node, CameraInfo, '~/camera_info')
         self._markers = latched_publisher(node, MarkerArray, '~/markers')
-        self._transforms = Transforms(node, tf_parent=options.tf_parent, publish_tf=node_options.publish_tf)
+        self._transforms = GroundTransformPublisher(node, tf_parent=options.tf_parent, publish_tf=node_options.publish_tf)
 
     def change(self, options: Options, node_options: NodeOptions) -> None:
         """Publish by other options from now on."""
@@ -76,29 +76,29 @@ class InForce:
         """Why nothing is on /tf_static, '' where nothing stands in the way."""
         return self._transforms.conflict
 
-    def image_came(self, message: Any, image_frame: str) -> Published | None:
+    def on_image(self, message: Any, image_frame: str) -> Published | None:
         """Give an image its camera_info; return a restored calibration that is withdrawn because it is of other frames.
 
         Of compressed images the first has to be decoded before their size is known.
         """
         with self._lock:
-            foreign = self._take_frame(image_frame) if image_frame != self.image_frame else None
+            foreign = self._on_new_frame(image_frame) if image_frame != self.image_frame else None
             size = (message.width, message.height) if hasattr(message, 'width') else self.image_size
             published = self.published
             if self._per_image and published is not None and size == (published.fields.width, published.fields.height):
                 self._camera_info.publish(self.camera_info(published, message.header.stamp, image_frame))
         return foreign
 
-    def _take_frame(self, image_frame: str) -> Published | None:
+    def _on_new_frame(self, image_frame: str) -> Published | None:
         self.image_frame = image_frame
-        self._transforms.expect(self._headers.ground_frame(image_frame), self._headers.camera_frame(image_frame))
+        self._transforms.announce_frames(self._headers.ground_frame(image_frame), self._headers.camera_frame(image_frame))
         published = self.published
         if self.state is not CalibrationState.RESTORED or published.image_frame == image_frame:
             return None
         self.withdraw()
         return published
 
-    def image_decoded(self, width: int, height: int) -> tuple[CalibrationState, Published] | None:
+    def on_image_size(self, width: int, height: int) -> tuple[CalibrationState, Published] | None:
         """Take the size of an image; return what is withdrawn because its lens was calibrated in other pixels."""
         with self._lock:
             self.image_size = (width, height)
@@ -108,7 +108,7 @@ class InForce:
             self.withdraw()
         return state, published
 
-    def began_anew(self) -> None:
+    def on_evidence_reset(self) -> None:
         """Keep what is in force until a solution of the new evidence is as sure, or contradicts it."""
         with self._lock:
             if self.state is CalibrationState.CALIBRATED:
@@ -118,30 +118,30 @@ class InForce:
         """Let a new solution confirm or replace what is in force; None where images have another size by now."""
         while True:
             before, state = self.published, self.state
-            decision = decided(state, before.result if before else None, result)
-            new = decision.in_force is result
+            decision = reconcile(state, before.result if before else None, result)
+            new = decision.calibration is result
             # this may take a while, and images do not wait for it
-            published = self._made(result, self.image_frame or DEFAULT_FRAME) if new or before is None else before
+            published = self._make_messages(result, self.image_frame or DEFAULT_FRAME) if new or before is None else before
             with self._lock:
                 if self.image_size not in (None, result.evidence.image_size):
                     return None
                 if self.published is before:
-                    self._decide(decision, published, new=new)
+                    self._apply(decision, published, new=new)
                     return decision
 
-    def _decide(self, decision: Decision, published: Published, *, new: bool) -> None:
+    def _apply(self, decision: Decision, published: Published, *, new: bool) -> None:
         confirmed = self.state is not decision.state
         if new:
-            self._put(decision.state, published)
+            self._publish(decision.state, published)
         self.state = decision.state
         if new or confirmed:
             self._taken(published, new)
         if decision.contradicted:
-            self._forget_latched()
+            self._clear_latched()
 
     def restore(self, result: Calibration, image_frame: str) -> None:
         """Publish a calibration of an earlier run; AutocalibError where it is not of these images."""
-        restored = self._made(result, image_frame)
+        restored = self._make_messages(result, image_frame)
         with self._lock:
             if self.state is not CalibrationState.NONE:
                 raise InputError(f'there is a {self.state.value} one already')
@@ -150,7 +150,7 @@ class InForce:
             if self.image_size not in (None, result.evidence.image_size):
                 raise InputError('it is of images of {}x{}, and these have {}x{}'.format(
                     *result.evidence.image_size, *self.image_size))
-            self._put(CalibrationState.RESTORED, restored)
+            self._publish(CalibrationState.RESTORED, restored)
 
     def withdraw(self) -> CalibrationState:
         """Publish nothing any more; return what was in force."""
@@ -159,7 +159,7 @@ class InForce:
             if was is not CalibrationState.NONE:
                 self._markers.publish(no_markers())
             self._withdrawn()
-            self._forget_latched()
+            self._clear_latched()
         return was
 
     def camera_info(self, published: Published, stamp: Time | None = None, image_frame: str = '') -> CameraInfo:
@@ -175,12 +175,12 @@ class InForce:
         except InputError:
             return messages.validated(messages.camera_info_message(fields, stamp, frame))
 
-    def _made(self, result: Calibration, image_frame: str) -> Published:
-        transform = self._transform_of(result, image_frame)
-        shown = no_markers() if transform is None else self._markers_of(result, image_frame)
+    def _make_messages(self, result: Calibration, image_frame: str) -> Published:
+        transform = self._make_transform(result, image_frame)
+        shown = no_markers() if transform is None else self._make_markers(result, image_frame)
         return Published(result, result.camera_info, image_frame, transform, shown)
 
-    def _markers_of(self, result: Calibration, image_frame: str) -> MarkerArray:
+    def _make_markers(self, result: Calibration, image_frame: str) -> MarkerArray:
         """Return the markers of a ground plane; nothing that is only looked at stops a calibration."""
         try:
             return messages.validated(markers(result, self._headers.ground_frame(image_frame)))
@@ -188,7 +188,7 @@ class InForce:
             self._node.get_logger().error(f'no markers: {type(error).__name__}: {error}')
             return no_markers()
 
-    def _transform_of(self, result: Calibration, image_frame: str) -> TransformStamped | None:
+    def _make_transform(self, result: Calibration, image_frame: str) -> TransformStamped | None:
         """Return the message of the ground plane, unless its scale is made up and nobody allowed that."""
         ground = result.ground
         if ground is None or not (ground.metric or self.options.allow_unit_scale):
@@ -197,14 +197,14 @@ class InForce:
             ground, messages.time_message(result.newest_stamp_ns), self._headers.ground_frame(image_frame),
             self._headers.camera_frame(image_frame), self.options.tf_parent)
 
-    def _put(self, state: CalibrationState, published: Published) -> None:
+    def _publish(self, state: CalibrationState, published: Published) -> None:
         self._camera_info.publish(self.camera_info(published))
         if published.transform is not None:
             self._transforms.publish(published.transform)
         self._markers.publish(published.markers)
         self.published, self.state = published, state
 
-    def _forget_latched(self) -> None:
+    def _clear_latched(self) -> None:
         """Let late joiners no longer have what is not in force: a latched message goes with its publisher.
 
         Publishers change in the executor's thread, which may be waiting for their events.

@@ -19,20 +19,20 @@ from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.report.scene import ReportScene, SolutionSnapshot, append_snapshot
 from autocalib_ros.results.calibration import Calibration, Refusal
 from autocalib_ros.ros.solver_process import NICENESS
-from autocalib_ros.util.threads import use_one_thread_for_linear_algebra
+from autocalib_ros.util.threads import limit_blas_threads
 
-END_S = 1.0
+PROCESS_EXIT_S = 1.0
 
 
 @dataclass(frozen=True)
-class Place:
+class ReportPaths:
     """Where a report goes."""
 
     page: Path
     figures: Path
 
 
-class Reports:
+class ReportWriter:
     """Remembers what a report shows of the solutions, and writes one after the other; of those that wait, the newest.
 
     Callable from any thread. `tell(text, good)` hears from a thread what became of each.
@@ -42,8 +42,8 @@ class Reports:
         self._tell = tell
         self._changed = threading.Condition()
         self._moments: tuple[SolutionSnapshot, ...] = ()
-        self._rests: tuple[Calibration, Evidence] | None = None
-        self._next: tuple[Place, ReportScene] | None = None
+        self._accepted: tuple[Calibration, Evidence] | None = None
+        self._next: tuple[ReportPaths, ReportScene] | None = None
         self._thread: threading.Thread | None = None
         self._process: BaseProcess | None = None
         self._closed = False
@@ -53,30 +53,30 @@ class Reports:
         with self._changed:
             self._moments = append_snapshot(self._moments, result)
 
-    def rests_on(self, result: Calibration, evidence: Evidence | None) -> None:
+    def set_evidence(self, result: Calibration, evidence: Evidence | None) -> None:
         """Keep the evidence of the calibration that is in force from now on."""
         with self._changed:
-            self._rests = None if evidence is None else (result, evidence)
+            self._accepted = None if evidence is None else (result, evidence)
 
     def forget(self) -> None:
         """Forget what solutions said, and what they rest on."""
         with self._changed:
-            self._moments, self._rests = (), None
+            self._moments, self._accepted = (), None
 
     def scene(self, result: Calibration, seen: tuple[Evidence | None, np.ndarray | None], options: Options,
               source: str) -> ReportScene:
         """Put together what a report of a calibration shows, with what is `seen` now."""
         evidence, background = seen
         with self._changed:
-            if self._rests is not None and self._rests[0] is result:
-                evidence = self._rests[1]
+            if self._accepted is not None and self._accepted[0] is result:
+                evidence = self._accepted[1]
             moments = self._moments
         if evidence is None or evidence.image_size != result.evidence.image_size:
-            evidence, background = _nothing_seen(result, options), None
+            evidence, background = _empty_evidence(result, options), None
         return ReportScene(result=result, evidence=evidence, background=background, options=options, source=source,
                      moments=moments)
 
-    def write(self, place: Place, scene: ReportScene) -> None:
+    def write(self, place: ReportPaths, scene: ReportScene) -> None:
         """Write a report soon."""
         with self._changed:
             if self._closed:
@@ -96,7 +96,7 @@ class Reports:
         if process is not None:
             process.kill()
         if self._thread is not None:
-            self._thread.join(END_S)
+            self._thread.join(PROCESS_EXIT_S)
 
     def _run(self) -> None:
         while True:
@@ -112,27 +112,27 @@ class Reports:
                                                           name='autocalib report', daemon=True)
                 process.start()
             theirs.close()
-            fault = self._told_by(process, ours)
+            fault = self._wait_for(process, ours)
             if not self._closed:
                 self._tell(f'the report was not written: {fault}' if fault else f'the report is written: {place.page}',
                            not fault)
 
     @staticmethod
-    def _told_by(process: BaseProcess, ours: Connection) -> str:
+    def _wait_for(process: BaseProcess, ours: Connection) -> str:
         """Wait for a process that writes a report; return why that failed, '' where it did not."""
         try:
             fault = ours.recv()
         except (EOFError, OSError):
             fault = 'the process that draws it ended before it was done: is there enough memory?'
         ours.close()
-        process.join(END_S)
+        process.join(PROCESS_EXIT_S)
         return fault
 
 
-def _write(pipe: Connection, place: Place, scene: ReportScene) -> None:
+def _write(pipe: Connection, place: ReportPaths, scene: ReportScene) -> None:
     """Draw and write, behind everything else on the machine, and say what failed."""
     os.nice(NICENESS)
-    use_one_thread_for_linear_algebra()
+    limit_blas_threads()
     try:
         from autocalib_ros.report.page import write_report
 
@@ -142,7 +142,7 @@ def _write(pipe: Connection, place: Place, scene: ReportScene) -> None:
         pipe.send(f'{type(error).__name__}: {error}')
 
 
-def _nothing_seen(result: Calibration, options: Options) -> Evidence:
+def _empty_evidence(result: Calibration, options: Options) -> Evidence:
     """Return evidence without traffic, for a calibration of an earlier run."""
     return EvidenceBuffer(options.buffer).snapshot(
         image_size=result.evidence.image_size, first_stamp_ns=result.newest_stamp_ns,

@@ -23,14 +23,14 @@ from autocalib_ros.results.calibration import Calibration, Refusal
 Result = Calibration | Refusal
 NICENESS = 10
 """A solution has minutes, an image has milliseconds."""
-END_S = 1.0
+PROCESS_EXIT_S = 1.0
 
 
-class SolverEnded(AutocalibError):
+class SolverDied(AutocalibError):
     """The process that solves ended before it gave a result."""
 
 
-class _InChild(Exception):
+class _ChildTraceback(Exception):
     """The traceback of the child, to stand above that of the parent."""
 
 
@@ -47,7 +47,7 @@ class SolverProcess:
         # Not forked: a fork would share the locks of the parent's threads and its middleware.
         context = multiprocessing.get_context('spawn')
         self._pipe, child_pipe = context.Pipe()
-        process = context.Process(target=_serve, args=(child_pipe,), name='autocalib solver', daemon=True)
+        process = context.Process(target=_run_child, args=(child_pipe,), name='autocalib solver', daemon=True)
         process.start()
         child_pipe.close()
         return process
@@ -59,12 +59,12 @@ class SolverProcess:
             self._pipe.send((evidence, options, lens))
             result, error, told = self._pipe.recv()
         except (EOFError, OSError) as lost:
-            process.join(END_S)
+            process.join(PROCESS_EXIT_S)
             self._process = None
-            raise SolverEnded(f'the process that solves ended with status {process.exitcode} before it gave a result; '
+            raise SolverDied(f'the process that solves ended with status {process.exitcode} before it gave a result; '
                               'the next solution starts another: is there enough memory?') from lost
         if error is not None:
-            raise error from _InChild(told)
+            raise error from _ChildTraceback(told)
         return result
 
     def close(self) -> None:
@@ -72,10 +72,10 @@ class SolverProcess:
         process, self._process = self._process, None
         if process is not None:
             process.kill()
-            process.join(END_S)
+            process.join(PROCESS_EXIT_S)
 
 
-def _serve(pipe: Connection) -> None:
+def _run_child(pipe: Connection) -> None:
     """Solve what comes until the parent is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt from the keyboard is the parent's to answer
     os.nice(NICENESS)

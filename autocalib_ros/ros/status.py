@@ -7,20 +7,20 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
 
-from autocalib_ros.calibrator import Progress
+from autocalib_ros.calibrator import CalibrationProgress
 from autocalib_ros.results.calibration import Calibration
 from autocalib_ros.ros.log_text import tilt_deg
-from autocalib_ros.ros.watchdog import Silence
+from autocalib_ros.ros.watchdog import NoImageDiagnosis
 
 OK, WARN, ERROR = 0, 1, 2
 """Levels of diagnostic_msgs/DiagnosticStatus; STALE is the aggregator's to say."""
 RATE_WINDOW_S = 5.0
 """Real seconds over which rates are counted."""
-DROPPED_SHARE = 0.1
+MAX_DROPPED_FRACTION = 0.1
 """Images dropped, as a share of those received, from which the machine is too slow for the camera."""
 
 
-class State(str, Enum):
+class NodeState(str, Enum):
     """What the node is doing."""
 
     WAITING_FOR_IMAGES = 'WAITING_FOR_IMAGES'
@@ -29,7 +29,7 @@ class State(str, Enum):
     CALIBRATED = 'CALIBRATED'
 
 
-LEVELS = {State.WAITING_FOR_IMAGES: WARN, State.COLLECTING: WARN, State.RESTORED: WARN, State.CALIBRATED: OK}
+LEVELS = {NodeState.WAITING_FOR_IMAGES: WARN, NodeState.COLLECTING: WARN, NodeState.RESTORED: WARN, NodeState.CALIBRATED: OK}
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Counts:
     """Lost by the middleware before they came here."""
 
 
-class Recent:
+class RateCounter:
     """Counts of the last `RATE_WINDOW_S`."""
 
     def __init__(self) -> None:
@@ -74,10 +74,10 @@ class Situation:
     """The calibration in force."""
     restored: bool = False
     """It was stored by an earlier run and is not yet confirmed by traffic."""
-    progress: Progress | None = None
+    progress: CalibrationProgress | None = None
     image_age_s: float | None = None
     encoding: str = ''
-    silence: Silence | None = None
+    silence: NoImageDiagnosis | None = None
     unreadable: str = ''
     """Why the newest image could not be used."""
     errors: tuple[str, ...] = ()
@@ -94,11 +94,11 @@ class Status:
     values: tuple[tuple[str, str], ...]
 
 
-def state_of(situation: Situation) -> State:
+def state_of(situation: Situation) -> NodeState:
     """Return what the node is doing."""
     if situation.result is not None:
-        return State.RESTORED if situation.restored else State.CALIBRATED
-    return State.COLLECTING if situation.counts.used else State.WAITING_FOR_IMAGES
+        return NodeState.RESTORED if situation.restored else NodeState.CALIBRATED
+    return NodeState.COLLECTING if situation.counts.used else NodeState.WAITING_FOR_IMAGES
 
 
 def status(situation: Situation) -> Status:
@@ -109,14 +109,14 @@ def status(situation: Situation) -> Status:
     return Status(level, message, tuple(_values(state, situation)))
 
 
-def _headline(state: State, situation: Situation) -> str:
+def _headline(state: NodeState, situation: Situation) -> str:
     result, progress = situation.result, situation.progress
     if result is not None:
-        note = ', not yet verified by traffic' if state is State.RESTORED else ''
+        note = ', not yet verified by traffic' if state is NodeState.RESTORED else ''
         return f'{state.value}: grade {result.grade}, focal length {result.camera.focal_px:.1f} px{note}'
-    if state is State.COLLECTING and progress is not None:
+    if state is NodeState.COLLECTING and progress is not None:
         return f'{state.value}: {progress}'
-    return f'{state.value}: {situation.topic}' if state is State.WAITING_FOR_IMAGES else state.value
+    return f'{state.value}: {situation.topic}' if state is NodeState.WAITING_FOR_IMAGES else state.value
 
 
 def _problems(situation: Situation) -> Iterator[tuple[int, str]]:
@@ -127,14 +127,14 @@ def _problems(situation: Situation) -> Iterator[tuple[int, str]]:
         yield ERROR if situation.silence.lasting else WARN, situation.silence.words
     yield from ((WARN, words) for words in situation.warnings)
     rates = situation.rates_hz
-    if rates is not None and rates.dropped > DROPPED_SHARE * rates.received:
+    if rates is not None and rates.dropped > MAX_DROPPED_FRACTION * rates.received:
         yield WARN, (f'{rates.dropped:.1f} of {rates.received:.1f} images a second are dropped: lower the rate or size '
                      'of the images, max_image_width or tracking.max_points')
     if rates is not None and rates.received > 0 and rates.late >= rates.received:
         yield WARN, 'no image is newer than those before: the time stamps of the images do not advance'
 
 
-def _values(state: State, situation: Situation) -> Iterator[tuple[str, str]]:
+def _values(state: NodeState, situation: Situation) -> Iterator[tuple[str, str]]:
     counts, rates, progress = situation.counts, situation.rates_hz, situation.progress
     yield 'state', state.value
     yield 'evidence_percent', '0' if progress is None else f'{progress.percent:.0f}'

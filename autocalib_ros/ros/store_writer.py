@@ -9,14 +9,14 @@ from concurrent.futures import Future
 from typing import Any
 
 from autocalib_ros.errors import AutocalibError
-from autocalib_ros.results.store import Store, Stored
+from autocalib_ros.results.store import Store, StoredCalibration
 
 SAVE_PERIOD_S = 60.0
 """Real seconds between two files that nobody asked for: solutions may follow each other by seconds, for months, and
 flash memory wears."""
 
 
-class Keeper:
+class StoreWriter:
     """Writes one calibration after the other; of those that wait, the newest. Callable from any thread.
 
     `tell` hears from the thread why an offer could not be written, once until that changes; it is tried again.
@@ -26,7 +26,7 @@ class Keeper:
         self._tell, self._period_s = tell, period_s
         self._changed = threading.Condition()
         self._steps: list[tuple[Callable[[], Any], Future]] = []
-        self._offered: Callable[[], None] | None = None
+        self._pending: Callable[[], None] | None = None
         self._due = time.monotonic()
         self._closed = False
         self.fault = ''
@@ -34,16 +34,16 @@ class Keeper:
         self._thread = threading.Thread(target=self._run, name='keeper', daemon=True)
         self._thread.start()
 
-    def offer(self, store: Store, stored: Stored) -> None:
+    def offer(self, store: Store, stored: StoredCalibration) -> None:
         """Write soon: at once when nothing was written for `period_s`; a newer offer takes this one's place."""
         with self._changed:
-            self._offered = lambda: store.save(stored)
+            self._pending = lambda: store.save(stored)
             self._changed.notify_all()
 
     def withdraw(self) -> None:
         """Leave out what was offered and has not been written yet."""
         with self._changed:
-            self._offered = None
+            self._pending = None
 
     def run(self, step: Callable[[], Any]) -> Future:
         """Run a step at once; the future holds what it returns, or the AutocalibError that it raised."""
@@ -67,39 +67,39 @@ class Keeper:
     def _run(self) -> None:
         while True:
             with self._changed:
-                while not (self._closed or self._steps or self._until_due() == 0.0):
-                    self._changed.wait(self._until_due())
+                while not (self._closed or self._steps or self._seconds_until_due() == 0.0):
+                    self._changed.wait(self._seconds_until_due())
                 steps, self._steps = self._steps, []
-                offered = self._take_offered()
+                pending = self._take_pending()
                 ends = self._closed
             for step, future in steps:
                 future.set_result(self._guarded(step))
-            if offered is not None:
-                self._write(offered)
+            if pending is not None:
+                self._write(pending)
             if ends:
                 return
 
-    def _write(self, offered: Callable[[], None]) -> None:
-        result = self._guarded(offered)
+    def _write(self, pending: Callable[[], None]) -> None:
+        result = self._guarded(pending)
         fault = str(result) if isinstance(result, Exception) else ''
         if fault:
             with self._changed:  # a disk may have room again
-                self._offered = self._offered or offered
+                self._pending = self._pending or pending
         if fault and fault != self.fault:
             self._tell(fault)
         self.fault = fault
 
-    def _until_due(self) -> float | None:
+    def _seconds_until_due(self) -> float | None:
         """Return the seconds until the offer is written; None while there is none."""
-        return None if self._offered is None else max(0.0, self._due - time.monotonic())
+        return None if self._pending is None else max(0.0, self._due - time.monotonic())
 
-    def _take_offered(self) -> Callable[[], None] | None:
+    def _take_pending(self) -> Callable[[], None] | None:
         """Return the offer when its time has come, or no other will."""
-        if self._offered is None or not (self._closed or self._until_due() == 0.0):
+        if self._pending is None or not (self._closed or self._seconds_until_due() == 0.0):
             return None
-        offered, self._offered = self._offered, None
+        pending, self._pending = self._pending, None
         self._due = time.monotonic() + self._period_s
-        return offered
+        return pending
 
     @staticmethod
     def _guarded(step: Callable[[], Any]) -> Any:

@@ -26,52 +26,52 @@ try:
 except ImportError:
     TFMessage = None
 
-SETTLE_S = 2.0
+LISTEN_S = 2.0
 """Real seconds of listening before the first broadcast: a transform that tf2 has taken in cannot be taken back."""
-MESSAGES = 100
+TF_QUEUE = 100
 """Messages of /tf and /tf_static that may wait: each static publisher latches one."""
-STATIC = QoSProfile(depth=MESSAGES, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-MOVING = QoSProfile(depth=MESSAGES, reliability=ReliabilityPolicy.BEST_EFFORT)
+TF_STATIC_QOS = QoSProfile(depth=TF_QUEUE, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+TF_QOS = QoSProfile(depth=TF_QUEUE, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Best effort connects to every publisher of /tf, and what is lost there comes again."""
-NO_TF2 = ('tf2_msgs is not there: the ground transform is published on {} but not on /tf_static '
+TF2_MISSING = ('tf2_msgs is not there: the ground transform is published on {} but not on /tf_static '
           '(apt install ros-jazzy-tf2-msgs, or see the README for ROS from pip; publish_tf:=false hides this line)')
 
 
-class Transforms:
+class GroundTransformPublisher:
     """Publishes `~/ground_transform`, and the same on /tf_static where that leaves tf a tree; safe in any thread."""
 
     def __init__(self, node: Node, *, tf_parent: str, publish_tf: bool) -> None:
         self._node, self._tf_parent = node, tf_parent
         self._ground_transform = latched_publisher(node, TransformStamped, '~/ground_transform')
         self._lock = threading.Lock()
-        self._broadcasts = publish_tf and TFMessage is not None
-        self._settled = self._on_air = False
+        self._may_broadcast = publish_tf and TFMessage is not None
+        self._listened = self._broadcasting = False
         self._edge: tuple[str, str] | None = None
         self._latest: TransformStamped | None = None
         self._ours: set[tuple[str, str]] = set()
         self._foreign: set[tuple[str, str]] = set()
         self.conflict = ''
         """Why nothing is broadcast, '' where nothing stands in the way."""
-        if self._broadcasts:
+        if self._may_broadcast:
             self._tf_static = node.create_publisher(TFMessage, '/tf_static', LATCHED)
-            node.create_subscription(TFMessage, '/tf_static', self._on_tf, STATIC)
-            node.create_subscription(TFMessage, '/tf', self._on_moving_tf, MOVING, raw=True)
-            self._timer = node.create_timer(SETTLE_S, self._settle, clock=Clock(clock_type=ClockType.STEADY_TIME))
+            node.create_subscription(TFMessage, '/tf_static', self._on_tf, TF_STATIC_QOS)
+            node.create_subscription(TFMessage, '/tf', self._on_moving_tf, TF_QOS, raw=True)
+            self._timer = node.create_timer(LISTEN_S, self._end_listening, clock=Clock(clock_type=ClockType.STEADY_TIME))
         elif publish_tf:
-            node.get_logger().warning(NO_TF2.format(self._ground_transform.topic_name))
+            node.get_logger().warning(TF2_MISSING.format(self._ground_transform.topic_name))
 
-    def expect(self, ground_frame: str, camera_frame: str) -> None:
+    def announce_frames(self, ground_frame: str, camera_frame: str) -> None:
         """Name the frames of a transform that is to come, so that a conflict is told now and not after an hour."""
         with self._lock:
             below = self._tf_parent == 'ground'
-            self._join(*((ground_frame, camera_frame) if below else (camera_frame, ground_frame)))
+            self._set_edge(*((ground_frame, camera_frame) if below else (camera_frame, ground_frame)))
 
     def publish(self, message: TransformStamped) -> None:
         """Publish the transform between camera and ground in place of the one before."""
         with self._lock:
             self._ground_transform.publish(validated(message))
             self._latest = message
-            self._join(message.header.frame_id, message.child_frame_id)
+            self._set_edge(message.header.frame_id, message.child_frame_id)
             self._broadcast()
 
     def forget(self) -> None:
@@ -85,10 +85,10 @@ class Transforms:
             self._node.destroy_publisher(self._ground_transform)
             self._ground_transform = latched_publisher(self._node, TransformStamped, '~/ground_transform')
 
-    def _settle(self) -> None:
+    def _end_listening(self) -> None:
         self._timer.cancel()
         with self._lock:
-            self._settled = True
+            self._listened = True
             self._broadcast()
 
     def _on_moving_tf(self, serialized: bytes) -> None:
@@ -105,16 +105,16 @@ class Transforms:
             new = edges - self._ours - self._foreign
             if new:
                 self._foreign |= new
-                self._look()
+                self._check_conflict()
 
-    def _join(self, parent: str, child: str) -> None:
+    def _set_edge(self, parent: str, child: str) -> None:
         if self._edge != (parent, child):
             self._edge = parent, child
-            self._look()
+            self._check_conflict()
 
-    def _look(self) -> None:
+    def _check_conflict(self) -> None:
         """Look for a conflict; once there is one, take back what can be."""
-        if not self._broadcasts or self._edge is None:
+        if not self._may_broadcast or self._edge is None:
             return
         before, self.conflict = self.conflict, conflict(*self._edge, self._foreign, tf_parent=self._tf_parent)
         if self.conflict and self.conflict != before:
@@ -123,15 +123,15 @@ class Transforms:
             self._clear()
 
     def _broadcast(self) -> None:
-        if self._broadcasts and self._settled and self._latest is not None and not self.conflict:
+        if self._may_broadcast and self._listened and self._latest is not None and not self.conflict:
             self._ours.add(self._edge)
             self._tf_static.publish(validated(TFMessage(transforms=[self._latest])))
-            self._on_air = True
+            self._broadcasting = True
 
     def _clear(self) -> None:
-        if self._on_air:
+        if self._broadcasting:
             self._tf_static.publish(validated(TFMessage()))
-            self._on_air = False
+            self._broadcasting = False
 
 
 def conflict(parent: str, child: str, foreign: Set[tuple[str, str]], *, tf_parent: str) -> str:

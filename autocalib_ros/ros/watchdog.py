@@ -11,7 +11,7 @@ SUFFIX = '/compressed'
 
 
 @dataclass(frozen=True)
-class Offer:
+class PublisherOffer:
     """What one publisher offers: the name of its node, the type of its messages, reliable or best effort."""
 
     node: str
@@ -20,50 +20,50 @@ class Offer:
 
 
 @dataclass(frozen=True)
-class Silence:
+class NoImageDiagnosis:
     """Why no image arrives; `lasting` when waiting alone does not mend it."""
 
     words: str
     lasting: bool
 
 
-def why_silent(topic: str, type_name: str, offers: Sequence[Offer], *, asks_reliable: bool,
-               beside: Sequence[Offer] = ()) -> Silence:
+def diagnose(topic: str, type_name: str, offers: Sequence[PublisherOffer], *, asks_reliable: bool,
+               other_offers: Sequence[PublisherOffer] = ()) -> NoImageDiagnosis:
     """Say why no image arrives on `topic`, whose messages should be `type_name`.
 
-    `beside` is what is offered on the topic of the other transport, see `topic_beside`.
+    `other_offers` is what is offered on the topic of the other transport, see `other_transport_topic`.
     """
     if not offers:
-        return _nobody(topic, type_name, beside)
-    fitting = [offer for offer in offers if offer.type_name == type_name]
-    if not fitting:
-        return _other_type(topic, type_name, offers)
-    if asks_reliable and not any(offer.reliable for offer in fitting):
-        return Silence(f'{_names(fitting)} publishes {topic} as best effort, and this node asks for reliable '
+        return _no_publisher(topic, type_name, other_offers)
+    matching = [offer for offer in offers if offer.type_name == type_name]
+    if not matching:
+        return _wrong_type(topic, type_name, offers)
+    if asks_reliable and not any(offer.reliable for offer in matching):
+        return NoImageDiagnosis(f'{_names(matching)} publishes {topic} as best effort, and this node asks for reliable '
                        '(incompatible QoS): set image_reliability:=auto', True)
-    lossy = '' if any(offer.reliable for offer in fitting) else '; best effort loses large images, see the README'
-    return Silence(f'{_names(fitting)} publishes {topic}, and nothing arrives: is the camera running?{lossy}', False)
+    lossy = '' if any(offer.reliable for offer in matching) else '; best effort loses large images, see the README'
+    return NoImageDiagnosis(f'{_names(matching)} publishes {topic}, and nothing arrives: is the camera running?{lossy}', False)
 
 
-def topic_beside(topic: str, type_name: str) -> str:
+def other_transport_topic(topic: str, type_name: str) -> str:
     """Return where the same camera publishes by the other transport: beside raw images the compressed ones."""
     return topic.removesuffix(SUFFIX) if type_name == COMPRESSED else topic + SUFFIX
 
 
-def _nobody(topic: str, type_name: str, beside: Sequence[Offer]) -> Silence:
-    other = topic_beside(topic, type_name)
-    sent = {offer.type_name for offer in beside}
+def _no_publisher(topic: str, type_name: str, other_offers: Sequence[PublisherOffer]) -> NoImageDiagnosis:
+    other = other_transport_topic(topic, type_name)
+    sent = {offer.type_name for offer in other_offers}
     if type_name == COMPRESSED and COMPRESSED in sent:
-        return Silence(f"nobody publishes {topic}, but {other} holds compressed images: '{SUFFIX}' is added here, "
+        return NoImageDiagnosis(f"nobody publishes {topic}, but {other} holds compressed images: '{SUFFIX}' is added here, "
                        f'so remap without it, -r image:={other.removesuffix(SUFFIX)}', True)
     transport = {IMAGE: 'compressed', COMPRESSED: 'raw'}[type_name]
     if any(TRANSPORT.get(name) == transport for name in sent):
-        return Silence(f'nobody publishes {topic}, but {_names(beside)} publishes {other}: set '
+        return NoImageDiagnosis(f'nobody publishes {topic}, but {_names(other_offers)} publishes {other}: set '
                        f'image_transport:={transport}', True)
-    return Silence(f'nobody publishes {topic}: start the camera, or remap with -r image:=/your/image_topic', False)
+    return NoImageDiagnosis(f'nobody publishes {topic}: start the camera, or remap with -r image:=/your/image_topic', False)
 
 
-def _other_type(topic: str, type_name: str, offers: Sequence[Offer]) -> Silence:
+def _wrong_type(topic: str, type_name: str, offers: Sequence[PublisherOffer]) -> NoImageDiagnosis:
     sent = sorted({offer.type_name for offer in offers})
     what = f'{_names(offers)} publishes {topic} as {", ".join(sent)}, and this node takes {type_name}'
     if type_name == IMAGE and sent == [COMPRESSED]:
@@ -74,8 +74,8 @@ def _other_type(topic: str, type_name: str, offers: Sequence[Offer]) -> Silence:
         advice = f'set image_transport:=raw, and remap -r image:={topic}'
     else:
         advice = 'remap with -r image:=/your/image_topic'
-    return Silence(f'{what}: {advice}', True)
+    return NoImageDiagnosis(f'{what}: {advice}', True)
 
 
-def _names(offers: Sequence[Offer]) -> str:
+def _names(offers: Sequence[PublisherOffer]) -> str:
     return ', '.join(sorted({offer.node for offer in offers}))

@@ -20,7 +20,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from autocalib_ros.calibrator import AutoCalibrator, Intake, Progress
+from autocalib_ros.calibrator import AutoCalibrator, CalibrationProgress, FrameStatus
 from autocalib_ros.config import Options
 from autocalib_ros.errors import AutocalibError
 from autocalib_ros.evidence.snapshot import Evidence
@@ -28,11 +28,11 @@ from autocalib_ros.lens.camera import Camera
 from autocalib_ros.perception.detector.detector import VehicleDetector
 from autocalib_ros.results.calibration import Calibration, Refusal
 
-WAITING_IMAGES = 8
+IMAGE_QUEUE_SIZE = 8
 """Images that may wait for the perception thread: half a second of a hiccup at 15 Hz, 22 MB at 1280x720."""
 REST = 4.0
 """Time without a solution after one, in units of what that took: solutions take a fifth of a core at the most."""
-TRIED_PERCENT = 99.0
+MAX_REFUSED_PERCENT = 99.0
 """The most that is told while the last solution was refused."""
 PROGRESS_PERIOD_S = 1.0
 """Real time between two looks at the progress."""
@@ -59,10 +59,10 @@ class Viewer(Protocol):
 class Listener(Protocol):
     """Who is told what the threads find; called from the threads."""
 
-    def image_taken(self, width: int, height: int) -> None:
+    def image_accepted(self, width: int, height: int) -> None:
         """An image of this size has been decoded."""
 
-    def began_anew(self, why: str) -> None:
+    def on_evidence_reset(self, why: str) -> None:
         """The evidence so far was dropped."""
 
     def image_unreadable(self, error: AutocalibError) -> None:
@@ -94,13 +94,13 @@ class Counters:
 @dataclass
 class _Job:
     evidence: Evidence
-    life: int
+    generation: int
     """Number of resets before the evidence was gathered."""
     waiting: list[Future] = field(default_factory=list)
     """Callers of the service, who get the result of this snapshot or of a newer one that replaced it."""
 
 
-class Pipeline:
+class CalibrationWorker:
     """Owns the calibrator and the two threads; `offer` and `solve_now` may be called from any thread.
 
     `stop_solving` ends a solution that runs, when the pipeline is closed.
@@ -114,24 +114,24 @@ class Pipeline:
         self._decode, self._solve, self._listener, self._viewer = decode, solve, listener, viewer
         self._calibrator = AutoCalibrator(options, detector)
         self._changed = threading.Condition()
-        self._images: deque[tuple[int, Any]] = deque(maxlen=WAITING_IMAGES)
+        self._images: deque[tuple[int, Any]] = deque(maxlen=IMAGE_QUEUE_SIZE)
         self._requests: list[Future] = []
-        self._looks: list[Future] = []
+        self._snapshot_requests: list[Future] = []
         self._job: _Job | None = None
         self._running: _Job | None = None
         self._closed = self._changing = False
-        self._life, self._calibrator_life = 0, 0
-        self._telling = threading.Lock()
-        self._unsolved = 0
-        self._arrived = self._rested = time.monotonic()
-        self._looked = -PROGRESS_PERIOD_S
+        self._generation, self._calibrator_generation = 0, 0
+        self._listener_lock = threading.Lock()
+        self._unsolved_images = 0
+        self._last_arrival = self._rest_until = time.monotonic()
+        self._progress_at = -PROGRESS_PERIOD_S
         self.counters = Counters()
-        self.progress: Progress | None = None
-        self.told_of: Evidence | None = None
+        self.progress: CalibrationProgress | None = None
+        self.reported_evidence: Evidence | None = None
         """What the solution rests on that the listener is told of at the moment."""
         self._refused = ''
         self._threads = [threading.Thread(target=run, name=name, daemon=True)
-                         for run, name in ((self._perceive, 'perception'), (self._estimate, 'solver'))]
+                         for run, name in ((self._run_perception, 'perception'), (self._run_solver, 'solver'))]
         for thread in self._threads:
             thread.start()
 
@@ -139,9 +139,9 @@ class Pipeline:
         """Leave an image for the perception thread; when too many wait, the oldest is dropped."""
         with self._changed:
             self.counters.received += 1
-            self.counters.dropped += len(self._images) == WAITING_IMAGES
+            self.counters.dropped += len(self._images) == IMAGE_QUEUE_SIZE
             self._images.append((stamp_ns, message))
-            self._arrived = time.monotonic()
+            self._last_arrival = time.monotonic()
             self._changed.notify_all()
 
     def solve_now(self) -> Future:
@@ -155,14 +155,14 @@ class Pipeline:
                 self._changed.notify_all()
         return future
 
-    def look(self) -> Future:
+    def request_snapshot(self) -> Future:
         """Ask for what is seen: the future holds the evidence and the road without traffic, None each before that."""
         future: Future = Future()
         with self._changed:
             if self._closed:
                 future.set_result((None, None))
             else:
-                self._looks.append(future)
+                self._snapshot_requests.append(future)
                 self._changed.notify_all()
         return future
 
@@ -172,17 +172,17 @@ class Pipeline:
         Not to be called by the listener. A solution that runs cannot be interrupted; its result is dropped, and
         its callers get None.
         """
-        with self._telling, self._changed:
-            self._life += 1
+        with self._listener_lock, self._changed:
+            self._generation += 1
             self._images.clear()
-            self._unsolved = 0
-            waiting = self._take_waiting()
+            self._unsolved_images = 0
+            waiting = self._drop_waiting()
             self.progress, self._refused = None, ''
             self._changed.notify_all()
-        self._answer(waiting, None)
+        self._resolve(waiting, None)
 
     def change(self, options: Options, idle_solve_s: float) -> None:
-        """Solve by other options from now on, which may differ in what `config.may_change` says."""
+        """Solve by other options from now on, which may differ in what `config.is_reconfigurable` says."""
         with self._changed:
             self._options, self._idle_solve_s, self._changing = options, idle_solve_s, True
             self._changed.notify_all()
@@ -191,18 +191,18 @@ class Pipeline:
         """Stop both threads and say whether they ended in time: not every solver can be interrupted."""
         with self._changed:
             self._closed = True
-            waiting = self._take_waiting()
-            looks, self._looks = self._looks, []
+            waiting = self._drop_waiting()
+            snapshot_requests, self._snapshot_requests = self._snapshot_requests, []
             self._changed.notify_all()
-        self._answer(waiting, None)
-        self._answer(looks, (None, None))
+        self._resolve(waiting, None)
+        self._resolve(snapshot_requests, (None, None))
         self._stop_solving()
         deadline = time.monotonic() + timeout_s
         for thread in self._threads:
             thread.join(max(0.0, deadline - time.monotonic()))
         return not any(thread.is_alive() for thread in self._threads)
 
-    def _take_waiting(self) -> list[Future]:
+    def _drop_waiting(self) -> list[Future]:
         """Drop what waits to be solved, and return who waits for that or for the solution that runs."""
         waiting = self._requests
         for job in (self._job, self._running):
@@ -210,48 +210,48 @@ class Pipeline:
         self._requests, self._job = [], None
         return waiting
 
-    def _perceive(self) -> None:
+    def _run_perception(self) -> None:
         """Run the perception thread: the only one that touches the calibrator."""
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: (self._closed or self._images or self._requests or self._looks
+                self._changed.wait_for(lambda: (self._closed or self._images or self._requests or self._snapshot_requests
                                                 or self._changing), self._until_idle())
                 if self._closed:
                     return
-                life = self._life
+                generation = self._generation
                 changing, self._changing = self._changing, False
-                looks, self._looks = self._looks, []
+                snapshot_requests, self._snapshot_requests = self._snapshot_requests, []
                 image = self._images.popleft() if self._images else None
                 requests: list[Future] = []
                 # a caller means all that has come so far, but does not wait for a queue that never empties
-                if len(self._images) in (0, WAITING_IMAGES - 1):
+                if len(self._images) in (0, IMAGE_QUEUE_SIZE - 1):
                     requests, self._requests = self._requests, []
-            if life != self._calibrator_life:
-                self._calibrator, self._calibrator_life = AutoCalibrator(self._options, self._detector), life
+            if generation != self._calibrator_generation:
+                self._calibrator, self._calibrator_generation = AutoCalibrator(self._options, self._detector), generation
             if changing:
                 self._calibrator.change(self._options)
-                self._unsolved += 1  # so that it takes effect even when no image comes any more
+                self._unsolved_images += 1  # so that it takes effect even when no image comes any more
             if image is not None:
-                self._use(*image)
-            if looks:
-                self._answer(looks, self._guarded(lambda: (self._calibrator.snapshot(), self._calibrator.background()))
+                self._process_image(*image)
+            if snapshot_requests:
+                self._resolve(snapshot_requests, self._guarded(lambda: (self._calibrator.snapshot(), self._calibrator.background()))
                              or (None, None))
             if requests or (image is None and self._until_idle() == 0.0):
                 self._submit(self._guarded(self._calibrator.snapshot), requests)
 
     def _until_idle(self) -> float | None:
         """Return the seconds until what is left counts as all there is; None when nothing is left to solve."""
-        if not self._unsolved:
+        if not self._unsolved_images:
             return None
-        return max(0.0, self._arrived + self._idle_solve_s - time.monotonic())
+        return max(0.0, self._last_arrival + self._idle_solve_s - time.monotonic())
 
-    def _use(self, stamp_ns: int, message: Any) -> None:
+    def _process_image(self, stamp_ns: int, message: Any) -> None:
         """Turn one image into evidence; submit a snapshot when one is due."""
         try:
             image = self._decode(message)
             height, width = image.shape[:2]
-            self._fitting((width, height))  # an image of another shape than the lens's is left out
-            intake = self._calibrator.add_image(stamp_ns, image)
+            self._lens_for((width, height))  # an image of another shape than the lens's is left out
+            frame_status = self._calibrator.add_image(stamp_ns, image)
         except AutocalibError as error:
             self.counters.unreadable += 1
             self._listener.image_unreadable(error)
@@ -259,39 +259,39 @@ class Pipeline:
         except Exception as error:  # an unattended camera must survive one bad frame
             self._listener.failed(error)
             return
-        if intake is Intake.LATE:
+        if frame_status is FrameStatus.LATE:
             self.counters.late += 1
             return
-        if intake in (Intake.STEPPED, Intake.RESIZED):
+        if frame_status in (FrameStatus.TIME_JUMPED, FrameStatus.RESIZED):
             self._refused = ''
-            self._listener.began_anew(intake.value)
+            self._listener.on_evidence_reset(frame_status.value)
         self.counters.used += 1
         with self._changed:
-            self._unsolved += self._life == self._calibrator_life
-        self._listener.image_taken(width, height)
+            self._unsolved_images += self._generation == self._calibrator_generation
+        self._listener.image_accepted(width, height)
         if self._viewer is not None:
             self._guarded(partial(self._viewer.image_used, message, image, self._calibrator.followed))
-        evidence = self._guarded(self._calibrator.take_due)
+        evidence = self._guarded(self._calibrator.snapshot_if_due)
         if evidence is not None:
             self._submit(evidence, [])
-        if time.monotonic() >= self._looked + PROGRESS_PERIOD_S:
-            self._looked = time.monotonic()
-            progress = self._with_refusal(self._guarded(self._calibrator.progress))
+        if time.monotonic() >= self._progress_at + PROGRESS_PERIOD_S:
+            self._progress_at = time.monotonic()
+            progress = self._add_refusal(self._guarded(self._calibrator.progress))
             with self._changed:
-                self.progress = progress if self._life == self._calibrator_life else None
+                self.progress = progress if self._generation == self._calibrator_generation else None
 
     def _submit(self, evidence: Evidence | None, requests: list[Future]) -> None:
         """Leave a snapshot for the solver thread; it takes the place, and the callers, of one still waiting."""
         with self._changed:
-            self._unsolved = 0
-            if evidence is not None and not self._closed and self._life == self._calibrator_life:
+            self._unsolved_images = 0
+            if evidence is not None and not self._closed and self._generation == self._calibrator_generation:
                 waiting = self._job.waiting if self._job else []
-                self._job = _Job(evidence, self._life, [*waiting, *requests])
+                self._job = _Job(evidence, self._generation, [*waiting, *requests])
                 self._changed.notify_all()
                 return
-        self._answer(requests, None)
+        self._resolve(requests, None)
 
-    def _estimate(self) -> None:
+    def _run_solver(self) -> None:
         """Run the solver thread."""
         while True:
             job = self._next_job()
@@ -300,18 +300,18 @@ class Pipeline:
             began = time.monotonic()
             result = self._guarded(partial(self._solved, job.evidence))
             if result is not None:
-                self.told_of = job.evidence
-                result = self._told(result, job)
-                self.told_of = None
-            self._rested = time.monotonic() + REST * (time.monotonic() - began)
-            self._answer(job.waiting, result)
+                self.reported_evidence = job.evidence
+                result = self._notify(result, job)
+                self.reported_evidence = None
+            self._rest_until = time.monotonic() + REST * (time.monotonic() - began)
+            self._resolve(job.waiting, result)
 
     def _next_job(self) -> _Job | None:
         """Wait for a snapshot, and for the end of the rest unless somebody waits for it; None at the end."""
         with self._changed:
             while not self._closed:
                 job = self._job
-                rest_s = 0.0 if job is None or job.waiting else self._rested - time.monotonic()
+                rest_s = 0.0 if job is None or job.waiting else self._rest_until - time.monotonic()
                 if job is not None and rest_s <= 0.0:
                     self._running, self._job = job, None
                     return job
@@ -319,12 +319,12 @@ class Pipeline:
         return None
 
     def _solved(self, evidence: Evidence) -> Result:
-        return self._solve(evidence, self._options, lens=self._fitting(evidence.image_size))
+        return self._solve(evidence, self._options, lens=self._lens_for(evidence.image_size))
 
-    def _told(self, result: Result, job: _Job) -> Result | None:
+    def _notify(self, result: Result, job: _Job) -> Result | None:
         """Tell the listener and the viewer, unless a reset came before."""
-        with self._telling:
-            if job.life != self._life:
+        with self._listener_lock:
+            if job.generation != self._generation:
                 return None
             self._refused = result.message if isinstance(result, Refusal) else ''
             self._guarded(partial(self._listener.solved, result))
@@ -332,18 +332,18 @@ class Pipeline:
                 self._guarded(partial(self._viewer.solution_found, result, job.evidence))
             return result
 
-    def _with_refusal(self, progress: Progress | None) -> Progress | None:
+    def _add_refusal(self, progress: CalibrationProgress | None) -> CalibrationProgress | None:
         """Add why the last solution was refused: evidence may be enough to try and not to succeed."""
         if progress is None or not self._refused:
             return progress
-        return replace(progress, percent=min(progress.percent, TRIED_PERCENT),
+        return replace(progress, percent=min(progress.percent, MAX_REFUSED_PERCENT),
                        missing=tuple(dict.fromkeys((*progress.missing, self._refused))))
 
-    def _fitting(self, image_size: tuple[int, int]) -> Camera | None:
+    def _lens_for(self, image_size: tuple[int, int]) -> Camera | None:
         """Return the known lens for images of that size; UsageError when they have another shape."""
         return None if self._lens is None else self._lens.scaled_to(*image_size)
 
-    def _answer(self, futures: list[Future], result: Any) -> None:
+    def _resolve(self, futures: list[Future], result: Any) -> None:
         """Give callers their result; `close` may have sent them away in the meantime."""
         with self._changed:
             for future in futures:

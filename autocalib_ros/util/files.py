@@ -32,7 +32,7 @@ def write_atomically(path: Path, text: str) -> None:
         raise InputError(f'cannot write {path}: {error.strerror or error}') from error
 
 
-def keep_as(path: Path, kept: Path) -> None:
+def keep_copy(path: Path, kept: Path) -> None:
     """Give the file a second name in one step, in place of what had that name; InputError where that fails.
 
     Replacing one of the two leaves the other as it is.
@@ -52,7 +52,7 @@ def keep_as(path: Path, kept: Path) -> None:
     write_atomically(kept, text)
 
 
-def remove_unfinished(path: Path) -> None:
+def remove_temporaries(path: Path) -> None:
     """Remove what writers of this file left behind that were killed."""
     for left in path.parent.glob(f'{glob.escape(_prefix(path))}*'):
         with contextlib.suppress(OSError):

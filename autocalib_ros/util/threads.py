@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 
 
-def use_one_thread_for_linear_algebra() -> None:
+def limit_blas_threads() -> None:
     """Keep BLAS to one thread, unless the environment says otherwise.
 
     The matrices here are small: threads that wait for each other doubled the processor time of a solution and

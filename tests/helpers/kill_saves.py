@@ -13,7 +13,7 @@ from collections import Counter
 from pathlib import Path
 
 from autocalib_ros.lens.camera_info_yaml import read_camera_info
-from autocalib_ros.results.store import Kind, Store, document
+from autocalib_ros.results.store import Store, StoreState, stored_json
 from stored_results import calibration, stored
 
 LONGEST_LIFE_S = 0.08
@@ -31,15 +31,15 @@ def save_until_killed(store: Store, number: int) -> None:
         store.save(numbered(number))
 
 
-def check(store: Store, last: int) -> tuple[Kind, int]:
+def check(store: Store, last: int) -> tuple[StoreState, int]:
     """Return what is there now, after any driver could read the YAML."""
     read_camera_info(store.path)
-    store.tidy()
+    store.remove_leftovers()
     found = store.load()
     assert found.stored is not None, found
     number = found.stored.calibration.evidence.frames
     assert number >= last, f'{number} after {last}'
-    assert document(found.stored) == document(numbered(number)), 'not what was saved'
+    assert stored_json(found.stored) == stored_json(numbered(number)), 'not what was saved'
     left = [path.name for path in store.path.parent.iterdir() if path.name.startswith('.')]
     assert not left, left
     return found.kind, number
@@ -62,7 +62,7 @@ def main(folder: Path, kills: int, seed: int) -> None:
     # one that is cut off is followed by whole ones again
     store.save(numbered(last + 1))
     kind, last = check(store, last + 1)
-    assert kind is Kind.WHOLE
+    assert kind is StoreState.INTACT
     print(f'{kills} kills, {last} saves: {dict(sorted(kinds.items()))}')
 
 

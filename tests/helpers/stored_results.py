@@ -16,13 +16,13 @@ from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.lens.camera_info import camera_info
 from autocalib_ros.results.calibration import (
-    COVARIANCE_OF,
+    COVARIANCE_PARAMETERS,
     Calibration,
     EvidenceSummary,
     PaperReport,
     StandardDeviations,
 )
-from autocalib_ros.results.store import Stored
+from autocalib_ros.results.store import StoredCalibration
 
 SIZE = (640, 360)
 LOOKS_ALONG = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -46,7 +46,7 @@ def calibration(focal_px: float = 300.0, *, tilt_deg: float = 12.3, roll_deg: fl
         evidence=EvidenceSummary(image_size=SIZE, seconds=61.7, frames=number, tracks=300, segments=4000, vehicles=70,
                                  coverage=0.61),
         newest_stamp_ns=1_700_000_000_123_456_789,
-        covariance=sigmas**2 * np.cov(np.random.default_rng(number).normal(size=(len(COVARIANCE_OF), 40))))
+        covariance=sigmas**2 * np.cov(np.random.default_rng(number).normal(size=(len(COVARIANCE_PARAMETERS), 40))))
 
 
 def lens_only(result: Calibration) -> Calibration:
@@ -54,8 +54,8 @@ def lens_only(result: Calibration) -> Calibration:
         result.stddev, tilt_deg=None, roll_deg=None, height_m=None, ground_point_m=()))
 
 
-def stored(result: Calibration) -> Stored:
-    return Stored(result, camera_info(result.camera), 'north', 'cam_optical')
+def stored(result: Calibration) -> StoredCalibration:
+    return StoredCalibration(result, camera_info(result.camera), 'north', 'cam_optical')
 
 
 @contextmanager

@@ -19,11 +19,11 @@ from autocalib_ros.lens.camera_info import (
     ModelMisfit,
     Readout,
     camera_info,
-    in_full_resolution,
     rectified_matrix,
+    to_full_resolution,
 )
 from autocalib_ros.lens.camera_info_yaml import read_camera_info, write_camera_info_yaml
-from autocalib_ros.lens.opencv_lens import MAX_ERROR_PX, nearest_coefficients, seen_angle_rad
+from autocalib_ros.lens.opencv_lens import MAX_MODEL_ERROR_PX, fit_opencv_coefficients, max_visible_angle_rad
 
 WIDTH, HEIGHT = 1280, 720
 EQUIDISTANT, BARREL, NARROWING, TANGENT = (
@@ -77,20 +77,20 @@ def test_the_error_that_is_told_is_that_of_opencv_over_the_whole_image(model, fi
     # neither the grid nor the fit looks exactly where the error is largest, but both look near to it
     assert worst <= 1.001 * info.error_px + EXACT_PX
     assert worst >= 0.8 * info.error_px - EXACT_PX
-    assert info.error_px <= MAX_ERROR_PX
+    assert info.error_px <= MAX_MODEL_ERROR_PX
 
 
 @pytest.mark.parametrize('k', LENSES)
 @pytest.mark.parametrize('field_deg', [60, 90, 130])
 def test_no_plumb_bob_comes_nearer_than_the_fitted_one(field_deg, k):
     camera = lens(field_deg, k)
-    theta = np.linspace(0, seen_angle_rad(camera), 801)[1:]
+    theta = np.linspace(0, max_visible_angle_rad(camera), 801)[1:]
     slope, radius = np.tan(theta), camera.radius(theta)
     powers = camera.focal_px * slope[:, None] * (slope[:, None] / slope[-1]) ** [2, 4, 6]
     rest, one = radius - camera.focal_px * slope, np.ones((800, 1))
     least = linprog([0, 0, 0, 1], np.block([[powers, -one], [-powers, -one]]), np.concatenate([rest, -rest]),
                     bounds=[(None, None)] * 3 + [(0, None)], method='highs')
-    error_px = nearest_coefficients(camera, rational=False)[1]
+    error_px = fit_opencv_coefficients(camera, rational=False)[1]
     assert error_px <= 1.1 * least.fun + 1e-4
 
 
@@ -98,7 +98,7 @@ def test_no_plumb_bob_comes_nearer_than_the_fitted_one(field_deg, k):
 def test_a_wide_lens_is_refused_in_plumb_bob_with_the_way_out(field_deg):
     with pytest.raises(ModelMisfit) as raised:
         camera_info(lens(field_deg), 'plumb_bob')
-    error_px = nearest_coefficients(lens(field_deg), rational=False)[1]
+    error_px = fit_opencv_coefficients(lens(field_deg), rational=False)[1]
     assert f'up to {error_px:.3g} px' in raised.value.message
     assert f'sees {field_deg / 2:.0f} degrees from its axis; 0.5 px is the most' in raised.value.message
     assert 'Set distortion_model to rational_polynomial, which is off by' in raised.value.remedy
@@ -118,7 +118,7 @@ def test_a_lens_that_sees_half_the_world_is_equidistant_or_nothing(model, field_
 def test_a_disc_in_the_image_is_fitted_up_to_its_edge():
     # r(theta) falls from 62 degrees on, which is 235 px from the centre: the corners show nothing
     camera = Camera(WIDTH, HEIGHT, 300.0, (639.5, 359.5), (-0.25, -0.01, 0.0, 0.0))
-    assert np.degrees(camera.max_angle_rad) == pytest.approx(np.degrees(seen_angle_rad(camera)))
+    assert np.degrees(camera.max_angle_rad) == pytest.approx(np.degrees(max_visible_angle_rad(camera)))
     info = camera_info(camera, 'rational_polynomial')
     assert worst_px(info, camera) <= info.error_px + EXACT_PX
 
@@ -137,7 +137,7 @@ def test_what_is_written_in_another_model_is_read_as_the_lens(tmp_path: Path, mo
     assert f'distortion_model: {model}\n' in (tmp_path / 'c.yaml').read_text()
     again = read_camera_info(tmp_path / 'c.yaml')
     pixels, bearings = seen(camera)
-    assert np.hypot(*(again.project(bearings)[0] - pixels).T).max() < MAX_ERROR_PX
+    assert np.hypot(*(again.project(bearings)[0] - pixels).T).max() < MAX_MODEL_ERROR_PX
 
 
 @settings(deadline=None)
@@ -192,7 +192,7 @@ def test_what_the_lens_does_not_see_is_not_mirrored_into_the_rectified_image(mod
     truth, found = camera.project(rays)[0], by_opencv(camera_info(camera, model), rays)
     def inside(pixels: np.ndarray) -> np.ndarray:
         return ((pixels >= 0) & (pixels <= (WIDTH - 1, HEIGHT - 1))).all(axis=1)
-    assert np.hypot(*(found - truth)[inside(found)].T).max() <= MAX_ERROR_PX
+    assert np.hypot(*(found - truth)[inside(found)].T).max() <= MAX_MODEL_ERROR_PX
 
 
 def as_image_geometry(matrix: list[float], columns: int, readout: Readout) -> np.ndarray:
@@ -210,7 +210,7 @@ def as_image_geometry(matrix: list[float], columns: int, readout: Readout) -> np
 def test_a_message_in_full_resolution_is_the_calibration_in_the_image(readout):
     camera = lens(110, BARREL, (12.0, -7.0))
     info = camera_info(camera, 'rational_polynomial')
-    full = in_full_resolution(info, readout)
+    full = to_full_resolution(info, readout)
     assert (full.width, full.height) == (readout.width, readout.height)
     assert (full.d, full.r, full.distortion_model) == (info.d, info.r, info.distortion_model)
     np.testing.assert_allclose(as_image_geometry(full.k, 3, readout), np.reshape(info.k, (3, 3)), rtol=1e-14)
@@ -225,9 +225,9 @@ def test_a_message_in_full_resolution_is_the_calibration_in_the_image(readout):
     (Readout(0, 0, (1, 1), (0, 0), (1280, 720)), 'reaches beyond its 0x0 pixels')])
 def test_a_readout_of_other_images_is_told(readout, told):
     with pytest.raises(InputError, match=told):
-        in_full_resolution(camera_info(lens(100)), readout)
+        to_full_resolution(camera_info(lens(100)), readout)
 
 
 def test_without_binning_nothing_changes():
     info = camera_info(replace(lens(100), width=640, height=360))
-    assert in_full_resolution(info, Readout(640, 360)) == info
+    assert to_full_resolution(info, Readout(640, 360)) == info

@@ -131,7 +131,7 @@ def test_a_new_case_has_moved() -> None:
 def test_a_full_result_is_told_with_lens_pose_and_sigmas() -> None:
     outcome = told(FULL)
     assert (outcome.words['state'], outcome.words['grade'], outcome.words['refusal']) == ('calibrated', 'full', None)
-    assert list(outcome.numbers) == list(golden.COVARIANCE_OF)
+    assert list(outcome.numbers) == list(golden.COVARIANCE_PARAMETERS)
     assert outcome.numbers['focal_px'] == FULL.camera.focal_px
     assert outcome.stddev['focal_px'] == FULL.stddev.focal_px
 

@@ -20,7 +20,7 @@ from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.benchmark.monte_carlo import (
     Run,
     Task,
-    compared,
+    compare_calibrations,
     csv_rows,
     distance_error,
     evidence_of,
@@ -77,7 +77,7 @@ def cells(text: str, block: str, name: str) -> list[str]:
 
 def test_the_truth_has_no_error() -> None:
     stddev = StandardDeviations(focal_px=5.6, tilt_deg=0.2, roll_deg=0.3)
-    found = compared(TASK, 'joint', calibration(JUNCTION.camera, plane(heading_deg=10.0), stddev), JUNCTION, 1.5)
+    found = compare_calibrations(TASK, 'joint', calibration(JUNCTION.camera, plane(heading_deg=10.0), stddev), JUNCTION, 1.5)
     errors = (found.focal_error, found.rays_deg, found.normal_deg, found.tilt_error_deg, found.roll_error_deg,
               found.distance_error)
     np.testing.assert_allclose(errors, 0.0, atol=1e-6)  # the heading of the ground frame is free
@@ -88,7 +88,7 @@ def test_the_truth_has_no_error() -> None:
 def test_known_faults_are_measured_in_their_units() -> None:
     camera = replace(JUNCTION.camera, focal_px=1.02 * JUNCTION.camera.focal_px)
     result = calibration(camera, plane(tilt_deg=33.0, roll_deg=0.5), StandardDeviations())
-    found = compared(TASK, 'joint', result, JUNCTION, 1.0)
+    found = compare_calibrations(TASK, 'joint', result, JUNCTION, 1.0)
     assert found.focal_error == pytest.approx(0.02)
     assert found.tilt_error_deg == pytest.approx(1.0)
     assert found.roll_error_deg == pytest.approx(0.5)  # the pose's roll turns the image, this one the camera
@@ -97,13 +97,13 @@ def test_known_faults_are_measured_in_their_units() -> None:
 
 
 def test_a_lens_alone_has_no_error_of_the_plane() -> None:
-    found = compared(TASK, 'joint', calibration(JUNCTION.camera, None, StandardDeviations()), JUNCTION, 1.0)
+    found = compare_calibrations(TASK, 'joint', calibration(JUNCTION.camera, None, StandardDeviations()), JUNCTION, 1.0)
     assert found.accepted and np.isnan([found.normal_deg, found.tilt_error_deg, found.distance_error]).all()
 
 
 def test_a_refusal_keeps_its_code() -> None:
-    refusal = Refusal.because(Reason('no_motion', '', ''), 'joint', SUMMARY, Figures())
-    found = compared(TASK, 'joint', refusal, JUNCTION, 2.0)
+    refusal = Refusal.from_reason(Reason('no_motion', '', ''), 'joint', SUMMARY, Figures())
+    found = compare_calibrations(TASK, 'joint', refusal, JUNCTION, 2.0)
     assert (found.accepted, found.code, found.cpu_s) == (False, 'no_motion', 2.0)
 
 

@@ -7,14 +7,14 @@ import pytest
 
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.pictures.road import GroundGrid, enlargement, error_ellipses, view_frustum
-from autocalib_ros.results.calibration import COVARIANCE_OF, GROUND_DISTANCES_M
+from autocalib_ros.results.calibration import COVARIANCE_PARAMETERS, GROUND_DISTANCES_M
 
 HEIGHT_SIGMA_M = 0.1
 
 
 @pytest.fixture
 def with_height_unsure(calibration):
-    covariance = np.zeros((len(COVARIANCE_OF),) * 2)
+    covariance = np.zeros((len(COVARIANCE_PARAMETERS),) * 2)
     covariance[-1, -1] = HEIGHT_SIGMA_M ** 2
     return lambda camera, ground: calibration(camera, ground, covariance=covariance)
 

@@ -10,7 +10,7 @@ import pytest
 
 from autocalib_ros.errors import InputError
 from autocalib_ros.results.calibration import Reason, Refusal
-from autocalib_ros.results.calibration_json import calibration_json, calibration_of, read_json
+from autocalib_ros.results.calibration_json import calibration_from_json, calibration_json, read_json
 from stored_results import calibration, lens_only
 
 WHOLE = calibration()
@@ -31,12 +31,12 @@ def test_whole_case_leaves_no_field_of_a_calibration_untested():
 @pytest.mark.parametrize('name', CASES)
 def test_text_of_a_calibration_that_was_read_is_the_text_that_was_written(name):
     text = calibration_json(CASES[name])
-    assert calibration_json(calibration_of(json.loads(text))) == text
+    assert calibration_json(calibration_from_json(json.loads(text))) == text
 
 
 @pytest.mark.parametrize('name', CASES)
 def test_every_field_survives_to_the_last_bit(name):
-    again = calibration_of(json.loads(calibration_json(CASES[name])))
+    again = calibration_from_json(json.loads(calibration_json(CASES[name])))
     for item in fields(again):
         if item.name not in ('figures', 'ground', 'road_directions', 'covariance'):
             assert getattr(again, item.name) == getattr(CASES[name], item.name), item.name
@@ -70,13 +70,13 @@ POSE = broken()['ground_from_camera']
 ])
 def test_document_that_cannot_be_used_says_why(document, told):
     with pytest.raises(InputError, match=told):
-        calibration_of(document)
+        calibration_from_json(document)
 
 
 def test_refusal_is_no_calibration():
     refusal = Refusal(code='no_motion', message='nothing', remedy='wait', method='joint', evidence=WHOLE.evidence)
     with pytest.raises(InputError, match='holds no calibration'):
-        calibration_of(json.loads(calibration_json(refusal)))
+        calibration_from_json(json.loads(calibration_json(refusal)))
 
 
 @pytest.mark.parametrize(('text', 'told'), [

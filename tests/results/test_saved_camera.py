@@ -14,10 +14,10 @@ from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.lens.camera_info import rectified_matrix
 from autocalib_ros.lens.camera_info_yaml import write_camera_info_yaml
-from autocalib_ros.results.calibration import COVARIANCE_OF
+from autocalib_ros.results.calibration import COVARIANCE_PARAMETERS
 from autocalib_ros.results.calibration_json import calibration_json, write_calibration_json
-from autocalib_ros.results.saved_camera import KnownCamera, read_known_camera
-from autocalib_ros.results.store import document
+from autocalib_ros.results.saved_camera import SavedCamera, read_saved_camera
+from autocalib_ros.results.store import stored_json
 from stored_results import calibration, stored
 
 WHOLE = calibration()
@@ -39,12 +39,12 @@ def ours(request, tmp_path):
     elif request.param == 'camera_info.yaml':
         write_camera_info_yaml(path, WHOLE.camera, 'north')
     else:
-        path.write_text(document(stored(WHOLE)))
+        path.write_text(stored_json(stored(WHOLE)))
     return path
 
 
 def test_our_own_files_give_the_same_lens(ours):
-    known = read_known_camera(ours)
+    known = read_saved_camera(ours)
     bearings, valid = known.unproject(PIXELS)
     expected, _ = WHOLE.camera.unproject(PIXELS)
     assert valid.all()
@@ -60,7 +60,7 @@ def test_our_own_files_give_the_same_lens(ours):
 
 def test_a_checkerboards_file_keeps_what_a_kannala_brandt_lens_has_not(tmp_path):
     (tmp_path / 'c.yaml').write_text(yaml.safe_dump(CHECKERBOARD))
-    known = read_known_camera(tmp_path / 'c.yaml')
+    known = read_saved_camera(tmp_path / 'c.yaml')
     assert known.focal_px == pytest.approx(np.sqrt(400 * 404))
     assert known.k is None  # two focal lengths and tangential distortion
     slopes = np.array([0.3, -0.2])
@@ -73,7 +73,7 @@ def test_a_checkerboards_file_keeps_what_a_kannala_brandt_lens_has_not(tmp_path)
 
 
 def test_scaled_the_same_place_of_the_image_has_the_same_ray(ours):
-    known = read_known_camera(ours)
+    known = read_saved_camera(ours)
     half = known.scaled_to(320, 180)
     assert half.unproject((PIXELS + 0.5) / 2 - 0.5)[0] == pytest.approx(known.unproject(PIXELS)[0], abs=1e-9)
     whole = np.array([0.1, 0.05, 1.0])
@@ -82,12 +82,12 @@ def test_scaled_the_same_place_of_the_image_has_the_same_ray(ours):
     if known.covariance is not None:
         assert half.stddev.focal_px == pytest.approx(known.stddev.focal_px / 2)
         assert np.diag(half.covariance)[[0, 3, 9]] == pytest.approx(np.diag(known.covariance)[[0, 3, 9]] / [4, 1, 1])
-        assert len(half.covariance) == len(COVARIANCE_OF)
+        assert len(half.covariance) == len(COVARIANCE_PARAMETERS)
 
 
 def test_images_of_another_shape_are_wrong_usage(ours):
     with pytest.raises(UsageError, match='640x360, and these images have 640x480, another shape'):
-        read_known_camera(ours).scaled_to(640, 480)
+        read_saved_camera(ours).scaled_to(640, 480)
 
 
 @pytest.mark.parametrize(('name', 'text', 'told'), [
@@ -102,30 +102,30 @@ def test_images_of_another_shape_are_wrong_usage(ours):
 def test_a_wrong_file_is_told_by_name(name, text, told, tmp_path):
     (tmp_path / name).write_text(text)
     with pytest.raises(InputError, match=told) as error:
-        read_known_camera(tmp_path / name)
+        read_saved_camera(tmp_path / name)
     assert name in str(error.value)
 
 
 def test_a_file_that_is_not_there_is_told(tmp_path):
     for name in ('a.json', 'a.yaml'):
         with pytest.raises(InputError, match=f'cannot read .*{name}'):
-            read_known_camera(tmp_path / name)
+            read_saved_camera(tmp_path / name)
 
 
 def test_a_projection_that_images_nothing_is_left_out(tmp_path):
     broken = {**CHECKERBOARD, 'projection_matrix': {'rows': 3, 'cols': 4, 'data': [0.0] * 12}}
     (tmp_path / 'c.yaml').write_text(yaml.safe_dump(broken))
-    assert read_known_camera(tmp_path / 'c.yaml').rectified is None
+    assert read_saved_camera(tmp_path / 'c.yaml').rectified is None
 
 
 def test_a_rectification_turns_the_camera(tmp_path):
     turn = Rotation.from_euler('y', 5, degrees=True).as_matrix()
     turned = {**CHECKERBOARD, 'rectification_matrix': {'rows': 3, 'cols': 3, 'data': turn.ravel().tolist()}}
     (tmp_path / 'left.yaml').write_text(yaml.safe_dump(turned))
-    middle = read_known_camera(tmp_path / 'left.yaml').rectified @ turn.T @ [0, 0, 1]
+    middle = read_saved_camera(tmp_path / 'left.yaml').rectified @ turn.T @ [0, 0, 1]
     assert middle[:2] / middle[2] == pytest.approx([320, 240])
 
 
 def test_of_a_calibration_is_what_it_holds():
     lens = replace(WHOLE, camera=Camera.equidistant(640, 360, 280.0))
-    assert KnownCamera.of(lens).focal_px == pytest.approx(280.0)
+    assert SavedCamera.of(lens).focal_px == pytest.approx(280.0)

@@ -14,7 +14,7 @@ import yaml
 
 from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.lens.camera_info_yaml import camera_info_yaml, read_camera_info
-from autocalib_ros.results.store import Kind, Store, document, path_of
+from autocalib_ros.results.store import Store, StoreState, resolve_url, stored_json
 from stored_results import calibration, lens_only, stored
 
 KILLS = 60
@@ -44,11 +44,11 @@ def test_url_names_a_file_as_camera_info_manager_reads_it(quick_path, url, path)
     marker.touch()
     environment = {'ROS_HOME': '/ros', 'AMENT_PREFIX_PATH': f'/nowhere:{quick_path}'}
     share = quick_path / 'share' / 'some_robot'
-    assert path_of(url, 'cam_1', environment) == Path(path.format(share=share))
+    assert resolve_url(url, 'cam_1', environment) == Path(path.format(share=share))
 
 
 def test_default_folder_is_in_the_home_without_ros_home():
-    assert path_of('', 'cam', {'HOME': '/home/ann'}) == Path('/home/ann/.ros/camera_info/cam.yaml')
+    assert resolve_url('', 'cam', {'HOME': '/home/ann'}) == Path('/home/ann/.ros/camera_info/cam.yaml')
 
 
 @pytest.mark.parametrize(('url', 'told'), [
@@ -58,19 +58,19 @@ def test_default_folder_is_in_the_home_without_ros_home():
 ])
 def test_url_that_names_no_file_is_wrong_usage(url, told):
     with pytest.raises(UsageError, match=told):
-        path_of(url, 'cam', {'HOME': '/home/ann'})
+        resolve_url(url, 'cam', {'HOME': '/home/ann'})
 
 
 def test_nothing_is_found_where_nothing_was_saved(store):
-    assert (store.load().kind, store.load().note) == (Kind.NOTHING, '')
+    assert (store.load().kind, store.load().note) == (StoreState.EMPTY, '')
 
 
 @pytest.mark.parametrize('kept', [FIRST, replace(FIRST, calibration=lens_only(FIRST.calibration))])
 def test_what_was_saved_comes_back_to_the_last_bit(store, kept):
     store.save(kept)
     found = store.load()
-    assert (found.kind, found.note) == (Kind.WHOLE, '')
-    assert document(found.stored) == document(kept)
+    assert (found.kind, found.note) == (StoreState.INTACT, '')
+    assert stored_json(found.stored) == stored_json(kept)
     assert (found.stored.camera_name, found.stored.image_frame) == ('north', 'cam_optical')
 
 
@@ -83,7 +83,7 @@ def test_yaml_is_the_lens_for_camera_info_manager(store):
 def test_version_before_is_kept(store):
     for kept in (FIRST, SECOND, THIRD):
         store.save(kept)
-    for path in (store.path, store.beside):
+    for path in (store.path, store.json_path):
         path.write_bytes(path.with_name(path.name + '.bak').read_bytes())
     assert number_of(store.load()) == 1
 
@@ -94,10 +94,10 @@ def test_pair_that_a_kill_tore_gives_the_calibration_before(store):
     store.save(SECOND)
     store.path.write_bytes(before)
     found = store.load()
-    assert (found.kind, number_of(found)) == (Kind.CUT_OFF, 0)
+    assert (found.kind, number_of(found)) == (StoreState.INTERRUPTED, 0)
     assert 'a write was cut off' in found.note
     store.save(THIRD)
-    assert (store.load().kind, number_of(store.load())) == (Kind.WHOLE, 2)
+    assert (store.load().kind, number_of(store.load())) == (StoreState.INTACT, 2)
 
 
 def test_what_killed_writers_left_is_removed(store):
@@ -106,7 +106,7 @@ def test_what_killed_writers_left_is_removed(store):
     left.write_text('half a li')
     another = store.path.with_name('.another.yaml~abcd1234')
     another.touch()
-    store.tidy()
+    store.remove_leftovers()
     assert not left.exists() and another.exists()
 
 
@@ -126,7 +126,7 @@ def test_broken_yaml_gives_the_pair_before_and_is_told(store, broken):
     store.save(SECOND)
     store.path.write_text(broken)
     found = store.load()
-    assert (found.kind, number_of(found)) == (Kind.BROKEN, 0)
+    assert (found.kind, number_of(found)) == (StoreState.CORRUPT, 0)
     assert str(store.path) in found.note and 'the pair before' in found.note
     store.save(THIRD)
     assert number_of(store.load()) == 2
@@ -136,24 +136,24 @@ def test_broken_yaml_gives_the_pair_before_and_is_told(store, broken):
 def test_broken_json_gives_the_pair_before_and_is_told(store, broken):
     store.save(FIRST)
     store.save(SECOND)
-    store.beside.write_text(broken)
+    store.json_path.write_text(broken)
     found = store.load()
-    assert (found.kind, number_of(found)) == (Kind.BROKEN, 0)
-    assert str(store.beside) in found.note
+    assert (found.kind, number_of(found)) == (StoreState.CORRUPT, 0)
+    assert str(store.json_path) in found.note
 
 
 def test_broken_file_without_a_pair_before_is_told(store):
     store.save(FIRST)
-    store.beside.write_text('{')
+    store.json_path.write_text('{')
     assert store.load().stored is None
-    assert str(store.beside) in store.load().note and 'nothing is restored' in store.load().note
+    assert str(store.json_path) in store.load().note and 'nothing is restored' in store.load().note
 
 
 def test_removed_yaml_means_that_nothing_is_kept(store):
     store.save(FIRST)
     store.save(SECOND)
     store.path.unlink()
-    assert (store.load().kind, store.load().stored) == (Kind.NOTHING, None)
+    assert (store.load().kind, store.load().stored) == (StoreState.EMPTY, None)
     assert 'is missing' in store.load().note
 
 
@@ -163,7 +163,7 @@ def test_yaml_that_a_driver_wrote_of_our_numbers_with_fewer_digits_is_ours(store
                      else match[0], store.path.read_text())
     assert rounded != store.path.read_text()
     store.path.write_text(rounded)
-    assert store.load().kind is Kind.WHOLE
+    assert store.load().kind is StoreState.INTACT
 
 
 @pytest.mark.parametrize('ours_before', [False, True])
@@ -174,7 +174,7 @@ def test_yaml_of_another_hand_is_not_taken_for_ours_and_left_alone(store, ours_b
         store.save(SECOND)
     store.path.write_text(CHECKERBOARD)
     found = store.load()
-    assert (found.kind, found.stored) == (Kind.FOREIGN, None)
+    assert (found.kind, found.stored) == (StoreState.FOREIGN, None)
     assert 'was not written by this node, or changed since' in found.note
     with pytest.raises(InputError, match='left alone: call ~/save'):
         store.save(THIRD)
@@ -203,7 +203,7 @@ def test_second_yaml_of_another_hand_is_not_lost(store):
 def test_folder_that_cannot_be_made_is_told(quick_path):
     (quick_path / 'file').touch()
     blocked = Store(quick_path / 'file' / 'north.yaml')
-    assert blocked.load().kind is Kind.NOTHING
+    assert blocked.load().kind is StoreState.EMPTY
     with pytest.raises(InputError, match=f'cannot write {quick_path}/file/north.autocalib.json'):
         blocked.save(FIRST)
 
@@ -219,5 +219,5 @@ def test_full_disk_leaves_what_was_there(store, monkeypatch):
     with pytest.raises(InputError, match='No space left on device'):
         store.save(THIRD)
     monkeypatch.undo()
-    assert (store.load().kind, number_of(store.load())) == (Kind.WHOLE, 1)
+    assert (store.load().kind, number_of(store.load())) == (StoreState.INTACT, 1)
     assert len(list(store.path.parent.iterdir())) == 4

@@ -151,14 +151,14 @@ def quantiles(values: list[float]) -> dict:
 
 def run_node(options: argparse.Namespace) -> dict:
     """Run a node with clocks in it until it is interrupted."""
-    from autocalib_ros.util.threads import use_one_thread_for_linear_algebra
-    use_one_thread_for_linear_algebra()
+    from autocalib_ros.util.threads import limit_blas_threads
+    limit_blas_threads()
     from autocalib_ros.ros import autocalib_node, diagnostics, image_input, node
     from autocalib_ros.ros import solver_process as solver
     from autocalib_ros.ros import worker as pipeline
     timed, latencies_ms, solved_s, ends = Timed(), [], [], []
     if options.depth:
-        image_input.DEPTH = options.depth
+        image_input.QUEUE_DEPTH = options.depth
     start: list[tuple[float, float]] = []
     own_take = image_input.ImageInput._take
 
@@ -172,8 +172,8 @@ def run_node(options: argparse.Namespace) -> dict:
     image_input.ImageInput._take = take
     timed.wrap(autocalib_node.AutocalibNode, '_on_image')
     timed.wrap(diagnostics.Diagnostics, '_publish')
-    timed.wrap(image_input.ImageInput, '_watch')
-    timed.wrap(pipeline.Pipeline, '_use')
+    timed.wrap(image_input.ImageInput, '_check_publishers')
+    timed.wrap(pipeline.CalibrationWorker, '_process_image')
     if options.watch:
         from autocalib_ros.pictures import live_overlay as live
         from autocalib_ros.ros.live_pictures import LivePictures
@@ -181,7 +181,7 @@ def run_node(options: argparse.Namespace) -> dict:
                             (live.TopPicture, 'draw'), (live.RectifiedPicture, 'draw')):
             timed.wrap(owner, name)
     if options.bare:
-        pipeline.Pipeline._use = lambda self, stamp_ns, message: None
+        pipeline.CalibrationWorker._process_image = lambda self, stamp_ns, message: None
 
     own_solve = solver.SolverProcess.__call__
 
@@ -202,7 +202,7 @@ def run_node(options: argparse.Namespace) -> dict:
             super().__init__(**more)
             nodes.append(self)
             if options.always_solve:
-                threading.Thread(target=solve_always, args=(self._pipeline,), daemon=True).start()
+                threading.Thread(target=solve_always, args=(self._worker,), daemon=True).start()
 
     def solve_always(running):
         while not running._closed:
@@ -215,12 +215,12 @@ def run_node(options: argparse.Namespace) -> dict:
     given = ['--params-file', str(options.params_file)] if options.params_file else []
     node.main(['autocalib_node', '--ros-args', *given, '-p', 'camera_height:=8.0', '-r', f'__ns:={options.namespace}'])
     (began, cpu_before), (ended, cpu_after) = start[0], ends[0]
-    counters = nodes[0]._pipeline.counters
+    counters = nodes[0]._worker.counters
     child = resource.getrusage(resource.RUSAGE_CHILDREN)
     return {**vars(counters), 'lost_by_dds': nodes[0]._input.lost, 'cores': (cpu_after - cpu_before) / (ended - began),
             'ms_of_processor_for_an_image_used': round(1e3 * (cpu_after - cpu_before) / max(counters.used, 1), 2),
             'cores_solving': (child.ru_utime + child.ru_stime) / (ended - began),
-            'state': 'calibrated' if nodes[0].in_force.published else 'collecting',
+            'state': 'calibrated' if nodes[0].publication.published else 'collecting',
             'solutions_s': quantiles(solved_s or [0.0]), 'latency_ms': quantiles(latencies_ms), 'ms': timed.summary(),
             'memory_mb': resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024}
 

@@ -44,12 +44,12 @@ def driver(bench):
 def test_calibration_is_sent_once(bench, driver, told):
     node, publisher = calibrated(bench, upload_to_driver=True)
     wait_for(lambda: any('took the calibration' in line for line in told), 'the line of the log')
-    fields = camera_info(node.in_force.published.result.camera)
+    fields = camera_info(node.publication.published.result.camera)
     sent, = driver.received
     assert (list(sent.k), list(sent.d), sent.width) == (fields.k, fields.d, fields.width)
-    before = node._pipeline.counters.used
-    publish_until(publisher, lambda: node._pipeline.counters.used > before + 3, 'more images')
-    assert not threading.Event().wait(2 * driver_upload.POLL_S)
+    before = node._worker.counters.used
+    publish_until(publisher, lambda: node._worker.counters.used > before + 3, 'more images')
+    assert not threading.Event().wait(2 * driver_upload.UPLOAD_POLL_S)
     assert len(driver.received) == 1
 
 
@@ -64,7 +64,7 @@ def test_newest_of_several_calibrations_is_sent_after_a_while(bench, driver, tol
 
 def test_nothing_is_sent_unless_asked_for(bench, driver):
     calibrated(bench)
-    assert not threading.Event().wait(2 * driver_upload.POLL_S)
+    assert not threading.Event().wait(2 * driver_upload.UPLOAD_POLL_S)
     assert not driver.received
 
 
@@ -74,9 +74,9 @@ def test_restored_calibration_is_sent_only_when_the_traffic_confirms_it(bench, d
     bench.stop(node)
     node = bench.start(lambda evidence, options, lens: calibration(evidence), camera_name='north',
                        upload_to_driver=True, idle_solve_s=1000.0)
-    assert node.in_force.state is CalibrationState.RESTORED
-    publish_until(publisher, lambda: node._pipeline.counters.used, 'an image')
-    assert not threading.Event().wait(2 * driver_upload.POLL_S)
+    assert node.publication.state is CalibrationState.RESTORED
+    publish_until(publisher, lambda: node._worker.counters.used, 'an image')
+    assert not threading.Event().wait(2 * driver_upload.UPLOAD_POLL_S)
     assert not driver.received
     assert bench.calibrate().success
     wait_for(lambda: driver.received, 'the call')
@@ -96,7 +96,7 @@ def test_missing_driver_is_told_and_found_when_it_comes(bench, told, request):
 
 
 def test_driver_that_does_not_answer_is_given_up(bench, told, monkeypatch):
-    monkeypatch.setattr(driver_upload, 'TIMEOUT_S', 0.5)
+    monkeypatch.setattr(driver_upload, 'DRIVER_TIMEOUT_S', 0.5)
     monkeypatch.setattr('autocalib_ros.ros.driver_upload.DriverUpload._answered', lambda self, call: None)
     silent = bench.client.create_service(SetCameraInfo, '/set_camera_info', lambda request, response: response)
     assert silent

@@ -10,13 +10,13 @@ from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, Image
 
-from autocalib_ros.calibrator import AutoCalibrator, Progress
+from autocalib_ros.calibrator import AutoCalibrator, CalibrationProgress
 from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.offline.synthetic.junction import pose
 from autocalib_ros.pictures import live_overlay as live
 from autocalib_ros.results.calibration import EvidenceSummary, Reason
 from autocalib_ros.revalidation import CalibrationState
-from autocalib_ros.ros.live_pictures import GOOD, WAITING, LivePictures, caption_of, image_message
+from autocalib_ros.ros.live_pictures import VERIFIED_COLOUR, WAITING_COLOUR, LivePictures, caption_of, image_message
 from autocalib_ros.ros.messages import header, stamp_ns, time_message, validated
 from bench import PATIENCE_S, SIZE, calibration, image, refusal, wait_for
 
@@ -46,8 +46,8 @@ class Stream:
 
     def used(self, number: int) -> None:
         """Send so many more images, and wait until they are used."""
-        wanted = self.node._pipeline.counters.used + number
-        self.send_until(lambda: self.node._pipeline.counters.used >= wanted, f'{number} images')
+        wanted = self.node._worker.counters.used + number
+        self.send_until(lambda: self.node._worker.counters.used >= wanted, f'{number} images')
 
     def calibrated(self) -> 'Stream':
         self.used(1)
@@ -118,7 +118,7 @@ def test_drawing_ends_with_the_last_subscriber(bench, drawn):
         found for found in bench.client.subscriptions if found.topic_name.endswith('debug_image'))))
     wait_for(lambda: not stream.node._pictures._debug_image.get_subscription_count(), 'the end of the subscription')
     stream.used(1)
-    wait_for(lambda: stream.node._pictures._shot is None, 'what was still to be drawn')
+    wait_for(lambda: stream.node._pictures._pending is None, 'what was still to be drawn')
     stream.used(1)
     drawn.clear()
     stream.used(10)
@@ -147,7 +147,7 @@ def test_image_rect_goes_with_camera_info(bench):
     pictures = stream.look('image_rect')
     stream.send_until(lambda: {stamp_ns(info.header.stamp) for info in infos}
                       & {stamp_ns(picture.header.stamp) for picture in pictures}, 'a pair')
-    published = stream.node.in_force.published
+    published = stream.node.publication.published
     assert list(infos[-1].p) == published.fields.p
     expected = live.RectifiedPicture(published.result).draw(pixels(image(0))[..., 0])
     np.testing.assert_array_equal(pixels(pictures[-1])[..., 0], expected)
@@ -173,7 +173,7 @@ def test_pictures_come_no_oftener_than_asked(bench):
     stream = Stream(bench, debug_rate_hz=1.0).calibrated()
     received = stream.look('debug_image')
     stream.send_until(lambda: len(received) >= 3, 'three pictures')
-    assert stream.node._pipeline.counters.used > 20  # one image in 0.02 s, one picture in 1 s
+    assert stream.node._worker.counters.used > 20  # one image in 0.02 s, one picture in 1 s
 
 
 def test_the_rate_may_change_while_the_node_runs(bench):
@@ -228,14 +228,14 @@ def test_what_became_of_the_tracks_is_shown_until_the_next_solution_or_a_reset(b
     found = [calibration, refusal, calibration]
     stream = Stream(bench, lambda evidence, options, lens: found.pop(0)(evidence)).calibrated()
     pictures = stream.node._pictures
-    first = pictures._judged
+    first = pictures._labelled_tracks
     assert first is not None
     assert not bench.calibrate().success
-    assert pictures._judged is first
+    assert pictures._labelled_tracks is first
     assert bench.calibrate().success
-    assert pictures._judged is not None and pictures._judged is not first
+    assert pictures._labelled_tracks is not None and pictures._labelled_tracks is not first
     bench.ask('reset')
-    assert pictures._judged is None
+    assert pictures._labelled_tracks is None
 
 
 def test_a_picture_as_a_message_is_the_picture():
@@ -245,7 +245,7 @@ def test_a_picture_as_a_message_is_the_picture():
     np.testing.assert_array_equal(pixels(message), picture[:, ::-1])
 
 
-PROGRESS = Progress(42.0, ('17 of 40 tracks', 'traffic covers 9 % of the image'), 'about 6 min more at this rate')
+PROGRESS = CalibrationProgress(42.0, ('17 of 40 tracks', 'traffic covers 9 % of the image'), 'about 6 min more at this rate')
 
 
 def result(**more):
@@ -258,7 +258,7 @@ def result(**more):
 
 def test_collecting_says_how_far_and_what_is_missing():
     caption = caption_of(CalibrationState.NONE, None, PROGRESS)
-    assert (caption.title, caption.colour) == ('COLLECTING 42 %', WAITING)
+    assert (caption.title, caption.colour) == ('COLLECTING 42 %', WAITING_COLOUR)
     assert caption.text == '17 of 40 tracks; traffic covers 9 % of the image; about 6 min more at this rate'
 
 
@@ -269,13 +269,13 @@ def test_before_the_first_look_at_the_evidence_there_is_no_percentage():
 @pytest.mark.parametrize('state', [CalibrationState.CALIBRATED, CalibrationState.VERIFIED])
 def test_calibrated_gives_grade_and_numbers(state):
     caption = caption_of(state, result(), PROGRESS)
-    assert (caption.title, caption.colour) == ('CALIBRATED, grade full', GOOD)
+    assert (caption.title, caption.colour) == ('CALIBRATED, grade full', VERIFIED_COLOUR)
     assert caption.text == 'focal length 300.00 px (sigma 1), tilt 30.00 deg, height 8 m'
 
 
 def test_restored_is_not_yet_verified_and_says_what_the_traffic_still_lacks():
     caption = caption_of(CalibrationState.RESTORED, result(), PROGRESS)
-    assert caption.title.startswith('RESTORED, not yet verified') and caption.colour == WAITING
+    assert caption.title.startswith('RESTORED, not yet verified') and caption.colour == WAITING_COLOUR
     assert 'focal length 300.00 px' in caption.text and 'COLLECTING 42 %: 17 of 40 tracks' in caption.text
 
 

@@ -10,7 +10,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_evidence
-from autocalib_ros.results.calibration import COVARIANCE_OF
+from autocalib_ros.results.calibration import COVARIANCE_PARAMETERS
 from autocalib_ros.ros.markers import markers, no_markers
 from autocalib_ros.ros.messages import InvalidMessage, validated
 from bench import calibration, image, wait_for
@@ -22,7 +22,7 @@ TOPIC = '/autocalib/markers'
 def result():
     """A calibration that looks down at the road, its height good to 0.9 %."""
     made = calibration(synthetic_evidence(Junction(), np.random.default_rng(0)))
-    covariance = np.zeros((len(COVARIANCE_OF),) * 2)
+    covariance = np.zeros((len(COVARIANCE_PARAMETERS),) * 2)
     covariance[-1, -1] = 0.072 ** 2
     return replace(made, camera=Camera(1280, 720, 560.0, (630.0, 371.0)),
                    ground=GroundPlane(pose(32.0, 1.0, 0.0).T, 8.0), covariance=covariance)
@@ -106,7 +106,7 @@ def start(bench, **more):
         nonlocal number
         number += 1
         publisher.publish(image(1_700_000_000_000_000_000 + number * 100_000_000))
-        return node._pipeline.counters.used
+        return node._worker.counters.used
 
     wait_for(step, 'an image')
     assert bench.calibrate().success
@@ -137,4 +137,4 @@ def test_a_fault_in_the_markers_stops_no_calibration(bench, monkeypatch):
 
     monkeypatch.setattr('autocalib_ros.ros.publication.markers', broken)
     node = start(bench)
-    assert node.in_force.published.markers == no_markers()
+    assert node.publication.published.markers == no_markers()

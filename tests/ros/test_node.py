@@ -12,7 +12,7 @@ from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage
 
-from autocalib_ros.calibrator import in_asked_form
+from autocalib_ros.calibrator import with_requested_model
 from autocalib_ros.errors import UsageError
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.lens.camera_info import camera_info
@@ -53,7 +53,7 @@ def publish_until(publisher, condition, what: str, make=image) -> int:
 
 
 def used(node) -> bool:
-    return node._pipeline.counters.used > 0
+    return node._worker.counters.used > 0
 
 
 def calibrated(bench: Bench, solve=instantly, make=image, publisher=None, **parameters):
@@ -82,8 +82,8 @@ def test_publisher_that_comes_back_with_another_reliability_is_matched(bench):
     publish_until(first, lambda: used(node), 'an image')
     bench.client.destroy_publisher(first)
     second = bench.publisher(reliability=ReliabilityPolicy.BEST_EFFORT)
-    before = node._pipeline.counters.received
-    publish_until(second, lambda: node._pipeline.counters.received > before, 'an image of the second publisher')
+    before = node._worker.counters.received
+    publish_until(second, lambda: node._worker.counters.received > before, 'an image of the second publisher')
 
 
 def test_each_image_gets_camera_info_with_exactly_its_header(bench):
@@ -100,7 +100,7 @@ def test_camera_info_holds_the_lens(bench):
     node, _ = calibrated(bench)
     infos = bench.collect(CameraInfo, INFO, latched=True)
     info = wait_for(lambda: infos, 'camera_info')[0]
-    fields = camera_info(node.in_force.published.result.camera)
+    fields = camera_info(node.publication.published.result.camera)
     assert (info.width, info.height, info.distortion_model) == (*SIZE, 'equidistant')
     assert [list(info.k), list(info.d), list(info.r), list(info.p)] == [fields.k, fields.d, fields.r, fields.p]
 
@@ -119,8 +119,8 @@ def test_camera_info_stays_silent_image_by_image_when_latched_only(bench):
     infos = bench.collect(CameraInfo, INFO)
     node, publisher = calibrated(bench, camera_info_mode='latched_only')
     bench.listening(INFO)
-    before = node._pipeline.counters.received
-    publish_until(publisher, lambda: node._pipeline.counters.received > before + 3, 'four images')
+    before = node._worker.counters.received
+    publish_until(publisher, lambda: node._worker.counters.received > before + 3, 'four images')
     assert bench.calibrate().success
     wait_for(lambda: infos, 'camera_info')
     assert len(infos) <= 2  # one for each solution, the first of which may have come before this subscriber
@@ -154,7 +154,7 @@ def test_images_services_and_parameters_do_not_wait_for_a_solution(bench):
     assert not answer.done()
     release.set()
     wait_for(answer.done, 'the solution')
-    assert node.in_force.published.result.camera.focal_px == 400.0
+    assert node.publication.published.result.camera.focal_px == 400.0
 
 
 def test_a_lens_without_plane_does_not_replace_one_with_its_plane(bench):
@@ -194,7 +194,7 @@ def test_refusal_keeps_the_calibration_before(bench):
     bench.listening(INFO)
     assert not bench.calibrate().success
     publish_until(publisher, lambda: infos, 'camera_info after a refusal')
-    assert node.in_force.published.result.camera.focal_px == 300.0
+    assert node.publication.published.result.camera.focal_px == 300.0
 
 
 def test_new_calibration_replaces_the_latched_one(bench):
@@ -230,15 +230,15 @@ def test_driver_without_stamp_and_frame_is_served(bench):
     publish_until(publisher, lambda: infos and not stamp_ns(infos[-1].header.stamp), 'camera_info of an image',
                   lambda stamp: image(0, frame_id=''))
     assert infos[-1].header.frame_id == 'camera_optical_frame'
-    assert node.in_force.published.result.evidence.frames >= 1
+    assert node.publication.published.result.evidence.frames >= 1
 
 
 def test_image_that_cannot_be_decoded_does_not_stop_the_stream(bench):
     node, publisher = calibrated(bench)
-    publish_until(publisher, lambda: node._pipeline.counters.unreadable > 0, 'an unreadable image',
+    publish_until(publisher, lambda: node._worker.counters.unreadable > 0, 'an unreadable image',
                   lambda stamp: image(stamp, encoding='no_such_encoding'))
-    before = node._pipeline.counters.used
-    publish_until(publisher, lambda: node._pipeline.counters.used > before, 'a readable image')
+    before = node._worker.counters.used
+    publish_until(publisher, lambda: node._worker.counters.used > before, 'a readable image')
 
 
 def test_compressed_images_come_from_the_topic_beside_the_resolved_one(bench):
@@ -257,7 +257,7 @@ def test_calibration_of_another_image_size_is_withdrawn(bench):
     node, publisher = calibrated(bench)
     infos = bench.collect(CameraInfo, INFO)
     bench.listening(INFO)
-    publish_until(publisher, lambda: node.in_force.published is None, 'the withdrawal',
+    publish_until(publisher, lambda: node.publication.published is None, 'the withdrawal',
                   lambda stamp: image(stamp, size=(160, 120)))
     assert not infos
 
@@ -265,14 +265,14 @@ def test_calibration_of_another_image_size_is_withdrawn(bench):
 def test_solution_is_tried_when_the_images_end(bench):
     node = bench.start(instantly, camera_height=8.0, idle_solve_s=0.5)
     publish_until(bench.connected(bench.publisher()), lambda: used(node), 'an image')
-    wait_for(lambda: node.in_force.published, 'a calibration that nobody asked for')
+    wait_for(lambda: node.publication.published, 'a calibration that nobody asked for')
 
 
 def test_known_lens_is_read_and_given_to_the_solver_in_the_size_of_the_images(bench, tmp_path):
     write_camera_info_yaml(tmp_path / 'lens.yaml', Camera.equidistant(2 * SIZE[0], 2 * SIZE[1], 512.0), 'cam')
     node, _ = calibrated(bench, lambda evidence, options, lens: replace(calibration(evidence), camera=lens),
                          camera_info_file=str(tmp_path / 'lens.yaml'))
-    assert node.in_force.published.result.camera == Camera.equidistant(*SIZE, 256.0)
+    assert node.publication.published.result.camera == Camera.equidistant(*SIZE, 256.0)
 
 
 def test_solver_gets_no_lens_unless_one_is_given(bench):
@@ -289,7 +289,7 @@ def test_known_lens_in_a_distortion_model_that_cannot_say_it_is_wrong_usage(benc
 
 def test_answer_of_calibrate_tells_the_error_of_a_fitted_distortion_model(bench):
     def solve(evidence, options, lens):
-        return in_asked_form(calibration(evidence), options)
+        return with_requested_model(calibration(evidence), options)
 
     node = bench.start(solve, camera_height=8.0, idle_solve_s=1000.0, distortion_model='rational_polynomial')
     publish_until(bench.connected(bench.publisher()), lambda: used(node), 'an image')
@@ -303,14 +303,14 @@ def test_answer_of_calibrate_tells_the_error_of_a_fitted_distortion_model(bench)
 
 def test_lens_that_the_asked_model_cannot_say_is_refused_and_nothing_is_published(bench):
     def solve(evidence, options, lens):
-        return in_asked_form(calibration(evidence, 180.0), options)
+        return with_requested_model(calibration(evidence, 180.0), options)
 
     node = bench.start(solve, camera_height=8.0, idle_solve_s=1000.0, distortion_model='plumb_bob')
     publish_until(bench.connected(bench.publisher()), lambda: used(node), 'an image')
     answer = bench.calibrate()
     assert not answer.success
     assert answer.message.startswith('refused (distortion_model): plumb_bob would be off by up to')
-    assert node.in_force.published is None
+    assert node.publication.published is None
 
 
 def test_reliability_of_a_publisher_is_overridden_by_a_parameter(bench):

@@ -11,7 +11,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, RegionOfInterest
 
 from autocalib_ros.results.calibration import StandardDeviations
-from autocalib_ros.ros.driver_info import size_doubt
+from autocalib_ros.ros.driver_info import check_size
 from autocalib_ros.ros.messages import stamp_ns, time_message
 from bench import SIZE, Bench, calibration, image, wait_for
 
@@ -43,7 +43,7 @@ def fed(bench: Bench, count: int = 3, **parameters):
 
     node = bench.start(solve, idle_solve_s=0.3, **parameters)
     publisher = bench.connected(bench.publisher())
-    counters = node._pipeline.counters
+    counters = node._worker.counters
     for number in range(count):
         publisher.publish(image(START_NS + number * FRAME_NS))
         wait_for(lambda wanted=number + 1: counters.used >= wanted, 'an image')
@@ -69,12 +69,12 @@ def test_image_that_cannot_be_decoded_is_an_error_until_one_can(bench, told):
 
 def test_size_that_changes_is_an_error_until_there_is_a_new_calibration(bench, told):
     node, publisher = fed(bench, camera_height=8.0)
-    wait_for(lambda: node.in_force.published, 'the calibration')
-    node._pipeline.change(node.options, 1000.0)  # no solution for now
+    wait_for(lambda: node.publication.published, 'the calibration')
+    node._worker.change(node.options, 1000.0)  # no solution for now
     publisher.publish(image(START_NS + 10 * FRAME_NS, size=(160, 120)))
     wait_for(lambda: 'these have 160x120: it is withdrawn' in message(told), 'the error')
     assert (told[-1].status[0].level, values(told)['state']) == (b'\x02', 'COLLECTING')
-    node._pipeline.change(node.options, 0.1)
+    node._worker.change(node.options, 0.1)
     wait_for(lambda: values(told)['state'] == 'CALIBRATED', 'a calibration of the new size')
     assert told[-1].status[0].level == b'\x00'
 
@@ -97,14 +97,14 @@ def test_newest_message_of_the_driver_is_kept_where_that_is_wanted(bench, wanted
     driver = bench.client.create_publisher(CameraInfo, 'camera_info_in', QoSProfile(depth=1))
     node = bench.start(use_driver_camera_info=wanted)
     if not wanted:
-        assert (node._driver.newest, node._driver.doubt(SIZE), driver.get_subscription_count()) == (None, '', 0)
+        assert (node._driver.newest, node._driver.check(SIZE), driver.get_subscription_count()) == (None, '', 0)
         return
-    assert 'no CameraInfo comes on /camera_info_in' in node._driver.doubt(SIZE)
+    assert 'no CameraInfo comes on /camera_info_in' in node._driver.check(SIZE)
     bench.connected(driver)
     driver.publish(CameraInfo(width=2 * SIZE[0], height=2 * SIZE[1], binning_x=2, binning_y=2))
     wait_for(lambda: node._driver.newest, 'the message')
-    assert (node._driver.newest.binning_x, node._driver.doubt(SIZE)) == (2, '')
-    assert '320x240, and these have 640x480' in node._driver.doubt((640, 480))
+    assert (node._driver.newest.binning_x, node._driver.check(SIZE)) == (2, '')
+    assert '320x240, and these have 640x480' in node._driver.check((640, 480))
 
 
 def test_binning_and_region_of_the_driver_are_published_where_they_are_of_these_images(bench):
@@ -116,7 +116,7 @@ def test_binning_and_region_of_the_driver_are_published_where_they_are_of_these_
     readouts = (CameraInfo(width=1920, height=1080, binning_x=2, binning_y=2, roi=region),
                 CameraInfo(width=700, height=480, roi=RegionOfInterest(x_offset=500, width=SIZE[0], height=SIZE[1])),
                 CameraInfo(width=7, height=7))
-    wait_for(lambda: node.in_force.published, 'the calibration')
+    wait_for(lambda: node.publication.published, 'the calibration')
     for number, told_by_driver in enumerate(readouts, 10):
         driver.publish(told_by_driver)
         wait_for(lambda width=told_by_driver.width: node._driver.newest and node._driver.newest.width == width, 'it')
@@ -143,7 +143,7 @@ def test_binning_and_region_of_the_driver_are_published_where_they_are_of_these_
     (CameraInfo(width=640, height=480, binning_x=2, binning_y=2), False),
 ])
 def test_size_of_the_drivers_message_is_compared_with_the_images(info, fits):
-    assert (size_doubt(info, (640, 480)) == '') is fits
+    assert (check_size(info, (640, 480)) == '') is fits
 
 
 def test_camera_height_that_changes_is_solved_with_at_once(bench):
@@ -165,12 +165,12 @@ def test_pixel_outside_the_images_is_refused_once_their_size_is_known(bench):
 def test_recording_that_loops_begins_the_evidence_anew_and_keeps_the_calibration(bench):
     infos = bench.collect(CameraInfo, INFO)
     node, publisher = fed(bench, count=20, camera_height=8.0)
-    wait_for(lambda: (now := node.in_force.published) and now.result.evidence.frames == 20, 'the calibration')
+    wait_for(lambda: (now := node.publication.published) and now.result.evidence.frames == 20, 'the calibration')
     bench.listening(INFO)
     again = image(START_NS)
     publisher.publish(again)
     wait_for(lambda: infos and infos[-1].header == again.header, 'camera_info of the first image again')
-    wait_for(lambda: node.in_force.published.result.evidence.frames == 1, 'the evidence of the second time')
+    wait_for(lambda: node.publication.published.result.evidence.frames == 1, 'the evidence of the second time')
 
 
 @pytest.mark.parametrize(('focal_px', 'state', 'in_force_px'),
@@ -182,20 +182,20 @@ def test_after_a_loop_a_surer_calibration_stays_unless_the_traffic_contradicts_i
         return replace(calibration(evidence, focal_px), stddev=StandardDeviations(focal_px=9.0))
 
     node = bench.start(solve, idle_solve_s=0.3, camera_height=8.0)
-    publisher, counters = bench.connected(bench.publisher()), node._pipeline.counters
+    publisher, counters = bench.connected(bench.publisher()), node._worker.counters
     for number in range(20):
         publisher.publish(image(START_NS + number * FRAME_NS))
         wait_for(lambda wanted=number + 1: counters.used >= wanted, 'an image')
-    wait_for(lambda: (now := node.in_force.published) and now.result.evidence.frames == 20, 'the calibration')
+    wait_for(lambda: (now := node.publication.published) and now.result.evidence.frames == 20, 'the calibration')
     publisher.publish(image(START_NS))
-    wait_for(lambda: counters.used == 21 and node.in_force.state.name == state, 'the first after the loop')
-    wait_for(lambda: node.in_force.published.result.camera.focal_px == in_force_px, 'what is in force')
+    wait_for(lambda: counters.used == 21 and node.publication.state.name == state, 'the first after the loop')
+    wait_for(lambda: node.publication.published.result.camera.focal_px == in_force_px, 'what is in force')
 
 
 def test_images_twice_and_out_of_order_are_left_out_of_the_evidence_but_get_camera_info(bench, told):
     infos = bench.collect(CameraInfo, INFO)
     node, publisher = fed(bench, count=10, camera_height=8.0)
-    wait_for(lambda: node.in_force.published, 'the calibration')
+    wait_for(lambda: node.publication.published, 'the calibration')
     bench.listening(INFO)
     late = [image(START_NS + number * FRAME_NS) for number in (9, 5)]
     for sent in late:
@@ -210,12 +210,12 @@ def test_images_without_stamps_take_their_time_from_the_clock_of_the_recording(b
     clock = bench.client.create_publisher(Clock, '/clock', latched)
     node = bench.start(lambda evidence, options, lens: calibration(evidence), use_sim_time=True, idle_solve_s=0.3)
     publisher = bench.connected(bench.publisher())
-    counters = node._pipeline.counters
+    counters = node._worker.counters
     for second in (5000, 5001, 20):  # the clock steps back, as where a recording is played in a loop
         clock.publish(Clock(clock=time_message(second * 10 ** 9)))
         wait_for(lambda now=second: node.get_clock().now().nanoseconds == now * 10 ** 9, 'the clock')
         before = counters.used
         publisher.publish(image(0))
         wait_for(lambda before=before: counters.used == before + 1, 'an image')
-    wait_for(lambda: (now := node.in_force.published) and now.result.newest_stamp_ns == 20 * 10 ** 9, 'the solution')
-    assert node.in_force.published.result.evidence.frames == 1
+    wait_for(lambda: (now := node.publication.published) and now.result.newest_stamp_ns == 20 * 10 ** 9, 'the solution')
+    assert node.publication.published.result.evidence.frames == 1

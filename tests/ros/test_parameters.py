@@ -12,13 +12,13 @@ from rcl_interfaces.msg import ParameterType
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.parameter import Parameter
 
-from autocalib_ros.config import NodeOptions, Options, declared, flattened, may_change
+from autocalib_ros.config import NodeOptions, Options, flatten, is_reconfigurable, walk_options
 from autocalib_ros.errors import UsageError
 from autocalib_ros.ros.declared_parameters import read
 from autocalib_ros.ros.live_parameters import changed_options
 from bench import PATIENCE_S, Bench, wait_for
 
-OPTIONS = [*declared(Options()), *declared(NodeOptions())]
+OPTIONS = [*walk_options(Options()), *walk_options(NodeOptions())]
 NODE = [sys.executable, '-m', 'autocalib_ros.ros.node', '--ros-args']
 PARAMETER_TYPE = {bool: ParameterType.PARAMETER_BOOL, int: ParameterType.PARAMETER_INTEGER,
                   float: ParameterType.PARAMETER_DOUBLE, str: ParameterType.PARAMETER_STRING}
@@ -34,7 +34,7 @@ def test_every_option_is_a_described_parameter(bench: Bench):
         descriptor = node.describe_parameter(item.name)
         assert node.get_parameter(item.name).value == item.default
         assert (descriptor.type, descriptor.read_only) == (PARAMETER_TYPE[type(item.default)],
-                                                           not may_change(item.name))
+                                                           not is_reconfigurable(item.name))
         assert descriptor.description == item.doc
 
 
@@ -64,7 +64,7 @@ def test_a_distance_is_a_parameter_of_text(bench: Bench):
     ('image_transport', False), ('camera_frame', False), ('camera_info_file', False), ('gate_of_another', False),
 ])
 def test_what_is_read_at_each_solution_may_change_and_what_shapes_the_evidence_may_not(name, expected):
-    assert may_change(name) is expected
+    assert is_reconfigurable(name) is expected
 
 
 @pytest.mark.parametrize(('given', 'told'), [
@@ -132,7 +132,7 @@ def test_parameter_that_shapes_the_evidence_does_not_change(bench: Bench):
 @pytest.mark.parametrize('name', ['thermal', 'low_power'])
 def test_example_file_holds_only_options_that_differ_and_can_be_used(request, name):
     file = request.config.rootpath / 'config' / f'{name}.yaml'
-    values = flattened(yaml.safe_load(file.read_text())['/**']['ros__parameters'])
+    values = flatten(yaml.safe_load(file.read_text())['/**']['ros__parameters'])
     read(values)
     defaults = {item.name: item.default for item in OPTIONS}
     assert values and not [key for key, value in values.items() if value == defaults[key]]

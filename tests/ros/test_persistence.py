@@ -15,7 +15,7 @@ from sensor_msgs.msg import CameraInfo
 
 from autocalib_ros.lens.camera_info import camera_info
 from autocalib_ros.lens.camera_info_yaml import read_camera_info
-from autocalib_ros.results.store import Kind, Store, Stored
+from autocalib_ros.results.store import Store, StoredCalibration, StoreState
 from autocalib_ros.revalidation import CalibrationState
 from autocalib_ros.ros.messages import stamp_ns
 from bench import PATIENCE_S, SIZE, Bench, calibration, image, refusal, wait_for
@@ -49,10 +49,10 @@ def evidence():
 
 
 @pytest.fixture
-def kept(store, evidence) -> Stored:
+def kept(store, evidence) -> StoredCalibration:
     """Return a calibration of an earlier run that lies in the store of the camera `north`."""
     result = calibration(evidence, 300.0)
-    store.save(Stored(result, camera_info(result.camera), 'north', 'cam_optical'))
+    store.save(StoredCalibration(result, camera_info(result.camera), 'north', 'cam_optical'))
     return store.load().stored
 
 
@@ -83,7 +83,7 @@ def test_late_joiner_gets_the_restored_calibration_before_any_image(bench, kept)
     assert [list(infos[0].k), list(infos[0].d), list(infos[0].p)] == [fields.k, fields.d, fields.p]
     assert (infos[0].header.frame_id, stamp_ns(infos[0].header.stamp)) == ('cam_optical', START_NS)
     assert (transforms[0].header.frame_id, transforms[0].transform.translation.z) == ('north_ground', 8.0)
-    assert node.in_force.state is RESTORED
+    assert node.publication.state is RESTORED
 
 
 def test_images_of_the_restored_calibration_get_camera_info(bench, kept):
@@ -94,16 +94,16 @@ def test_images_of_the_restored_calibration_get_camera_info(bench, kept):
     sent = image(START_NS + 10 ** 12)
     publisher.publish(sent)
     wait_for(lambda: infos and infos[-1].header == sent.header, 'camera_info with the header of the image')
-    assert node.in_force.state is RESTORED
+    assert node.publication.state is RESTORED
 
 
 def test_store_named_after_the_frame_is_found_with_the_first_image(bench, kept, ros_home):
     frames = Store(ros_home / 'camera_info' / 'cam_optical.yaml')
     frames.save(kept)
     node = bench.start(never)
-    assert node.in_force.state is NONE
+    assert node.publication.state is NONE
     first_image(bench, node)
-    wait_for(lambda: node.in_force.state is RESTORED, 'the restored calibration')
+    wait_for(lambda: node.publication.state is RESTORED, 'the restored calibration')
 
 
 @pytest.mark.parametrize('make', [lambda stamp: image(stamp, size=(160, 120)),
@@ -113,7 +113,7 @@ def test_restored_calibration_of_another_size_or_frame_is_withdrawn(bench, kept,
     infos = bench.collect(CameraInfo, INFO)
     bench.listening(INFO)
     first_image(bench, node, make)
-    wait_for(lambda: node.in_force.state is NONE, 'the withdrawal')
+    wait_for(lambda: node.publication.state is NONE, 'the withdrawal')
     assert not [info for info in infos if info.header.frame_id == 'another_optical']
     assert not [info for info in infos if stamp_ns(info.header.stamp) != START_NS]  # the latched one alone
     wait_for(lambda: nothing_latched(bench), 'the end of the latched messages', 5.0)
@@ -137,12 +137,12 @@ def test_calibration_that_agrees_but_is_less_sure_verifies_the_restored_one(benc
         kept.calibration.stddev, principal_point_px=(1.0, 1.0), k1=0.1, k2=0.1, tilt_deg=0.1, roll_deg=0.1))
     Store(Path(os.environ['ROS_HOME']) / 'camera_info' / 'north.yaml').save(replace(kept, calibration=sure))
     node, _ = calibrated(bench, vague, camera_name='north')
-    assert (node.in_force.state, node.in_force.published.result.camera.focal_px) == (VERIFIED, 300.0)
+    assert (node.publication.state, node.publication.published.result.camera.focal_px) == (VERIFIED, 300.0)
 
 
 def test_calibration_that_does_not_agree_replaces_the_restored_one(bench, kept, store):
     node, _ = calibrated(bench, focal(340.0), camera_name='north')
-    assert (node.in_force.state, node.in_force.published.result.camera.focal_px) == (CALIBRATED, 340.0)
+    assert (node.publication.state, node.publication.published.result.camera.focal_px) == (CALIBRATED, 340.0)
     infos, _ = latched(bench)
     assert wait_for(lambda: infos, 'camera_info')[0].k[0] == 340.0
     wait_for(lambda: store.load().stored.calibration.camera.focal_px == 340.0, 'the file')
@@ -165,12 +165,12 @@ def test_calibration_is_kept_where_the_url_says_and_restored_by_the_next_node(be
     first, _ = calibrated(bench, focal(311.0), camera_name='north pole', camera_info_url=url)
     path = ros_home / 'somewhere' / 'north_pole_lens.yaml'
     wait_for(path.exists, 'the file')
-    assert read_camera_info(path) == first.in_force.published.result.camera
-    published = first.in_force.published.result
+    assert read_camera_info(path) == first.publication.published.result.camera
+    published = first.publication.published.result
     bench.stop(first)
     second = bench.start(never, camera_name='north pole', camera_info_url=url, camera_height=8.0)
-    assert second.in_force.state is RESTORED
-    again = second.in_force.published.result
+    assert second.publication.state is RESTORED
+    again = second.publication.published.result
     assert (again.camera, again.ground.rotation.tolist()) == (published.camera, published.ground.rotation.tolist())
 
 
@@ -180,7 +180,7 @@ def test_without_autosave_only_the_service_writes(bench, store):
     answer = bench.ask('save')
     assert answer.success and str(store.path) in answer.message and 'calibrated' in answer.message
     assert store.load().stored.calibration.camera.focal_px == 311.0
-    assert node.in_force.state is CALIBRATED
+    assert node.publication.state is CALIBRATED
 
 
 def test_restored_calibration_can_be_saved(bench, kept, store):
@@ -200,7 +200,7 @@ def test_save_without_a_calibration_says_why_not(bench, store):
 def test_node_goes_on_where_nothing_can_be_written(bench, ros_home):
     (ros_home / 'camera_info').touch()
     node, publisher = calibrated(bench, camera_name='north')
-    wait_for(lambda: node.keeper.fault, 'the fault')
+    wait_for(lambda: node.store_writer.fault, 'the fault')
     answer = bench.ask('save')
     assert not answer.success and 'cannot write' in answer.message
     infos = bench.collect(CameraInfo, INFO)
@@ -211,14 +211,14 @@ def test_node_goes_on_where_nothing_can_be_written(bench, ros_home):
 @pytest.mark.parametrize('text', ['', 'image_width: [', 'camera_name: north\n'])
 def test_node_starts_over_a_broken_file(bench, kept, store, text):
     store.path.write_text(text)
-    store.beside.unlink()
+    store.json_path.unlink()
     node, _ = calibrated(bench, camera_name='north')
-    assert node.in_force.state is CALIBRATED
-    wait_for(lambda: 'left alone' in node.keeper.fault, 'what is told of the file')
+    assert node.publication.state is CALIBRATED
+    wait_for(lambda: 'left alone' in node.store_writer.fault, 'what is told of the file')
     assert store.path.read_text() == text
     assert bench.ask('save').success
     assert store.path.with_name('north.yaml.orig').read_text() == text
-    assert store.load().kind is Kind.WHOLE
+    assert store.load().kind is StoreState.INTACT
 
 
 def test_reset_withdraws_what_is_published_and_leaves_what_is_stored(bench, store):
@@ -226,14 +226,14 @@ def test_reset_withdraws_what_is_published_and_leaves_what_is_stored(bench, stor
     wait_for(store.path.exists, 'the file')
     answer = bench.ask('reset')
     assert answer.success and 'the calibrated calibration is withdrawn' in answer.message
-    assert node.in_force.state is NONE
+    assert node.publication.state is NONE
     wait_for(lambda: nothing_latched(bench), 'the end of the latched messages', 5.0)
     assert store.load().stored.calibration.camera.focal_px == 311.0
     publisher.publish(image(START_NS + 10 ** 12))
     wait_for(lambda: bench.calibrate().success, 'a calibration after the reset')
     infos, transforms = latched(bench)
     wait_for(lambda: infos and transforms, 'both messages')
-    assert node.in_force.published.result.evidence.frames == 1
+    assert node.publication.published.result.evidence.frames == 1
 
 
 def test_solution_that_runs_during_a_reset_is_not_published(bench, store):
@@ -253,7 +253,7 @@ def test_solution_that_runs_during_a_reset_is_not_published(bench, store):
     assert not answer.result().success and 'a reset came in between' in answer.result().message
     release.set()
     assert not bench.calibrate().success
-    assert node.in_force.state is NONE and not store.path.exists()
+    assert node.publication.state is NONE and not store.path.exists()
 
 
 def test_wrong_url_ends_the_node_with_status_2_and_one_line():
@@ -288,7 +288,7 @@ def test_killed_node_leaves_its_calibration_to_the_next_which_tells_that_it_is_n
         wait_for(store.path.exists, 'the file')
         first.send_signal(signal.SIGKILL)
         first.wait(PATIENCE_S)
-    assert store.load().kind is Kind.WHOLE
+    assert store.load().kind is StoreState.INTACT
     with process(tmp_path / 'second', 350.0) as second:
         infos = bench.collect(CameraInfo, info, latched=True)
         transforms = bench.collect(TransformStamped, ground, latched=True)

@@ -9,7 +9,7 @@ import pytest
 
 from autocalib_ros.config import Options
 from autocalib_ros.results.store import Store
-from autocalib_ros.ros.report_writer import Place, Reports
+from autocalib_ros.ros.report_writer import ReportPaths, ReportWriter
 from bench import SIZE, calibration, wait_for
 from synthetic_results import full_result, grey_road, junction_evidence
 from test_node import calibrated
@@ -25,7 +25,7 @@ def told():
 
 @pytest.fixture
 def reports(told):
-    made = Reports(lambda text, good: told.append((text, good)))
+    made = ReportWriter(lambda text, good: told.append((text, good)))
     yield made
     made.close()
 
@@ -46,7 +46,7 @@ def test_a_report_shows_the_evidence_that_the_calibration_rests_on(reports):
     evidence = junction_evidence()
     result = full_result(evidence)
     later = replace(evidence, frames=evidence.frames + 1)
-    reports.rests_on(result, evidence)
+    reports.set_evidence(result, evidence)
     assert reports.scene(result, (later, grey_road()), OPTIONS, '').evidence is evidence
     other = full_result(evidence)
     assert reports.scene(other, (later, grey_road()), OPTIONS, '').evidence is later
@@ -69,7 +69,7 @@ def test_images_of_another_size_are_not_shown(reports):
 def test_a_report_that_cannot_be_written_is_told(reports, told, tmp_path):
     (tmp_path / 'file').touch()
     scene = reports.scene(full_result(junction_evidence()), (None, None), OPTIONS, '')
-    reports.write(Place(tmp_path / 'file' / 'page.html', tmp_path / 'file' / 'figures'), scene)
+    reports.write(ReportPaths(tmp_path / 'file' / 'page.html', tmp_path / 'file' / 'figures'), scene)
     wait_for(lambda: told, 'the complaint', 120.0)
     (text, good), = told
     assert text.startswith('the report was not written: InputError: cannot write') and not good
@@ -77,7 +77,7 @@ def test_a_report_that_cannot_be_written_is_told(reports, told, tmp_path):
 
 def test_a_node_that_ends_gives_the_report_up(reports, told, tmp_path):
     scene = reports.scene(full_result(junction_evidence()), (None, np.zeros((180, 320), np.uint8)), OPTIONS, '')
-    reports.write(Place(tmp_path / 'page.html', tmp_path / 'figures'), scene)
+    reports.write(ReportPaths(tmp_path / 'page.html', tmp_path / 'figures'), scene)
     reports.close()
     assert not told and not (tmp_path / 'page.html').exists()
 

@@ -12,7 +12,7 @@ from autocalib_ros.calibrator import AutoCalibrator, solve
 from autocalib_ros.config import Options, ScaleOptions
 from autocalib_ros.errors import UsageError
 from autocalib_ros.results.calibration import Refusal
-from autocalib_ros.ros.solver_process import SolverEnded, SolverProcess
+from autocalib_ros.ros.solver_process import SolverDied, SolverProcess
 from bench import PATIENCE_S, PIXELS
 
 OPTIONS = Options(camera_height=8.0)
@@ -50,7 +50,7 @@ def test_exception_of_the_solver_is_raised_here_with_its_traceback(solver):
 def test_process_that_dies_is_told_and_the_next_solution_starts_another(solver):
     assert not solver(snapshot(), OPTIONS, lens=None)
     os.kill(solver._process.pid, signal.SIGKILL)
-    with pytest.raises(SolverEnded, match='ended with status -9'):
+    with pytest.raises(SolverDied, match='ended with status -9'):
         solver(snapshot(), OPTIONS, lens=None)
     assert not solver(snapshot(), OPTIONS, lens=None)
 
@@ -64,5 +64,5 @@ def test_close_ends_a_solution_that_runs(solver):
         assert not threading.Event().wait(0.2)
         assert not answer.done()
         solver.close()
-        assert isinstance(answer.exception(PATIENCE_S), SolverEnded)
+        assert isinstance(answer.exception(PATIENCE_S), SolverDied)
     assert not process.is_alive()

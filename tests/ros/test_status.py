@@ -5,12 +5,23 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from autocalib_ros.calibrator import Progress
+from autocalib_ros.calibrator import CalibrationProgress
 from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.results.calibration import Calibration, EvidenceSummary, Reason, StandardDeviations
-from autocalib_ros.ros.status import ERROR, OK, RATE_WINDOW_S, WARN, Counts, Recent, Situation, State, state_of, status
-from autocalib_ros.ros.watchdog import Silence
+from autocalib_ros.ros.status import (
+    ERROR,
+    OK,
+    RATE_WINDOW_S,
+    WARN,
+    Counts,
+    NodeState,
+    RateCounter,
+    Situation,
+    state_of,
+    status,
+)
+from autocalib_ros.ros.watchdog import NoImageDiagnosis
 
 TILT_DEG = 30.0
 COS, SIN = np.cos(np.radians(TILT_DEG)), np.sin(np.radians(TILT_DEG))
@@ -24,17 +35,17 @@ RESULT = Calibration(
                              coverage=0.4), newest_stamp_ns=1_700_000_000_250_000_000)
 WAITING = Situation(topic='/cam1/image', counts=Counts())
 COLLECTING = replace(WAITING, counts=Counts(received=50, used=49, dropped=1), image_age_s=0.04, encoding='bgr8',
-                     progress=Progress(42.4, ('17 of 40 tracks', 'another'), 'about 6 min more at this rate'),
+                     progress=CalibrationProgress(42.4, ('17 of 40 tracks', 'another'), 'about 6 min more at this rate'),
                      rates_hz=Counts(received=10.0, used=9.8, dropped=0.2))
-CALIBRATED = replace(COLLECTING, result=RESULT, progress=Progress(100.0, ()))
+CALIBRATED = replace(COLLECTING, result=RESULT, progress=CalibrationProgress(100.0, ()))
 
 
 @pytest.mark.parametrize(('situation', 'state', 'level'), [
-    (WAITING, State.WAITING_FOR_IMAGES, WARN),
-    (replace(WAITING, counts=Counts(received=9, unreadable=9)), State.WAITING_FOR_IMAGES, WARN),
-    (COLLECTING, State.COLLECTING, WARN),
-    (CALIBRATED, State.CALIBRATED, OK),
-    (replace(CALIBRATED, restored=True), State.RESTORED, WARN),
+    (WAITING, NodeState.WAITING_FOR_IMAGES, WARN),
+    (replace(WAITING, counts=Counts(received=9, unreadable=9)), NodeState.WAITING_FOR_IMAGES, WARN),
+    (COLLECTING, NodeState.COLLECTING, WARN),
+    (CALIBRATED, NodeState.CALIBRATED, OK),
+    (replace(CALIBRATED, restored=True), NodeState.RESTORED, WARN),
 ])
 def test_state_and_its_level(situation, state, level):
     assert state_of(situation) is state
@@ -44,8 +55,8 @@ def test_state_and_its_level(situation, state, level):
 
 
 @pytest.mark.parametrize(('changes', 'level', 'told'), [
-    ({'silence': Silence('nobody publishes', False)}, WARN, 'nobody publishes'),
-    ({'silence': Silence('another type', True)}, ERROR, 'another type'),
+    ({'silence': NoImageDiagnosis('nobody publishes', False)}, WARN, 'nobody publishes'),
+    ({'silence': NoImageDiagnosis('another type', True)}, ERROR, 'another type'),
     ({'unreadable': "image encoding 'x' is not supported"}, ERROR, "images cannot be used: image encoding 'x'"),
     ({'errors': ('the image size changed',)}, ERROR, 'the image size changed'),
     ({'warnings': ('two publishers',)}, WARN, 'two publishers'),
@@ -105,7 +116,7 @@ def test_every_state_has_the_same_keys_of_text(situation):
 
 
 def test_rates_are_those_of_the_last_seconds():
-    recent = Recent()
+    recent = RateCounter()
     assert recent.rates_hz(0.0, Counts()) is None
     for second in range(1, 61):
         count = 10 * second if second <= 30 else 300 + 2 * (second - 30)  # the camera slows down after 30 s
@@ -115,6 +126,6 @@ def test_rates_are_those_of_the_last_seconds():
 
 
 def test_rates_of_a_node_asked_seldom_still_cover_something():
-    recent = Recent()
+    recent = RateCounter()
     recent.rates_hz(0.0, Counts())
     assert recent.rates_hz(4 * RATE_WINDOW_S, Counts(received=40)).received == pytest.approx(40 / (4 * RATE_WINDOW_S))

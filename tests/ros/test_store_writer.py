@@ -5,7 +5,7 @@ import threading
 import pytest
 
 from autocalib_ros.results.store import Store
-from autocalib_ros.ros.store_writer import Keeper
+from autocalib_ros.ros.store_writer import StoreWriter
 from bench import PATIENCE_S, wait_for
 from stored_results import calibration, stored
 
@@ -27,13 +27,13 @@ def told() -> list[str]:
 def start(told):
     started = []
 
-    def make(period_s: float = NEVER_S) -> Keeper:
-        started.append(Keeper(told.append, period_s))
+    def make(period_s: float = NEVER_S) -> StoreWriter:
+        started.append(StoreWriter(told.append, period_s))
         return started[-1]
 
     yield make
-    for keeper in started:
-        keeper.close(PATIENCE_S)
+    for store_writer in started:
+        store_writer.close(PATIENCE_S)
 
 
 def kept(store: Store) -> int | None:
@@ -42,55 +42,55 @@ def kept(store: Store) -> int | None:
 
 
 def test_first_offer_is_written_at_once_and_of_later_ones_the_newest_at_the_end(start, store):
-    keeper = start()
-    keeper.offer(store, FIRST)
+    store_writer = start()
+    store_writer.offer(store, FIRST)
     wait_for(lambda: kept(store) == 0, 'the first')
-    keeper.offer(store, SECOND)
-    keeper.offer(store, THIRD)
+    store_writer.offer(store, SECOND)
+    store_writer.offer(store, THIRD)
     assert not threading.Event().wait(0.2)
     assert kept(store) == 0
-    assert keeper.close(PATIENCE_S)
+    assert store_writer.close(PATIENCE_S)
     assert kept(store) == 2
 
 
 def test_offers_are_written_after_a_while(start, store):
-    keeper = start(0.1)
+    store_writer = start(0.1)
     for number, offered in enumerate((FIRST, SECOND, THIRD)):
-        keeper.offer(store, offered)
+        store_writer.offer(store, offered)
         wait_for(lambda wanted=number: kept(store) == wanted, f'offer {number}')
 
 
 def test_what_is_withdrawn_is_not_written(start, store):
-    keeper = start()
-    keeper.offer(store, FIRST)
+    store_writer = start()
+    store_writer.offer(store, FIRST)
     wait_for(lambda: kept(store) == 0, 'the first')
-    keeper.offer(store, SECOND)
-    keeper.withdraw()
-    keeper.close(PATIENCE_S)
+    store_writer.offer(store, SECOND)
+    store_writer.withdraw()
+    store_writer.close(PATIENCE_S)
     assert kept(store) == 0
 
 
 def test_step_runs_at_once_and_gives_its_result_or_error(start, store):
-    keeper = start()
-    assert keeper.run(lambda: store.save(SECOND)).result(PATIENCE_S) is None
+    store_writer = start()
+    assert store_writer.run(lambda: store.save(SECOND)).result(PATIENCE_S) is None
     assert kept(store) == 1
-    assert 'ZeroDivisionError' in str(keeper.run(lambda: 1 / 0).result(PATIENCE_S))
-    assert keeper.run(lambda: 5).result(PATIENCE_S) == 5
+    assert 'ZeroDivisionError' in str(store_writer.run(lambda: 1 / 0).result(PATIENCE_S))
+    assert store_writer.run(lambda: 5).result(PATIENCE_S) == 5
 
 
 def test_fault_is_told_once_and_the_offer_is_tried_again(start, store, told, quick_path):
     (quick_path / 'camera_info').touch()
-    keeper = start(0.02)
-    keeper.offer(store, FIRST)
+    store_writer = start(0.02)
+    store_writer.offer(store, FIRST)
     wait_for(lambda: told, 'the fault')
     assert not threading.Event().wait(0.2)  # ten more tries
-    assert len(told) == 1 and 'cannot write' in told[0] and keeper.fault == told[0]
+    assert len(told) == 1 and 'cannot write' in told[0] and store_writer.fault == told[0]
     (quick_path / 'camera_info').unlink()
     wait_for(lambda: kept(store) == 0, 'the calibration')
-    wait_for(lambda: not keeper.fault, 'the end of the fault')
+    wait_for(lambda: not store_writer.fault, 'the end of the fault')
 
 
 def test_closed_keeper_takes_no_more_steps(start):
-    keeper = start()
-    keeper.close(PATIENCE_S)
-    assert 'shutting down' in str(keeper.run(lambda: 5).result(PATIENCE_S))
+    store_writer = start()
+    store_writer.close(PATIENCE_S)
+    assert 'shutting down' in str(store_writer.run(lambda: 5).result(PATIENCE_S))

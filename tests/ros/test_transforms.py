@@ -128,7 +128,7 @@ class Cameras:
         self.node = bench.start(lambda evidence, options, lens: calibration(evidence, height_m=left.pop(0)),
                                 camera_height=8.0, idle_solve_s=1000.0, camera_name='north', **parameters)
         publisher, stamps = bench.connected(bench.publisher()), iter(range(10 ** 9, 10 ** 13, 10 ** 8))
-        wait_for(lambda: publisher.publish(image(next(stamps))) or self.node._pipeline.counters.used, 'an image')
+        wait_for(lambda: publisher.publish(image(next(stamps))) or self.node._worker.counters.used, 'an image')
 
     def calibrate(self) -> None:
         answer = self.bench.calibrate()
@@ -160,13 +160,13 @@ def test_late_joiners_and_listeners_have_the_newest_calibration(bench):
 def test_a_camera_that_hangs_elsewhere_gets_no_second_parent(bench, capfd, topic):
     with neighbour('hang', 'cam_optical', 'mast', topic), neighbour('listen') as heard:
         cameras = Cameras(bench, 8.0)
-        wait_for(lambda: cameras.node.in_force.conflict, 'the conflict, before any calibration')
+        wait_for(lambda: cameras.node.publication.conflict, 'the conflict, before any calibration')
         cameras.calibrate()
         wait_for(lambda: heights(heard, 'ground_transform') == [8.0], 'the transform on its own topic')
-        wait_for(lambda: cameras.node.in_force._transforms._settled, 'the time when it would be broadcast')
+        wait_for(lambda: cameras.node.publication._transforms._settled, 'the time when it would be broadcast')
         assert not any(child == 'cam_optical' and parent != 'mast'
                        for name, found in heard if name == '/tf_static' for parent, child, *_ in found)
-    assert "'mast' as the parent of 'cam_optical'" in cameras.node.in_force.conflict
+    assert "'mast' as the parent of 'cam_optical'" in cameras.node.publication.conflict
     assert capfd.readouterr().err.count("set tf_parent to 'camera'") == 1
 
 
@@ -186,9 +186,9 @@ def test_a_ground_under_a_camera_that_hangs_elsewhere_is_broadcast(bench):
 def test_a_parent_that_comes_later_takes_the_transform_off_the_air(bench):
     cameras = Cameras(bench, 8.0, 9.0)
     cameras.calibrate()
-    wait_for(lambda: cameras.node.in_force._transforms._on_air, 'the broadcast')
+    wait_for(lambda: cameras.node.publication._transforms._broadcasting, 'the broadcast')
     with neighbour('hang', 'cam_optical', 'mast', '/tf'):
-        wait_for(lambda: cameras.node.in_force.conflict, 'the conflict')
+        wait_for(lambda: cameras.node.publication.conflict, 'the conflict')
         cameras.calibrate()
         with neighbour('listen') as late:
             wait_for(lambda: last(late, 'ground_transform') and last(late, '/tf_static') == [], 'an empty list')

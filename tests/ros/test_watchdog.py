@@ -2,16 +2,16 @@
 
 import pytest
 
-from autocalib_ros.ros.watchdog import COMPRESSED, IMAGE, Offer, topic_beside, why_silent
+from autocalib_ros.ros.watchdog import COMPRESSED, IMAGE, PublisherOffer, diagnose, other_transport_topic
 
-RAW = Offer('/cam/driver', IMAGE, True)
-LOSSY = Offer('/cam/driver', IMAGE, False)
-PACKED = Offer('/cam/driver', COMPRESSED, True)
-POINTS = Offer('/lidar', 'sensor_msgs/msg/PointCloud2', True)
+RAW = PublisherOffer('/cam/driver', IMAGE, True)
+LOSSY = PublisherOffer('/cam/driver', IMAGE, False)
+PACKED = PublisherOffer('/cam/driver', COMPRESSED, True)
+POINTS = PublisherOffer('/lidar', 'sensor_msgs/msg/PointCloud2', True)
 T, C = '/cam/image', '/cam/image/compressed'
 
 
-@pytest.mark.parametrize(('topic', 'kind', 'offers', 'beside', 'reliable', 'told', 'lasting'), [
+@pytest.mark.parametrize(('topic', 'kind', 'offers', 'other_offers', 'reliable', 'told', 'lasting'), [
     (T, IMAGE, [], [], True, 'nobody publishes /cam/image: start the camera, or remap', False),
     (T, IMAGE, [], [PACKED], True, '/cam/image/compressed: set image_transport:=compressed', True),
     (C, COMPRESSED, [], [RAW], True, 'publishes /cam/image: set image_transport:=raw', True),
@@ -25,13 +25,13 @@ T, C = '/cam/image', '/cam/image/compressed'
     (T, IMAGE, [LOSSY], [], False, 'best effort loses large images', False),
     (T, IMAGE, [RAW], [], False, 'is the camera running?', False),
 ])
-def test_fault_is_named_with_what_mends_it(topic, kind, offers, beside, reliable, told, lasting):
-    silence = why_silent(topic, kind, offers, asks_reliable=reliable, beside=beside)
+def test_fault_is_named_with_what_mends_it(topic, kind, offers, other_offers, reliable, told, lasting):
+    silence = diagnose(topic, kind, offers, asks_reliable=reliable, other_offers=other_offers)
     assert told in silence.words
     assert '\n' not in silence.words
     assert silence.lasting == lasting
 
 
-@pytest.mark.parametrize(('topic', 'kind', 'beside'), [(T, IMAGE, C), (C, COMPRESSED, T)])
-def test_other_transport_of_a_camera_is_beside_it(topic, kind, beside):
-    assert topic_beside(topic, kind) == beside
+@pytest.mark.parametrize(('topic', 'kind', 'other_offers'), [(T, IMAGE, C), (C, COMPRESSED, T)])
+def test_other_transport_of_a_camera_is_beside_it(topic, kind, other_offers):
+    assert other_transport_topic(topic, kind) == other_offers

@@ -10,7 +10,7 @@ import pytest
 from autocalib_ros.config import Options
 from autocalib_ros.errors import InputError
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.ros.worker import WAITING_IMAGES, Pipeline
+from autocalib_ros.ros.worker import IMAGE_QUEUE_SIZE, CalibrationWorker
 from bench import PATIENCE_S, PIXELS, calibration, refusal, wait_for
 
 FRAME_NS = 66_000_000
@@ -23,10 +23,10 @@ class Heard:
     def __init__(self):
         self.sizes, self.unreadable, self.results, self.faults, self.anew = [], [], [], [], []
 
-    def image_taken(self, width, height):
+    def image_accepted(self, width, height):
         self.sizes.append((width, height))
 
-    def began_anew(self, why):
+    def on_evidence_reset(self, why):
         self.anew.append(why)
 
     def image_unreadable(self, error):
@@ -67,12 +67,12 @@ def start(heard):
     """Start a pipeline around a solver; closed at the end."""
     started = []
 
-    def make(solve, idle_solve_s: float = NEVER_S, **more) -> Pipeline:
+    def make(solve, idle_solve_s: float = NEVER_S, **more) -> CalibrationWorker:
         """`solve` takes the evidence, and the lens too where one is given."""
         def adapted(evidence, options, *, lens):
             return solve(evidence) if lens is None else solve(evidence, lens)
 
-        started.append(Pipeline(Options(), idle_solve_s=idle_solve_s, decode=decode, solve=adapted, listener=heard,
+        started.append(CalibrationWorker(Options(), idle_solve_s=idle_solve_s, decode=decode, solve=adapted, listener=heard,
                                 **more))
         return started[-1]
 
@@ -81,14 +81,14 @@ def start(heard):
         pipeline.close(PATIENCE_S)
 
 
-def feed(pipeline: Pipeline, heard: Heard, count: int, first: int = 0) -> None:
+def feed(pipeline: CalibrationWorker, heard: Heard, count: int, first: int = 0) -> None:
     """Offer images one by one, each after the one before has been used."""
     for number in range(first, first + count):
         pipeline.offer(number * FRAME_NS, PIXELS)
         wait_for(lambda wanted=number + 1: len(heard.sizes) >= wanted, f'image {number}')
 
 
-def offer_while_held_up(pipeline: Pipeline, count: int) -> None:
+def offer_while_held_up(pipeline: CalibrationWorker, count: int) -> None:
     """Offer `count` images, all but the first while the first one is being decoded."""
     entered, release = threading.Event(), threading.Event()
     pipeline._decode = lambda message: (entered.set(), release.wait(PATIENCE_S), message)[2]
@@ -141,15 +141,15 @@ def test_newest_snapshot_takes_the_place_and_the_callers_of_one_that_waits(start
 
 def test_late_images_are_dropped_and_counted(start, heard):
     pipeline = start(calibration)
-    offer_while_held_up(pipeline, WAITING_IMAGES + 4)
-    wait_for(lambda: pipeline.counters.used == WAITING_IMAGES + 1, 'the first and the newest images')
-    assert (pipeline.counters.received, pipeline.counters.dropped) == (WAITING_IMAGES + 4, 3)
+    offer_while_held_up(pipeline, IMAGE_QUEUE_SIZE + 4)
+    wait_for(lambda: pipeline.counters.used == IMAGE_QUEUE_SIZE + 1, 'the first and the newest images')
+    assert (pipeline.counters.received, pipeline.counters.dropped) == (IMAGE_QUEUE_SIZE + 4, 3)
 
 
 def test_a_hiccup_loses_no_image(start, heard):
     pipeline = start(calibration)
-    offer_while_held_up(pipeline, WAITING_IMAGES + 1)
-    wait_for(lambda: pipeline.counters.used == WAITING_IMAGES + 1, 'all images')
+    offer_while_held_up(pipeline, IMAGE_QUEUE_SIZE + 1)
+    wait_for(lambda: pipeline.counters.used == IMAGE_QUEUE_SIZE + 1, 'all images')
     assert pipeline.counters.dropped == 0
 
 

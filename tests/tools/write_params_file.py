@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from autocalib_ros.config import MAY_CHANGE, NodeOptions, Options
+from autocalib_ros.config import RECONFIGURABLE, NodeOptions, Options
 
 HEAD = """\
 # Every option of autocalib_ros with its default: what it does, and what it may be.
@@ -74,7 +74,7 @@ def first_line(options: Any) -> str:
 def document() -> str:
     """Return the whole file."""
     node = NodeOptions()
-    wrapped = textwrap.wrap(f'{CHANGES} {", ".join(MAY_CHANGE)}. {FIXED}', WIDTH - 2)
+    wrapped = textwrap.wrap(f'{CHANGES} {", ".join(RECONFIGURABLE)}. {FIXED}', WIDTH - 2)
     head = HEAD.format(changes='\n'.join(f'# {line}' for line in wrapped))
     lines = [head, *lines_of(Options(), '    '), '', f'    # {first_line(node)}', *lines_of(node, '    ')]
     return '\n'.join(lines) + '\n'

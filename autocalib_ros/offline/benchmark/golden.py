@@ -24,7 +24,7 @@ from autocalib_ros.offline.benchmark.processes import in_order
 from autocalib_ros.offline.parameter_file import options_with
 from autocalib_ros.offline.terminal.progress import progress_bar
 from autocalib_ros.offline.terminal.style import aligned
-from autocalib_ros.results.calibration import COVARIANCE_OF, GROUND_DISTANCES_M, Calibration, Refusal
+from autocalib_ros.results.calibration import COVARIANCE_PARAMETERS, GROUND_DISTANCES_M, Calibration, Refusal
 from autocalib_ros.util.files import write_atomically
 
 EXPECTED = 'expected.json'
@@ -44,7 +44,7 @@ class Outcome:
     words: Mapping[str, str | int | None]
     """By the names of `WORDS`."""
     numbers: Mapping[str, float] = field(default_factory=dict)
-    """Lens and pose, by the names of `COVARIANCE_OF`."""
+    """Lens and pose, by the names of `COVARIANCE_PARAMETERS`."""
     stddev: Mapping[str, float] = field(default_factory=dict)
     """One sigma of those that have one, and of road points ahead."""
 
@@ -158,8 +158,8 @@ def told(result: Calibration | Refusal) -> Outcome:
                   sigma.height_m)
     ahead = {f'ground_point_{distance:g}_m': value
              for distance, value in zip(GROUND_DISTANCES_M, sigma.ground_point_m, strict=False)}
-    return Outcome(words, _given(dict(zip(COVARIANCE_OF, numbers, strict=True))),
-                   _given({**dict(zip(COVARIANCE_OF, deviations, strict=True)), **ahead}))
+    return Outcome(words, _given(dict(zip(COVARIANCE_PARAMETERS, numbers, strict=True))),
+                   _given({**dict(zip(COVARIANCE_PARAMETERS, deviations, strict=True)), **ahead}))
 
 
 def _given(values: Mapping[str, float | None]) -> dict[str, float]:

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from autocalib_ros.calibrator import solve
-from autocalib_ros.comparison import best_turn
+from autocalib_ros.comparison import best_rotation
 from autocalib_ros.config import Options
 from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.evidence.snapshot import Evidence
@@ -122,10 +122,10 @@ def run_method(task: Task, method: str, junction: Junction, evidence: Evidence) 
     except Exception as error:
         return Run(family=task.family, method=method, run=task.run, accepted=False,
                    code=f'crash:{type(error).__name__}')
-    return compared(task, method, result, junction, time.process_time() - began)
+    return compare_calibrations(task, method, result, junction, time.process_time() - began)
 
 
-def compared(task: Task, method: str, result: Calibration | Refusal, junction: Junction, cpu_s: float) -> Run:
+def compare_calibrations(task: Task, method: str, result: Calibration | Refusal, junction: Junction, cpu_s: float) -> Run:
     """Return how far a result is from the truth."""
     if isinstance(result, Refusal):
         return Run(family=task.family, method=method, run=task.run, accepted=False, code=result.code, cpu_s=cpu_s)
@@ -158,7 +158,7 @@ def rays_error_deg(camera: Camera, true: Camera) -> float:
     pixels = pixel_grid(true, *RAY_GRID)
     (found, valid), (wanted, there) = camera.unproject(pixels), true.unproject(pixels)
     found, wanted = found[valid & there], wanted[valid & there]
-    return float(angles_deg(found @ best_turn(wanted, found).T, wanted).mean()) if len(found) else NAN
+    return float(angles_deg(found @ best_rotation(wanted, found).T, wanted).mean()) if len(found) else NAN
 
 
 def distance_error(camera: Camera, ground: GroundPlane | None, junction: Junction) -> float:

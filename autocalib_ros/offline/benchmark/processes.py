@@ -7,7 +7,7 @@ from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from typing import TypeVar
 
-from autocalib_ros.util.threads import use_one_thread_for_linear_algebra
+from autocalib_ros.util.threads import limit_blas_threads
 
 Task = TypeVar('Task')
 Result = TypeVar('Result')
@@ -19,7 +19,7 @@ def in_order(work: Callable[[Task], Result], tasks: Sequence[Task], jobs: int) -
         yield from map(work, tasks)
         return
     # spawned, not forked: a worker has to set its threads before numpy comes in
-    with ProcessPoolExecutor(jobs, get_context('spawn'), use_one_thread_for_linear_algebra) as pool:
+    with ProcessPoolExecutor(jobs, get_context('spawn'), limit_blas_threads) as pool:
         try:
             yield from pool.map(work, tasks)
         finally:

@@ -15,7 +15,7 @@ from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag2 import Reader as Reader2
 from rosbags.typesys import Stores, get_typestore
 
-from autocalib_ros.calibrator import REORDERED_NS
+from autocalib_ros.calibrator import MAX_REORDERING_NS
 from autocalib_ros.errors import AutocalibError, InputError, UsageError
 from autocalib_ros.offline.recordings.sources import Frame, StoredImage, Window, nothing_in_window
 from autocalib_ros.offline.recordings.truncated_mcap import is_torn, sealed
@@ -201,7 +201,7 @@ class _Order:
     def accepts(self, stamp_ns: int) -> bool:
         """Say whether an image of that stamp is to be used."""
         newest = self._newest_ns
-        if newest is not None and newest - REORDERED_NS < stamp_ns <= newest:
+        if newest is not None and newest - MAX_REORDERING_NS < stamp_ns <= newest:
             self.late += 1
             return False
         self._newest_ns = stamp_ns
