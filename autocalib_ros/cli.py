@@ -32,10 +32,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; return 0 calibrated or done, 3 refused, 2 wrong usage or unreadable input, 130 interrupted."""
     limit_blas_threads()
     _silence_libraries()
-    _speak_to_any_terminal()
+    _replace_unencodable_characters()
     try:
         with _warnings_on_stderr():
-            arguments = _parsed(sys.argv[1:] if argv is None else list(argv))
+            arguments = _parse_arguments(sys.argv[1:] if argv is None else list(argv))
             return arguments.run(arguments)
     except AutocalibError as error:
         print(f'autocalib: error: {error}', file=sys.stderr)
@@ -54,7 +54,7 @@ def _silence_libraries() -> None:
     logging.getLogger('matplotlib').setLevel(logging.ERROR)
 
 
-def _speak_to_any_terminal() -> None:
+def _replace_unencodable_characters() -> None:
     """Print a replacement for what a terminal cannot show, such as the plus-minus sign, instead of failing."""
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, 'reconfigure'):
@@ -82,7 +82,7 @@ class _Parser(argparse.ArgumentParser):
         raise UsageError(f'{message} (see {self.prog} --help)')
 
 
-def _parsed(argv: list[str]) -> argparse.Namespace:
+def _parse_arguments(argv: list[str]) -> argparse.Namespace:
     parser = _Parser(prog='autocalib', description='Calibrate a fixed roadside camera from the traffic that it sees.')
     parser.add_argument('--version', action='version', version=f'autocalib {__version__}')
     commands = parser.add_subparsers(title='commands', metavar='COMMAND', required=True, parser_class=_Parser)

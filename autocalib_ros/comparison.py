@@ -47,8 +47,8 @@ def compare_calibrations(first: SavedCamera, second: SavedCamera) -> Comparison:
     pose, pose_notes = _pose_differences(first, second)
     road, road_notes = _road_differences(*sides, ahead) if metric else ((), [])
     return Comparison(
-        lens=lens, lens_px=max_lens_difference_px(first, second), rays=_ray_difference(*everywhere, grid, aligned=False),
-        rays_aligned=_ray_difference(*everywhere, grid, aligned=True),
+        lens=lens, lens_px=max_lens_difference_px(first, second), rays=_ray_difference(*everywhere, grid, align_columns=False),
+        rays_aligned=_ray_difference(*everywhere, grid, align_columns=True),
         alignment_deg=_rotation_angle_deg(best_rotation(everywhere[0].nominal.rays, everywhere[1].nominal.rays)), pose=pose,
         normal_deg=_normal_angle_deg(first.ground, second.ground) if both else None, road=road, stated=stated,
         notes=(*notes, *lens_notes, *pose_notes, *road_notes))
@@ -148,9 +148,9 @@ class _PerturbedRays:
                      None if self.perturbed is None else [view.subset(which) for view in self.perturbed])
 
 
-def _ray_difference(first: _PerturbedRays, second: _PerturbedRays, pixels: np.ndarray, *, aligned: bool) -> RayDifference:
+def _ray_difference(first: _PerturbedRays, second: _PerturbedRays, pixels: np.ndarray, *, align_columns: bool) -> RayDifference:
     def difference(one: _PixelRays, other: _PixelRays) -> np.ndarray:
-        return (other.rays @ best_rotation(one.rays, other.rays).T if aligned else other.rays) - one.rays
+        return (other.rays @ best_rotation(one.rays, other.rays).T if align_columns else other.rays) - one.rays
 
     chords = np.linalg.norm(difference(first.nominal, second.nominal), axis=1)
     seen = np.isfinite(chords)

@@ -399,7 +399,7 @@ SCALES = {
         distance_px='500 500 900 450', distance_m=10.0, distance_sigma_m=0.1)),
     'assumed': Options(camera_height=HEIGHT_M, joint=JointOptions(roll_prior_deg=2.0)),
 }
-ONE_ROAD = Junction(road_angles_deg=(0.0,), turning_share=0.0, vehicles=120, camera_from_ground=pose(35.0, 1.0, 60.0),
+ONE_ROAD = Junction(road_angles_deg=(0.0,), turning_fraction=0.0, vehicles=120, camera_from_ground=pose(35.0, 1.0, 60.0),
                     centre_m=(6.0, -10.0))
 
 

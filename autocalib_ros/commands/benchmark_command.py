@@ -51,15 +51,15 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.what == 'golden':
         from autocalib_ros.offline.benchmark.runtime import golden
 
-        measured = golden.measure(arguments.folder, arguments.only, tolerance=arguments.tolerance,
+        measured = golden.run_monte_carlo(arguments.folder, arguments.only, tolerance=arguments.tolerance,
                                   exact=arguments.exact, jobs=arguments.jobs)
         print('\n'.join(golden.lines(measured)))
         if arguments.update:
             golden.update(arguments.folder, measured)
         return MOVED if measured.moved else DONE
-    from autocalib_ros.offline.benchmark.monte_carlo import measure
-    from autocalib_ros.offline.benchmark.table import tables
+    from autocalib_ros.offline.benchmark.monte_carlo import run_monte_carlo
+    from autocalib_ros.offline.benchmark.table import format_tables
 
-    print(tables(measure(arguments.family, arguments.method, arguments.runs, seed=arguments.seed, jobs=arguments.jobs,
+    print(format_tables(run_monte_carlo(arguments.family, arguments.method, arguments.runs, seed=arguments.seed, jobs=arguments.jobs,
                          out=arguments.out)))
     return DONE

@@ -10,12 +10,12 @@ from autocalib_ros.commands import DONE, REFUSED
 HELP = 'say how two calibrations of one camera differ'
 DESCRIPTION = ('Say how two calibrations of one camera differ: is that of last month still right? Exit status: 0 they '
                'agree within 3 combined standard deviations, 3 they differ, or nothing tells, 2 wrong input.')
-FILES = 'calibration.json, NAME.autocalib.json of the node, or a camera_info.yaml, of a checkerboard for example'
+CALIBRATION_FILES = 'calibration.json, NAME.autocalib.json of the node, or a camera_info.yaml, of a checkerboard for example'
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the two files and the truth."""
-    parser.add_argument('first', metavar='A', type=Path, help=FILES)
+    parser.add_argument('first', metavar='A', type=Path, help=CALIBRATION_FILES)
     parser.add_argument('second', metavar='B', type=Path, help='the same')
     parser.add_argument('--truth', metavar='T', type=Path, help='truth.json of a simulation, to compare both with')
     parser.add_argument('--json', action='store_true', help='print a document instead of the table')
@@ -28,7 +28,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     from autocalib_ros.commands.comparison_table import comparison_document, comparison_lines, truth_lines
     from autocalib_ros.comparison import compare_calibrations
-    from autocalib_ros.offline.terminal.style import painted
+    from autocalib_ros.offline.terminal.style import coloured
     from autocalib_ros.results.saved_camera import read_saved_camera
 
     both = [read_saved_camera(path) for path in (arguments.first, arguments.second)]
@@ -44,7 +44,7 @@ def run(arguments: argparse.Namespace) -> int:
         print(json.dumps({**document, **({'against_truth': errors} if errors else {})}, indent=1, allow_nan=False))
     else:
         colour = {True: 'green', False: 'red', None: 'yellow'}[result.agrees]
-        print(painted(result.verdict(), colour, sys.stdout))
+        print(coloured(result.verdict(), colour, sys.stdout))
         print(f'A: {arguments.first}\nB: {arguments.second}')
         print('\n'.join(comparison_lines(result)))
         if errors:

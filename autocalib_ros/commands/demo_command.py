@@ -7,7 +7,7 @@ import shutil
 from pathlib import Path
 
 from autocalib_ros.commands import DONE, REFUSED
-from autocalib_ros.commands.output import replay_and_tell, tell
+from autocalib_ros.commands.output import print_stderr, replay_and_report
 from autocalib_ros.commands.replay_command import DEFAULT_OUT
 
 HELP = 'simulate traffic, calibrate from it, compare with the truth'
@@ -27,21 +27,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Simulate, replay and compare; return the exit status."""
     from autocalib_ros.offline import outputs
-    from autocalib_ros.offline.demonstration import compare, options_from, simulate_into
+    from autocalib_ros.offline.demonstration import compare_with_truth, options_from_truth, simulate_bag
     from autocalib_ros.offline.recordings.open import open_source
 
     bag = arguments.out / 'recording'
-    outputs.prepare(arguments.out, bag)
+    outputs.prepare_output_dir(arguments.out, bag)
     try:
-        truth = simulate_into(bag, arguments.seed)
-        replayed = replay_and_tell(open_source(bag), options_from(truth, arguments.scale_from), arguments.out)
+        truth = simulate_bag(bag, arguments.seed)
+        replayed = replay_and_report(open_source(bag), options_from_truth(truth, arguments.scale_from), arguments.out)
     finally:
         if not arguments.keep_bag:
             shutil.rmtree(bag, ignore_errors=True)
-    comparison = compare(replayed.result, truth)
+    comparison = compare_with_truth(replayed.result, truth)
     if comparison is None:
         return REFUSED
     print(comparison.table())
-    if not comparison.good:
-        tell('The demonstration failed: the result is farther from the truth than promised.')
-    return DONE if comparison.good else REFUSED
+    if not comparison.within_tolerance:
+        print_stderr('The demonstration failed: the result is farther from the truth than promised.')
+    return DONE if comparison.within_tolerance else REFUSED

@@ -6,8 +6,8 @@ import argparse
 from pathlib import Path
 
 from autocalib_ros.commands import DONE, REFUSED
-from autocalib_ros.commands.output import tell_missing_height, tell_result
-from autocalib_ros.commands.solve_options import add_solving, known_lens, options_of
+from autocalib_ros.commands.output import print_result, warn_missing_scale
+from autocalib_ros.commands.solve_options import add_solve_options, options_from_arguments, read_known_lens
 
 HELP = 'solve saved evidence again with other options'
 DESCRIPTION = ('Solve the evidence.npz of a replay again, without its pictures. Options of tracking, motion and buffer '
@@ -17,24 +17,24 @@ DESCRIPTION = ('Solve the evidence.npz of a replay again, without its pictures. 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the file and what is told to the solution."""
     parser.add_argument('file', metavar='FILE.npz', type=Path, help='evidence that a replay has saved')
-    add_solving(parser)
+    add_solve_options(parser)
     parser.add_argument('--out', type=Path, metavar='DIR', help='folder for the results (default: nothing is written)')
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Solve; return the exit status."""
-    options = options_of(arguments)
-    lens = known_lens(arguments, options)
+    options = options_from_arguments(arguments)
+    lens = read_known_lens(arguments, options)
     from autocalib_ros.evidence.snapshot import Evidence
     from autocalib_ros.offline import outputs
-    from autocalib_ros.offline.replay_recording import solve_again
+    from autocalib_ros.offline.replay_recording import solve_evidence
 
     evidence, out = Evidence.load(arguments.file), arguments.out
     if out is not None:
-        outputs.prepare(out)
+        outputs.prepare_output_dir(out)
     if not arguments.quiet:
-        tell_missing_height(options, lens)
-    solved = solve_again(evidence, options, lens)
+        warn_missing_scale(options, lens)
+    solved = solve_evidence(evidence, options, lens)
     names = [] if out is None else outputs.write_result(out, solved, arguments.file.name)
-    tell_result(solved, out, names, quiet=arguments.quiet, json=arguments.json)
+    print_result(solved, out, names, quiet=arguments.quiet, json=arguments.json)
     return DONE if solved.result else REFUSED

@@ -15,12 +15,12 @@ if TYPE_CHECKING:
     from autocalib_ros.perception.detector.detector import VehicleDetector
 
 
-def tell(line: str) -> None:
+def print_stderr(line: str) -> None:
     """Print a line on stderr."""
     print(line, file=sys.stderr)
 
 
-def replay_and_tell(source: Source, options: Options, out: Path, *, lens: Camera | None = None,
+def replay_and_report(source: Source, options: Options, out: Path, *, lens: Camera | None = None,
                     detector: VehicleDetector | None = None, quiet: bool = False, json: bool = False) -> ReplayResult:
     """Replay, write the results and say what came out."""
     from autocalib_ros.offline.outputs import write_outputs
@@ -28,40 +28,40 @@ def replay_and_tell(source: Source, options: Options, out: Path, *, lens: Camera
     from autocalib_ros.offline.terminal.progress import progress_bar
 
     if not quiet:
-        tell_missing_height(options, lens)
+        warn_missing_scale(options, lens)
     with progress_bar(source.total, 'images', 'replay', quiet=quiet) as progress:
         replayed = replay(source, options, progress.update_to, lens=lens, detector=detector)
-    tell_result(replayed, out, write_outputs(out, replayed, source), quiet=quiet, json=json)
+    print_result(replayed, out, write_outputs(out, replayed, source), quiet=quiet, json=json)
     return replayed
 
 
-def tell_missing_height(options: Options, lens: Camera | None) -> None:
+def warn_missing_scale(options: Options, lens: Camera | None) -> None:
     """Say on stderr what a solution without any scale leaves out."""
     if options.scale_from == 'height' and options.camera_height == 0:
         scale = 'is given in units of that height' if options.allow_unit_scale else 'is left out'
         calibrated = 'the lens is calibrated' if lens is None else 'the lens is known'
-        tell(f'No camera height given: {calibrated}, the ground plane {scale} (see --camera-height, --scale-distance'
+        print_stderr(f'No camera height given: {calibrated}, the ground plane {scale} (see --camera-height, --scale-distance'
              ' and --scale-speed).')
 
 
-def tell_result(replayed: ReplayResult, out: Path | None, names: list[str], *, quiet: bool, json: bool) -> None:
+def print_result(replayed: ReplayResult, out: Path | None, names: list[str], *, quiet: bool, json: bool) -> None:
     """Print a refusal's reason on stderr; the summary on stdout, or instead calibration.json."""
-    from autocalib_ros.offline.terminal.style import columns_of, is_terminal, painted, state_colour
+    from autocalib_ros.offline.terminal.style import coloured, is_terminal, state_colour, terminal_width
     from autocalib_ros.offline.terminal.summary import summary_lines
     from autocalib_ros.report.text import remedy, verdict
     from autocalib_ros.results.calibration_json import calibration_json
 
     result = replayed.result
     if not result:
-        tell(painted(f'{verdict(result)} {remedy(result)}'.rstrip(), state_colour(result), sys.stderr))
+        print_stderr(coloured(f'{verdict(result)} {remedy(result)}'.rstrip(), state_colour(result), sys.stderr))
     if json:
         print(calibration_json(result, accepted_at_s=replayed.accepted_at_s), flush=True)
     if quiet:
         return
     if not json:
-        columns = columns_of(sys.stdout) if is_terminal(sys.stdout) else None
+        columns = terminal_width(sys.stdout) if is_terminal(sys.stdout) else None
         if result:
-            print(painted(verdict(result), state_colour(result), sys.stdout))
+            print(coloured(verdict(result), state_colour(result), sys.stdout))
         print('\n'.join(summary_lines(result, replayed.accepted_at_s, columns)))
     if names:
         print(f'Written to {out}: {", ".join(names)}', file=sys.stderr if json else sys.stdout)

@@ -20,4 +20,4 @@ def run(arguments: argparse.Namespace) -> int:
     """Write; return the exit status."""
     from autocalib_ros.pictures.showcase import showcase
 
-    return views.write(arguments, 'picture', lambda known: lambda image: showcase(known, image))
+    return views.render_to_file(arguments, 'picture', lambda known: lambda image: showcase(known, image))

@@ -21,4 +21,4 @@ def run(arguments: argparse.Namespace) -> int:
     """Write; return the exit status."""
     from autocalib_ros.pictures.known_views import rectified_renderer
 
-    return views.write(arguments, 'rectify', lambda known: rectified_renderer(known, arguments.balance))
+    return views.render_to_file(arguments, 'rectify', lambda known: rectified_renderer(known, arguments.balance))

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from autocalib_ros.commands import DONE, REFUSED
-from autocalib_ros.commands.output import replay_and_tell, tell
-from autocalib_ros.commands.solve_options import add_solving, known_lens, options_of
+from autocalib_ros.commands.output import print_stderr, replay_and_report
+from autocalib_ros.commands.solve_options import add_solve_options, options_from_arguments, read_known_lens
 from autocalib_ros.config import Options
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the recording and what becomes of it."""
     parser.add_argument('source', metavar='SOURCE', type=Path,
                         help='rosbag2 folder, .mcap, .db3, ROS 1 .bag or video file')
-    add_solving(parser)
+    add_solve_options(parser)
     parser.add_argument('--topic', metavar='T', help='image topic; needed when there are several')
     parser.add_argument('--out', type=Path, default=DEFAULT_OUT, metavar='DIR', help='folder for the results '
                         '(default: %(default)s)')
@@ -36,19 +36,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Replay; return the exit status."""
-    options = options_of(arguments)
-    lens = known_lens(arguments, options)
+    options = options_from_arguments(arguments)
+    lens = read_known_lens(arguments, options)
     from autocalib_ros.offline.recordings.open import open_source
     from autocalib_ros.perception.detector.detector import open_detector
 
     detector = open_detector(options.detector)
     if detector is not None and not arguments.quiet:
-        tell(f'Vehicles by a {detector}')
+        print_stderr(f'Vehicles by a {detector}')
     source = open_source(arguments.source, arguments.topic, arguments.start, arguments.duration)
     from autocalib_ros.offline import outputs
 
-    outputs.prepare(arguments.out, arguments.write_bag)
-    replayed = replay_and_tell(source, options, arguments.out, lens=lens, detector=detector, quiet=arguments.quiet,
+    outputs.prepare_output_dir(arguments.out, arguments.write_bag)
+    replayed = replay_and_report(source, options, arguments.out, lens=lens, detector=detector, quiet=arguments.quiet,
                                json=arguments.json)
     if arguments.write_bag is not None:
         _write_bag(arguments.write_bag, replayed, source, options)
@@ -57,7 +57,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _write_bag(path: Path, replayed: ReplayResult, source: Source, options: Options) -> None:
     if not replayed.result:
-        tell(f'{path} is not written: there is no calibration')
+        print_stderr(f'{path} is not written: there is no calibration')
         return
     from autocalib_ros.offline.recordings.write_bag import write_bag
 

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from autocalib_ros.lens.camera import Camera
 
 
-def add_solving(parser: argparse.ArgumentParser) -> None:
+def add_solve_options(parser: argparse.ArgumentParser) -> None:
     """Add what is told to the solution, whatever it is fed from, and how its result is printed."""
     scale = parser.add_mutually_exclusive_group()
     scale.add_argument('--camera-height', type=float, metavar='H',
@@ -35,9 +35,9 @@ def add_solving(parser: argparse.ArgumentParser) -> None:
                         help='print calibration.json on stdout instead of the summary')
 
 
-def options_of(arguments: argparse.Namespace) -> Options:
+def options_from_arguments(arguments: argparse.Namespace) -> Options:
     """Put the options together: defaults, then the parameter file, then the command line."""
-    from autocalib_ros.offline.parameter_file import options_with, parse_assignments, read_params_file
+    from autocalib_ros.offline.parameter_file import override_options, parse_assignments, read_params_file
 
     values: dict[str, Any] = read_params_file(arguments.params_file) if arguments.params_file else {}
     values.update(parse_assignments(arguments.param))
@@ -46,7 +46,7 @@ def options_of(arguments: argparse.Namespace) -> Options:
         values['method'] = arguments.method
     if arguments.allow_unit_scale:
         values['allow_unit_scale'] = True
-    return options_with(Options(), values)
+    return override_options(Options(), values)
 
 
 def _scale_values(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -62,7 +62,7 @@ def _scale_values(arguments: argparse.Namespace) -> dict[str, Any]:
     return {}
 
 
-def known_lens(arguments: argparse.Namespace, options: Options) -> Camera | None:
+def read_known_lens(arguments: argparse.Namespace, options: Options) -> Camera | None:
     """Read the known lens: that of the command line, else the one that the parameter file gives to a live node.
 
     UsageError where the results could not say it in the distortion model that is asked for.

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from autocalib_ros.commands import view_options as views
 
 if TYPE_CHECKING:
-    from autocalib_ros.offline.view_files import View
+    from autocalib_ros.offline.view_files import Renderer
     from autocalib_ros.results.saved_camera import SavedCamera
 
 HELP = 'show the road from above, from an image or video'
@@ -32,7 +32,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Write; return the exit status."""
     from autocalib_ros.pictures.known_views import choose_top_view, top_view_renderer
 
-    def view_of(known: SavedCamera) -> View:
+    def make_renderer(known: SavedCamera) -> Renderer:
         view = choose_top_view(known, arguments.px_per_m, arguments.x, arguments.y)
         return top_view_renderer(known, view, grid=arguments.grid, scale_bar=arguments.scale_bar)
-    return views.write(arguments, 'topview', view_of)
+    return views.render_to_file(arguments, 'topview', make_renderer)

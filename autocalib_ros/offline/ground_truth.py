@@ -16,18 +16,18 @@ from autocalib_ros.lens.camera import Camera
 from autocalib_ros.pictures.views import image_to_ground
 from autocalib_ros.results.saved_camera import SavedCamera
 
-NEAR_M = 40.0
+MAX_COMPARED_RANGE_M = 40.0
 """Distances are compared between points of the road this near to the camera."""
-LEAST_DISTANCE_M = 2.0
+MIN_COMPARED_DISTANCE_M = 2.0
 """Shorter distances on the road are not compared: their relative error says little."""
 
 
-def distances_error(true_m: np.ndarray, found_m: np.ndarray) -> float:
+def median_distance_error(true_m: np.ndarray, found_m: np.ndarray) -> float:
     """Median relative error of the distances between points (n, 2) on the road; nan where all are too short."""
     first, second = np.triu_indices(len(true_m), 1)
     true_lengths = np.hypot(*(true_m[first] - true_m[second]).T)
     lengths = np.hypot(*(found_m[first] - found_m[second]).T)
-    far_apart = true_lengths > LEAST_DISTANCE_M
+    far_apart = true_lengths > MIN_COMPARED_DISTANCE_M
     if not far_apart.any():
         return float('nan')
     # a point that ends up above the horizon is as wrong as can be, and must not drop out of the median
@@ -45,20 +45,20 @@ def read_truth(path: Path) -> dict[str, Any]:
         raise InputError(f'{path} is not a truth.json: {error}') from error
 
 
-def near_points(truth: dict[str, Any]) -> np.ndarray:
+def nearby_road_points(truth: dict[str, Any]) -> np.ndarray:
     """Return rows X, Y, u, v of points of the road that are not too far away, shape (n, 4)."""
     points = np.array(truth['ground_points']['rows']).reshape(-1, 4)
-    return points[np.hypot(*(points[:, :2] - truth['camera']['position'][:2]).T) <= NEAR_M]
+    return points[np.hypot(*(points[:, :2] - truth['camera']['position'][:2]).T) <= MAX_COMPARED_RANGE_M]
 
 
-def distance_percent(camera: Camera, ground: GroundPlane, truth: dict[str, Any]) -> float:
+def distance_error_percent(camera: Camera, ground: GroundPlane, truth: dict[str, Any]) -> float:
     """Return the median error of distances between points of the road that are not too far away."""
-    points = near_points(truth)
+    points = nearby_road_points(truth)
     true_m, pixels = points[:, :2], points[:, 2:]
-    return 100 * distances_error(true_m, image_to_ground(camera, ground, pixels))
+    return 100 * median_distance_error(true_m, image_to_ground(camera, ground, pixels))
 
 
-TRUE_LENSES = ('equidistant', 'kannala_brandt')
+SUPPORTED_LENS_MODELS = ('equidistant', 'kannala_brandt')
 """Models of a truth.json that are read; both are the one of camera.py."""
 
 
@@ -66,8 +66,8 @@ def true_camera(truth: dict[str, Any]) -> SavedCamera:
     """Return the lens and pose of a truth.json; InputError where it holds none."""
     try:
         lens, pose = truth['lens'], truth['camera']
-        if lens['model'] not in TRUE_LENSES:
-            raise InputError(f"the lens of the truth is {lens['model']!r}, expected {' or '.join(TRUE_LENSES)}")
+        if lens['model'] not in SUPPORTED_LENS_MODELS:
+            raise InputError(f"the lens of the truth is {lens['model']!r}, expected {' or '.join(SUPPORTED_LENS_MODELS)}")
         camera = Camera(int(truth['width']), int(truth['height']), float(lens['f']), (float(lens['cx']),
                         float(lens['cy'])), tuple(float(value) for value in lens['k']))
         ground = GroundPlane(np.array(pose['R_world_from_camera'], float).reshape(3, 3), float(pose['height']))
@@ -91,5 +91,5 @@ def errors_against_truth(known: SavedCamera, truth: dict[str, Any]) -> dict[str,
         'rays, best turned, largest, deg': result.rays_aligned.largest_deg,
         'ground normal, deg': result.normal_deg, 'tilt, deg': pose.get('tilt'), 'roll, deg': pose.get('roll'),
         'height, m': pose.get('height'),
-        f'distances within {NEAR_M:g} m, median, %':
-            distance_percent(scaled.lens, scaled.ground, truth) if metric else None}
+        f'distances within {MAX_COMPARED_RANGE_M:g} m, median, %':
+            distance_error_percent(scaled.lens, scaled.ground, truth) if metric else None}

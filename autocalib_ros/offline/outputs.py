@@ -16,7 +16,7 @@ from autocalib_ros.results.calibration_json import write_calibration_json
 CAMERA_INFO, CALIBRATION, EVIDENCE, REPORT = 'camera_info.yaml', 'calibration.json', 'evidence.npz', 'report.html'
 
 
-def prepare(out_dir: Path, bag: Path | None = None) -> None:
+def prepare_output_dir(out_dir: Path, bag: Path | None = None) -> None:
     """Make the folder for the results, and make sure that nothing stands in the way; UsageError otherwise."""
     if out_dir.exists() and not out_dir.is_dir():
         raise UsageError(f'{out_dir} is a file, not a folder for the results')

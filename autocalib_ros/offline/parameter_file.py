@@ -13,12 +13,12 @@ from autocalib_ros.errors import InputError, UsageError
 
 WILDCARDS = ('*', '**')
 ROS_PARAMETERS = ('use_sim_time', 'start_type_description_service')
-OVERRIDES_OF_ROS = 'qos_overrides.'
+QOS_OVERRIDES_PREFIX = 'qos_overrides.'
 
 
 def read_params_file(path: Path) -> dict[str, Any]:
     """Return the core's options in a ROS 2 parameter file by full name; what only a live node needs is left out."""
-    return {name: value for name, value in _values(path).items() if not _only_for_nodes(name)}
+    return {name: value for name, value in _read_values(path).items() if not _is_node_only(name)}
 
 
 def camera_info_file(path: Path) -> str:
@@ -26,10 +26,10 @@ def camera_info_file(path: Path) -> str:
 
     A replay uses the lens that the live node uses, so that both give the same.
     """
-    return NodeOptions(camera_info_file=_values(path).get('camera_info_file', '')).camera_info_file
+    return NodeOptions(camera_info_file=_read_values(path).get('camera_info_file', '')).camera_info_file
 
 
-def _values(path: Path) -> dict[str, Any]:
+def _read_values(path: Path) -> dict[str, Any]:
     try:
         tree = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
     except OSError as error:
@@ -37,7 +37,7 @@ def _values(path: Path) -> dict[str, Any]:
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise InputError(f'{path} is not YAML: {" ".join(str(error).split())}') from error
     values: dict[str, Any] = {}
-    for section in _chosen(path, _sections(tree)):
+    for section in _applicable_sections(path, _sections(tree)):
         values.update(flatten(section))
     return values
 
@@ -53,7 +53,7 @@ def _sections(tree: Any, name: str = '') -> dict[str, Mapping[str, Any]]:
     return found
 
 
-def _chosen(path: Path, sections: dict[str, Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+def _applicable_sections(path: Path, sections: dict[str, Mapping[str, Any]]) -> list[Mapping[str, Any]]:
     """Return the sections that hold for a replay, those for all nodes first: a file may serve several nodes."""
     if not sections:
         raise InputError(f"{path} is not a ROS 2 parameter file: it has no 'ros__parameters'")
@@ -66,9 +66,9 @@ def _chosen(path: Path, sections: dict[str, Mapping[str, Any]]) -> list[Mapping[
     return [sections[name] for name in general + named]
 
 
-def _only_for_nodes(name: str) -> bool:
+def _is_node_only(name: str) -> bool:
     node_names = {item.name for item in walk_options(NodeOptions())}
-    return name in node_names or name in ROS_PARAMETERS or name.startswith(OVERRIDES_OF_ROS)
+    return name in node_names or name in ROS_PARAMETERS or name.startswith(QOS_OVERRIDES_PREFIX)
 
 
 def parse_assignments(assignments: list[str]) -> dict[str, Any]:
@@ -85,7 +85,7 @@ def parse_assignments(assignments: list[str]) -> dict[str, Any]:
     return values
 
 
-def options_with(options: Options, values: Mapping[str, Any]) -> Options:
+def override_options(options: Options, values: Mapping[str, Any]) -> Options:
     """Return `options` with values by full name; YAML takes `1e-05`, without a point, for text."""
     floats = {item.name for item in walk_options(options) if isinstance(item.default, float)}
     return with_overrides(options, {name: _as_float(value) if name in floats else value

@@ -17,10 +17,10 @@ from autocalib_ros.perception.detector.detector import VehicleDetector
 from autocalib_ros.report.scene import SolutionSnapshot, append_snapshot
 from autocalib_ros.results.calibration import Calibration, Refusal
 
-SETTLING = 2.0
+SOLVE_AGAIN_GROWTH = 2.0
 """Once accepted, a solution on the way is tried again when the recording has grown by this factor: by then a standard
 deviation has fallen by a third. Only the report has use for it."""
-NOTE_EVERY = 15
+PROGRESS_EVERY_FRAMES = 15
 """Frames between two questions for the progress: it is for people, who read slowly."""
 
 
@@ -48,32 +48,32 @@ def replay(source: Source, options: Options, on_progress: Callable[[int, str], N
     pose is solved; UsageError at the first image that is not of its shape. A `detector` that is open already is used,
     else that of the options is opened.
     """
-    tell = on_progress or (lambda done, note: None)
-    calibrator, accepted_at_s, count, note, fitting = AutoCalibrator(options, detector), None, 0, '', None
+    report_progress = on_progress or (lambda done, note: None)
+    calibrator, accepted_at_s, count, note, scaled_lens = AutoCalibrator(options, detector), None, 0, '', None
     latest: Calibration | Refusal | None = None
     moments: tuple[SolutionSnapshot, ...] = ()
-    again_s = 0.0
+    next_solve_s = 0.0
     for count, frame in enumerate(source.frames(), start=1):
-        fitting = _fitting(lens, (frame.image.shape[1], frame.image.shape[0]))
+        scaled_lens = _scaled_lens(lens, (frame.image.shape[1], frame.image.shape[0]))
         calibrator.add_image(frame.stamp_ns, frame.image)
         due = calibrator.snapshot_if_due()
-        if due is not None and due.seconds >= again_s:
-            tell(count, 'solving')
-            tried = solve(due, options, lens=fitting)
+        if due is not None and due.seconds >= next_solve_s:
+            report_progress(count, 'solving')
+            tried = solve(due, options, lens=scaled_lens)
             moments = append_snapshot(moments, tried)
             if tried and accepted_at_s is None:  # a live run would have been accepted then
                 accepted_at_s = due.seconds
             latest = tried if tried or accepted_at_s is None else latest
-            again_s = 0.0 if accepted_at_s is None else SETTLING * due.seconds
-        if on_progress is not None and count % NOTE_EVERY == 1:
-            note = _note(calibrator, latest, accepted_at_s)
-        tell(count, note)
+            next_solve_s = 0.0 if accepted_at_s is None else SOLVE_AGAIN_GROWTH * due.seconds
+        if on_progress is not None and count % PROGRESS_EVERY_FRAMES == 1:
+            note = _progress_note(calibrator, latest, accepted_at_s)
+        report_progress(count, note)
     evidence = calibrator.snapshot()
     if evidence is None:
         raise InputError(f'{source.name} gives no image')
-    tell(count, 'solving')
-    result = solve(evidence, options, lens=fitting)
-    tell(count, 'calibrated' if result else 'refused')
+    report_progress(count, 'solving')
+    result = solve(evidence, options, lens=scaled_lens)
+    report_progress(count, 'calibrated' if result else 'refused')
     if result and accepted_at_s is None:
         accepted_at_s = evidence.seconds
     return ReplayResult(result=result, evidence=evidence, accepted_at_s=accepted_at_s,
@@ -81,7 +81,7 @@ def replay(source: Source, options: Options, on_progress: Callable[[int, str], N
                         moments=append_snapshot(moments, result))
 
 
-def _note(calibrator: AutoCalibrator, latest: Calibration | Refusal | None, accepted_at_s: float | None) -> str:
+def _progress_note(calibrator: AutoCalibrator, latest: Calibration | Refusal | None, accepted_at_s: float | None) -> str:
     """Say the state, how far the evidence has come, and what is missing."""
     if isinstance(latest, Calibration):
         return f'calibrated since {accepted_at_s:.0f} s: focal length {latest.camera.focal_px:.0f} px'
@@ -91,11 +91,11 @@ def _note(calibrator: AutoCalibrator, latest: Calibration | Refusal | None, acce
     return f'collecting {progress}' + (f': {latest.message}' if refused else '')
 
 
-def solve_again(evidence: Evidence, options: Options, lens: Camera | None = None) -> ReplayResult:
+def solve_evidence(evidence: Evidence, options: Options, lens: Camera | None = None) -> ReplayResult:
     """Solve saved evidence; it does not tell when it would first have been accepted, and has no picture."""
-    return ReplayResult(result=solve(evidence, options, lens=_fitting(lens, evidence.image_size)), evidence=evidence,
+    return ReplayResult(result=solve(evidence, options, lens=_scaled_lens(lens, evidence.image_size)), evidence=evidence,
                         accepted_at_s=None, background=None, frames=evidence.frames, options=options)
 
 
-def _fitting(lens: Camera | None, image_size: tuple[int, int]) -> Camera | None:
+def _scaled_lens(lens: Camera | None, image_size: tuple[int, int]) -> Camera | None:
     return None if lens is None else lens.scaled_to(*image_size)

@@ -17,17 +17,17 @@ from autocalib_ros.offline.recordings.sources import Source
 from autocalib_ros.offline.recordings.videos import FALLBACK_FPS
 from autocalib_ros.offline.terminal.progress import progress_bar
 
-PICTURES = ('.png', '.jpg', '.jpeg')
-CODECS = {'.mp4': 'mp4v', '.avi': 'MJPG'}
-IMAGES = (*PICTURES, '.bmp', '.tif', '.tiff', '.webp', '.pgm', '.ppm')
+PICTURE_SUFFIXES = ('.png', '.jpg', '.jpeg')
+VIDEO_CODECS = {'.mp4': 'mp4v', '.avi': 'MJPG'}
+IMAGE_SUFFIXES = (*PICTURE_SUFFIXES, '.bmp', '.tif', '.tiff', '.webp', '.pgm', '.ppm')
 JPEG_QUALITY = 88
 
-View = Callable[[np.ndarray], np.ndarray]
+Renderer = Callable[[np.ndarray], np.ndarray]
 """Takes an image, grey (H, W) or BGR (H, W, 3) uint8, to the picture of it, BGR uint8."""
 
 
 @dataclass(frozen=True)
-class Part:
+class SourceSelection:
     """Which images of a recording: a picture takes the first of them."""
 
     topic: str | None = None
@@ -35,34 +35,34 @@ class Part:
     duration_s: float | None = None
 
 
-def write_view(source: Path, out: Path, part: Part, view_for: Callable[[int, int], View], *, label: str,
+def write_view(source: Path, out: Path, selection: SourceSelection, renderer_for: Callable[[int, int], Renderer], *, label: str,
                quiet: bool = False) -> tuple[int, int]:
-    """Write what `view_for(width, height)` makes of the images; return the size of the picture or video.
+    """Write what `renderer_for(width, height)` makes of the images; return the size of the picture or video.
 
     A file of that name is replaced once the new one is whole. UsageError where the names do not fit each other,
     InputError where something cannot be read or written.
     """
-    _check(source, out, part)
-    if source.suffix.lower() in IMAGES:
-        return _write_picture(out, _applied(view_for, read_image(source)))
-    recording = open_source(source, part.topic, part.start_s, part.duration_s)
-    if out.suffix.lower() in PICTURES:
-        return _write_picture(out, _applied(view_for, next(iter(recording.frames())).image))
-    return _write_video(recording, out, view_for, label, quiet)
+    _check(source, out, selection)
+    if source.suffix.lower() in IMAGE_SUFFIXES:
+        return _write_picture(out, _render(renderer_for, read_image(source)))
+    recording = open_source(source, selection.topic, selection.start_s, selection.duration_s)
+    if out.suffix.lower() in PICTURE_SUFFIXES:
+        return _write_picture(out, _render(renderer_for, next(iter(recording.frames())).image))
+    return _write_video(recording, out, renderer_for, label, quiet)
 
 
-def _check(source: Path, out: Path, part: Part) -> None:
+def _check(source: Path, out: Path, selection: SourceSelection) -> None:
     kind = out.suffix.lower()
-    if kind not in (*PICTURES, *CODECS):
-        raise UsageError(f'{out} is neither a picture nor a video: name it {", ".join((*PICTURES, *CODECS))}')
+    if kind not in (*PICTURE_SUFFIXES, *VIDEO_CODECS):
+        raise UsageError(f'{out} is neither a picture nor a video: name it {", ".join((*PICTURE_SUFFIXES, *VIDEO_CODECS))}')
     if out.is_dir():
         raise UsageError(f'{out} is a folder, not a file to write')
     if out.exists() and source.exists() and out.samefile(source):
         raise UsageError(f'{out} is the source itself: choose another name for the result')
-    if source.suffix.lower() in IMAGES and (kind in CODECS or part != Part()):
-        raise UsageError(f'{source} is one image: write one picture ({", ".join(PICTURES)}) of it, without --at,'
+    if source.suffix.lower() in IMAGE_SUFFIXES and (kind in VIDEO_CODECS or selection != SourceSelection()):
+        raise UsageError(f'{source} is one image: write one picture ({", ".join(PICTURE_SUFFIXES)}) of it, without --at,'
                          ' --duration and --topic')
-    if kind in PICTURES and part.duration_s is not None:
+    if kind in PICTURE_SUFFIXES and selection.duration_s is not None:
         raise UsageError(f'{out} is one picture, and --duration is for videos: give --at alone')
 
 
@@ -78,12 +78,12 @@ def read_image(path: Path) -> np.ndarray:
     return image
 
 
-def _applied(view_for: Callable[[int, int], View], image: np.ndarray) -> np.ndarray:
-    return view_for(image.shape[1], image.shape[0])(image)
+def _render(renderer_for: Callable[[int, int], Renderer], image: np.ndarray) -> np.ndarray:
+    return renderer_for(image.shape[1], image.shape[0])(image)
 
 
 def _write_picture(out: Path, picture: np.ndarray) -> tuple[int, int]:
-    with _whole(out) as unfinished:
+    with _atomic_output(out) as unfinished:
         encoded, data = cv2.imencode(out.suffix.lower(), picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
         if not encoded:
             raise InputError(f'cannot write {out}: OpenCV has no encoder for {out.suffix}')
@@ -91,17 +91,17 @@ def _write_picture(out: Path, picture: np.ndarray) -> tuple[int, int]:
     return picture.shape[1], picture.shape[0]
 
 
-def _write_video(recording: Source, out: Path, view_for: Callable[[int, int], View], label: str,
+def _write_video(recording: Source, out: Path, renderer_for: Callable[[int, int], Renderer], label: str,
                  quiet: bool) -> tuple[int, int]:
     view = writer = size = None
-    with _whole(out) as unfinished, progress_bar(recording.total, 'images', label, quiet=quiet) as progress:
+    with _atomic_output(out) as unfinished, progress_bar(recording.total, 'images', label, quiet=quiet) as progress:
         try:
             for count, frame in enumerate(recording.frames(), start=1):
-                view = view or view_for(frame.image.shape[1], frame.image.shape[0])
+                view = view or renderer_for(frame.image.shape[1], frame.image.shape[0])
                 picture = view(frame.image)
                 if writer is None:
                     size = (picture.shape[1] // 2 * 2, picture.shape[0] // 2 * 2)  # codecs halve the colours
-                    writer = _opened(out, unfinished, _rate(recording), size)
+                    writer = _open_writer(out, unfinished, _frame_rate(recording), size)
                 writer.write(np.ascontiguousarray(picture[:size[1], :size[0]]))
                 progress.update_to(count)
         finally:
@@ -110,8 +110,8 @@ def _write_video(recording: Source, out: Path, view_for: Callable[[int, int], Vi
     return size
 
 
-def _opened(out: Path, unfinished: Path, rate: float, size: tuple[int, int]) -> cv2.VideoWriter:
-    codec = CODECS[out.suffix.lower()]
+def _open_writer(out: Path, unfinished: Path, rate: float, size: tuple[int, int]) -> cv2.VideoWriter:
+    codec = VIDEO_CODECS[out.suffix.lower()]
     writer = cv2.VideoWriter(str(unfinished), cv2.VideoWriter_fourcc(*codec), rate, size)
     if not writer.isOpened():
         raise InputError(f'cannot write {out}: this OpenCV cannot encode {codec} of {size[0]}x{size[1]} there; choose'
@@ -119,12 +119,12 @@ def _opened(out: Path, unfinished: Path, rate: float, size: tuple[int, int]) -> 
     return writer
 
 
-def _rate(recording: Source) -> float:
+def _frame_rate(recording: Source) -> float:
     return recording.total / recording.duration_s if recording.total and recording.duration_s else FALLBACK_FPS
 
 
 @contextmanager
-def _whole(out: Path) -> Iterator[Path]:
+def _atomic_output(out: Path) -> Iterator[Path]:
     """Yield a name to write to, which takes the place of `out` at the end; nothing of it is left after an error."""
     unfinished = out.with_name(f'.{out.stem}~{os.getpid()}{out.suffix}')
     try:

@@ -10,7 +10,7 @@ import pytest
 from autocalib_ros.config import Options
 from autocalib_ros.errors import InputError
 from autocalib_ros.geometry.ground_plane import GroundPlane
-from autocalib_ros.offline.demonstration import compare, options_from
+from autocalib_ros.offline.demonstration import compare_with_truth, options_from_truth
 from autocalib_ros.offline.ground_truth import read_truth
 from autocalib_ros.pictures.views import ground_to_image
 
@@ -27,24 +27,24 @@ def truth(full):
 
 
 def test_the_truth_itself_has_no_error(full, truth):
-    comparison = compare(full.result, truth)
-    assert comparison.good
-    assert comparison.focal_percent == pytest.approx(0)
+    comparison = compare_with_truth(full.result, truth)
+    assert comparison.within_tolerance
+    assert comparison.focal_error_percent == pytest.approx(0)
     assert comparison.normal_deg == pytest.approx(0, abs=1e-6)
-    assert comparison.distance_percent == pytest.approx(0, abs=1e-6)
+    assert comparison.distance_error_percent == pytest.approx(0, abs=1e-6)
     assert 'within 3 %' in comparison.table()
 
 
 def test_a_wrong_scale_shows_in_height_and_distances(full, truth):
     ground = GroundPlane(full.result.ground.rotation, 8.8)
-    comparison = compare(replace(full.result, ground=ground), truth)
+    comparison = compare_with_truth(replace(full.result, ground=ground), truth)
     assert comparison.height_m == pytest.approx(0.8)
-    assert comparison.distance_percent == pytest.approx(10)
+    assert comparison.distance_error_percent == pytest.approx(10)
 
 
 def test_somebody_who_knows_a_distance_or_a_speed_is_given_the_truth(truth):
-    assert options_from(truth, 'height') == Options(camera_height=8.0)
-    by_distance = options_from(truth, 'distance')
+    assert options_from_truth(truth, 'height') == Options(camera_height=8.0)
+    by_distance = options_from_truth(truth, 'distance')
     (u, v), _ = by_distance.scale.pixels
     assert min(np.hypot(u - row[2], v - row[3]) for row in truth['ground_points']['rows']) < 0.1
     assert 0 < by_distance.scale.distance_m <= 18 * np.sqrt(2) + 1e-9
@@ -54,25 +54,25 @@ def test_somebody_who_knows_a_distance_or_a_speed_is_given_the_truth(truth):
     truth |= {'road_directions': [[1, 0, 0], [0, 1, 0]],
               'vehicles': {'tracks': [{'rows': along + waiting}, {'rows': turning}, {'rows': along}]}}
     # waiting takes no way, and a loop on the way does not see it
-    assert options_from(truth, 'speed').scale.speed_km_h == pytest.approx(36.0)
+    assert options_from_truth(truth, 'speed').scale.speed_km_h == pytest.approx(36.0)
 
 
 def test_a_tilted_ground_is_not_good(full, truth):
     angle = np.radians(1.5)
     tilt = np.array([[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]])
-    comparison = compare(replace(full.result, ground=GroundPlane(tilt @ full.result.ground.rotation, 8.0)), truth)
+    comparison = compare_with_truth(replace(full.result, ground=GroundPlane(tilt @ full.result.ground.rotation, 8.0)), truth)
     assert comparison.normal_deg == pytest.approx(1.5)
-    assert not comparison.good
+    assert not comparison.within_tolerance
 
 
 def test_a_wrong_focal_length_is_not_good(full, truth):
     truth['lens']['f'] = 130.0
-    assert not compare(full.result, truth).good
+    assert not compare_with_truth(full.result, truth).within_tolerance
 
 
 def test_a_lens_without_ground_is_not_good_and_a_refusal_is_nothing(lens_only, refused, truth):
-    assert not compare(lens_only.result, truth).good
-    assert compare(refused.result, truth) is None
+    assert not compare_with_truth(lens_only.result, truth).within_tolerance
+    assert compare_with_truth(refused.result, truth) is None
 
 
 @pytest.mark.parametrize('text', [None, '{'])

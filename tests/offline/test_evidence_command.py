@@ -16,7 +16,7 @@ from autocalib_ros.lens.camera import Camera
 from autocalib_ros.lens.camera_info_yaml import read_camera_info, write_camera_info_yaml
 from autocalib_ros.offline.synthetic.junction import Junction, synthetic_evidence
 
-JUNCTION = Junction(noise_px=0.2, turning_share=0.0)
+JUNCTION = Junction(noise_px=0.2, turning_fraction=0.0)
 SMALL_LENS = Camera(640, 360, 280.0, (319.5, 179.5))
 """The junction's lens, in images of half the size."""
 REFUSE = ('-p', 'gate.min_tracks=100000')

@@ -62,7 +62,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def spoil(folder: Path, case: str, **changes: Any) -> None:
+def corrupt_track(folder: Path, case: str, **changes: Any) -> None:
     """Expect something else of a case."""
     path = folder / golden.EXPECTED
     document = json.loads(path.read_text())
@@ -215,8 +215,8 @@ def test_nothing_moved_is_status_0(folder: Path, capsys: pytest.CaptureFixture[s
 def test_what_moved_is_printed_and_status_3_until_it_is_expected(
         folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     right = (folder / golden.EXPECTED).read_text()
-    spoil(folder, 'bend', refusal='horizon')
-    spoil(folder, 'pedestrians', refusal='horizon')
+    corrupt_track(folder, 'bend', refusal='horizon')
+    corrupt_track(folder, 'pedestrians', refusal='horizon')
     wrong = (folder / golden.EXPECTED).read_text()
     command = ['benchmark', 'golden', str(folder), '--only', 'bend']
     assert main(command) == 3
@@ -226,7 +226,7 @@ def test_what_moved_is_printed_and_status_3_until_it_is_expected(
     assert (folder / golden.EXPECTED).read_text() == wrong
     assert main([*command, '--update']) == 3  # it did move
     assert main(command) == 0
-    spoil(folder, 'pedestrians', refusal=json.loads(right)['cases']['pedestrians']['expected']['refusal'])
+    corrupt_track(folder, 'pedestrians', refusal=json.loads(right)['cases']['pedestrians']['expected']['refusal'])
     assert json.loads((folder / golden.EXPECTED).read_text()) == json.loads(right)  # what was not solved stayed
 
 

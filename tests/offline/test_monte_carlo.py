@@ -21,15 +21,15 @@ from autocalib_ros.offline.benchmark.monte_carlo import (
     Run,
     Task,
     compare_calibrations,
-    csv_rows,
     distance_error,
-    evidence_of,
-    measure,
-    rays_error_deg,
+    draw_evidence,
+    mean_ray_error_deg,
+    open_csv,
     run_method,
+    run_monte_carlo,
     run_task,
 )
-from autocalib_ros.offline.benchmark.table import beyond_own_sigmas, falsely_accepted, tables
+from autocalib_ros.offline.benchmark.table import falsely_accepted, format_tables, is_overconfident
 from autocalib_ros.offline.synthetic.junction import Junction, pose
 from autocalib_ros.results.calibration import (
     Calibration,
@@ -108,16 +108,16 @@ def test_a_refusal_keeps_its_code() -> None:
 
 
 def test_a_solver_that_fails_does_not_end_the_benchmark() -> None:
-    found = run_method(TASK, 'unheard_of', *evidence_of('few', 0, 0))
+    found = run_method(TASK, 'unheard_of', *draw_evidence('few', 0, 0))
     assert (found.accepted, found.code) == (False, 'crash:UsageError')
 
 
 def test_turning_the_camera_is_no_error_of_its_rays() -> None:
     true = Camera.equidistant(1280, 720, 560.0)
     shifted = Camera(1280, 720, 560.0, (659.5, 359.5))
-    assert rays_error_deg(true, true) == pytest.approx(0.0, abs=1e-9)
-    assert rays_error_deg(shifted, true) < 0.3  # 20 px are two degrees, most of which is a rotation
-    assert rays_error_deg(replace(true, focal_px=1.05 * 560.0), true) > 1.0
+    assert mean_ray_error_deg(true, true) == pytest.approx(0.0, abs=1e-9)
+    assert mean_ray_error_deg(shifted, true) < 0.3  # 20 px are two degrees, most of which is a rotation
+    assert mean_ray_error_deg(replace(true, focal_px=1.05 * 560.0), true) > 1.0
 
 
 def test_a_plane_tilted_by_a_degree_falsifies_distances_by_some_per_cent() -> None:
@@ -131,14 +131,14 @@ def test_a_plane_tilted_by_a_degree_falsifies_distances_by_some_per_cent() -> No
 def test_families_of_scenes_are_solved_without_a_crash(family: str) -> None:
     results = run_task(Task(family, 0, 0, ('paper', *(['joint'] if family == 'sparse' else []))))  # the quickest
     assert not any(result.code.startswith('crash') for result in results)
-    assert not any(beyond_own_sigmas(result) for result in results)
+    assert not any(is_overconfident(result) for result in results)
 
 
 def test_a_run_can_be_drawn_again_alone() -> None:
-    (_, first), (_, again), (_, other) = (evidence_of('few', 3, number) for number in (1, 1, 2))
+    (_, first), (_, again), (_, other) = (draw_evidence('few', 3, number) for number in (1, 1, 2))
     np.testing.assert_array_equal(first.points_px, again.points_px)
     assert not np.array_equal(first.points_px[:20], other.points_px[:20])
-    assert not np.array_equal(first.points_px[:20], evidence_of('few', 4, 1)[1].points_px[:20])
+    assert not np.array_equal(first.points_px[:20], draw_evidence('few', 4, 1)[1].points_px[:20])
 
 
 @pytest.mark.parametrize(('changes', 'wrong'), [
@@ -167,8 +167,8 @@ def test_false_is_what_its_own_sigmas_or_five_per_cent_forbid(changes: dict[str,
     ({'focal_error': 0.4, 'focal_sigma': float('nan')}, False),
     ({'tilt_error_deg': float('nan'), 'roll_error_deg': float('nan')}, False)])
 def test_beyond_is_what_its_own_sigmas_forbid(changes: dict[str, object], beyond: bool) -> None:
-    assert beyond_own_sigmas(run(**changes)) is beyond
-    assert not beyond_own_sigmas(refused('no_motion', **{name: changes[name] for name in changes}))
+    assert is_overconfident(run(**changes)) is beyond
+    assert not is_overconfident(refused('no_motion', **{name: changes[name] for name in changes}))
 
 
 @pytest.mark.parametrize(('family', 'title'), [('standard', 'determines the calibration: stated'),
@@ -176,15 +176,15 @@ def test_beyond_is_what_its_own_sigmas_forbid(changes: dict[str, object], beyond
 def test_table_flags_what_is_beyond_its_own_sigmas_in_either_list(family: str, title: str) -> None:
     runs = [run(family=family), run(family=family, tilt_error_deg=0.7), run(family=family, focal_error=0.2),
             refused('horizon', family=family)]
-    words = cells(tables(runs), title, family)
+    words = cells(format_tables(runs), title, family)
     assert words[4:6] == ['1', '2']
-    assert re.search(r'false +beyond', tables(runs))
+    assert re.search(r'false +beyond', format_tables(runs))
 
 
 def test_table_counts_acceptance_refusals_and_errors() -> None:
     runs = [run(focal_error=0.03, normal_deg=0.5), run(focal_error=-0.01, normal_deg=1.5), refused('horizon'),
             refused('no_motion'), refused('no_motion')]
-    assert cells(tables(runs), 'determines the calibration: errors', 'standard') == [
+    assert cells(format_tables(runs), 'determines the calibration: errors', 'standard') == [
         'standard', 'joint', '5', '40', 'no_motion', '+1.00', '2.83', '2.00', '3.00', '1.00', '1.50', '0.200', '2.00']
 
 
@@ -193,21 +193,21 @@ def test_table_holds_errors_against_their_sigmas() -> None:
             run(normal_deg=float('nan'), tilt_error_deg=float('nan'), roll_error_deg=float('nan'), grade='lens'),
             refused('horizon')]
     # focal z 1, 7, 1, 1; tilt z 1.5, 1.5, 2.5; roll z 0.8, 0.8, -3
-    assert cells(tables(runs), 'determines the calibration: stated', 'standard') == [
+    assert cells(format_tables(runs), 'determines the calibration: stated', 'standard') == [
         'standard', 'joint', '5', '80', '1', '1', '75', '75', '67', '67', '3.61', '1.89', '1.40']
 
 
 def test_table_shows_a_dash_where_there_is_nothing() -> None:
     paper = [run(method='paper', focal_sigma=float('nan'), tilt_sigma_deg=float('nan'), roll_sigma_deg=float('nan'))]
-    assert cells(tables(paper), 'stated', 'standard')[7:12] == ['-'] * 5
-    assert cells(tables([refused('horizon')]), 'errors', 'standard')[5:] == ['-'] * 8
+    assert cells(format_tables(paper), 'stated', 'standard')[7:12] == ['-'] * 5
+    assert cells(format_tables([refused('horizon')]), 'errors', 'standard')[5:] == ['-'] * 8
 
 
 def test_methods_stand_beneath_each_other_and_lines_fit_a_terminal() -> None:
     runs = [run(family=family, method=method, focal_error=-12.3456, normal_deg=123.456)
             for family in ('lane_changes', 'distortion_free_skew') for method in ('joint', 'paper')]
     runs.append(refused('crash:LinAlgError', family='noise', run=4))
-    text = tables(runs)
+    text = format_tables(runs)
     assert max(map(len, text.splitlines())) <= 120
     lines = [line.split()[:2] for line in text.splitlines()]
     place = lines.index(['lane_changes', 'joint'])
@@ -217,7 +217,7 @@ def test_methods_stand_beneath_each_other_and_lines_fit_a_terminal() -> None:
 
 
 def test_csv_has_a_row_a_run_and_leaves_blank_what_is_not_given(tmp_path: Path) -> None:
-    with csv_rows(tmp_path / 'new' / 'runs.csv') as write:
+    with open_csv(tmp_path / 'new' / 'runs.csv') as write:
         write([run(run=1), refused('horizon', run=2)])
     with (tmp_path / 'new' / 'runs.csv').open(newline='') as stream:
         first, second = csv.DictReader(stream)
@@ -227,7 +227,7 @@ def test_csv_has_a_row_a_run_and_leaves_blank_what_is_not_given(tmp_path: Path) 
 
 def test_a_csv_that_cannot_be_written_is_told_before_the_work(tmp_path: Path) -> None:
     with pytest.raises(InputError, match='cannot write'):
-        measure(['many'], ['joint'], 1000, out=tmp_path, quiet=True)
+        run_monte_carlo(['many'], ['joint'], 1000, out=tmp_path, quiet=True)
 
 
 def test_benchmark_runs_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -243,7 +243,7 @@ def test_benchmark_runs_from_the_command_line(tmp_path: Path, capsys: pytest.Cap
 
 
 def test_processes_do_not_change_the_result() -> None:
-    alone, shared = (measure(['pedestrians'], ['paper'], 2, jobs=jobs, quiet=True) for jobs in (1, 2))
+    alone, shared = (run_monte_carlo(['pedestrians'], ['paper'], 2, jobs=jobs, quiet=True) for jobs in (1, 2))
     assert [str(replace(item, cpu_s=0.0)) for item in alone] == [str(replace(item, cpu_s=0.0)) for item in shared]
 
 

@@ -64,11 +64,11 @@ def test_a_refusal_removes_the_camera_info_of_an_earlier_run(tmp_path, refused, 
 def test_what_stands_in_the_way_is_wrong_usage(tmp_path):
     (tmp_path / 'file').touch()
     with pytest.raises(UsageError, match='is a file, not a folder'):
-        outputs.prepare(tmp_path / 'file', None)
+        outputs.prepare_output_dir(tmp_path / 'file', None)
     with pytest.raises(UsageError, match='cannot make the folder'):
-        outputs.prepare(tmp_path / 'file' / 'out', None)
+        outputs.prepare_output_dir(tmp_path / 'file' / 'out', None)
     with pytest.raises(UsageError, match='exists already and is not overwritten'):
-        outputs.prepare(tmp_path / 'out', tmp_path / 'file')
+        outputs.prepare_output_dir(tmp_path / 'out', tmp_path / 'file')
 
 
 def test_the_new_bag_holds_images_calibration_and_transforms(tmp_path, full, source, jazzy):

@@ -6,13 +6,13 @@ import pytest
 
 from autocalib_ros.config import Options
 from autocalib_ros.errors import InputError, UsageError
-from autocalib_ros.offline.parameter_file import camera_info_file, options_with, parse_assignments, read_params_file
+from autocalib_ros.offline.parameter_file import camera_info_file, override_options, parse_assignments, read_params_file
 
 
 def options_from(tmp_path, text: str) -> Options:
     path = tmp_path / 'params.yaml'
     path.write_text(text)
-    return options_with(Options(), read_params_file(path))
+    return override_options(Options(), read_params_file(path))
 
 
 def test_nested_names_are_read(tmp_path):
@@ -97,7 +97,7 @@ def test_a_missing_file_is_named(tmp_path):
 
 @pytest.mark.parametrize('text', ['joint.noise_px=0.25', 'joint.noise_px:=0.25', 'joint.noise_px=25e-2'])
 def test_assignments_are_read(text):
-    assert options_with(Options(), parse_assignments([text])).joint.noise_px == 0.25
+    assert override_options(Options(), parse_assignments([text])).joint.noise_px == 0.25
 
 
 @pytest.mark.parametrize('text', ['noise', '=3', 'a=[1'])
@@ -114,4 +114,4 @@ def test_a_distance_stands_in_a_file_as_text(tmp_path):
 
 def test_a_distance_is_assigned_on_the_command_line():
     values = parse_assignments(['scale_from=distance', 'scale.distance_px=412 530 888 530', 'scale.distance_m:=12'])
-    assert options_with(Options(), values).scale.pixels == ((412.0, 530.0), (888.0, 530.0))
+    assert override_options(Options(), values).scale.pixels == ((412.0, 530.0), (888.0, 530.0))

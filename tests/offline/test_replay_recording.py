@@ -13,7 +13,7 @@ from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.recordings.open import open_source
 from autocalib_ros.offline.recordings.sources import Frame
-from autocalib_ros.offline.replay_recording import replay, solve_again
+from autocalib_ros.offline.replay_recording import replay, solve_evidence
 from autocalib_ros.results.calibration import Refusal
 
 
@@ -86,7 +86,7 @@ def test_a_lens_of_another_shape_is_noticed_at_the_first_image():
 
 def test_evidence_solved_again_gives_the_same():
     replayed = replay(Drive(40), Options())
-    again = solve_again(replayed.evidence, Options())
+    again = solve_evidence(replayed.evidence, Options())
     assert again.result == replayed.result
     assert (again.frames, again.background, again.accepted_at_s) == (40, None, None)
 

@@ -11,30 +11,41 @@ import pytest
 from autocalib_ros.errors import UsageError
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.offline.benchmark.families import distortion_free_lens, families, radial, short_piece, viewpoint
+from autocalib_ros.offline.benchmark.families import (
+    draw_distortion_free_lens,
+    families,
+    radial,
+    short_piece,
+    standard_junction,
+)
 from autocalib_ros.offline.simulate.junctions import junction as crossing
 from autocalib_ros.offline.simulate.motorway import highway
 from autocalib_ros.offline.simulate.network import Network
 from autocalib_ros.offline.simulate.roundabout import RING_RADIUS_M, roundabout
 from autocalib_ros.offline.simulate.scenes import bend
-from autocalib_ros.offline.synthetic.disturbances import background_drift_px, fold, spoil, waving
+from autocalib_ros.offline.synthetic.disturbances import (
+    background_drift_px,
+    corrupt_track,
+    random_sway,
+    reflect_into_image,
+)
 from autocalib_ros.offline.synthetic.drives import (
     INTERVAL_S,
     ROUTE_REACH_M,
-    Path,
+    Trajectory,
     drive_across,
     drive_bend,
     drive_ring,
     drive_route,
     shadow,
-    stroll,
     trailer,
+    walk_along_road,
 )
 from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_evidence
 
 FAMILIES = tuple(families())
 TRACKS = {'standard': 60, 'few': 40, 'many': 400}
-CLEAN = Junction(turning_share=0.0, wander_m=0.0, noise_px=0.0)
+CLEAN = Junction(turning_fraction=0.0, wander_m=0.0, noise_px=0.0)
 NETWORKS = {'highway': highway(one_way=True, changing_fraction=1.0), 'bend': bend(one_way=False),
             'roundabout': roundabout(turning_fraction=0.5), 'skew': crossing(np.radians(65.0), turning_fraction=1.0),
             'tee': crossing(np.pi / 2, turning_fraction=0.5, tee=True)}
@@ -101,7 +112,7 @@ def test_tracks_are_shared_among_vehicles(name: str, least_vehicles: int) -> Non
 
 @pytest.mark.parametrize('camera', [
     Camera.equidistant(1280, 720, 560.0), Camera(1280, 720, 610.0, (655.0, 345.0), (-0.05, 0.0, 0.0, 0.0)),
-    distortion_free_lens(rng())], ids=['equidistant', 'kannala_brandt', 'distortion_free'])
+    draw_distortion_free_lens(rng())], ids=['equidistant', 'kannala_brandt', 'distortion_free'])
 def test_parallel_noise_free_tracks_meet_in_the_true_direction(camera: Camera) -> None:
     junction = replace(CLEAN, camera=camera, camera_from_ground=pose(30.0, -1.5, 40.0), road_angles_deg=(20.0,))
     normals, worst = circles(junction, synthetic_evidence(junction, rng()))
@@ -119,20 +130,20 @@ def test_the_truth_has_the_normal_of_its_roads() -> None:
 
 
 def test_a_distortion_free_lens_keeps_straight_lines() -> None:
-    camera = distortion_free_lens(rng())
+    camera = draw_distortion_free_lens(rng())
     pixels = np.stack(np.meshgrid(np.linspace(0, 1279, 20), np.linspace(0, 719, 12)), axis=-1).reshape(-1, 2)
     assert np.abs(camera.undistort(pixels) - pixels).max() < 1.0  # the series of the tangent ends
 
 
 def test_the_asked_for_share_of_tracks_is_spoilt() -> None:
-    junction = replace(CLEAN, tracks=300, points_per_vehicle=1, outlier_share=0.2)
+    junction = replace(CLEAN, tracks=300, points_per_vehicle=1, outlier_fraction=0.2)
     _, worst = circles(junction, synthetic_evidence(junction, rng()))
     assert 0.13 < (worst > 1.0).mean() < 0.27  # three sigmas of 300 throws
 
 
 def test_gross_outliers_are_jumps_and_curves_inside_the_image() -> None:
     line = np.column_stack([np.linspace(300, 900, 20), np.full(20, 300.0)])
-    spoilt = [spoil(line, (1280, 720), rng(seed)) for seed in range(40)]
+    spoilt = [corrupt_track(line, (1280, 720), rng(seed)) for seed in range(40)]
     kept = np.array([(points[:2] == line[:2]).all() for points in spoilt])
     assert 8 < kept.sum() < 32  # a jump leaves the beginning as it was
     assert all((points >= 0).all() and (points <= (1279, 719)).all() for points in spoilt)
@@ -141,12 +152,12 @@ def test_gross_outliers_are_jumps_and_curves_inside_the_image() -> None:
 
 def test_folding_mirrors_at_the_border_and_leaves_the_inside_alone() -> None:
     points = np.array([[5.0, 5.0], [-3.0, 4.0], [12.0, 21.0]])
-    np.testing.assert_allclose(fold(points, (11, 11)), [[5.0, 5.0], [3.0, 4.0], [8.0, 1.0]])
+    np.testing.assert_allclose(reflect_into_image(points, (11, 11)), [[5.0, 5.0], [3.0, 4.0], [8.0, 1.0]])
 
 
 @pytest.mark.parametrize('seed', range(5))
 def test_a_lane_change_goes_one_lane_sideways_over_thirty_to_fifty_metres(seed: int) -> None:
-    junction = replace(CLEAN, road_angles_deg=(0.0,), lane_change_share=1.0)
+    junction = replace(CLEAN, road_angles_deg=(0.0,), lane_change_fraction=1.0)
     path, heading = drive_across(junction, rng(seed))
     moving = np.abs(np.gradient(path[:, 1])) > 1e-6
     assert np.ptp(path[:, 1]) == pytest.approx(3.5, abs=1e-6)
@@ -176,7 +187,7 @@ def _centre_of_circle(path: np.ndarray) -> np.ndarray:
     return solution[:2]
 
 
-def routes(network: Network, count: int = 12, wander_m: float = 0.0) -> list[Path]:
+def routes(network: Network, count: int = 12, wander_m: float = 0.0) -> list[Trajectory]:
     junction = replace(CLEAN, centre_m=(0.0, 0.0), wander_m=wander_m)
     return [drive_route(junction, rng(seed), network=network) for seed in range(count)]
 
@@ -211,7 +222,7 @@ def test_a_roundabout_is_entered_circled_and_left() -> None:
 
 def test_a_network_can_be_turned_scaled_and_placed() -> None:
     junction = replace(CLEAN, centre_m=(30.0, -7.0))
-    path, heading = drive_route(junction, rng(1), network=NETWORKS['roundabout'], turned_rad=0.5, scale=1.25)
+    path, heading = drive_route(junction, rng(1), network=NETWORKS['roundabout'], rotation_rad=0.5, scale=1.25)
     radius = np.hypot(*(path - junction.centre_m).T)
     assert radius.min() == pytest.approx(1.25 * RING_RADIUS_M, abs=0.05)
     assert abs(np.sin(2 * (heading[0] - 0.5))) < 1e-6  # arms are square to each other, and turned
@@ -233,7 +244,7 @@ def test_sparse_traffic_is_a_vehicle_every_twelve_seconds() -> None:
 
 
 def test_pedestrians_are_slow_and_change_their_minds() -> None:
-    path, heading = stroll(CLEAN, rng())
+    path, heading = walk_along_road(CLEAN, rng())
     assert np.hypot(*np.diff(path, axis=0).T).max() / INTERVAL_S < 1.8  # metres per second
     assert 3 <= (np.abs(np.diff(heading)) > 0.1).sum() <= 20  # about every four of thirty seconds
 
@@ -248,14 +259,14 @@ def test_a_road_straight_ahead_passes_near_the_distortion_centre() -> None:
 def test_a_short_piece_of_road_is_all_that_is_seen() -> None:
     junction = short_piece(rng())
     evidence = synthetic_evidence(junction, rng())
-    assert junction.window_px is not None
-    assert evidence.points_px[:, 0].min() > junction.window_px[0] - 5 * junction.noise_px
+    assert junction.visible_columns_px is not None
+    assert evidence.points_px[:, 0].min() > junction.visible_columns_px[0] - 5 * junction.noise_px
     assert np.ptp(evidence.points_px[:, 0]) < 0.31 * 1280
 
 
 @pytest.mark.parametrize('seed', range(4))
 def test_a_waving_camera_turns_by_half_to_a_few_degrees_and_its_monitor_sees_it(seed: int) -> None:
-    sway = waving(rng(seed))
+    sway = random_sway(rng(seed))
     trace = np.trace(sway(np.arange(0.0, 200.0, 0.1)), axis1=1, axis2=2)
     largest_deg = np.degrees(np.arccos((trace.min() - 1) / 2))
     assert 0.5 < largest_deg < 12.0  # up to 3 degrees of swing, and four sigmas of the walk
@@ -282,7 +293,7 @@ def test_a_road_out_of_view_is_told() -> None:
 
 
 def test_viewpoints_differ_in_lens_and_pose() -> None:
-    junctions = [viewpoint(rng(seed)) for seed in range(30)]
+    junctions = [standard_junction(rng(seed)) for seed in range(30)]
     tilt = np.degrees(np.arcsin([-junction.normal_in_camera[2] for junction in junctions]))
     k1 = np.array([junction.camera.k[0] for junction in junctions])
     assert 26 <= tilt.min() < 29 and 35 < tilt.max() <= 38

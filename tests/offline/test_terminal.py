@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import pytest
 
-from autocalib_ros.offline.terminal.style import aligned, painted, shortened, shows_colours, state_colour
+from autocalib_ros.offline.terminal.style import align_columns, coloured, state_colour, truncate, wants_colour
 from autocalib_ros.offline.terminal.summary import summary_lines
 
 
@@ -31,14 +31,14 @@ def test_colours_are_for_terminals_that_want_them(environment, on_terminal, else
         monkeypatch.delenv(name, raising=False)
     for name, value in {'TERM': 'xterm', **environment}.items():
         monkeypatch.setenv(name, value)
-    assert (shows_colours(Terminal()), shows_colours(io.StringIO())) == (on_terminal, elsewhere)
+    assert (wants_colour(Terminal()), wants_colour(io.StringIO())) == (on_terminal, elsewhere)
 
 
 def test_a_painted_text_ends_its_colour(monkeypatch):
     monkeypatch.setenv('TERM', 'xterm')
     monkeypatch.delenv('NO_COLOR', raising=False)
-    assert painted('so', 'green', Terminal()) == '\033[32mso\033[0m'
-    assert painted('so', 'green', io.StringIO()) == 'so'
+    assert coloured('so', 'green', Terminal()) == '\033[32mso\033[0m'
+    assert coloured('so', 'green', io.StringIO()) == 'so'
 
 
 def test_green_is_what_was_asked_for_yellow_a_part_of_it_red_nothing(full, lens_only, refused):
@@ -49,11 +49,11 @@ def test_green_is_what_was_asked_for_yellow_a_part_of_it_red_nothing(full, lens_
 
 @pytest.mark.parametrize(('columns', 'shown'), [(20, 'three tracks, of 40'), (13, 'three tracks…'), (1, '…'), (-3, '')])
 def test_a_text_is_cut_to_the_columns_there_are(columns, shown):
-    assert shortened('three tracks,\n of 40', columns) == shown
+    assert truncate('three tracks,\n of 40', columns) == shown
 
 
 def test_columns_stand_below_each_other():
-    assert aligned([('a', 'one', '1'), ('long', 'b', '2')]) == ['a     one  1', 'long  b    2']
+    assert align_columns([('a', 'one', '1'), ('long', 'b', '2')]) == ['a     one  1', 'long  b    2']
 
 
 def test_the_summary_has_the_numbers_with_their_sigmas(full):

@@ -259,7 +259,7 @@ def test_ignored_regions_are_black_in_images_of_any_size(image, command, saved):
 
 
 def test_a_codec_that_is_missing_is_told_and_leaves_nothing(command, saved, video, monkeypatch):
-    monkeypatch.setitem(view_files.CODECS, '.mp4', '????')
+    monkeypatch.setitem(view_files.VIDEO_CODECS, '.mp4', '????')
     status, _, stderr = command('rectify', video, saved / 'out.mp4', '--quiet')
     assert status == 2 and 'cannot encode' in stderr
     assert not (saved / 'out.mp4').exists() and not list(saved.glob('.*'))

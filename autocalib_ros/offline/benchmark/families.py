@@ -21,58 +21,58 @@ from autocalib_ros.offline.simulate.network import Network
 from autocalib_ros.offline.simulate.roundabout import RING_RADIUS_M
 from autocalib_ros.offline.simulate.roundabout import roundabout as ring_roads
 from autocalib_ros.offline.simulate.scenes import bend as road_bend
-from autocalib_ros.offline.synthetic.disturbances import random_walk, straggle, waving
+from autocalib_ros.offline.synthetic.disturbances import noisy_line, random_sway, random_walk
 from autocalib_ros.offline.synthetic.drives import (
     INTERVAL_S,
     drive_arc,
     drive_bend,
     drive_ring,
     drive_route,
-    stroll,
+    walk_along_road,
 )
-from autocalib_ros.offline.synthetic.junction import HEADWAY_S, Junction, gathered, pose, synthetic_evidence
+from autocalib_ros.offline.synthetic.junction import HEADWAY_S, Junction, evidence_from_tracks, pose, synthetic_evidence
 
 WIDTH, HEIGHT = 1280, 720
 FOCAL_PX = (500.0, 640.0)
 LONG_FOCAL_PX = (700.0, 1200.0)
 """Of distortion-free lenses, which are not made as wide."""
-DISTORTION_FREE = (1 / 3, 2 / 15, 17 / 315, 62 / 2835)
+TANGENT_SERIES = (1 / 3, 2 / 15, 17 / 315, 62 / 2835)
 """The series of the tangent."""
 MAX_K1 = 0.05
 TURNING_K1 = 0.03
-MAX_SHIFT_PX = 20.0
+MAX_CENTRE_OFFSET_PX = 20.0
 """Of the principal point from the image centre, along each axis."""
-USUAL_SHIFT = 0.01
+PRINCIPAL_POINT_SIGMA = 0.01
 """Standard deviation of the same, share of the image width: what joint.principal_point_sigma_px is by default."""
 
 Family = Callable[[np.random.Generator], tuple[Junction, Evidence]]
 """Draws the truth, and evidence of it."""
 
 
-def viewpoint(generator: np.random.Generator, heading_deg: tuple[float, float] = (25.0, 65.0)) -> Junction:
+def standard_junction(generator: np.random.Generator, heading_deg: tuple[float, float] = (25.0, 65.0)) -> Junction:
     """Draw the standard case: 60 tracks, one per vehicle, on two perpendicular roads that cross ahead of the camera."""
     tilt, roll, heading, height = generator.uniform([26, -2, heading_deg[0], 6], [38, 2, heading_deg[1], 10])
     reach = generator.uniform(1.1, 1.7) * height / np.tan(np.radians(tilt))
     bearing = np.radians(generator.uniform(-8, 8) - heading)
     return Junction(
-        camera=lens(generator), camera_from_ground=pose(tilt, roll, heading), height_m=float(height),
+        camera=draw_lens(generator), camera_from_ground=pose(tilt, roll, heading), height_m=float(height),
         centre_m=(float(reach * np.cos(bearing)), float(reach * np.sin(bearing))), tracks=60, points_per_vehicle=1)
 
 
-def lens(generator: np.random.Generator) -> Camera:
+def draw_lens(generator: np.random.Generator) -> Camera:
     """Draw a lens near equidistant whose principal point is off the image centre."""
-    focal, k1, right, down = generator.uniform([FOCAL_PX[0], -MAX_K1, -MAX_SHIFT_PX, -MAX_SHIFT_PX],
-                                               [FOCAL_PX[1], MAX_K1, MAX_SHIFT_PX, MAX_SHIFT_PX])
+    focal, k1, right, down = generator.uniform([FOCAL_PX[0], -MAX_K1, -MAX_CENTRE_OFFSET_PX, -MAX_CENTRE_OFFSET_PX],
+                                               [FOCAL_PX[1], MAX_K1, MAX_CENTRE_OFFSET_PX, MAX_CENTRE_OFFSET_PX])
     cx, cy = image_centre(WIDTH, HEIGHT)
     return Camera(WIDTH, HEIGHT, float(focal), (float(cx + right), float(cy + down)), (float(k1), 0.0, 0.0, 0.0))
 
 
-def distortion_free_lens(generator: np.random.Generator) -> Camera:
+def draw_distortion_free_lens(generator: np.random.Generator) -> Camera:
     """Draw a lens that images straight lines as straight lines."""
-    return replace(lens(generator), focal_px=float(generator.uniform(*LONG_FOCAL_PX)), k=DISTORTION_FREE)
+    return replace(draw_lens(generator), focal_px=float(generator.uniform(*LONG_FOCAL_PX)), k=TANGENT_SERIES)
 
 
-def driven(junction_of: Callable[[np.random.Generator], Junction]) -> Family:
+def family_of(junction_of: Callable[[np.random.Generator], Junction]) -> Family:
     """Make a family of junctions that are drawn and then driven through."""
     def family(generator: np.random.Generator) -> tuple[Junction, Evidence]:
         junction = junction_of(generator)
@@ -81,55 +81,55 @@ def driven(junction_of: Callable[[np.random.Generator], Junction]) -> Family:
     return family
 
 
-def varied(**changes: Any) -> Family:
+def standard_with(**changes: Any) -> Family:
     """Make a family of standard junctions with other values of some fields."""
-    return driven(lambda generator: replace(viewpoint(generator), **changes))
+    return family_of(lambda generator: replace(standard_junction(generator), **changes))
 
 
 def skew(generator: np.random.Generator) -> Junction:
     """Two roads that cross at 60 to 85 degrees."""
     crossing = generator.choice([-1.0, 1.0]) * generator.uniform(60.0, 85.0)
-    return replace(viewpoint(generator), road_angles_deg=(0.0, float(crossing)))
+    return replace(standard_junction(generator), road_angles_deg=(0.0, float(crossing)))
 
 
 def equidistant(generator: np.random.Generator) -> Junction:
     """An equidistant lens, centred: the solver's prior is the truth."""
-    return replace(viewpoint(generator), camera=Camera.equidistant(WIDTH, HEIGHT, generator.uniform(*FOCAL_PX)))
+    return replace(standard_junction(generator), camera=Camera.equidistant(WIDTH, HEIGHT, generator.uniform(*FOCAL_PX)))
 
 
 def three_roads(generator: np.random.Generator) -> Junction:
     """A third road at about 45 degrees to the two perpendicular ones."""
-    return replace(viewpoint(generator), road_angles_deg=(0.0, 90.0, float(generator.uniform(35.0, 55.0))))
+    return replace(standard_junction(generator), road_angles_deg=(0.0, 90.0, float(generator.uniform(35.0, 55.0))))
 
 
 def one_road(generator: np.random.Generator) -> Junction:
     """One road, straight, passing off the optical axis: the lens alone can be had."""
-    return replace(_amount(viewpoint(generator, (40.0, 75.0)), generator), road_angles_deg=(0.0,), turning_share=0.0)
+    return replace(_random_track_count(standard_junction(generator, (40.0, 75.0)), generator), road_angles_deg=(0.0,), turning_fraction=0.0)
 
 
 def distortion_free(generator: np.random.Generator) -> Junction:
     """A distortion-free lens over perpendicular roads: the right angle alone tells the focal length."""
-    return replace(viewpoint(generator), camera=distortion_free_lens(generator))
+    return replace(standard_junction(generator), camera=draw_distortion_free_lens(generator))
 
 
 def radial(generator: np.random.Generator) -> Junction:
     """One road straight ahead: each track runs through the distortion centre, where no lens bends it."""
-    junction = _amount(viewpoint(generator, (-1.0, 1.0)), generator)
+    junction = _random_track_count(standard_junction(generator, (-1.0, 1.0)), generator)
     lanes = (0.0, float(generator.uniform(0.3, 1.5)))
     return replace(junction, centre_m=(junction.centre_m[0], 0.0), road_angles_deg=(0.0,), lanes_m=lanes,
-                   turning_share=0.0)
+                   turning_fraction=0.0)
 
 
 def bend(generator: np.random.Generator) -> Junction:
     """Curved traffic only: one bend of constant radius."""
     drive = partial(drive_bend, radius_m=generator.uniform(15.0, 60.0), towards_rad=generator.uniform(0, 2 * np.pi))
-    return replace(_amount(viewpoint(generator), generator), drive=drive)
+    return replace(_random_track_count(standard_junction(generator), generator), drive=drive)
 
 
 def roundabout(generator: np.random.Generator) -> Junction:
     """Curved traffic only: the ring of a roundabout."""
     drive = partial(drive_ring, radius_m=generator.uniform(15.0, 30.0))
-    return replace(_amount(viewpoint(generator), generator), drive=drive)
+    return replace(_random_track_count(standard_junction(generator), generator), drive=drive)
 
 
 def turning(generator: np.random.Generator) -> Junction:
@@ -137,65 +137,65 @@ def turning(generator: np.random.Generator) -> Junction:
 
     The principal point is the image centre: turns tell less of it than of all else.
     """
-    junction = _centred(viewpoint(generator), generator)
+    junction = _with_centred_lens(standard_junction(generator), generator)
     return replace(junction, drive=partial(drive_arc, radii_m=(12.0, 60.0)), tracks=None, vehicles=25,
-                   points_per_vehicle=8, joined_share=0.2)
+                   points_per_vehicle=8, merged_fraction=0.2)
 
 
 def turning_off_centre(generator: np.random.Generator) -> Junction:
     """Vehicles that turn, before a lens whose principal point is off the image centre as the solver expects it."""
     junction = turning(generator)
-    point = np.array(junction.camera.principal_point_px) + generator.normal(0.0, USUAL_SHIFT * WIDTH, 2)
+    point = np.array(junction.camera.principal_point_px) + generator.normal(0.0, PRINCIPAL_POINT_SIGMA * WIDTH, 2)
     return replace(junction, camera=replace(junction.camera, principal_point_px=(float(point[0]), float(point[1]))))
 
 
 def motorway(generator: np.random.Generator) -> Junction:
     """A motorway of three lanes one way, a third of the vehicles changing lanes: the lens alone can be had."""
-    return _driven_on(viewpoint(generator, (40.0, 75.0)), highway(one_way=True, changing_fraction=0.3))
+    return _with_traffic_on(standard_junction(generator, (40.0, 75.0)), highway(one_way=True, changing_fraction=0.3))
 
 
 def long_bend(generator: np.random.Generator) -> Junction:
     """A road with lanes both ways that bends by 80 degrees on 64 to 112 m: in view, mostly about one point."""
-    junction = _centred(viewpoint(generator), generator)
-    return _driven_on(junction, road_bend(one_way=False), turned_rad=generator.uniform(0, 2 * np.pi),
+    junction = _with_centred_lens(standard_junction(generator), generator)
+    return _with_traffic_on(junction, road_bend(one_way=False), rotation_rad=generator.uniform(0, 2 * np.pi),
                       scale=generator.uniform(0.8, 1.4))
 
 
 def roundabout_arms(generator: np.random.Generator) -> Junction:
     """A roundabout with vehicles that enter, circle and leave, seen from outside."""
-    junction = _centred(viewpoint(generator), generator)
+    junction = _with_centred_lens(standard_junction(generator), generator)
     scale = generator.uniform(0.8, 1.3)
     direction = np.array(junction.centre_m) / np.hypot(*junction.centre_m)
     x, y = (scale * RING_RADIUS_M + generator.uniform(6.0, 14.0)) * direction
-    return _driven_on(replace(junction, centre_m=(float(x), float(y))), ring_roads(turning_fraction=0.5),
-                      turned_rad=generator.uniform(0, 2 * np.pi), scale=scale)
+    return _with_traffic_on(replace(junction, centre_m=(float(x), float(y))), ring_roads(turning_fraction=0.5),
+                      rotation_rad=generator.uniform(0, 2 * np.pi), scale=scale)
 
 
 def skew_turning(generator: np.random.Generator) -> Junction:
     """Two roads that cross at 60 to 70 degrees, a third of the vehicles turning."""
     network = crossing(np.radians(generator.uniform(60.0, 70.0)), turning_fraction=0.35)
-    return _driven_on(viewpoint(generator), network, turned_rad=np.pi * generator.integers(2))
+    return _with_traffic_on(standard_junction(generator), network, rotation_rad=np.pi * generator.integers(2))
 
 
 def tee(generator: np.random.Generator) -> Junction:
     """A road on which another one ends: all its vehicles turn, and some of the main road's."""
     network = crossing(np.pi / 2, turning_fraction=0.35, tee=True)
-    return _driven_on(viewpoint(generator), network, turned_rad=np.pi / 2 * generator.integers(4))
+    return _with_traffic_on(standard_junction(generator), network, rotation_rad=np.pi / 2 * generator.integers(4))
 
 
 def sparse(generator: np.random.Generator) -> Junction:
     """A junction with a vehicle every twelve seconds, watched for two to four minutes."""
-    junction = _driven_on(viewpoint(generator), crossing(np.pi / 2, turning_fraction=0.3))
+    junction = _with_traffic_on(standard_junction(generator), crossing(np.pi / 2, turning_fraction=0.3))
     return replace(junction, vehicles=int(generator.integers(10, 21)), headway_s=12.0)
 
 
-def _driven_on(junction: Junction, network: Network, *, turned_rad: float = 0.0, scale: float = 1.0) -> Junction:
+def _with_traffic_on(junction: Junction, network: Network, *, rotation_rad: float = 0.0, scale: float = 1.0) -> Junction:
     """Let 40 vehicles with eight points each drive the routes of a network."""
-    drive = partial(drive_route, network=network, turned_rad=turned_rad, scale=scale)
+    drive = partial(drive_route, network=network, rotation_rad=rotation_rad, scale=scale)
     return replace(junction, drive=drive, tracks=None, vehicles=40, points_per_vehicle=8)
 
 
-def _centred(junction: Junction, generator: np.random.Generator) -> Junction:
+def _with_centred_lens(junction: Junction, generator: np.random.Generator) -> Junction:
     """Give the camera a lens nearer equidistant, with its principal point at the image centre."""
     camera = replace(Camera.equidistant(WIDTH, HEIGHT, junction.camera.focal_px),
                      k=(float(generator.uniform(-TURNING_K1, TURNING_K1)), 0.0, 0.0, 0.0))
@@ -204,45 +204,45 @@ def _centred(junction: Junction, generator: np.random.Generator) -> Junction:
 
 def pedestrians(generator: np.random.Generator) -> Junction:
     """People on pavements, nobody on the road."""
-    return replace(viewpoint(generator), drive=stroll, tracks=int(generator.integers(60, 200)))
+    return replace(standard_junction(generator), drive=walk_along_road, tracks=int(generator.integers(60, 200)))
 
 
 def short_piece(generator: np.random.Generator) -> Junction:
     """One road from the side, of which only a short piece is in view."""
     left = generator.uniform(0.2, 0.6) * WIDTH
-    return replace(_amount(viewpoint(generator, (75.0, 105.0)), generator), road_angles_deg=(0.0,),
-                   turning_share=0.0, window_px=(left, left + generator.uniform(0.15, 0.3) * WIDTH))
+    return replace(_random_track_count(standard_junction(generator, (75.0, 105.0)), generator), road_angles_deg=(0.0,),
+                   turning_fraction=0.0, visible_columns_px=(left, left + generator.uniform(0.15, 0.3) * WIDTH))
 
 
 def distortion_free_skew(generator: np.random.Generator) -> Junction:
     """A distortion-free lens over skewed roads: neither curvature nor a right angle tells the focal length."""
-    return replace(_amount(skew(generator), generator), camera=distortion_free_lens(generator))
+    return replace(_random_track_count(skew(generator), generator), camera=draw_distortion_free_lens(generator))
 
 
-def waved_camera(generator: np.random.Generator) -> Junction:
+def swaying_camera(generator: np.random.Generator) -> Junction:
     """Draw ordinary traffic before a camera that does not stand still."""
-    return replace(_amount(viewpoint(generator), generator), sway=waving(generator))
+    return replace(_random_track_count(standard_junction(generator), generator), sway=random_sway(generator))
 
 
-def waved_unseen(generator: np.random.Generator) -> tuple[Junction, Evidence]:
+def undetected_sway(generator: np.random.Generator) -> tuple[Junction, Evidence]:
     """Draw the same, where the monitor of the background sees nothing of it."""
-    junction, evidence = driven(waved_camera)(generator)
+    junction, evidence = family_of(swaying_camera)(generator)
     return junction, replace(evidence, drift_px=0.0)
 
 
 def noise(generator: np.random.Generator) -> tuple[Junction, Evidence]:
     """Points that stagger or straggle through the image and belong to no road."""
-    junction = viewpoint(generator)
+    junction = standard_junction(generator)
     tracks = []
     for number in range(int(generator.integers(60, 240))):
         count = int(generator.integers(8, 33))
-        draw = random_walk if generator.uniform() < 0.5 else straggle
+        draw = random_walk if generator.uniform() < 0.5 else noisy_line
         times = HEADWAY_S * number + INTERVAL_S * np.arange(count)
         tracks.append(Track(number, times, draw(count, junction.image_size, generator)))
-    return junction, gathered(tracks, junction.image_size, float(tracks[-1].times_s[-1]))
+    return junction, evidence_from_tracks(tracks, junction.image_size, float(tracks[-1].times_s[-1]))
 
 
-def _amount(junction: Junction, generator: np.random.Generator) -> Junction:
+def _random_track_count(junction: Junction, generator: np.random.Generator) -> Junction:
     """Give each vehicle one to four points: 60 to 240 tracks."""
     points = int(generator.integers(1, 5))
     return replace(junction, tracks=60 * points, points_per_vehicle=points)
@@ -250,37 +250,37 @@ def _amount(junction: Junction, generator: np.random.Generator) -> Junction:
 
 # A family's name is part of the seed of its runs.
 DETERMINED: dict[str, Family] = {
-    'standard': varied(),
-    'few': varied(tracks=40),
-    'many': varied(tracks=400, points_per_vehicle=4),
-    'noisy': varied(noise_px=1.5),
-    'wander': varied(wander_m=0.25),
-    'outliers': varied(outlier_share=0.2),
-    'skew': driven(skew),
-    'equidistant': driven(equidistant),
-    'three_roads': driven(three_roads),
-    'lane_changes': varied(lane_change_share=0.3),
-    'one_road': driven(one_road),
-    'distortion_free': driven(distortion_free),
-    'turning': driven(turning),
-    'turning_off_centre': driven(turning_off_centre),
-    'highway': driven(motorway),
-    'roundabout_arms': driven(roundabout_arms),
-    'skew_turning': driven(skew_turning),
-    'tee': driven(tee),
-    'sparse': driven(sparse),
+    'standard': standard_with(),
+    'few': standard_with(tracks=40),
+    'many': standard_with(tracks=400, points_per_vehicle=4),
+    'noisy': standard_with(noise_px=1.5),
+    'wander': standard_with(wander_m=0.25),
+    'outliers': standard_with(outlier_fraction=0.2),
+    'skew': family_of(skew),
+    'equidistant': family_of(equidistant),
+    'three_roads': family_of(three_roads),
+    'lane_changes': standard_with(lane_change_fraction=0.3),
+    'one_road': family_of(one_road),
+    'distortion_free': family_of(distortion_free),
+    'turning': family_of(turning),
+    'turning_off_centre': family_of(turning_off_centre),
+    'highway': family_of(motorway),
+    'roundabout_arms': family_of(roundabout_arms),
+    'skew_turning': family_of(skew_turning),
+    'tee': family_of(tee),
+    'sparse': family_of(sparse),
 }
 UNDERDETERMINED: dict[str, Family] = {
-    'radial': driven(radial),
-    'bend': driven(bend),
-    'long_bend': driven(long_bend),
-    'roundabout': driven(roundabout),
-    'pedestrians': driven(pedestrians),
+    'radial': family_of(radial),
+    'bend': family_of(bend),
+    'long_bend': family_of(long_bend),
+    'roundabout': family_of(roundabout),
+    'pedestrians': family_of(pedestrians),
     'noise': noise,
-    'waved': driven(waved_camera),
-    'waved_unseen': waved_unseen,
-    'short_piece': driven(short_piece),
-    'distortion_free_skew': driven(distortion_free_skew),
+    'waved': family_of(swaying_camera),
+    'waved_unseen': undetected_sway,
+    'short_piece': family_of(short_piece),
+    'distortion_free_skew': family_of(distortion_free_skew),
 }
 
 

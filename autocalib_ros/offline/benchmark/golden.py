@@ -21,9 +21,9 @@ from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.benchmark.processes import in_order
-from autocalib_ros.offline.parameter_file import options_with
+from autocalib_ros.offline.parameter_file import override_options
 from autocalib_ros.offline.terminal.progress import progress_bar
-from autocalib_ros.offline.terminal.style import aligned
+from autocalib_ros.offline.terminal.style import align_columns
 from autocalib_ros.results.calibration import COVARIANCE_PARAMETERS, GROUND_DISTANCES_M, Calibration, Refusal
 from autocalib_ros.util.files import write_atomically
 
@@ -128,7 +128,7 @@ def chosen(cases: Sequence[Case], names: Sequence[str]) -> list[Case]:
 
 def outcome_of(folder: Path, case: Case) -> Outcome:
     """Solve a case; a solver that fails is an outcome too, and does not end the benchmark."""
-    evidence, options = Evidence.load(folder / case.evidence), options_with(Options(), case.options)
+    evidence, options = Evidence.load(folder / case.evidence), override_options(Options(), case.options)
     lens = None if case.lens is None else Camera(
         *evidence.image_size, case.lens['focal_px'], tuple(case.lens['principal_point_px']), tuple(case.lens['k']))
     try:
@@ -207,7 +207,7 @@ def lines(measured: Measured) -> list[str]:
     rows += [(item.case, item.quantity, *_cells(item.expected, item.found),
               '-' if item.sigmas is None else f'{item.sigmas:+.2g}') for item in moved]
     touched = len({item.case for item in moved})
-    return [*aligned(rows), f'{cases}: {len(moved)} value{"" if len(moved) == 1 else "s"} moved in {touched}']
+    return [*align_columns(rows), f'{cases}: {len(moved)} value{"" if len(moved) == 1 else "s"} moved in {touched}']
 
 
 def _cells(expected: str | float | None, found: str | float | None) -> tuple[str, str]:

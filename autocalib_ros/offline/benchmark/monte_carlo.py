@@ -1,7 +1,7 @@
 """How near the results come to the truth, by Monte Carlo: `autocalib benchmark accuracy`.
 
 Every run draws a lens, a pose and traffic of one family of evidence, solves it by each method and compares with the
-truth. The evidence of a run follows from seed, family and number of the run alone: `evidence_of` draws it again.
+truth. The evidence of a run follows from seed, family and number of the run alone: `draw_evidence` draws it again.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from autocalib_ros.geometry.ground_plane import GroundPlane, angles_deg, tilt_an
 from autocalib_ros.lens.camera import Camera, pixel_grid
 from autocalib_ros.offline.benchmark.families import families
 from autocalib_ros.offline.benchmark.processes import in_order
-from autocalib_ros.offline.ground_truth import NEAR_M, distances_error
+from autocalib_ros.offline.ground_truth import MAX_COMPARED_RANGE_M, median_distance_error
 from autocalib_ros.offline.synthetic.junction import Junction
 from autocalib_ros.offline.terminal.progress import progress_bar
 from autocalib_ros.pictures.views import ground_to_image, image_to_ground
@@ -35,7 +35,7 @@ from autocalib_ros.results.calibration import Calibration, Refusal
 RAY_GRID = (49, 28)
 GROUND_GRID = 5
 """Distances are compared between so many ranges times so many bearings on the road."""
-BEARINGS_DEG = 40.0
+MAX_BEARING_DEG = 40.0
 """Those points lie so far to either side of where the camera looks."""
 NAN = math.nan
 
@@ -77,15 +77,15 @@ class Task:
     methods: tuple[str, ...]
 
 
-def measure(names: Sequence[str], methods: Sequence[str], runs: int, *, seed: int = 0, jobs: int = 1,
+def run_monte_carlo(names: Sequence[str], methods: Sequence[str], runs: int, *, seed: int = 0, jobs: int = 1,
             out: Path | None = None, quiet: bool = False) -> list[Run]:
     """Solve `runs` draws of each family by each method; write a row a run to `out` as they come."""
     for name, value, least in (('runs', runs, 1), ('jobs', jobs, 1), ('seed', seed, 0)):
         if value < least:
             raise UsageError(f'--{name} is {least} or more; got {value}')
-    tasks = [Task(family, seed, run, tuple(methods)) for family in known(names) for run in range(runs)]
+    tasks = [Task(family, seed, run, tuple(methods)) for family in select_families(names) for run in range(runs)]
     done: list[Run] = []
-    with csv_rows(out) as write, progress_bar(len(tasks), 'draws', 'accuracy', quiet=quiet) as progress:
+    with open_csv(out) as write, progress_bar(len(tasks), 'draws', 'accuracy', quiet=quiet) as progress:
         for count, results in enumerate(in_order(run_task, tasks, jobs), 1):
             write(results)
             done += results
@@ -93,7 +93,7 @@ def measure(names: Sequence[str], methods: Sequence[str], runs: int, *, seed: in
     return done
 
 
-def known(names: Sequence[str]) -> list[str]:
+def select_families(names: Sequence[str]) -> list[str]:
     """Return the names of families, all of them for none, or raise UsageError."""
     every = list(families())
     for name in names:
@@ -104,11 +104,11 @@ def known(names: Sequence[str]) -> list[str]:
 
 def run_task(task: Task) -> list[Run]:
     """Draw the evidence of a task and solve it by each of its methods."""
-    junction, evidence = evidence_of(task.family, task.seed, task.run)
+    junction, evidence = draw_evidence(task.family, task.seed, task.run)
     return [run_method(task, method, junction, evidence) for method in task.methods]
 
 
-def evidence_of(family: str, seed: int, run: int) -> tuple[Junction, Evidence]:
+def draw_evidence(family: str, seed: int, run: int) -> tuple[Junction, Evidence]:
     """Draw truth and evidence of one run of a family."""
     sequence = np.random.SeedSequence([seed, zlib.crc32(family.encode()), run])
     return families()[family](np.random.default_rng(sequence))
@@ -133,14 +133,14 @@ def compare_calibrations(task: Task, method: str, result: Calibration | Refusal,
     tilt, roll, normal = _pose_errors_deg(result.ground, junction.normal_in_camera)
     return Run(
         family=task.family, method=method, run=task.run, accepted=True, code='', grade=result.grade,
-        focal_error=result.camera.focal_px / true.focal_px - 1, focal_sigma=_number(sigma.focal_px) / true.focal_px,
-        rays_deg=rays_error_deg(result.camera, true), normal_deg=normal,
-        tilt_error_deg=tilt, tilt_sigma_deg=_number(sigma.tilt_deg),
-        roll_error_deg=roll, roll_sigma_deg=_number(sigma.roll_deg),
+        focal_error=result.camera.focal_px / true.focal_px - 1, focal_sigma=_nan_if_none(sigma.focal_px) / true.focal_px,
+        rays_deg=mean_ray_error_deg(result.camera, true), normal_deg=normal,
+        tilt_error_deg=tilt, tilt_sigma_deg=_nan_if_none(sigma.tilt_deg),
+        roll_error_deg=roll, roll_sigma_deg=_nan_if_none(sigma.roll_deg),
         distance_error=distance_error(result.camera, result.ground, junction), cpu_s=cpu_s)
 
 
-def _number(value: float | None) -> float:
+def _nan_if_none(value: float | None) -> float:
     return NAN if value is None else float(value)
 
 
@@ -153,7 +153,7 @@ def _pose_errors_deg(ground: GroundPlane | None, true_normal: np.ndarray) -> tup
     return float(tilt), float((roll + 180) % 360 - 180), float(angles_deg(normal, true_normal))
 
 
-def rays_error_deg(camera: Camera, true: Camera) -> float:
+def mean_ray_error_deg(camera: Camera, true: Camera) -> float:
     """Mean angle over the image between the rays of two lenses, the one turned onto the other as well as can be."""
     pixels = pixel_grid(true, *RAY_GRID)
     (found, valid), (wanted, there) = camera.unproject(pixels), true.unproject(pixels)
@@ -162,18 +162,18 @@ def rays_error_deg(camera: Camera, true: Camera) -> float:
 
 
 def distance_error(camera: Camera, ground: GroundPlane | None, junction: Junction) -> float:
-    """Median relative error of distances between points of the road in view, up to `NEAR_M` from the camera."""
+    """Median relative error of distances between points of the road in view, up to `MAX_COMPARED_RANGE_M` from the camera."""
     if ground is None:
         return NAN
     true_m, pixels = _road_points(junction)
-    return distances_error(true_m, image_to_ground(camera, ground, pixels))
+    return median_distance_error(true_m, image_to_ground(camera, ground, pixels))
 
 
 def _road_points(junction: Junction) -> tuple[np.ndarray, np.ndarray]:
     """Points (n, 2) on the road before the camera, metres, and where the image shows them (n, 2)."""
     ahead = junction.camera_from_ground[2]
-    bearings = np.arctan2(ahead[1], ahead[0]) + np.radians(np.linspace(-BEARINGS_DEG, BEARINGS_DEG, GROUND_GRID))
-    ranges, bearings = np.meshgrid(NEAR_M * np.arange(1, GROUND_GRID + 1) / GROUND_GRID, bearings)
+    bearings = np.arctan2(ahead[1], ahead[0]) + np.radians(np.linspace(-MAX_BEARING_DEG, MAX_BEARING_DEG, GROUND_GRID))
+    ranges, bearings = np.meshgrid(MAX_COMPARED_RANGE_M * np.arange(1, GROUND_GRID + 1) / GROUND_GRID, bearings)
     points = np.stack([ranges * np.cos(bearings), ranges * np.sin(bearings), np.zeros(ranges.shape)], -1).reshape(-1, 3)
     truth = GroundPlane(junction.camera_from_ground.T, junction.height_m)
     pixels = ground_to_image(junction.camera, truth, points)
@@ -182,7 +182,7 @@ def _road_points(junction: Junction) -> tuple[np.ndarray, np.ndarray]:
 
 
 @contextmanager
-def csv_rows(path: Path | None) -> Iterator[Callable[[Sequence[Run]], None]]:
+def open_csv(path: Path | None) -> Iterator[Callable[[Sequence[Run]], None]]:
     """Open a CSV with one row a run; without a path, write nowhere."""
     if path is None:
         yield lambda runs: None

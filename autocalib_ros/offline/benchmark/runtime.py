@@ -16,8 +16,8 @@ from autocalib_ros.calibrator import AutoCalibrator, solve
 from autocalib_ros.config import Options
 from autocalib_ros.offline.recordings.open import open_source
 
-BARE_POINTS = 300
-BARE_REPEATS = 30
+FLOW_POINTS = 300
+FLOW_REPEATS = 30
 
 
 def cost(path: Path, duration_s: float | None) -> str:
@@ -43,17 +43,17 @@ def cost(path: Path, duration_s: float | None) -> str:
     return '\n'.join([
         f'{width}x{height}, {len(spent)} frames of {source.name}, one thread',
         f'processor time per frame: mean {mean:.1f} ms, 95 % of frames below {1e3 * np.quantile(spent, 0.95):.1f} ms',
-        f'bare optical flow of {BARE_POINTS} points: {bare:.1f} ms; a frame costs {mean / bare:.1f} times that',
+        f'bare optical flow of {FLOW_POINTS} points: {bare:.1f} ms; a frame costs {mean / bare:.1f} times that',
         f'one solution: {solution:.1f} s of processor time ({"calibrated" if result else "refused"})',
         f'largest memory of the process: {memory:.0f} MB before the solution, {after:.0f} MB after'])
 
 
 def bare_optical_flow_s(images: list[np.ndarray]) -> float:
-    """Processor time of one pyramidal Lucas-Kanade step of `BARE_POINTS` points between two images."""
+    """Processor time of one pyramidal Lucas-Kanade step of `FLOW_POINTS` points between two images."""
     before, after = (cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image for image in images)
-    points = cv2.goodFeaturesToTrack(before, BARE_POINTS, 0.01, 10)
+    points = cv2.goodFeaturesToTrack(before, FLOW_POINTS, 0.01, 10)
     began = time.thread_time()
-    for _ in range(BARE_REPEATS):
+    for _ in range(FLOW_REPEATS):
         cv2.calcOpticalFlowPyrLK(before, after, points, None, winSize=(15, 15), maxLevel=3)
-    return (time.thread_time() - began) / BARE_REPEATS
+    return (time.thread_time() - began) / FLOW_REPEATS
 

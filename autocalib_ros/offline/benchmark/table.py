@@ -10,17 +10,17 @@ import numpy as np
 from autocalib_ros.offline.benchmark.families import UNDERDETERMINED
 from autocalib_ros.offline.benchmark.monte_carlo import Run
 
-COVERED_SIGMAS = 1.96
+COVERAGE_SIGMAS = 1.96
 """A normal error lies within so many sigmas in 95 % of the cases."""
-FALSE_SIGMAS = 3.0
-FALSE_FOCAL = 0.05
-FALSE_DEG = 1.0
-NAME = '{:<21}{:<6}{:>5}{:>6}'
-ERRORS = NAME + '  {:<21}{:>7}{:>7}{:>7}{:>7}{:>8}{:>7}{:>7}{:>7}'
-SIGMAS = NAME + '{:>7}{:>8}{:>7}{:>8}{:>7}{:>7}{:>8}{:>7}{:>8}'
+FALSE_ACCEPT_SIGMAS = 3.0
+FALSE_ACCEPT_FOCAL = 0.05
+FALSE_ACCEPT_DEG = 1.0
+NAME_FORMAT = '{:<21}{:<6}{:>5}{:>6}'
+ERRORS_FORMAT = NAME_FORMAT + '  {:<21}{:>7}{:>7}{:>7}{:>7}{:>8}{:>7}{:>7}{:>7}'
+SIGMAS_FORMAT = NAME_FORMAT + '{:>7}{:>8}{:>7}{:>8}{:>7}{:>7}{:>8}{:>7}{:>8}'
 
 
-def tables(runs: Sequence[Run]) -> str:
+def format_tables(runs: Sequence[Run]) -> str:
     """Return the errors of the families, their standard deviations held against them, and the crashes."""
     determined = [run for run in runs if run.family not in UNDERDETERMINED]
     doubtful = [run for run in runs if run.family in UNDERDETERMINED]
@@ -35,18 +35,18 @@ def falsely_accepted(run: Run) -> bool:
         return False
     focal = abs(run.focal_error)
     tilted = _beyond(run.tilt_error_deg, run.tilt_sigma_deg) or _beyond(run.roll_error_deg, run.roll_sigma_deg)
-    return focal > FALSE_FOCAL or focal > FALSE_SIGMAS * run.focal_sigma or tilted
+    return focal > FALSE_ACCEPT_FOCAL or focal > FALSE_ACCEPT_SIGMAS * run.focal_sigma or tilted
 
 
-def beyond_own_sigmas(run: Run) -> bool:
+def is_overconfident(run: Run) -> bool:
     """Whether a published focal length, tilt or roll is wrong by more than three of its own standard deviations."""
     pairs = ((run.focal_error, run.focal_sigma), (run.tilt_error_deg, run.tilt_sigma_deg),
              (run.roll_error_deg, run.roll_sigma_deg))
-    return run.accepted and any(abs(error) > FALSE_SIGMAS * sigma for error, sigma in pairs)
+    return run.accepted and any(abs(error) > FALSE_ACCEPT_SIGMAS * sigma for error, sigma in pairs)
 
 
 def _beyond(error_deg: float, sigma_deg: float) -> bool:
-    return abs(error_deg) > FALSE_SIGMAS * sigma_deg and abs(error_deg) > FALSE_DEG
+    return abs(error_deg) > FALSE_ACCEPT_SIGMAS * sigma_deg and abs(error_deg) > FALSE_ACCEPT_DEG
 
 
 def _blocks(title: str, runs: Sequence[Run]) -> list[str]:
@@ -54,47 +54,47 @@ def _blocks(title: str, runs: Sequence[Run]) -> list[str]:
         return []
     groups = list(dict.fromkeys((run.family, run.method) for run in runs))
     grouped = [[run for run in runs if (run.family, run.method) == group] for group in groups]
-    return [_block(f'{title}: errors', ERROR_HEADS, map(_errors, grouped)),
-            _block(f'{title}: stated standard deviations against errors', SIGMA_HEADS, map(_sigmas, grouped))]
+    return [_block(f'{title}: errors', ERROR_HEADERS, map(_errors, grouped)),
+            _block(f'{title}: stated standard deviations against errors', SIGMA_HEADERS, map(_sigmas, grouped))]
 
 
 def _block(title: str, heads: Sequence[str], lines: Iterable[str]) -> str:
     return '\n'.join([title, '-' * max(map(len, heads)), *heads, *lines])
 
 
-ERROR_HEADS = (
-    ERRORS.format('', '', '', 'acc.', 'most common', 'focal', 'length', '%', '', 'normal', 'deg', 'rays', 'dist.'),
-    ERRORS.format('family', '', 'runs', '%', 'refusal', 'bias', 'spread', 'mean', 'worst', 'mean', 'worst', 'deg', '%'))
-SIGMA_HEADS = (
-    SIGMAS.format('', '', '', 'acc.', 'false', 'beyond', 'plane', 'in 95 %', 'inter-', 'val, %', 'rms', 'z', 'solve'),
-    SIGMAS.format('family', '', 'runs', '%', 'acc.', '3 sig', '%', 'focal', 'tilt', 'roll', 'focal', 'tilt', 'cpu s'))
+ERROR_HEADERS = (
+    ERRORS_FORMAT.format('', '', '', 'acc.', 'most common', 'focal', 'length', '%', '', 'normal', 'deg', 'rays', 'dist.'),
+    ERRORS_FORMAT.format('family', '', 'runs', '%', 'refusal', 'bias', 'spread', 'mean', 'worst', 'mean', 'worst', 'deg', '%'))
+SIGMA_HEADERS = (
+    SIGMAS_FORMAT.format('', '', '', 'acc.', 'false', 'beyond', 'plane', 'in 95 %', 'inter-', 'val, %', 'rms', 'z', 'solve'),
+    SIGMAS_FORMAT.format('family', '', 'runs', '%', 'acc.', '3 sig', '%', 'focal', 'tilt', 'roll', 'focal', 'tilt', 'cpu s'))
 
 
 def _errors(runs: Sequence[Run]) -> str:
     accepted = [run for run in runs if run.accepted]
     focal, normal = 100 * _column(accepted, 'focal_error'), _column(accepted, 'normal_deg')
-    return ERRORS.format(
-        *_name(runs), _common_refusal(runs), _told(focal, np.mean, '+.2f'), _told(focal, _spread, '.2f'),
-        _told(np.abs(focal), np.mean, '.2f'), _told(np.abs(focal), np.max, '.2f'), _told(normal, np.mean, '.2f'),
-        _told(normal, np.max, '.2f'), _told(_column(accepted, 'rays_deg'), np.mean, '.3f'),
-        _told(100 * _column(accepted, 'distance_error'), np.median, '.2f')).rstrip()
+    return ERRORS_FORMAT.format(
+        *_label_cells(runs), _common_refusal(runs), _format_statistic(focal, np.mean, '+.2f'), _format_statistic(focal, _spread, '.2f'),
+        _format_statistic(np.abs(focal), np.mean, '.2f'), _format_statistic(np.abs(focal), np.max, '.2f'), _format_statistic(normal, np.mean, '.2f'),
+        _format_statistic(normal, np.max, '.2f'), _format_statistic(_column(accepted, 'rays_deg'), np.mean, '.3f'),
+        _format_statistic(100 * _column(accepted, 'distance_error'), np.median, '.2f')).rstrip()
 
 
 def _sigmas(runs: Sequence[Run]) -> str:
     accepted = [run for run in runs if run.accepted]
     planes = np.isfinite([run.normal_deg for run in accepted]).astype(float)
-    focal, tilt, roll = (_z(accepted, 'focal_error', 'focal_sigma'), _z(accepted, 'tilt_error_deg', 'tilt_sigma_deg'),
-                         _z(accepted, 'roll_error_deg', 'roll_sigma_deg'))
-    return SIGMAS.format(
-        *_name(runs), sum(map(falsely_accepted, runs)), sum(map(beyond_own_sigmas, runs)),
-        _told(100 * planes, np.mean, '.0f'),
-        *(_told(z, _coverage, '.0f') for z in (focal, tilt, roll)), *(_told(z, _rms, '.2f') for z in (focal, tilt)),
-        _told(_column(runs, 'cpu_s'), np.mean, '.2f')).rstrip()
+    focal, tilt, roll = (_z_scores(accepted, 'focal_error', 'focal_sigma'), _z_scores(accepted, 'tilt_error_deg', 'tilt_sigma_deg'),
+                         _z_scores(accepted, 'roll_error_deg', 'roll_sigma_deg'))
+    return SIGMAS_FORMAT.format(
+        *_label_cells(runs), sum(map(falsely_accepted, runs)), sum(map(is_overconfident, runs)),
+        _format_statistic(100 * planes, np.mean, '.0f'),
+        *(_format_statistic(z, _coverage, '.0f') for z in (focal, tilt, roll)), *(_format_statistic(z, _rms, '.2f') for z in (focal, tilt)),
+        _format_statistic(_column(runs, 'cpu_s'), np.mean, '.2f')).rstrip()
 
 
-def _name(runs: Sequence[Run]) -> tuple[str, str, int, str]:
-    share = 100 * sum(run.accepted for run in runs) / len(runs)
-    return runs[0].family, runs[0].method, len(runs), f'{share:.0f}'
+def _label_cells(runs: Sequence[Run]) -> tuple[str, str, int, str]:
+    percent = 100 * sum(run.accepted for run in runs) / len(runs)
+    return runs[0].family, runs[0].method, len(runs), f'{percent:.0f}'
 
 
 def _common_refusal(runs: Sequence[Run]) -> str:
@@ -114,14 +114,14 @@ def _column(runs: Sequence[Run], name: str) -> np.ndarray:
     return values[~np.isnan(values)]
 
 
-def _z(runs: Sequence[Run], error: str, sigma: str) -> np.ndarray:
+def _z_scores(runs: Sequence[Run], error: str, sigma: str) -> np.ndarray:
     """Return errors in units of their stated standard deviations, where there is one."""
     pairs = np.array([(getattr(run, error), getattr(run, sigma)) for run in runs], float).reshape(-1, 2)
     errors, sigmas = pairs[(pairs[:, 1] > 0) & np.isfinite(pairs[:, 0])].T
     return errors / sigmas
 
 
-def _told(values: np.ndarray, statistic: Callable[[np.ndarray], float], form: str) -> str:
+def _format_statistic(values: np.ndarray, statistic: Callable[[np.ndarray], float], form: str) -> str:
     return format(float(statistic(values)), form) if len(values) else '-'
 
 
@@ -130,7 +130,7 @@ def _spread(values: np.ndarray) -> float:
 
 
 def _coverage(z: np.ndarray) -> float:
-    return 100 * float(np.mean(np.abs(z) <= COVERED_SIGMAS))
+    return 100 * float(np.mean(np.abs(z) <= COVERAGE_SIGMAS))
 
 
 def _rms(z: np.ndarray) -> float:

@@ -17,20 +17,20 @@ from rosbags.typesys import Stores, get_typestore
 
 from autocalib_ros.calibrator import MAX_REORDERING_NS
 from autocalib_ros.errors import AutocalibError, InputError, UsageError
-from autocalib_ros.offline.recordings.sources import Frame, StoredImage, Window, nothing_in_window
-from autocalib_ros.offline.recordings.truncated_mcap import is_torn, sealed
+from autocalib_ros.offline.recordings.sources import Frame, StoredImage, TimeWindow, no_image_error
+from autocalib_ros.offline.recordings.truncated_mcap import is_truncated, readable_path
 from autocalib_ros.perception.images import ImageDecoder
 
 LOG = logging.getLogger(__name__)
 
 IMAGE_TYPES = ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage')
-PEEKED = 5
+PEEK_IMAGES = 5
 """Images looked at beforehand to learn whether their header stamps can be trusted."""
 ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 
 
 @dataclass(frozen=True)
-class _Stored:
+class _BagMessage:
     """One message: when it was recorded, its bytes as CDR or ROS 1, and the message."""
 
     recorded_ns: int
@@ -41,26 +41,26 @@ class _Stored:
 class BagSource:
     """The images of one topic of a rosbag2 folder, a lone .mcap or .db3, or a ROS 1 .bag."""
 
-    def __init__(self, path: Path, topic: str | None, window: Window) -> None:
+    def __init__(self, path: Path, topic: str | None, window: TimeWindow) -> None:
         self.name = str(path)
         self._path, self._window = path, window
         self._ros1 = _is_ros1(path)
         self._types = get_typestore(Stores.ROS1_NOETIC if self._ros1 else Stores.ROS2_JAZZY)
-        with _clear_errors(path), _opened(path) as readers:
+        with _as_input_errors(path), _open_readers(path) as readers:
             topics = _Topics(self.name, readers)
             self.topic, self.image_type = topics.choose(topic)
             count = topics.counts[self.topic]
             first = self._peek(readers)
             recording_s = (max(reader.end_time for reader in readers) - self._first_ns) * 1e-9
         self.camera_frame = first.header.frame_id.lstrip('/') if first else ''
-        self.duration_s = window.seconds_of(recording_s)
-        if any(is_torn(part) for part in _parts(path)):
+        self.duration_s = window.overlap_s(recording_s)
+        if any(is_truncated(part) for part in _recording_files(path)):
             LOG.warning('%s ended early, its recorder did not close it; what is whole of it is used', self.name)
-        self.total = count if window.whole else round(count * self.duration_s / max(recording_s, 1e-9))
+        self.total = count if window.is_whole_recording else round(count * self.duration_s / max(recording_s, 1e-9))
 
     def frames(self) -> Iterator[Frame]:
         """Decode the images of the window; InputError when there is none."""
-        decoder, order = ImageDecoder(), _Order()
+        decoder, order = ImageDecoder(), _StampFilter()
         decoded, broken, reason = 0, 0, ''
         for stored in self._messages():
             try:
@@ -87,37 +87,37 @@ class BagSource:
         for stored in self._messages():
             if stored.message is not None:
                 header = stored.message.header
-                cdr = self._ros2_cdr(stored.message) if self._ros1 else stored.raw
+                cdr = self._to_ros2_cdr(stored.message) if self._ros1 else stored.raw
                 yield StoredImage(stored.recorded_ns, _header_ns(header), header.frame_id, cdr)
 
-    def _messages(self) -> Iterator[_Stored]:
+    def _messages(self) -> Iterator[_BagMessage]:
         """Read the window's messages; a recording that breaks off midway gives what it has, and a warning."""
         start_ns, stop_ns = self._window.bounds_ns
         start_ns += self._first_ns
         stop_ns = None if stop_ns is None else stop_ns + self._first_ns
-        given = 0
+        yielded = 0
         with ExitStack() as stack:
-            with _clear_errors(self._path):
-                readers = stack.enter_context(_opened(self._path))
+            with _as_input_errors(self._path):
+                readers = stack.enter_context(_open_readers(self._path))
             try:
                 for stored in self._read(readers, None if self._window.start_s == 0 else start_ns, stop_ns):
-                    given += 1
+                    yielded += 1
                     yield stored
             except AutocalibError:
                 raise
             except Exception as error:  # a damaged file can raise anything from the depths of its decoder
-                if not given:
+                if not yielded:
                     raise InputError(f'cannot read {self.name}: {_one_line(error)}') from error
-                LOG.warning('%s ended early, after %d images: %s', self.name, given, _one_line(error))
-        if not given:
-            raise nothing_in_window(self.name, self._window, None)
+                LOG.warning('%s ended early, after %d images: %s', self.name, yielded, _one_line(error))
+        if not yielded:
+            raise no_image_error(self.name, self._window, None)
 
-    def _read(self, readers: list[Any], start_ns: int | None, stop_ns: int | None) -> Iterator[_Stored]:
+    def _read(self, readers: list[Any], start_ns: int | None, stop_ns: int | None) -> Iterator[_BagMessage]:
         for reader in readers:
             wanted = [c for c in reader.connections if (c.topic, c.msgtype) == (self.topic, self.image_type)]
             for _, recorded_ns, raw in reader.messages(wanted, start_ns, stop_ns) if wanted else ():
-                raw = _unpacked(raw)
-                yield _Stored(recorded_ns, raw, self._message(raw))
+                raw = _decompressed(raw)
+                yield _BagMessage(recorded_ns, raw, self._message(raw))
 
     def _message(self, raw: bytes | memoryview) -> Any:
         """Return the message, or None where its bytes make no sense."""
@@ -129,7 +129,7 @@ class BagSource:
 
     def _peek(self, readers: list[Any]) -> Any:
         """Look at the first images: where time begins, and whether the stamps in their headers can be used."""
-        first = list(islice(self._read(readers, None, None), PEEKED))
+        first = list(islice(self._read(readers, None, None), PEEK_IMAGES))
         if not first:
             raise InputError(f'{self.name} gives no image on {self.topic}')
         self._first_ns = first[0].recorded_ns
@@ -141,10 +141,10 @@ class BagSource:
             LOG.warning('the stamps in the headers on %s are %s; the times of recording are used', self.topic, what)
         return messages[0] if messages else None
 
-    def _stamp_ns(self, stored: _Stored) -> int:
+    def _stamp_ns(self, stored: _BagMessage) -> int:
         return _header_ns(stored.message.header) if self._use_headers else stored.recorded_ns
 
-    def _ros2_cdr(self, message: Any) -> memoryview:
+    def _to_ros2_cdr(self, message: Any) -> memoryview:
         """Return a message of ROS 1 as CDR; its header loses its `seq`."""
         types = get_typestore(Stores.ROS2_JAZZY)
         time, header = types.types['builtin_interfaces/msg/Time'], types.types['std_msgs/msg/Header']
@@ -175,23 +175,23 @@ class _Topics:
         """Return the image topic and its type: the one asked for, or the only one there is."""
         images = [name for name in self.counts if self._types[name] in IMAGE_TYPES and self.counts[name]]
         if not images:
-            raise InputError(f'{self._name} holds no images; its topics: {self._listed(self.counts)}')
+            raise InputError(f'{self._name} holds no images; its topics: {self._describe(self.counts)}')
         if topic is None and len(images) > 1:
             raise UsageError(f'{self._name} has {len(images)} image topics, choose one with --topic:'
-                             f' {self._listed(images)}')
+                             f' {self._describe(images)}')
         chosen = images[0] if topic is None else '/' + topic.lstrip('/')
         if chosen not in self.counts:
-            raise UsageError(f'{self._name} has no topic {chosen}; its image topics: {self._listed(images)}')
+            raise UsageError(f'{self._name} has no topic {chosen}; its image topics: {self._describe(images)}')
         if chosen not in images:
-            raise UsageError(f'{chosen} holds no images but {self._listed([chosen])}; image topics:'
-                             f' {self._listed(images)}')
+            raise UsageError(f'{chosen} holds no images but {self._describe([chosen])}; image topics:'
+                             f' {self._describe(images)}')
         return chosen, self._types[chosen]
 
-    def _listed(self, topics: Any) -> str:
+    def _describe(self, topics: Any) -> str:
         return ', '.join(f'{topic} ({self._types[topic]}, {self.counts[topic]} messages)' for topic in sorted(topics))
 
 
-class _Order:
+class _StampFilter:
     """Lets stamps pass that grow, or that step back so far that the clock must have been set."""
 
     def __init__(self) -> None:
@@ -209,11 +209,11 @@ class _Order:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[list[Any]]:
+def _open_readers(path: Path) -> Iterator[list[Any]]:
     """Open all files of a recording; a folder without metadata.yaml is what a recorder leaves that was killed."""
     with ExitStack() as stack:
-        readers = [stack.enter_context(Reader1(part) if _is_ros1(part) else Reader2(sealed(part)))
-                   for part in _parts(path)]
+        readers = [stack.enter_context(Reader1(part) if _is_ros1(part) else Reader2(readable_path(part)))
+                   for part in _recording_files(path)]
         yield sorted(readers, key=lambda reader: reader.start_time)
 
 
@@ -222,13 +222,13 @@ def _is_ros1(path: Path) -> bool:
     return path.suffix.lower() == '.bag' and not path.is_dir()
 
 
-def _parts(path: Path) -> list[Path]:
+def _recording_files(path: Path) -> list[Path]:
     """Return what is to be opened: the recording itself, or the files of a folder whose metadata.yaml is no use."""
     if not path.is_dir():
         return [path]
     parts = sorted(part for part in path.iterdir() if part.suffix in ('.mcap', '.db3'))
     metadata = path / 'metadata.yaml'
-    if metadata.exists() and (not parts or metadata.stat().st_size) and not any(is_torn(part) for part in parts):
+    if metadata.exists() and (not parts or metadata.stat().st_size) and not any(is_truncated(part) for part in parts):
         return [path]
     if not parts:
         raise InputError(f'{path} is not a recording: it has neither a metadata.yaml nor .mcap or .db3 files')
@@ -238,7 +238,7 @@ def _parts(path: Path) -> list[Path]:
 
 
 @contextmanager
-def _clear_errors(path: Path) -> Iterator[None]:
+def _as_input_errors(path: Path) -> Iterator[None]:
     """Turn whatever a damaged file makes rosbags raise into one line."""
     try:
         yield
@@ -259,7 +259,7 @@ def _header_ns(header: Any) -> int:
     return header.stamp.sec * 1_000_000_000 + header.stamp.nanosec
 
 
-def _unpacked(raw: bytes | memoryview) -> bytes | memoryview:
+def _decompressed(raw: bytes | memoryview) -> bytes | memoryview:
     """Unpack a message of a lone file whose metadata.yaml, gone by now, said that messages are compressed."""
     if bytes(raw[:4]) != ZSTD_MAGIC:  # a CDR message begins with 00, a ROS 1 image with its counter
         return raw

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from autocalib_ros.errors import InputError, UsageError
-from autocalib_ros.offline.recordings.sources import BAG_SUFFIXES, Source, Window
+from autocalib_ros.offline.recordings.sources import BAG_SUFFIXES, Source, TimeWindow
 
 
 def open_source(path: str | Path, topic: str | None = None, start_s: float = 0.0,
@@ -14,7 +14,7 @@ def open_source(path: str | Path, topic: str | None = None, start_s: float = 0.0
 
     Raises UsageError when the topic has to be chosen or is not there, InputError when the file cannot be read.
     """
-    path, window = Path(path), Window(start_s, duration_s)
+    path, window = Path(path), TimeWindow(start_s, duration_s)
     _check_readable(path)
     if path.is_dir() or path.suffix.lower() in BAG_SUFFIXES:
         from autocalib_ros.offline.recordings.bags import BagSource  # imported late: a video needs no rosbags

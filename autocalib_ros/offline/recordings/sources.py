@@ -33,7 +33,7 @@ class StoredImage:
 
 
 @dataclass(frozen=True)
-class Window:
+class TimeWindow:
     """The part of a recording that is asked for, in seconds from its first image."""
 
     start_s: float = 0.0
@@ -46,7 +46,7 @@ class Window:
             raise UsageError(f'the duration is a positive number of seconds, got {self.duration_s}')
 
     @property
-    def whole(self) -> bool:
+    def is_whole_recording(self) -> bool:
         """Whether it is all of the recording."""
         return self.start_s == 0 and self.duration_s is None
 
@@ -56,7 +56,7 @@ class Window:
         start = round(self.start_s * 1e9)
         return start, None if self.duration_s is None else start + round(self.duration_s * 1e9)
 
-    def seconds_of(self, recording_s: float) -> float:
+    def overlap_s(self, recording_s: float) -> float:
         """Return how much of a recording of that length falls into the window, in seconds."""
         rest = max(recording_s - self.start_s, 0.0)
         return rest if self.duration_s is None else min(rest, self.duration_s)
@@ -85,7 +85,7 @@ class Source(Protocol):
         """Go through the images of the window without decoding them."""
 
 
-def nothing_in_window(name: str, window: Window, recording_s: float | None) -> InputError:
+def no_image_error(name: str, window: TimeWindow, recording_s: float | None) -> InputError:
     """Return the error of a recording that gives no image, or none in the window."""
     if window.start_s > 0:
         length = '' if recording_s is None else f', which lasts {recording_s:.1f} s'

@@ -19,7 +19,7 @@ DATA_END = 0x0F
 RECORD_HEAD = struct.Struct('<BQ')
 
 
-def is_torn(path: Path) -> bool:
+def is_truncated(path: Path) -> bool:
     """Say whether a file is an .mcap without its end; what is no .mcap at all is not."""
     if path.suffix != '.mcap':
         return False
@@ -31,15 +31,15 @@ def is_torn(path: Path) -> bool:
         return size < 2 * len(MAGIC) or stream.read() != MAGIC
 
 
-def sealed(path: Path) -> Any:
+def readable_path(path: Path) -> Any:
     """Return the path itself, or for a torn .mcap a stand-in whose `open` gives the whole records and a footer."""
-    if not is_torn(path):
+    if not is_truncated(path):
         return path
     with path.open('rb') as stream:
-        return _Sealed(path, _whole_bytes(stream, stream.seek(0, io.SEEK_END)))
+        return _TruncatedMcapPath(path, _count_complete_bytes(stream, stream.seek(0, io.SEEK_END)))
 
 
-def _whole_bytes(stream: BinaryIO, size: int) -> int:
+def _count_complete_bytes(stream: BinaryIO, size: int) -> int:
     """Return where the last whole record of the data section ends."""
     position = len(MAGIC)
     while position + RECORD_HEAD.size <= size:
@@ -51,11 +51,11 @@ def _whole_bytes(stream: BinaryIO, size: int) -> int:
     return position
 
 
-class _Sealed:
+class _TruncatedMcapPath:
     """Stands in for the path of a torn file, as far as rosbags uses it."""
 
-    def __init__(self, path: Path, whole: int) -> None:
-        self._path, self._whole = path, whole
+    def __init__(self, path: Path, complete_bytes: int) -> None:
+        self._path, self._complete_bytes = path, complete_bytes
         self.suffix, self.stem = path.suffix, path.stem
 
     def __str__(self) -> str:
@@ -71,15 +71,15 @@ class _Sealed:
 
     def open(self, *_: Any, **__: Any) -> BinaryIO:
         """Open the whole part and the footer behind it, for reading."""
-        return io.BufferedReader(_WithFooter(self._path.open('rb', buffering=0), self._whole))
+        return io.BufferedReader(_StreamWithFooter(self._path.open('rb', buffering=0), self._complete_bytes))
 
 
-class _WithFooter(io.RawIOBase):
-    """The first `whole` bytes of a file, then FOOTER."""
+class _StreamWithFooter(io.RawIOBase):
+    """The first `complete_bytes` bytes of a file, then FOOTER."""
 
-    def __init__(self, stream: Any, whole: int) -> None:
+    def __init__(self, stream: Any, complete_bytes: int) -> None:
         super().__init__()
-        self._stream, self._whole, self._position = stream, whole, 0
+        self._stream, self._complete_bytes, self._position = stream, complete_bytes, 0
 
     def readable(self) -> bool:
         """Yes."""
@@ -91,17 +91,17 @@ class _WithFooter(io.RawIOBase):
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
         """Move to a position and return it."""
-        base = {io.SEEK_SET: 0, io.SEEK_CUR: self._position, io.SEEK_END: self._whole + len(FOOTER)}[whence]
+        base = {io.SEEK_SET: 0, io.SEEK_CUR: self._position, io.SEEK_END: self._complete_bytes + len(FOOTER)}[whence]
         self._position = max(base + offset, 0)
         return self._position
 
     def readinto(self, buffer: Any) -> int:
         """Fill the buffer from the file or from the footer."""
-        if self._position < self._whole:
+        if self._position < self._complete_bytes:
             self._stream.seek(self._position)
-            data = self._stream.read(min(len(buffer), self._whole - self._position))
+            data = self._stream.read(min(len(buffer), self._complete_bytes - self._position))
         else:
-            behind = self._position - self._whole
+            behind = self._position - self._complete_bytes
             data = FOOTER[behind:behind + len(buffer)]
         buffer[:len(data)] = data
         self._position += len(data)

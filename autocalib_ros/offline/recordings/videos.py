@@ -10,13 +10,13 @@ from pathlib import Path
 import cv2
 
 from autocalib_ros.errors import InputError
-from autocalib_ros.offline.recordings.sources import Frame, StoredImage, Window, nothing_in_window
+from autocalib_ros.offline.recordings.sources import Frame, StoredImage, TimeWindow, no_image_error
 
 LOG = logging.getLogger(__name__)
 
-SANE_FPS = (0.01, 1000.0)
+PLAUSIBLE_FPS = (0.01, 1000.0)
 FALLBACK_FPS = 25.0
-ENDED_EARLY_BELOW = 0.95
+MIN_DECODED_FRACTION = 0.95
 """Share of the frames promised by the file's header; some containers only estimate their number."""
 
 
@@ -25,21 +25,21 @@ class VideoSource:
 
     topic = image_type = camera_frame = ''
 
-    def __init__(self, path: Path, window: Window) -> None:
+    def __init__(self, path: Path, window: TimeWindow) -> None:
         self.name = str(path)
         self._path, self._window = path, window
         with self._capture() as capture:
-            fps, promised = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
+            fps, declared_frames = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
             if not capture.grab():
                 raise InputError(f'{self.name} holds no frame that can be decoded')
-        if not SANE_FPS[0] <= fps <= SANE_FPS[1]:
+        if not PLAUSIBLE_FPS[0] <= fps <= PLAUSIBLE_FPS[1]:
             LOG.warning('%s does not say its frame rate; taken for %g frames/s', self.name, FALLBACK_FPS)
             fps = FALLBACK_FPS
         self._fps = fps
-        self._promised = int(promised) if 0 < promised < 1e9 else None
+        self._declared_frames = int(declared_frames) if 0 < declared_frames < 1e9 else None
         self.duration_s = self.total = None
-        if self._promised:
-            self.duration_s = window.seconds_of(self._promised / fps)
+        if self._declared_frames:
+            self.duration_s = window.overlap_s(self._declared_frames / fps)
             self.total = round(self.duration_s * fps)
 
     def frames(self) -> Iterator[Frame]:
@@ -56,23 +56,23 @@ class VideoSource:
     def _stamped(self) -> Iterator[tuple[int, cv2.VideoCapture]]:
         """Yield the stamp of each frame of the window, and the capture that holds the frame."""
         start_ns, stop_ns = self._window.bounds_ns
-        clock, given = _Clock(self._fps), 0
+        clock, yielded = _FrameClock(self._fps), 0
         with self._capture() as capture:
             while capture.grab():
                 stamp_ns = clock.next_ns(capture.get(cv2.CAP_PROP_POS_MSEC))
                 if stop_ns is not None and stamp_ns >= stop_ns:
                     break
                 if stamp_ns >= start_ns:
-                    given += 1
+                    yielded += 1
                     yield stamp_ns, capture
             else:
-                self._judge_end(clock.ticks)
-        if not given:
-            raise nothing_in_window(self.name, self._window, clock.ticks / self._fps)
+                self._warn_if_truncated(clock.ticks)
+        if not yielded:
+            raise no_image_error(self.name, self._window, clock.ticks / self._fps)
 
-    def _judge_end(self, frames: int) -> None:
-        if frames and self._promised and frames < ENDED_EARLY_BELOW * self._promised - 2:
-            LOG.warning('%s ended early: %d of %d frames could be read', self.name, frames, self._promised)
+    def _warn_if_truncated(self, frames: int) -> None:
+        if frames and self._declared_frames and frames < MIN_DECODED_FRACTION * self._declared_frames - 2:
+            LOG.warning('%s ended early: %d of %d frames could be read', self.name, frames, self._declared_frames)
 
     @contextmanager
     def _capture(self) -> Iterator[cv2.VideoCapture]:
@@ -86,7 +86,7 @@ class VideoSource:
             capture.release()
 
 
-class _Clock:
+class _FrameClock:
     """Presentation times where the container has sane ones, counted frames elsewhere."""
 
     def __init__(self, fps: float) -> None:

@@ -27,9 +27,9 @@ BAG_VERSION = 9
 """What Jazzy writes."""
 DEFAULT_FRAME = 'camera_optical_frame'
 GROUND_TOPIC = '/autocalib/ground_transform'
-FOREVER = QosTime(2147483647, 4294967295)
-LATCHED = Qos(QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL, FOREVER, FOREVER,
-              QosLiveliness.AUTOMATIC, FOREVER, False)
+INFINITE_DURATION = QosTime(2147483647, 4294967295)
+LATCHED_QOS = Qos(QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL, INFINITE_DURATION, INFINITE_DURATION,
+              QosLiveliness.AUTOMATIC, INFINITE_DURATION, False)
 
 
 def write_bag(path: Path, result: Calibration, source: Source, tf_parent: str = 'ground',
@@ -44,7 +44,7 @@ def write_bag(path: Path, result: Calibration, source: Source, tf_parent: str = 
         raise UsageError(f'{path} exists already and is not overwritten')
     try:
         with Writer(path, version=BAG_VERSION, storage_plugin=StoragePlugin.MCAP) as writer:
-            _Recording(writer, result, source, tf_parent, ignored).write()
+            _BagWriter(writer, result, source, tf_parent, ignored).write()
     except BaseException as error:
         shutil.rmtree(path, ignore_errors=True)  # half a bag is worse than none
         if isinstance(error, OSError):
@@ -58,7 +58,7 @@ def camera_info_topic(source: Source) -> str:
     return '/'.join([*parts, 'camera_info']) if source.topic else '/camera/camera_info'
 
 
-class _Recording:
+class _BagWriter:
     """The connections and messages of one new bag."""
 
     def __init__(self, writer: Writer, result: Calibration, source: Source, tf_parent: str,
@@ -75,7 +75,7 @@ class _Recording:
         for index, stored in enumerate(self._source.stored()):
             if index == 0 and self._result.ground is not None:
                 self._write_ground(self._result.ground, stored)
-            self._put(info, stored.recorded_ns, self._camera_info(stored))
+            self._write_message(info, stored.recorded_ns, self._camera_info(stored))
             if images is not None and (cdr := self._image(stored.cdr)) is not None:
                 self._writer.write(images, stored.recorded_ns, cdr)
         if self._broken:
@@ -100,7 +100,7 @@ class _Recording:
         transform = self._transform(ground, first.frame_id.lstrip('/') or DEFAULT_FRAME)
         together = self._make('tf2_msgs/msg/TFMessage', transforms=[transform])
         for topic, message in ((GROUND_TOPIC, transform), ('/tf_static', together)):
-            self._put(self._connect(topic, message.__msgtype__), first.recorded_ns, message)
+            self._write_message(self._connect(topic, message.__msgtype__), first.recorded_ns, message)
 
     def _camera_info(self, stored: StoredImage) -> Any:
         info = self._result.camera_info
@@ -126,10 +126,10 @@ class _Recording:
         stamp = self._make('builtin_interfaces/msg/Time', sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
         return self._make('std_msgs/msg/Header', stamp=stamp, frame_id=frame_id)
 
-    def _connect(self, topic: str, kind: str, qos: tuple[Qos, ...] = (LATCHED,)) -> Any:
+    def _connect(self, topic: str, kind: str, qos: tuple[Qos, ...] = (LATCHED_QOS,)) -> Any:
         return self._writer.add_connection(topic, kind, typestore=self._store, offered_qos_profiles=qos)
 
-    def _put(self, connection: Any, recorded_ns: int, message: Any) -> None:
+    def _write_message(self, connection: Any, recorded_ns: int, message: Any) -> None:
         self._writer.write(connection, recorded_ns, self._store.serialize_cdr(message, message.__msgtype__))
 
     def _make(self, kind: str, **fields: Any) -> Any:

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from autocalib_ros.lens.camera import Camera
 
 SWAY_STEP_S = 0.5
-SWAY_S = 3000.0
+SWAY_DURATION_S = 3000.0
 """A swaying camera sways for so long; synthetic recordings are shorter."""
 DRIFT_QUANTILES = (0.05, 0.95)
 """Of the background's offsets, as the monitor of stillness takes them."""
@@ -20,12 +20,12 @@ Sway = Callable[[np.ndarray], np.ndarray]
 """Rotations (n, 3, 3) of the camera about its mean pose at times (n,) in seconds."""
 
 
-def spoil(points: np.ndarray, size: tuple[int, int], generator: np.random.Generator) -> np.ndarray:
+def corrupt_track(points: np.ndarray, size: tuple[int, int], generator: np.random.Generator) -> np.ndarray:
     """Make a gross outlier of a track (n, 2): a jump to something else, or a curve that has nothing to do with it."""
     if generator.uniform() < 0.5:
         jumped = points.copy()
         jumped[generator.integers(2, len(points) - 2):] += generator.uniform(40, 200) * _any_direction(generator)
-        return fold(jumped, size)
+        return reflect_into_image(jumped, size)
     return random_curve(len(points), size, generator)
 
 
@@ -35,39 +35,39 @@ def random_curve(count: int, size: tuple[int, int], generator: np.random.Generat
     along = np.linspace(0.0, generator.uniform(80, 500), count)
     heading = generator.uniform(0, 2 * np.pi) + bend * along
     steps = np.gradient(along)[:, None] * np.column_stack([np.cos(heading), np.sin(heading)])
-    return fold(generator.uniform((0, 0), size) + np.cumsum(steps, axis=0), size)
+    return reflect_into_image(generator.uniform((0, 0), size) + np.cumsum(steps, axis=0), size)
 
 
 def random_walk(count: int, size: tuple[int, int], generator: np.random.Generator) -> np.ndarray:
     """Return `count` points (n, 2) that stagger about: rain, leaves, a lost tracker."""
     steps = generator.normal(scale=generator.uniform(2.0, 8.0), size=(count, 2))
-    return fold(generator.uniform((0, 0), size) + np.cumsum(steps, axis=0), size)
+    return reflect_into_image(generator.uniform((0, 0), size) + np.cumsum(steps, axis=0), size)
 
 
-def straggle(count: int, size: tuple[int, int], generator: np.random.Generator) -> np.ndarray:
+def noisy_line(count: int, size: tuple[int, int], generator: np.random.Generator) -> np.ndarray:
     """Return `count` points (n, 2) along an almost straight line anywhere in the image, any way."""
     way = _any_direction(generator)
     along = np.linspace(0.0, generator.uniform(60, 500), count)
     sideways = np.cumsum(generator.normal(scale=generator.uniform(0.2, 1.5), size=count))
     line = along[:, None] * way + sideways[:, None] * np.array([-way[1], way[0]])
-    return fold(generator.uniform((0, 0), size) + line, size)
+    return reflect_into_image(generator.uniform((0, 0), size) + line, size)
 
 
-def fold(points: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+def reflect_into_image(points: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """Mirror points (n, 2) at the image's borders until they lie inside."""
     last = np.array(size) - 1.0
     turned = np.mod(points, 2 * last)
     return np.minimum(turned, 2 * last - turned)
 
 
-def waving(generator: np.random.Generator) -> Sway:
+def random_sway(generator: np.random.Generator) -> Sway:
     """Draw a motion of 0.5 to 3 degrees over 1 to 10 s: a swing about one axis and a random walk about all three."""
     amplitude = np.radians(0.5 * 6.0 ** generator.uniform())
     period, memory = generator.uniform(1.0, 10.0, 2)
     axis, phase = generator.normal(size=3), generator.uniform(0, 2 * np.pi)
     axis /= np.linalg.norm(axis)
     keep = np.exp(-SWAY_STEP_S / memory)
-    pushes = generator.normal(scale=0.5 * amplitude * np.sqrt(1 - keep**2), size=(int(SWAY_S / SWAY_STEP_S), 3))
+    pushes = generator.normal(scale=0.5 * amplitude * np.sqrt(1 - keep**2), size=(int(SWAY_DURATION_S / SWAY_STEP_S), 3))
     walk = lfilter([1.0], [1.0, -keep], pushes, axis=0)
     ticks = SWAY_STEP_S * np.arange(len(walk))
 

@@ -13,21 +13,21 @@ from autocalib_ros.errors import UsageError
 from autocalib_ros.evidence.buffer import EvidenceBuffer
 from autocalib_ros.evidence.snapshot import Evidence, Segments, Track
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.offline.synthetic.disturbances import Sway, background_drift_px, spoil
+from autocalib_ros.offline.synthetic.disturbances import Sway, background_drift_px, corrupt_track
 from autocalib_ros.offline.synthetic.drives import (
     INTERVAL_S,
     LANE_M,
-    Company,
+    Companion,
     Drive,
     beside,
     drive_across,
 )
 
 SEGMENT_INTERVAL_S = 0.4
-MIN_LENGTH_PX = 25.0
-MIN_POINTS = 8
-MAX_POINTS = 100
-RANGE_M = 60.0
+MIN_TRACK_LENGTH_PX = 25.0
+MIN_TRACK_POINTS = 8
+MAX_TRACK_POINTS = 100
+MAX_TRACKED_RANGE_M = 60.0
 """Farther points are too small to be followed."""
 HEADWAY_S = 1.5
 MAX_VEHICLES_PER_TRACK = 100
@@ -64,17 +64,17 @@ class Junction:
     points_per_vehicle: int = 4
     headway_s: float = HEADWAY_S
     """Time between vehicles."""
-    turning_share: float = 0.2
-    lane_change_share: float = 0.0
-    joined_share: float = 0.0
+    turning_fraction: float = 0.2
+    lane_change_fraction: float = 0.0
+    merged_fraction: float = 0.0
     """Share of the vehicles that have company with which they are taken for one."""
-    company: Company = beside
+    companion: Companion = beside
     """What moves with them: another vehicle beside them, a trailer, a shadow."""
     wander_m: float = 0.1
     noise_px: float = 0.5
-    outlier_share: float = 0.0
+    outlier_fraction: float = 0.0
     """Share of the tracks that are spoilt."""
-    window_px: tuple[float, float] | None = None
+    visible_columns_px: tuple[float, float] | None = None
     """Columns between which the road is in view; all of them where it is None."""
     sway: Sway | None = None
     """How the camera moves about `camera_from_ground`."""
@@ -99,17 +99,17 @@ def synthetic_evidence(junction: Junction, generator: np.random.Generator) -> Ev
         times = junction.headway_s * vehicle + INTERVAL_S * np.arange(len(path))
         newest = max(newest, float(times[-1]))
         bodies = [(path, heading)]
-        if junction.joined_share and generator.uniform() < junction.joined_share:
-            bodies.append(junction.company(path, heading, generator))
+        if junction.merged_fraction and generator.uniform() < junction.merged_fraction:
+            bodies.append(junction.companion(path, heading, generator))
         for number in range(junction.points_per_vehicle):
             track = _observe(junction, generator, *bodies[number % len(bodies)], times, vehicle)
             if track is not None and len(tracks) != junction.tracks:
                 tracks.append(track)
     drift = 0.0 if junction.sway is None else background_drift_px(junction.camera, junction.sway, newest)
-    return gathered(tracks, junction.image_size, newest, drift)
+    return evidence_from_tracks(tracks, junction.image_size, newest, drift)
 
 
-def gathered(tracks: list[Track], image_size: tuple[int, int], newest_s: float, drift_px: float = 0.0) -> Evidence:
+def evidence_from_tracks(tracks: list[Track], image_size: tuple[int, int], newest_s: float, drift_px: float = 0.0) -> Evidence:
     """Return the evidence of tracks, with the segments that matches between masked frames would give."""
     buffer = EvidenceBuffer(BufferOptions())
     for track in tracks:
@@ -144,16 +144,16 @@ def _observe(junction: Junction, generator: np.random.Generator, path: np.ndarra
     relative = np.column_stack([ground, np.full(len(ground), up - junction.height_m)])
     pixels, valid = junction.camera.project(_bearings(junction, relative, times))
     seen = valid & (pixels >= 0).all(axis=1) & (pixels < junction.image_size).all(axis=1)
-    seen &= np.hypot(*ground.T) < RANGE_M
-    if junction.window_px is not None:
-        seen &= (pixels[:, 0] >= junction.window_px[0]) & (pixels[:, 0] < junction.window_px[1])
+    seen &= np.hypot(*ground.T) < MAX_TRACKED_RANGE_M
+    if junction.visible_columns_px is not None:
+        seen &= (pixels[:, 0] >= junction.visible_columns_px[0]) & (pixels[:, 0] < junction.visible_columns_px[1])
     first, last = _longest_run(seen)
     points = pixels[first:last] + generator.normal(scale=junction.noise_px, size=(last - first, 2))
-    if len(points) >= MIN_POINTS and junction.outlier_share and generator.uniform() < junction.outlier_share:
-        points = spoil(points, junction.image_size, generator)
-    if len(points) < MIN_POINTS or np.hypot(*(points[-1] - points[0])) < MIN_LENGTH_PX:
+    if len(points) >= MIN_TRACK_POINTS and junction.outlier_fraction and generator.uniform() < junction.outlier_fraction:
+        points = corrupt_track(points, junction.image_size, generator)
+    if len(points) < MIN_TRACK_POINTS or np.hypot(*(points[-1] - points[0])) < MIN_TRACK_LENGTH_PX:
         return None
-    chosen = np.unique(np.round(np.linspace(0, len(points) - 1, MAX_POINTS)).astype(int))
+    chosen = np.unique(np.round(np.linspace(0, len(points) - 1, MAX_TRACK_POINTS)).astype(int))
     return Track(vehicle, times[first:last][chosen], points[chosen])
 
 

@@ -8,17 +8,17 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Protocol, TextIO
 
-from autocalib_ros.offline.terminal.style import columns_of, is_terminal, shortened
+from autocalib_ros.offline.terminal.style import is_terminal, terminal_width, truncate
 
 LINE_EVERY_S = 5.0
-LINE_EVERY_SHARE = 0.1
-LEAST_BETWEEN_S = 1.0
+LINE_EVERY_FRACTION = 0.1
+MIN_INTERVAL_S = 1.0
 """A short run that goes through its tenths or its states in a moment needs no ten lines."""
 BAR = '{desc} {percentage:3.0f} %|{bar:8}| {remaining} left{postfix}'
 OPEN_BAR = '{desc} {n_fmt}{unit}, {elapsed}{postfix}'
 
 
-class Progress(Protocol):
+class ProgressReporter(Protocol):
     """What `progress_bar` hands out."""
 
     def update_to(self, done: float, note: str = '') -> None:
@@ -27,29 +27,29 @@ class Progress(Protocol):
 
 @contextmanager
 def progress_bar(total: float | None, unit: str, label: str, *, quiet: bool = False,
-                 stream: TextIO | None = None) -> Iterator[Progress]:
+                 stream: TextIO | None = None) -> Iterator[ProgressReporter]:
     """Show progress on stderr until the block ends: tqdm's bar on a terminal, plain lines elsewhere.
 
     `total` is counted in `unit`s, None where it is not known beforehand; `quiet` shows nothing.
     """
     stream = stream or sys.stderr
     if quiet:
-        yield _Silent()
+        yield _NoProgress()
     elif is_terminal(stream):
-        with _Bar(total, unit, label, stream) as bar:
+        with _ProgressBar(total, unit, label, stream) as bar:
             yield bar
     else:
-        lines = _Lines(total, unit, label, stream)
+        lines = _ProgressLines(total, unit, label, stream)
         yield lines
         lines.finish()
 
 
-class _Silent:
+class _NoProgress:
     def update_to(self, done: float, note: str = '') -> None:
         """Show nothing."""
 
 
-class _Bar:
+class _ProgressBar:
     """tqdm's bar, with as much of the note behind it as the terminal has columns for."""
 
     def __init__(self, total: float | None, unit: str, label: str, stream: TextIO) -> None:
@@ -58,10 +58,10 @@ class _Bar:
         self._stream = stream
         # a terminal of unknown size has no line for tqdm, which then shows nothing
         self._bar = tqdm(total=total, unit=' ' + unit, desc=label, file=stream, leave=True, nrows=2,
-                         ncols=columns_of(stream) - 1, bar_format=BAR if total else OPEN_BAR)
+                         ncols=terminal_width(stream) - 1, bar_format=BAR if total else OPEN_BAR)
         self._note = ''
 
-    def __enter__(self) -> _Bar:
+    def __enter__(self) -> _ProgressBar:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -71,43 +71,43 @@ class _Bar:
     def update_to(self, done: float, note: str = '') -> None:
         """Move the bar to `done`; show another state at once, because it may take a while."""
         changed, self._note = _state(note) != _state(self._note), note
-        self._bar.ncols = columns_of(self._stream) - 1  # the window may have been resized
+        self._bar.ncols = terminal_width(self._stream) - 1  # the window may have been resized
         fixed = {**self._bar.format_dict, 'n': done, 'postfix': '', 'ncols': None}
         room = self._bar.ncols - len(self._bar.format_meter(**fixed)) - len(', ')
-        self._bar.set_postfix_str(shortened(note, room), refresh=False)
+        self._bar.set_postfix_str(truncate(note, room), refresh=False)
         self._bar.update(done - self._bar.n)
         if changed:
             self._bar.refresh()
 
 
-class _Lines:
+class _ProgressLines:
     """One line every few seconds or per cent, and for another state: for logs, pipes and files."""
 
     def __init__(self, total: float | None, unit: str, label: str, stream: TextIO) -> None:
         self._total, self._unit, self._label, self._stream = total, unit, label, stream
-        self._begun = self._said_at = time.monotonic()
-        self._said = self._done = 0.0
-        self._note = self._said_note = ''
+        self._started_at = self._reported_at = time.monotonic()
+        self._reported = self._done = 0.0
+        self._note = self._reported_note = ''
 
     def update_to(self, done: float, note: str = '') -> None:
         """Remember `done` and say it when it is time."""
         self._done, self._note = done, note
-        step = LINE_EVERY_SHARE * self._total if self._total else float('inf')
+        step = LINE_EVERY_FRACTION * self._total if self._total else float('inf')
         now = time.monotonic()
-        late = now - self._said_at >= LINE_EVERY_S
-        far = done - self._said >= step or _state(note) != _state(self._said_note)
-        complete = self._total is not None and self._said < self._total <= done
-        if late or complete or (far and now - self._said_at >= LEAST_BETWEEN_S):
-            self._say(now)
+        late = now - self._reported_at >= LINE_EVERY_S
+        far = done - self._reported >= step or _state(note) != _state(self._reported_note)
+        complete = self._total is not None and self._reported < self._total <= done
+        if late or complete or (far and now - self._reported_at >= MIN_INTERVAL_S):
+            self._report(now)
 
     def finish(self) -> None:
         """Say the last state once."""
-        if self._done > self._said or not self._said:
-            self._say(time.monotonic())
+        if self._done > self._reported or not self._reported:
+            self._report(time.monotonic())
 
-    def _say(self, now: float) -> None:
-        self._said, self._said_at, self._said_note = self._done, now, self._note
-        elapsed = max(now - self._begun, 1e-6)
+    def _report(self, now: float) -> None:
+        self._reported, self._reported_at, self._reported_note = self._done, now, self._note
+        elapsed = max(now - self._started_at, 1e-6)
         parts = [f'{self._done:g} {self._unit}']
         if self._total:
             parts = [f'{self._done:g} of {self._total:g} {self._unit} ({100 * self._done / self._total:.0f} %)']

@@ -10,10 +10,10 @@ from autocalib_ros.results.calibration import Calibration, Refusal
 ESCAPES = {'green': '\033[32m', 'yellow': '\033[33m', 'red': '\033[31m'}
 RESET = '\033[0m'
 ELLIPSIS = '…'
-COLUMNS = 80
+DEFAULT_COLUMNS = 80
 
 
-def shows_colours(stream: TextIO) -> bool:
+def wants_colour(stream: TextIO) -> bool:
     """Whether colours are wanted: on a terminal that is not dumb, unless NO_COLOR says no or FORCE_COLOR yes.
 
     Both count when they are not empty (no-color.org), and no goes before yes.
@@ -28,18 +28,18 @@ def is_terminal(stream: TextIO) -> bool:
     return stream.isatty() and os.environ.get('TERM') != 'dumb'
 
 
-def columns_of(stream: TextIO) -> int:
-    """Return how many columns the terminal has; `COLUMNS` where it does not tell, as in a container without a size."""
+def terminal_width(stream: TextIO) -> int:
+    """Return how many columns the terminal has; `DEFAULT_COLUMNS` where it does not tell, as in a container without a size."""
     try:
         size = os.get_terminal_size(stream.fileno())
     except (OSError, ValueError):
-        return COLUMNS
-    return size.columns if size.columns and size.lines else COLUMNS
+        return DEFAULT_COLUMNS
+    return size.columns if size.columns and size.lines else DEFAULT_COLUMNS
 
 
-def painted(text: str, colour: str, stream: TextIO) -> str:
+def coloured(text: str, colour: str, stream: TextIO) -> str:
     """Return the text in one of `ESCAPES` where the stream shows colours."""
-    return f'{ESCAPES[colour]}{text}{RESET}' if shows_colours(stream) else text
+    return f'{ESCAPES[colour]}{text}{RESET}' if wants_colour(stream) else text
 
 
 def state_colour(result: Calibration | Refusal) -> str:
@@ -49,7 +49,7 @@ def state_colour(result: Calibration | Refusal) -> str:
     return 'green' if result.grade == 'full' else 'yellow'
 
 
-def shortened(text: str, columns: int) -> str:
+def truncate(text: str, columns: int) -> str:
     """Return the text on one line of so many columns at the most, with an ellipsis where it was cut."""
     text = ' '.join(text.split())
     if len(text) <= columns:
@@ -57,7 +57,7 @@ def shortened(text: str, columns: int) -> str:
     return text[:max(columns - 1, 0)].rstrip(' ,;:') + ELLIPSIS if columns > 0 else ''
 
 
-def aligned(rows: list[tuple[str, ...]], gap: str = '  ') -> list[str]:
+def align_columns(rows: list[tuple[str, ...]], gap: str = '  ') -> list[str]:
     """Return rows of equally many cells as lines, cells of a column below each other."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return [gap.join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]

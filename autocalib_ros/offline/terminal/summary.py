@@ -5,7 +5,7 @@ from __future__ import annotations
 import textwrap
 from dataclasses import replace
 
-from autocalib_ros.offline.terminal.style import aligned
+from autocalib_ros.offline.terminal.style import align_columns
 from autocalib_ros.report.text import number_rows, remedy
 from autocalib_ros.results.calibration import Calibration, Refusal
 
@@ -17,19 +17,19 @@ def summary_lines(result: Calibration | Refusal, accepted_at_s: float | None = N
     """Return what is known with one sigma, then assumptions, checks and what helps; wrapped to so many columns."""
     if isinstance(result, Refusal):
         rows = [(row.name, row.value) for row in number_rows(result)]
-        return [INDENT + line for line in aligned(rows)] + _told([('what helps', remedy(result))], columns)
+        return [INDENT + line for line in align_columns(rows)] + _wrap_pairs([('what helps', remedy(result))], columns)
     numbers = number_rows(replace(result, paper=None), accepted_at_s)
     # rows without a deviation may be long, and would push the column of the others far out
     cells = [('', 'value', '1 sigma'), *((row.name, row.value, f'± {row.sigma}') for row in numbers if row.sigma)]
     name_width, value_width = (max(len(cell[column]) for cell in cells) for column in (0, 1))
     table = [cells[0], *((row.name, row.value, f'± {row.sigma}' if row.sigma else '') for row in numbers)]
     lines = [f'{name:<{name_width}}  {value:<{value_width}}  {sigma}'.rstrip() for name, value, sigma in table]
-    told = [*(('assumed', text) for text in result.assumptions), *(('checked', text) for text in result.checks),
+    remarks = [*(('assumed', text) for text in result.assumptions), *(('checked', text) for text in result.checks),
             ('what helps', remedy(result))]
-    return [INDENT + line for line in lines] + _told(told, columns)
+    return [INDENT + line for line in lines] + _wrap_pairs(remarks, columns)
 
 
-def _told(pairs: list[tuple[str, str]], columns: int | None) -> list[str]:
+def _wrap_pairs(pairs: list[tuple[str, str]], columns: int | None) -> list[str]:
     lines = []
     for name, text in pairs:
         start = f'{INDENT}{name + ":":<12}'

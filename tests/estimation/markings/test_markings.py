@@ -23,7 +23,7 @@ from autocalib_ros.estimation.verification.ground_normal import PlaneEstimate
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.ground_plane import GroundPlane, tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.offline.benchmark.families import viewpoint
+from autocalib_ros.offline.benchmark.families import standard_junction
 from autocalib_ros.offline.benchmark.monte_carlo import distance_error
 from autocalib_ros.offline.synthetic.drives import drive_ring
 from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_evidence
@@ -37,7 +37,7 @@ NEAR_EQUIDISTANT = JointOptions(lens_prior='equidistant')
 """One family of lenses: the others take three quarters of a second each."""
 JUNCTION = Junction(vehicles=16, points_per_vehicle=5)
 """Both roads are driven on, so that lines on both are beside traffic."""
-LONE_ROAD = Junction(road_angles_deg=(0.0,), vehicles=40, points_per_vehicle=2, turning_share=0.25)
+LONE_ROAD = Junction(road_angles_deg=(0.0,), vehicles=40, points_per_vehicle=2, turning_fraction=0.25)
 """Its traffic gives the lens alone; the few that turn show that there is road across, too."""
 RING = Junction(drive=partial(drive_ring, radius_m=15.0), vehicles=22, points_per_vehicle=6)
 """Traffic that is refused: all of it circles about one point."""
@@ -174,7 +174,7 @@ def test_without_lines_nothing_is_told() -> None:
 
 
 def test_lines_where_nobody_drives_are_not_on_the_road() -> None:
-    lone = replace(JUNCTION, road_angles_deg=(0.0,), turning_share=0.0, vehicles=24, points_per_vehicle=2)
+    lone = replace(JUNCTION, road_angles_deg=(0.0,), turning_fraction=0.0, vehicles=24, points_per_vehicle=2)
     places = driven(lone).points_px
     lines = painted_lines(lone, np.random.default_rng(1))
     away = np.hypot(*(0.5 * (lines[:, None, :2] + lines[:, None, 2:]) - places).transpose(2, 0, 1)).min(axis=1)
@@ -372,7 +372,7 @@ def test_lines_complete_a_lens_that_is_known() -> None:
 def drawn(seed: int) -> tuple[Junction, Evidence]:
     """A junction of any pose, lens and traffic, with paint, posts and clutter."""
     generator = np.random.default_rng([seed, 77])
-    junction = replace(viewpoint(generator), tracks=None, vehicles=16, points_per_vehicle=3)
+    junction = replace(standard_junction(generator), tracks=None, vehicles=16, points_per_vehicle=3)
     evidence = synthetic_evidence(junction, generator)
     lines = painted_lines(junction, generator, Paint(askew_deg=0.3))
     return junction, replace(evidence, still_lines_px=np.concatenate([

@@ -14,7 +14,7 @@ from autocalib_ros.estimation.observations.track_set import SAMPLES_PER_TRACK
 from autocalib_ros.estimation.observations.tracklets import MAX_INSTANTS, Tracklets, find_tracklets, no_tracklets
 from autocalib_ros.estimation.observations.two_frame_windows import ResampledTracks, find_windows
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.offline.benchmark.monte_carlo import evidence_of
+from autocalib_ros.offline.benchmark.monte_carlo import draw_evidence
 from autocalib_ros.offline.synthetic.junction import pose
 
 CAMERA = Camera(1280, 720, 560.0, (645.0, 352.0), (0.01, 0.0, 0.0, 0.0))
@@ -102,7 +102,7 @@ def test_the_residuals_tell_whether_points_drift() -> None:
 
 
 def test_lives_follow_the_tracks_of_a_body_and_take_bodies_in_turn() -> None:
-    _, evidence = evidence_of('turning', 0, 0)
+    _, evidence = draw_evidence('turning', 0, 0)
     instants = ResampledTracks(evidence)
     windows = find_windows(evidence, instants)
     lives = find_tracklets(windows, instants, 1000)

@@ -17,7 +17,7 @@ from autocalib_ros.estimation.straight.initialisation import focal_trials
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.synthetic.junction import Junction, synthetic_evidence
 
-STRAIGHT = Junction(turning_share=0.0, wander_m=0.0, noise_px=0.2)
+STRAIGHT = Junction(turning_fraction=0.0, wander_m=0.0, noise_px=0.2)
 WINDOW = PaperOptions(window_s=3.0)  # synthetic vehicles cross the image in three to eight seconds
 
 
@@ -68,7 +68,7 @@ def test_polynomial_maps_distorted_to_undistorted() -> None:
 
 
 def test_robust_sweep_finds_the_focal_length_among_turning_traffic() -> None:
-    evidence = synthetic_evidence(Junction(turning_share=0.3), np.random.default_rng(3))
+    evidence = synthetic_evidence(Junction(turning_fraction=0.3), np.random.default_rng(3))
     tracks = select_tracks(evidence, 500)
     trials = focal_trials(tracks, evidence.image_size, 60)
     best = trials[np.argmin(straightness_sweep(tracks, evidence.image_size, trials))]

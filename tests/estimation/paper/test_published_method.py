@@ -11,7 +11,7 @@ from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_e
 from autocalib_ros.results.calibration import Calibration, Refusal
 
 OPTIONS = Options(camera_height=8.0, method='paper', paper=PaperOptions(window_s=3.0, vote_sigmas=0.0))
-CLEAN = Junction(turning_share=0.0, wander_m=0.0, noise_px=0.2, camera_from_ground=pose(32.0, 1.0, 40.0))
+CLEAN = Junction(turning_fraction=0.0, wander_m=0.0, noise_px=0.2, camera_from_ground=pose(32.0, 1.0, 40.0))
 
 
 @pytest.fixture(scope='module')

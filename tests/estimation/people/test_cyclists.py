@@ -11,7 +11,7 @@ from autocalib_ros.calibrator import solve
 from autocalib_ros.config import Options
 from autocalib_ros.estimation.people.cyclists import cyclists
 from autocalib_ros.evidence.snapshot import Evidence, Outlines, Track
-from autocalib_ros.offline.synthetic.junction import Junction, gathered, synthetic_evidence
+from autocalib_ros.offline.synthetic.junction import Junction, evidence_from_tracks, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration
 from silhouette_evidence import CAR_M, RIDER_M, driven, with_outlines
 
@@ -38,7 +38,7 @@ def several(first: int, count: int, size_m: tuple[float, float, float], speed_m_
 
 def told(tracks: list[Track], outlines: list[Outlines]) -> np.ndarray:
     newest = max(float(track.times_s[-1]) for track in tracks)
-    evidence = with_outlines(gathered(tracks, JUNCTION.image_size, newest), outlines)
+    evidence = with_outlines(evidence_from_tracks(tracks, JUNCTION.image_size, newest), outlines)
     return cyclists(evidence, JUNCTION.camera, JUNCTION.normal_in_camera, JUNCTION.height_m)
 
 
@@ -106,7 +106,7 @@ def street() -> tuple[Evidence, Evidence]:
     vehicles = synthetic_evidence(JUNCTION, np.random.default_rng(5))
     tracks, outlines = several(FIRST_RIDER, 20, RIDER_M)
     both = [*vehicles.tracks(), *tracks]
-    return vehicles, with_outlines(gathered(both, JUNCTION.image_size, 100.0), outlines)
+    return vehicles, with_outlines(evidence_from_tracks(both, JUNCTION.image_size, 100.0), outlines)
 
 
 def test_lens_and_plane_are_of_the_vehicles_alone(street: tuple[Evidence, Evidence]) -> None:

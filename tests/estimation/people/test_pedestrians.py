@@ -11,7 +11,7 @@ from autocalib_ros.calibrator import solve
 from autocalib_ros.config import Options
 from autocalib_ros.estimation.people.pedestrians import find_pedestrians
 from autocalib_ros.evidence.snapshot import Evidence, Track
-from autocalib_ros.offline.synthetic.junction import Junction, gathered, synthetic_evidence
+from autocalib_ros.offline.synthetic.junction import Junction, evidence_from_tracks, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration
 
 FIRST_WALKER = 1000
@@ -62,7 +62,7 @@ def _crawler(junction: Junction, number: int, generator: np.random.Generator) ->
 
 def _joined(junction: Junction, evidence: Evidence, tracks: list[Track]) -> Evidence:
     both = [*evidence.tracks(), *tracks]
-    return gathered(both, junction.image_size, max(float(track.times_s[-1]) for track in both))
+    return evidence_from_tracks(both, junction.image_size, max(float(track.times_s[-1]) for track in both))
 
 
 @pytest.fixture(scope='module')
@@ -87,7 +87,7 @@ def test_cars_in_a_jam_are_no_people():
     generator = np.random.default_rng(6)
     junction = Junction()
     crawling = [track for number in range(20) for track in _crawler(junction, number, generator)]
-    evidence = gathered(crawling, junction.image_size, 80.0)
+    evidence = evidence_from_tracks(crawling, junction.image_size, 80.0)
     told = find_pedestrians(evidence, junction.camera, junction.normal_in_camera, junction.height_m)
     # Six points fall anywhere over a width of 1.6 m: of one car in twenty or so all fall within half of it.
     assert len(told) <= 3
@@ -105,7 +105,7 @@ def test_a_calibration_counts_vehicles_without_people_and_is_no_worse_for_them(s
 
 def test_people_beside_a_lone_road_do_not_pass_for_turning_traffic():
     generator = np.random.default_rng(7)
-    junction = Junction(road_angles_deg=(0.0,), turning_share=0.0, vehicles=25, points_per_vehicle=6)
+    junction = Junction(road_angles_deg=(0.0,), turning_fraction=0.0, vehicles=25, points_per_vehicle=6)
     people = [track for number in range(25) for track in _stroller(junction, FIRST_WALKER + number, generator)]
     evidence = _joined(junction, synthetic_evidence(junction, generator), people)
     # A third and more of all that moved follows no road.

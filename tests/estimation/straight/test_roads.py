@@ -17,12 +17,12 @@ from autocalib_ros.estimation.verification.gates import NOT_CROSS_CHECKED, check
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.benchmark.families import families
-from autocalib_ros.offline.benchmark.monte_carlo import evidence_of
+from autocalib_ros.offline.benchmark.monte_carlo import draw_evidence
 from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration, Refusal
 
 OPTIONS = Options(camera_height=8.0)
-ONE_ROAD = Junction(road_angles_deg=(0.0,), turning_share=0.0, vehicles=120,
+ONE_ROAD = Junction(road_angles_deg=(0.0,), turning_fraction=0.0, vehicles=120,
                     camera_from_ground=pose(35.0, 1.0, 60.0), centre_m=(6.0, -10.0))
 
 
@@ -38,7 +38,7 @@ def normal_error_deg(result: Calibration, junction: Junction) -> float:
 
 
 def test_perfect_traffic_gives_the_truth() -> None:
-    junction = Junction(turning_share=0.0, wander_m=0.0, noise_px=0.0)
+    junction = Junction(turning_fraction=0.0, wander_m=0.0, noise_px=0.0)
     result = solved(junction)
     assert isinstance(result, Calibration)
     assert result.camera.focal_px == pytest.approx(560.0, rel=1e-3)
@@ -65,7 +65,7 @@ def test_a_lens_that_is_not_quite_equidistant_is_found(k1: float, shift: tuple[f
 
 
 def test_turning_vehicles_do_not_pull_the_solution() -> None:
-    junction = Junction(turning_share=0.5, vehicles=120)
+    junction = Junction(turning_fraction=0.5, vehicles=120)
     result = solved(junction)
     assert isinstance(result, Calibration)
     assert result.camera.focal_px == pytest.approx(560.0, rel=0.03)
@@ -188,14 +188,14 @@ def test_a_road_level_across_the_image_gives_no_plane_even_where_a_level_camera_
 
 
 def test_traffic_that_only_turns_is_refused() -> None:
-    result = solved(Junction(turning_share=1.0, vehicles=80))
+    result = solved(Junction(turning_fraction=1.0, vehicles=80))
     assert isinstance(result, Refusal)
     assert result.code in ('turning_traffic', 'halves_disagree', 'no_direction')
 
 
 @pytest.mark.parametrize('changing_share', [0.3, 0.4])
 def test_a_road_on_which_many_change_lanes_still_gives_the_lens(changing_share: float) -> None:
-    junction = replace(ONE_ROAD, lane_change_share=changing_share)
+    junction = replace(ONE_ROAD, lane_change_fraction=changing_share)
     result = solved(junction)
     assert isinstance(result, Calibration)
     assert abs(result.camera.focal_px - 560.0) < 3 * result.stddev.focal_px
@@ -209,7 +209,7 @@ def test_a_ring_of_which_an_arc_passes_for_a_road_is_refused(points: int) -> Non
 
 
 def test_vehicles_of_one_track_each_do_not_tell_whether_they_keep_to_a_road() -> None:
-    _, evidence = evidence_of('roundabout', 0, 8)  # two thirds of its tracks, the short ones, pass for straight
+    _, evidence = draw_evidence('roundabout', 0, 8)  # two thirds of its tracks, the short ones, pass for straight
     assert isinstance(solve(evidence, OPTIONS), Refusal)
 
 

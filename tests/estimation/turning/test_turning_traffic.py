@@ -10,7 +10,15 @@ import pytest
 
 from autocalib_ros.calibrator import solve
 from autocalib_ros.config import Options
-from autocalib_ros.offline.synthetic.drives import Company, beside, drive_arc, drive_ring, shadow, stroll, trailer
+from autocalib_ros.offline.synthetic.drives import (
+    Companion,
+    beside,
+    drive_arc,
+    drive_ring,
+    shadow,
+    trailer,
+    walk_along_road,
+)
 from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration, Refusal
 
@@ -35,10 +43,10 @@ def test_perfect_turning_traffic_gives_the_truth() -> None:
     assert any('rigid bodies' in check for check in result.checks)
 
 
-@pytest.mark.parametrize(('joined', 'company'), [
+@pytest.mark.parametrize(('joined', 'companion'), [
     (0.0, beside), (0.3, beside), (0.5, partial(beside, speeds=(1.0, 1.0))), (0.5, trailer), (0.5, shadow)])
-def test_turning_traffic_alone_calibrates_even_when_groups_are_wrong(joined: float, company: Company) -> None:
-    junction = replace(TURNING, joined_share=joined, company=company)
+def test_turning_traffic_alone_calibrates_even_when_groups_are_wrong(joined: float, companion: Companion) -> None:
+    junction = replace(TURNING, merged_fraction=joined, companion=companion)
     result = solved(junction, seed=1)
     assert isinstance(result, Calibration)
     sigma = result.stddev
@@ -50,7 +58,7 @@ def test_turning_traffic_alone_calibrates_even_when_groups_are_wrong(joined: flo
 
 def test_cars_side_by_side_on_one_road_tell_no_plane() -> None:
     junction = Junction(road_angles_deg=(0.0,), camera_from_ground=pose(30.0, 1.0, 60.0), vehicles=60,
-                        points_per_vehicle=8, turning_share=0.0, joined_share=0.7)
+                        points_per_vehicle=8, turning_fraction=0.0, merged_fraction=0.7)
     result = solved(junction)
     if isinstance(result, Calibration):
         assert result.ground is None and result.ground_refusal is not None
@@ -59,7 +67,7 @@ def test_cars_side_by_side_on_one_road_tell_no_plane() -> None:
 
 def test_turning_traffic_completes_a_single_road() -> None:
     junction = Junction(road_angles_deg=(0.0,), camera_from_ground=pose(30.0, 1.0, 50.0), vehicles=80,
-                        points_per_vehicle=8, turning_share=0.5)
+                        points_per_vehicle=8, turning_fraction=0.5)
     result = solved(junction)
     assert isinstance(result, Calibration)
     assert normal_error_deg(result, junction) < 1.5
@@ -76,7 +84,7 @@ def test_a_ring_alone_is_refused_unless_it_tells_the_lens(seed: int) -> None:
 
 
 def test_people_on_foot_are_no_rigid_bodies() -> None:
-    result = solved(Junction(drive=stroll, vehicles=60, points_per_vehicle=8))
+    result = solved(Junction(drive=walk_along_road, vehicles=60, points_per_vehicle=8))
     assert isinstance(result, Refusal)
 
 

@@ -28,7 +28,7 @@ from autocalib_ros.results.calibration import Calibration
 
 CAMERA = Camera(1280, 720, 560.0, (639.5, 359.5))
 HEIGHT_M = 8.0
-ONE_ROAD = Junction(road_angles_deg=(0.0,), turning_share=0.0, vehicles=120,
+ONE_ROAD = Junction(road_angles_deg=(0.0,), turning_fraction=0.0, vehicles=120,
                     camera_from_ground=pose(35.0, 1.0, 60.0), centre_m=(6.0, -10.0))
 BOX_M = np.array([[length, width, up] for length in (-2.2, 2.2) for width in (-0.9, 0.9) for up in (0.0, 1.5)])
 """Corners of a vehicle about its middle on the road, x ahead."""

@@ -279,7 +279,7 @@ def test_too_few_vehicles_tell_no_speed(count: int) -> None:
 
 
 def test_without_a_plane_there_is_no_scale() -> None:
-    one_road = Junction(road_angles_deg=(0.0,), turning_share=0.0, vehicles=120,
+    one_road = Junction(road_angles_deg=(0.0,), turning_fraction=0.0, vehicles=120,
                         camera_from_ground=pose(35.0, 1.0, 60.0), centre_m=(6.0, -10.0))
     found = solved(one_road, by_speed(MEAN_KM_H))
     assert found.ground is None and found.ground_refusal.code == 'one_direction'

@@ -7,7 +7,7 @@ import pytest
 
 from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.offline.recordings.open import open_source
-from autocalib_ros.offline.recordings.videos import _Clock
+from autocalib_ros.offline.recordings.videos import _FrameClock
 
 
 @pytest.mark.parametrize('suffix', ['.mp4', '.avi', '.mkv'])
@@ -80,10 +80,10 @@ def test_a_compressed_part_of_a_recording_is_explained(tmp_path):
 
 
 def test_positions_that_stand_still_give_way_to_the_frame_rate():
-    clock = _Clock(10.0)
+    clock = _FrameClock(10.0)
     assert [clock.next_ns(0.0) for _ in range(3)] == [0, 100_000_000, 200_000_000]
 
 
 def test_uneven_positions_are_kept():
-    clock = _Clock(10.0)
+    clock = _FrameClock(10.0)
     assert [clock.next_ns(ms) for ms in (40.0, 140.0, 340.0)] == [0, 100_000_000, 300_000_000]
