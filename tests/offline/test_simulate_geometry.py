@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from autocalib_ros.errors import UsageError
-from autocalib_ros.offline.simulate.faces import Canvas, Faces, Texture, Window
-from autocalib_ros.offline.simulate.lens import CameraPose, Lens, look
+from autocalib_ros.offline.simulate.faces import Canvas, Faces, PixelRect, Texture
+from autocalib_ros.offline.simulate.lens import CameraPose, KannalaBrandtLens, look_rotation
 from autocalib_ros.offline.simulate.options import SimulationOptions
 from autocalib_ros.offline.simulate.simulation import Simulation
 
@@ -19,7 +19,7 @@ SMALL = {'width_px': 320, 'height_px': 180, 'focal_px': 140.0, 'rate_hz': 5.0, '
 
 @pytest.mark.parametrize('k', [(0, 0, 0, 0), (0.05, -0.01, 0, 0), (1 / 3, 2 / 15, 0, 0)])
 def test_lens_projects_its_own_bearings_back_to_the_pixel(k):
-    lens = Lens(500.0, k, (320.0, 180.0))
+    lens = KannalaBrandtLens(500.0, k, (320.0, 180.0))
     pixels = np.random.default_rng(0).uniform((0, 0), (639, 359), (200, 2))
     back, valid = lens.project(3.0 * lens.bearings(pixels))
     assert valid.all()
@@ -27,7 +27,7 @@ def test_lens_projects_its_own_bearings_back_to_the_pixel(k):
 
 
 def test_lens_follows_its_polynomial():
-    lens = Lens(500.0, (0.1, -0.02, 0.003, -0.001), (0.0, 0.0))
+    lens = KannalaBrandtLens(500.0, (0.1, -0.02, 0.003, -0.001), (0.0, 0.0))
     theta = 0.8
     radius = 500.0 * (
         theta + 0.1 * theta**3 - 0.02 * theta**5 + 0.003 * theta**7 - 0.001 * theta**9
@@ -37,13 +37,13 @@ def test_lens_follows_its_polynomial():
 
 
 def test_points_outside_the_range_of_the_lens_are_invalid():
-    lens = Lens(500.0, (-0.1, 0, 0, 0), (0.0, 0.0))
+    lens = KannalaBrandtLens(500.0, (-0.1, 0, 0, 0), (0.0, 0.0))
     _, valid = lens.project(np.array([[0.0, 0.0, -1.0], [0.0, 0.1, 1.0]]))
     assert valid.tolist() == [False, True]
 
 
 def test_camera_looks_down_along_its_heading():
-    forward = look(90.0, 30.0, 0.0)[:, 2]
+    forward = look_rotation(90.0, 30.0, 0.0)[:, 2]
     assert forward == pytest.approx((0.0, math.cos(math.pi / 6), -0.5), abs=1e-12)
 
 
@@ -52,15 +52,15 @@ def _painted_corner_error_px(texels: int, distance_m: float) -> float:
     picture = np.full((texels, texels, 4), 255, np.uint8)
     half = texels // 2
     picture[:half, half:, :3] = picture[half:, :half, :3] = 20
-    lens = Lens(300.0, (0.02, -0.004, 0, 0), (322.3, 181.1))
-    pose = CameraPose(look(20.0, 30.0, 5.0), np.array([0.0, 0.0, 6.0]))
+    lens = KannalaBrandtLens(300.0, (0.02, -0.004, 0, 0), (322.3, 181.1))
+    pose = CameraPose(look_rotation(20.0, 30.0, 5.0), np.array([0.0, 0.0, 6.0]))
     bearing = pose.world_from_camera @ lens.bearings(np.array([470.0, 120.0]))
     origin = pose.position_m + distance_m * bearing
     corners = np.array([[origin, (0.9, -1.8, 0.0), (0.0, 0.0, -2.0)]])
     canvas = Canvas(lens, 640, 360)
     canvas.colour[:] = 128
-    canvas.draw(canvas.plan([Faces(corners, (Texture(picture),))], pose)[0])
-    grey = np.ascontiguousarray(canvas.resolved(Window(0, 0, 640, 360))[..., 0])
+    canvas.draw(canvas.project_faces([Faces(corners, (Texture(picture),))], pose)[0])
+    grey = np.ascontiguousarray(canvas.resolve(PixelRect(0, 0, 640, 360))[..., 0])
     point = corners[0, 0] + 0.5 * (corners[0, 1] + corners[0, 2])
     expected, _ = lens.project(pose.to_camera(point))
     found = np.round(expected).astype(np.float32).reshape(1, 1, 2).copy()
@@ -76,8 +76,8 @@ def test_painted_corner_appears_where_the_lens_puts_it(texels, distance_m):
 
 
 def test_nearer_face_hides_the_farther_one_in_any_order():
-    lens = Lens(100.0, (0, 0, 0, 0), (31.5, 31.5))
-    pose = CameraPose(look(0.0, 0.0, 0.0), np.zeros(3))
+    lens = KannalaBrandtLens(100.0, (0, 0, 0, 0), (31.5, 31.5))
+    pose = CameraPose(look_rotation(0.0, 0.0, 0.0), np.zeros(3))
     red, blue = (np.full((8, 8, 4), c, np.uint8) for c in ((0, 0, 255, 255), (255, 0, 0, 255)))
 
     def wall(x: float, picture: np.ndarray) -> Faces:
@@ -85,8 +85,8 @@ def test_nearer_face_hides_the_farther_one_in_any_order():
 
     canvas = Canvas(lens, 64, 64)
     for faces in (wall(4.0, red), wall(8.0, blue)):
-        canvas.draw(canvas.plan([faces], pose)[0])
-    assert canvas.resolved(Window(0, 0, 64, 64))[32, 32].tolist() == [0, 0, 255]
+        canvas.draw(canvas.project_faces([faces], pose)[0])
+    assert canvas.resolve(PixelRect(0, 0, 64, 64))[32, 32].tolist() == [0, 0, 255]
 
 
 @pytest.fixture(scope='module')

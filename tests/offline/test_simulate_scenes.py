@@ -15,10 +15,10 @@ from autocalib_ros.offline.simulate.network import Network
 from autocalib_ros.offline.simulate.options import SCENES, SimulationOptions
 from autocalib_ros.offline.simulate.palette import DAY
 from autocalib_ros.offline.simulate.roundabout import RING_RADIUS_M
-from autocalib_ros.offline.simulate.scenes import BEND_RADIUS_M, network_of
+from autocalib_ros.offline.simulate.scenes import BEND_RADIUS_M, build_network
 from autocalib_ros.offline.simulate.simulation import Simulation
 from autocalib_ros.offline.simulate.traffic_flow import simulate_traffic
-from autocalib_ros.offline.simulate.vehicle_models import STEP_S, Traffic, Vehicle, VehicleState
+from autocalib_ros.offline.simulate.vehicle_models import STEP_S, SimulatedTraffic, Vehicle, VehicleState
 
 TINY = {'width_px': 192, 'height_px': 108, 'focal_px': 84.0, 'rate_hz': 2.0, 'duration_s': 2.0}
 TIMES_S = np.arange(0.03, 60.0, 4.7)
@@ -26,13 +26,13 @@ each_scene = pytest.mark.parametrize('scene', SCENES)
 
 
 @lru_cache
-def driven(scene: str) -> tuple[Network, Traffic]:
+def driven(scene: str) -> tuple[Network, SimulatedTraffic]:
     options = SimulationOptions(scene=scene)
-    network = network_of(options)
+    network = build_network(options)
     return network, simulate_traffic(network, options)
 
 
-def states(traffic: Traffic, times_s: np.ndarray = TIMES_S) -> list[tuple[Vehicle, float]]:
+def states(traffic: SimulatedTraffic, times_s: np.ndarray = TIMES_S) -> list[tuple[Vehicle, float]]:
     return [(v, t) for t in times_s for v in traffic.vehicles if v.state(t) is not None and v.state(t + STEP_S)]
 
 
@@ -69,9 +69,9 @@ def angle_between(a: float, b: float) -> float:
 @each_scene
 def test_paths_go_on_where_they_were_and_bend_smoothly(scene: str) -> None:
     for route in driven(scene)[0].routes:
-        pieces = route.path.pieces
-        assert min(piece.length for piece in pieces) > 0
-        for before, after in zip(pieces[:-1], pieces[1:], strict=True):
+        segments = route.path.segments
+        assert min(segment.length for segment in segments) > 0
+        for before, after in zip(segments[:-1], segments[1:], strict=True):
             assert before.end() == pytest.approx((after.x, after.y, after.heading), abs=1e-9)
             curvature = before.curvature + before.sharpness * before.length
             assert curvature == pytest.approx(after.curvature, abs=1e-9)
@@ -123,7 +123,7 @@ def test_wheels_stay_on_the_asphalt(scene: str) -> None:
 @pytest.mark.parametrize('seed', [0, 1])
 def test_vehicles_of_no_scene_overlap(scene: str, seed: int) -> None:
     options = SimulationOptions(scene=scene, seed=seed)
-    traffic = driven(scene)[1] if seed == 0 else simulate_traffic(network_of(options), options)
+    traffic = driven(scene)[1] if seed == 0 else simulate_traffic(build_network(options), options)
     for t in TIMES_S:
         there = [(v, s) for v in traffic.vehicles if (s := v.state(t)) is not None]
         assert not [(a[0].number, b[0].number) for i, a in enumerate(there) for b in there[:i]
@@ -175,7 +175,7 @@ def test_a_bend_keeps_its_lanes_apart_and_has_its_radius() -> None:
 def test_a_ring_is_driven_anticlockwise_on_its_radius_by_who_entered_and_leaves() -> None:
     for route in driven('roundabout')[0].routes:
         ring = route.ring
-        x, y, heading = route.path.at(np.linspace(ring.joins_s, ring.leaves_s, 20)).T
+        x, y, heading = route.path.at(np.linspace(ring.entry_s, ring.exit_s, 20)).T
         assert np.hypot(x, y) == pytest.approx(RING_RADIUS_M, abs=1e-6)
         assert (x * np.sin(heading) - y * np.cos(heading) > 0).all()
         start, end = route.path.at(np.array([0.0, route.path.length]))
@@ -186,7 +186,7 @@ def test_a_ring_is_driven_anticlockwise_on_its_radius_by_who_entered_and_leaves(
 
 def test_vehicles_slow_down_for_the_ring_and_wait_for_it() -> None:
     _, traffic = driven('roundabout')
-    on_ring = [float(v.speeds_mps[(v.s > v.route.ring.joins_s) & (v.s < v.route.ring.leaves_s)].max(initial=0.0))
+    on_ring = [float(v.speeds_mps[(v.s > v.route.ring.entry_s) & (v.s < v.route.ring.exit_s)].max(initial=0.0))
                for v in traffic.vehicles]
     assert 4.0 < max(on_ring) < 7.0  # metres per second; two m/s^2 to the side on 19 m are 6.2
     assert any((v.speeds_mps[(v.s > 70) & (v.s < v.route.stop_s)] < 0.5).any() for v in traffic.vehicles)
@@ -205,7 +205,7 @@ def test_a_share_of_the_motorway_traffic_changes_lanes_at_motorway_speed() -> No
 
 
 def test_a_motorway_of_one_way_has_one_heading() -> None:
-    network = network_of(SimulationOptions(scene='highway', one_way=True))
+    network = build_network(SimulationOptions(scene='highway', one_way=True))
     ends = [route.path.at(np.array([0.0, route.path.length]))[:, 2] for route in network.routes]
     assert np.abs(ends).max() < 1e-9 and len({route.approach for route in network.routes}) == 3
 
@@ -222,15 +222,15 @@ def test_a_sparse_junction_has_a_vehicle_every_ten_seconds_or_rarer() -> None:
     counts = []
     for seed in range(3):
         options = SimulationOptions(scene='sparse', seed=seed, duration_s=200.0)
-        traffic = simulate_traffic(network_of(options), options)
+        traffic = simulate_traffic(build_network(options), options)
         counts.append(sum(v.start_s > 0 for v in traffic.vehicles))
     assert 10 < np.mean(counts) < 20  # of at most twenty in 200 s
 
 
 def test_a_skew_crossing_takes_another_angle_when_told() -> None:
-    assert SimulationOptions(scene='skew').crossing_deg == 65.0
-    assert SimulationOptions().crossing_deg == 90.0
-    assert SimulationOptions(scene='skew', road_angle_deg=70.0).crossing_deg == 70.0
+    assert SimulationOptions(scene='skew').road_crossing_deg == 65.0
+    assert SimulationOptions().road_crossing_deg == 90.0
+    assert SimulationOptions(scene='skew', road_angle_deg=70.0).road_crossing_deg == 70.0
 
 
 @pytest.mark.parametrize('scene', ['roundabout', 'tee', 'skew', 'sparse'])

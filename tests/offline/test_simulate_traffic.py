@@ -10,21 +10,21 @@ import pytest
 from autocalib_ros.offline.simulate.junctions import junction
 from autocalib_ros.offline.simulate.network import Network
 from autocalib_ros.offline.simulate.options import SimulationOptions
-from autocalib_ros.offline.simulate.scenes import network_of
+from autocalib_ros.offline.simulate.scenes import build_network
 from autocalib_ros.offline.simulate.simulation import Simulation
 from autocalib_ros.offline.simulate.traffic_flow import simulate_traffic
-from autocalib_ros.offline.simulate.vehicle_models import STEP_S, Traffic, Vehicle, Wander
+from autocalib_ros.offline.simulate.vehicle_models import STEP_S, SimulatedTraffic, Vehicle, Wander
 
 MINUTE = SimulationOptions()
 
 
 @pytest.fixture(scope='module')
 def network() -> Network:
-    return network_of(MINUTE)
+    return build_network(MINUTE)
 
 
 @pytest.fixture(scope='module')
-def traffic(network) -> Traffic:
+def traffic(network) -> SimulatedTraffic:
     return simulate_traffic(network, MINUTE)
 
 
@@ -34,7 +34,7 @@ def _crossing_time(vehicle: Vehicle) -> float | None:
     return vehicle.start_s + STEP_S * int(passed.argmax()) if passed.any() else None
 
 
-def _crossings(traffic: Traffic, movement: str) -> list[Vehicle]:
+def _crossings(traffic: SimulatedTraffic, movement: str) -> list[Vehicle]:
     return [
         v for v in traffic.vehicles
         if v.route.movement == movement
@@ -118,7 +118,7 @@ def test_empty_road_has_no_vehicles(given, network):
 
 def test_one_way_traffic_has_one_heading():
     options = SimulationOptions(one_way=True)
-    traffic = simulate_traffic(network_of(options), options)
+    traffic = simulate_traffic(build_network(options), options)
     headings = {round(float(v.route.path.at(50.0)[2]), 6) for v in traffic.vehicles}
     assert headings == {0.0}
 

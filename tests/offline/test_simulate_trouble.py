@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from autocalib_ros.errors import UsageError
-from autocalib_ros.offline.simulate.lamps import lamps_of
+from autocalib_ros.offline.simulate.lamps import vehicle_lamps
 from autocalib_ros.offline.simulate.options import SimulationOptions
 from autocalib_ros.offline.simulate.simulation import Simulation
-from autocalib_ros.offline.simulate.weather import GroundView, box_of
+from autocalib_ros.offline.simulate.weather import GroundBuffer, box_corners
 
 SMALL = {'width_px': 320, 'height_px': 180, 'focal_px': 140.0, 'rate_hz': 10.0, 'duration_s': 40.0, 'noise_sigma': 0.0,
          'pedestrians': 0}
@@ -32,7 +32,7 @@ def _changed(trouble: str, first: int, second: int, **given) -> np.ndarray:
 
 def _off_road() -> np.ndarray:
     simulation = _simulation()
-    return GroundView.of(simulation.options, simulation.network, simulation.pose).off_road_m
+    return GroundBuffer.of(simulation.options, simulation.network, simulation.pose).off_road_m
 
 
 @pytest.mark.parametrize('trouble', ['trees', 'flags', 'leds', 'water', 'shadows', 'rain', 'drops', 'clock'])
@@ -64,7 +64,7 @@ def test_a_vehicle_shades_the_ground_beside_it_and_not_itself():
     simulation, plain = _simulation(trouble='shadows'), _simulation()
     index = 150
     darker = plain.frame(index).astype(int).max(-1) - simulation.frame(index).max(-1)
-    ground = GroundView.of(plain.options, plain.network, plain.pose)
+    ground = GroundBuffer.of(plain.options, plain.network, plain.pose)
     clouds = _simulation(trouble='shadows', empty=True).frame(index).astype(int).max(-1)
     # Without its vehicles the same place is as bright as the clouds leave it.
     cast = (clouds - simulation.frame(index).max(-1) > 25) & (darker > 25) & np.isfinite(ground.distance_m)
@@ -74,7 +74,7 @@ def test_a_vehicle_shades_the_ground_beside_it_and_not_itself():
 
 def _inside(simulation: Simulation, vehicle, state) -> np.ndarray:
     """Where (h, w) the box of a vehicle is seen."""
-    pixels, _ = simulation.lens.project(simulation.pose.to_camera(box_of(vehicle, state)))
+    pixels, _ = simulation.lens.project(simulation.pose.to_camera(box_corners(vehicle, state)))
     mask = np.zeros((simulation.options.height_px, simulation.options.width_px), np.uint8)
     cv2.fillConvexPoly(mask, cv2.convexHull(np.round(pixels).astype(np.int32)), 1)
     return mask > 0
@@ -84,22 +84,22 @@ def test_a_wet_road_mirrors_lamps_as_far_below_it_as_they_are_above():
     wet, dry = _simulation(trouble='wet', night=True), _simulation(night=True)
     index = 150
     added = wet.frame(index).astype(int).max(-1) - dry.frame(index).max(-1)
-    near = [pixel for vehicle, state in dry.states(dry.time_s(index)) for lamp in lamps_of(vehicle, state)
+    near = [pixel for vehicle, state in dry.states(dry.time_s(index)) for lamp in vehicle_lamps(vehicle, state)
             if (pixel := _mirrored(dry, lamp)) is not None]
     bright = [added[int(round(y)), int(round(x))] for x, y in near]
     assert np.quantile(bright, 0.9) > 40
     # And not above the road: nothing is added over the horizon.
-    ground = GroundView.of(dry.options, dry.network, dry.pose)
+    ground = GroundBuffer.of(dry.options, dry.network, dry.pose)
     assert (added[np.isinf(ground.distance_m)] < 20).all()
 
 
 def _mirrored(simulation: Simulation, lamp) -> np.ndarray | None:
     """Pixel (2,) of a lamp's mirror image where it is in the picture and shines this way."""
-    below = lamp.place_m * (1, 1, -1)
+    below = lamp.position_m * (1, 1, -1)
     to_camera = simulation.pose.position_m - below
     pixel, valid = simulation.lens.project(simulation.pose.to_camera(below))
     size = (simulation.options.width_px - 1, simulation.options.height_px - 1)
-    towards = float(lamp.outward @ to_camera[:2]) / float(np.linalg.norm(to_camera))
+    towards = float(lamp.direction @ to_camera[:2]) / float(np.linalg.norm(to_camera))
     return pixel if valid and (pixel > 1).all() and (pixel < np.array(size) - 1).all() and towards > 0.3 else None
 
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from autocalib_ros.offline.simulate.faces import SAMPLES, Canvas, Faces
+from autocalib_ros.offline.simulate.faces import SAMPLES_PER_PIXEL, Canvas, Faces
 from autocalib_ros.offline.simulate.ground_surface import GroundMap
 from autocalib_ros.offline.simulate.lens import CameraPose
 from autocalib_ros.offline.simulate.palette import Palette
 
-_HAZE_M = 260.0
+_HAZE_LENGTH_M = 260.0
 
 
 def draw_backdrop(
@@ -29,7 +29,7 @@ def draw_backdrop(
     for ground in grounds:
         _draw_ground(canvas, places, distance, height, ground)
     _add_haze(canvas, palette)
-    canvas.draw(canvas.plan([scenery], pose)[0])
+    canvas.draw(canvas.project_faces([scenery], pose)[0])
 
 
 def _draw_sky(canvas: Canvas, rays: np.ndarray, palette: Palette) -> None:
@@ -45,7 +45,7 @@ def _draw_ground(
     """Colour the samples that look at the ground map, each from the level that suits it."""
     inside = np.isfinite(distance) & (np.abs(places) < ground.half_m).all(-1)
     # Footprint of a sample: the mean of its width and of its length along the line of sight.
-    angle = 1.0 / (canvas.lens.focal_px * SAMPLES)
+    angle = 1.0 / (canvas.lens.focal_px * SAMPLES_PER_PIXEL)
     footprint = angle * distance * np.sqrt(np.maximum(distance / height, 1.0))
     wanted = np.log2(np.maximum(footprint / ground.texel_m, 1e-6))
     wanted = np.where(inside, wanted, 0.0)
@@ -67,7 +67,7 @@ def _draw_ground(
 
 def _add_haze(canvas: Canvas, palette: Palette) -> None:
     far = np.isfinite(canvas.distance)
-    part = (1 - np.exp(-canvas.distance[far] / _HAZE_M))[:, None]
+    part = (1 - np.exp(-canvas.distance[far] / _HAZE_LENGTH_M))[:, None]
     colour = canvas.colour[far][:, :3].astype(np.float32)
     colour += part * (np.array(palette.sky_low, np.float32) - colour)
     canvas.colour[far, :3] = colour.astype(np.uint8)

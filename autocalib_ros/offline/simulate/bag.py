@@ -23,10 +23,10 @@ from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.offline.simulate.options import SimulationOptions
 from autocalib_ros.offline.simulate.simulation import Simulation
 
-TRUTH_NAME = 'truth.json'
+TRUTH_FILE_NAME = 'truth.json'
 _BAG_VERSION: Literal[9] = 9
 _LATENCY_NS = 5_000_000  # recorders see an image a little after its stamp
-_BATCH = 64
+_BATCH_FRAMES = 64
 _JPEG_QUALITY = 92
 
 
@@ -46,13 +46,13 @@ def write_bag(
     path = Path(path)
     if workers is not None and workers < 1:
         raise UsageError(f'workers is {workers}: choose 1 or more')
-    _make_room(path, overwrite)
+    _clear_target(path, overwrite)
     simulation = Simulation(options)
     try:
         with _writer(path, options) as writer:
-            _write_messages(writer, simulation, workers or _cores(), progress)
+            _write_messages(writer, simulation, workers or _core_count(), progress)
         text = json.dumps(simulation.truth(), indent=1)
-        (path / TRUTH_NAME).write_text(text, encoding='utf-8')
+        (path / TRUTH_FILE_NAME).write_text(text, encoding='utf-8')
     except BaseException as error:
         shutil.rmtree(path, ignore_errors=True)  # half a bag is worse than none
         if isinstance(error, (OSError, WriterError)):
@@ -61,7 +61,7 @@ def write_bag(
     return path
 
 
-def _make_room(path: Path, overwrite: bool) -> None:
+def _clear_target(path: Path, overwrite: bool) -> None:
     """Make sure that nothing stands at the path; remove only what is a bag, and only if told to."""
     if not path.exists():
         return
@@ -90,7 +90,7 @@ def _writer(path: Path, options: SimulationOptions) -> Writer:
     return writer
 
 
-def _cores() -> int:
+def _core_count() -> int:
     if hasattr(os, 'sched_getaffinity'):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -107,7 +107,7 @@ def _write_messages(
     infos = writer.add_connection(
         options.truth_topic, 'sensor_msgs/msg/CameraInfo', typestore=store
     )
-    with _drawn(simulation, min(workers, options.frame_count)) as messages:
+    with _rendered_images(simulation, min(workers, options.frame_count)) as messages:
         for index, message in enumerate(messages):
             recorded_ns = simulation.stamp_ns(index) + _LATENCY_NS
             writer.write(images, recorded_ns, message)
@@ -117,14 +117,14 @@ def _write_messages(
 
 
 @contextmanager
-def _drawn(simulation: Simulation, workers: int) -> Iterator[Iterator[bytes]]:
+def _rendered_images(simulation: Simulation, workers: int) -> Iterator[Iterator[bytes]]:
     """Hand out the serialised images in order, drawn here or by other processes."""
     count = simulation.options.frame_count
     if workers == 1:
         yield (_image(simulation, index) for index in range(count))
         return
     # Spawned, not forked: OpenCV and BLAS have threads of their own. The backdrop goes along.
-    simulation.artist().prepare()
+    simulation.renderer().prepare()
     context = multiprocessing.get_context('spawn')
     with context.Pool(workers, _start_worker, (simulation,)) as pool:
         yield _in_batches(pool, count)
@@ -132,8 +132,8 @@ def _drawn(simulation: Simulation, workers: int) -> Iterator[Iterator[bytes]]:
 
 def _in_batches(pool: Any, count: int) -> Iterator[bytes]:
     """Hand out images in order; only a batch at a time, or a slow disk would fill the memory."""
-    for start in range(0, count, _BATCH):
-        yield from pool.imap(_work, range(start, min(start + _BATCH, count)))
+    for start in range(0, count, _BATCH_FRAMES):
+        yield from pool.imap(_render_in_worker, range(start, min(start + _BATCH_FRAMES, count)))
 
 
 _worker_simulation: Simulation | None = None
@@ -145,7 +145,7 @@ def _start_worker(simulation: Simulation) -> None:
     _worker_simulation = simulation
 
 
-def _work(index: int) -> bytes:
+def _render_in_worker(index: int) -> bytes:
     if _worker_simulation is None:
         raise RuntimeError('worker process without a simulation')
     return _image(_worker_simulation, index)

@@ -9,21 +9,21 @@ import numpy as np
 
 from autocalib_ros.offline.simulate import paint
 from autocalib_ros.offline.simulate.faces import Faces, Texture
-from autocalib_ros.offline.simulate.palette import palette_of
-from autocalib_ros.offline.simulate.shapes import SHAPES, Outline, Part, Shape
+from autocalib_ros.offline.simulate.palette import palette_for
+from autocalib_ros.offline.simulate.shapes import SHAPES, BodyPart, Profile, VehicleShape
 
-FINE, COARSE = 80, 40  # texels to the metre
-_BANK = 1024
-_Texels = Callable[[Outline], np.ndarray]
+FINE_TEXELS_PER_M, COARSE_TEXELS_PER_M = 80, 40  # texels to the metre
+_DIRT_BANK_TEXELS = 1024
+_Texels = Callable[[Profile], np.ndarray]
 # Body paint is never clean: grain of several sizes, in texels and grey levels.
 _DIRT = ((2.0, 3.0), (6.0, 4.0), (18.0, 4.0), (60.0, 5.0))
 _REAR = ('rear', 'rear_screen', 'boot', 'doors', 'plain')
 
 
 @lru_cache(maxsize=256)
-def body_of(kind: str, colour: int, thermal: bool, texels_per_m: int = FINE) -> Faces:
+def body_faces(kind: str, colour: int, thermal: bool, texels_per_m: int = FINE_TEXELS_PER_M) -> Faces:
     """Return the faces of one vehicle in its body frame (x forward, y left, on the ground)."""
-    painter = _Painter(SHAPES[kind], colour, thermal, texels_per_m)
+    painter = _BodyPainter(SHAPES[kind], colour, thermal, texels_per_m)
     corners: list[list[tuple[float, float, float]]] = []
     textures: list[Texture] = []
     for part in SHAPES[kind].parts:
@@ -38,11 +38,11 @@ def body_of(kind: str, colour: int, thermal: bool, texels_per_m: int = FINE) -> 
 
 @lru_cache(maxsize=1)
 def _dirt_bank() -> np.ndarray:
-    return paint.grain(_BANK, _BANK, _DIRT, np.random.default_rng(10))
+    return paint.octave_noise(_DIRT_BANK_TEXELS, _DIRT_BANK_TEXELS, _DIRT, np.random.default_rng(10))
 
 
 @lru_cache(maxsize=16)
-def shadow_of(kind: str, thermal: bool) -> Faces:
+def shadow_faces(kind: str, thermal: bool) -> Faces:
     """Return the soft shadow under a vehicle, to be drawn as a gain."""
     shape = SHAPES[kind]
     margin = 0.7
@@ -59,7 +59,7 @@ def shadow_of(kind: str, thermal: bool) -> Faces:
     return Faces(np.array(corners), (Texture(picture),))
 
 
-def _side_corners(part: Part, side: int) -> list[tuple[float, float, float]]:
+def _side_corners(part: BodyPart, side: int) -> list[tuple[float, float, float]]:
     """Origin and edges of the left (side 1) or right (-1) wall, from the ground to the top."""
     xs = [x for x, _ in part.profile]
     front, rear = max(xs), min(xs)
@@ -71,7 +71,7 @@ def _side_corners(part: Part, side: int) -> list[tuple[float, float, float]]:
     ]
 
 
-def _strip_corners(part: Part, i: int) -> list[tuple[float, float, float]]:
+def _strip_corners(part: BodyPart, i: int) -> list[tuple[float, float, float]]:
     """Origin and edges of the strip over the width that belongs to an edge of the profile."""
     (x0, z0), (x1, z1) = part.profile[i], part.profile[i + 1]
     half = part.width_m / 2
@@ -80,17 +80,17 @@ def _strip_corners(part: Part, i: int) -> list[tuple[float, float, float]]:
     return [(x1, -half, z1), (0.0, 2 * half, 0.0), (x0 - x1, 0.0, z0 - z1)]
 
 
-class _Painter:
+class _BodyPainter:
     """Paints the faces of one vehicle."""
 
-    def __init__(self, shape: Shape, colour: int, thermal: bool, texels_per_m: int) -> None:
+    def __init__(self, shape: VehicleShape, colour: int, thermal: bool, texels_per_m: int) -> None:
         self.shape = shape
         self.scale = texels_per_m
-        self.palette = palette_of(thermal)
+        self.palette = palette_for(thermal)
         self.body = self.palette.bodies[colour]
         self.rng = np.random.default_rng([colour, thermal, *shape.kind.encode()])
 
-    def side(self, part: Part, side: int) -> Texture:
+    def side(self, part: BodyPart, side: int) -> Texture:
         """Paint a wall: windows, doors, wheels; alpha cuts out the profile and the wheels."""
         xs = [x for x, _ in part.profile]
         front, rear = max(xs), min(xs)
@@ -102,7 +102,7 @@ class _Painter:
             across = (front - xz[:, 0]) if side > 0 else (xz[:, 0] - rear)
             return np.stack([across, part.top_m - xz[:, 1]], 1) * scale
 
-        picture = paint.filled(height, width, self.body)
+        picture = paint.filled_image(height, width, self.body)
         self._dirt(picture)
         outline = texels(part.profile)
         self._panels(picture, part, texels)
@@ -114,26 +114,26 @@ class _Painter:
         picture[..., 3] = alpha
         return Texture(picture)
 
-    def strip(self, part: Part, i: int, label: str) -> Texture:
+    def strip(self, part: BodyPart, i: int, label: str) -> Texture:
         """Paint a strip across the vehicle."""
         (x0, z0), (x1, z1) = part.profile[i], part.profile[i + 1]
         height = round(float(np.hypot(x1 - x0, z1 - z0)) * self.scale)
-        picture = paint.filled(height, round(part.width_m * self.scale), self.body)
+        picture = paint.filled_image(height, round(part.width_m * self.scale), self.body)
         self._dirt(picture)
         getattr(self, '_' + label)(picture)
         return Texture(picture)
 
     def _dirt(self, picture: np.ndarray) -> None:
         height, width = picture.shape[:2]
-        row, column = (int(self.rng.integers(_BANK - n)) for n in (height, width))
+        row, column = (int(self.rng.integers(_DIRT_BANK_TEXELS - n)) for n in (height, width))
         dirt = _dirt_bank()[row:row + height, column:column + width]
-        paint.roughen(picture, dirt * np.float32(self.palette.texture))
+        paint.add_noise(picture, dirt * np.float32(self.palette.texture))
 
     def _shade(self, part: float) -> tuple[int, ...]:
         """The body colour on its way to dark trim."""
-        return (*paint.mixed(self.body, self.palette.trim, part), 255)
+        return (*paint.mix_colours(self.body, self.palette.trim, part), 255)
 
-    def _panels(self, picture: np.ndarray, part: Part, texels: _Texels) -> None:
+    def _panels(self, picture: np.ndarray, part: BodyPart, texels: _Texels) -> None:
         """Draw door gaps, a rubbing strip, handles and the lettering."""
         low = min(z for _, z in part.profile)
         xs = [x for x, _ in part.profile]
@@ -154,7 +154,7 @@ class _Painter:
             self._lettering(picture, part, texels, front, rear)
 
     def _lettering(
-        self, picture: np.ndarray, part: Part, texels: _Texels, front: float, rear: float
+        self, picture: np.ndarray, part: BodyPart, texels: _Texels, front: float, rear: float
     ) -> None:
         end = min([x for w in part.windows for x, _ in w] or [front]) - 0.2
         low, high, first = 0.62 * part.top_m, 0.85 * part.top_m, end
@@ -162,7 +162,7 @@ class _Painter:
             low, high, first = 0.62, 1.05, front - 0.6
         (xa, ya), (xb, yb) = texels(((rear + 0.3, low), (first, high)))
         box = (min(xa, xb), min(ya, yb), max(xa, xb), max(ya, yb))
-        paint.letters(picture, part.lettering, box, self.palette.ink)
+        paint.draw_text(picture, part.lettering, box, self.palette.ink)
 
     def _window(self, picture: np.ndarray, outline: np.ndarray) -> None:
         """Fill an outline with glass that shows seats and a streak of light."""
@@ -172,15 +172,15 @@ class _Painter:
         paint.polygon(picture, outline, (*self.palette.glass, 255))
         low, high = outline.min(0), outline.max(0)
         size = high - low
-        bright = (*paint.mixed(self.palette.glass, self.palette.sky_low, 0.3), 255)
-        dark = (*paint.mixed(self.palette.glass, self.palette.trim, 0.8), 255)
+        bright = (*paint.mix_colours(self.palette.glass, self.palette.sky_low, 0.3), 255)
+        dark = (*paint.mix_colours(self.palette.glass, self.palette.trim, 0.8), 255)
         for x in self.rng.uniform(0.15, 0.85, 2):
             spot = low + size * (x, self.rng.uniform(0.45, 0.75))
             paint.disc(picture, tuple(spot), 0.18 * min(size), dark)
         streak = low + size * np.array([(0.30, 0.98), (0.42, 0.98), (0.55, 0.04), (0.47, 0.04)])
         paint.polygon(picture, streak, bright)
 
-    def _wheels(self, picture: np.ndarray, alpha: np.ndarray, part: Part, texels: _Texels) -> None:
+    def _wheels(self, picture: np.ndarray, alpha: np.ndarray, part: BodyPart, texels: _Texels) -> None:
         xs = [x for x, _ in part.profile]
         radius = self.shape.wheel_radius_m
         for x in self.shape.wheels_x_m:
@@ -217,12 +217,12 @@ class _Painter:
         self._box(picture, 0.36, 0.55, 0.64, 0.80, self.palette.marking)
         height, width = picture.shape[:2]
         box = (0.38 * width, 0.58 * height, 0.62 * width, 0.77 * height)
-        paint.letters(picture, f'K {self.rng.integers(100, 999)}', box, self.palette.ink)
+        paint.draw_text(picture, f'K {self.rng.integers(100, 999)}', box, self.palette.ink)
 
     def _bonnet(self, picture: np.ndarray) -> None:
         height, width = picture.shape[:2]
         if self.palette.engine:
-            warm = paint.mixed(self.body, self.palette.engine, 0.7)
+            warm = paint.mix_colours(self.body, self.palette.engine, 0.7)
             self._box(picture, 0.12, 0.1, 0.88, 1.0, warm)
         for x, lean in ((0.14, 0.06), (0.86, -0.06), (0.38, 0.03), (0.62, -0.03)):
             ends = (x * width, 0.0), ((x + lean) * width, float(height))
@@ -272,7 +272,7 @@ class _Painter:
         paint.line(picture, (width / 2, 0.0), (width / 2, float(height)), self._shade(0.9), 3)
         for x in (0.30, 0.62):
             self._box(picture, x, 0.1, x + 0.03, 0.85, self._shade(0.5))
-        paint.letters(
+        paint.draw_text(
             picture, '24 H', (0.15 * width, 0.2 * height, 0.85 * width, 0.5 * height),
             self.palette.ink,
         )

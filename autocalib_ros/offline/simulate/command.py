@@ -11,7 +11,7 @@ from autocalib_ros.errors import UsageError
 from autocalib_ros.offline.simulate.options import SCENES, SHUTTER_SHOWS, STORAGES, SimulationOptions
 
 _UNIT = re.compile(r'_(px|deg|m|s|hz)$')
-_BY_HAND = ('width_px', 'height_px', 'k')
+_CUSTOM_OPTIONS = ('width_px', 'height_px', 'k')
 _PAIRS = {'principal_point_offset_px': ('DX', 'DY'), 'position_m': ('X', 'Y')}
 _CHOICES = {'scene': SCENES, 'storage': STORAGES, 'shutter_shows': SHUTTER_SHOWS}
 
@@ -21,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('bag', metavar='BAG', help='rosbag2 folder to write')
     _add_lens_and_size(parser)
     for field in fields(SimulationOptions):
-        if field.name not in _BY_HAND:
+        if field.name not in _CUSTOM_OPTIONS:
             _add_option(parser, field.name, field.type, field.default, field.metadata['help'])
     parser.add_argument('--workers', type=int, metavar='N', help='processes; default: one a core')
     parser.add_argument('--overwrite', action='store_true', help='replace a bag of that name')
@@ -47,7 +47,7 @@ def options_from(args: argparse.Namespace) -> SimulationOptions:
 
 def run(args: argparse.Namespace) -> int:
     """Write the bag; return the exit status."""
-    from autocalib_ros.offline.simulate.bag import TRUTH_NAME, write_bag
+    from autocalib_ros.offline.simulate.bag import TRUTH_FILE_NAME, write_bag
     from autocalib_ros.offline.terminal.progress import progress_bar
 
     options = options_from(args)
@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
             args.bag, options, workers=args.workers, overwrite=args.overwrite,
             progress=lambda done, total: bar.update_to(done),
         )
-    print(f'wrote {path} and {path / TRUTH_NAME}')
+    print(f'wrote {path} and {path / TRUTH_FILE_NAME}')
     return 0
 
 

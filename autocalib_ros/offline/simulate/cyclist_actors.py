@@ -12,13 +12,13 @@ from autocalib_ros.offline.simulate import paint
 from autocalib_ros.offline.simulate.faces import Faces, Texture
 from autocalib_ros.offline.simulate.network import Network, Road
 from autocalib_ros.offline.simulate.options import SimulationOptions
-from autocalib_ros.offline.simulate.palette import palette_of
+from autocalib_ros.offline.simulate.palette import palette_for
 
-_REACH_M = 45.0  # from the middle of the network, either way
+_ROUTE_HALF_LENGTH_M = 45.0  # from the middle of the network, either way
 _FROM_KERB_M = 0.6
-_LENGTH_M, _TOP_M = 1.75, 1.0  # of the bicycle
-_WHEEL_M = 0.34
-_SCALE = 60  # texels to the metre
+_BICYCLE_LENGTH_M, _BICYCLE_HEIGHT_M = 1.75, 1.0  # of the bicycle
+_WHEEL_RADIUS_M = 0.34
+_TEXELS_PER_M = 60  # texels to the metre
 
 
 @dataclass(frozen=True)
@@ -36,13 +36,13 @@ class Cyclist:
 
     def place(self, time_s: float) -> tuple[float, float, float, float]:
         """Return (x, y, heading, phase of the pedals in radians)."""
-        way = (time_s - self.first_s) * self.speed_mps % (2 * _REACH_M)
-        along = way - _REACH_M if self.forward else _REACH_M - way
+        way = (time_s - self.first_s) * self.speed_mps % (2 * _ROUTE_HALF_LENGTH_M)
+        along = way - _ROUTE_HALF_LENGTH_M if self.forward else _ROUTE_HALF_LENGTH_M - way
         x, y = self.road.at(along, self.aside_m + 0.06 * math.sin(way / 1.3)).tolist()
         return x, y, self.road.heading(along) + (0.0 if self.forward else math.pi), way * 2 * math.pi / 4.5
 
 
-def cyclists_of(network: Network, options: SimulationOptions) -> tuple[Cyclist, ...]:
+def spawn_cyclists(network: Network, options: SimulationOptions) -> tuple[Cyclist, ...]:
     """Return the cyclists of a recording; none where there is no pavement, and none round a roundabout."""
     if options.empty or network.rural or network.roundabout is not None:
         return ()
@@ -58,7 +58,7 @@ def _cyclist(network: Network, rng: np.random.Generator) -> Cyclist:
                    -float(rng.uniform(0.0, 30.0)), int(rng.integers(15)))
 
 
-def faces_of(cyclist: Cyclist, place: tuple[float, float, float, float], viewer_xy: np.ndarray, thermal: bool) -> Faces:
+def figure_faces(cyclist: Cyclist, place: tuple[float, float, float, float], viewer_xy: np.ndarray, thermal: bool) -> Faces:
     """Return a flat bicycle, seen from both sides, and upright rectangles of its rider that face the viewer (2,)."""
     x, y, heading, phase = place
     ride = np.array([math.cos(heading), math.sin(heading)])
@@ -66,9 +66,9 @@ def faces_of(cyclist: Cyclist, place: tuple[float, float, float, float], viewer_
     to_viewer = math.atan2(viewer_xy[1] - y, viewer_xy[0] - x)
     across = np.array([-math.sin(to_viewer), math.cos(to_viewer)])
     here = np.array([x, y])
-    front, rear = here + ride * _LENGTH_M / 2, here - ride * _LENGTH_M / 2
+    front, rear = here + ride * _BICYCLE_LENGTH_M / 2, here - ride * _BICYCLE_LENGTH_M / 2
     corners = [
-        [(*start, _TOP_M), (*(end - start), 0.0), (0.0, 0.0, -_TOP_M)] for start, end in ((front, rear), (rear, front))
+        [(*start, _BICYCLE_HEIGHT_M), (*(end - start), 0.0), (0.0, 0.0, -_BICYCLE_HEIGHT_M)] for start, end in ((front, rear), (rear, front))
     ]
     swing = 0.17 * math.sin(phase)
     for ahead_low, aside_low, low, ahead_high, aside_high, high, width in (
@@ -87,32 +87,32 @@ def faces_of(cyclist: Cyclist, place: tuple[float, float, float, float], viewer_
 
 @lru_cache(maxsize=32)
 def _textures(clothes: int, thermal: bool) -> tuple[Texture, ...]:
-    palette = palette_of(thermal)
+    palette = palette_for(thermal)
     rng = np.random.default_rng([clothes, 6])
     coat = palette.clothes[clothes % len(palette.clothes)]
     legs = palette.clothes[(clothes * 3 + 1) % len(palette.clothes)]
     bicycle = Texture(_bicycle(palette.tyre, palette.bodies[clothes % len(palette.bodies)]))
     pictures = []
     for colour, size in (
-        (legs, (44, 10)), (paint.mixed(legs, palette.trim, 0.3), (44, 10)), (coat, (36, 26)), (coat, (32, 7)),
+        (legs, (44, 10)), (paint.mix_colours(legs, palette.trim, 0.3), (44, 10)), (coat, (36, 26)), (coat, (32, 7)),
         (coat, (32, 7)), (palette.skin, (17, 13)),
     ):
-        picture = paint.filled(*size, colour)
-        paint.roughen(picture, paint.grain(*size, ((2.0, 6.0 * palette.texture), (8.0, 8.0 * palette.texture)), rng))
+        picture = paint.filled_image(*size, colour)
+        paint.add_noise(picture, paint.octave_noise(*size, ((2.0, 6.0 * palette.texture), (8.0, 8.0 * palette.texture)), rng))
         pictures.append(picture)
     return bicycle, bicycle, *(Texture(picture) for picture in pictures)
 
 
 def _bicycle(tyre: tuple[int, int, int], frame: tuple[int, int, int]) -> np.ndarray:
     """Paint two wheels and the bars of the frame; alpha cuts the rest out."""
-    height, width = round(_TOP_M * _SCALE), round(_LENGTH_M * _SCALE)
-    picture = paint.filled(height, width, tyre)
+    height, width = round(_BICYCLE_HEIGHT_M * _TEXELS_PER_M), round(_BICYCLE_LENGTH_M * _TEXELS_PER_M)
+    picture = paint.filled_image(height, width, tyre)
     alpha = np.zeros((height, width), np.uint8)
-    hub = height - _WHEEL_M * _SCALE
-    wheels = [(_WHEEL_M * _SCALE, hub), (width - _WHEEL_M * _SCALE, hub)]
+    hub = height - _WHEEL_RADIUS_M * _TEXELS_PER_M
+    wheels = [(_WHEEL_RADIUS_M * _TEXELS_PER_M, hub), (width - _WHEEL_RADIUS_M * _TEXELS_PER_M, hub)]
     for wheel in wheels:
-        paint.disc(alpha, wheel, _WHEEL_M * _SCALE, (255,))
-        paint.disc(alpha, wheel, (_WHEEL_M - 0.06) * _SCALE, (70,))
+        paint.disc(alpha, wheel, _WHEEL_RADIUS_M * _TEXELS_PER_M, (255,))
+        paint.disc(alpha, wheel, (_WHEEL_RADIUS_M - 0.06) * _TEXELS_PER_M, (70,))
     saddle, bar, pedals = (0.62 * width, 0.1 * height), (0.27 * width, 0.08 * height), (0.5 * width, hub)
     for start, end in ((wheels[0], bar), (wheels[1], saddle), (bar, pedals), (saddle, pedals), (saddle, bar),
                        (pedals, wheels[1])):

@@ -16,26 +16,26 @@ from typing import Any
 import cv2
 import numpy as np
 
-from autocalib_ros.offline.simulate.lens import CameraPose, Lens
+from autocalib_ros.offline.simulate.lens import CameraPose, KannalaBrandtLens
 
 NO_MAP: Any = None  # to cv2.remap: its first map holds x and y; the stubs know no None
-SAMPLES = 2  # per pixel and axis
-_CELL = 4  # samples between the points where faces are met exactly
-_STEPS = np.linspace(0.0, 1.0, 5)[:-1]
+SAMPLES_PER_PIXEL = 2  # per pixel and axis
+_CELL_SAMPLES = 4  # samples between the points where faces are met exactly
+_EDGE_FRACTIONS = np.linspace(0.0, 1.0, 5)[:-1]
 # The rim of a face as fractions along both edges, once round: straight edges appear curved.
-_RIM = np.concatenate(
+_RIM_FRACTIONS = np.concatenate(
     [
-        np.stack([_STEPS, 0 * _STEPS], 1),
-        np.stack([0 * _STEPS + 1, _STEPS], 1),
-        np.stack([1 - _STEPS, 0 * _STEPS + 1], 1),
-        np.stack([0 * _STEPS, 1 - _STEPS], 1),
+        np.stack([_EDGE_FRACTIONS, 0 * _EDGE_FRACTIONS], 1),
+        np.stack([0 * _EDGE_FRACTIONS + 1, _EDGE_FRACTIONS], 1),
+        np.stack([1 - _EDGE_FRACTIONS, 0 * _EDGE_FRACTIONS + 1], 1),
+        np.stack([0 * _EDGE_FRACTIONS, 1 - _EDGE_FRACTIONS], 1),
     ]
 )
 _TOP, _RIGHT, _BOTTOM, _LEFT = 2, 6, 10, 14  # middles of the edges within the rim
-_SLACK_PX = 1.5
-_BULGE = 0.005  # of the extent: what an edge bulges between two points of the rim
-_BAND_PX = 24
-_SMALLEST_PX2 = 1.0
+_BOUNDS_MARGIN_PX = 1.5
+_BULGE_FRACTION = 0.005  # of the extent: what an edge bulges between two points of the rim
+_BAND_HEIGHT_PX = 24
+_MIN_AREA_PX2 = 1.0
 
 
 class Texture:
@@ -91,7 +91,7 @@ class Faces:
         return Faces(turned, self.textures)
 
 
-def join(parts: Sequence[Faces]) -> Faces:
+def concatenate_faces(parts: Sequence[Faces]) -> Faces:
     """Return several bodies as one."""
     return Faces(
         np.concatenate([p.corners for p in parts]) if parts else np.zeros((0, 3, 3)),
@@ -100,7 +100,7 @@ def join(parts: Sequence[Faces]) -> Faces:
 
 
 @dataclass(frozen=True)
-class Window:
+class PixelRect:
     """A rectangle of pixels, upper bounds excluded."""
 
     x0: int
@@ -109,7 +109,7 @@ class Window:
     y1: int
 
     @classmethod
-    def around(cls, drawings: list[Drawing]) -> Window:
+    def around(cls, drawings: list[Drawing]) -> PixelRect:
         """Return the window that holds all drawings."""
         windows = [w for d in drawings for w in d.windows]
         return cls(
@@ -124,7 +124,7 @@ class Window:
     def samples(self) -> tuple[slice, slice]:
         """Index of the samples."""
         return (
-            slice(self.y0 * SAMPLES, self.y1 * SAMPLES), slice(self.x0 * SAMPLES, self.x1 * SAMPLES)
+            slice(self.y0 * SAMPLES_PER_PIXEL, self.y1 * SAMPLES_PER_PIXEL), slice(self.x0 * SAMPLES_PER_PIXEL, self.x1 * SAMPLES_PER_PIXEL)
         )
 
 
@@ -135,7 +135,7 @@ class Drawing:
     offset_m: distance of its plane from the camera.
     """
 
-    windows: list[Window]
+    windows: list[PixelRect]
     matrix: np.ndarray
     offset_m: float
     texture: np.ndarray
@@ -150,16 +150,16 @@ class Canvas:
     cells of 2 x 2 pixels and interpolated: over so little the meeting point is linear to 0.01 px.
     """
 
-    def __init__(self, lens: Lens, width_px: int, height_px: int, margin_px: int = 0) -> None:
+    def __init__(self, lens: KannalaBrandtLens, width_px: int, height_px: int, margin_px: int = 0) -> None:
         self.lens = lens
         self.width_px, self.height_px, self.margin_px = width_px, height_px, margin_px
-        shape = tuple((n + 2 * margin_px) * SAMPLES for n in (height_px, width_px))
+        shape = tuple((n + 2 * margin_px) * SAMPLES_PER_PIXEL for n in (height_px, width_px))
         self.colour = np.zeros((*shape, 4), np.uint8)
         self.distance = np.full(shape, np.inf, np.float32)
         # One cell more on every side, so that interpolation never runs out of cells.
-        rows, columns = (np.arange(-1, -(-n // _CELL) + 1) for n in shape)
+        rows, columns = (np.arange(-1, -(-n // _CELL_SAMPLES) + 1) for n in shape)
         self._cell_bearings = self._bearings(
-            (columns + 0.5) * _CELL - 0.5, (rows + 0.5) * _CELL - 0.5
+            (columns + 0.5) * _CELL_SAMPLES - 0.5, (rows + 0.5) * _CELL_SAMPLES - 0.5
         )
 
     def bearings(self) -> np.ndarray:
@@ -169,18 +169,18 @@ class Canvas:
 
     def _bearings(self, columns: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Return the rays of a grid of sample coordinates."""
-        x, y = ((n + 0.5) / SAMPLES - 0.5 - self.margin_px for n in (columns, rows))
+        x, y = ((n + 0.5) / SAMPLES_PER_PIXEL - 0.5 - self.margin_px for n in (columns, rows))
         grid = np.stack(np.broadcast_arrays(x[None, :], y[:, None]), -1)
         return self.lens.bearings(grid).astype(np.float32)
 
-    def cleared(self) -> Canvas:
+    def empty_copy(self) -> Canvas:
         """Return another canvas for the same rays."""
         other = copy.copy(self)
         other.colour = np.zeros_like(self.colour)
         other.distance = np.full_like(self.distance, np.inf)
         return other
 
-    def plan(
+    def project_faces(
         self, bodies: Sequence[Faces], pose: CameraPose, gain: bool = False
     ) -> list[list[Drawing]]:
         """Find the faces of each body that are seen from a pose, and where.
@@ -188,7 +188,7 @@ class Canvas:
         gain: do not cover the picture but multiply it by texture / 100, leaving distances.
         """
         groups: list[list[Drawing]] = [[] for _ in bodies]
-        faces = join(bodies)
+        faces = concatenate_faces(bodies)
         corners = faces.corners @ pose.world_from_camera
         corners[:, 0] = pose.to_camera(faces.corners[:, 0])
         normals = np.cross(corners[:, 1], corners[:, 2])
@@ -198,9 +198,9 @@ class Canvas:
         owners = np.repeat(np.arange(len(bodies)), [len(b.corners) for b in bodies])[facing]
         corners, normals, offsets = corners[facing], normals[facing], offsets[facing]
         textures = [faces.textures[i] for i in np.flatnonzero(facing)]
-        rim = corners[:, None, 0] + _RIM @ corners[:, 1:]
+        rim = corners[:, None, 0] + _RIM_FRACTIONS @ corners[:, 1:]
         pixels, valid = self.lens.project(rim)
-        levels, large = _levels(pixels, textures)
+        levels, large = _mip_levels(pixels, textures)
         bounds = self._bounds(pixels)
         seen = np.flatnonzero(valid.any(1) & large & (bounds[:, 1] > bounds[:, 0]).all(1))
         chosen = [textures[i].level(*levels[i]) for i in seen]
@@ -219,7 +219,7 @@ class Canvas:
             for window in drawing.windows:
                 self._draw(drawing, window)
 
-    def resolved(self, window: Window) -> np.ndarray:
+    def resolve(self, window: PixelRect) -> np.ndarray:
         """Return the BGR pixels of a window as the means of their samples."""
         samples = self.colour[window.samples()]
         size = (window.x1 - window.x0, window.y1 - window.y0)
@@ -230,26 +230,26 @@ class Canvas:
         """Return the window bounds (n, 2, 2), low and high (x, y), of outlines (n, 16, 2)."""
         limit = np.array([self.width_px, self.height_px]) + 2 * self.margin_px
         low, high = rims.min(1), rims.max(1)
-        slack = _SLACK_PX + _BULGE * (high - low)
+        slack = _BOUNDS_MARGIN_PX + _BULGE_FRACTION * (high - low)
         bounds = np.stack([np.floor(low - slack), np.ceil(high + slack) + 1], 1)
         return np.clip(bounds + self.margin_px, 0, limit).astype(int)
 
-    def _bands(self, rim: np.ndarray, bounds: np.ndarray) -> list[Window]:
+    def _bands(self, rim: np.ndarray, bounds: np.ndarray) -> list[PixelRect]:
         """Return windows, narrow bands of rows, that hold an outline (16, 2) within its bounds."""
         (left, top), (right, bottom) = bounds.tolist()
-        if bottom - top <= 1.5 * _BAND_PX:
-            return [Window(left, top, right, bottom)]
-        slack = _SLACK_PX + _BULGE * np.ptp(rim, axis=0)
-        edges = np.append(np.arange(top, bottom, _BAND_PX), bottom)
+        if bottom - top <= 1.5 * _BAND_HEIGHT_PX:
+            return [PixelRect(left, top, right, bottom)]
+        slack = _BOUNDS_MARGIN_PX + _BULGE_FRACTION * np.ptp(rim, axis=0)
+        edges = np.append(np.arange(top, bottom, _BAND_HEIGHT_PX), bottom)
         low, high = edges[:-1] - slack[1], edges[1:] + slack[1]
         begin, end = _band_extents(rim + self.margin_px, low, high)
         x0 = np.clip(np.floor(begin - slack[0]), left, right).astype(int).tolist()
         x1 = np.clip(np.ceil(end + slack[0]) + 1, left, right).astype(int).tolist()
         rows = edges.tolist()
-        bands = [Window(*w) for w in zip(x0, rows[:-1], x1, rows[1:], strict=True) if w[2] > w[0]]
-        return bands or [Window(left, top, right, bottom)]
+        bands = [PixelRect(*w) for w in zip(x0, rows[:-1], x1, rows[1:], strict=True) if w[2] > w[0]]
+        return bands or [PixelRect(left, top, right, bottom)]
 
-    def _draw(self, drawing: Drawing, window: Window) -> None:
+    def _draw(self, drawing: Drawing, window: PixelRect) -> None:
         """Draw a face within a window; its picture alone tells where it ends."""
         samples = window.samples()
         cells, inner = _cells(samples)
@@ -278,16 +278,16 @@ def _cells(samples: tuple[slice, slice]) -> tuple[tuple[slice, slice], tuple[sli
     """Return the cells around samples, and where the samples lie in the refined cells."""
     outer, inner = [], []
     for part in samples:
-        first, last = part.start // _CELL, -(-part.stop // _CELL)
+        first, last = part.start // _CELL_SAMPLES, -(-part.stop // _CELL_SAMPLES)
         outer.append(slice(first, last + 2))  # index 0 is the cell before the picture
-        start = part.start - (first - 1) * _CELL
+        start = part.start - (first - 1) * _CELL_SAMPLES
         inner.append(slice(start, start + part.stop - part.start))
     return (outer[0], outer[1]), (inner[0], inner[1])
 
 
 def _refined(values: np.ndarray, inner: tuple[slice, slice]) -> np.ndarray:
     """Interpolate values of cells (h, w[, 2]) to samples and cut out the inner ones."""
-    return cv2.resize(values, None, fx=_CELL, fy=_CELL)[inner]
+    return cv2.resize(values, None, fx=_CELL_SAMPLES, fy=_CELL_SAMPLES)[inner]
 
 
 def _band_extents(
@@ -307,7 +307,7 @@ def _band_extents(
     )
 
 
-def _levels(pixels: np.ndarray, textures: list[Texture]) -> tuple[list[list[int]], np.ndarray]:
+def _mip_levels(pixels: np.ndarray, textures: list[Texture]) -> tuple[list[list[int]], np.ndarray]:
     """Choose how often to halve each texture: about one texel to the sample along either axis.
 
     pixels: the rims (n, 16, 2).  Returns (across, down) of each and whether it is large enough.
@@ -317,9 +317,9 @@ def _levels(pixels: np.ndarray, textures: list[Texture]) -> tuple[list[list[int]
     area = np.abs(along[:, 0] * down[:, 1] - along[:, 1] * down[:, 0])
     sizes = np.array([(t.width, t.height) for t in textures], float).reshape(-1, 2)
     spread = np.stack([np.hypot(*down.T), np.hypot(*along.T)], 1)
-    texels = sizes * spread / np.maximum(area, 1e-6)[:, None] / SAMPLES
+    texels = sizes * spread / np.maximum(area, 1e-6)[:, None] / SAMPLES_PER_PIXEL
     levels = (np.log2(np.maximum(texels, 1.0)) + 0.3).astype(int)
-    return levels.tolist(), area > _SMALLEST_PX2
+    return levels.tolist(), area > _MIN_AREA_PX2
 
 
 def _ray_matrices(

@@ -12,7 +12,7 @@ from autocalib_ros.offline.simulate.network import (
     Route,
     straight_road,
 )
-from autocalib_ros.offline.simulate.paths import Path, corner, joined, line, tangent_per_radius
+from autocalib_ros.offline.simulate.paths import Path, join_lines, line_intersection, straight_lane, tangent_per_radius
 
 RIGHT_RADIUS_M = 8.0
 """About the same point as the kerb of the corner."""
@@ -86,7 +86,7 @@ def _arm_routes(
                 movement=movement,
                 share=share,
                 stop_s=ARM_LENGTH_M - stop_m - 0.5,
-                split_s=split,
+                diverge_s=split,
                 narrow=movement == 'right',
                 signal=f'{"left" if movement == "left" else "main"}{road}',
             )
@@ -98,14 +98,14 @@ def _through(
     heading: float, offset: float, leave: float, exit_offset: float, stop_m: float, movement: str
 ) -> tuple[Path, float]:
     """Join an approach lane to an exit lane by a turn; return the path and the turn's start."""
-    lane = line(heading, offset, ARM_LENGTH_M)
+    lane = straight_lane(heading, offset, ARM_LENGTH_M)
     if movement == 'straight':
         return Path((lane,)), math.inf
-    out = line(leave, exit_offset, ARM_LENGTH_M)
-    d_in, d_out = corner(lane, out)
+    out = straight_lane(leave, exit_offset, ARM_LENGTH_M)
+    d_in, d_out = line_intersection(lane, out)
     stop_s = ARM_LENGTH_M - stop_m
     # A clothoid hardly leaves the lane at first: it may begin before the stop line.
     room = min(d_in - stop_s, (2 * ARM_LENGTH_M - stop_s) - d_out) + 2.0
     per_radius = tangent_per_radius(math.remainder(leave - heading, 2 * math.pi))
-    path = joined(lane, out, min(room / per_radius, RIGHT_RADIUS_M if movement == 'right' else LEFT_RADIUS_M))
-    return path, path.pieces[0].length
+    path = join_lines(lane, out, min(room / per_radius, RIGHT_RADIUS_M if movement == 'right' else LEFT_RADIUS_M))
+    return path, path.segments[0].length

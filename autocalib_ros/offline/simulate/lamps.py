@@ -8,23 +8,23 @@ from functools import lru_cache
 
 import numpy as np
 
-from autocalib_ros.offline.simulate.faces import SAMPLES, Canvas, Faces, Texture
+from autocalib_ros.offline.simulate.faces import SAMPLES_PER_PIXEL, Canvas, Faces, Texture
 from autocalib_ros.offline.simulate.lens import CameraPose
-from autocalib_ros.offline.simulate.paint import mixed
+from autocalib_ros.offline.simulate.paint import mix_colours
 from autocalib_ros.offline.simulate.sensor import add_glow
 from autocalib_ros.offline.simulate.shapes import SHAPES
 from autocalib_ros.offline.simulate.vehicle_models import Vehicle, VehicleState
 
-_HEAD = (215, 240, 255)
-_TAIL = (40, 30, 230)
-_BEAM_M = (16.0, 6.0)
-LAMP_M = 0.7
+_HEAD_LAMP_COLOUR = (215, 240, 255)
+_TAIL_LAMP_COLOUR = (40, 30, 230)
+_BEAM_SIZE_M = (16.0, 6.0)
+LAMP_HEIGHT_M = 0.7
 
 
 @lru_cache(maxsize=16)
-def beam_of(kind: str) -> Faces:
+def beam_faces(kind: str) -> Faces:
     """Return the light that a vehicle throws on the road before it, to be drawn as a gain."""
-    length, width = _BEAM_M
+    length, width = _BEAM_SIZE_M
     start = SHAPES[kind].length_m / 2
     # Texture x runs along the beam, y across it.
     x, y = np.linspace(0, 1, 96)[None], np.linspace(-1, 1, 48)[:, None]
@@ -34,7 +34,7 @@ def beam_of(kind: str) -> Faces:
 
 
 @lru_cache(maxsize=1)
-def pool() -> Faces:
+def light_pool() -> Faces:
     """Return the pool of light under a street lamp, to be drawn as a gain."""
     line = np.linspace(-1, 1, 64)
     light = np.exp(-3.5 * (line[None] ** 2 + line[:, None] ** 2))
@@ -51,21 +51,21 @@ def _gain_faces(light: np.ndarray, corners: list[tuple[float, float, float]]) ->
 class Lamp:
     """A lamp of a vehicle: its place (3,), the heading (2,) in which it shines, its colour and size."""
 
-    place_m: np.ndarray
-    outward: np.ndarray
+    position_m: np.ndarray
+    direction: np.ndarray
     colour: tuple[int, int, int]
     size_m: float
 
 
-def lamps_of(vehicle: Vehicle, state: VehicleState) -> Iterator[Lamp]:
+def vehicle_lamps(vehicle: Vehicle, state: VehicleState) -> Iterator[Lamp]:
     """Yield the head and tail lamps of a vehicle."""
     shape = vehicle.shape
     ahead = np.array([np.cos(state.heading), np.sin(state.heading)])
     left = np.array([-ahead[1], ahead[0]])
-    for end, colour, size in ((1, _HEAD, 0.24), (-1, _TAIL, 0.13)):
+    for end, colour, size in ((1, _HEAD_LAMP_COLOUR, 0.24), (-1, _TAIL_LAMP_COLOUR, 0.13)):
         for side in (0.36, -0.36):
             xy = np.array([state.x, state.y]) + ahead * end * (shape.length_m / 2 + 0.05)
-            yield Lamp(np.array([*(xy + left * side * shape.width_m), LAMP_M]), ahead * end, colour, size)
+            yield Lamp(np.array([*(xy + left * side * shape.width_m), LAMP_HEIGHT_M]), ahead * end, colour, size)
 
 
 def add_lamps(
@@ -74,23 +74,23 @@ def add_lamps(
 ) -> None:
     """Add the blobs of all lamps that are turned to the camera and not hidden, in place."""
     for vehicle, state in vehicles:
-        for lamp in lamps_of(vehicle, state):
+        for lamp in vehicle_lamps(vehicle, state):
             _add_lamp(picture, canvas, pose, lamp)
 
 
 def _add_lamp(picture: np.ndarray, canvas: Canvas, pose: CameraPose, lamp: Lamp) -> None:
-    to_camera = pose.position_m - lamp.place_m
+    to_camera = pose.position_m - lamp.position_m
     distance = float(np.linalg.norm(to_camera))
-    turned = float(lamp.outward @ to_camera[:2]) / distance
-    pixel, valid = canvas.lens.project(pose.to_camera(lamp.place_m))
+    turned = float(lamp.direction @ to_camera[:2]) / distance
+    pixel, valid = canvas.lens.project(pose.to_camera(lamp.position_m))
     column, row = (int(round(c)) for c in pixel)
     if turned < 0.05 or not valid:
         return
     if not (0 <= row < picture.shape[0] and 0 <= column < picture.shape[1]):
         return
-    if canvas.distance[row * SAMPLES, column * SAMPLES] < distance - 0.5:
+    if canvas.distance[row * SAMPLES_PER_PIXEL, column * SAMPLES_PER_PIXEL] < distance - 0.5:
         return
     # A lamp is dazzling along its axis and fades to the side; far ones stay visible.
     radius = max(1.2, lamp.size_m * canvas.lens.focal_px / distance * (0.6 + 1.4 * turned**2))
     strength = min(1.0, 0.35 + turned)
-    add_glow(picture, pixel, radius, mixed((0, 0, 0), lamp.colour, strength))
+    add_glow(picture, pixel, radius, mix_colours((0, 0, 0), lamp.colour, strength))

@@ -15,7 +15,7 @@ import numpy as np
 
 
 @dataclass(frozen=True)
-class Lens:
+class KannalaBrandtLens:
     """A radially symmetric lens in front of square pixels.
 
     focal_px: f in pixels; k: k1..k4; centre_px: the principal point (x, y) in pixels.
@@ -94,7 +94,7 @@ class CameraPose:
         return CameraPose(self.world_from_camera @ camera_rotation, self.position_m)
 
 
-def look(yaw_deg: float, pitch_deg: float, roll_deg: float) -> np.ndarray:
+def look_rotation(yaw_deg: float, pitch_deg: float, roll_deg: float) -> np.ndarray:
     """Return world_from_camera (3, 3) of a camera looking along a heading and down.
 
     Positive roll turns the camera clockwise as seen from behind it.
@@ -106,10 +106,10 @@ def look(yaw_deg: float, pitch_deg: float, roll_deg: float) -> np.ndarray:
     right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])
     down = np.cross(forward, right)
     level = np.stack([right, down, forward], 1)
-    return level @ rotation(np.array([0.0, 0.0, roll]))
+    return level @ rotation_from_vector(np.array([0.0, 0.0, roll]))
 
 
-def rotation(vector_rad: np.ndarray) -> np.ndarray:
+def rotation_from_vector(vector_rad: np.ndarray) -> np.ndarray:
     """Return the rotation (3, 3) about a vector (3,) by its length in radians (Rodrigues)."""
     angle = float(np.linalg.norm(vector_rad))
     if angle < 1e-15:

@@ -11,18 +11,18 @@ from autocalib_ros.offline.simulate.options import SimulationOptions
 
 COUNTS_PER_LEVEL = 8.0
 """Counts to one grey level of the palette: at 25 counts a kelvin, which is usual, engines are 19 K above the road."""
-NOISE_COUNTS = 1.5
+NOISE_COUNTS_PER_LEVEL = 1.5
 """Counts of noise to one grey level of `noise_sigma`: by default 3, or 120 mK."""
 BASE_COUNTS = 6400.0
-DRIFT_PER_S = 0.8
+OFFSET_DRIFT_PER_S = 0.8
 """Counts that the offset gains each second while the housing warms, until the shutter takes them away."""
-PIXEL_COUNTS, COLUMN_COUNTS = 2.0, 1.5
+PIXEL_FPN_COUNTS, COLUMN_FPN_COUNTS = 2.0, 1.5
 """Standard deviation of what the correction leaves of each pixel's and each column's own offset."""
-BOWL_COUNTS, BOWL_PER_S = 12.0, 0.4
+SHADING_COUNTS, SHADING_PER_S = 12.0, 0.4
 """Counts that the corners glow more than the centre: standard deviation after the shutter, and growth."""
-STEP_COUNTS = 60.0
+FFC_OFFSET_COUNTS = 60.0
 """Standard deviation of the offset that one closing of the shutter leaves."""
-SHUT_S = 0.5
+SHUTTER_CLOSED_S = 0.5
 """How long the shutter hides the scene."""
 
 
@@ -33,50 +33,50 @@ class Microbolometer:
         self._options = options
         self._event = -1
         self._pattern = np.zeros(0)
-        self._offset = self._glow = 0.0
+        self._offset = self._shading_gain = 0.0
         height, width = options.height_px, options.width_px
         y, x = np.mgrid[:height, :width]
         square = ((x - width / 2) / (width / 2)) ** 2 + ((y - height / 2) / (height / 2)) ** 2
-        self._bowl = (square / 2).astype(np.float32)
+        self._shading = (square / 2).astype(np.float32)
 
-    def counts(self, picture: np.ndarray, time_s: float, noise: np.ndarray, *, shut: bool = False) -> np.ndarray:
-        """Return mono16 counts (h, w) of a heat picture (h, w, 3) and noise (h, w, 1); `shut` sees the shutter."""
-        event, since_s = self._since_shutter(time_s)
-        self._renew(event)
+    def counts(self, picture: np.ndarray, time_s: float, noise: np.ndarray, *, shutter_closed: bool = False) -> np.ndarray:
+        """Return mono16 counts (h, w) of a heat picture (h, w, 3) and noise (h, w, 1); `shutter_closed` sees the shutter."""
+        event, since_s = self._shutter_state(time_s)
+        self._redraw_pattern(event)
         heat = cv2.GaussianBlur(np.ascontiguousarray(picture[..., 0]).astype(np.float32), (0, 0), 0.6)
-        if shut:
+        if shutter_closed:
             heat[:] = heat.mean()
         gain = COUNTS_PER_LEVEL * (1 + 0.03 * math.sin(2 * math.pi * time_s / 47.0))
-        offset = BASE_COUNTS + 30.0 * math.sin(2 * math.pi * time_s / 31.0 + 1.0) + DRIFT_PER_S * since_s
-        bowl = (self._glow + BOWL_PER_S * since_s) * self._bowl
+        offset = BASE_COUNTS + 30.0 * math.sin(2 * math.pi * time_s / 31.0 + 1.0) + OFFSET_DRIFT_PER_S * since_s
+        bowl = (self._shading_gain + SHADING_PER_S * since_s) * self._shading
         counts = heat * gain + (offset + self._offset) + self._pattern + bowl + noise[..., 0]
         return np.clip(np.round(counts), 0, 16383).astype(np.uint16)
 
-    def _since_shutter(self, time_s: float) -> tuple[int, float]:
+    def _shutter_state(self, time_s: float) -> tuple[int, float]:
         """Return how often the shutter has opened by then, and the seconds since."""
         every_s = self._options.shutter_every_s
-        if every_s is None or time_s < every_s + SHUT_S:
+        if every_s is None or time_s < every_s + SHUTTER_CLOSED_S:
             return 0, time_s
-        event = math.floor((time_s - SHUT_S) / every_s)
-        return event, time_s - SHUT_S - event * every_s
+        event = math.floor((time_s - SHUTTER_CLOSED_S) / every_s)
+        return event, time_s - SHUTTER_CLOSED_S - event * every_s
 
-    def _renew(self, event: int) -> None:
+    def _redraw_pattern(self, event: int) -> None:
         """Draw the offset and the pattern that hold since the shutter opened for the `event`-th time."""
         if event == self._event:
             return
         rng = np.random.default_rng([self._options.seed, 9, event])
-        height, width = self._bowl.shape
-        self._offset = float(rng.normal(0.0, STEP_COUNTS)) if event else 0.0
-        self._glow = float(rng.normal(0.0, BOWL_COUNTS))
-        pixels = rng.standard_normal((height, width), np.float32) * PIXEL_COUNTS
-        self._pattern = pixels + rng.standard_normal(width, np.float32) * COLUMN_COUNTS
+        height, width = self._shading.shape
+        self._offset = float(rng.normal(0.0, FFC_OFFSET_COUNTS)) if event else 0.0
+        self._shading_gain = float(rng.normal(0.0, SHADING_COUNTS))
+        pixels = rng.standard_normal((height, width), np.float32) * PIXEL_FPN_COUNTS
+        self._pattern = pixels + rng.standard_normal(width, np.float32) * COLUMN_FPN_COUNTS
         self._event = event
 
 
-def shut_since(options: SimulationOptions, time_s: float) -> float | None:
+def shutter_closed_since(options: SimulationOptions, time_s: float) -> float | None:
     """Return when the shutter closed that hides the scene at a time; None where it is open."""
     every_s = options.shutter_every_s
     if every_s is None or time_s < every_s:
         return None
     closed_s = math.floor(time_s / every_s) * every_s
-    return closed_s if time_s - closed_s < SHUT_S else None
+    return closed_s if time_s - closed_s < SHUTTER_CLOSED_S else None

@@ -5,29 +5,29 @@ from __future__ import annotations
 import math
 
 from autocalib_ros.offline.simulate.network import Network, Route, straight_road
-from autocalib_ros.offline.simulate.paths import Path, lane_change, line
+from autocalib_ros.offline.simulate.paths import Path, lane_change, straight_lane
 
-MOTORWAY_LANE_M = 3.6
-MOTORWAY_REACH_M = 150.0
-MOTORWAY_SHARE = 1.2
+MOTORWAY_LANE_WIDTH_M = 3.6
+MOTORWAY_HALF_LENGTH_M = 150.0
+MOTORWAY_TRAFFIC_FACTOR = 1.2
 """Traffic of a lane relative to one in a town."""
 MOTORWAY_SPEEDS_MPS = (24.0, 28.0, 32.0)
 """Of the lanes, the outer one first."""
-MEDIAN_M = 1.4
+MEDIAN_WIDTH_M = 1.4
 """From the barrier in the middle of a motorway to its inner edge line."""
-SHOULDER_M = 2.6
-LANE_CHANGE_M = 110.0
+SHOULDER_WIDTH_M = 2.6
+LANE_CHANGE_LENGTH_M = 110.0
 """Four seconds at the speed of the middle lane."""
-LANE_CHANGES_S = (60.0, 95.0, 130.0)
+LANE_CHANGE_STARTS_M = (60.0, 95.0, 130.0)
 """Where lane changes begin, from the start of a lane."""
 
 
 def highway(one_way: bool, changing_fraction: float) -> Network:
     """Return a motorway along the x axis, three lanes each way; a part of the vehicles change lanes."""
-    w = MOTORWAY_LANE_M
-    inner = -1.5 * w if one_way else MEDIAN_M
+    w = MOTORWAY_LANE_WIDTH_M
+    inner = -1.5 * w if one_way else MEDIAN_WIDTH_M
     painted = [(inner, 'solid'), (inner + w, 'dash'), (inner + 2 * w, 'dash'), (inner + 3 * w, 'solid')]
-    half = inner + 3 * w + SHOULDER_M
+    half = inner + 3 * w + SHOULDER_WIDTH_M
     sides = (1,) if one_way else (1, -1)
     edges = tuple((side * offset, kind) for side in sides for offset, kind in painted)
     # From the outer lane, which is the rightmost, inwards.
@@ -49,21 +49,21 @@ def _motorway_routes(
     heading: float, offsets: list[float], index: int, changing_fraction: float
 ) -> list[Route]:
     """Return the routes that begin in a lane: on in it, and into the lanes beside it."""
-    lane = line(heading, offsets[index], MOTORWAY_REACH_M)
+    lane = straight_lane(heading, offsets[index], MOTORWAY_HALF_LENGTH_M)
     names = [f'lane {math.degrees(heading):.0f} {offset:+.1f}' for offset in offsets]
     speed = MOTORWAY_SPEEDS_MPS[index]
     targets = [i for i in (index - 1, index + 1) if 0 <= i < len(offsets)]
-    share = MOTORWAY_SHARE * changing_fraction / (len(targets) * len(LANE_CHANGES_S))
+    share = MOTORWAY_TRAFFIC_FACTOR * changing_fraction / (len(targets) * len(LANE_CHANGE_STARTS_M))
     routes = [
         Route(Path((lane,)), names[index], names[index], 'straight',
-              MOTORWAY_SHARE * (1.0 - changing_fraction), stop_s=0.0, speed_mps=speed)
+              MOTORWAY_TRAFFIC_FACTOR * (1.0 - changing_fraction), stop_s=0.0, speed_mps=speed)
     ]
     for target in targets:
-        for begin_s in LANE_CHANGES_S:
+        for begin_s in LANE_CHANGE_STARTS_M:
             aside = offsets[target] - offsets[index]
-            path = lane_change(lane, begin_s, LANE_CHANGE_M, aside)
+            path = lane_change(lane, begin_s, LANE_CHANGE_LENGTH_M, aside)
             routes.append(
                 Route(path, names[index], names[target], 'lane change', share, stop_s=0.0,
-                      split_s=begin_s + 0.75 * LANE_CHANGE_M, speed_mps=speed)
+                      diverge_s=begin_s + 0.75 * LANE_CHANGE_LENGTH_M, speed_mps=speed)
             )
     return routes

@@ -12,16 +12,16 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import cKDTree
 
-from autocalib_ros.offline.simulate.paths import Path, Piece
+from autocalib_ros.offline.simulate.paths import Path, PathSegment
 
 LANE_WIDTH_M = 3.2
-RURAL_LANE_M = 3.5
+RURAL_LANE_WIDTH_M = 3.5
 ARM_LENGTH_M = 110.0
 CROSSING_WIDTH_M = 3.5
 CITY_SPEED_MPS = 12.5
-_SAMPLES_M = np.arange(-400.0, 400.0, 0.5)
+_AXIS_SAMPLES_M = np.arange(-400.0, 400.0, 0.5)
 """Where a curved road is looked up; roads are painted no farther."""
-_BESIDE_M = 60.0
+_MAX_AXIS_DISTANCE_M = 60.0
 """Farther from a curved road nobody asks how far exactly."""
 
 
@@ -32,18 +32,18 @@ class Circulation:
     joins_s, leaves_s: arc lengths of the route; joins_m: place on the ring where it joins.
     """
 
-    joins_s: float
-    leaves_s: float
-    joins_m: float
+    entry_s: float
+    exit_s: float
+    entry_m: float
     circumference_m: float
 
-    def place_m(self, s: float) -> float:
+    def position_m(self, s: float) -> float:
         """Return the place on the ring at an arc length of the route; before the ring, ahead of it."""
-        return self.joins_m + s - self.joins_s
+        return self.entry_m + s - self.entry_s
 
-    def ahead_m(self, place_m: float, s: float) -> float:
+    def distance_ahead_m(self, position_m: float, s: float) -> float:
         """Return the way round the ring from where a route is at s to a place, 0..circumference."""
-        return (place_m - self.place_m(s)) % self.circumference_m
+        return (position_m - self.position_m(s)) % self.circumference_m
 
 
 @dataclass(frozen=True)
@@ -63,14 +63,14 @@ class Route:
     movement: str
     share: float
     stop_s: float = math.inf
-    split_s: float = math.inf
+    diverge_s: float = math.inf
     signal: str | None = None
     ring: Circulation | None = None
     narrow: bool = False
     speed_mps: float = CITY_SPEED_MPS
 
     @property
-    def entered(self) -> frozenset[str]:
+    def entry_lanes(self) -> frozenset[str]:
         """The lanes that it uses from its start."""
         return frozenset({self.approach, self.leave} if self.stop_s <= 0 else {self.approach})
 
@@ -96,7 +96,7 @@ class Road:
     @property
     def headings(self) -> tuple[float, ...]:
         """The headings of its straight parts."""
-        return tuple(piece.heading for piece in self.path.pieces if piece.straight)
+        return tuple(segment.heading for segment in self.path.segments if segment.straight)
 
     def reaches(self, along: float) -> bool:
         """Tell whether it is there at a distance along its axis."""
@@ -115,8 +115,8 @@ class Road:
     def edge_distance(self, xy: np.ndarray) -> np.ndarray:
         """Return how far points (..., 2) lie outside the strip, in metres; negative on it."""
         if not self.straight:
-            found, _ = self._axis_tree.query(xy, distance_upper_bound=_BESIDE_M)
-            return np.minimum(found, _BESIDE_M) - self.half_width_m
+            found, _ = self._axis_tree.query(xy, distance_upper_bound=_MAX_AXIS_DISTANCE_M)
+            return np.minimum(found, _MAX_AXIS_DISTANCE_M) - self.half_width_m
         x, y, heading = self.path.at(0.0).tolist()
         dx, dy = xy[..., 0] - x, xy[..., 1] - y
         c, s = math.cos(heading), math.sin(heading)
@@ -129,7 +129,7 @@ class Road:
 
     @cached_property
     def _axis_tree(self) -> cKDTree:
-        return cKDTree(self.path.at(_SAMPLES_M)[:, :2])
+        return cKDTree(self.path.at(_AXIS_SAMPLES_M)[:, :2])
 
 
 def straight_road(
@@ -137,7 +137,7 @@ def straight_road(
     begin_m: float = -math.inf,
 ) -> Road:
     """Return a road through the origin."""
-    return Road(Path((Piece(0.0, 0.0, heading, 0.0),)), half_width_m, lane_edges_m, begin_m)
+    return Road(Path((PathSegment(0.0, 0.0, heading, 0.0),)), half_width_m, lane_edges_m, begin_m)
 
 
 @dataclass(frozen=True)

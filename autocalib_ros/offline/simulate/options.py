@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 from autocalib_ros.errors import UsageError
-from autocalib_ros.offline.simulate.lens import Lens
+from autocalib_ros.offline.simulate.lens import KannalaBrandtLens
 
 SCENES = ('junction', 'road', 'highway', 'bend', 'roundabout', 'skew', 'tee', 'sparse')
 SQUARE_DEG = 90.0
@@ -107,18 +107,18 @@ class SimulationOptions:
         return frozenset(filter(None, self.trouble.split(',')))
 
     @property
-    def crossing_deg(self) -> float:
+    def road_crossing_deg(self) -> float:
         """Angle between the two roads of a junction."""
         if self.road_angle_deg is not None:
             return self.road_angle_deg
         return SKEW_DEG if self.scene == 'skew' else SQUARE_DEG
 
     @property
-    def lens(self) -> Lens:
+    def lens(self) -> KannalaBrandtLens:
         """The true lens."""
         dx, dy = self.principal_point_offset_px
         centre = ((self.width_px - 1) / 2 + dx, (self.height_px - 1) / 2 + dy)
-        return Lens(self.focal_px, tuple(self.k), centre)
+        return KannalaBrandtLens(self.focal_px, tuple(self.k), centre)
 
     def _check_names(self) -> None:
         for name, allowed in (('scene', SCENES), ('storage', STORAGES), ('shutter_shows', SHUTTER_SHOWS)):

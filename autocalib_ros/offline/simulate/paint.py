@@ -9,17 +9,17 @@ import numpy as np
 
 from autocalib_ros.offline.simulate.palette import Colour
 
-_SHIFT = 4  # fractional bits of the drawing functions of OpenCV
+_FIXED_POINT_BITS = 4  # fractional bits of the drawing functions of OpenCV
 
 
-def filled(height: int, width: int, colour: Colour) -> np.ndarray:
+def filled_image(height: int, width: int, colour: Colour) -> np.ndarray:
     """Return an opaque BGRA picture (h, w, 4) of one colour."""
     picture = np.empty((max(height, 2), max(width, 2), 4), np.uint8)
     picture[:] = (*colour, 255)
     return picture
 
 
-def grain(
+def octave_noise(
     height: int, width: int, octaves: Iterable[tuple[float, float]], rng: np.random.Generator
 ) -> np.ndarray:
     """Return smooth noise (h, w) float32: a sum over (size in texels, standard deviation)."""
@@ -35,7 +35,7 @@ def grain(
     return total
 
 
-def roughen(picture: np.ndarray, noise: np.ndarray) -> None:
+def add_noise(picture: np.ndarray, noise: np.ndarray) -> None:
     """Add noise (h, w) in grey levels to the colours of a picture (h, w, 3 or 4), in place."""
     rough = picture[..., :3].astype(np.float32) + noise[..., None]
     picture[..., :3] = np.clip(rough, 0, 255).astype(np.uint8)
@@ -43,8 +43,8 @@ def roughen(picture: np.ndarray, noise: np.ndarray) -> None:
 
 def polygon(picture: np.ndarray, points: np.ndarray, colour: tuple[int, ...]) -> None:
     """Fill a polygon (n, 2) given in texels, (0, 0) being the corner of the picture."""
-    fixed = np.round((np.asarray(points, float) - 0.5) * (1 << _SHIFT)).astype(np.int32)
-    cv2.fillPoly(picture, [fixed], colour, cv2.LINE_AA, _SHIFT)
+    fixed = np.round((np.asarray(points, float) - 0.5) * (1 << _FIXED_POINT_BITS)).astype(np.int32)
+    cv2.fillPoly(picture, [fixed], colour, cv2.LINE_AA, _FIXED_POINT_BITS)
 
 
 def line(
@@ -52,20 +52,20 @@ def line(
     colour: tuple[int, ...], width: int = 1,
 ) -> None:
     """Draw a line between two points given in texels."""
-    ends = [tuple(int(round((c - 0.5) * (1 << _SHIFT))) for c in p) for p in (start, end)]
-    cv2.line(picture, ends[0], ends[1], colour, width, cv2.LINE_AA, _SHIFT)
+    ends = [tuple(int(round((c - 0.5) * (1 << _FIXED_POINT_BITS))) for c in p) for p in (start, end)]
+    cv2.line(picture, ends[0], ends[1], colour, width, cv2.LINE_AA, _FIXED_POINT_BITS)
 
 
 def disc(
     picture: np.ndarray, centre: tuple[float, float], radius: float, colour: tuple[int, ...]
 ) -> None:
     """Fill a circle given in texels."""
-    x, y = (int(round((c - 0.5) * (1 << _SHIFT))) for c in centre)
-    radius_fixed = int(round(radius * (1 << _SHIFT)))
-    cv2.circle(picture, (x, y), radius_fixed, colour, -1, cv2.LINE_AA, _SHIFT)
+    x, y = (int(round((c - 0.5) * (1 << _FIXED_POINT_BITS))) for c in centre)
+    radius_fixed = int(round(radius * (1 << _FIXED_POINT_BITS)))
+    cv2.circle(picture, (x, y), radius_fixed, colour, -1, cv2.LINE_AA, _FIXED_POINT_BITS)
 
 
-def letters(
+def draw_text(
     picture: np.ndarray, text: str, box: tuple[float, float, float, float], colour: Colour
 ) -> None:
     """Write a text as large as it fits into the box (x0, y0, x1, y1) of texels."""
@@ -81,7 +81,7 @@ def letters(
     )
 
 
-def mixed(a: Colour, b: Colour, part: float) -> Colour:
+def mix_colours(a: Colour, b: Colour, part: float) -> Colour:
     """Return the colour this part of the way from a to b."""
     blue, green, red = (round(x + part * (y - x)) for x, y in zip(a, b, strict=True))
     return (blue, green, red)

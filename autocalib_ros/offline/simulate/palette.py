@@ -97,6 +97,6 @@ THERMAL = Palette(
 )
 
 
-def palette_of(thermal: bool) -> Palette:
+def palette_for(thermal: bool) -> Palette:
     """Return the palette of a kind of camera."""
     return THERMAL if thermal else DAY

@@ -9,12 +9,12 @@ from functools import cached_property
 
 import numpy as np
 
-NODES, WEIGHTS = (a / 2 for a in np.polynomial.legendre.leggauss(16))
-NODES = NODES + 0.5
+GAUSS_NODES, GAUSS_WEIGHTS = (a / 2 for a in np.polynomial.legendre.leggauss(16))
+GAUSS_NODES = GAUSS_NODES + 0.5
 """Quadrature on 0..1: exact to a nanometre for pieces that turn by less than a full circle."""
-SPIRAL_SHARE = 0.125
+SPIRAL_FRACTION = 0.125
 """Part of a turn that each of its two clothoids takes; the arc between them takes the rest."""
-SOLVER_STEPS = 8
+NEWTON_STEPS = 8
 """Newton steps until a length is found to a micrometre."""
 
 Pose = tuple[float, float, float]
@@ -22,7 +22,7 @@ Pose = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
-class Piece:
+class PathSegment:
     """A line, an arc or a clothoid; positive curvature (1/m) turns left.
 
     sharpness: change of the curvature per metre.
@@ -38,8 +38,8 @@ class Piece:
     def at(self, s: np.ndarray | float) -> np.ndarray:
         """Return (x, y, heading) rows (..., 3) at arc lengths s, extended beyond both ends."""
         s = np.asarray(s, float)
-        between = self._heading(s[..., None] * NODES)
-        dx, dy = s * (np.cos(between) @ WEIGHTS), s * (np.sin(between) @ WEIGHTS)
+        between = self._heading(s[..., None] * GAUSS_NODES)
+        dx, dy = s * (np.cos(between) @ GAUSS_WEIGHTS), s * (np.sin(between) @ GAUSS_WEIGHTS)
         return np.stack([self.x + dx, self.y + dy, self._heading(s)], -1)
 
     def end(self) -> Pose:
@@ -53,7 +53,7 @@ class Piece:
         return not self.curvature and not self.sharpness
 
     @property
-    def sharpest(self) -> float:
+    def max_curvature(self) -> float:
         """Its largest curvature without sign."""
         return max(abs(self.curvature), abs(self.curvature + self.sharpness * self.length))
 
@@ -65,84 +65,84 @@ class Piece:
 class Path:
     """Pieces joined end to end, addressed by arc length from start_s on."""
 
-    pieces: tuple[Piece, ...]
+    segments: tuple[PathSegment, ...]
     start_s: float = 0.0
 
     @cached_property
     def starts(self) -> np.ndarray:
         """Arc length at which each piece starts."""
-        return self.start_s + np.concatenate([[0.0], np.cumsum([p.length for p in self.pieces[:-1]])])
+        return self.start_s + np.concatenate([[0.0], np.cumsum([p.length for p in self.segments[:-1]])])
 
     @cached_property
     def length(self) -> float:
         """Length in metres."""
-        return float(sum(p.length for p in self.pieces))
+        return float(sum(p.length for p in self.segments))
 
     @property
     def straight(self) -> bool:
         """Whether it is one line."""
-        return all(piece.straight for piece in self.pieces)
+        return all(segment.straight for segment in self.segments)
 
     def at(self, s: np.ndarray | float) -> np.ndarray:
         """Return (x, y, heading) rows (..., 3) at arc lengths s; ends go on as they are."""
         s = np.asarray(s, float)
         starts = self.starts
-        if len(self.pieces) == 1:
-            return self.pieces[0].at(s - starts[0])
-        index = np.clip(np.searchsorted(starts, s, side='right') - 1, 0, len(self.pieces) - 1)
+        if len(self.segments) == 1:
+            return self.segments[0].at(s - starts[0])
+        index = np.clip(np.searchsorted(starts, s, side='right') - 1, 0, len(self.segments) - 1)
         out = np.empty((*s.shape, 3))
-        for i, piece in enumerate(self.pieces):
+        for i, segment in enumerate(self.segments):
             here = index == i
             if here.any():
-                out[here] = piece.at(s[here] - starts[i])
+                out[here] = segment.at(s[here] - starts[i])
         return out
 
     def curves(self) -> list[tuple[float, float, float]]:
         """Return (start, end, least radius) of every piece that is not straight."""
         return [
-            (float(start), float(start) + p.length, 1.0 / p.sharpest)
-            for start, p in zip(self.starts, self.pieces, strict=True)
+            (float(start), float(start) + p.length, 1.0 / p.max_curvature)
+            for start, p in zip(self.starts, self.segments, strict=True)
             if not p.straight
         ]
 
 
-def line(heading: float, offset: float, reach_m: float, about: tuple[float, float] = (0.0, 0.0)) -> Piece:
+def straight_lane(heading: float, offset: float, reach_m: float, about: tuple[float, float] = (0.0, 0.0)) -> PathSegment:
     """Return a lane: parallel to a heading through a point, offset to its left, reach_m both ways."""
     c, s = math.cos(heading), math.sin(heading)
     x, y = about[0] - reach_m * c - offset * s, about[1] - reach_m * s + offset * c
-    return Piece(x, y, heading, 2 * reach_m)
+    return PathSegment(x, y, heading, 2 * reach_m)
 
 
-def chained(start: Pose, spans: Iterable[tuple[float, float, float]]) -> tuple[Piece, ...]:
+def chain_segments(start: Pose, spans: Iterable[tuple[float, float, float]]) -> tuple[PathSegment, ...]:
     """Return pieces end to end: spans are (length, curvature where it begins, where it ends)."""
-    pieces = []
+    segments = []
     for length, first, last in spans:
-        pieces.append(Piece(*start, length, first, (last - first) / length if length else 0.0))
-        start = pieces[-1].end()
-    return tuple(pieces)
+        segments.append(PathSegment(*start, length, first, (last - first) / length if length else 0.0))
+        start = segments[-1].end()
+    return tuple(segments)
 
 
-def turn(start: Pose, radius: float, deflection: float) -> tuple[Piece, ...]:
+def clothoid_turn(start: Pose, radius: float, deflection: float) -> tuple[PathSegment, ...]:
     """Return clothoid, arc and clothoid that turn by a signed angle; radius is that of the arc."""
     curvature = math.copysign(1.0 / radius, deflection)
-    spiral = 2 * SPIRAL_SHARE * abs(deflection) * radius
-    arc = (1 - 2 * SPIRAL_SHARE) * abs(deflection) * radius
-    return chained(start, [(spiral, 0.0, curvature), (arc, curvature, curvature), (spiral, curvature, 0.0)])
+    spiral = 2 * SPIRAL_FRACTION * abs(deflection) * radius
+    arc = (1 - 2 * SPIRAL_FRACTION) * abs(deflection) * radius
+    return chain_segments(start, [(spiral, 0.0, curvature), (arc, curvature, curvature), (spiral, curvature, 0.0)])
 
 
 def tangent_per_radius(deflection: float) -> float:
     """Return how far before the corner of its tangents a turn of radius 1 begins."""
-    return turn((0.0, 0.0, 0.0), 1.0, abs(deflection))[-1].end()[0] / (1 + math.cos(deflection))
+    return clothoid_turn((0.0, 0.0, 0.0), 1.0, abs(deflection))[-1].end()[0] / (1 + math.cos(deflection))
 
 
 def apex_per_radius(deflection: float) -> float:
     """Return how far from the corner of its tangents a turn of radius 1 passes."""
-    middle = Path(turn((0.0, 0.0, 0.0), 1.0, abs(deflection)))
+    middle = Path(clothoid_turn((0.0, 0.0, 0.0), 1.0, abs(deflection)))
     x, y, _ = middle.at(middle.length / 2).tolist()
     return math.hypot(x - tangent_per_radius(deflection), y)
 
 
-def corner(first: Piece, last: Piece) -> tuple[float, float]:
+def line_intersection(first: PathSegment, last: PathSegment) -> tuple[float, float]:
     """Return where two lines meet, as the distance along each."""
     directions = np.array([[math.cos(p.heading), math.sin(p.heading)] for p in (first, last)])
     gap = np.array([last.x - first.x, last.y - first.y])
@@ -150,30 +150,30 @@ def corner(first: Piece, last: Piece) -> tuple[float, float]:
     return along, back
 
 
-def joined(first: Piece, last: Piece, radius: float) -> Path:
+def join_lines(first: PathSegment, last: PathSegment, radius: float) -> Path:
     """Return the path along one line, through a turn of a radius, and along another line."""
     deflection = math.remainder(last.heading - first.heading, 2 * math.pi)
     tangent = radius * tangent_per_radius(deflection)
-    along, back = corner(first, last)
-    lead = Piece(first.x, first.y, first.heading, along - tangent)
-    curve = turn(lead.end(), radius, deflection)
-    return Path((lead, *curve, Piece(*curve[-1].end(), last.length - back - tangent)))
+    along, back = line_intersection(first, last)
+    lead = PathSegment(first.x, first.y, first.heading, along - tangent)
+    curve = clothoid_turn(lead.end(), radius, deflection)
+    return Path((lead, *curve, PathSegment(*curve[-1].end(), last.length - back - tangent)))
 
 
-def lane_change(lane: Piece, begin_s: float, length: float, aside_m: float) -> Path:
+def lane_change(lane: PathSegment, begin_s: float, length: float, aside_m: float) -> Path:
     """Return a lane that is left at begin_s for one aside_m to its left, over a length."""
-    lead = Piece(lane.x, lane.y, lane.heading, begin_s)
+    lead = PathSegment(lane.x, lane.y, lane.heading, begin_s)
     curvature = 8 * aside_m / length**2
-    for _ in range(SOLVER_STEPS):
+    for _ in range(NEWTON_STEPS):
         shift = _swerve((0.0, 0.0, 0.0), length, curvature)[-1].end()[1]
         curvature *= aside_m / shift
     swerve = _swerve(lead.end(), length, curvature)
     gone = _swerve((0.0, 0.0, 0.0), length, curvature)[-1].end()[0]
-    return Path((lead, *swerve, Piece(*swerve[-1].end(), lane.length - begin_s - gone)))
+    return Path((lead, *swerve, PathSegment(*swerve[-1].end(), lane.length - begin_s - gone)))
 
 
-def _swerve(start: Pose, length: float, curvature: float) -> tuple[Piece, ...]:
+def _swerve(start: Pose, length: float, curvature: float) -> tuple[PathSegment, ...]:
     """Return four clothoids that turn one way and back again."""
     quarter = length / 4
-    return chained(start, [(quarter, 0.0, curvature), (quarter, curvature, 0.0),
+    return chain_segments(start, [(quarter, 0.0, curvature), (quarter, curvature, 0.0),
                            (quarter, 0.0, -curvature), (quarter, -curvature, 0.0)])

@@ -12,13 +12,13 @@ from autocalib_ros.offline.simulate import paint
 from autocalib_ros.offline.simulate.faces import Faces, Texture
 from autocalib_ros.offline.simulate.network import CROSSING_WIDTH_M, Network, Road
 from autocalib_ros.offline.simulate.options import SimulationOptions
-from autocalib_ros.offline.simulate.palette import palette_of
+from autocalib_ros.offline.simulate.palette import palette_for
 
 _WALK_RANGE_M = 45.0
 
 
 @dataclass(frozen=True)
-class Person:
+class Pedestrian:
     """Somebody who walks along a line, again and again (period_s) or within a time span."""
 
     start: tuple[float, float]
@@ -44,9 +44,9 @@ class Person:
         return self.start[0] + way * c - aside * s, self.start[1] + way * s + aside * c, step
 
 
-def people_of(
-    network: Network, greens: tuple[tuple[str, float, float], ...], options: SimulationOptions
-) -> tuple[Person, ...]:
+def spawn_pedestrians(
+    network: Network, green_phases: tuple[tuple[str, float, float], ...], options: SimulationOptions
+) -> tuple[Pedestrian, ...]:
     """Return the people of a recording: walkers on the pavements, and some who cross."""
     if options.empty or not options.pedestrians or network.rural:
         return ()
@@ -54,15 +54,15 @@ def people_of(
     walkers = [_walker(network, rng) for _ in range(options.pedestrians)]
     crossing = [
         _crosser(network, name, start, rng)
-        for name, start, _ in greens
+        for name, start, _ in green_phases
         if name.startswith('main') and start > -20.0
         for _ in range(max(1, options.pedestrians // 4))
     ]
     return tuple(walkers + crossing)
 
 
-def faces_of(
-    person: Person, place: tuple[float, float, float], viewer_xy: np.ndarray, thermal: bool
+def figure_faces(
+    person: Pedestrian, place: tuple[float, float, float], viewer_xy: np.ndarray, thermal: bool
 ) -> Faces:
     """Return upright rectangles that face the viewer (2,): legs, trunk, arms, head."""
     x, y, step = place
@@ -98,18 +98,18 @@ def faces_of(
 
 @lru_cache(maxsize=64)
 def _textures(clothes: int, thermal: bool) -> tuple[Texture, ...]:
-    palette = palette_of(thermal)
+    palette = palette_for(thermal)
     rng = np.random.default_rng([clothes, 5])
     coat = palette.clothes[clothes % len(palette.clothes)]
     legs = palette.clothes[(clothes * 3 + 1) % len(palette.clothes)]
     pictures = []
     for colour, size in (
-        (legs, (40, 10)), (paint.mixed(legs, palette.trim, 0.3), (40, 10)), (coat, (36, 24)),
+        (legs, (40, 10)), (paint.mix_colours(legs, palette.trim, 0.3), (40, 10)), (coat, (36, 24)),
         (coat, (32, 8)), (coat, (32, 8)), (palette.skin, (14, 12)),
     ):
-        picture = paint.filled(*size, colour)
+        picture = paint.filled_image(*size, colour)
         octaves = ((2.0, 6.0 * palette.texture), (8.0, 8.0 * palette.texture))
-        paint.roughen(picture, paint.grain(*size, octaves, rng))
+        paint.add_noise(picture, paint.octave_noise(*size, octaves, rng))
         pictures.append(picture)
     alpha = np.zeros((14, 12), np.uint8)
     paint.disc(alpha, (6.0, 7.0), 6.0, (255,))
@@ -123,7 +123,7 @@ def _arm(road: Road, rng: np.random.Generator) -> float:
     return arm if road.reaches(arm * _WALK_RANGE_M) else -arm
 
 
-def _walker(network: Network, rng: np.random.Generator) -> Person:
+def _walker(network: Network, rng: np.random.Generator) -> Pedestrian:
     """Somebody on a pavement, from one end of the view to the other and back at the start."""
     road = network.roads[int(rng.integers(len(network.roads)))]
     side = float(rng.choice([-1.0, 1.0]))
@@ -138,7 +138,7 @@ def _walker(network: Network, rng: np.random.Generator) -> Person:
     begin = ends[0] if forward else ends[1]
     length = ends[1] - ends[0]
     speed = float(rng.uniform(1.0, 1.6))
-    return Person(
+    return Pedestrian(
         tuple(road.at(begin, offset).tolist()),
         road.heading(begin) + (0 if forward else math.pi), length, speed,
         -float(rng.uniform(0, length / speed)), length / speed,
@@ -146,7 +146,7 @@ def _walker(network: Network, rng: np.random.Generator) -> Person:
     )
 
 
-def _crosser(network: Network, green: str, start_s: float, rng: np.random.Generator) -> Person:
+def _crosser(network: Network, green: str, start_s: float, rng: np.random.Generator) -> Pedestrian:
     """Somebody who crosses the road that is not the one with green."""
     other = 1 - int(green[-1])
     road = network.roads[other]
@@ -156,7 +156,7 @@ def _crosser(network: Network, green: str, start_s: float, rng: np.random.Genera
     along = arm * (centre + rng.uniform(-1.2, 1.2))
     across = side * (road.half_width_m + 0.5)
     heading = road.heading(along) + (-side) * math.pi / 2
-    return Person(
+    return Pedestrian(
         tuple(road.at(along, across).tolist()), heading, 2 * road.half_width_m + 1.0,
         float(rng.uniform(1.3, 1.7)), start_s + float(rng.uniform(0.0, 2.0)), None,
         float(rng.uniform(1.55, 1.9)), int(rng.integers(15)),

@@ -8,14 +8,14 @@ from scipy.optimize import brentq
 
 from autocalib_ros.offline.simulate.network import (
     ARM_LENGTH_M,
-    RURAL_LANE_M,
+    RURAL_LANE_WIDTH_M,
     Circulation,
     Network,
     Roundabout,
     Route,
     straight_road,
 )
-from autocalib_ros.offline.simulate.paths import Path, Piece, chained, line
+from autocalib_ros.offline.simulate.paths import Path, PathSegment, chain_segments, straight_lane
 
 RING_RADIUS_M = 19.0
 """Of the path on the ring of a roundabout."""
@@ -28,7 +28,7 @@ RING_SPIRAL_M = 7.0
 
 def roundabout(turning_fraction: float) -> Network:
     """Return a ring with four arms of a lane each way; who enters gives way."""
-    half = RURAL_LANE_M
+    half = RURAL_LANE_WIDTH_M
     edges = ((-half, 'edge'), (half, 'edge'), (0.0, 'solid'))
     ring = Roundabout(RING_RADIUS_M + RING_WIDTH_M / 2, RING_RADIUS_M - RING_WIDTH_M / 2)
     stop_m = ring.outer_m + 1.5
@@ -48,26 +48,26 @@ def roundabout(turning_fraction: float) -> Network:
 
 def _ring_route(heading: float, exits: int, share: float, stop_m: float) -> Route:
     """Return the route that enters with a heading and leaves at the first, second or third exit."""
-    offset = -RURAL_LANE_M / 2
+    offset = -RURAL_LANE_WIDTH_M / 2
     entry, before_m, joined_rad = _entry(offset)
-    lane = line(heading, offset, ARM_LENGTH_M)
-    lead = Piece(lane.x, lane.y, heading, ARM_LENGTH_M - before_m)
+    lane = straight_lane(heading, offset, ARM_LENGTH_M)
+    lead = PathSegment(lane.x, lane.y, heading, ARM_LENGTH_M - before_m)
     # Exit k lies k quarters round from the arm of entry; the way out is the way in, mirrored.
     around = exits * math.pi / 2 - 2 * joined_rad
     curvature = 1 / RING_RADIUS_M
     spans = [*entry, (around * RING_RADIUS_M, curvature, curvature)]
     spans += [(length, last, first) for length, first, last in reversed(entry)]
-    curve = chained(lead.end(), spans)
-    path = Path((lead, *curve, Piece(*curve[-1].end(), ARM_LENGTH_M - before_m)))
-    joins_s = float(path.starts[1 + len(entry)])
-    leaves_s = joins_s + around * RING_RADIUS_M
+    curve = chain_segments(lead.end(), spans)
+    path = Path((lead, *curve, PathSegment(*curve[-1].end(), ARM_LENGTH_M - before_m)))
+    entry_s = float(path.starts[1 + len(entry)])
+    exit_s = entry_s + around * RING_RADIUS_M
     leave = heading + math.pi + exits * math.pi / 2
     return Route(
         path=path, approach=f'in {math.degrees(heading):.0f}',
         leave=f'out {math.degrees(leave) % 360:.0f}',
         movement={1: 'right', 2: 'straight', 3: 'left'}[exits], share=share,
-        stop_s=ARM_LENGTH_M - stop_m, split_s=leaves_s + 4.0,
-        ring=Circulation(joins_s, leaves_s, (heading + math.pi + joined_rad) * RING_RADIUS_M,
+        stop_s=ARM_LENGTH_M - stop_m, diverge_s=exit_s + 4.0,
+        ring=Circulation(entry_s, exit_s, (heading + math.pi + joined_rad) * RING_RADIUS_M,
                          2 * math.pi * RING_RADIUS_M),
         narrow=True,
     )
@@ -86,7 +86,7 @@ def _entry(offset: float) -> tuple[list[tuple[float, float, float]], float, floa
 
     def centre(arc_m: float) -> tuple[float, float, float]:
         """Return the middle of the ring as seen from where the spans begin, and their turn."""
-        x, y, heading = chained((0.0, 0.0, 0.0), spans(arc_m))[-1].end()
+        x, y, heading = chain_segments((0.0, 0.0, 0.0), spans(arc_m))[-1].end()
         return x - RING_RADIUS_M * math.sin(heading), y + RING_RADIUS_M * math.cos(heading), heading
 
     arc_m = brentq(lambda arc: centre(arc)[1] + offset, 0.1, ENTRY_RADIUS_M * math.pi / 2)

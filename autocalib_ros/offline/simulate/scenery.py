@@ -7,26 +7,26 @@ import math
 import numpy as np
 
 from autocalib_ros.offline.simulate import paint
-from autocalib_ros.offline.simulate.faces import Faces, Texture, join
-from autocalib_ros.offline.simulate.ground_surface import PAVEMENT_M, edge_distance
+from autocalib_ros.offline.simulate.faces import Faces, Texture, concatenate_faces
+from autocalib_ros.offline.simulate.ground_surface import PAVEMENT_WIDTH_M, edge_distance
 from autocalib_ros.offline.simulate.network import Network, Road
 from autocalib_ros.offline.simulate.palette import Palette
 
 _TEXELS_PER_M = 24
 _PANEL_M = 6.0
-_LAMPS_M = np.arange(-105.0, 106.0, 30.0)
-_BARRIER_M = 0.8
+_LAMP_POSITIONS_M = np.arange(-105.0, 106.0, 30.0)
+_BARRIER_HEIGHT_M = 0.8
 _BARRIER_REACH_M = 300.0
 _BARRIER_PANEL_M = 6.0
 
 
-def scenery_of(
+def build_scenery(
     network: Network, viewpoint: np.ndarray, palette: Palette, seed: int
 ) -> Faces:
     """Return all standing things; viewpoint (2,) is the foot of the camera, kept in the clear."""
     rng = np.random.default_rng([seed, 4])
     parts: list[Faces] = []
-    crowns = [crown(palette, rng) for _ in range(6)]
+    crowns = [foliage_texture(palette, rng) for _ in range(6)]
     for road in network.roads:
         for side in (1, -1):
             if not network.rural:
@@ -34,10 +34,10 @@ def scenery_of(
             parts += _trees(road, side, network, viewpoint, palette, crowns, rng)
             parts += _poles(road, side, network, viewpoint, palette)
     parts += _barriers(network, palette)
-    return join(parts)
+    return concatenate_faces(parts)
 
 
-def _clear(network: Network, viewpoint: np.ndarray, points: np.ndarray, kerb_m: float,
+def _is_unobstructed(network: Network, viewpoint: np.ndarray, points: np.ndarray, kerb_m: float,
            camera_m: float) -> bool:
     """Tell whether points (n, 2) keep off the roads, the camera and its view of the centre."""
     if edge_distance(network, points).min() < kerb_m:
@@ -57,15 +57,15 @@ def _buildings(road: Road, side: int, network: Network, viewpoint: np.ndarray, p
         length, depth = rng.uniform(14, 22), rng.uniform(10, 14)
         height = float(rng.choice([6.4, 9.6, 12.8]))
         wall = palette.walls[int(rng.integers(len(palette.walls)))]
-        aside = side * (road.half_width_m + PAVEMENT_M + rng.uniform(3.0, 6.0) + depth / 2)
+        aside = side * (road.half_width_m + PAVEMENT_WIDTH_M + rng.uniform(3.0, 6.0) + depth / 2)
         centre = road.at(along, aside)
-        box = _ring(centre, road.heading(along), length, depth)
-        if _clear(network, viewpoint, _dense(box), PAVEMENT_M + 1.0, 20.0):
-            parts.append(_block(box, height, wall, palette, rng))
+        box = _rectangle(centre, road.heading(along), length, depth)
+        if _is_unobstructed(network, viewpoint, _perimeter_points(box), PAVEMENT_WIDTH_M + 1.0, 20.0):
+            parts.append(_building(box, height, wall, palette, rng))
     return parts
 
 
-def _ring(centre: np.ndarray, heading: float, length: float, depth: float) -> np.ndarray:
+def _rectangle(centre: np.ndarray, heading: float, length: float, depth: float) -> np.ndarray:
     """Return the four corners (4, 2) of a rectangle, counter-clockwise."""
     axis = np.array([math.cos(heading), math.sin(heading)]) * length / 2
     normal = np.array([-math.sin(heading), math.cos(heading)]) * depth / 2
@@ -73,13 +73,13 @@ def _ring(centre: np.ndarray, heading: float, length: float, depth: float) -> np
                      centre - axis + normal])
 
 
-def _dense(ring: np.ndarray) -> np.ndarray:
+def _perimeter_points(ring: np.ndarray) -> np.ndarray:
     """Return points along the sides of a ring (4, 2)."""
     following = np.roll(ring, -1, axis=0)
     return np.concatenate([ring + f * (following - ring) for f in (0, 0.25, 0.5, 0.75)])
 
 
-def _block(ring: np.ndarray, height: float, wall: tuple[int, int, int], palette: Palette,
+def _building(ring: np.ndarray, height: float, wall: tuple[int, int, int], palette: Palette,
            rng: np.random.Generator) -> Faces:
     """Return a building: walls in panels a few metres wide, and a flat roof."""
     corners, textures = [], []
@@ -90,7 +90,7 @@ def _block(ring: np.ndarray, height: float, wall: tuple[int, int, int], palette:
         for i in range(count):
             corners.append([(*(start + i * step), height), (*step, 0), (0, 0, -height)])
             textures.append(panel)
-    roof = paint.filled(32, 32, paint.mixed(wall, palette.asphalt, 0.5))
+    roof = paint.filled_image(32, 32, paint.mix_colours(wall, palette.asphalt, 0.5))
     corners.append([(*ring[3], height), (*(ring[2] - ring[3]), 0), (*(ring[0] - ring[3]), 0)])
     textures.append(Texture(roof))
     return Faces(np.array(corners, float), tuple(textures))
@@ -100,15 +100,15 @@ def _wall_texture(height: float, wall: tuple[int, int, int], palette: Palette,
                   rng: np.random.Generator) -> Texture:
     """Paint one panel with two windows to the storey."""
     rows, columns = round(height * _TEXELS_PER_M), round(_PANEL_M * _TEXELS_PER_M)
-    picture = paint.filled(rows, columns, wall)
+    picture = paint.filled_image(rows, columns, wall)
     octaves = [(s, 5.0 * palette.texture) for s in (1.5, 5.0, 20.0)]
-    paint.roughen(picture, paint.grain(rows, columns, octaves, rng))
+    paint.add_noise(picture, paint.octave_noise(rows, columns, octaves, rng))
     storey = 3.2 * _TEXELS_PER_M
     for top in np.arange(0.8 * _TEXELS_PER_M, rows - storey / 2, storey):
         for left in (0.12, 0.60):
             x0, x1 = left * columns, (left + 0.27) * columns
             y0, y1 = top, top + 1.5 * _TEXELS_PER_M
-            glass = paint.mixed(palette.window, palette.sky_low, float(rng.uniform(0, 0.5)))
+            glass = paint.mix_colours(palette.window, palette.sky_low, float(rng.uniform(0, 0.5)))
             box = np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)])
             frame = box + [(-2, -2), (2, -2), (2, 2), (-2, 2)]
             paint.polygon(picture, frame, (*palette.kerb, 255))
@@ -117,7 +117,7 @@ def _wall_texture(height: float, wall: tuple[int, int, int], palette: Palette,
     return Texture(picture)
 
 
-def upright(place: np.ndarray, viewpoint: np.ndarray, width: float, low: float,
+def billboard(place: np.ndarray, viewpoint: np.ndarray, width: float, low: float,
              high: float) -> list[tuple[float, ...]]:
     """Return an upright rectangle that faces the camera."""
     away = place - viewpoint
@@ -129,30 +129,30 @@ def _trees(road: Road, side: int, network: Network, viewpoint: np.ndarray, palet
            crowns: list[Texture], rng: np.random.Generator) -> list[Faces]:
     parts = []
     for along in np.arange(-100.0, 101.0, 11.0):
-        aside = side * (road.half_width_m + PAVEMENT_M + rng.uniform(0.5, 2.0))
+        aside = side * (road.half_width_m + PAVEMENT_WIDTH_M + rng.uniform(0.5, 2.0))
         place = road.at(along + rng.uniform(-3, 3), aside)
         height = rng.uniform(4.5, 8.0)
-        if not road.reaches(along) or not _clear(network, viewpoint, place[None], PAVEMENT_M - 0.2, 14.0):
+        if not road.reaches(along) or not _is_unobstructed(network, viewpoint, place[None], PAVEMENT_WIDTH_M - 0.2, 14.0):
             continue
         width = 0.7 * height
-        corners = [upright(place, viewpoint, 0.25, 0.0, 0.5 * height),
-                   upright(place, viewpoint, width, 0.3 * height, height)]
-        trunk = Texture(paint.filled(32, 4, palette.trunk))
+        corners = [billboard(place, viewpoint, 0.25, 0.0, 0.5 * height),
+                   billboard(place, viewpoint, width, 0.3 * height, height)]
+        trunk = Texture(paint.filled_image(32, 4, palette.trunk))
         parts.append(Faces(np.array(corners), (trunk, crowns[int(rng.integers(len(crowns)))])))
     return parts
 
 
-def crown(palette: Palette, rng: np.random.Generator) -> Texture:
+def foliage_texture(palette: Palette, rng: np.random.Generator) -> Texture:
     """Paint leaves: overlapping discs, lit from above."""
     size = 128
-    picture = paint.filled(size, size, palette.foliage)
+    picture = paint.filled_image(size, size, palette.foliage)
     alpha = np.zeros((size, size), np.uint8)
     for _ in range(160):
         angle, radius = rng.uniform(0, 2 * np.pi), 0.40 * np.sqrt(rng.uniform())
         x, y = 0.5 + radius * np.cos(angle), 0.5 + radius * np.sin(angle)
         light = (0.45 - y) + rng.normal(0, 0.15)
         other = palette.sky_low if light > 0 else palette.trim
-        colour = paint.mixed(palette.foliage, other, min(0.5, abs(light) * 0.5))
+        colour = paint.mix_colours(palette.foliage, other, min(0.5, abs(light) * 0.5))
         centre, spread = (x * size, y * size), rng.uniform(0.04, 0.10) * size
         paint.disc(picture, centre, spread, (*colour, 255))
         paint.disc(alpha, centre, spread, (255,))
@@ -163,11 +163,11 @@ def crown(palette: Palette, rng: np.random.Generator) -> Texture:
 def _poles(road: Road, side: int, network: Network, viewpoint: np.ndarray,
            palette: Palette) -> list[Faces]:
     """Street lamps along the road and signal posts at the stop lines."""
-    metal = Texture(paint.filled(32, 4, palette.pole))
-    head = paint.filled(48, 16, palette.trim)
+    metal = Texture(paint.filled_image(32, 4, palette.pole))
+    head = paint.filled_image(48, 16, palette.trim)
     for i, colour in enumerate(((40, 40, 200), (40, 160, 200), (80, 180, 60))):
-        paint.disc(head, (8.0, 8.0 + 16 * i), 5.0, (*paint.mixed(palette.trim, colour, 0.4), 255))
-    plans = [(along, 0.6, 0.14, 8.0) for along in _LAMPS_M]
+        paint.disc(head, (8.0, 8.0 + 16 * i), 5.0, (*paint.mix_colours(palette.trim, colour, 0.4), 255))
+    plans = [(along, 0.6, 0.14, 8.0) for along in _LAMP_POSITIONS_M]
     if network.phases:
         plans += [(side * network.stop_m, 0.5, 0.16, 4.2)]
     parts = []
@@ -177,9 +177,9 @@ def _poles(road: Road, side: int, network: Network, viewpoint: np.ndarray,
             continue
         if edge_distance(network, place) < 0.2 or np.hypot(*(place - viewpoint)) < 9.0:
             continue
-        corners, textures = [upright(place, viewpoint, width, 0.0, height)], [metal]
+        corners, textures = [billboard(place, viewpoint, width, 0.0, height)], [metal]
         if height < 5.0:
-            corners.append(upright(place, viewpoint, 0.36, height - 1.0, height + 0.1))
+            corners.append(billboard(place, viewpoint, 0.36, height - 1.0, height + 0.1))
             textures.append(Texture(head))
         parts.append(Faces(np.array(corners), tuple(textures)))
     return parts
@@ -187,25 +187,25 @@ def _poles(road: Road, side: int, network: Network, viewpoint: np.ndarray,
 
 def _barriers(network: Network, palette: Palette) -> list[Faces]:
     """Return concrete crash barriers along the first road."""
-    concrete = Texture(paint.filled(16, 16, palette.kerb))
+    concrete = Texture(paint.filled_image(16, 16, palette.kerb))
     parts = []
     for aside in network.barriers_m:
         for along in np.arange(-_BARRIER_REACH_M, _BARRIER_REACH_M, _BARRIER_PANEL_M):
             a, b = network.roads[0].at(np.array([along, along + _BARRIER_PANEL_M]), aside)
             left = (b - a)[::-1] * (-1, 1) / _BARRIER_PANEL_M * 0.15
             step = (*(b - a), 0.0)
-            faces = [[(*(a + side * left), _BARRIER_M), step, (0.0, 0.0, -_BARRIER_M)] for side in (1, -1)]
-            faces.append([(*(a + left), _BARRIER_M), step, (*(-2 * left), 0.0)])
+            faces = [[(*(a + side * left), _BARRIER_HEIGHT_M), step, (0.0, 0.0, -_BARRIER_HEIGHT_M)] for side in (1, -1)]
+            faces.append([(*(a + left), _BARRIER_HEIGHT_M), step, (*(-2 * left), 0.0)])
             parts.append(Faces(np.array(faces), (concrete,) * 3))
     return parts
 
 
-def lamp_places(network: Network) -> list[tuple[float, float]]:
+def street_lamp_positions(network: Network) -> list[tuple[float, float]]:
     """Return the ground points (x, y) under the street lamps."""
     places = []
     for road in network.roads:
         for side in (1, -1):
-            for along in filter(road.reaches, _LAMPS_M):
+            for along in filter(road.reaches, _LAMP_POSITIONS_M):
                 x, y = road.at(along, side * (road.half_width_m - 1.5)).tolist()
                 places.append((x, y))
     return places

@@ -10,26 +10,26 @@ from autocalib_ros.offline.simulate.motorway import highway
 from autocalib_ros.offline.simulate.network import (
     ARM_LENGTH_M,
     LANE_WIDTH_M,
-    RURAL_LANE_M,
+    RURAL_LANE_WIDTH_M,
     Network,
     Road,
     Route,
     straight_road,
 )
 from autocalib_ros.offline.simulate.options import SimulationOptions
-from autocalib_ros.offline.simulate.paths import Path, apex_per_radius, joined, line
+from autocalib_ros.offline.simulate.paths import Path, apex_per_radius, join_lines, straight_lane
 from autocalib_ros.offline.simulate.roundabout import roundabout
 
-SPARSE_SHARE = 1 / 15
+SPARSE_TRAFFIC_FACTOR = 1 / 15
 """Of the traffic of a junction: a vehicle every ten to fifteen seconds on all its arms together."""
 
 BEND_RADIUS_M = 80.0
 BEND_DEG = 80.0
 
 
-def network_of(options: SimulationOptions) -> Network:
+def build_network(options: SimulationOptions) -> Network:
     """Return the road network that the options ask for."""
-    angle = math.radians(options.crossing_deg)
+    angle = math.radians(options.road_crossing_deg)
     turning = options.turning_fraction
     if options.scene == 'highway':
         return highway(options.one_way, turning)
@@ -40,7 +40,7 @@ def network_of(options: SimulationOptions) -> Network:
     if options.one_way or options.scene == 'road':
         return single_road(one_way=options.one_way)
     if options.scene == 'sparse':
-        return with_traffic(junction(angle, turning), SPARSE_SHARE)
+        return scale_traffic(junction(angle, turning), SPARSE_TRAFFIC_FACTOR)
     return junction(angle, turning, tee=options.scene == 'tee')
 
 
@@ -50,7 +50,7 @@ def single_road(one_way: bool) -> Network:
     routes = []
     for i in offsets:
         heading = 0.0 if one_way or i < 0 else math.pi
-        lane = line(heading, math.copysign(i, -1 if heading else i) * LANE_WIDTH_M, ARM_LENGTH_M)
+        lane = straight_lane(heading, math.copysign(i, -1 if heading else i) * LANE_WIDTH_M, ARM_LENGTH_M)
         name = f'lane{i:+g}'
         routes.append(Route(Path((lane,)), name, name, 'straight', 1.0))
     # Near enough to fill the picture, and looking across the road, not along it.
@@ -70,14 +70,14 @@ def _lanes(one_way: bool, width_m: float) -> tuple[list[float], float, tuple[tup
     return offsets, half, tuple(edges)
 
 
-def with_traffic(network: Network, share: float) -> Network:
+def scale_traffic(network: Network, share: float) -> Network:
     """Return a network with a multiple of its traffic."""
     return replace(network, routes=tuple(replace(r, share=share * r.share) for r in network.routes))
 
 
 def bend(one_way: bool) -> Network:
     """Return a country road that bends to the left, its middle at the origin and along x there."""
-    offsets, half, edges = _lanes(one_way, RURAL_LANE_M)
+    offsets, half, edges = _lanes(one_way, RURAL_LANE_WIDTH_M)
     turned = math.radians(BEND_DEG)
     along = BEND_RADIUS_M * apex_per_radius(turned)
     axis = _bend_lane(0.0, along, forward=True)
@@ -86,7 +86,7 @@ def bend(one_way: bool) -> Network:
     for i in offsets:
         forward = one_way or i < 0
         name = f'lane{i:+g}'
-        path = _bend_lane(i * RURAL_LANE_M, along, forward)
+        path = _bend_lane(i * RURAL_LANE_WIDTH_M, along, forward)
         routes.append(Route(path, name, name, 'straight', 1.0))
     return Network(
         (Road(axis, half + 0.6, edges),), tuple(routes), (), None, (-6.0, -half - 7.0), 66.0, rural=True
@@ -98,8 +98,8 @@ def _bend_lane(aside_m: float, apex_m: float, forward: bool) -> Path:
     half_turn = math.radians(BEND_DEG) / 2
     # The turn that is as far from the axis in the middle of the bend as on its straights.
     radius = BEND_RADIUS_M - aside_m * (1 / math.cos(half_turn) - 1) / apex_per_radius(2 * half_turn)
-    ends = [line(h, aside_m, ARM_LENGTH_M + 20.0, (0.0, -apex_m)) for h in (-half_turn, half_turn)]
+    ends = [straight_lane(h, aside_m, ARM_LENGTH_M + 20.0, (0.0, -apex_m)) for h in (-half_turn, half_turn)]
     if forward:
-        return joined(ends[0], ends[1], radius)
+        return join_lines(ends[0], ends[1], radius)
     back = [replace(p, x=x, y=y, heading=p.heading + math.pi) for p in ends for x, y, _ in [p.end()]]
-    return joined(back[1], back[0], radius)
+    return join_lines(back[1], back[0], radius)

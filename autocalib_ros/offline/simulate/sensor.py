@@ -7,14 +7,14 @@ import math
 import cv2
 import numpy as np
 
-from autocalib_ros.offline.simulate.microbolometer import NOISE_COUNTS
+from autocalib_ros.offline.simulate.microbolometer import NOISE_COUNTS_PER_LEVEL
 from autocalib_ros.offline.simulate.options import SimulationOptions
 
 _NOISE_MARGIN_PX = 64
 NIGHT_GAIN = 0.28
 
 
-class Noise:
+class SensorNoise:
     """Sensor noise: a crop, at a random place and flipped at random, of one large noise picture."""
 
     def __init__(self, options: SimulationOptions) -> None:
@@ -23,7 +23,7 @@ class Noise:
         sigma = options.noise_sigma * (1.8 if options.night else 1.0)
         channels = 1 if options.thermal else 3
         if options.thermal:
-            sigma *= NOISE_COUNTS
+            sigma *= NOISE_COUNTS_PER_LEVEL
         rng = np.random.default_rng([options.seed, 6])
         shape = (*(n + _NOISE_MARGIN_PX for n in self._size), channels)
         self._bank = np.round(rng.standard_normal(shape, np.float32) * sigma).astype(np.int16)

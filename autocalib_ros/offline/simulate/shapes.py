@@ -7,21 +7,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-Outline = tuple[tuple[float, float], ...]
+Profile = tuple[tuple[float, float], ...]
 
 
 @dataclass(frozen=True)
-class Part:
+class BodyPart:
     """A profile (x, z) from the lower front over the top to the lower rear, and its extrusion.
 
     labels: what each of the len(profile) - 1 strips between neighbouring points shows.
     windows: outlines (x, z) of the side windows.
     """
 
-    profile: Outline
+    profile: Profile
     labels: tuple[str, ...]
     width_m: float
-    windows: tuple[Outline, ...] = ()
+    windows: tuple[Profile, ...] = ()
     lettering: str = ''
     painted: bool = True
 
@@ -32,7 +32,7 @@ class Part:
 
 
 @dataclass(frozen=True)
-class Shape:
+class VehicleShape:
     """One kind of vehicle; share is its part of the traffic."""
 
     kind: str
@@ -40,7 +40,7 @@ class Shape:
     width_m: float
     wheelbase_m: float
     wheel_radius_m: float
-    parts: tuple[Part, ...]
+    parts: tuple[BodyPart, ...]
     share: float
     acceleration_mps2: float
     fits_narrow_turns: bool = True
@@ -60,7 +60,7 @@ def _windows(*spans: tuple[float, float], low: float, high: float, slant: float 
     )
 
 
-_SEDAN = Part(
+_SEDAN = BodyPart(
     profile=(
         (2.25, 0.28), (2.27, 0.68), (1.22, 0.92), (0.48, 1.40), (-0.85, 1.44), (-1.55, 1.02),
         (-2.24, 0.96), (-2.25, 0.30),
@@ -72,7 +72,7 @@ _SEDAN = Part(
         ((-0.03, 0.95), (-0.03, 1.34), (-0.78, 1.36), (-1.30, 1.0)),
     ),
 )
-_HATCH = Part(
+_HATCH = BodyPart(
     profile=(
         (1.95, 0.28), (1.98, 0.72), (1.12, 0.98), (0.40, 1.46), (-1.35, 1.50), (-1.86, 0.95),
         (-1.95, 0.30),
@@ -84,7 +84,7 @@ _HATCH = Part(
         ((-0.08, 1.0), (-0.08, 1.40), (-1.20, 1.42), (-1.50, 1.02)),
     ),
 )
-_WAGON = Part(
+_WAGON = BodyPart(
     profile=(
         (2.30, 0.35), (2.34, 0.92), (1.30, 1.12), (0.62, 1.66), (-1.95, 1.70), (-2.26, 1.12),
         (-2.32, 0.36),
@@ -97,7 +97,7 @@ _WAGON = Part(
         ((-1.05, 1.12), (-1.05, 1.60), (-1.80, 1.60), (-2.02, 1.14)),
     ),
 )
-_VAN = Part(
+_VAN = BodyPart(
     profile=(
         (2.60, 0.35), (2.62, 1.02), (1.95, 1.24), (1.25, 2.02), (-2.52, 2.10), (-2.58, 0.36),
     ),
@@ -106,19 +106,19 @@ _VAN = Part(
     windows=(((1.72, 1.22), (1.20, 1.82), (0.62, 1.86), (0.62, 1.22)),),
     lettering='NORTHSIDE PARCEL',
 )
-_CAB = Part(
+_CAB = BodyPart(
     profile=((3.70, 0.45), (3.74, 1.35), (3.45, 2.45), (2.05, 2.52), (2.05, 0.50)),
     labels=('front', 'screen', 'roof', 'plain'),
     width_m=2.25,
     windows=(((3.30, 1.45), (3.10, 2.20), (2.40, 2.24), (2.40, 1.45)),),
 )
-_CARGO = Part(
+_CARGO = BodyPart(
     profile=((1.90, 0.85), (1.90, 3.25), (-3.75, 3.25), (-3.75, 0.85)),
     labels=('plain', 'tarpaulin', 'doors'),
     width_m=2.40,
     lettering='KESTREL FREIGHT 58',
 )
-_COACH = Part(
+_COACH = BodyPart(
     profile=((5.70, 0.40), (5.72, 1.20), (5.55, 2.95), (-5.62, 3.02), (-5.70, 0.42)),
     labels=('front', 'screen', 'bus_roof', 'rear'),
     width_m=2.50,
@@ -132,15 +132,15 @@ _COACH = Part(
 SHAPES = {
     shape.kind: shape
     for shape in (
-        Shape('sedan', 4.5, 1.78, 2.65, 0.31, (_SEDAN,), 0.27, 1.8),
-        Shape('hatchback', 3.9, 1.72, 2.45, 0.30, (_HATCH,), 0.24, 1.9),
-        Shape('wagon', 4.6, 1.88, 2.75, 0.35, (_WAGON,), 0.20, 1.7),
-        Shape('van', 5.2, 1.98, 3.20, 0.33, (_VAN,), 0.15, 1.5),
-        Shape(
+        VehicleShape('sedan', 4.5, 1.78, 2.65, 0.31, (_SEDAN,), 0.27, 1.8),
+        VehicleShape('hatchback', 3.9, 1.72, 2.45, 0.30, (_HATCH,), 0.24, 1.9),
+        VehicleShape('wagon', 4.6, 1.88, 2.75, 0.35, (_WAGON,), 0.20, 1.7),
+        VehicleShape('van', 5.2, 1.98, 3.20, 0.33, (_VAN,), 0.15, 1.5),
+        VehicleShape(
             'truck', 7.5, 2.40, 4.20, 0.45, (_CAB, _CARGO), 0.09, 1.0, fits_narrow_turns=False,
             top_speed_mps=24.0,
         ),
-        Shape(
+        VehicleShape(
             'bus', 11.4, 2.50, 5.80, 0.46, (_COACH,), 0.05, 1.0, fits_narrow_turns=False,
             top_speed_mps=27.0,
         ),

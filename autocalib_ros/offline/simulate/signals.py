@@ -8,7 +8,7 @@ AMBER_S = 3.0
 ALL_RED_S = 1.0
 
 
-class Signals:
+class SignalController:
     """The lights of one junction; without phases everything is always green."""
 
     def __init__(self, phases: tuple[tuple[str, float], ...], start_s: float) -> None:
@@ -16,7 +16,7 @@ class Signals:
         self._index = 0
         self._start_s = start_s
         self._now = start_s
-        self.greens: list[tuple[str, float, float]] = []
+        self.green_phases: list[tuple[str, float, float]] = []
         self._log()
 
     def update(self, now: float, waiting: Collection[str | None]) -> None:
@@ -43,4 +43,4 @@ class Signals:
     def _log(self) -> None:
         if self._phases:
             name, green_s = self._phases[self._index]
-            self.greens.append((name, self._start_s, self._start_s + green_s))
+            self.green_phases.append((name, self._start_s, self._start_s + green_s))

@@ -9,11 +9,11 @@ import numpy as np
 
 from autocalib_ros.offline.simulate import cyclist_actors as cyclists
 from autocalib_ros.offline.simulate import pedestrian_actors as people
-from autocalib_ros.offline.simulate.lens import CameraPose, look, rotation
-from autocalib_ros.offline.simulate.microbolometer import shut_since
+from autocalib_ros.offline.simulate.lens import CameraPose, look_rotation, rotation_from_vector
+from autocalib_ros.offline.simulate.microbolometer import shutter_closed_since
 from autocalib_ros.offline.simulate.options import SimulationOptions
-from autocalib_ros.offline.simulate.render import Artist, Scene
-from autocalib_ros.offline.simulate.scenes import network_of
+from autocalib_ros.offline.simulate.render import Renderer, SceneState
+from autocalib_ros.offline.simulate.scenes import build_network
 from autocalib_ros.offline.simulate.traffic_flow import simulate_traffic
 from autocalib_ros.offline.simulate.truth import truth_of
 from autocalib_ros.offline.simulate.vehicle_models import Vehicle, VehicleState
@@ -28,35 +28,35 @@ class Simulation:
     def __init__(self, options: SimulationOptions) -> None:
         self.options = options
         self.lens = options.lens
-        self.network = network_of(options)
+        self.network = build_network(options)
         self.traffic = simulate_traffic(self.network, options)
-        self.people = people.people_of(self.network, self.traffic.greens, options)
-        self.cyclists = cyclists.cyclists_of(self.network, options)
+        self.people = people.spawn_pedestrians(self.network, self.traffic.green_phases, options)
+        self.cyclists = cyclists.spawn_cyclists(self.network, options)
         x, y = options.position_m or self.network.viewpoint_m
         yaw = self.network.view_yaw_deg if options.yaw_deg is None else options.yaw_deg
         self.pose = CameraPose(
-            look(yaw, options.pitch_deg, options.roll_deg),
+            look_rotation(yaw, options.pitch_deg, options.roll_deg),
             np.array([x, y, options.camera_height_m]),
         )
         self.yaw_deg = float(yaw)
         self._shake_rad = _shake(options)
-        self._artist: Artist | None = None
+        self._renderer: Renderer | None = None
 
     def frame(self, index: int) -> np.ndarray:
         """Return a frame: BGR (h, w, 3) uint8, or for a thermal camera (h, w) uint16."""
-        return self.artist().frame(self.scene(self._seen(index)))
+        return self.renderer().frame(self.scene(self._shown_index(index)))
 
-    def artist(self) -> Artist:
+    def renderer(self) -> Renderer:
         """Return what draws the pictures; made when first needed."""
-        if self._artist is None:
-            self._artist = Artist(self.options, self.network, self.pose, self.bumped_pose())
-        return self._artist
+        if self._renderer is None:
+            self._renderer = Renderer(self.options, self.network, self.pose, self.bumped_pose())
+        return self._renderer
 
-    def scene(self, index: int) -> Scene:
+    def scene(self, index: int) -> SceneState:
         """Return everything that a frame shows."""
         time_s = self.time_s(index)
         walking = ((person, person.place(time_s)) for person in self.people)
-        return Scene(
+        return SceneState(
             index,
             time_s,
             self.is_bumped(time_s),
@@ -64,12 +64,12 @@ class Simulation:
             self.states(time_s),
             [(person, place) for person, place in walking if place is not None],
             [(cyclist, cyclist.place(time_s)) for cyclist in self.cyclists],
-            shut_since(self.options, time_s) is not None,
+            shutter_closed_since(self.options, time_s) is not None,
         )
 
-    def _seen(self, index: int) -> int:
+    def _shown_index(self, index: int) -> int:
         """Return the frame whose picture is sent: while a shutter freezes the picture, the last before it closed."""
-        closed_s = shut_since(self.options, self.time_s(index))
+        closed_s = shutter_closed_since(self.options, self.time_s(index))
         if closed_s is None or self.options.shutter_shows == 'flat':
             return index
         return math.ceil(closed_s * self.options.rate_hz - 1e-9) - 1
@@ -85,7 +85,7 @@ class Simulation:
     def bumped_pose(self) -> CameraPose:
         """Return the pose of the camera after it was knocked askew."""
         axis = _BUMP_AXIS / np.linalg.norm(_BUMP_AXIS)
-        return self.pose.rotated(rotation(axis * math.radians(self.options.bump_deg)))
+        return self.pose.rotated(rotation_from_vector(axis * math.radians(self.options.bump_deg)))
 
     def resting_pose(self, time_s: float) -> CameraPose:
         """Return the pose at a time without the shake."""
@@ -97,7 +97,7 @@ class Simulation:
 
     def shake(self, index: int) -> np.ndarray:
         """Return the rotation (3, 3) that shakes the camera in a frame."""
-        return rotation(self._shake_rad[index])
+        return rotation_from_vector(self._shake_rad[index])
 
     def states(self, time_s: float) -> list[tuple[Vehicle, VehicleState]]:
         """Return all vehicles under way at a time."""

@@ -14,16 +14,16 @@ import numpy as np
 
 from autocalib_ros.offline.simulate.network import CITY_SPEED_MPS, Network, Route
 from autocalib_ros.offline.simulate.options import SimulationOptions
-from autocalib_ros.offline.simulate.shapes import SHAPES, Shape
-from autocalib_ros.offline.simulate.signals import Signals
-from autocalib_ros.offline.simulate.vehicle_models import STEP_S, Traffic, Vehicle, Wander
+from autocalib_ros.offline.simulate.shapes import SHAPES, VehicleShape
+from autocalib_ros.offline.simulate.signals import SignalController
+from autocalib_ros.offline.simulate.vehicle_models import STEP_S, SimulatedTraffic, Vehicle, Wander
 
 WARM_UP_S = 52.0
 STANDSTILL_GAP_M = 2.0
-COLOURS = 10  # how many body colours a palette has
+COLOUR_COUNT = 10  # how many body colours a palette has
 _BRAKING_MPS2 = 1.5  # for a curve or a ring ahead
 _CRITICAL_GAP_S = 4.0  # drivers enter a ring when nobody will be at their place for so long
-_CLEAR_M = 8.0  # beyond an exit, until a vehicle's tail is clear of the ring
+_EXIT_CLEARANCE_M = 8.0  # beyond an exit, until a vehicle's tail is clear of the ring
 
 
 @dataclass
@@ -31,7 +31,7 @@ class _Driver:
     """A vehicle under way."""
 
     number: int
-    shape: Shape
+    shape: VehicleShape
     colour: int
     route: Route
     wander: Wander
@@ -50,27 +50,27 @@ class _Driver:
         )
 
 
-def simulate_traffic(network: Network, options: SimulationOptions) -> Traffic:
+def simulate_traffic(network: Network, options: SimulationOptions) -> SimulatedTraffic:
     """Simulate the traffic of a whole recording, with a warm-up before its first frame."""
     if options.empty or options.density == 0:
-        return Traffic((), ())
+        return SimulatedTraffic((), ())
     rng = np.random.default_rng([options.seed, 1])
-    signals = Signals(network.phases, -WARM_UP_S)
+    signals = SignalController(network.phases, -WARM_UP_S)
     arrivals = _Arrivals(network.routes, options, rng)
     drivers: list[_Driver] = []
     done: list[Vehicle] = []
     steps = math.ceil((options.duration_s + WARM_UP_S) / STEP_S) + 2
     for i in range(steps):
         now = i * STEP_S - WARM_UP_S
-        signals.update(now, {d.route.signal for d in drivers if _waits(d)})
+        signals.update(now, {d.route.signal for d in drivers if _requests_green(d)})
         arrivals.admit(now, drivers)
-        _advance(drivers, signals)
+        _step_drivers(drivers, signals)
         gone = [d for d in drivers if d.s > d.route.path.length]
         done += [d.vehicle() for d in gone]
         drivers = [d for d in drivers if d.s <= d.route.path.length]
     done += [d.vehicle() for d in drivers if len(d.trace) > 1]
     seen = [v for v in done if v.start_s + len(v.s) * STEP_S > 0.0]
-    return Traffic(tuple(sorted(seen, key=lambda v: v.number)), tuple(signals.greens))
+    return SimulatedTraffic(tuple(sorted(seen, key=lambda v: v.number)), tuple(signals.green_phases))
 
 
 class _Arrivals:
@@ -93,7 +93,7 @@ class _Arrivals:
                 self._waiting.setdefault(route.approach, []).append(route)
                 self._next[i] += self._rng.exponential(1 / rate)
         for queue in self._waiting.values():
-            if queue and (room := _room(queue[0], drivers))[0] > 20.0:
+            if queue and (room := _entry_gap(queue[0], drivers))[0] > 20.0:
                 drivers.append(self._driver(now, queue.pop(0), *room))
 
     def _driver(self, now: float, route: Route, room_m: float, leader_mps: float) -> _Driver:
@@ -106,37 +106,37 @@ class _Arrivals:
         safe = max(0.0, min(cruise, leader_mps + 0.1 * (room_m - 20.0)))
         self._count += 1
         return _Driver(
-            self._count, shape, int(rng.integers(COLOURS)), route,
+            self._count, shape, int(rng.integers(COLOUR_COUNT)), route,
             Wander.draw(self._wander_m, rng, route.speed_mps), cruise, float(rng.uniform(1.0, 1.5)), now,
             shape.length_m / 2, safe,
         )
 
 
-def _room(route: Route, drivers: list[_Driver]) -> tuple[float, float]:
+def _entry_gap(route: Route, drivers: list[_Driver]) -> tuple[float, float]:
     """Return the free way at the start of a route and the speed of the last vehicle there."""
-    inside = [d for d in drivers if d.route.entered & route.entered]
+    inside = [d for d in drivers if d.route.entry_lanes & route.entry_lanes]
     if not inside:
         return math.inf, math.inf
     last = min(inside, key=lambda d: d.s)
     return last.s - last.shape.length_m / 2, last.v
 
 
-def _waits(driver: _Driver) -> bool:
+def _requests_green(driver: _Driver) -> bool:
     """Tell whether a vehicle is before its stop line and close enough to call for a green."""
     ahead = driver.route.stop_s - driver.s
     return math.isfinite(ahead) and 0.0 < ahead < 40.0
 
 
-def _advance(drivers: list[_Driver], signals: Signals) -> None:
+def _step_drivers(drivers: list[_Driver], signals: SignalController) -> None:
     """Move all drivers by one step."""
     if not drivers:
         return
     v = np.array([d.v for d in drivers])
     gap, leader_v = _leaders(drivers)
-    stop = np.array([_stop_gap(d, signals, drivers) for d in drivers])
+    stop = np.array([_stop_line_gap(d, signals, drivers) for d in drivers])
     leader_v = np.where(stop < gap, 0.0, leader_v)
     gap = np.minimum(gap, stop)
-    wish = np.array([min(d.cruise_mps, _curve_limit(d)) for d in drivers])
+    wish = np.array([min(d.cruise_mps, _curve_speed_limit(d)) for d in drivers])
     strength = np.array([d.shape.acceleration_mps2 for d in drivers])
     headway = np.array([d.headway_s for d in drivers])
     free = 1 - (v / wish) ** 4
@@ -157,12 +157,12 @@ def _leaders(drivers: list[_Driver]) -> tuple[np.ndarray, np.ndarray]:
     s = np.array([d.s for d in drivers])
     half = np.array([d.shape.length_m / 2 for d in drivers])
     names = [d.route.approach for d in drivers] + [d.route.leave for d in drivers]
-    approach, leave = np.split(_codes(names), 2)
+    approach, leave = np.split(_integer_codes(names), 2)
     stop = np.array([d.route.stop_s for d in drivers])
     past_line = s > np.minimum(stop, [d.route.path.length for d in drivers])
     left = np.array([d.route.path.length for d in drivers]) - s
     # On the approach lane until the leader's tail has turned off; then towards a shared exit lane.
-    split = np.array([d.route.split_s for d in drivers]) + 2 * half + 1.0
+    split = np.array([d.route.diverge_s for d in drivers]) + 2 * half + 1.0
     same_route = (approach[:, None] == approach) & (leave[:, None] == leave)
     ahead = (approach[:, None] == approach) & (same_route | (s < split)[None, :])
     along = np.where(ahead, s[None, :] - s[:, None], np.inf)
@@ -175,8 +175,8 @@ def _leaders(drivers: list[_Driver]) -> tuple[np.ndarray, np.ndarray]:
     merged = np.where(merging & ~same_route, left[:, None] - left[None, :], np.inf)
     along[along <= 0] = np.inf
     merged[merged <= 0] = np.inf
-    ahead_m = np.minimum(np.minimum(along, merged), _ways_round(drivers))
-    gaps = ahead_m - half[:, None] - half[None, :]
+    distance_ahead_m = np.minimum(np.minimum(along, merged), _ring_distances(drivers))
+    gaps = distance_ahead_m - half[:, None] - half[None, :]
     np.fill_diagonal(gaps, np.inf)
     first = gaps.argmin(1)
     rows = np.arange(len(drivers))
@@ -184,62 +184,62 @@ def _leaders(drivers: list[_Driver]) -> tuple[np.ndarray, np.ndarray]:
     return gaps[rows, first], np.where(np.isfinite(gaps[rows, first]), speeds, 0.0)
 
 
-def _ways_round(drivers: list[_Driver]) -> np.ndarray:
+def _ring_distances(drivers: list[_Driver]) -> np.ndarray:
     """Return the way round a ring (n, n) from each vehicle on it to each one ahead; else inf.
 
     On the ring is who has passed its give-way line and has not left with its tail.
     """
     ways = np.full((len(drivers), len(drivers)), np.inf)
-    on_ring = [i for i, d in enumerate(drivers) if _circles(d)]
+    on_ring = [i for i, d in enumerate(drivers) if _is_on_ring(d)]
     for i, j in permutations(on_ring, 2):
-        ways[i, j] = _way_round(drivers[i], drivers[j])
+        ways[i, j] = _ring_distance(drivers[i], drivers[j])
     return ways
 
 
-def _way_round(driver: _Driver, other: _Driver) -> float:
+def _ring_distance(driver: _Driver, other: _Driver) -> float:
     """Return the way round the ring to another vehicle on it if that is ahead, else inf."""
     ring, there = driver.route.ring, other.route.ring
-    ahead = ring.ahead_m(there.place_m(other.s), driver.s)
-    stays = ring.leaves_s - driver.s
-    if other.s < there.joins_s:
-        concerned = stays > ring.ahead_m(there.joins_m, driver.s)
+    ahead = ring.distance_ahead_m(there.position_m(other.s), driver.s)
+    stays = ring.exit_s - driver.s
+    if other.s < there.entry_s:
+        concerned = stays > ring.distance_ahead_m(there.entry_m, driver.s)
     else:
-        concerned = ahead < stays + (driver.shape.length_m + other.shape.length_m) / 2 + _CLEAR_M
+        concerned = ahead < stays + (driver.shape.length_m + other.shape.length_m) / 2 + _EXIT_CLEARANCE_M
     return ahead if concerned and ahead < ring.circumference_m / 2 else math.inf
 
 
-def _circles(driver: _Driver) -> bool:
+def _is_on_ring(driver: _Driver) -> bool:
     ring, half_m = driver.route.ring, driver.shape.length_m / 2
     return ring is not None and driver.s + half_m > driver.route.stop_s and driver.s < (
-        ring.leaves_s + half_m + _CLEAR_M)
+        ring.exit_s + half_m + _EXIT_CLEARANCE_M)
 
 
-def _gives_way(driver: _Driver, drivers: list[_Driver]) -> bool:
+def _must_yield(driver: _Driver, drivers: list[_Driver]) -> bool:
     """Tell whether somebody on the ring will soon pass where a vehicle wants to join it."""
     ring = driver.route.ring
     for other in drivers:
-        if other is driver or not _circles(other) or other.route.approach == driver.route.approach:
+        if other is driver or not _is_on_ring(other) or other.route.approach == driver.route.approach:
             continue
-        round_m = other.route.ring.ahead_m(ring.joins_m, other.s)
-        passes = other.route.ring.leaves_s - other.s > round_m
+        round_m = other.route.ring.distance_ahead_m(ring.entry_m, other.s)
+        passes = other.route.ring.exit_s - other.s > round_m
         if passes and round_m < _CRITICAL_GAP_S * max(other.v, 3.0) + other.shape.length_m:
             return True
     return False
 
 
-def _codes(names: list[str]) -> np.ndarray:
+def _integer_codes(names: list[str]) -> np.ndarray:
     """Number the names, equal names alike: numbers compare faster."""
     numbers: dict[str, int] = {}
     return np.array([numbers.setdefault(name, len(numbers)) for name in names])
 
 
-def _stop_gap(driver: _Driver, signals: Signals, drivers: list[_Driver]) -> float:
+def _stop_line_gap(driver: _Driver, signals: SignalController, drivers: list[_Driver]) -> float:
     """Return the way to the stop line if the driver has to stop there, else inf."""
     ahead = driver.route.stop_s - driver.s - driver.shape.length_m / 2
     if ahead < -0.3 or math.isinf(ahead):
         return math.inf
     if driver.route.ring is not None:
-        light = 'amber' if _gives_way(driver, drivers) else 'green'
+        light = 'amber' if _must_yield(driver, drivers) else 'green'
     elif driver.route.signal is not None:
         light = signals.light(driver.route.signal)
     else:
@@ -251,7 +251,7 @@ def _stop_gap(driver: _Driver, signals: Signals, drivers: list[_Driver]) -> floa
     return max(ahead, 0.0) + STANDSTILL_GAP_M - 0.6
 
 
-def _curve_limit(driver: _Driver) -> float:
+def _curve_speed_limit(driver: _Driver) -> float:
     """Return the speed that the curve of the route allows here, braking early for it."""
     limit = math.inf
     for start, end, radius in driver.route.path.curves():

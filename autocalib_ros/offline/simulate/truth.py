@@ -8,22 +8,22 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from autocalib_ros.offline.simulate.ground_surface import PAVEMENT_M, edge_distance
+from autocalib_ros.offline.simulate.ground_surface import PAVEMENT_WIDTH_M, edge_distance
 from autocalib_ros.offline.simulate.lens import CameraPose
 
 if TYPE_CHECKING:
     from autocalib_ros.offline.simulate.cyclist_actors import Cyclist
-    from autocalib_ros.offline.simulate.pedestrian_actors import Person
+    from autocalib_ros.offline.simulate.pedestrian_actors import Pedestrian
     from autocalib_ros.offline.simulate.simulation import Simulation
     from autocalib_ros.offline.simulate.vehicle_models import VehicleState
 
     _State = tuple[float, float, float, float]  # x, y, heading, speed
 
 TRACK_RATE_HZ = 5
-_RANGE_M = 60.0
+_TRACK_RANGE_M = 60.0
 _GROUND_POINTS = 48
 _GROUND_RANGE_M = 45.0
-_HIDDEN_M = 0.5  # a static thing hides a point when it is nearer to the camera by more than this
+_OCCLUSION_MARGIN_M = 0.5  # a static thing hides a point when it is nearer to the camera by more than this
 
 
 def truth_of(simulation: Simulation) -> dict[str, Any]:
@@ -82,17 +82,17 @@ def _camera(pose: CameraPose) -> dict[str, Any]:
         'R_world_from_camera': rotation.round(9).tolist(),
         'position': pose.position_m.round(6).tolist(),
         'height': float(pose.position_m[2]),
-        'yaw_deg': _degrees(np.arctan2(rotation[1, 2], rotation[0, 2])),
-        'pitch_down_deg': _degrees(np.arcsin(-rotation[2, 2])),
-        'roll_deg': _degrees(np.arctan2(-rotation[2, 0], -rotation[2, 1])),
+        'yaw_deg': _rounded_degrees(np.arctan2(rotation[1, 2], rotation[0, 2])),
+        'pitch_down_deg': _rounded_degrees(np.arcsin(-rotation[2, 2])),
+        'roll_deg': _rounded_degrees(np.arctan2(-rotation[2, 0], -rotation[2, 1])),
     }
 
 
-def _degrees(angle: float) -> float:
+def _rounded_degrees(angle: float) -> float:
     return round(float(np.degrees(angle)), 6)
 
 
-def _visible(
+def _project_visible(
     simulation: Simulation, pose: CameraPose, bumped: bool, points: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the pixels (n, 2) of world points (n, 3) and whether each is seen."""
@@ -101,8 +101,8 @@ def _visible(
     limit = np.array([simulation.options.width_px - 1, simulation.options.height_px - 1])
     seen &= ((pixels >= 0) & (pixels <= limit)).all(1)
     index = np.flatnonzero(seen)
-    behind = simulation.artist().static_distance_m(bumped, pixels[index])
-    seen[index] = behind > np.linalg.norm(camera[index], axis=1) - _HIDDEN_M
+    behind = simulation.renderer().background_distance_m(bumped, pixels[index])
+    seen[index] = behind > np.linalg.norm(camera[index], axis=1) - _OCCLUSION_MARGIN_M
     return pixels, seen
 
 
@@ -113,25 +113,25 @@ def _ground_points(simulation: Simulation, bumped: bool) -> dict[str, Any]:
     reach = _GROUND_RANGE_M * np.sqrt(rng.uniform(0.01, 1.0, 4000))
     angle = rng.uniform(0, 2 * np.pi, 4000)
     xy = pose.position_m[:2] + reach[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1)
-    xy = xy[edge_distance(simulation.network, xy) < PAVEMENT_M].round(2)
-    pixels, seen = _visible(simulation, pose, bumped, np.pad(xy, ((0, 0), (0, 1))))
+    xy = xy[edge_distance(simulation.network, xy) < PAVEMENT_WIDTH_M].round(2)
+    pixels, seen = _project_visible(simulation, pose, bumped, np.pad(xy, ((0, 0), (0, 1))))
     rows = np.concatenate([xy, pixels.round(4)], 1)[seen][:_GROUND_POINTS]
     return {'columns': ['X', 'Y', 'u', 'v'], 'rows': rows.tolist()}
 
 
-_COLUMNS = ['t', 'X', 'Y', 'heading_rad', 'speed_mps', 'u', 'v']
+_TRACK_COLUMNS = ['t', 'X', 'Y', 'heading_rad', 'speed_mps', 'u', 'v']
 
 
 def _vehicles(simulation: Simulation) -> dict[str, Any]:
     tracks = []
     for vehicle in simulation.traffic.vehicles:
-        rows = _track(simulation, lambda t, vehicle=vehicle: _driven(vehicle.state(t)))
+        rows = _track_rows(simulation, lambda t, vehicle=vehicle: _vehicle_state(vehicle.state(t)))
         if rows:
             tracks.append({'id': f'v{vehicle.number}', 'type': vehicle.kind, 'rows': rows})
     return {
-        'columns': _COLUMNS,
+        'columns': _TRACK_COLUMNS,
         'note': f'ground-plane centre of the vehicle footprint, {TRACK_RATE_HZ} Hz, only while in '
-                f'view, within {_RANGE_M:.0f} m and not hidden by static objects (may be hidden '
+                f'view, within {_TRACK_RANGE_M:.0f} m and not hidden by static objects (may be hidden '
                 'by other vehicles); shake of the camera not included',
         'tracks': tracks,
     }
@@ -140,29 +140,29 @@ def _vehicles(simulation: Simulation) -> dict[str, Any]:
 def _people(simulation: Simulation) -> dict[str, Any]:
     """Return the tracks of who walks and who cycles, each with a gap where it begins anew."""
     tracks = []
-    for kind, everybody, state in (('pedestrian', simulation.people, _walked),
-                                   ('cyclist', simulation.cyclists, _cycled)):
+    for kind, everybody, state in (('pedestrian', simulation.people, _pedestrian_state),
+                                   ('cyclist', simulation.cyclists, _cyclist_state)):
         for number, person in enumerate(everybody, 1):
-            rows = _track(simulation, lambda t, person=person, state=state: state(person, t))
+            rows = _track_rows(simulation, lambda t, person=person, state=state: state(person, t))
             if rows:
                 tracks.append({'id': f'{kind[0]}{number}', 'type': kind, 'rows': rows})
-    return {'columns': _COLUMNS, 'tracks': tracks}
+    return {'columns': _TRACK_COLUMNS, 'tracks': tracks}
 
 
-def _driven(state: VehicleState | None) -> _State | None:
+def _vehicle_state(state: VehicleState | None) -> _State | None:
     return None if state is None else (state.x, state.y, state.heading, state.speed_mps)
 
 
-def _walked(person: Person, time_s: float) -> _State | None:
+def _pedestrian_state(person: Pedestrian, time_s: float) -> _State | None:
     place = person.place(time_s)
     return None if place is None else (*place[:2], person.heading, person.speed_mps)
 
 
-def _cycled(cyclist: Cyclist, time_s: float) -> _State:
+def _cyclist_state(cyclist: Cyclist, time_s: float) -> _State:
     return (*cyclist.place(time_s)[:3], cyclist.speed_mps)
 
 
-def _track(simulation: Simulation, state: Callable[[float], _State | None]) -> list[list[float]]:
+def _track_rows(simulation: Simulation, state: Callable[[float], _State | None]) -> list[list[float]]:
     """Return the rows of what is in a `state` at a time, while it can be seen."""
     duration = simulation.options.frame_count / simulation.options.rate_hz
     times = np.arange(int(np.ceil(duration * TRACK_RATE_HZ - 1e-9))) / TRACK_RATE_HZ
@@ -175,8 +175,8 @@ def _track(simulation: Simulation, state: Callable[[float], _State | None]) -> l
         values = np.array(part)
         pose = simulation.bumped_pose() if bumped else simulation.pose
         centres = np.pad(values[:, 1:3], ((0, 0), (0, 1)))
-        pixels, seen = _visible(simulation, pose, bumped, centres)
-        seen &= np.hypot(*(centres - pose.position_m)[:, :2].T) <= _RANGE_M
+        pixels, seen = _project_visible(simulation, pose, bumped, centres)
+        seen &= np.hypot(*(centres - pose.position_m)[:, :2].T) <= _TRACK_RANGE_M
         kept = np.concatenate([values.round(4), pixels.round(3)], 1)[seen]
         rows += kept.tolist()
     return rows

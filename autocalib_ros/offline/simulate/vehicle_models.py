@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from autocalib_ros.offline.simulate.network import CITY_SPEED_MPS, Route
-from autocalib_ros.offline.simulate.shapes import SHAPES, Shape
+from autocalib_ros.offline.simulate.shapes import SHAPES, VehicleShape
 
 STEP_S = 0.1
-_TANGENT_M = 0.1  # short enough for the tangent of a path
+_TANGENT_STEP_M = 0.1  # short enough for the tangent of a path
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class Vehicle:
     speeds_mps: np.ndarray
 
     @property
-    def shape(self) -> Shape:
+    def shape(self) -> VehicleShape:
         """Its dimensions."""
         return SHAPES[self.kind]
 
@@ -86,7 +86,7 @@ class Vehicle:
     def pose(self, s: float) -> tuple[float, float, float]:
         """Return (x, y, heading): the rear axle follows the wandering path and rolls along it."""
         half_m = self.shape.wheelbase_m / 2
-        near = s - half_m + np.array([-0.5, 0.5]) * _TANGENT_M
+        near = s - half_m + np.array([-0.5, 0.5]) * _TANGENT_STEP_M
         rows = self.route.path.at(near)
         aside = self.wander.at(near)
         xy = rows[:, :2] + aside[:, None] * np.stack([-np.sin(rows[:, 2]), np.cos(rows[:, 2])], -1)
@@ -97,8 +97,8 @@ class Vehicle:
 
 
 @dataclass(frozen=True)
-class Traffic:
+class SimulatedTraffic:
     """All vehicles, and the green times (signal, start, end) that they obeyed."""
 
     vehicles: tuple[Vehicle, ...]
-    greens: tuple[tuple[str, float, float], ...]
+    green_phases: tuple[tuple[str, float, float], ...]

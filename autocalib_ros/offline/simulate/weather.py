@@ -11,39 +11,39 @@ import numpy as np
 
 from autocalib_ros.offline.simulate.faces import NO_MAP
 from autocalib_ros.offline.simulate.ground_surface import edge_distance
-from autocalib_ros.offline.simulate.lamps import lamps_of
-from autocalib_ros.offline.simulate.lens import CameraPose, Lens
+from autocalib_ros.offline.simulate.lamps import vehicle_lamps
+from autocalib_ros.offline.simulate.lens import CameraPose, KannalaBrandtLens
 from autocalib_ros.offline.simulate.network import Network
 from autocalib_ros.offline.simulate.options import SimulationOptions
-from autocalib_ros.offline.simulate.paint import grain
+from autocalib_ros.offline.simulate.paint import octave_noise
 from autocalib_ros.offline.simulate.sensor import add_glow
 from autocalib_ros.offline.simulate.vehicle_models import Vehicle, VehicleState
 
-_NEARER_M = 0.4
+_OCCLUSION_MARGIN_M = 0.4
 """What is nearer than the ground behind it by more stands before it."""
 _SUN_RAD = math.radians(28.0)
-_SHADE = 0.5
-_CLOUD_MPS, _CLOUD_M, _CLOUD_SHADE = 7.0, 45.0, 0.4
+_SHADOW_ATTENUATION = 0.5
+_CLOUD_SPEED_MPS, _CLOUD_SIZE_M, _CLOUD_ATTENUATION = 7.0, 45.0, 0.4
 _CLOUD_TEXELS = 256
-_POND_M = (5.0, 3.5)
-_WAVES = 10
-_GRAVITY = 9.81
-_WET_M = 1.5
+_POND_SEMI_AXES_M = (5.0, 3.5)
+_WAVE_COUNT = 10
+_GRAVITY_MPS2 = 9.81
+_PUDDLE_SIZE_M = 1.5
 """Size of the puddles and dry patches of a wet road."""
-_SMEAR_M = (0.25, 0.45, 0.7, 1.0, 1.5)
+_REFLECTION_DEPTHS_M = (0.25, 0.45, 0.7, 1.0, 1.5)
 """Depths below the road at which the rough mirror of a wet road shows a lamp of 0.7 m."""
-_DROPS = 9
-_STREAKS = 350
+_DROP_COUNT = 9
+_RAIN_STREAK_COUNT = 350
 _RAIN_FALL_MPS, _EXPOSURE_S = 7.0, 1 / 60
-_LED_M = 0.12
-_LED_HEAD_M = 3.6
-_POLE_FREE_M = 9.0
+_SIGNAL_LAMP_SIZE_M = 0.12
+_SIGNAL_HEAD_HEIGHT_M = 3.6
+_MIN_SIGNAL_DISTANCE_M = 9.0
 """So near the camera stands no signal."""
 _CLOCK_FONT = cv2.FONT_HERSHEY_DUPLEX
 
 
 @dataclass(frozen=True)
-class GroundView:
+class GroundBuffer:
     """The ground behind each pixel."""
 
     xy: np.ndarray
@@ -54,7 +54,7 @@ class GroundView:
     """How far off the asphalt, shape (h, w)."""
 
     @classmethod
-    def of(cls, options: SimulationOptions, network: Network, pose: CameraPose) -> GroundView:
+    def of(cls, options: SimulationOptions, network: Network, pose: CameraPose) -> GroundBuffer:
         """Meet every pixel's ray with the ground."""
         grid = np.stack(np.meshgrid(np.arange(options.width_px), np.arange(options.height_px)), -1)
         rays = options.lens.bearings(grid) @ pose.world_from_camera.T
@@ -64,13 +64,13 @@ class GroundView:
         xy = pose.position_m[:2] + rays[..., :2] * reach[..., None]
         return cls(xy.astype(np.float32), distance.astype(np.float32), edge_distance(network, xy).astype(np.float32))
 
-    def seen(self, depth_m: np.ndarray) -> np.ndarray:
+    def visible(self, depth_m: np.ndarray) -> np.ndarray:
         """Where (h, w) the ground is seen, given the distance (h, w) of what is nearest."""
-        return np.isfinite(self.distance_m) & (depth_m > self.distance_m - _NEARER_M)
+        return np.isfinite(self.distance_m) & (depth_m > self.distance_m - _OCCLUSION_MARGIN_M)
 
 
 @dataclass(frozen=True)
-class View:
+class FrameContext:
     """What the effects of one frame are given."""
 
     picture: np.ndarray
@@ -87,67 +87,67 @@ class Weather:
 
     def __init__(self, options: SimulationOptions, network: Network, poses: dict[bool, CameraPose]) -> None:
         self._options, self._network, self._troubles = options, network, options.troubles
-        self._lens: Lens = options.lens
-        self._ground = ({bumped: GroundView.of(options, network, pose) for bumped, pose in poses.items()}
+        self._lens: KannalaBrandtLens = options.lens
+        self._ground = ({bumped: GroundBuffer.of(options, network, pose) for bumped, pose in poses.items()}
                         if self._troubles & {'shadows', 'water', 'wet'} else {})
         rng = np.random.default_rng([options.seed, 11])
         self._sun_rad = float(rng.uniform(0, 2 * np.pi))
         wind = rng.uniform(0, 2 * np.pi)
         self._wind = np.array([math.cos(wind), math.sin(wind)])
         size = _CLOUD_TEXELS
-        self._clouds = np.clip(0.5 + grain(size, size, ((32.0, 0.5),), rng), 0, 1)
-        self._puddles = np.clip(0.55 + grain(size, size, ((2.0, 0.25), (6.0, 0.3)), rng), 0, 1)
-        self._waves = _ripples(wind, rng)
+        self._clouds = np.clip(0.5 + octave_noise(size, size, ((32.0, 0.5),), rng), 0, 1)
+        self._puddles = np.clip(0.55 + octave_noise(size, size, ((2.0, 0.25), (6.0, 0.3)), rng), 0, 1)
+        self._waves = _deep_water_waves(wind, rng)
         self._pond = self._pond_mask(rng) if 'water' in self._troubles else None
         self._drops = _drops_of(options, rng)
 
-    def on_ground(self, view: View, bumped: bool) -> None:
+    def apply_ground_effects(self, view: FrameContext, bumped: bool) -> None:
         """Change how the ground looks by daylight: shadows, water."""
         if 'water' in self._troubles:
-            self._shimmer(view, bumped)
+            self._draw_waves(view, bumped)
         if 'shadows' in self._troubles:
-            self._shade(view, bumped)
+            self._darken_shadows(view, bumped)
 
-    def lights(self, view: View, bumped: bool) -> None:
+    def add_light_sources(self, view: FrameContext, bumped: bool) -> None:
         """Add what shines: mirrored lamps, signals."""
         if 'wet' in self._troubles:
-            self._mirror_lamps(view, bumped)
+            self._add_lamp_reflections(view, bumped)
         if 'leds' in self._troubles:
             self._signals(view)
 
-    def on_lens(self, view: View) -> np.ndarray:
+    def apply_lens_effects(self, view: FrameContext) -> np.ndarray:
         """Return the picture through rain and drops, with the clock that the recorder burns in."""
         picture = view.picture
         if 'rain' in self._troubles:
             picture = self._rain(picture, view.index)
         if 'drops' in self._troubles:
-            picture = _through_drops(picture, self._drops, view.time_s)
+            picture = _apply_drops(picture, self._drops, view.time_s)
         if 'clock' in self._troubles:
-            _clock(picture, view.time_s)
+            _burn_in_clock(picture, view.time_s)
         return picture
 
-    def _shade(self, view: View, bumped: bool) -> None:
+    def _darken_shadows(self, view: FrameContext, bumped: bool) -> None:
         """Darken the ground under clouds that move with the wind, and in the shadows of vehicles."""
         ground = self._ground[bumped]
-        coarse = (ground.xy[::8, ::8] - self._wind.astype(np.float32) * np.float32(_CLOUD_MPS * view.time_s))
-        texels = np.mod(coarse * (_CLOUD_TEXELS / (8 * _CLOUD_M)), _CLOUD_TEXELS).astype(np.float32)
+        coarse = (ground.xy[::8, ::8] - self._wind.astype(np.float32) * np.float32(_CLOUD_SPEED_MPS * view.time_s))
+        texels = np.mod(coarse * (_CLOUD_TEXELS / (8 * _CLOUD_SIZE_M)), _CLOUD_TEXELS).astype(np.float32)
         cloud = cv2.remap(self._clouds, texels, NO_MAP, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
         height, width = ground.distance_m.shape
-        light = 1 - _CLOUD_SHADE * cv2.resize(cloud, (width, height), interpolation=cv2.INTER_LINEAR)
+        light = 1 - _CLOUD_ATTENUATION * cv2.resize(cloud, (width, height), interpolation=cv2.INTER_LINEAR)
         mask = np.zeros((height, width), np.uint8)
         for vehicle, state in view.vehicles:
-            outline = self._shadow(vehicle, state, view.pose)
+            outline = self._shadow_outline(vehicle, state, view.pose)
             if outline is not None:
                 cv2.fillConvexPoly(mask, outline, 255, cv2.LINE_AA, 4)
         shadow = cv2.GaussianBlur(mask, (0, 0), 1.0).astype(np.float32) / 255
-        light *= 1 - _SHADE * shadow
-        light[~ground.seen(view.depth_m)] = 1.0
+        light *= 1 - _SHADOW_ATTENUATION * shadow
+        light[~ground.visible(view.depth_m)] = 1.0
         view.picture[:] = (view.picture * light[..., None]).astype(np.uint8)
 
-    def _shadow(self, vehicle: Vehicle, state: VehicleState, pose: CameraPose) -> np.ndarray | None:
+    def _shadow_outline(self, vehicle: Vehicle, state: VehicleState, pose: CameraPose) -> np.ndarray | None:
         """Return the outline (n, 2), in sixteenths of a pixel, of the shadow that the low sun casts, if all is seen."""
         shape = vehicle.shape
-        base = box_of(vehicle, state)[:4, :2]
+        base = box_corners(vehicle, state)[:4, :2]
         top = max(part.top_m for part in shape.parts)
         away = top / math.tan(_SUN_RAD) * np.array([math.cos(self._sun_rad), math.sin(self._sun_rad)])
         hull = cv2.convexHull(np.concatenate([base, base + away]).astype(np.float32))[:, 0]
@@ -159,52 +159,52 @@ class Weather:
     def _pond_mask(self, rng: np.random.Generator) -> dict[bool, tuple[np.ndarray, np.ndarray]]:
         """Lay a pond beside the road; return its pixels (n,) rows and columns by pose."""
         ground = self._ground[False]
-        fit = np.argwhere((ground.off_road_m > _POND_M[1] + 2.5) & (ground.off_road_m < _POND_M[1] + 9.0)
+        fit = np.argwhere((ground.off_road_m > _POND_SEMI_AXES_M[1] + 2.5) & (ground.off_road_m < _POND_SEMI_AXES_M[1] + 9.0)
                           & (ground.distance_m < 40.0))
         if not len(fit):
             return {}
         row, column = fit[int(rng.integers(len(fit)))]
         centre = ground.xy[row, column]
-        return {bumped: np.nonzero((((view.xy - centre) / _POND_M) ** 2).sum(-1) < 1) for bumped, view
+        return {bumped: np.nonzero((((view.xy - centre) / _POND_SEMI_AXES_M) ** 2).sum(-1) < 1) for bumped, view
                 in self._ground.items()}
 
-    def _shimmer(self, view: View, bumped: bool) -> None:
+    def _draw_waves(self, view: FrameContext, bumped: bool) -> None:
         """Draw waves that travel with the wind, with the glitter of the sun on their slopes."""
         if not self._pond:
             return
         rows, columns = self._pond[bumped]
         ground = self._ground[bumped]
-        seen = ground.seen(view.depth_m)[rows, columns]
-        rows, columns = rows[seen], columns[seen]
+        visible = ground.visible(view.depth_m)[rows, columns]
+        rows, columns = rows[visible], columns[visible]
         numbers, rates, phases = self._waves
-        slope = np.sin(ground.xy[rows, columns] @ numbers.T - rates * view.time_s + phases).sum(-1) / math.sqrt(_WAVES)
+        slope = np.sin(ground.xy[rows, columns] @ numbers.T - rates * view.time_s + phases).sum(-1) / math.sqrt(_WAVE_COUNT)
         level = 70 + 28 * slope + 130 * (slope > 1.3)
         view.picture[rows, columns] = np.clip(level[:, None] * (1.0, 0.95, 0.8), 0, 255).astype(np.uint8)
 
-    def _mirror_lamps(self, view: View, bumped: bool) -> None:
+    def _add_lamp_reflections(self, view: FrameContext, bumped: bool) -> None:
         """Add the lamps that the wet road mirrors: they shine from below it, smeared by its roughness."""
         ground, camera = self._ground[bumped], view.pose.position_m
         height, width = ground.distance_m.shape
-        for lamp in (lamp for vehicle, state in view.vehicles for lamp in lamps_of(vehicle, state)):
-            for depth in _SMEAR_M:
-                below = np.array([*lamp.place_m[:2], -depth])
+        for lamp in (lamp for vehicle, state in view.vehicles for lamp in vehicle_lamps(vehicle, state)):
+            for depth in _REFLECTION_DEPTHS_M:
+                below = np.array([*lamp.position_m[:2], -depth])
                 to_camera = camera - below
                 distance = float(np.linalg.norm(to_camera))
-                turned = float(lamp.outward @ to_camera[:2]) / distance
+                turned = float(lamp.direction @ to_camera[:2]) / distance
                 pixel, valid = self._lens.project(view.pose.to_camera(below))
                 column, row = (round(float(c)) for c in pixel)
                 if turned < 0.05 or not valid or not (0 <= row < height and 0 <= column < width):
                     continue
-                if view.depth_m[row, column] < ground.distance_m[row, column] - _NEARER_M:
+                if view.depth_m[row, column] < ground.distance_m[row, column] - _OCCLUSION_MARGIN_M:
                     continue
-                texel = (ground.xy[row, column] / _WET_M * 6.0).astype(int) % _CLOUD_TEXELS
+                texel = (ground.xy[row, column] / _PUDDLE_SIZE_M * 6.0).astype(int) % _CLOUD_TEXELS
                 # A film of water mirrors the more, the flatter one looks at it.
-                mirrored = 0.05 + 0.95 * (1 - float(to_camera[2]) / distance) ** 5
-                share = 1.6 * mirrored * float(self._puddles[texel[1], texel[0]]) * min(1.0, 0.35 + turned)
+                reflectance = 0.05 + 0.95 * (1 - float(to_camera[2]) / distance) ** 5
+                share = 1.6 * reflectance * float(self._puddles[texel[1], texel[0]]) * min(1.0, 0.35 + turned)
                 radius = max(1.2, 1.3 * lamp.size_m * self._lens.focal_px / distance)
                 add_glow(view.picture, pixel, radius, _scaled(lamp.colour, min(share, 0.7)))
 
-    def _signals(self, view: View) -> None:
+    def _signals(self, view: FrameContext) -> None:
         """Add the lit lamps of signals, whose pulses beat with the exposures."""
         if not self._network.phases or self._network.stop_m is None:
             return
@@ -212,26 +212,26 @@ class Weather:
             for side in (1, -1):
                 foot = road.at(side * self._network.stop_m, side * (road.half_width_m + 0.5))
                 red = int(view.time_s / 12 + number) % 2
-                lamp = np.array([*foot, _LED_HEAD_M + 0.35 * red])
+                lamp = np.array([*foot, _SIGNAL_HEAD_HEIGHT_M + 0.35 * red])
                 pixel, valid = self._lens.project(view.pose.to_camera(lamp))
                 column, row = (round(float(c)) for c in pixel)
                 inside = 0 <= row < self._options.height_px and 0 <= column < self._options.width_px
                 distance = float(np.linalg.norm(view.pose.position_m - lamp))
-                if not valid or not inside or distance < _POLE_FREE_M or view.depth_m[row, column] < distance - 1.0:
+                if not valid or not inside or distance < _MIN_SIGNAL_DISTANCE_M or view.depth_m[row, column] < distance - 1.0:
                     continue
                 beat = np.clip(0.5 + 0.9 * math.sin(2 * np.pi * (3.1 + 0.7 * number) * view.time_s + side), 0.05, 1.0)
                 colour = (60, 60, 255) if red else (190, 255, 60)
-                add_glow(view.picture, pixel, max(1.5, _LED_M * self._lens.focal_px / distance * 1.5),
+                add_glow(view.picture, pixel, max(1.5, _SIGNAL_LAMP_SIZE_M * self._lens.focal_px / distance * 1.5),
                          _scaled(colour, float(beat)))
 
     def _rain(self, picture: np.ndarray, index: int) -> np.ndarray:
         """Draw the streaks that drops near the camera leave in one exposure, under a veil of those farther off."""
         rng = np.random.default_rng([self._options.seed, 12, index])
         height, width = picture.shape[:2]
-        distance = 1.0 + 12.0 * rng.uniform(size=_STREAKS) ** 0.5
+        distance = 1.0 + 12.0 * rng.uniform(size=_RAIN_STREAK_COUNT) ** 0.5
         length = _RAIN_FALL_MPS * _EXPOSURE_S * self._lens.focal_px / distance
-        start = rng.uniform((0, 0), (width, height), (_STREAKS, 2))
-        lean = 0.12 + rng.normal(0, 0.03, _STREAKS)
+        start = rng.uniform((0, 0), (width, height), (_RAIN_STREAK_COUNT, 2))
+        lean = 0.12 + rng.normal(0, 0.03, _RAIN_STREAK_COUNT)
         veil = np.zeros((height, width), np.uint8)
         for (x, y), reach, slant, metres in zip(start, length, lean, distance, strict=True):
             ends = [(round(16 * x), round(16 * y)), (round(16 * (x + slant * reach)), round(16 * (y + reach)))]
@@ -241,7 +241,7 @@ class Weather:
         return cv2.add(hazy, cv2.cvtColor(veil, cv2.COLOR_GRAY2BGR))
 
 
-def box_of(vehicle: Vehicle, state: VehicleState) -> np.ndarray:
+def box_corners(vehicle: Vehicle, state: VehicleState) -> np.ndarray:
     """Return the corners (8, 3) of a vehicle's box, the four on the ground first."""
     shape = vehicle.shape
     c, s = math.cos(state.heading), math.sin(state.heading)
@@ -256,47 +256,47 @@ def _scaled(colour: tuple[int, int, int], share: float) -> Any:
     return tuple(round(c * share) for c in colour)
 
 
-def _ripples(wind: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _deep_water_waves(wind: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Wave vectors (n, 2) in 1/m, rates (n,) in 1/s of waves on deep water, and phases (n,)."""
-    length = np.exp(rng.uniform(math.log(0.4), math.log(2.5), _WAVES))
-    heading = wind + rng.normal(0, 0.5, _WAVES)
+    length = np.exp(rng.uniform(math.log(0.4), math.log(2.5), _WAVE_COUNT))
+    heading = wind + rng.normal(0, 0.5, _WAVE_COUNT)
     number = 2 * np.pi / length
-    return (number[:, None] * np.stack([np.cos(heading), np.sin(heading)], 1), np.sqrt(_GRAVITY * number),
-            rng.uniform(0, 2 * np.pi, _WAVES))
+    return (number[:, None] * np.stack([np.cos(heading), np.sin(heading)], 1), np.sqrt(_GRAVITY_MPS2 * number),
+            rng.uniform(0, 2 * np.pi, _WAVE_COUNT))
 
 
 @dataclass(frozen=True)
-class Drop:
+class WaterDrop:
     """Water on the front glass, far out of focus: it comes, rests, runs down, and comes again."""
 
     x_px: float
     y_px: float
     radius_px: float
-    comes_s: float
-    rests_s: float
-    runs_px_s: float
-    again_s: float
+    appears_s: float
+    rest_s: float
+    run_px_per_s: float
+    period_s: float
 
     def place(self, time_s: float, height_px: int) -> tuple[float, float] | None:
         """Return where it is at a time, None while it is not there."""
-        age = (time_s - self.comes_s) % self.again_s
-        running = max(0.0, age - self.rests_s)
+        age = (time_s - self.appears_s) % self.period_s
+        running = max(0.0, age - self.rest_s)
         # It creeps, then goes faster, held up by the glass now and then.
-        way = self.runs_px_s * (running + 0.25 * math.sin(4 * running)) * min(1.0, running)
+        way = self.run_px_per_s * (running + 0.25 * math.sin(4 * running)) * min(1.0, running)
         y = self.y_px + way
         if y > height_px + self.radius_px:
             return None
         return self.x_px + 6 * math.sin(0.02 * way), y
 
 
-def _drops_of(options: SimulationOptions, rng: np.random.Generator) -> list[Drop]:
+def _drops_of(options: SimulationOptions, rng: np.random.Generator) -> list[WaterDrop]:
     width, height = options.width_px, options.height_px
-    return [Drop(float(rng.uniform(0, width)), float(rng.uniform(0, 0.8 * height)),
+    return [WaterDrop(float(rng.uniform(0, width)), float(rng.uniform(0, 0.8 * height)),
                  float(rng.uniform(0.012, 0.035) * width), float(rng.uniform(0, 30)), float(rng.uniform(3, 20)),
-                 float(rng.uniform(0.1, 0.5) * height), float(rng.uniform(25, 40))) for _ in range(_DROPS)]
+                 float(rng.uniform(0.1, 0.5) * height), float(rng.uniform(25, 40))) for _ in range(_DROP_COUNT)]
 
 
-def _through_drops(picture: np.ndarray, drops: list[Drop], time_s: float) -> np.ndarray:
+def _apply_drops(picture: np.ndarray, drops: list[WaterDrop], time_s: float) -> np.ndarray:
     """Blend in, under each drop, what it shows: the surroundings upside down and blurred."""
     height, width = picture.shape[:2]
     small = cv2.resize(picture, (width // 8, height // 8), interpolation=cv2.INTER_AREA)
@@ -321,7 +321,7 @@ def _through_drops(picture: np.ndarray, drops: list[Drop], time_s: float) -> np.
     return picture
 
 
-def _clock(picture: np.ndarray, time_s: float) -> None:
+def _burn_in_clock(picture: np.ndarray, time_s: float) -> None:
     """Burn date and time into the picture, in place."""
     text = f'2024-05-17 08:{int(time_s) // 60:02d}:{int(time_s) % 60:02d}:{int(time_s * 100) % 100:02d}'
     scale = picture.shape[1] / 1280
