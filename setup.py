@@ -38,9 +38,11 @@ setup(
     maintainer_email='autocalib_ros@example.com',
     description='Calibrates a fixed roadside wide-angle camera from the traffic that it sees.',
     license='Apache-2.0',
-    entry_points={'console_scripts': [
-        'autocalib = autocalib_ros.cli:main',
-        'autocalib_node = autocalib_ros.ros.node:main',
-        'ground_points_node = autocalib_ros.ros.ground_points_node:main',
-    ]},
+    entry_points={
+        'console_scripts': [
+            'autocalib = autocalib_ros.cli:main',
+            'autocalib_node = autocalib_ros.ros.node:main',
+            'ground_points_node = autocalib_ros.ros.ground_points_node:main',
+        ]
+    },
 )

@@ -191,8 +191,13 @@ class AutoCalibrator:
         if self._observer is None:
             return None
         return self._buffer.snapshot(
-            image_size=self._size, first_stamp_ns=self._first_stamp_ns, newest_stamp_ns=self._newest_stamp_ns,
-            frames=self._frames, drift_px=self._observer.drift_px, unfinished=self._observer.unfinished())
+            image_size=self._size,
+            first_stamp_ns=self._first_stamp_ns,
+            newest_stamp_ns=self._newest_stamp_ns,
+            frames=self._frames,
+            drift_px=self._observer.drift_px,
+            unfinished=self._observer.unfinished(),
+        )
 
     def progress(self) -> CalibrationProgress:
         """Say how much of the evidence that a solution needs is there."""
@@ -236,12 +241,18 @@ def with_requested_model(result: Calibration, options: Options) -> Calibration |
     try:
         info = asked.camera_info
     except ModelMisfit as misfit:
-        return Refusal.from_reason(Reason('distortion_model', misfit.message, misfit.remedy), result.method,
-                               result.evidence, result.figures)
+        return Refusal.from_reason(
+            Reason('distortion_model', misfit.message, misfit.remedy), result.method, result.evidence, result.figures
+        )
     if info.distortion_model == 'equidistant':
         return asked
-    return replace(asked, checks=(*result.checks, f'camera_info is {info.distortion_model}, off by at most '
-                                                  f'{info.error_px:.2g} px anywhere in the image'))
+    return replace(
+        asked,
+        checks=(
+            *result.checks,
+            f'camera_info is {info.distortion_model}, off by at most {info.error_px:.2g} px anywhere in the image',
+        ),
+    )
 
 
 def _solve(evidence: Evidence, options: Options, lens: Camera | None) -> Calibration | Refusal:
@@ -250,7 +261,8 @@ def _solve(evidence: Evidence, options: Options, lens: Camera | None) -> Calibra
     figures = Figures(
         track_labels=np.full(evidence.track_count, -1),
         focal_sweep_px=np.zeros((0, 2)) if intrinsics is None else intrinsics.sweep,
-        paper_tracks=np.zeros(0, int) if intrinsics is None else intrinsics.tracks)
+        paper_tracks=np.zeros(0, int) if intrinsics is None else intrinsics.tracks,
+    )
 
     def refused(reason: Reason) -> Refusal:
         return Refusal.from_reason(reason, options.method, evidence.summary(), figures)
@@ -269,13 +281,25 @@ def _solve(evidence: Evidence, options: Options, lens: Camera | None) -> Calibra
         solution = _solution(traffic, tracks, options, lens)
         if isinstance(solution, Reason):
             return solution
-        return _calibration(options, solution, Calibration(
-            method=options.method, grade='lens', assumptions=solution.assumptions, checks=solution.checks,
-            camera=solution.fit.state.camera, ground=None, ground_refusal=solution.plane_refusal,
-            road_directions=solution.fit.state.directions, stddev=_lens_stddev(solution),
-            paper=None if intrinsics is None else intrinsics.report, evidence=evidence.summary(),
-            newest_stamp_ns=evidence.newest_stamp_ns,
-            figures=_figures(figures, solution, kept[tracks.indices], evidence, options))), not solution.from_markings
+        return _calibration(
+            options,
+            solution,
+            Calibration(
+                method=options.method,
+                grade='lens',
+                assumptions=solution.assumptions,
+                checks=solution.checks,
+                camera=solution.fit.state.camera,
+                ground=None,
+                ground_refusal=solution.plane_refusal,
+                road_directions=solution.fit.state.directions,
+                stddev=_lens_stddev(solution),
+                paper=None if intrinsics is None else intrinsics.report,
+                evidence=evidence.summary(),
+                newest_stamp_ns=evidence.newest_stamp_ns,
+                figures=_figures(figures, solution, kept[tracks.indices], evidence, options),
+            ),
+        ), not solution.from_markings
 
     found = solved(traffic, kept)
     if isinstance(found, Reason):
@@ -320,15 +344,24 @@ def _choose_solution(of_all: Calibration, of_vehicles_only: Calibration | Reason
 def _count_pedestrians(result: Calibration, pedestrian_count: int) -> Calibration:
     """Count people apart from the vehicles."""
     seen = result.evidence
-    return replace(result, evidence=replace(seen, vehicles=seen.vehicles - pedestrian_count,
-                                            people=seen.people + pedestrian_count))
+    return replace(
+        result, evidence=replace(seen, vehicles=seen.vehicles - pedestrian_count, people=seen.people + pedestrian_count)
+    )
 
 
 def _solution(evidence: Evidence, tracks: TrackSet, options: Options, lens: Camera | None) -> Solution | Reason:
     """Solve; where the height follows from the solution and is unlike the usual one, solve with it once more."""
+
     def with_height(height_m: float) -> Solution | Reason:
-        return find_solution(evidence, tracks, options.joint, options.gate, np.random.default_rng(options.random_seed),
-                             height_m=height_m, lens=lens)
+        return find_solution(
+            evidence,
+            tracks,
+            options.joint,
+            options.gate,
+            np.random.default_rng(options.random_seed),
+            height_m=height_m,
+            lens=lens,
+        )
 
     solution = with_height(options.camera_height)
     if options.scale_from == 'height' or isinstance(solution, Reason) or solution.plane_refusal:
@@ -343,21 +376,29 @@ def _scale(options: Options, solution: Solution) -> Scale | Reason:
     return known_scale(options, *solution.plane.lens_and_normal, solution.flow)
 
 
-def _figures(figures: Figures, solution: Solution, indices: np.ndarray, evidence: Evidence,
-             options: Options) -> Figures:
+def _figures(
+    figures: Figures, solution: Solution, indices: np.ndarray, evidence: Evidence, options: Options
+) -> Figures:
     """Add what became of each track (n,) by its index, and the orientations of the segments in the solved lens."""
     labels = figures.track_labels.copy()
     labels[indices] = np.where(solution.fit.inliers(), solution.fit.labels, -2)
     found = segment_orientations(solution.fit.state.camera, evidence.segments_px, options.paper)
-    return replace(figures, track_labels=labels, orientation_histogram=found.histogram,
-                   orientation_peaks_deg=found.peaks_deg, residuals=collect_residuals(solution.fit))
+    return replace(
+        figures,
+        track_labels=labels,
+        orientation_histogram=found.histogram,
+        orientation_peaks_deg=found.peaks_deg,
+        residuals=collect_residuals(solution.fit),
+    )
 
 
 def _lens_stddev(solution: Solution) -> StandardDeviations:
-    focal, cx, cy, k1, k2 = solution.fit.sigma(lambda state: np.array(
-        [state.camera.focal_px, *state.camera.principal_point_px, *state.camera.k[:2]]))
-    return StandardDeviations(focal_px=float(focal), principal_point_px=(float(cx), float(cy)), k1=float(k1),
-                              k2=float(k2))
+    focal, cx, cy, k1, k2 = solution.fit.sigma(
+        lambda state: np.array([state.camera.focal_px, *state.camera.principal_point_px, *state.camera.k[:2]])
+    )
+    return StandardDeviations(
+        focal_px=float(focal), principal_point_px=(float(cx), float(cy)), k1=float(k1), k2=float(k2)
+    )
 
 
 def _height_stddev(plane: PlaneEstimate, scale: Scale) -> float:
@@ -385,9 +426,17 @@ def _ground_point_stddev(plane: PlaneEstimate, scale: Scale) -> tuple[float | No
 
 def _covariance(plane: PlaneEstimate, scale: Scale) -> np.ndarray:
     """Covariance (10, 10) of lens, tilt, roll and height, in the order of COVARIANCE_OF."""
+
     def published(camera: Camera, normal: np.ndarray) -> np.ndarray:
-        return np.array([camera.focal_px, *camera.principal_point_px, *camera.k, *tilt_and_roll_deg(normal),
-                         scale.height(camera, normal)])
+        return np.array(
+            [
+                camera.focal_px,
+                *camera.principal_point_px,
+                *camera.k,
+                *tilt_and_roll_deg(normal),
+                scale.height(camera, normal),
+            ]
+        )
 
     covariance = plane.covariance(published)
     covariance[-1, -1] += scale.sigma**2
@@ -407,9 +456,16 @@ def _calibration(options: Options, solution: Solution, lens: Calibration) -> Cal
     tilt, roll = plane.sigma(lambda _, normal: tilt_and_roll_deg(normal))
     grade = 'unit_scale' if not scale.metric else 'assumed' if solution.assumed else 'full'
     return replace(
-        lens, grade=grade, ground=ground_plane(normal, solution.along, height, metric=scale.metric),
+        lens,
+        grade=grade,
+        ground=ground_plane(normal, solution.along, height, metric=scale.metric),
         assumptions=(*lens.assumptions, *scale.assumption(height, height_sigma)),
         covariance=_covariance(plane, scale) if scale.metric else None,
-        stddev=replace(lens.stddev, tilt_deg=float(tilt), roll_deg=float(roll),
-                       height_m=height_sigma if scale.metric and height_sigma > 0 else None,
-                       ground_point_m=_ground_point_stddev(plane, scale) if scale.metric else ()))
+        stddev=replace(
+            lens.stddev,
+            tilt_deg=float(tilt),
+            roll_deg=float(roll),
+            height_m=height_sigma if scale.metric and height_sigma > 0 else None,
+            ground_point_m=_ground_point_stddev(plane, scale) if scale.metric else (),
+        ),
+    )

@@ -24,8 +24,17 @@ from autocalib_ros.commands import topview_command as topview
 from autocalib_ros.errors import AutocalibError, UsageError
 from autocalib_ros.util.threads import limit_blas_threads
 
-COMMANDS = {'replay': replay, 'evidence': evidence, 'compare': compare, 'rectify': rectify, 'topview': topview,
-            'picture': picture, 'simulate': simulate, 'demo': demo, 'benchmark': benchmark}
+COMMANDS = {
+    'replay': replay,
+    'evidence': evidence,
+    'compare': compare,
+    'rectify': rectify,
+    'topview': topview,
+    'picture': picture,
+    'simulate': simulate,
+    'demo': demo,
+    'benchmark': benchmark,
+}
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -34,12 +34,18 @@ def compare_calibrations(first: SavedCamera, second: SavedCamera) -> Comparison:
         notes.append(f'B is scaled from {second.width}x{second.height} to {first.width}x{first.height}')
         second = second.scaled_to(first.width, first.height)
     stated = first.stddev.focal_px is not None, second.stddev.focal_px is not None
-    notes += [f'{name} states no standard deviations and is taken as exact'
-              for name, has_sigma, other in zip('AB', stated, stated[::-1], strict=True) if not has_sigma and other]
+    notes += [
+        f'{name} states no standard deviations and is taken as exact'
+        for name, has_sigma, other in zip('AB', stated, stated[::-1], strict=True)
+        if not has_sigma and other
+    ]
     both = first.ground is not None and second.ground is not None
     metric = both and first.ground.metric and second.ground.metric
-    ahead = pixels_ahead(first.lens, first.ground.normal_in_camera, first.ground.height_m,
-                         np.array(GROUND_DISTANCES_M)) if metric else np.zeros((0, 2))
+    ahead = (
+        pixels_ahead(first.lens, first.ground.normal_in_camera, first.ground.height_m, np.array(GROUND_DISTANCES_M))
+        if metric
+        else np.zeros((0, 2))
+    )
     grid = pixel_grid(first, *COMPARISON_GRID)
     sides = _PerturbedRays.of(first, np.vstack([grid, ahead])), _PerturbedRays.of(second, np.vstack([grid, ahead]))
     everywhere = sides[0].subset(slice(len(grid))), sides[1].subset(slice(len(grid)))
@@ -47,11 +53,17 @@ def compare_calibrations(first: SavedCamera, second: SavedCamera) -> Comparison:
     pose, pose_notes = _pose_differences(first, second)
     road, road_notes = _road_differences(*sides, ahead) if metric else ((), [])
     return Comparison(
-        lens=lens, lens_px=max_lens_difference_px(first, second), rays=_ray_difference(*everywhere, grid, align_columns=False),
+        lens=lens,
+        lens_px=max_lens_difference_px(first, second),
+        rays=_ray_difference(*everywhere, grid, align_columns=False),
         rays_aligned=_ray_difference(*everywhere, grid, align_columns=True),
-        alignment_deg=_rotation_angle_deg(best_rotation(everywhere[0].nominal.rays, everywhere[1].nominal.rays)), pose=pose,
-        normal_deg=_normal_angle_deg(first.ground, second.ground) if both else None, road=road, stated=stated,
-        notes=(*notes, *lens_notes, *pose_notes, *road_notes))
+        alignment_deg=_rotation_angle_deg(best_rotation(everywhere[0].nominal.rays, everywhere[1].nominal.rays)),
+        pose=pose,
+        normal_deg=_normal_angle_deg(first.ground, second.ground) if both else None,
+        road=road,
+        stated=stated,
+        notes=(*notes, *lens_notes, *pose_notes, *road_notes),
+    )
 
 
 def max_lens_difference_px(first: SavedCamera | Camera, second: SavedCamera | Camera) -> float:
@@ -65,34 +77,56 @@ def max_lens_difference_px(first: SavedCamera | Camera, second: SavedCamera | Ca
 
 def _lens_differences(first: SavedCamera, second: SavedCamera) -> tuple[tuple[Difference, ...], list[str]]:
     points = [known.stddev.principal_point_px or (None, None) for known in (first, second)]
-    found = [_difference('focal length', 'px', first.focal_px, second.focal_px,
-                         first.stddev.focal_px, second.stddev.focal_px)]
-    found += [_difference(f'principal point {axis}', 'px', first.principal_point_px[index],
-                          second.principal_point_px[index], points[0][index], points[1][index])
-              for index, axis in enumerate('xy')]
+    found = [
+        _difference(
+            'focal length', 'px', first.focal_px, second.focal_px, first.stddev.focal_px, second.stddev.focal_px
+        )
+    ]
+    found += [
+        _difference(
+            f'principal point {axis}',
+            'px',
+            first.principal_point_px[index],
+            second.principal_point_px[index],
+            points[0][index],
+            points[1][index],
+        )
+        for index, axis in enumerate('xy')
+    ]
     if first.k is None or second.k is None:
         return tuple(found), ['k1 and k2 are not compared: a lens is not near to Kannala-Brandt, see the rays']
     if any(first.k[COMPARABLE_COEFFICIENTS:]) or any(second.k[COMPARABLE_COEFFICIENTS:]):
         return tuple(found), ['k1 and k2 are not compared: a lens has more coefficients than these, see the rays']
-    found += [_difference('k1', '', first.k[0], second.k[0], first.stddev.k1, second.stddev.k1),
-              _difference('k2', '', first.k[1], second.k[1], first.stddev.k2, second.stddev.k2)]
+    found += [
+        _difference('k1', '', first.k[0], second.k[0], first.stddev.k1, second.stddev.k1),
+        _difference('k2', '', first.k[1], second.k[1], first.stddev.k2, second.stddev.k2),
+    ]
     return tuple(found), []
 
 
 def _pose_differences(first: SavedCamera, second: SavedCamera) -> tuple[tuple[Difference, ...], list[str]]:
     missing = [name for name, known in (('A', first), ('B', second)) if known.ground is None]
     if missing:
-        return (), [f'poses are not compared: {" and ".join(missing)} {"holds" if len(missing) == 1 else "hold"}'
-                    ' no ground plane']
+        return (), [
+            f'poses are not compared: {" and ".join(missing)} {"holds" if len(missing) == 1 else "hold"}'
+            ' no ground plane'
+        ]
     angles = [tilt_and_roll_deg(known.ground.normal_in_camera) for known in (first, second)]
     sigmas = [(known.stddev.tilt_deg, known.stddev.roll_deg) for known in (first, second)]
-    found = [_difference(name, 'deg', float(angles[0][index]), float(angles[1][index]), sigmas[0][index],
-                         sigmas[1][index]) for index, name in enumerate(('tilt', 'roll'))]
+    found = [
+        _difference(name, 'deg', float(angles[0][index]), float(angles[1][index]), sigmas[0][index], sigmas[1][index])
+        for index, name in enumerate(('tilt', 'roll'))
+    ]
     if not (first.ground.metric and second.ground.metric):
         return tuple(found), ["heights and metres are not compared: a plane is in units of its camera's height"]
     # a height that was given has no deviation: it is exact
-    height = Difference('height', 'm', first.ground.height_m, second.ground.height_m, math.hypot(
-        first.stddev.height_m or 0.0, second.stddev.height_m or 0.0))
+    height = Difference(
+        'height',
+        'm',
+        first.ground.height_m,
+        second.ground.height_m,
+        math.hypot(first.stddev.height_m or 0.0, second.stddev.height_m or 0.0),
+    )
     return (*found, height), []
 
 
@@ -138,17 +172,30 @@ class _PerturbedRays:
         nominal = _PixelRays.of(known, known.ground, pixels)
         if known.covariance is None or known.ground is None:
             return cls(nominal, [] if known.stddev.focal_px is None else None)
-        ground = Ground(lens=known.lens, rotation=known.ground.rotation, camera_m=known.ground.translation_m,
-                        covariance=known.covariance)
-        return cls(nominal, [_PixelRays.of(lens, GroundPlane(rotation, float(camera_m[2])), pixels)
-                          for lens, rotation, camera_m in ground.perturbations])
+        ground = Ground(
+            lens=known.lens,
+            rotation=known.ground.rotation,
+            camera_m=known.ground.translation_m,
+            covariance=known.covariance,
+        )
+        return cls(
+            nominal,
+            [
+                _PixelRays.of(lens, GroundPlane(rotation, float(camera_m[2])), pixels)
+                for lens, rotation, camera_m in ground.perturbations
+            ],
+        )
 
     def subset(self, which: slice | np.ndarray) -> _PerturbedRays:
-        return _PerturbedRays(self.nominal.subset(which),
-                     None if self.perturbed is None else [view.subset(which) for view in self.perturbed])
+        return _PerturbedRays(
+            self.nominal.subset(which),
+            None if self.perturbed is None else [view.subset(which) for view in self.perturbed],
+        )
 
 
-def _ray_difference(first: _PerturbedRays, second: _PerturbedRays, pixels: np.ndarray, *, align_columns: bool) -> RayDifference:
+def _ray_difference(
+    first: _PerturbedRays, second: _PerturbedRays, pixels: np.ndarray, *, align_columns: bool
+) -> RayDifference:
     def difference(one: _PixelRays, other: _PixelRays) -> np.ndarray:
         return (other.rays @ best_rotation(one.rays, other.rays).T if align_columns else other.rays) - one.rays
 
@@ -159,12 +206,17 @@ def _ray_difference(first: _PerturbedRays, second: _PerturbedRays, pixels: np.nd
     angles_deg = np.degrees(2 * np.arcsin(np.clip(np.where(seen, chords, 0.0) / 2, 0, 1)))
     worst = int(np.argmax(angles_deg))
     sigma = _sigma(first, second, lambda one, other: difference(one, other)[worst])
-    return RayDifference(float(angles_deg[seen].mean()), float(angles_deg[worst]), tuple(map(float, pixels[worst])),
-                         None if sigma is None else math.degrees(sigma))
+    return RayDifference(
+        float(angles_deg[seen].mean()),
+        float(angles_deg[worst]),
+        tuple(map(float, pixels[worst])),
+        None if sigma is None else math.degrees(sigma),
+    )
 
 
-def _road_differences(first: _PerturbedRays, second: _PerturbedRays,
-                      ahead: np.ndarray) -> tuple[tuple[RoadDifference, ...], list[str]]:
+def _road_differences(
+    first: _PerturbedRays, second: _PerturbedRays, ahead: np.ndarray
+) -> tuple[tuple[RoadDifference, ...], list[str]]:
     """Compare where the pixels `ahead` (m, 2), the last of both sides, meet the road; nan is not in the image."""
     far, count = max(GROUND_DISTANCES_M), len(ahead)
     near = np.logical_and(*(np.abs(side.nominal.ground_points()) <= far for side in (first, second)))  # nan is not near
@@ -183,17 +235,28 @@ def _road_differences(first: _PerturbedRays, second: _PerturbedRays,
             heading = np.nansum(between / np.abs(between))
             gap = others[index] * heading / np.abs(heading) - ones[index]
             return np.array([gap.real, gap.imag])
+
         separation_m = float(np.hypot(*difference(first.nominal, second.nominal)))
-        found.append(RoadDifference(distance, tuple(map(float, pixel)), math.inf if math.isnan(separation_m) else separation_m,
-                                    _sigma(first, second, difference)))
+        found.append(
+            RoadDifference(
+                distance,
+                tuple(map(float, pixel)),
+                math.inf if math.isnan(separation_m) else separation_m,
+                _sigma(first, second, difference),
+            )
+        )
     return tuple(found), notes
 
 
-def _sigma(first: _PerturbedRays, second: _PerturbedRays, difference: Callable[[_PixelRays, _PixelRays], np.ndarray]) -> float | None:
-    """Return one sigma of the length of `difference` of the two (n,), by the covariances of both; None where not known."""
+def _sigma(
+    first: _PerturbedRays, second: _PerturbedRays, difference: Callable[[_PixelRays, _PixelRays], np.ndarray]
+) -> float | None:
+    """Return one sigma of the length of `difference` of the two (n,), None where no covariance is known."""
     if first.perturbed is None or second.perturbed is None:
         return None
-    moves = [difference(view, second.nominal) for view in first.perturbed] + [difference(first.nominal, view) for view in second.perturbed]
+    moves = [difference(view, second.nominal) for view in first.perturbed] + [
+        difference(first.nominal, view) for view in second.perturbed
+    ]
     if not moves:
         return None
     steps = (np.array(moves[::2]) - np.array(moves[1::2])) / (2 * PERTURBATION_SIGMAS)
@@ -311,8 +374,11 @@ class Comparison:
         lens = [*((item.name, item.sigmas) for item in self.lens)]
         if self.rays_aligned.sigma_deg is not None:
             lens.append(('the shape of the lens', self.rays_aligned.sigmas))
-        return ([] if self.same_lens else lens) + [(item.name, item.sigmas) for item in self.pose] + [
-            (f'the road {item.distance_m:g} m ahead', item.sigmas) for item in self.road if item.sigma_m is not None]
+        return (
+            ([] if self.same_lens else lens)
+            + [(item.name, item.sigmas) for item in self.pose]
+            + [(f'the road {item.distance_m:g} m ahead', item.sigmas) for item in self.road if item.sigma_m is not None]
+        )
 
     @property
     def agrees(self) -> bool | None:
@@ -326,15 +392,23 @@ class Comparison:
         """Say it in one sentence."""
         what = 'The calibrations' if self.pose else 'The lenses'
         if self.agrees is None:
-            return (f'Whether {what.lower()} agree cannot be told: neither states standard deviations, and the lenses'
-                    f' are up to {self.lens_px:.3g} px apart.')
+            return (
+                f'Whether {what.lower()} agree cannot be told: neither states standard deviations, and the lenses'
+                f' are up to {self.lens_px:.3g} px apart.'
+            )
         if self.agrees:
             largest, sigmas = max(self.terms(), key=lambda pair: pair[1], default=('', 0.0))
-            far = f'; farthest apart is {largest}, {sigmas:.1f} sigmas' if largest else (
-                f': up to {self.lens_px:.2g} px apart')
+            far = (
+                f'; farthest apart is {largest}, {sigmas:.1f} sigmas'
+                if largest
+                else (f': up to {self.lens_px:.2g} px apart')
+            )
             return f'{what} agree within {AGREEMENT_SIGMAS:g} combined sigmas{far}.'
-        beyond = [f'{name} ({_sigmas_words(sigmas)})' for name, sigmas in self.terms()
-                  if sigmas is not None and sigmas > AGREEMENT_SIGMAS]
+        beyond = [
+            f'{name} ({_sigmas_words(sigmas)})'
+            for name, sigmas in self.terms()
+            if sigmas is not None and sigmas > AGREEMENT_SIGMAS
+        ]
         return f'{what} differ in {_listed(beyond)}.'
 
 

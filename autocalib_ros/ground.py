@@ -75,12 +75,15 @@ class Ground:
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.camera_m).all() and np.isfinite(self.rotation).all() and self.camera_m[2] > 0):
-            raise InputError(f'the camera is {self.camera_m[2]:g} m above the plane z = 0 of the ground, expected more'
-                             ' than 0: give the transform to the ground frame, whose z axis points up')
+            raise InputError(
+                f'the camera is {self.camera_m[2]:g} m above the plane z = 0 of the ground, expected more'
+                ' than 0: give the transform to the ground frame, whose z axis points up'
+            )
 
     @classmethod
-    def from_messages(cls, camera_info: Any, ground_transform: Any, *, camera_frame: str = '',
-                      rectified: bool = False) -> Ground:
+    def from_messages(
+        cls, camera_info: Any, ground_transform: Any, *, camera_frame: str = '', rectified: bool = False
+    ) -> Ground:
         """Build from a CameraInfo and a TransformStamped between its frame and the ground, either of them the parent.
 
         `camera_frame` is the frame of the pose where that is not the one of the CameraInfo; `rectified` is for
@@ -89,8 +92,10 @@ class Ground:
         camera = (camera_frame or camera_info.header.frame_id).lstrip('/')
         parent, child = ground_transform.header.frame_id.lstrip('/'), ground_transform.child_frame_id.lstrip('/')
         if (parent == camera) == (child == camera):
-            raise InputError(f"the transform joins '{parent}' and '{child}', and one of the two should be the camera's"
-                             f" frame '{camera}': take the ground transform of this camera, or say camera_frame")
+            raise InputError(
+                f"the transform joins '{parent}' and '{child}', and one of the two should be the camera's"
+                f" frame '{camera}': take the ground transform of this camera, or say camera_frame"
+            )
         rotation, translation = _parse_transform(ground_transform.transform)
         if parent == camera:
             rotation, translation = rotation.T, -rotation.T @ translation
@@ -100,8 +105,13 @@ class Ground:
             raise InputError(f'camera_info: {error}') from error
         if rectified:
             rotation = rotation @ np.array([float(value) for value in message_field(camera_info, 'r')]).reshape(3, 3).T
-        return cls(lens=lens, rotation=rotation, camera_m=translation, camera_frame=camera,
-                   ground_frame=child if parent == camera else parent)
+        return cls(
+            lens=lens,
+            rotation=rotation,
+            camera_m=translation,
+            camera_frame=camera,
+            ground_frame=child if parent == camera else parent,
+        )
 
     @classmethod
     def from_file(cls, path: Path | str) -> Ground:
@@ -127,11 +137,13 @@ class Ground:
             raise InputError(f'it holds no ground plane{why}')
         if not ground.metric:
             raise InputError("its plane is in units of the camera's height, not in metres: calibrate with the height")
-        return cls(lens=result.camera, rotation=ground.rotation, camera_m=ground.translation_m,
-                   covariance=result.covariance)
+        return cls(
+            lens=result.camera, rotation=ground.rotation, camera_m=ground.translation_m, covariance=result.covariance
+        )
 
-    def points(self, pixels: np.ndarray, *, height_m: float | np.ndarray = 0.0,
-               pixel_sigma_px: float = 0.0) -> GroundPoints:
+    def points(
+        self, pixels: np.ndarray, *, height_m: float | np.ndarray = 0.0, pixel_sigma_px: float = 0.0
+    ) -> GroundPoints:
         """Return where pixels (n, 2) meet the road, or the plane `height_m` above it: a number, or one each, (n,).
 
         `pixel_sigma_px` is one sigma of the pixels themselves in x and in y, for `noise_m2`.
@@ -139,7 +151,9 @@ class Ground:
         pixels = np.asarray(pixels, float).reshape(-1, 2)
         numbers = np.isfinite(pixels).all(axis=1)
         pixels = np.where(numbers[:, None], pixels, 0.0)
-        near = pixels + DIFFERENCE_STEP_PX * np.array([[[0, 0]], [[1, 0]], [[0, 1]]])  # (3, n, 2): the pixel, right, below
+        near = pixels + DIFFERENCE_STEP_PX * np.array(
+            [[[0, 0]], [[1, 0]], [[0, 1]]]
+        )  # (3, n, 2): the pixel, right, below
         bearings, seen = self.lens.unproject(near.reshape(-1, 2))
         rays = bearings.reshape(3, -1, 3) @ self.rotation.T
         with np.errstate(all='ignore'):  # what is not valid may be anything, and is left out
@@ -151,8 +165,12 @@ class Ground:
         points = np.column_stack([places[0, :, :2], np.where(valid, height_m, np.nan)])
         by_pixel = (places[1:, :, :2] - places[0, :, :2]) * (pixel_sigma_px / DIFFERENCE_STEP_PX)
         noise = _outer_product_sum(by_pixel) if pixel_sigma_px > 0 else None
-        return GroundPoints(points_m=points, valid=valid, covariance_m2=self._calibration_covariance(pixels, height_m, valid),
-                            noise_m2=noise)
+        return GroundPoints(
+            points_m=points,
+            valid=valid,
+            covariance_m2=self._calibration_covariance(pixels, height_m, valid),
+            noise_m2=noise,
+        )
 
     def pixels(self, points_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return pixels (n, 2), nan where there are none, of points (n, 3) in the ground frame; and where valid (n,).
@@ -186,9 +204,12 @@ class Ground:
         The ground frame stays below where the optical axis points to: its heading is chosen, not measured.
         """
         (cx, cy), (k1, k2, k3, k4) = self.lens.principal_point_px, self.lens.k
-        lens = replace(self.lens, focal_px=self.lens.focal_px + step[0],
-                       principal_point_px=(cx + step[1], cy + step[2]),
-                       k=(k1 + step[3], k2 + step[4], k3 + step[5], k4 + step[6]))
+        lens = replace(
+            self.lens,
+            focal_px=self.lens.focal_px + step[0],
+            principal_point_px=(cx + step[1], cy + step[2]),
+            k=(k1 + step[3], k2 + step[4], k3 + step[5], k4 + step[6]),
+        )
         normal = self.rotation[2]
         tilt, roll = np.arcsin(np.clip(-normal[2], -1, 1)), np.arctan2(-normal[0], -normal[1])
         tilt, roll = tilt + np.radians(step[7]), roll + np.radians(step[8])
@@ -196,14 +217,19 @@ class Ground:
         in_road = self.rotation @ _ground_axes(normal)
         return lens, in_road @ _ground_axes(up).T, self.camera_m + [0.0, 0.0, step[9]]
 
-    def _calibration_covariance(self, pixels: np.ndarray, height_m: float | np.ndarray, valid: np.ndarray) -> np.ndarray | None:
+    def _calibration_covariance(
+        self, pixels: np.ndarray, height_m: float | np.ndarray, valid: np.ndarray
+    ) -> np.ndarray | None:
         """Covariance (n, 2, 2) of the places of pixels that the calibration leaves, nan where they are not valid."""
         moved = self.perturbations
         if moved is None:
             return None
         with np.errstate(all='ignore'):  # what is not valid may be anything, and is left out
-            places = [((height_m - camera_m[2]) / rays[:, 2])[:, None] * rays[:, :2]
-                      for lens, rotation, camera_m in moved for rays in [lens.unproject(pixels)[0] @ rotation.T]]
+            places = [
+                ((height_m - camera_m[2]) / rays[:, 2])[:, None] * rays[:, :2]
+                for lens, rotation, camera_m in moved
+                for rays in [lens.unproject(pixels)[0] @ rotation.T]
+            ]
             sides = np.reshape(places, (len(places) // 2, 2, len(pixels), 2))
             spread = _outer_product_sum((sides[:, 0] - sides[:, 1]) / (2 * PERTURBATION_SIGMAS))
         spread[~valid] = np.nan
@@ -227,6 +253,8 @@ def _parse_transform(transform: Any) -> tuple[np.ndarray, np.ndarray]:
     turn, shift = transform.rotation, transform.translation
     quaternion = np.array([float(turn.x), float(turn.y), float(turn.z), float(turn.w)])
     if not abs(np.linalg.norm(quaternion) - 1.0) < QUATERNION_TOLERANCE:
-        raise InputError(f'the rotation of the transform has the length {np.linalg.norm(quaternion):.6g}, expected 1:'
-                         ' it is no rotation, so its sender is at fault')
+        raise InputError(
+            f'the rotation of the transform has the length {np.linalg.norm(quaternion):.6g}, expected 1:'
+            ' it is no rotation, so its sender is at fault'
+        )
     return Rotation.from_quat(quaternion).as_matrix(), np.array([float(shift.x), float(shift.y), float(shift.z)])

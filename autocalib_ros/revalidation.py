@@ -59,22 +59,39 @@ def reconcile(state: CalibrationState, before: Calibration | None, fresh: Calibr
     if state is CalibrationState.CALIBRATED:
         # consumers would go on to use the plane that is latched, with a lens that it does not belong to
         loses = before.ground is not None and fresh.ground is None
-        return Decision(state, before, 'the calibration before stays: the new one has no ground plane') if loses else (
-            Decision(state, fresh))
+        return (
+            Decision(state, before, 'the calibration before stays: the new one has no ground plane')
+            if loses
+            else (Decision(state, fresh))
+        )
     differences = [*_lens_differences(before, fresh), *_plane_differences(before, fresh)]
     if differences:
         found = ', '.join(filter(None, differences))
-        return Decision(CalibrationState.CALIBRATED, fresh, contradicted=True, words=(
-            f'the earlier calibration does not hold any more and is replaced: {found}' if found else 'the earlier '
-            'calibration is replaced: without standard deviations nothing tells whether it still holds'))
+        return Decision(
+            CalibrationState.CALIBRATED,
+            fresh,
+            contradicted=True,
+            words=(
+                f'the earlier calibration does not hold any more and is replaced: {found}'
+                if found
+                else 'the earlier '
+                'calibration is replaced: without standard deviations nothing tells whether it still holds'
+            ),
+        )
     if before.ground is not None and fresh.ground is None:
         why = f': {fresh.ground_refusal.message}' if fresh.ground_refusal else ''
         return Decision(state, before, f'the traffic confirms the earlier lens; its ground plane is not verified{why}')
     if _at_least_as_precise(fresh, before):
-        return Decision(CalibrationState.CALIBRATED, fresh, 'the earlier calibration is confirmed, and replaced by '
-                        'one as sure')
-    return Decision(CalibrationState.VERIFIED, before, '' if state is CalibrationState.VERIFIED else
-                    'the traffic confirms the earlier calibration, which is surer and stays in force')
+        return Decision(
+            CalibrationState.CALIBRATED, fresh, 'the earlier calibration is confirmed, and replaced by one as sure'
+        )
+    return Decision(
+        CalibrationState.VERIFIED,
+        before,
+        ''
+        if state is CalibrationState.VERIFIED
+        else 'the traffic confirms the earlier calibration, which is surer and stays in force',
+    )
 
 
 def _lens_differences(before: Calibration, fresh: Calibration) -> list[str | None]:
@@ -103,17 +120,23 @@ class _Estimate:
 def _lens_estimates(result: Calibration) -> list[_Estimate]:
     camera, sigma = result.camera, result.stddev
     point = sigma.principal_point_px or (None, None)
-    return [_Estimate('focal length', camera.focal_px, sigma.focal_px, ' px'),
-            _Estimate('principal point x', camera.principal_point_px[0], point[0], ' px'),
-            _Estimate('principal point y', camera.principal_point_px[1], point[1], ' px'),
-            _Estimate('k1', camera.k[0], sigma.k1), _Estimate('k2', camera.k[1], sigma.k2)]
+    return [
+        _Estimate('focal length', camera.focal_px, sigma.focal_px, ' px'),
+        _Estimate('principal point x', camera.principal_point_px[0], point[0], ' px'),
+        _Estimate('principal point y', camera.principal_point_px[1], point[1], ' px'),
+        _Estimate('k1', camera.k[0], sigma.k1),
+        _Estimate('k2', camera.k[1], sigma.k2),
+    ]
 
 
 def _plane_estimates(ground: GroundPlane, sigma: StandardDeviations) -> list[_Estimate]:
     tilt, roll = tilt_and_roll_deg(ground.normal_in_camera)
     # a height that was given has no deviation: it is exact
-    return [_Estimate('tilt', float(tilt), sigma.tilt_deg, ' deg'), _Estimate('roll', float(roll), sigma.roll_deg, ' deg'),
-            _Estimate('height', ground.height_m, sigma.height_m or 0.0, ' m')]
+    return [
+        _Estimate('tilt', float(tilt), sigma.tilt_deg, ' deg'),
+        _Estimate('roll', float(roll), sigma.roll_deg, ' deg'),
+        _Estimate('height', ground.height_m, sigma.height_m or 0.0, ' m'),
+    ]
 
 
 def _differences(before: list[_Estimate], fresh: list[_Estimate]) -> list[str | None]:
@@ -125,8 +148,10 @@ def _differences(before: list[_Estimate], fresh: list[_Estimate]) -> list[str | 
         if old.sigma is None or new.sigma is None:
             found.append(None)
         elif difference > AGREEMENT_SIGMAS * math.hypot(old.sigma, new.sigma):
-            found.append(f'{old.name} {old.value:.4g} +- {old.sigma:.2g}{old.unit} was kept, {new.value:.4g} +- '
-                        f'{new.sigma:.2g}{new.unit} was found')
+            found.append(
+                f'{old.name} {old.value:.4g} +- {old.sigma:.2g}{old.unit} was kept, {new.value:.4g} +- '
+                f'{new.sigma:.2g}{new.unit} was found'
+            )
     return found
 
 
@@ -137,8 +162,9 @@ def _at_least_as_precise(fresh: Calibration, before: Calibration) -> bool:
     sigmas = [(fresh.stddev.focal_px, before.stddev.focal_px)]
     if before.ground is not None:
         sigmas += [(fresh.stddev.tilt_deg, before.stddev.tilt_deg), (fresh.stddev.roll_deg, before.stddev.roll_deg)]
-    return (_rank(fresh.grade) >= _rank(before.grade)
-            and all(_sigma_or_inf(new) <= _sigma_or_inf(old) for new, old in sigmas))
+    return _rank(fresh.grade) >= _rank(before.grade) and all(
+        _sigma_or_inf(new) <= _sigma_or_inf(old) for new, old in sigmas
+    )
 
 
 def _sigma_or_inf(sigma: float | None) -> float:
@@ -167,8 +193,14 @@ def with_current_options(kept: Calibration, options: Options, lens: Camera | Non
     options.scale.require_inside(*size)
     scale = known_scale(options, kept.camera, kept.ground.normal_in_camera)
     if not isinstance(scale, Scale):
-        return replace(kept, grade='lens', ground=None, ground_refusal=scale, covariance=None,
-                       stddev=replace(kept.stddev, tilt_deg=None, roll_deg=None, height_m=None, ground_point_m=()))
+        return replace(
+            kept,
+            grade='lens',
+            ground=None,
+            ground_refusal=scale,
+            covariance=None,
+            stddev=replace(kept.stddev, tilt_deg=None, roll_deg=None, height_m=None, ground_point_m=()),
+        )
     return _scaled(kept, kept.ground, scale)
 
 
@@ -178,8 +210,11 @@ def _scaled(kept: Calibration, ground: GroundPlane, scale: Scale) -> Calibration
         return kept
     words = tuple(text for text in kept.assumptions if not text.startswith('scale by '))
     return replace(
-        kept, grade=kept.grade if ground.metric else 'assumed', ground=replace(ground, height_m=height, metric=True),
+        kept,
+        grade=kept.grade if ground.metric else 'assumed',
+        ground=replace(ground, height_m=height, metric=True),
         assumptions=(*words, *scale.assumption(height)),
         covariance=None,
         # road points so many metres away are others now, and nothing is left that tells how sure they are
-        stddev=replace(kept.stddev, height_m=scale.sigma or None, ground_point_m=()))
+        stddev=replace(kept.stddev, height_m=scale.sigma or None, ground_point_m=()),
+    )

@@ -15,15 +15,20 @@ ARGUMENTS = (
     ('image', 'image_raw', 'image topic, relative to the namespace or absolute'),
     ('camera_height', '', 'height of the camera above the road, metres; empty leaves it to params_file'),
     ('params_file', '', 'file with options, as config/autocalib.yaml documents them; empty takes the defaults'),
-    ('camera_info', '', 'where camera_info goes, `camera_info` say when the driver publishes none; '
-                        'empty is <namespace>/autocalib/camera_info'),
+    (
+        'camera_info',
+        '',
+        'where camera_info goes, `camera_info` say when the driver publishes none; '
+        'empty is <namespace>/autocalib/camera_info',
+    ),
 )
 
 
 def generate_launch_description() -> LaunchDescription:
     """Declare the arguments and start the node with those that were given."""
-    walk_options = [DeclareLaunchArgument(name, default_value=default, description=text)
-                for name, default, text in ARGUMENTS]
+    walk_options = [
+        DeclareLaunchArgument(name, default_value=default, description=text) for name, default, text in ARGUMENTS
+    ]
     return LaunchDescription([*walk_options, OpaqueFunction(function=start_node)])
 
 
@@ -36,5 +41,14 @@ def start_node(context: LaunchContext) -> list[Node]:
     remappings = [('image', given['image'])]
     if given['camera_info']:
         remappings.append(('~/camera_info', given['camera_info']))
-    return [Node(package='autocalib_ros', executable='autocalib_node', name='autocalib', namespace=given['namespace'],
-                 output='screen', parameters=parameters, remappings=remappings)]
+    return [
+        Node(
+            package='autocalib_ros',
+            executable='autocalib_node',
+            name='autocalib',
+            namespace=given['namespace'],
+            output='screen',
+            parameters=parameters,
+            remappings=remappings,
+        )
+    ]

@@ -15,12 +15,25 @@ from autocalib_ros.ros.cameras import NODE_NAME, read_cameras
 
 def generate_launch_description() -> LaunchDescription:
     """Declare the file's argument and start what it asks for."""
-    return LaunchDescription([DeclareLaunchArgument('cameras', description='YAML file with the list of cameras'),
-                              OpaqueFunction(function=start_nodes)])
+    return LaunchDescription(
+        [
+            DeclareLaunchArgument('cameras', description='YAML file with the list of cameras'),
+            OpaqueFunction(function=start_nodes),
+        ]
+    )
 
 
 def start_nodes(context: LaunchContext) -> list[Node]:
     """Return a node for each camera of the file."""
-    return [Node(package='autocalib_ros', executable='autocalib_node', name=NODE_NAME, namespace=camera.namespace,
-                 output='screen', parameters=list(camera.parameters), remappings=list(camera.remappings))
-            for camera in read_cameras(LaunchConfiguration('cameras').perform(context))]
+    return [
+        Node(
+            package='autocalib_ros',
+            executable='autocalib_node',
+            name=NODE_NAME,
+            namespace=camera.namespace,
+            output='screen',
+            parameters=list(camera.parameters),
+            remappings=list(camera.remappings),
+        )
+        for camera in read_cameras(LaunchConfiguration('cameras').perform(context))
+    ]

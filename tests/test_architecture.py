@@ -12,15 +12,42 @@ import autocalib_ros
 
 PACKAGE = Path(autocalib_ros.__file__).parent
 # From the ground up. A room imports from rooms in lower lines only; rooms of one line do not know each other.
-STOREYS = (('errors', 'threads', 'redundancy'), ('config', 'files'), ('camera',), ('opencv_lens',), ('camera_info',),
-           ('calibration', 'info_lens'), ('calibration_reader',),
-           ('evidence', 'ground', 'store', 'known_camera', 'comparison'),
-           ('perception', 'estimation', 'pictures'), ('compare',), ('calibrator', 'standing'), ('report',),
-           ('ros', 'offline'), ('commands',), ('cli',), ('__main__', 'benchmark'))
+STOREYS = (
+    ('errors', 'threads', 'redundancy'),
+    ('config', 'files'),
+    ('camera',),
+    ('opencv_lens',),
+    ('camera_info',),
+    ('calibration', 'info_lens'),
+    ('calibration_reader',),
+    ('evidence', 'ground', 'store', 'known_camera', 'comparison'),
+    ('perception', 'estimation', 'pictures'),
+    ('compare',),
+    ('calibrator', 'standing'),
+    ('report',),
+    ('ros', 'offline'),
+    ('commands',),
+    ('cli',),
+    ('__main__', 'benchmark'),
+)
 STOREY = {room: height for height, rooms in enumerate(STOREYS) for room in rooms}
-ROS_PACKAGES = ('rclpy', 'ament_index_python', 'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs',
-                'rcl_interfaces', 'rosgraph_msgs', 'sensor_msgs', 'std_msgs', 'std_srvs', 'tf2_msgs', 'tf2_ros',
-                'visualization_msgs', 'rosidl_parser', 'rpyutils')
+ROS_PACKAGES = (
+    'rclpy',
+    'ament_index_python',
+    'builtin_interfaces',
+    'diagnostic_msgs',
+    'geometry_msgs',
+    'rcl_interfaces',
+    'rosgraph_msgs',
+    'sensor_msgs',
+    'std_msgs',
+    'std_srvs',
+    'tf2_msgs',
+    'tf2_ros',
+    'visualization_msgs',
+    'rosidl_parser',
+    'rpyutils',
+)
 WITHOUT_ROS = """
 import importlib, sys
 
@@ -56,7 +83,7 @@ def imported_modules(module: str, path: Path) -> list[str]:
         if isinstance(node, ast.Import):
             names += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
-            above = package.split('.')[:len(package.split('.')) - node.level + 1] if node.level else []
+            above = package.split('.')[: len(package.split('.')) - node.level + 1] if node.level else []
             source = '.'.join([*above, *([node.module] if node.module else [])])
             names += [f'{source}.{alias.name}' for alias in node.names] if source == 'autocalib_ros' else [source]
     return names
@@ -65,8 +92,9 @@ def imported_modules(module: str, path: Path) -> list[str]:
 def run_without_ros(modules: list[str], then: str = '') -> subprocess.CompletedProcess:
     program = WITHOUT_ROS.format(packages=set(ROS_PACKAGES), modules=modules, then=then)
     environment = {**os.environ, 'PYTHONPATH': str(PACKAGE.parent)}
-    return subprocess.run([sys.executable, '-c', program], capture_output=True, text=True, timeout=120,
-                          env=environment, check=False)
+    return subprocess.run(
+        [sys.executable, '-c', program], capture_output=True, text=True, timeout=120, env=environment, check=False
+    )
 
 
 @pytest.mark.parametrize('module', [name for name in MODULES if room_of(name)])

@@ -21,7 +21,7 @@ def image(index: int, size: tuple[int, int] = (180, 320)) -> np.ndarray:
     picture = generator.integers(60, 120, size).astype(np.uint8)
     block = np.kron(generator.integers(0, 255, (8, 12)), np.ones((5, 5))).astype(np.uint8)
     left = 6 * (index % 40)
-    picture[60:100, left:left + 60] = block[:, :max(0, min(60, size[1] - left))]
+    picture[60:100, left : left + 60] = block[:, : max(0, min(60, size[1] - left))]
     return picture
 
 
@@ -89,15 +89,18 @@ def test_a_repeated_or_late_stamp_is_left_out(stamp_ns: int) -> None:
     assert evidence is not None and evidence.frames == 10
 
 
-@pytest.mark.parametrize(('stamp_ns', 'size', 'expected'), [
-    (1_000_000_000, (180, 320), FrameStatus.USED),
-    (900_000_000, (180, 320), FrameStatus.LATE),  # the stamp of the image before
-    (1, (180, 320), FrameStatus.LATE),
-    (-100_000_000, (180, 320), FrameStatus.TIME_JUMPED),
-    (800_000_000 + CLOCK_JUMP_NS, (180, 320), FrameStatus.USED),
-    (900_000_000 + CLOCK_JUMP_NS, (180, 320), FrameStatus.TIME_JUMPED),
-    (1_000_000_000, (240, 320), FrameStatus.RESIZED),
-])
+@pytest.mark.parametrize(
+    ('stamp_ns', 'size', 'expected'),
+    [
+        (1_000_000_000, (180, 320), FrameStatus.USED),
+        (900_000_000, (180, 320), FrameStatus.LATE),  # the stamp of the image before
+        (1, (180, 320), FrameStatus.LATE),
+        (-100_000_000, (180, 320), FrameStatus.TIME_JUMPED),
+        (800_000_000 + CLOCK_JUMP_NS, (180, 320), FrameStatus.USED),
+        (900_000_000 + CLOCK_JUMP_NS, (180, 320), FrameStatus.TIME_JUMPED),
+        (1_000_000_000, (240, 320), FrameStatus.RESIZED),
+    ],
+)
 def test_what_became_of_an_image_is_told(stamp_ns: int, size: tuple[int, int], expected: FrameStatus) -> None:
     assert fed(10).add_image(stamp_ns, image(30, size)) is expected
 
@@ -122,8 +125,9 @@ def test_other_options_make_a_solution_due() -> None:
     assert calibrator.snapshot_if_due() is not None
 
 
-@pytest.mark.parametrize('picture', [np.zeros((10, 10), np.uint16), np.zeros((10, 10, 4), np.uint8),
-                                     np.zeros(10, np.uint8)])
+@pytest.mark.parametrize(
+    'picture', [np.zeros((10, 10), np.uint16), np.zeros((10, 10, 4), np.uint8), np.zeros(10, np.uint8)]
+)
 def test_another_kind_of_array_is_refused(picture: np.ndarray) -> None:
     with pytest.raises(InputError, match='8 bits'):
         AutoCalibrator(OPTIONS).add_image(0, picture)
@@ -162,7 +166,7 @@ def watched(seconds: float, moved_at_s: float = np.inf, gone_at_s: float = np.in
             picture = np.roll(picture, (4, 7), axis=(0, 1))
         picture = picture.copy()
         if 60 <= index < 100:
-            picture[60:105, 6 * (index - 60):6 * (index - 60) + 60] = block
+            picture[60:105, 6 * (index - 60) : 6 * (index - 60) + 60] = block
         calibrator.add_image(index * 500_000_000, cv2.add(picture, noise[index % 2]))
     return calibrator
 
@@ -197,5 +201,6 @@ def test_evidence_is_forgotten_when_the_camera_may_look_elsewhere() -> None:
 
 def test_progress_reads_as_one_line() -> None:
     assert str(CalibrationProgress(42.4, ('17 of 40 tracks',), 'about 6 min more at this rate')) == (
-        '42 %: 17 of 40 tracks, about 6 min more at this rate')
+        '42 %: 17 of 40 tracks, about 6 min more at this rate'
+    )
     assert str(CalibrationProgress(100.0, ())) == '100 %'

@@ -32,8 +32,15 @@ def still_video(tmp_path) -> Path:
 
 def autocalib(*arguments: object, folder: Path, **more: str) -> subprocess.CompletedProcess:
     environment = {**os.environ, 'PYTHONPATH': str(Path(autocalib_ros.__file__).parents[1]), **more}
-    return subprocess.run([sys.executable, '-m', 'autocalib_ros', *map(str, arguments)], capture_output=True,
-                          text=True, timeout=60, cwd=folder, env=environment, check=False)
+    return subprocess.run(
+        [sys.executable, '-m', 'autocalib_ros', *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        cwd=folder,
+        env=environment,
+        check=False,
+    )
 
 
 def one_line(text: str) -> str:
@@ -53,44 +60,54 @@ def test_help_and_version_end_well(capsys):
 
 
 def test_help_imports_nothing_heavy(tmp_path):
-    code = ("import sys; from autocalib_ros.cli import main; main(['--help']);"
-            "print(sorted({'cv2', 'numpy', 'rosbags', 'matplotlib', 'scipy'} & set(sys.modules)))")
-    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True,
-                          env={**os.environ, 'PYTHONPATH': str(Path(autocalib_ros.__file__).parents[1])})
+    code = (
+        "import sys; from autocalib_ros.cli import main; main(['--help']);"
+        "print(sorted({'cv2', 'numpy', 'rosbags', 'matplotlib', 'scipy'} & set(sys.modules)))"
+    )
+    done = subprocess.run(
+        [sys.executable, '-c', code],
+        capture_output=True,
+        text=True,
+        check=True,
+        env={**os.environ, 'PYTHONPATH': str(Path(autocalib_ros.__file__).parents[1])},
+    )
     assert done.stdout.endswith('[]\n')
 
 
-@pytest.mark.parametrize(('arguments', 'message'), [
-    ([], 'the following arguments are required: COMMAND'),
-    (['replay'], 'the following arguments are required: SOURCE'),
-    (['explode'], "invalid choice: 'explode'"),
-    (['replay', 'x', '--camera-height', 'high'], "invalid float value: 'high'"),
-    (['replay', 'x', '--method', 'magic'], "invalid choice: 'magic'"),
-    (['replay', 'x', '--unheard-of'], 'unrecognized arguments: --unheard-of'),
-    (['replay', 'x', '--camera-height', '-3'], "'camera_height' lies between 0 and 500; got -3.0"),
-    (['replay', 'x', '--camera-height', 'nan'], "'camera_height' lies between 0 and 500; got nan"),
-    (['replay', 'x', '--camera-height', 'inf'], "'camera_height' lies between 0 and 500; got inf"),
-    (['replay', 'x', '--camera-height', '8', '--scale-speed', '50'], 'not allowed with argument --camera-height'),
-    (['evidence', 'x', '--scale-speed', '50', '-p', 'camera_height=8'], "'camera_height' is given too"),
-    (['replay', 'x', '--scale-distance', '1', '2', '3', '4'], 'expected 5 arguments'),
-    (['replay', 'x', '--scale-distance', '1', '2', '3', '4', '5'], 'px apart'),
-    (['replay', 'x', '--scale-distance', '1', '2', '300', '4', '0'], "needs 'scale.distance_m'"),
-    (['evidence', 'x', '--scale-speed', '0'], "needs 'scale.speed_km_h'"),
-    (['evidence', 'x', '-p', 'scale_from=distance'], "needs 'scale.distance_px'"),
-    (['demo', '--scale-from', 'guess'], "invalid choice: 'guess'"),
-    (['replay', 'x', '-p', 'camera_hight=3'], "did you mean 'camera_height'?"),
-    (['replay', 'x', '-p', 'camera_height'], 'is not of the form name=value'),
-    (['replay', 'x', '-p', 'tracking.max_points=many'], "'max_points' takes a int, got 'many'"),
-    (['replay', 'x', '--params-file', 'nowhere.yaml'], 'cannot read nowhere.yaml'),
-    (['replay', 'nowhere.mp4'], 'nowhere.mp4 does not exist'),
-    (['replay', 'x', '--camera-info', 'nowhere.yaml'], 'cannot read nowhere.yaml'),
-    (['replay', 'x', '-p', 'detector.model=nowhere.onnx'], "'detector.model' is nowhere.onnx, which is not a file"),
-    (['replay', 'x', '-p', 'detector.layout=yolo'], "'layout' is one of auto, yolox"),
-    (['evidence'], 'the following arguments are required: FILE.npz'),
-    (['evidence', 'nowhere.npz'], 'nowhere.npz'),
-    (['evidence', 'nowhere.npz', '-p', 'camera_hight=3'], "did you mean 'camera_height'?"),
-    (['demo', '--seed', 'x'], "invalid int value: 'x'"),
-])
+@pytest.mark.parametrize(
+    ('arguments', 'message'),
+    [
+        ([], 'the following arguments are required: COMMAND'),
+        (['replay'], 'the following arguments are required: SOURCE'),
+        (['explode'], "invalid choice: 'explode'"),
+        (['replay', 'x', '--camera-height', 'high'], "invalid float value: 'high'"),
+        (['replay', 'x', '--method', 'magic'], "invalid choice: 'magic'"),
+        (['replay', 'x', '--unheard-of'], 'unrecognized arguments: --unheard-of'),
+        (['replay', 'x', '--camera-height', '-3'], "'camera_height' lies between 0 and 500; got -3.0"),
+        (['replay', 'x', '--camera-height', 'nan'], "'camera_height' lies between 0 and 500; got nan"),
+        (['replay', 'x', '--camera-height', 'inf'], "'camera_height' lies between 0 and 500; got inf"),
+        (['replay', 'x', '--camera-height', '8', '--scale-speed', '50'], 'not allowed with argument --camera-height'),
+        (['evidence', 'x', '--scale-speed', '50', '-p', 'camera_height=8'], "'camera_height' is given too"),
+        (['replay', 'x', '--scale-distance', '1', '2', '3', '4'], 'expected 5 arguments'),
+        (['replay', 'x', '--scale-distance', '1', '2', '3', '4', '5'], 'px apart'),
+        (['replay', 'x', '--scale-distance', '1', '2', '300', '4', '0'], "needs 'scale.distance_m'"),
+        (['evidence', 'x', '--scale-speed', '0'], "needs 'scale.speed_km_h'"),
+        (['evidence', 'x', '-p', 'scale_from=distance'], "needs 'scale.distance_px'"),
+        (['demo', '--scale-from', 'guess'], "invalid choice: 'guess'"),
+        (['replay', 'x', '-p', 'camera_hight=3'], "did you mean 'camera_height'?"),
+        (['replay', 'x', '-p', 'camera_height'], 'is not of the form name=value'),
+        (['replay', 'x', '-p', 'tracking.max_points=many'], "'max_points' takes a int, got 'many'"),
+        (['replay', 'x', '--params-file', 'nowhere.yaml'], 'cannot read nowhere.yaml'),
+        (['replay', 'nowhere.mp4'], 'nowhere.mp4 does not exist'),
+        (['replay', 'x', '--camera-info', 'nowhere.yaml'], 'cannot read nowhere.yaml'),
+        (['replay', 'x', '-p', 'detector.model=nowhere.onnx'], "'detector.model' is nowhere.onnx, which is not a file"),
+        (['replay', 'x', '-p', 'detector.layout=yolo'], "'layout' is one of auto, yolox"),
+        (['evidence'], 'the following arguments are required: FILE.npz'),
+        (['evidence', 'nowhere.npz'], 'nowhere.npz'),
+        (['evidence', 'nowhere.npz', '-p', 'camera_hight=3'], "did you mean 'camera_height'?"),
+        (['demo', '--seed', 'x'], "invalid int value: 'x'"),
+    ],
+)
 def test_wrong_usage_is_one_line_and_status_2(arguments, message, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(arguments) == 2
@@ -125,8 +142,9 @@ def test_a_truncated_video_is_one_line_from_the_libraries_too(tmp_path):
 
 def test_nothing_that_moves_is_refused_with_the_reason(still_video, tmp_path):
     # a terminal that knows no more than ASCII is no reason to fail
-    done = autocalib('replay', still_video, '--camera-height', 8, '--out', 'out', folder=tmp_path,
-                     PYTHONIOENCODING='ascii')
+    done = autocalib(
+        'replay', still_video, '--camera-height', 8, '--out', 'out', folder=tmp_path, PYTHONIOENCODING='ascii'
+    )
     assert done.returncode == 3, done.stderr
     assert 'Not calibrated: ' in done.stderr
     assert 'Traceback' not in done.stderr
@@ -134,7 +152,11 @@ def test_nothing_that_moves_is_refused_with_the_reason(still_video, tmp_path):
     assert document['state'] == 'refused'
     assert document['refusal']['message'].rstrip('.') in done.stderr
     assert sorted(path.name for path in (tmp_path / 'out').iterdir()) == [
-        'calibration.json', 'evidence.npz', 'figures', 'report.html']
+        'calibration.json',
+        'evidence.npz',
+        'figures',
+        'report.html',
+    ]
     assert 'Written to out: calibration.json, report.html, evidence.npz' in done.stdout
 
 
@@ -149,7 +171,8 @@ def test_pixels_outside_the_image_are_noticed_at_the_first_image(still_video, tm
     command = ['replay', str(still_video), '--quiet', '--out', str(tmp_path / 'out')]
     assert main([*command, '--scale-distance', '10', '80', '400', '80', '12.5']) == 2
     assert "(400, 80) of 'scale.distance_px' lies outside the images, which have 160x96" in one_line(
-        capsys.readouterr().err)
+        capsys.readouterr().err
+    )
 
 
 @pytest.mark.parametrize('scale', [['--scale-distance', '10', '80', '150', '80', '12.5'], ['--scale-speed', '50']])
@@ -169,8 +192,7 @@ def test_quiet_says_only_the_reason(still_video, tmp_path, capsys):
     assert main(['replay', str(still_video), '--quiet', '--out', str(tmp_path / 'out'), '--write-bag', str(bag)]) == 3
     captured = capsys.readouterr()
     assert captured.out == ''
-    assert [line.split(':')[0] for line in captured.err.splitlines()] == [
-        'Not calibrated', f'{bag} is not written']
+    assert [line.split(':')[0] for line in captured.err.splitlines()] == ['Not calibrated', f'{bag} is not written']
     assert not bag.exists()
 
 
@@ -181,8 +203,15 @@ def test_an_existing_bag_is_noticed_before_the_work(still_video, tmp_path, capsy
 
 def test_the_command_line_overrides_the_file(still_video, tmp_path):
     (tmp_path / 'p.yaml').write_text('/**: {ros__parameters: {method: paper, camera_height: 5.0}}')
-    base = ['replay', str(still_video), '--quiet', '--out', str(tmp_path / 'out'), '--params-file',
-            str(tmp_path / 'p.yaml')]
+    base = [
+        'replay',
+        str(still_video),
+        '--quiet',
+        '--out',
+        str(tmp_path / 'out'),
+        '--params-file',
+        str(tmp_path / 'p.yaml'),
+    ]
     for more, method in (([], 'paper'), (['--method', 'joint'], 'joint'), (['-p', 'method=joint'], 'joint')):
         assert main([*base, *more]) == 3
         assert json.loads((tmp_path / 'out' / 'calibration.json').read_text())['method'] == method
@@ -198,6 +227,7 @@ def test_two_runs_write_the_same_calibration(still_video, tmp_path):
 def test_an_interrupt_ends_quietly(still_video, tmp_path, monkeypatch, capsys):
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
+
     monkeypatch.setattr('autocalib_ros.offline.recordings.sources.open_source', interrupted)
     assert main(['replay', str(still_video), '--out', str(tmp_path / 'out')]) == 130
     assert 'Traceback' not in capsys.readouterr().err

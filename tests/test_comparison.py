@@ -20,8 +20,9 @@ from autocalib_ros.results.saved_camera import SavedCamera
 
 CAMERA = Camera(1280, 720, 560.0, (642.0, 357.0), (0.01, -0.002, 0.0, 0.0))
 SIGMAS = np.array([3.0, 2.0, 2.0, 0.004, 0.002, 0.0, 0.0, 0.15, 0.1, 0.08])
-STATED = StandardDeviations(focal_px=3.0, principal_point_px=(2.0, 2.0), k1=0.004, k2=0.002, tilt_deg=0.15,
-                            roll_deg=0.1, height_m=0.08)
+STATED = StandardDeviations(
+    focal_px=3.0, principal_point_px=(2.0, 2.0), k1=0.004, k2=0.002, tilt_deg=0.15, roll_deg=0.1, height_m=0.08
+)
 NONE = StandardDeviations()
 
 
@@ -35,9 +36,16 @@ def pose(tilt_deg: float = 28.0, roll_deg: float = 1.0, heading_deg: float = 0.0
 
 def known(camera: Camera = CAMERA, ground: GroundPlane | None = None, *, sure: bool = False) -> SavedCamera:
     """Return a camera, and with `sure` its deviations with a covariance without correlations."""
-    return SavedCamera(width=camera.width, height=camera.height, lens=camera, matrix=camera.matrix, k=camera.k,
-                       ground=ground or pose(), stddev=STATED if sure else NONE,
-                       covariance=np.diag(SIGMAS**2) if sure else None)
+    return SavedCamera(
+        width=camera.width,
+        height=camera.height,
+        lens=camera,
+        matrix=camera.matrix,
+        k=camera.k,
+        ground=ground or pose(),
+        stddev=STATED if sure else NONE,
+        covariance=np.diag(SIGMAS**2) if sure else None,
+    )
 
 
 def number(result, name):
@@ -53,12 +61,18 @@ def test_a_calibration_is_its_own_equal():
 
 
 def test_numbers_are_those_put_in_and_counted_in_combined_sigmas():
-    other = known(replace(CAMERA, focal_px=565.0, principal_point_px=(640.0, 360.0)), pose(28.5, 0.8, height_m=8.1),
-                  sure=True)
+    other = known(
+        replace(CAMERA, focal_px=565.0, principal_point_px=(640.0, 360.0)), pose(28.5, 0.8, height_m=8.1), sure=True
+    )
     result = compare_calibrations(known(sure=True), other)
-    for name, difference, sigma in (('focal length', 5.0, 3.0), ('principal point x', -2.0, 2.0),
-                                    ('principal point y', 3.0, 2.0), ('tilt', 0.5, 0.15), ('roll', -0.2, 0.1),
-                                    ('height', 0.1, 0.08)):
+    for name, difference, sigma in (
+        ('focal length', 5.0, 3.0),
+        ('principal point x', -2.0, 2.0),
+        ('principal point y', 3.0, 2.0),
+        ('tilt', 0.5, 0.15),
+        ('roll', -0.2, 0.1),
+        ('height', 0.1, 0.08),
+    ):
         assert number(result, name).difference == pytest.approx(difference)
         assert number(result, name).sigma == pytest.approx(np.sqrt(2) * sigma)
         assert number(result, name).sigmas == pytest.approx(abs(difference) / (np.sqrt(2) * sigma))
@@ -132,8 +146,9 @@ def test_where_nobody_states_deviations_only_equal_lenses_agree():
 
 def test_heights_that_were_given_differently_differ():
     given = replace(STATED, height_m=None)
-    result = compare_calibrations(replace(known(sure=True), stddev=given),
-                      replace(known(ground=pose(height_m=8.2), sure=True), stddev=given))
+    result = compare_calibrations(
+        replace(known(sure=True), stddev=given), replace(known(ground=pose(height_m=8.2), sure=True), stddev=given)
+    )
     assert 'height (both exact)' in result.verdict()
 
 
@@ -169,14 +184,21 @@ def test_sigmas_on_the_road_and_of_rays_are_those_of_draws_from_the_covariance()
 
 
 def test_both_sides_deviations_add_up():
-    alone, both = (compare_calibrations(known(sure=True), known(ground=pose(28.2), sure=sure)) for sure in (False, True))
+    alone, both = (
+        compare_calibrations(known(sure=True), known(ground=pose(28.2), sure=sure)) for sure in (False, True)
+    )
     for one, two in zip(alone.road, both.road, strict=True):
         assert two.sigma_m == pytest.approx(np.sqrt(2) * one.sigma_m, rel=0.05)  # the poses are not quite the same
 
 
 def test_another_image_size_is_scaled_and_another_shape_is_wrong():
-    half = replace(CAMERA, width=640, height=360, focal_px=280.0,
-                   principal_point_px=tuple((value + 0.5) / 2 - 0.5 for value in CAMERA.principal_point_px))
+    half = replace(
+        CAMERA,
+        width=640,
+        height=360,
+        focal_px=280.0,
+        principal_point_px=tuple((value + 0.5) / 2 - 0.5 for value in CAMERA.principal_point_px),
+    )
     result = compare_calibrations(known(), known(half))
     assert result.lens_px == pytest.approx(0, abs=1e-6)
     assert 'B is scaled from 640x360 to 1280x720' in result.notes
@@ -186,8 +208,9 @@ def test_another_image_size_is_scaled_and_another_shape_is_wrong():
 
 def test_a_checkerboards_rational_lens_is_compared_by_its_rays():
     info = camera_info(CAMERA, 'rational_polynomial')
-    rational = SavedCamera.from_opencv_lens(OpencvLens(width=1280, height=720, matrix=CAMERA.matrix, equidistant=False,
-                                              coefficients=tuple(info.d)))
+    rational = SavedCamera.from_opencv_lens(
+        OpencvLens(width=1280, height=720, matrix=CAMERA.matrix, equidistant=False, coefficients=tuple(info.d))
+    )
     result = compare_calibrations(known(sure=True), rational)
     assert result.same_lens and result.agrees
     assert result.rays.largest_deg < np.degrees(0.1 / 560)

@@ -22,14 +22,17 @@ def test_an_unknown_option_names_its_nearest_neighbour() -> None:
         with_overrides(Options(), {'tracking.max_point': 5})
 
 
-@pytest.mark.parametrize(('name', 'value', 'says'), [
-    ('camera_height', -1.0, 'lies between 0 and 500'),
-    ('camera_height', float('nan'), 'lies between'),
-    ('camera_height', 'eight', 'takes a float'),
-    ('method', 'magic', 'one of joint, paper'),
-    ('tracking.max_points', 2.5, 'takes a int'),
-    ('allow_unit_scale', 1, 'takes a bool'),
-])
+@pytest.mark.parametrize(
+    ('name', 'value', 'says'),
+    [
+        ('camera_height', -1.0, 'lies between 0 and 500'),
+        ('camera_height', float('nan'), 'lies between'),
+        ('camera_height', 'eight', 'takes a float'),
+        ('method', 'magic', 'one of joint, paper'),
+        ('tracking.max_points', 2.5, 'takes a int'),
+        ('allow_unit_scale', 1, 'takes a bool'),
+    ],
+)
 def test_a_value_out_of_range_says_what_is_expected(name: str, value: object, says: str) -> None:
     with pytest.raises(UsageError, match=says):
         with_overrides(Options(), {name: value})
@@ -43,26 +46,32 @@ def test_a_whole_number_is_taken_for_a_float() -> None:
 PIXELS = '412 530 888 530'
 
 
-@pytest.mark.parametrize(('values', 'says'), [
-    ({'scale_from': 'distance'}, "which needs 'scale.distance_px'"),
-    ({'scale_from': 'distance', 'scale.distance_px': PIXELS}, "which needs 'scale.distance_m'"),
-    ({'scale_from': 'distance', 'scale.distance_m': 10.0}, "which needs 'scale.distance_px'"),
-    ({'scale_from': 'speed'}, "which needs 'scale.speed_km_h'"),
-    ({'scale_from': 'guess'}, 'one of height, distance, speed'),
-    ({'scale_from': 'speed', 'scale.speed_km_h': 50.0, 'camera_height': 8.0}, "'camera_height' is given too"),
-    ({'scale.speed_km_h': 50.0, 'camera_height': 8.0}, "'scale.speed_km_h' is given too"),
-    ({'scale.distance_px': PIXELS, 'scale.distance_m': 10.0}, "'scale.distance_px' is given too.* to distance"),
-    ({'scale_from': 'speed', 'scale.speed_km_h': 50.0, 'scale.distance_m': 10.0}, "'scale.distance_m' is given too"),
-    ({'camera_height_sigma': 0.1}, "without 'camera_height'"),
-    ({'scale_from': 'speed', 'scale.speed_km_h': 50.0, 'method': 'paper'}, 'height or distance'),
-    ({'scale_from': 'distance', 'scale.distance_px': PIXELS, 'scale.distance_m': -1.0}, 'lies between 0 and 1000'),
-    ({'scale.distance_px': '1 2 3'}, "four numbers in one text.* got '1 2 3'"),
-    ({'scale.distance_px': '1 2 3 nan'}, 'four numbers'),
-    ({'scale.distance_px': 'here there now then'}, 'four numbers'),
-    ({'scale.distance_px': [412.0, 530.0, 888.0, 530.0]}, 'four numbers in one text'),
-    ({'scale.distance_px': '412 530 412 530'}, '0.0 px apart'),
-    ({'scale.distance_px': '412 530 418 538'}, 'are 10.0 px apart.* known to 2 px'),
-])
+@pytest.mark.parametrize(
+    ('values', 'says'),
+    [
+        ({'scale_from': 'distance'}, "which needs 'scale.distance_px'"),
+        ({'scale_from': 'distance', 'scale.distance_px': PIXELS}, "which needs 'scale.distance_m'"),
+        ({'scale_from': 'distance', 'scale.distance_m': 10.0}, "which needs 'scale.distance_px'"),
+        ({'scale_from': 'speed'}, "which needs 'scale.speed_km_h'"),
+        ({'scale_from': 'guess'}, 'one of height, distance, speed'),
+        ({'scale_from': 'speed', 'scale.speed_km_h': 50.0, 'camera_height': 8.0}, "'camera_height' is given too"),
+        ({'scale.speed_km_h': 50.0, 'camera_height': 8.0}, "'scale.speed_km_h' is given too"),
+        ({'scale.distance_px': PIXELS, 'scale.distance_m': 10.0}, "'scale.distance_px' is given too.* to distance"),
+        (
+            {'scale_from': 'speed', 'scale.speed_km_h': 50.0, 'scale.distance_m': 10.0},
+            "'scale.distance_m' is given too",
+        ),
+        ({'camera_height_sigma': 0.1}, "without 'camera_height'"),
+        ({'scale_from': 'speed', 'scale.speed_km_h': 50.0, 'method': 'paper'}, 'height or distance'),
+        ({'scale_from': 'distance', 'scale.distance_px': PIXELS, 'scale.distance_m': -1.0}, 'lies between 0 and 1000'),
+        ({'scale.distance_px': '1 2 3'}, "four numbers in one text.* got '1 2 3'"),
+        ({'scale.distance_px': '1 2 3 nan'}, 'four numbers'),
+        ({'scale.distance_px': 'here there now then'}, 'four numbers'),
+        ({'scale.distance_px': [412.0, 530.0, 888.0, 530.0]}, 'four numbers in one text'),
+        ({'scale.distance_px': '412 530 412 530'}, '0.0 px apart'),
+        ({'scale.distance_px': '412 530 418 538'}, 'are 10.0 px apart.* known to 2 px'),
+    ],
+)
 def test_a_scale_is_told_by_one_source_and_whole(values: dict[str, object], says: str) -> None:
     more = {'scale.pixel_sigma_px': 2.0} if '418' in str(values) else {}
     with pytest.raises(UsageError, match=says):

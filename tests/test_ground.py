@@ -65,24 +65,58 @@ def header(frame: str) -> Any:
     return message('std_msgs/msg/Header', stamp=stamp, frame_id=frame)
 
 
-def info(model: str = 'equidistant', k: tuple[float, ...] = K, d: tuple[float, ...] = (0.015, 0.0, 0.0, 0.0), *,
-         p: tuple[float, ...] = (0.0,) * 12, r: np.ndarray | None = None, binning: int = 0,
-         offset: tuple[int, int] = (0, 0)) -> Any:
-    region = message('sensor_msgs/msg/RegionOfInterest', x_offset=offset[0], y_offset=offset[1],
-                     width=640 if any(offset) else 0, height=360 if any(offset) else 0, do_rectify=False)
-    return message('sensor_msgs/msg/CameraInfo', header=header('cam'), width=SIZE[0], height=SIZE[1],
-                   distortion_model=model, k=np.array(k), d=np.array(d), r=(np.eye(3) if r is None else r).ravel(),
-                   p=np.array(p), binning_x=binning, binning_y=binning, roi=region)
+def info(
+    model: str = 'equidistant',
+    k: tuple[float, ...] = K,
+    d: tuple[float, ...] = (0.015, 0.0, 0.0, 0.0),
+    *,
+    p: tuple[float, ...] = (0.0,) * 12,
+    r: np.ndarray | None = None,
+    binning: int = 0,
+    offset: tuple[int, int] = (0, 0),
+) -> Any:
+    region = message(
+        'sensor_msgs/msg/RegionOfInterest',
+        x_offset=offset[0],
+        y_offset=offset[1],
+        width=640 if any(offset) else 0,
+        height=360 if any(offset) else 0,
+        do_rectify=False,
+    )
+    return message(
+        'sensor_msgs/msg/CameraInfo',
+        header=header('cam'),
+        width=SIZE[0],
+        height=SIZE[1],
+        distortion_model=model,
+        k=np.array(k),
+        d=np.array(d),
+        r=(np.eye(3) if r is None else r).ravel(),
+        p=np.array(p),
+        binning_x=binning,
+        binning_y=binning,
+        roi=region,
+    )
 
 
-def transform(parent: str = 'road', child: str = 'cam', rotation: np.ndarray = CAMERA_FROM_GROUND.T,
-              translation: tuple[float, ...] = (0.0, 0.0, HEIGHT_M)) -> Any:
+def transform(
+    parent: str = 'road',
+    child: str = 'cam',
+    rotation: np.ndarray = CAMERA_FROM_GROUND.T,
+    translation: tuple[float, ...] = (0.0, 0.0, HEIGHT_M),
+) -> Any:
     turn = dict(zip('xyzw', Rotation.from_matrix(rotation).as_quat().tolist(), strict=True))
     shift = dict(zip('xyz', map(float, translation), strict=True))
-    return message('geometry_msgs/msg/TransformStamped', header=header(parent), child_frame_id=child,
-                   transform=message('geometry_msgs/msg/Transform',
-                                     translation=message('geometry_msgs/msg/Vector3', **shift),
-                                     rotation=message('geometry_msgs/msg/Quaternion', **turn)))
+    return message(
+        'geometry_msgs/msg/TransformStamped',
+        header=header(parent),
+        child_frame_id=child,
+        transform=message(
+            'geometry_msgs/msg/Transform',
+            translation=message('geometry_msgs/msg/Vector3', **shift),
+            rotation=message('geometry_msgs/msg/Quaternion', **turn),
+        ),
+    )
 
 
 def opencv_pixels(lens: tuple[str, tuple[float, ...], tuple[float, ...]], points_m: np.ndarray) -> np.ndarray:
@@ -97,15 +131,27 @@ def opencv_pixels(lens: tuple[str, tuple[float, ...], tuple[float, ...]], points
     return pixels[:, 0]
 
 
-def document(camera: Camera | None = None, covariance: np.ndarray | None = COVARIANCE,
-             **changed: Any) -> dict[str, Any]:
+def document(
+    camera: Camera | None = None, covariance: np.ndarray | None = COVARIANCE, **changed: Any
+) -> dict[str, Any]:
     """Return the document of a calibration, as it is read from its file."""
-    summary = EvidenceSummary(image_size=SIZE, seconds=60.0, frames=900, tracks=300, segments=4000, vehicles=70,
-                              coverage=0.6)
+    summary = EvidenceSummary(
+        image_size=SIZE, seconds=60.0, frames=900, tracks=300, segments=4000, vehicles=70, coverage=0.6
+    )
     result = Calibration(
-        method='joint', grade='full', assumptions=(), camera=camera or CAMERA,
-        ground=GroundPlane(CAMERA_FROM_GROUND.T, HEIGHT_M), ground_refusal=None, road_directions=np.zeros((0, 3)),
-        stddev=StandardDeviations(), covariance=covariance, paper=None, evidence=summary, newest_stamp_ns=1)
+        method='joint',
+        grade='full',
+        assumptions=(),
+        camera=camera or CAMERA,
+        ground=GroundPlane(CAMERA_FROM_GROUND.T, HEIGHT_M),
+        ground_refusal=None,
+        road_directions=np.zeros((0, 3)),
+        stddev=StandardDeviations(),
+        covariance=covariance,
+        paper=None,
+        evidence=summary,
+        newest_stamp_ns=1,
+    )
     return json.loads(json.dumps(to_json(replace(result, **changed))))
 
 
@@ -171,8 +217,10 @@ def test_either_frame_may_be_the_parent(pixels):
 
 
 def test_a_ground_frame_elsewhere_gives_points_in_that_frame(places):
-    here, away = (Ground.from_messages(info(), transform(translation=(*shift, HEIGHT_M)))
-                  for shift in ((0.0, 0.0), (100.0, -50.0)))
+    here, away = (
+        Ground.from_messages(info(), transform(translation=(*shift, HEIGHT_M)))
+        for shift in ((0.0, 0.0), (100.0, -50.0))
+    )
     pixels, _ = here.pixels(places)
     np.testing.assert_allclose(away.points(pixels).points_m[:, :2], places + [100.0, -50.0], atol=1e-8)
 
@@ -187,9 +235,13 @@ def test_the_frame_of_the_pose_may_have_another_name():
     assert Ground.from_messages(info(), transform('road', 'lens'), camera_frame='lens').ground_frame == 'road'
 
 
-@pytest.mark.parametrize(('changed', 'said'), [
-    ({'translation': (0.0, 0.0, -8.0)}, 'z axis points up'),
-    ({'translation': (0.0, 0.0, float('nan'))}, 'z axis points up')])
+@pytest.mark.parametrize(
+    ('changed', 'said'),
+    [
+        ({'translation': (0.0, 0.0, -8.0)}, 'z axis points up'),
+        ({'translation': (0.0, 0.0, float('nan'))}, 'z axis points up'),
+    ],
+)
 def test_a_camera_that_is_not_above_the_road_is_refused(changed, said):
     with pytest.raises(InputError, match=said):
         Ground.from_messages(info(), transform(**changed))
@@ -202,9 +254,14 @@ def test_a_rotation_that_is_none_is_refused():
         Ground.from_messages(info(), stamped)
 
 
-@pytest.mark.parametrize(('given', 'said'), [
-    ({'k': (0.0,) * 9}, 'not calibrated'), ({'model': 'kannala_brandt'}, 'distortion model'),
-    ({'d': (0.0,) * 9}, '9 numbers, expected 4')])
+@pytest.mark.parametrize(
+    ('given', 'said'),
+    [
+        ({'k': (0.0,) * 9}, 'not calibrated'),
+        ({'model': 'kannala_brandt'}, 'distortion model'),
+        ({'d': (0.0,) * 9}, '9 numbers, expected 4'),
+    ],
+)
 def test_what_is_no_lens_is_refused(given, said):
     with pytest.raises(InputError, match=said):
         Ground.from_messages(info(**given), transform())
@@ -212,10 +269,12 @@ def test_what_is_no_lens_is_refused(given, said):
 
 def horizon_row(column: float) -> float:
     """The row of the horizon in a column, by bisection of OpenCV's bearings."""
+
     def depression(row: float) -> float:
         model, k, d = LENSES['equidistant']
         slope = cv2.fisheye.undistortPoints(np.array([[[column, row]]]), np.reshape(k, (3, 3)), np.array(d))[0, 0]
         return float(-(CAMERA_FROM_GROUND.T @ [*slope, 1.0])[2])
+
     low, high = 0.0, 360.0
     for _ in range(60):
         middle = (low + high) / 2
@@ -254,8 +313,10 @@ def test_each_point_may_have_its_own_height(places):
 
 
 # x (1 - 0.5 r^2) is largest, 0.544, at r = 0.816; theta - 0.3 theta^3 is largest, 0.703, at 60 degrees
-@pytest.mark.parametrize(('model', 'd', 'largest'), [
-    ('plumb_bob', (-0.5, 0.0, 0.0, 0.0, 0.0), 0.5443), ('equidistant', (-0.3, 0.0, 0.0, 0.0), 0.7027)])
+@pytest.mark.parametrize(
+    ('model', 'd', 'largest'),
+    [('plumb_bob', (-0.5, 0.0, 0.0, 0.0, 0.0), 0.5443), ('equidistant', (-0.3, 0.0, 0.0, 0.0), 0.7027)],
+)
 def test_a_pixel_that_the_lens_does_not_reach_has_no_point(model, d, largest):
     ground = Ground.from_messages(info(model, K, d), transform(rotation=pose(90.0, 0.0, 0.0).T))
     shares = np.array([0.5, 0.95, 0.99, 1.01, 1.5, 3.0])  # straight down: no horizon is near
@@ -265,8 +326,9 @@ def test_a_pixel_that_the_lens_does_not_reach_has_no_point(model, d, largest):
 
 
 def test_a_point_beyond_the_fold_or_behind_has_no_pixel():
-    ground = Ground.from_messages(info('plumb_bob', K, (-0.5, 0.0, 0.0, 0.0, 0.0)),
-                                  transform(rotation=pose(90.0, 0.0, 0.0).T))
+    ground = Ground.from_messages(
+        info('plumb_bob', K, (-0.5, 0.0, 0.0, 0.0, 0.0)), transform(rotation=pose(90.0, 0.0, 0.0).T)
+    )
     pixels, seen = ground.pixels(np.array([[0.0, 0.0, 0.0], [0.0, 7.0, 0.0], [0.0, 1.0, 20.0], [0.0, 0.0, HEIGHT_M]]))
     np.testing.assert_array_equal(seen, [True, False, False, False])
     assert np.isnan(pixels[1:]).all()
@@ -300,8 +362,19 @@ def test_a_rectified_image_needs_p():
 def test_messages_of_ros_1_are_read(pixels):
     given = info(*LENSES['plumb_bob'])
     kind = get_typestore(Stores.ROS1_NOETIC).types['sensor_msgs/msg/CameraInfo']
-    old = kind(header=given.header, height=given.height, width=given.width, distortion_model=given.distortion_model,
-               D=given.d, K=given.k, R=given.r, P=given.p, binning_x=0, binning_y=0, roi=given.roi)
+    old = kind(
+        header=given.header,
+        height=given.height,
+        width=given.width,
+        distortion_model=given.distortion_model,
+        D=given.d,
+        K=given.k,
+        R=given.r,
+        P=given.p,
+        binning_x=0,
+        binning_y=0,
+        roi=given.roi,
+    )
     found, expected = (Ground.from_messages(one, transform()).points(pixels) for one in (old, given))
     np.testing.assert_array_equal(found.points_m, expected.points_m)
 
@@ -322,7 +395,8 @@ def worst_px(truth: dict[str, Any]) -> float:
     lens, camera = truth['lens'], truth['camera']
     ground = Ground.from_messages(
         info(k=(lens['f'], 0.0, lens['cx'], 0.0, lens['f'], lens['cy'], 0.0, 0.0, 1.0), d=tuple(lens['k'])),
-        transform(rotation=np.array(camera['R_world_from_camera']), translation=tuple(camera['position'])))
+        transform(rotation=np.array(camera['R_world_from_camera']), translation=tuple(camera['position'])),
+    )
     rows = np.array(truth['ground_points']['rows'])
     pixels, seen = ground.pixels(rows[:, :2])
     found = ground.points(rows[:, 2:])
@@ -337,12 +411,11 @@ def test_the_truth_of_the_simulator_is_met():
     assert worst_px(Simulation(options).truth()) < 1e-4  # its pixels are rounded to 4 digits, half of it
 
 
-@pytest.mark.skipif('AUTOCALIB_TEST_DATA' not in os.environ,
-                    reason='AUTOCALIB_TEST_DATA does not name a folder with recorded clips')
+@pytest.mark.skipif(
+    'AUTOCALIB_TEST_DATA' not in os.environ, reason='AUTOCALIB_TEST_DATA does not name a folder with recorded clips'
+)
 def test_the_truth_of_a_rendered_scene_is_met():
     assert worst_px(json.loads((DATA / 'scenes' / 'S1' / 'truth.json').read_text())) < 1e-4
-
-
 
 
 def test_sigma_is_the_spread_of_what_might_have_been_published():
@@ -360,14 +433,16 @@ def test_sigma_is_the_spread_of_what_might_have_been_published():
     # 3000 draws tell a variance to 2.6 %, and the farther points are a little beyond linear
     scale = np.sqrt(np.trace(expected, axis1=1, axis2=2))
     np.testing.assert_allclose(found.sigma_m, scale, rtol=0.08)
-    np.testing.assert_allclose(found.covariance_m2 / scale[:, None, None]**2, expected / scale[:, None, None]**2,
-                               atol=0.08)
+    np.testing.assert_allclose(
+        found.covariance_m2 / scale[:, None, None] ** 2, expected / scale[:, None, None] ** 2, atol=0.08
+    )
 
 
 def test_sigma_grows_towards_the_horizon_beyond_the_distance_itself():
     rows = horizon_row(640.0) + np.array([1.5, 5.0, 20.0, 60.0, 200.0])
     found = Ground.from_document(document(covariance=9.0 * COVARIANCE)).points(
-        np.column_stack([np.full(5, 640.0), rows]))
+        np.column_stack([np.full(5, 640.0), rows])
+    )
     share = found.sigma_m / np.hypot(*found.points_m[:, :2].T)
     assert found.valid.all() and (np.diff(share) < 0).all()
     assert share[0] > 1.0 and share[-1] < 0.1
@@ -388,19 +463,28 @@ def test_the_noise_of_pixels_is_told_and_adds_to_sigma():
 def test_messages_and_files_without_covariance_tell_no_sigma(pixels):
     older = document()
     del older['covariance']
-    grounds = (Ground.from_messages(info(), transform()), Ground.from_document(document(covariance=None)),
-               Ground.from_document(older))
+    grounds = (
+        Ground.from_messages(info(), transform()),
+        Ground.from_document(document(covariance=None)),
+        Ground.from_document(older),
+    )
     assert [ground.points(pixels).sigma_m for ground in grounds] == [None] * 3
 
 
 SCALES = {
     'height': Options(camera_height=HEIGHT_M, camera_height_sigma=0.1),
-    'distance': Options(scale_from='distance', scale=ScaleOptions(
-        distance_px='500 500 900 450', distance_m=10.0, distance_sigma_m=0.1)),
+    'distance': Options(
+        scale_from='distance', scale=ScaleOptions(distance_px='500 500 900 450', distance_m=10.0, distance_sigma_m=0.1)
+    ),
     'assumed': Options(camera_height=HEIGHT_M, joint=JointOptions(roll_prior_deg=2.0)),
 }
-ONE_ROAD = Junction(road_angles_deg=(0.0,), turning_fraction=0.0, vehicles=120, camera_from_ground=pose(35.0, 1.0, 60.0),
-                    centre_m=(6.0, -10.0))
+ONE_ROAD = Junction(
+    road_angles_deg=(0.0,),
+    turning_fraction=0.0,
+    vehicles=120,
+    camera_from_ground=pose(35.0, 1.0, 60.0),
+    centre_m=(6.0, -10.0),
+)
 
 
 @pytest.mark.parametrize('scale', SCALES)
@@ -409,11 +493,15 @@ def test_the_covariance_of_a_calibration_agrees_with_its_deviations(scale):
     result = solve(synthetic_evidence(junction, np.random.default_rng(0)), SCALES[scale])
     assert isinstance(result, Calibration) and result.ground is not None and result.covariance is not None
     sigma, (cx, cy) = result.stddev, result.stddev.principal_point_px
-    np.testing.assert_allclose(np.sqrt(np.diag(result.covariance)), [
-        sigma.focal_px, cx, cy, sigma.k1, sigma.k2, 0.0, 0.0, sigma.tilt_deg, sigma.roll_deg, sigma.height_m or 0.0],
-        rtol=1e-6, atol=1e-12)
-    ahead = pixels_ahead(result.camera, result.ground.normal_in_camera, result.ground.height_m,
-                         np.array(GROUND_DISTANCES_M))
+    np.testing.assert_allclose(
+        np.sqrt(np.diag(result.covariance)),
+        [sigma.focal_px, cx, cy, sigma.k1, sigma.k2, 0.0, 0.0, sigma.tilt_deg, sigma.roll_deg, sigma.height_m or 0.0],
+        rtol=1e-6,
+        atol=1e-12,
+    )
+    ahead = pixels_ahead(
+        result.camera, result.ground.normal_in_camera, result.ground.height_m, np.array(GROUND_DISTANCES_M)
+    )
     seen = np.isfinite(ahead).all(axis=1)
     found = Ground.from_document(json.loads(json.dumps(to_json(result)))).points(ahead[seen])
     assert seen.any()
@@ -426,14 +514,24 @@ def test_a_file_is_read(tmp_path, pixels):
     np.testing.assert_array_equal(found.points_m, Ground.from_document(document()).points(pixels).points_m)
 
 
-@pytest.mark.parametrize(('text', 'said'), [
-    ('{', 'is not JSON'), ('[]', 'holds no names with values'), ('{"version": 1}', 'holds no calibration'),
-    (json.dumps(document() | {'version': 2}), 'its version is 2, and only 1 is read'),
-    (json.dumps(document() | {'state': 'refused', 'refusal': {'code': 'no_motion', 'message': 'nothing moves'}}),
-     'no calibration .no_motion: nothing moves.'),
-    (json.dumps(document(grade='unit_scale')), "units of the camera's height"),
-    (json.dumps(document(ground=None, ground_refusal=Reason('no_height', 'none given', 'give it'))),
-     'no ground plane .no_height: none given.; give it')])
+@pytest.mark.parametrize(
+    ('text', 'said'),
+    [
+        ('{', 'is not JSON'),
+        ('[]', 'holds no names with values'),
+        ('{"version": 1}', 'holds no calibration'),
+        (json.dumps(document() | {'version': 2}), 'its version is 2, and only 1 is read'),
+        (
+            json.dumps(document() | {'state': 'refused', 'refusal': {'code': 'no_motion', 'message': 'nothing moves'}}),
+            'no calibration .no_motion: nothing moves.',
+        ),
+        (json.dumps(document(grade='unit_scale')), "units of the camera's height"),
+        (
+            json.dumps(document(ground=None, ground_refusal=Reason('no_height', 'none given', 'give it'))),
+            'no ground plane .no_height: none given.; give it',
+        ),
+    ],
+)
 def test_a_file_without_a_ground_plane_in_metres_is_refused(tmp_path, text, said):
     path = tmp_path / 'calibration.json'
     path.write_text(text)

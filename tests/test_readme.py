@@ -78,13 +78,18 @@ def test_ci_runs_the_second_command(commands):
     script = (ROOT / '.ci' / 'run').read_text(encoding='utf-8')
     extraction = re.search(r'test_command=\$\((.*)\)$', script, re.MULTILINE)
     assert extraction is not None
-    done = subprocess.run(['bash', '-c', extraction.group(1)], capture_output=True, text=True, check=True,
-                          env={**os.environ, 'root': str(ROOT)})
+    done = subprocess.run(
+        ['bash', '-c', extraction.group(1)],
+        capture_output=True,
+        text=True,
+        check=True,
+        env={**os.environ, 'root': str(ROOT)},
+    )
     assert done.stdout.strip() == commands[1]
 
 
 def test_the_example_of_a_tracker_runs(tmp_path, monkeypatch):
-    block, = re.findall(r'^```python\n(.*?)^```$', README.read_text(encoding='utf-8'), re.MULTILINE | re.DOTALL)
+    (block,) = re.findall(r'^```python\n(.*?)^```$', README.read_text(encoding='utf-8'), re.MULTILINE | re.DOTALL)
     evidence = synthetic_evidence(Junction(), np.random.default_rng(0))
     (tmp_path / 'results').mkdir()
     write_calibration_json(tmp_path / 'results' / 'calibration.json', solve(evidence, Options(camera_height=8.0)))
@@ -97,7 +102,7 @@ def test_the_example_of_a_tracker_runs(tmp_path, monkeypatch):
 
 
 def test_the_picture_at_the_top_is_what_its_command_makes(tmp_path, monkeypatch):
-    (link, title), = re.findall(r'!\[[^\]]+\]\((\S+) "([^"]+)"\)', README.read_text(encoding='utf-8'))
+    ((link, title),) = re.findall(r'!\[[^\]]+\]\((\S+) "([^"]+)"\)', README.read_text(encoding='utf-8'))
     demo, picture = (shlex.split(command) for command in title.split(' && '))
     assert demo == ['autocalib', 'demo', '--keep-bag']
     assert picture[:2] == ['autocalib', 'picture'] and picture[4] == link
@@ -117,15 +122,27 @@ def test_the_picture_at_the_top_is_what_its_command_makes(tmp_path, monkeypatch)
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(os.environ.get('AUTOCALIB_README_TEST') != '1',
-                    reason='installs everything anew, minutes: set AUTOCALIB_README_TEST=1')
+@pytest.mark.skipif(
+    os.environ.get('AUTOCALIB_README_TEST') != '1',
+    reason='installs everything anew, minutes: set AUTOCALIB_README_TEST=1',
+)
 def test_first_command_calibrates_the_demo(commands, tmp_path):
     checkout = tmp_path / 'autocalib_ros'
     made = shutil.ignore_patterns('.git', '.venv*', 'build', 'install', 'log', '*.egg-info')
     shutil.copytree(ROOT, checkout, ignore=made)
     # A ROS of pip in this process would leak its libraries into the new environment.
-    clean = {name: value for name, value in os.environ.items()
-             if name not in ('_ROS_WHEELS_BOOTSTRAP_COMPLETE', 'LD_LIBRARY_PATH', 'PYTHONPATH', 'VIRTUAL_ENV')}
-    done = subprocess.run(['bash', '-euo', 'pipefail', '-c', commands[0]], cwd=checkout, env=clean, text=True,
-                          capture_output=True, timeout=1800, check=False)
+    clean = {
+        name: value
+        for name, value in os.environ.items()
+        if name not in ('_ROS_WHEELS_BOOTSTRAP_COMPLETE', 'LD_LIBRARY_PATH', 'PYTHONPATH', 'VIRTUAL_ENV')
+    }
+    done = subprocess.run(
+        ['bash', '-euo', 'pipefail', '-c', commands[0]],
+        cwd=checkout,
+        env=clean,
+        text=True,
+        capture_output=True,
+        timeout=1800,
+        check=False,
+    )
     assert done.returncode == 0, done.stdout + done.stderr

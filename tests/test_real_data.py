@@ -17,9 +17,13 @@ from autocalib_ros.perception.detector.detector import open_detector
 from autocalib_ros.results.calibration import Calibration, Refusal
 
 DATA = Path(os.environ.get('AUTOCALIB_TEST_DATA', '')) / 'data'
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(
-    'AUTOCALIB_TEST_DATA' not in os.environ or not DATA.is_dir(),
-    reason='AUTOCALIB_TEST_DATA does not name a folder with recorded clips')]
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(
+        'AUTOCALIB_TEST_DATA' not in os.environ or not DATA.is_dir(),
+        reason='AUTOCALIB_TEST_DATA does not name a folder with recorded clips',
+    ),
+]
 
 
 def result_of(clip: Path, height_m: float, duration_s: float | None = None) -> Calibration | Refusal:
@@ -41,9 +45,14 @@ def test_a_hand_held_camera_is_refused() -> None:
     assert isinstance(result, Refusal) and result.code == 'camera_moving'
 
 
-@pytest.mark.parametrize('clip', ['highway_curve_640x360_11s/highway.mp4',
-                                  'jamcam_a13_352x288/625_201709211326.mp4',
-                                  'otvision_dresden/Testvideo_Cars-Truck_FR20_2020-01-01_00-00-00.mp4'])
+@pytest.mark.parametrize(
+    'clip',
+    [
+        'highway_curve_640x360_11s/highway.mp4',
+        'jamcam_a13_352x288/625_201709211326.mp4',
+        'otvision_dresden/Testvideo_Cars-Truck_FR20_2020-01-01_00-00-00.mp4',
+    ],
+)
 def test_real_clips_that_say_too_little_are_refused_with_a_remedy(clip: str) -> None:
     result = result_of(DATA / 'real' / clip, 8.0)
     assert isinstance(result, Refusal)
@@ -71,9 +80,13 @@ def frames_and_places(scene: str, numbers: tuple[int, ...]) -> tuple[list[np.nda
     """Frames of a scene, and the pixels (n, 2) of the vehicles' footprints in each."""
     truth = json.loads((DATA / 'scenes' / scene / 'truth.json').read_text())
     wanted = {number: round(number / truth['fps'], 2) for number in numbers}
-    frames = [frame.image for number, frame in enumerate(open_source(DATA / 'scenes' / scene / 'video.mp4',
-                                                                     duration_s=max(wanted.values()) + 0.01).frames())
-              if number in wanted]
+    frames = [
+        frame.image
+        for number, frame in enumerate(
+            open_source(DATA / 'scenes' / scene / 'video.mp4', duration_s=max(wanted.values()) + 0.01).frames()
+        )
+        if number in wanted
+    ]
     rows = np.concatenate([np.array(track['rows']) for track in truth['vehicles']['tracks']])
     return frames, [rows[np.abs(rows[:, 0] - time_s) < 0.01, 5:7] for time_s in wanted.values()]
 
@@ -81,10 +94,13 @@ def frames_and_places(scene: str, numbers: tuple[int, ...]) -> tuple[list[np.nda
 def test_evidence_by_a_real_detector_tells_people_from_vehicles() -> None:
     pytest.importorskip('onnxruntime', reason='onnxruntime is not installed')
     options = DetectorOptions(model=str(DATA.parent / 'models' / 'yolox_nano_dyn.onnx'))
-    evidence = replay(open_source(DATA / 'scenes' / 'S1' / 'video.mp4', duration_s=20.0),
-                      Options(camera_height=8.0, first_solve_s=1e5, detector=options)).evidence
-    way = np.array([np.hypot(*(track.points_px[-1] - track.points_px[0])) / np.ptp(track.times_s)
-                    for track in evidence.tracks()])
+    evidence = replay(
+        open_source(DATA / 'scenes' / 'S1' / 'video.mp4', duration_s=20.0),
+        Options(camera_height=8.0, first_solve_s=1e5, detector=options),
+    ).evidence
+    way = np.array(
+        [np.hypot(*(track.points_px[-1] - track.points_px[0])) / np.ptp(track.times_s) for track in evidence.tracks()]
+    )
     people = evidence.track_kinds == TrackKind.PERSON
     assert people.sum() > 5 and (evidence.track_kinds == TrackKind.VEHICLE).sum() > 50
     # pixels a second; who walks is slower than who drives, over the same places

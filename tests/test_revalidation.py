@@ -46,13 +46,16 @@ def test_solution_that_agrees_and_is_as_sure_takes_over():
     assert 'is confirmed' in decision.words
 
 
-@pytest.mark.parametrize(('fresh', 'told'), [
-    (calibration(310.0, sigmas=3.0), 'focal length 300 +- 1 px was kept, 310 +- 3 px was found'),
-    (calibration(tilt_deg=14.5, sigmas=3.0), 'tilt 12.3 +- 0.2 deg was kept, 14.5 +- 0.6 deg'),
-    (calibration(roll_deg=3.0, sigmas=3.0), 'roll'),
-    (calibration(height_m=8.7, sigmas=3.0), 'height 8.1 +- 0.05 m was kept, 8.7 +- 0.15 m'),
-    (replace(VAGUE, camera=replace(VAGUE.camera, principal_point_px=(340.0, 179.5))), 'principal point x'),
-])
+@pytest.mark.parametrize(
+    ('fresh', 'told'),
+    [
+        (calibration(310.0, sigmas=3.0), 'focal length 300 +- 1 px was kept, 310 +- 3 px was found'),
+        (calibration(tilt_deg=14.5, sigmas=3.0), 'tilt 12.3 +- 0.2 deg was kept, 14.5 +- 0.6 deg'),
+        (calibration(roll_deg=3.0, sigmas=3.0), 'roll'),
+        (calibration(height_m=8.7, sigmas=3.0), 'height 8.1 +- 0.05 m was kept, 8.7 +- 0.15 m'),
+        (replace(VAGUE, camera=replace(VAGUE.camera, principal_point_px=(340.0, 179.5))), 'principal point x'),
+    ],
+)
 def test_solution_that_does_not_agree_replaces_the_kept_one(fresh, told):
     decision = reconcile(RESTORED, KEPT, fresh)
     assert (decision.state, decision.calibration, decision.contradicted) == (CALIBRATED, fresh, True)
@@ -117,8 +120,14 @@ def test_height_that_is_given_now_scales_the_kept_plane():
     assert (scaled.camera, scaled.grade) == (KEPT.camera, 'full')
 
 
-@pytest.mark.parametrize('options', [Options(), Options(camera_height=8.1), Options(scale_from='speed', scale=replace(
-    Options().scale, speed_km_h=50.0))])
+@pytest.mark.parametrize(
+    'options',
+    [
+        Options(),
+        Options(camera_height=8.1),
+        Options(scale_from='speed', scale=replace(Options().scale, speed_km_h=50.0)),
+    ],
+)
 def test_kept_plane_keeps_its_scale_when_nothing_else_is_given(options):
     assert with_current_options(KEPT, options, None) is KEPT
 
@@ -145,8 +154,13 @@ def test_plane_in_heights_becomes_metres_when_the_height_is_given():
 
 
 def test_lens_that_is_given_now_has_to_be_the_kept_one():
-    double = replace(KEPT.camera, width=2 * SIZE[0], height=2 * SIZE[1], focal_px=600.0,
-                     principal_point_px=tuple(2 * x + 0.5 for x in KEPT.camera.principal_point_px))
+    double = replace(
+        KEPT.camera,
+        width=2 * SIZE[0],
+        height=2 * SIZE[1],
+        focal_px=600.0,
+        principal_point_px=tuple(2 * x + 0.5 for x in KEPT.camera.principal_point_px),
+    )
     assert with_current_options(KEPT, Options(), double) is KEPT
     with pytest.raises(UsageError, match='camera_info_file'):
         with_current_options(KEPT, Options(), Camera.equidistant(*SIZE, 320.0))

@@ -38,7 +38,7 @@ def test_rviz_shows_every_picture_markers_points_and_frames(rviz):
 
 
 def test_rviz_asks_for_latched_markers(rviz):
-    topic, = (display['Topic'] for display in rviz['Displays'] if display['Class'].endswith('MarkerArray'))
+    (topic,) = (display['Topic'] for display in rviz['Displays'] if display['Class'].endswith('MarkerArray'))
     assert topic['Durability Policy'] == 'Transient Local'
 
 

@@ -8,9 +8,13 @@ from pathlib import Path
 from autocalib_ros.commands import DONE, REFUSED
 
 HELP = 'say how two calibrations of one camera differ'
-DESCRIPTION = ('Say how two calibrations of one camera differ: is that of last month still right? Exit status: 0 they '
-               'agree within 3 combined standard deviations, 3 they differ, or nothing tells, 2 wrong input.')
-CALIBRATION_FILES = 'calibration.json, NAME.autocalib.json of the node, or a camera_info.yaml, of a checkerboard for example'
+DESCRIPTION = (
+    'Say how two calibrations of one camera differ: is that of last month still right? Exit status: 0 they '
+    'agree within 3 combined standard deviations, 3 they differ, or nothing tells, 2 wrong input.'
+)
+CALIBRATION_FILES = (
+    'calibration.json, NAME.autocalib.json of the node, or a camera_info.yaml, of a checkerboard for example'
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

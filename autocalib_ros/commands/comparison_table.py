@@ -21,11 +21,17 @@ def comparison_lines(result: Comparison) -> list[str]:
     if result.normal_deg is not None:
         rows.append(('ground normal', '', '', f'{result.normal_deg:.2f} deg apart', ''))
     for name, rays in (('rays, lens alone', result.rays), ('rays, best turned', result.rays_aligned)):
-        rows.append((name, '', '', f'up to {rays.largest_deg:.2f} deg, mean {rays.mean_deg:.2f}', _format_sigmas(rays.sigmas)))
-    rows += [(f'road {item.distance_m:g} m ahead', '', '', f'{item.separation_m:.2f} m apart', _format_sigmas(item.sigmas))
-             for item in result.road]
-    turned = (f'rays, best turned: after a rotation of B by {result.alignment_deg:.2f} degrees, which lenses trade against'
-              ' the principal point')
+        rows.append(
+            (name, '', '', f'up to {rays.largest_deg:.2f} deg, mean {rays.mean_deg:.2f}', _format_sigmas(rays.sigmas))
+        )
+    rows += [
+        (f'road {item.distance_m:g} m ahead', '', '', f'{item.separation_m:.2f} m apart', _format_sigmas(item.sigmas))
+        for item in result.road
+    ]
+    turned = (
+        f'rays, best turned: after a rotation of B by {result.alignment_deg:.2f} degrees, which lenses trade against'
+        ' the principal point'
+    )
     road = ['road: where one pixel meets it; the foot of the camera is one point, and headings are turned to fit']
     return [*align_columns(rows), turned, *(road if result.road else []), *result.notes]
 
@@ -33,8 +39,13 @@ def comparison_lines(result: Comparison) -> list[str]:
 def _row(item: Difference) -> tuple[str, ...]:
     digits, unit = DIGITS[item.unit], f' {item.unit}' if item.unit else ''
     percent = f' ({100 * item.difference / item.first:+.2f} %)' if item.name in ('focal length', 'height') else ''
-    return (item.name, f'{item.first:.{digits}f}{unit}', f'{item.second:.{digits}f}{unit}',
-            f'{item.difference:+.{digits}f}{unit}{percent}', _format_sigmas(item.sigmas))
+    return (
+        item.name,
+        f'{item.first:.{digits}f}{unit}',
+        f'{item.second:.{digits}f}{unit}',
+        f'{item.difference:+.{digits}f}{unit}{percent}',
+        _format_sigmas(item.sigmas),
+    )
 
 
 def _format_sigmas(sigmas: float | None) -> str:
@@ -45,17 +56,26 @@ def _format_sigmas(sigmas: float | None) -> str:
 
 def comparison_document(result: Comparison) -> dict[str, Any]:
     """Return everything, with the verdict, as a document for JSON; what is infinite or not known is null."""
+
     def with_sigmas(item: Any) -> dict[str, Any]:
         more = {'difference': item.difference} if isinstance(item, Difference) else {}
         return _finite({**asdict(item), **more, 'sigmas': item.sigmas})
 
     return {
-        'agrees': result.agrees, 'verdict': result.verdict(),
-        'lens': [with_sigmas(item) for item in result.lens], 'lens_px': _finite(result.lens_px),
+        'agrees': result.agrees,
+        'verdict': result.verdict(),
+        'lens': [with_sigmas(item) for item in result.lens],
+        'lens_px': _finite(result.lens_px),
         'focal_percent': 100 * result.lens[0].difference / result.lens[0].first,
-        'rays': with_sigmas(result.rays), 'rays_turned': with_sigmas(result.rays_aligned), 'turned_deg': result.alignment_deg,
-        'pose': [with_sigmas(item) for item in result.pose], 'normal_deg': result.normal_deg,
-        'road': [with_sigmas(item) for item in result.road], 'stated': list(result.stated), 'notes': list(result.notes)}
+        'rays': with_sigmas(result.rays),
+        'rays_turned': with_sigmas(result.rays_aligned),
+        'turned_deg': result.alignment_deg,
+        'pose': [with_sigmas(item) for item in result.pose],
+        'normal_deg': result.normal_deg,
+        'road': [with_sigmas(item) for item in result.road],
+        'stated': list(result.stated),
+        'notes': list(result.notes),
+    }
 
 
 def _finite(value: Any) -> Any:
@@ -69,6 +89,18 @@ def _finite(value: Any) -> Any:
 def truth_lines(errors: list[dict[str, float | None]]) -> list[str]:
     """Return the errors of A and B side by side."""
     rows = [('against the truth', 'A', 'B')]
-    rows += [(name, *('-' if one[name] is None else f'{one[name]:+.2f}' if name.split(',')[0] in SIGNED else
-                      f'{one[name]:.2f}' for one in errors)) for name in errors[0]]
+    rows += [
+        (
+            name,
+            *(
+                '-'
+                if one[name] is None
+                else f'{one[name]:+.2f}'
+                if name.split(',')[0] in SIGNED
+                else f'{one[name]:.2f}'
+                for one in errors
+            ),
+        )
+        for name in errors[0]
+    ]
     return align_columns(rows)

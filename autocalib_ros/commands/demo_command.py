@@ -16,11 +16,16 @@ DESCRIPTION = None
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add what can be chosen."""
-    parser.add_argument('--out', type=Path, default=DEFAULT_OUT, metavar='DIR', help='folder for the results '
-                        '(default: %(default)s)')
+    parser.add_argument(
+        '--out', type=Path, default=DEFAULT_OUT, metavar='DIR', help='folder for the results (default: %(default)s)'
+    )
     parser.add_argument('--seed', type=int, default=0, metavar='N', help='seed of the simulated traffic')
-    parser.add_argument('--scale-from', choices=('height', 'distance', 'speed'), default='height',
-                        help='what is given of the truth to tell the scale (default: %(default)s)')
+    parser.add_argument(
+        '--scale-from',
+        choices=('height', 'distance', 'speed'),
+        default='height',
+        help='what is given of the truth to tell the scale (default: %(default)s)',
+    )
     parser.add_argument('--keep-bag', action='store_true', help='leave the simulated recording in DIR/recording')
 
 

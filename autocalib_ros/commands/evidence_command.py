@@ -10,8 +10,10 @@ from autocalib_ros.commands.output import print_result, warn_missing_scale
 from autocalib_ros.commands.solve_options import add_solve_options, options_from_arguments, read_known_lens
 
 HELP = 'solve saved evidence again with other options'
-DESCRIPTION = ('Solve the evidence.npz of a replay again, without its pictures. Options of tracking, motion and buffer '
-               'shape the gathering and change nothing here. Exit status as of replay.')
+DESCRIPTION = (
+    'Solve the evidence.npz of a replay again, without its pictures. Options of tracking, motion and buffer '
+    'shape the gathering and change nothing here. Exit status as of replay.'
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -20,8 +20,16 @@ def print_stderr(line: str) -> None:
     print(line, file=sys.stderr)
 
 
-def replay_and_report(source: Source, options: Options, out: Path, *, lens: Camera | None = None,
-                    detector: VehicleDetector | None = None, quiet: bool = False, json: bool = False) -> ReplayResult:
+def replay_and_report(
+    source: Source,
+    options: Options,
+    out: Path,
+    *,
+    lens: Camera | None = None,
+    detector: VehicleDetector | None = None,
+    quiet: bool = False,
+    json: bool = False,
+) -> ReplayResult:
     """Replay, write the results and say what came out."""
     from autocalib_ros.offline.outputs import write_outputs
     from autocalib_ros.offline.replay_recording import replay
@@ -40,8 +48,10 @@ def warn_missing_scale(options: Options, lens: Camera | None) -> None:
     if options.scale_from == 'height' and options.camera_height == 0:
         scale = 'is given in units of that height' if options.allow_unit_scale else 'is left out'
         calibrated = 'the lens is calibrated' if lens is None else 'the lens is known'
-        print_stderr(f'No camera height given: {calibrated}, the ground plane {scale} (see --camera-height, --scale-distance'
-             ' and --scale-speed).')
+        print_stderr(
+            f'No camera height given: {calibrated}, the ground plane {scale} (see --camera-height, --scale-distance'
+            ' and --scale-speed).'
+        )
 
 
 def print_result(replayed: ReplayResult, out: Path | None, names: list[str], *, quiet: bool, json: bool) -> None:

@@ -7,8 +7,10 @@ import argparse
 from autocalib_ros.commands import view_options as views
 
 HELP = 'show in one picture what a calibration makes of an image: grid on the road, horizon, road from above'
-DESCRIPTION = ('One picture that tells what a calibration is: at the left the image with a grid on the road and the '
-               'horizon, at the right the road from above with the same grid.')
+DESCRIPTION = (
+    'One picture that tells what a calibration is: at the left the image with a grid on the road and the '
+    'horizon, at the right the road from above with the same grid.'
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

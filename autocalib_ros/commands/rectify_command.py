@@ -13,8 +13,12 @@ DESCRIPTION = 'Take the distortion out of an image or video, with a saved calibr
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the files and how much is shown."""
     views.add_files(parser)
-    parser.add_argument('--balance', type=float, metavar='B', help='0 shows valid pixels only, 1 all that the lens '
-                        'shows (default: as P of the calibration says)')
+    parser.add_argument(
+        '--balance',
+        type=float,
+        metavar='B',
+        help='0 shows valid pixels only, 1 all that the lens shows (default: as P of the calibration says)',
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -22,14 +22,20 @@ DEFAULT_OUT = Path('autocalib_out')
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the recording and what becomes of it."""
-    parser.add_argument('source', metavar='SOURCE', type=Path,
-                        help='rosbag2 folder, .mcap, .db3, ROS 1 .bag or video file')
+    parser.add_argument(
+        'source', metavar='SOURCE', type=Path, help='rosbag2 folder, .mcap, .db3, ROS 1 .bag or video file'
+    )
     add_solve_options(parser)
     parser.add_argument('--topic', metavar='T', help='image topic; needed when there are several')
-    parser.add_argument('--out', type=Path, default=DEFAULT_OUT, metavar='DIR', help='folder for the results '
-                        '(default: %(default)s)')
-    parser.add_argument('--write-bag', type=Path, metavar='BAG',
-                        help='write a new rosbag2 with the images, CameraInfo and the ground transform')
+    parser.add_argument(
+        '--out', type=Path, default=DEFAULT_OUT, metavar='DIR', help='folder for the results (default: %(default)s)'
+    )
+    parser.add_argument(
+        '--write-bag',
+        type=Path,
+        metavar='BAG',
+        help='write a new rosbag2 with the images, CameraInfo and the ground transform',
+    )
     parser.add_argument('--start', type=float, default=0.0, metavar='S', help='seconds to skip at the beginning')
     parser.add_argument('--duration', type=float, metavar='S', help='seconds to use')
 
@@ -48,8 +54,9 @@ def run(arguments: argparse.Namespace) -> int:
     from autocalib_ros.offline import outputs
 
     outputs.prepare_output_dir(arguments.out, arguments.write_bag)
-    replayed = replay_and_report(source, options, arguments.out, lens=lens, detector=detector, quiet=arguments.quiet,
-                               json=arguments.json)
+    replayed = replay_and_report(
+        source, options, arguments.out, lens=lens, detector=detector, quiet=arguments.quiet, json=arguments.json
+    )
     if arguments.write_bag is not None:
         _write_bag(arguments.write_bag, replayed, source, options)
     return DONE if replayed.result else REFUSED

@@ -15,24 +15,48 @@ if TYPE_CHECKING:
 def add_solve_options(parser: argparse.ArgumentParser) -> None:
     """Add what is told to the solution, whatever it is fed from, and how its result is printed."""
     scale = parser.add_mutually_exclusive_group()
-    scale.add_argument('--camera-height', type=float, metavar='H',
-                       help='height of the camera above the road in metres; without any scale only the lens is '
-                            'calibrated')
-    scale.add_argument('--scale-distance', type=float, nargs=5, metavar=('U1', 'V1', 'U2', 'V2', 'METRES'),
-                       help='instead: two pixels on the road, and the metres between them')
-    scale.add_argument('--scale-speed', type=float, metavar='KM_H',
-                       help='instead: the mean speed of the traffic that flows on the busiest road')
-    parser.add_argument('--camera-info', type=Path, metavar='FILE',
-                        help='file of camera_info_manager with the known lens: only the pose is solved')
+    scale.add_argument(
+        '--camera-height',
+        type=float,
+        metavar='H',
+        help='height of the camera above the road in metres; without any scale only the lens is calibrated',
+    )
+    scale.add_argument(
+        '--scale-distance',
+        type=float,
+        nargs=5,
+        metavar=('U1', 'V1', 'U2', 'V2', 'METRES'),
+        help='instead: two pixels on the road, and the metres between them',
+    )
+    scale.add_argument(
+        '--scale-speed',
+        type=float,
+        metavar='KM_H',
+        help='instead: the mean speed of the traffic that flows on the busiest road',
+    )
+    parser.add_argument(
+        '--camera-info',
+        type=Path,
+        metavar='FILE',
+        help='file of camera_info_manager with the known lens: only the pose is solved',
+    )
     parser.add_argument('--params-file', type=Path, metavar='F', help='ROS 2 parameter file with options')
     parser.add_argument('--method', choices=('joint', 'paper'), help='robust method (default) or the published one')
-    parser.add_argument('--allow-unit-scale', action='store_true',
-                        help="without a height, give the ground plane in units of the camera's height")
-    parser.add_argument('-p', '--param', action='append', default=[], metavar='NAME=VALUE',
-                        help='any option by its full name, for example joint.noise_px=0.7; may be repeated')
+    parser.add_argument(
+        '--allow-unit-scale',
+        action='store_true',
+        help="without a height, give the ground plane in units of the camera's height",
+    )
+    parser.add_argument(
+        '-p',
+        '--param',
+        action='append',
+        default=[],
+        metavar='NAME=VALUE',
+        help='any option by its full name, for example joint.noise_px=0.7; may be repeated',
+    )
     parser.add_argument('--quiet', action='store_true', help='no progress and no summary; refusals stay on stderr')
-    parser.add_argument('--json', action='store_true',
-                        help='print calibration.json on stdout instead of the summary')
+    parser.add_argument('--json', action='store_true', help='print calibration.json on stdout instead of the summary')
 
 
 def options_from_arguments(arguments: argparse.Namespace) -> Options:
@@ -55,8 +79,11 @@ def _scale_values(arguments: argparse.Namespace) -> dict[str, Any]:
         return {'camera_height': arguments.camera_height}
     if arguments.scale_distance is not None:
         *pixels, metres = arguments.scale_distance
-        return {'scale_from': 'distance', 'scale.distance_px': ' '.join(f'{value:g}' for value in pixels),
-                'scale.distance_m': metres}
+        return {
+            'scale_from': 'distance',
+            'scale.distance_px': ' '.join(f'{value:g}' for value in pixels),
+            'scale.distance_m': metres,
+        }
     if arguments.scale_speed is not None:
         return {'scale_from': 'speed', 'scale.speed_km_h': arguments.scale_speed}
     return {}

@@ -12,18 +12,26 @@ if TYPE_CHECKING:
     from autocalib_ros.results.saved_camera import SavedCamera
 
 HELP = 'show the road from above, from an image or video'
-DESCRIPTION = ('Show the road from above, from an image or video, with a saved calibration of the camera; x of the '
-               'ground frame to the right, y up.')
+DESCRIPTION = (
+    'Show the road from above, from an image or video, with a saved calibration of the camera; x of the '
+    'ground frame to the right, y up.'
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the files and what is shown."""
     views.add_files(parser, 'calibration.json, or NAME.autocalib.json of the node')
-    parser.add_argument('--px-per-m', type=float, metavar='P', help='pixels a metre (default: 1000 along the longer '
-                        'side)')
+    parser.add_argument(
+        '--px-per-m', type=float, metavar='P', help='pixels a metre (default: 1000 along the longer side)'
+    )
     for axis in 'xy':
-        parser.add_argument(f'--{axis}', type=float, nargs=2, metavar=('LOW', 'HIGH'),
-                            help=f'range of {axis} in metres (default: the road that the image shows)')
+        parser.add_argument(
+            f'--{axis}',
+            type=float,
+            nargs=2,
+            metavar=('LOW', 'HIGH'),
+            help=f'range of {axis} in metres (default: the road that the image shows)',
+        )
     parser.add_argument('--grid', action='store_true', help='draw lines at round metres')
     parser.add_argument('--scale-bar', action=argparse.BooleanOptionalAction, default=True, help='draw a scale bar')
 
@@ -35,4 +43,5 @@ def run(arguments: argparse.Namespace) -> int:
     def make_renderer(known: SavedCamera) -> Renderer:
         view = choose_top_view(known, arguments.px_per_m, arguments.x, arguments.y)
         return top_view_renderer(known, view, grid=arguments.grid, scale_bar=arguments.scale_bar)
+
     return views.render_to_file(arguments, 'topview', make_renderer)

@@ -21,12 +21,21 @@ def add_files(parser: argparse.ArgumentParser, calibration: str = CALIBRATION_FI
     parser.add_argument('calibration', metavar='CALIBRATION', type=Path, help=calibration)
     parser.add_argument('source', metavar='SOURCE', type=Path, help='image, video or recording of that camera')
     parser.add_argument('out', metavar='OUT', type=Path, help='.png or .jpg: one picture; .mp4 or .avi: a video')
-    parser.add_argument('--at', type=float, default=0.0, metavar='S',
-                        help='seconds after the first image: which one a picture shows, or where a video begins')
+    parser.add_argument(
+        '--at',
+        type=float,
+        default=0.0,
+        metavar='S',
+        help='seconds after the first image: which one a picture shows, or where a video begins',
+    )
     parser.add_argument('--duration', type=float, metavar='S', help='seconds of a video')
     parser.add_argument('--topic', metavar='T', help='image topic of a recording; needed when there are several')
-    parser.add_argument('--params-file', type=Path, metavar='F',
-                        help='ROS 2 parameter file of the camera, whose ignore_regions are black in the result')
+    parser.add_argument(
+        '--params-file',
+        type=Path,
+        metavar='F',
+        help='ROS 2 parameter file of the camera, whose ignore_regions are black in the result',
+    )
     parser.add_argument('--quiet', action='store_true', help='no progress, and not what was written')
 
 
@@ -52,7 +61,9 @@ def render_to_file(arguments: argparse.Namespace, label: str, make_renderer: Cal
             raise type(error)(f'{arguments.calibration}: {error}') from error
 
     selection = SourceSelection(arguments.topic, arguments.at, arguments.duration)
-    width, height = write_view(arguments.source, arguments.out, selection, renderer_for, label=label, quiet=arguments.quiet)
+    width, height = write_view(
+        arguments.source, arguments.out, selection, renderer_for, label=label, quiet=arguments.quiet
+    )
     if not arguments.quiet:
         print(f'Written to {arguments.out}: {width}x{height}')
     return DONE

@@ -119,9 +119,16 @@ class _Observations:
         return self.tracks.subset(evenly_spaced(len(self.tracks), MAX_SUBSAMPLE_TRACKS))
 
 
-def find_solution(evidence: Evidence, tracks: TrackSet, options: JointOptions, gate: GateOptions,
-                  generator: np.random.Generator, *, height_m: float = 0.0,
-                  lens: Camera | None = None) -> Solution | Reason:
+def find_solution(
+    evidence: Evidence,
+    tracks: TrackSet,
+    options: JointOptions,
+    gate: GateOptions,
+    generator: np.random.Generator,
+    *,
+    height_m: float = 0.0,
+    lens: Camera | None = None,
+) -> Solution | Reason:
     """Estimate lens, plane and roads from evidence and the tracks chosen of it; a reason when they cannot be trusted.
 
     Straight traffic is tried first, with what turns to complete it; where that gives no plane, or one that rests on
@@ -129,8 +136,11 @@ def find_solution(evidence: Evidence, tracks: TrackSet, options: JointOptions, g
     pose is found.
     """
     if len(tracks) < gate.min_tracks:
-        return Reason('too_few_tracks', f'{len(tracks)} tracks of the {gate.min_tracks} needed are long enough',
-                      'wait for more traffic, or record for longer')
+        return Reason(
+            'too_few_tracks',
+            f'{len(tracks)} tracks of the {gate.min_tracks} needed are long enough',
+            'wait for more traffic, or record for longer',
+        )
     priors = [known_lens(lens)] if lens is not None else lens_priors(evidence.image_size, options)
     crossing = None if options.crossing_deg is None else float(np.radians(options.crossing_deg))
     instants = ResampledTracks(evidence)
@@ -152,8 +162,11 @@ def _append_reason(found: Solution | Reason, description: str) -> Solution | Rea
     """Add to what is missing, if anything, what else was tried."""
     if isinstance(found, Reason):
         return replace(found, message=f'{found.message}; {description}')
-    return replace(found, plane_refusal=found.plane_refusal and replace(found.plane_refusal,
-                                                              message=f'{found.plane_refusal.message}; {description}'))
+    return replace(
+        found,
+        plane_refusal=found.plane_refusal
+        and replace(found.plane_refusal, message=f'{found.plane_refusal.message}; {description}'),
+    )
 
 
 def _solve_traffic(traffic: _Observations, config: AdjustmentConfig) -> Solution | Reason:
@@ -188,14 +201,28 @@ def _solve_markings(traffic: _Observations, config: AdjustmentConfig) -> Solutio
     known = known_lens(fit.state.camera)
     straight = _solve_straight(replace(traffic, priors=[known]), replace(config, prior=known))
     turned = fit_turning_traffic(traffic.tracks, traffic.windows, replace(config, prior=known))
-    checks = verify_with_traffic(fit, [*([] if isinstance(straight, Reason) else [straight.plane]),
-                             *([] if turned is None else [PlaneEstimate.of(turned, traffic.tracks)])])
+    checks = verify_with_traffic(
+        fit,
+        [
+            *([] if isinstance(straight, Reason) else [straight.plane]),
+            *([] if turned is None else [PlaneEstimate.of(turned, traffic.tracks)]),
+        ],
+    )
     if isinstance(checks, Reason):
         return checks
     along, flow = main_road(fit, traffic.tracks)
     plane = PlaneEstimate.of(fit, traffic.tracks)
-    return Solution(fit, plane, along, flow, (*lens_assumptions(fit, ()), assumed), checks,
-                    check_plane(plane, traffic.gate, assumed=True), reduced=True, from_markings=True)
+    return Solution(
+        fit,
+        plane,
+        along,
+        flow,
+        (*lens_assumptions(fit, ()), assumed),
+        checks,
+        check_plane(plane, traffic.gate, assumed=True),
+        reduced=True,
+        from_markings=True,
+    )
 
 
 def _prior_for_markings(prior: LensPrior, options: JointOptions) -> LensPrior:
@@ -212,18 +239,30 @@ def _refine_with_markings(found: Solution, traffic: _Observations) -> Solution:
         return found
     fit, assumed = by_markings
     apart = compare_solutions(found.fit, fit)
-    description = (f'lines on the road give a focal length {apart.focal:.1%} and a ground normal {apart.normal_deg:.1f} '
-             'degrees from those of the traffic')
+    description = (
+        f'lines on the road give a focal length {apart.focal:.1%} and a ground normal {apart.normal_deg:.1f} '
+        'degrees from those of the traffic'
+    )
     plane = PlaneEstimate.of(fit, traffic.tracks)
     if apart.exceeds(AGREEMENT_SIGMAS) or check_plane(plane, traffic.gate):
         return replace(found, checks=(*found.checks, f'{description}: not used'))
-    one, other = ((max(solved.focal_sigma, UNMODELLED_FOCAL), told.worst_sigma_deg)
-                  for solved, told in ((fit, plane), (found.fit, found.plane)))
+    one, other = (
+        (max(solved.focal_sigma, UNMODELLED_FOCAL), told.worst_sigma_deg)
+        for solved, told in ((fit, plane), (found.fit, found.plane))
+    )
     if one[0] * one[1] > other[0] * other[1]:
         return replace(found, checks=(*found.checks, description))
     along, flow = main_road(fit, traffic.tracks)
-    return replace(found, fit=fit, plane=plane, along=along, flow=flow, checks=(*found.checks, description),
-                   assumptions=(*lens_assumptions(fit, ()), assumed), from_markings=True)
+    return replace(
+        found,
+        fit=fit,
+        plane=plane,
+        along=along,
+        flow=flow,
+        checks=(*found.checks, description),
+        assumptions=(*lens_assumptions(fit, ()), assumed),
+        from_markings=True,
+    )
 
 
 def verify_with_traffic(by_markings: Adjustment, told: list[PlaneEstimate]) -> tuple[str, ...] | Reason:
@@ -237,26 +276,42 @@ def verify_with_traffic(by_markings: Adjustment, told: list[PlaneEstimate]) -> t
         best_deg, sigma_deg = min(best_deg, own_deg), float(np.hypot(own_deg, other_deg))
         description = f'{what} are {apart_deg:.1f} degrees apart, {sigma_deg:.1f} were expected'
         if own_deg <= MAX_CONFIRMING_SIGMA_DEG and apart_deg > max(AGREEMENT_SIGMAS * sigma_deg, PLANE_TOLERANCE_DEG):
-            return Reason('markings_contradicted', description,
-                          'wait for more traffic; if the markings are askew, set joint.road_markings to false')
+            return Reason(
+                'markings_contradicted',
+                description,
+                'wait for more traffic; if the markings are askew, set joint.road_markings to false',
+            )
         if own_deg <= MAX_CONFIRMING_SIGMA_DEG:
             checks.append(description)
     seen = f'tells the plane to {best_deg:.0f} degrees' if best_deg < 90.0 else 'tells nothing'
-    return tuple(checks) if checks else Reason(
-        'markings_unconfirmed', 'lines on the road give lens and plane, but nothing confirms them: with that lens the '
-        f'traffic {seen}, {MAX_CONFIRMING_SIGMA_DEG:g} are needed', 'wait for more traffic, straight or turning')
+    return (
+        tuple(checks)
+        if checks
+        else Reason(
+            'markings_unconfirmed',
+            'lines on the road give lens and plane, but nothing confirms them: with that lens the '
+            f'traffic {seen}, {MAX_CONFIRMING_SIGMA_DEG:g} are needed',
+            'wait for more traffic, straight or turning',
+        )
+    )
 
 
 def _separation(by_markings: Adjustment, told: PlaneEstimate) -> tuple[float, float, float, str]:
     """Angle of what the traffic tells from the lines, its own standard deviation, that of the lines, and its name."""
     if told.fit.plane_known:
         angle = unsigned_angle_deg(by_markings.state.rotation[:, 2], told.normal(told.fit.state))
-        return (angle, told.worst_sigma_deg, PlaneEstimate(by_markings, 1.0).worst_sigma_deg,
-                'ground normals of the traffic and of the lines')
+        return (
+            angle,
+            told.worst_sigma_deg,
+            PlaneEstimate(by_markings, 1.0).worst_sigma_deg,
+            'ground normals of the traffic and of the lines',
+        )
     road = told.fit.state.directions[0]
     angle = min(unsigned_angle_deg(axis, road) for axis in by_markings.state.directions)
-    own, other = (float(np.degrees(np.linalg.norm(fit.sigma(lambda state: state.directions[0]))))
-                  for fit in (told.fit, by_markings))
+    own, other = (
+        float(np.degrees(np.linalg.norm(fit.sigma(lambda state: state.directions[0]))))
+        for fit in (told.fit, by_markings)
+    )
     return angle, own, other, 'the road of the traffic and the lines along it'
 
 
@@ -265,8 +320,11 @@ def _solve_straight(traffic: _Observations, config: AdjustmentConfig) -> Solutio
     tracks, gate = traffic.tracks, traffic.gate
     found = solve_from_consensus(traffic.subsample, config, traffic.generator)
     if found is None:
-        return Reason('no_direction', f'{len(tracks)} tracks agree on no common direction',
-                      'straight traffic is needed: wait for it, or turn the camera towards a straight road')
+        return Reason(
+            'no_direction',
+            f'{len(tracks)} tracks agree on no common direction',
+            'straight traffic is needed: wait for it, or turn the camera towards a straight road',
+        )
     best, contrast = found
     fit = adjust(best.state, tracks, best.problem.config)
     support = road_support(fit, tracks)
@@ -287,8 +345,9 @@ def _select_noise_model(fit: Adjustment, traffic: _Observations) -> tuple[Adjust
     return fit, tracks
 
 
-def _refine_and_verify(fit: Adjustment, tracks: TrackSet, across: str, traffic: _Observations, *,
-               turned: bool = False) -> Solution | Reason:
+def _refine_and_verify(
+    fit: Adjustment, tracks: TrackSet, across: str, traffic: _Observations, *, turned: bool = False
+) -> Solution | Reason:
     """Refine a solution with all that the traffic tells, and doubt it.
 
     `across` counts the tracks on a second road for the one who waits for them; `turned` is a solution that started
@@ -303,7 +362,8 @@ def _refine_and_verify(fit: Adjustment, tracks: TrackSet, across: str, traffic: 
     fit, tracklet_state = refine_with_tracklets(fit, tracks, traffic.windows, traffic.instants)
     fit, fixed = fix_unidentifiable(fit, tracks)
     failed_check = _check_lens(fit, tracks, traffic, turned=turned) or (
-        check_turning_centres(fit, traffic.windows) if len(fit.state.angles_rad) < 2 else None)
+        check_turning_centres(fit, traffic.windows) if len(fit.state.angles_rad) < 2 else None
+    )
     if failed_check:
         return failed_check
     halves = check_halves(fit, tracks, gate)
@@ -315,13 +375,23 @@ def _refine_and_verify(fit: Adjustment, tracks: TrackSet, across: str, traffic: 
     if fit.plane_known:
         checks = (*_angle_and_turning_checks(fit, angle), halves)
         plane = PlaneEstimate.of(fit, tracks)
-        return Solution(fit, plane, along, flow, (*assumptions, angle) if fit.crossing_fixed and angle else assumptions,
-                        checks, check_plane(plane, gate))
-    return _refine_with_lane_changes(_complete_one_road(fit, tracks, traffic, assumptions, halves, across), tracks, traffic)
+        return Solution(
+            fit,
+            plane,
+            along,
+            flow,
+            (*assumptions, angle) if fit.crossing_fixed and angle else assumptions,
+            checks,
+            check_plane(plane, gate),
+        )
+    return _refine_with_lane_changes(
+        _complete_one_road(fit, tracks, traffic, assumptions, halves, across), tracks, traffic
+    )
 
 
-def _complete_one_road(fit: Adjustment, tracks: TrackSet, traffic: _Observations, assumptions: tuple[str, ...], halves: str,
-                    across: str) -> Solution:
+def _complete_one_road(
+    fit: Adjustment, tracks: TrackSet, traffic: _Observations, assumptions: tuple[str, ...], halves: str, across: str
+) -> Solution:
     """Complete a solution of one road, about which the plane is free, by what may be assumed."""
     gate, options = traffic.gate, fit.problem.config.options
     along, flow = main_road(fit, tracks)
@@ -330,11 +400,22 @@ def _complete_one_road(fit: Adjustment, tracks: TrackSet, traffic: _Observations
     if not isinstance(assumed, Reason | None):
         assumptions = (*assumptions, f'ground plane by one road and {assumed.description}')
         return Solution(fit, plane, along, flow, assumptions, checks, check_plane(plane, gate))
-    return Solution(fit, plane, along, flow, assumptions, checks, assumed or Reason(
-        'one_direction', f'too little traffic across the main road yet: {across}; {int(fit.inliers().sum())} '
-        'follow one road, and rotation about it is free'
-        + (': edges of vehicles do not tell it either' if options.transverse_edges else ''),
-        'wait for traffic across the main road, or that turns; or allow joint.roll_prior_deg'))
+    return Solution(
+        fit,
+        plane,
+        along,
+        flow,
+        assumptions,
+        checks,
+        assumed
+        or Reason(
+            'one_direction',
+            f'too little traffic across the main road yet: {across}; {int(fit.inliers().sum())} '
+            'follow one road, and rotation about it is free'
+            + (': edges of vehicles do not tell it either' if options.transverse_edges else ''),
+            'wait for traffic across the main road, or that turns; or allow joint.roll_prior_deg',
+        ),
+    )
 
 
 def _refine_with_lane_changes(found: Solution, tracks: TrackSet, traffic: _Observations) -> Solution:
@@ -348,20 +429,36 @@ def _refine_with_lane_changes(found: Solution, tracks: TrackSet, traffic: _Obser
         return found
     normal = plane.normal(fit.state)
     about_deg = float(np.degrees(fit.sigma(lambda state: np.array([np.cross(normal, state.rotation[:, 2]) @ road]))[0]))
-    description, checks = f'{vehicles} vehicles that change lanes: +- {about_deg:.1f} degrees about the road', found.checks
+    description, checks = (
+        f'{vehicles} vehicles that change lanes: +- {about_deg:.1f} degrees about the road',
+        found.checks,
+    )
     if found.plane_refusal is None:
         apart_deg = unsigned_angle_deg(normal, found.plane.normal(found.fit.state))
         sigma_deg = float(np.hypot(plane.worst_sigma_deg, found.plane.worst_sigma_deg))
         if apart_deg > max(AGREEMENT_SIGMAS * sigma_deg, PLANE_TOLERANCE_DEG):
-            return replace(found, plane_refusal=Reason(
-                'plane_uncertain', f'{found.plane.assumed.description}, and {description}, are {apart_deg:.1f} degrees apart',
-                'wait for more traffic, above all across the road or turning'))
+            return replace(
+                found,
+                plane_refusal=Reason(
+                    'plane_uncertain',
+                    f'{found.plane.assumed.description}, and {description}, are {apart_deg:.1f} degrees apart',
+                    'wait for more traffic, above all across the road or turning',
+                ),
+            )
         checks = (*checks, f'{description}, {apart_deg:.1f} degrees from what is assumed')
         if found.plane.worst_sigma_deg <= plane.worst_sigma_deg:
             return replace(found, checks=checks)
     along, flow = main_road(fit, tracks)
-    return Solution(fit, plane, along, flow, (*lens_assumptions(fit, ()), f'ground plane by one road and {description}'),
-                    checks, None, reduced=True)
+    return Solution(
+        fit,
+        plane,
+        along,
+        flow,
+        (*lens_assumptions(fit, ()), f'ground plane by one road and {description}'),
+        checks,
+        None,
+        reduced=True,
+    )
 
 
 def _check_lens(fit: Adjustment, tracks: TrackSet, traffic: _Observations, *, turned: bool) -> Reason | None:
@@ -383,21 +480,31 @@ def _vehicle_tracks(fit: Adjustment, tracks: TrackSet, evidence: Evidence) -> np
     return ~np.isin(evidence.track_vehicles[tracks.indices], told)
 
 
-def _assumption_across_road(fit: Adjustment, tracks: TrackSet,
-             traffic: _Observations) -> tuple[LevelCamera | TransverseDirection | Reason | None, tuple[str, ...]]:
+def _assumption_across_road(
+    fit: Adjustment, tracks: TrackSet, traffic: _Observations
+) -> tuple[LevelCamera | TransverseDirection | Reason | None, tuple[str, ...]]:
     """What one may assume of the direction across a lone road, a reason where that contradicts itself; and checks."""
     options = fit.problem.config.options
     level = LevelCamera(options.roll_prior_deg) if options.roll_prior_deg > 0 else None
-    square = find_transverse_direction(traffic.evidence, fit, tracks, traffic.generator) if options.transverse_edges else None
+    square = (
+        find_transverse_direction(traffic.evidence, fit, tracks, traffic.generator)
+        if options.transverse_edges
+        else None
+    )
     if level is None or square is None:
         return level or square, ()
     joined, apart_deg = combine_assumptions(level, square, fit.state)
     if joined is None:
         return Reason(
-            'plane_uncertain', f'edges of vehicles and a level camera disagree by {apart_deg:.1f} degrees about the '
-            'road', 'set joint.roll_prior_deg to 0 to trust the edges, or to what the camera may be rolled'), ()
-    return joined, ((f'edges of vehicles and a level camera differ by {apart_deg:.1f} degrees about the road',)
-                    if apart_deg >= 0 else ())
+            'plane_uncertain',
+            f'edges of vehicles and a level camera disagree by {apart_deg:.1f} degrees about the road',
+            'set joint.roll_prior_deg to 0 to trust the edges, or to what the camera may be rolled',
+        ), ()
+    return joined, (
+        (f'edges of vehicles and a level camera differ by {apart_deg:.1f} degrees about the road',)
+        if apart_deg >= 0
+        else ()
+    )
 
 
 def _angle_and_turning_checks(fit: Adjustment, angle: str | None) -> tuple[str, ...]:

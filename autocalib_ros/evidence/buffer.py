@@ -34,7 +34,7 @@ class _LineTable:
         """Keep the lines of these rows."""
         if len(rows) < self.retention.count:
             self.retention.keep(rows)
-            self._ends_px[:len(rows)], self._vehicles[:len(rows)] = self._ends_px[rows], self._vehicles[rows]
+            self._ends_px[: len(rows)], self._vehicles[: len(rows)] = self._ends_px[rows], self._vehicles[rows]
 
     def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Ends (lines, columns), vehicles (lines,) and times (lines,) of all that is held."""
@@ -63,8 +63,9 @@ class EvidenceBuffer:
         if self._track_retention.count == self._max_tracks:
             self._keep_tracks(self._track_retention.rows_after_eviction(1))
         points = track.points_px
-        self._track_retention.add(np.array([track.vehicle]), points[len(points) // 2], (points[-1] - points[0])[None],
-                            track.times_s[-1])
+        self._track_retention.add(
+            np.array([track.vehicle]), points[len(points) // 2], (points[-1] - points[0])[None], track.times_s[-1]
+        )
         self._tracks.append(track)
 
     def add_segments(self, segments: Segments) -> None:
@@ -104,17 +105,39 @@ class EvidenceBuffer:
     @property
     def oldest_s(self) -> float:
         """When the oldest of what is held ended; infinite where there is nothing."""
-        return min(retention.oldest_s for retention in (self._track_retention, *(lines.retention for lines in self._line_tables)))
+        return min(
+            retention.oldest_s
+            for retention in (self._track_retention, *(lines.retention for lines in self._line_tables))
+        )
 
-    def snapshot(self, *, image_size: tuple[int, int], first_stamp_ns: int, newest_stamp_ns: int, frames: int,
-                 drift_px: float, unfinished: list[Track]) -> Evidence:
+    def snapshot(
+        self,
+        *,
+        image_size: tuple[int, int],
+        first_stamp_ns: int,
+        newest_stamp_ns: int,
+        frames: int,
+        drift_px: float,
+        unfinished: list[Track],
+    ) -> Evidence:
         """Freeze what is held, with the tracks that are still being followed."""
         segments_px, segment_vehicles, segment_times_s = self._segments.arrays()
         edges_px, edge_vehicles, edge_times_s = self._edges.arrays()
         outlines_px, outline_vehicles, outline_times_s = self._outlines.arrays()
         return Evidence(
-            image_size=image_size, first_stamp_ns=first_stamp_ns, newest_stamp_ns=newest_stamp_ns, frames=frames,
-            drift_px=drift_px, segments_px=segments_px, segment_vehicles=segment_vehicles,
-            segment_times_s=segment_times_s, edges_px=edges_px, edge_vehicles=edge_vehicles, edge_times_s=edge_times_s,
-            outlines_px=outlines_px, outline_vehicles=outline_vehicles, outline_times_s=outline_times_s,
-            **_track_arrays([*self._tracks, *unfinished]))
+            image_size=image_size,
+            first_stamp_ns=first_stamp_ns,
+            newest_stamp_ns=newest_stamp_ns,
+            frames=frames,
+            drift_px=drift_px,
+            segments_px=segments_px,
+            segment_vehicles=segment_vehicles,
+            segment_times_s=segment_times_s,
+            edges_px=edges_px,
+            edge_vehicles=edge_vehicles,
+            edge_times_s=edge_times_s,
+            outlines_px=outlines_px,
+            outline_vehicles=outline_vehicles,
+            outline_times_s=outline_times_s,
+            **_track_arrays([*self._tracks, *unfinished]),
+        )

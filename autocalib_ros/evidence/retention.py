@@ -66,12 +66,16 @@ class RetentionIndex:
         self.count = 0
 
     def add(self, vehicles: np.ndarray, midpoints_px: np.ndarray, displacements_px: np.ndarray, time_s: float) -> None:
-        """Enter rows of vehicles (n,) that passed `midpoints_px` (n, 2), went `displacements_px` (n, 2) and ended at `time_s`.
+        """Add rows of vehicles (n,) at midpoints (n, 2) with displacements (n, 2) that ended at `time_s`.
 
-        There has to be room for them.
+        The caller makes room for them first.
         """
         part = slice(self.count, self.count + len(vehicles))
-        self._midpoints_px[part], self._headings[part], self._times_s[part] = midpoints_px, headings(displacements_px), time_s
+        self._midpoints_px[part], self._headings[part], self._times_s[part] = (
+            midpoints_px,
+            headings(displacements_px),
+            time_s,
+        )
         self._passage_ids[part] = [self._passage_id(vehicle) for vehicle in vehicles.tolist()]
         self.count += len(vehicles)
 
@@ -89,7 +93,7 @@ class RetentionIndex:
         goal = min(self._limit * (1.0 - EVICTION_FRACTION), self._limit - wanted)
         order = np.lexsort((newest_s, added))
         left = self.count - np.cumsum(np.bincount(vehicles)[order])
-        going = order[:int(np.argmax(left <= goal)) + 1]
+        going = order[: int(np.argmax(left <= goal)) + 1]
         return np.flatnonzero(~np.isin(vehicles, going))
 
     def rows_not_replaced(self, time_s: float) -> np.ndarray:
@@ -101,7 +105,7 @@ class RetentionIndex:
 
     def rows_since(self, time_s: float) -> np.ndarray:
         """Return the rows not older than `time_s`."""
-        return np.flatnonzero(self._times_s[:self.count] >= time_s)
+        return np.flatnonzero(self._times_s[: self.count] >= time_s)
 
     def _novelty(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Vehicle of each row (n,), numbered in the order they came; last time and worth of each vehicle."""
@@ -109,20 +113,24 @@ class RetentionIndex:
         _, vehicles = np.unique(self._passage_ids[held], return_inverse=True)
         newest_s = np.full(vehicles.max() + 1, -np.inf)
         np.maximum.at(newest_s, vehicles, self._times_s[held])
-        return vehicles, newest_s, novelty(vehicles, newest_s, cell_heading_bins(self._midpoints_px[held], self._headings[held]))
+        return (
+            vehicles,
+            newest_s,
+            novelty(vehicles, newest_s, cell_heading_bins(self._midpoints_px[held], self._headings[held])),
+        )
 
     def keep(self, rows: np.ndarray) -> None:
         """Keep only these rows (n,), by rising index."""
         self.count = len(rows)
         for column in (self._midpoints_px, self._headings, self._times_s, self._passage_ids):
-            column[:self.count] = column[rows]
-        held = set(self._passage_ids[:self.count].tolist())
+            column[: self.count] = column[rows]
+        held = set(self._passage_ids[: self.count].tolist())
         self._passages = {vehicle: passage for vehicle, passage in self._passages.items() if passage[0] in held}
 
     @property
     def times_s(self) -> np.ndarray:
         """Time of each row, shape (count,)."""
-        return self._times_s[:self.count]
+        return self._times_s[: self.count]
 
     @property
     def oldest_s(self) -> float:

@@ -135,8 +135,12 @@ class Evidence:
     def track(self, index: int) -> Track:
         """Return one track."""
         part = slice(self.track_starts[index], self.track_starts[index + 1])
-        return Track(int(self.track_vehicles[index]), self.times_s[part], self.points_px[part],
-                     TrackKind(self.track_kinds[index]))
+        return Track(
+            int(self.track_vehicles[index]),
+            self.times_s[part],
+            self.points_px[part],
+            TrackKind(self.track_kinds[index]),
+        )
 
     def tracks(self) -> Iterator[Track]:
         """Iterate over all tracks."""
@@ -155,9 +159,15 @@ class Evidence:
         """Return the counts that a result carries."""
         people = self.track_kinds == TrackKind.PERSON
         return EvidenceSummary(
-            image_size=self.image_size, seconds=self.seconds, frames=self.frames, tracks=self.track_count,
-            segments=len(self.segments_px), coverage=self.coverage,
-            vehicles=len(np.unique(self.track_vehicles[~people])), people=len(np.unique(self.track_vehicles[people])))
+            image_size=self.image_size,
+            seconds=self.seconds,
+            frames=self.frames,
+            tracks=self.track_count,
+            segments=len(self.segments_px),
+            coverage=self.coverage,
+            vehicles=len(np.unique(self.track_vehicles[~people])),
+            people=len(np.unique(self.track_vehicles[people])),
+        )
 
     def select_tracks(self, keep: np.ndarray) -> Evidence:
         """Return the evidence with only the tracks whose indices are in `keep`; segments and edges unchanged."""
@@ -165,14 +175,22 @@ class Evidence:
 
     def without_vehicles(self, vehicles: np.ndarray) -> Evidence:
         """Return the evidence without all that is of these vehicles (n,)."""
-        tracks, segments, edges, outlines = (~np.isin(vehicle_ids, vehicles) for vehicle_ids in (
-            self.track_vehicles, self.segment_vehicles, self.edge_vehicles, self.outline_vehicles))
+        tracks, segments, edges, outlines = (
+            ~np.isin(vehicle_ids, vehicles)
+            for vehicle_ids in (self.track_vehicles, self.segment_vehicles, self.edge_vehicles, self.outline_vehicles)
+        )
         return replace(
-            self.select_tracks(np.flatnonzero(tracks)), segments_px=self.segments_px[segments],
-            segment_vehicles=self.segment_vehicles[segments], segment_times_s=self.segment_times_s[segments],
-            edges_px=self.edges_px[edges], edge_vehicles=self.edge_vehicles[edges],
-            edge_times_s=self.edge_times_s[edges], outlines_px=self.outlines_px[outlines],
-            outline_vehicles=self.outline_vehicles[outlines], outline_times_s=self.outline_times_s[outlines])
+            self.select_tracks(np.flatnonzero(tracks)),
+            segments_px=self.segments_px[segments],
+            segment_vehicles=self.segment_vehicles[segments],
+            segment_times_s=self.segment_times_s[segments],
+            edges_px=self.edges_px[edges],
+            edge_vehicles=self.edge_vehicles[edges],
+            edge_times_s=self.edge_times_s[edges],
+            outlines_px=self.outlines_px[outlines],
+            outline_vehicles=self.outline_vehicles[outlines],
+            outline_times_s=self.outline_times_s[outlines],
+        )
 
     def save(self, path: Path) -> None:
         """Write the snapshot as .npz."""
@@ -188,8 +206,14 @@ class Evidence:
             path.parent.mkdir(parents=True, exist_ok=True)
             with path.open('wb') as stream:
                 np.savez_compressed(
-                    stream, format=FORMAT, image_size=self.image_size, drift_px=self.drift_px, frames=self.frames,
-                    stamps_ns=np.array([self.first_stamp_ns, self.newest_stamp_ns], np.int64), **arrays)
+                    stream,
+                    format=FORMAT,
+                    image_size=self.image_size,
+                    drift_px=self.drift_px,
+                    frames=self.frames,
+                    stamps_ns=np.array([self.first_stamp_ns, self.newest_stamp_ns], np.int64),
+                    **arrays,
+                )
         except OSError as error:
             raise InputError(f'cannot write {path}: {error.strerror or error}') from error
 
@@ -203,11 +227,19 @@ class Evidence:
                     raise InputError(f'{path} holds evidence of format {int(data["format"])}, not {FORMAT}')
                 first, newest = (int(stamp) for stamp in data['stamps_ns'])
                 width, height = (int(value) for value in data['image_size'])
-                evidence = cls(image_size=(width, height), first_stamp_ns=first, newest_stamp_ns=newest,
-                               frames=int(data['frames']), drift_px=float(data['drift_px']),
-                               **{name: data[name] for name in ARRAYS},
-                               **{name: data[name] for name in (*EDGE_ARRAYS, *OUTLINE_ARRAYS, STILL_LINES_PX, TRACK_KINDS)
-                                  if name in data})
+                evidence = cls(
+                    image_size=(width, height),
+                    first_stamp_ns=first,
+                    newest_stamp_ns=newest,
+                    frames=int(data['frames']),
+                    drift_px=float(data['drift_px']),
+                    **{name: data[name] for name in ARRAYS},
+                    **{
+                        name: data[name]
+                        for name in (*EDGE_ARRAYS, *OUTLINE_ARRAYS, STILL_LINES_PX, TRACK_KINDS)
+                        if name in data
+                    },
+                )
             _require_consistent(evidence)
         except LOAD_ERRORS as error:
             reason = ' '.join(str(error).split())
@@ -215,8 +247,15 @@ class Evidence:
         return evidence
 
 
-ARRAYS = ('track_starts', 'points_px', 'times_s', 'track_vehicles', 'segments_px', 'segment_vehicles',
-          'segment_times_s')
+ARRAYS = (
+    'track_starts',
+    'points_px',
+    'times_s',
+    'track_vehicles',
+    'segments_px',
+    'segment_vehicles',
+    'segment_times_s',
+)
 EDGE_ARRAYS = ('edges_px', 'edge_vehicles', 'edge_times_s')
 """Files written before edges were gathered have none of them."""
 OUTLINE_ARRAYS = ('outlines_px', 'outline_vehicles', 'outline_times_s')
@@ -227,28 +266,52 @@ TRACK_KINDS = 'track_kinds'
 """Only in files of evidence that was gathered with a detector."""
 
 
-LOAD_ERRORS = (OSError, LookupError, ValueError, TypeError, AttributeError, EOFError, OverflowError, MemoryError,
-              NotImplementedError, RuntimeError, zipfile.BadZipFile, zlib.error)
+LOAD_ERRORS = (
+    OSError,
+    LookupError,
+    ValueError,
+    TypeError,
+    AttributeError,
+    EOFError,
+    OverflowError,
+    MemoryError,
+    NotImplementedError,
+    RuntimeError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
 """What NumPy and zipfile raise at files that are damaged, encrypted, or of another kind."""
 
 
 def _require_consistent(evidence: Evidence) -> None:
     """Raise ValueError unless shapes, kinds and numbers are those that a snapshot has."""
     points, tracks = len(evidence.points_px), len(evidence.track_vehicles)
-    shapes = {'track_starts': (tracks + 1,), 'points_px': (points, 2), 'times_s': (points,),
-              'track_vehicles': (tracks,), 'segments_px': (len(evidence.segments_px), 4),
-              'segment_vehicles': (len(evidence.segments_px),), 'segment_times_s': (len(evidence.segments_px),),
-              'edges_px': (len(evidence.edges_px), 4), 'edge_vehicles': (len(evidence.edges_px),),
-              'edge_times_s': (len(evidence.edges_px),), STILL_LINES_PX: (len(evidence.still_lines_px), 4),
-              'outlines_px': (len(evidence.outlines_px), OUTLINE_COLUMNS), TRACK_KINDS: (tracks,),
-              'outline_vehicles': (len(evidence.outlines_px),), 'outline_times_s': (len(evidence.outlines_px),)}
+    shapes = {
+        'track_starts': (tracks + 1,),
+        'points_px': (points, 2),
+        'times_s': (points,),
+        'track_vehicles': (tracks,),
+        'segments_px': (len(evidence.segments_px), 4),
+        'segment_vehicles': (len(evidence.segments_px),),
+        'segment_times_s': (len(evidence.segments_px),),
+        'edges_px': (len(evidence.edges_px), 4),
+        'edge_vehicles': (len(evidence.edges_px),),
+        'edge_times_s': (len(evidence.edges_px),),
+        STILL_LINES_PX: (len(evidence.still_lines_px), 4),
+        'outlines_px': (len(evidence.outlines_px), OUTLINE_COLUMNS),
+        TRACK_KINDS: (tracks,),
+        'outline_vehicles': (len(evidence.outlines_px),),
+        'outline_times_s': (len(evidence.outlines_px),),
+    }
     for name, shape in shapes.items():
         array = getattr(evidence, name)
         kinds = 'iu' if name in ('track_starts', TRACK_KINDS) or name.endswith('vehicles') else 'f'
         if array.shape != shape or array.dtype.kind not in kinds or not np.isfinite(array).all():
             raise ValueError(f'{name} of {array.dtype} {array.shape} does not fit the rest')
     if not np.isin(evidence.track_kinds, list(TrackKind)).all():
-        raise ValueError(f'{TRACK_KINDS} holds other kinds than {", ".join(f"{kind:d} ({kind.name})" for kind in TrackKind)}')
+        raise ValueError(
+            f'{TRACK_KINDS} holds other kinds than {", ".join(f"{kind:d} ({kind.name})" for kind in TrackKind)}'
+        )
     starts = evidence.track_starts
     if starts[0] != 0 or starts[-1] != points or (np.diff(starts) < 1).any():
         raise ValueError('track_starts does not divide points_px into tracks')
@@ -267,4 +330,5 @@ def _track_arrays(tracks: list[Track]) -> dict[str, np.ndarray]:
         'points_px': np.concatenate([t.points_px for t in tracks] or [np.zeros((0, 2))]).astype(float),
         'times_s': np.concatenate([t.times_s for t in tracks] or [np.zeros(0)]).astype(float),
         'track_vehicles': np.array([track.vehicle for track in tracks], int),
-        'track_kinds': np.array([track.kind for track in tracks], np.uint8)}
+        'track_kinds': np.array([track.kind for track in tracks], np.uint8),
+    }

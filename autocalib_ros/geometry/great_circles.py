@@ -61,8 +61,10 @@ def bearing_change(rays: Rays, camera: Camera, pixels: np.ndarray, way_px: np.nd
     """Change (n, 3) of the bearings of pixels (n, 2) along a way (n, 2) in the image."""
     outward = pixels - camera.principal_point_px
     outward = outward / np.maximum(np.hypot(*outward.T), 1e-9)[:, None]
-    return (rays.radial * dot(way_px, outward)[:, None]
-            + rays.tangential * (way_px[:, 1] * outward[:, 0] - way_px[:, 0] * outward[:, 1])[:, None])
+    return (
+        rays.radial * dot(way_px, outward)[:, None]
+        + rays.tangential * (way_px[:, 1] * outward[:, 0] - way_px[:, 0] * outward[:, 1])[:, None]
+    )
 
 
 def scatter(rays: Rays, weights: np.ndarray, scale: np.ndarray) -> np.ndarray:

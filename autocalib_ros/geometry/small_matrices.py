@@ -30,8 +30,7 @@ def cofactors(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, n
     """
     flat = matrix.reshape(-1, 9).T
     diagonal, rest = flat[[0, 4, 8]], flat[[5, 2, 1]]
-    return (diagonal, rest, diagonal[NEXT] * diagonal[LAST] - rest * rest,
-            rest[NEXT] * rest[LAST] - diagonal * rest)
+    return (diagonal, rest, diagonal[NEXT] * diagonal[LAST] - rest * rest, rest[NEXT] * rest[LAST] - diagonal * rest)
 
 
 def smallest_eigenvectors(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -45,8 +44,9 @@ def smallest_eigenvectors(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     shift = _smallest_roots(trace, minors.sum(axis=0), diagonal[0] * minors[0] + (rest[1:] * mixed[1:]).sum(axis=0))
     minors = minors + shift * (diagonal - trace + shift)
     mixed = mixed + shift * rest
-    near = np.stack([minors[0], mixed[2], mixed[1], mixed[2], minors[1], mixed[0], mixed[1], mixed[0], minors[2]],
-                    axis=-1).reshape(-1, 3, 3)
+    near = np.stack(
+        [minors[0], mixed[2], mixed[1], mixed[2], minors[1], mixed[0], mixed[1], mixed[0], minors[2]], axis=-1
+    ).reshape(-1, 3, 3)
     columns = near[np.arange(len(near)), np.argmax(minors, axis=0)]
     axes = np.einsum('nij,nj->ni', near, columns)
     axes /= np.sqrt(dot(axes, axes))[:, None]

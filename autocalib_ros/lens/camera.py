@@ -68,8 +68,13 @@ class Camera:
             return self
         across, down = scale_factors((self.width, self.height), (width, height))
         cx, cy = self.principal_point_px
-        return replace(self, width=width, height=height, focal_px=self.focal_px * math.sqrt(across * down),
-                       principal_point_px=((cx + 0.5) * across - 0.5, (cy + 0.5) * down - 0.5))
+        return replace(
+            self,
+            width=width,
+            height=height,
+            focal_px=self.focal_px * math.sqrt(across * down),
+            principal_point_px=((cx + 0.5) * across - 0.5, (cy + 0.5) * down - 0.5),
+        )
 
     @property
     def matrix(self) -> np.ndarray:
@@ -151,8 +156,10 @@ def scale_factors(calibrated: tuple[int, int], images: tuple[int, int]) -> tuple
     across, down = images[0] / calibrated[0], images[1] / calibrated[1]
     # rounding to whole pixels may have changed the shape by half of one
     if min(abs(calibrated[1] * across - images[1]), abs(calibrated[0] * down - images[0])) > 0.5:
-        raise UsageError(f'the lens was calibrated in images of {calibrated[0]}x{calibrated[1]}, and these images have'
-                         f' {images[0]}x{images[1]}, another shape: give a calibration of their size')
+        raise UsageError(
+            f'the lens was calibrated in images of {calibrated[0]}x{calibrated[1]}, and these images have'
+            f' {images[0]}x{images[1]}, another shape: give a calibration of their size'
+        )
     return across, down
 
 
@@ -162,7 +169,7 @@ def _power_series(k: tuple[float, ...], t2: np.ndarray) -> np.ndarray:
     if not order:
         return np.ones_like(t2)
     total = t2 * k[order - 1]
-    for factor in reversed(k[:order - 1]):
+    for factor in reversed(k[: order - 1]):
         total += factor
         total *= t2
     return total + 1.0

@@ -21,7 +21,12 @@ EQUIDISTANT_K1_FLOOR = 1e-9
 RECTIFIED_LIMIT_DEG = 80.0
 """A distortion-free image ends at this angle from the axis at the latest: at 90 it would be infinitely large, and
 already here its border is magnified 33 times as much as its middle."""
-DISTORTION_MODELS = {'plumb_bob': (4, 5), 'rational_polynomial': (8,), 'equidistant': (0, 1, 2, 3, 4), 'fisheye': (0, 1, 2, 3, 4)}
+DISTORTION_MODELS = {
+    'plumb_bob': (4, 5),
+    'rational_polynomial': (8,),
+    'equidistant': (0, 1, 2, 3, 4),
+    'fisheye': (0, 1, 2, 3, 4),
+}
 """The distortion models that are read, and how many coefficients each may have."""
 
 
@@ -79,10 +84,15 @@ def camera_info(camera: Camera, distortion_model: str = 'auto', rectified_balanc
         raise _model_misfit(camera, model, error_px)
     rectified = rectified_matrix(camera, rectified_balance)
     return CameraInfo(
-        width=camera.width, height=camera.height, distortion_model=model,
-        k=[float(value) for value in camera.matrix.ravel()], d=coefficients,
+        width=camera.width,
+        height=camera.height,
+        distortion_model=model,
+        k=[float(value) for value in camera.matrix.ravel()],
+        d=coefficients,
         r=[float(value) for value in np.eye(3).ravel()],
-        p=[float(value) for value in np.hstack([rectified, np.zeros((3, 1))]).ravel()], error_px=error_px)
+        p=[float(value) for value in np.hstack([rectified, np.zeros((3, 1))]).ravel()],
+        error_px=error_px,
+    )
 
 
 def to_full_resolution(info: CameraInfo, readout: Readout) -> CameraInfo:
@@ -94,9 +104,13 @@ def to_full_resolution(info: CameraInfo, readout: Readout) -> CameraInfo:
     mismatch = check_readout(readout, (info.width, info.height))
     if mismatch:
         raise InputError(f'{mismatch}: its binning and region of interest are not theirs and are left out')
-    return replace(info, width=readout.width, height=readout.height,
-                   k=_to_full_resolution(info.k, 3, readout.bins, readout.offset),
-                   p=_to_full_resolution(info.p, 4, readout.bins, readout.offset))
+    return replace(
+        info,
+        width=readout.width,
+        height=readout.height,
+        k=_to_full_resolution(info.k, 3, readout.bins, readout.offset),
+        p=_to_full_resolution(info.p, 4, readout.bins, readout.offset),
+    )
 
 
 def check_readout(readout: Readout, image_size: tuple[int, int]) -> str:
@@ -105,15 +119,21 @@ def check_readout(readout: Readout, image_size: tuple[int, int]) -> str:
     window = readout.window[0] or readout.width, readout.window[1] or readout.height
     # drivers round half a bin up or down
     if abs(width * across - window[0]) >= across or abs(height * down - window[1]) >= down:
-        return (f"the driver's camera_info is of images of {window[0] // across}x{window[1] // down}, and these have"
-                f' {width}x{height}')
+        return (
+            f"the driver's camera_info is of images of {window[0] // across}x{window[1] // down}, and these have"
+            f' {width}x{height}'
+        )
     if readout.offset[0] + readout.window[0] > readout.width or readout.offset[1] + readout.window[1] > readout.height:
-        return ("the region of interest in the driver's camera_info reaches beyond its"
-                f' {readout.width}x{readout.height} pixels')
+        return (
+            "the region of interest in the driver's camera_info reaches beyond its"
+            f' {readout.width}x{readout.height} pixels'
+        )
     return ''
 
 
-def _to_full_resolution(matrix: list[float], columns: int, binning: tuple[int, int], offset: tuple[int, int]) -> list[float]:
+def _to_full_resolution(
+    matrix: list[float], columns: int, binning: tuple[int, int], offset: tuple[int, int]
+) -> list[float]:
     """Return K or P for the whole sensor."""
     rows = np.array(matrix).reshape(3, columns) * np.array([[binning[0]], [binning[1]], [1]])
     rows[:2, 2] += offset
@@ -128,18 +148,22 @@ def _coefficients(camera: Camera, model: str) -> tuple[list[float], float]:
             coefficients[0] = EQUIDISTANT_K1_FLOOR
         return coefficients, 0.0
     fitted, error_px = fit_opencv_coefficients(camera, rational=model == 'rational_polynomial')
-    return list(fitted[:DISTORTION_MODELS[model][-1]]), error_px
+    return list(fitted[: DISTORTION_MODELS[model][-1]]), error_px
 
 
 def _model_misfit(camera: Camera, model: str, error_px: float) -> ModelMisfit:
     """Say how far a model is from the lens, and which model to choose."""
     angle_deg = float(np.degrees(max_visible_angle_rad(camera)))
     if np.isfinite(error_px):
-        message = (f'{model} would be off by up to {error_px:.3g} px, as the lens sees {angle_deg:.0f} degrees from its'
-                   f' axis; {MAX_MODEL_ERROR_PX:g} px is the most that is allowed.')
+        message = (
+            f'{model} would be off by up to {error_px:.3g} px, as the lens sees {angle_deg:.0f} degrees from its'
+            f' axis; {MAX_MODEL_ERROR_PX:g} px is the most that is allowed.'
+        )
     else:
-        message = (f'The lens sees {angle_deg:.1f} degrees from its axis, and {model} ends before'
-                   f' {np.degrees(MAX_PINHOLE_ANGLE_RAD):.0f}.')
+        message = (
+            f'The lens sees {angle_deg:.1f} degrees from its axis, and {model} ends before'
+            f' {np.degrees(MAX_PINHOLE_ANGLE_RAD):.0f}.'
+        )
     others = 'equidistant, which is exact'
     if model == 'plumb_bob':
         rational_px = fit_opencv_coefficients(camera, rational=True)[1]
@@ -173,14 +197,24 @@ def _normalised_borders(camera: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarra
         theta = np.minimum(np.arctan2(from_axis, bearings[:, 2]), limit)
         return np.tan(theta)[:, None] * bearings[:, :2] / np.maximum(from_axis, 1e-12)[:, None]
 
-    return (normalised(0.0, down)[:, 0], normalised(width - 1.0, down)[:, 0],
-            normalised(across, 0.0)[:, 1], normalised(across, height - 1.0)[:, 1])
+    return (
+        normalised(0.0, down)[:, 0],
+        normalised(width - 1.0, down)[:, 0],
+        normalised(across, 0.0)[:, 1],
+        normalised(across, height - 1.0)[:, 1],
+    )
 
 
-def _matrix_for_rectangle(camera: Lens, left: float, right: float, top: float, bottom: float,
-          choose: Callable[[float, float], float]) -> np.ndarray:
+def _matrix_for_rectangle(
+    camera: Lens, left: float, right: float, top: float, bottom: float, choose: Callable[[float, float], float]
+) -> np.ndarray:
     """Return the K with square pixels that shows a rectangle of slopes in its middle, one of its sides exactly."""
     width, height = camera.width, camera.height
     focal = choose((width - 1) / max(right - left, 1e-6), (height - 1) / max(bottom - top, 1e-6))
-    return np.array([[focal, 0, (width - 1) / 2 - focal * (right + left) / 2],
-                     [0, focal, (height - 1) / 2 - focal * (bottom + top) / 2], [0, 0, 1]])
+    return np.array(
+        [
+            [focal, 0, (width - 1) / 2 - focal * (right + left) / 2],
+            [0, focal, (height - 1) / 2 - focal * (bottom + top) / 2],
+            [0, 0, 1],
+        ]
+    )

@@ -42,15 +42,23 @@ class CameraInfoLens:
         if rectified:
             projection = _numbers(message_field(info, 'p'))
             if len(projection) != 12 or not (projection[0] > 0 and projection[5] > 0):
-                raise InputError("its 'p' holds no projection: rectified images come with 12 numbers, focal lengths"
-                                 ' above 0 among them; take the image that is not rectified, or calibrate')
-            fields |= {'k': [*projection[0:3], *projection[4:7], *projection[8:11]], 'distortion_model': 'plumb_bob',
-                       'd': [0.0] * 5}
+                raise InputError(
+                    "its 'p' holds no projection: rectified images come with 12 numbers, focal lengths"
+                    ' above 0 among them; take the image that is not rectified, or calibrate'
+                )
+            fields |= {
+                'k': [*projection[0:3], *projection[4:7], *projection[8:11]],
+                'distortion_model': 'plumb_bob',
+                'd': [0.0] * 5,
+            }
         region = message_field(info, 'roi')
-        return cls(lens_from_fields({name: value if isinstance(value, (str, int)) else _numbers(value)
-                                   for name, value in fields.items()}),
-                   (max(int(info.binning_x), 1), max(int(info.binning_y), 1)),
-                   (int(region.x_offset), int(region.y_offset)))
+        return cls(
+            lens_from_fields(
+                {name: value if isinstance(value, (str, int)) else _numbers(value) for name, value in fields.items()}
+            ),
+            (max(int(info.binning_x), 1), max(int(info.binning_y), 1)),
+            (int(region.x_offset), int(region.y_offset)),
+        )
 
     @cached_property
     def _polynomial(self) -> Camera:

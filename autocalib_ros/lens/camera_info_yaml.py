@@ -26,8 +26,9 @@ Parsed = TypeVar('Parsed')
 EXPECTED_INPUT = 'give the file of camera_info_manager, or what `ros2 topic echo --once` prints of a CameraInfo'
 
 
-def write_camera_info_yaml(path: Path, camera: Camera, camera_name: str, distortion_model: str = 'auto',
-                           rectified_balance: float = 0.0) -> None:
+def write_camera_info_yaml(
+    path: Path, camera: Camera, camera_name: str, distortion_model: str = 'auto', rectified_balance: float = 0.0
+) -> None:
     """Write the file of camera_info_manager, atomically; `camera_name` is reduced to letters, digits and _."""
     write_atomically(path, camera_info_yaml(camera_info(camera, distortion_model, rectified_balance), camera_name))
 
@@ -39,15 +40,20 @@ def sanitised_name(name: str) -> str:
 
 def camera_info_yaml(info: CameraInfo, camera_name: str) -> str:
     """Return the text of camera_info_manager's file in full precision."""
+
     def matrix(rows: int, cols: int, data: list[float]) -> dict[str, Any]:
         return {'rows': rows, 'cols': cols, 'data': data}
 
     document = {
-        'image_width': info.width, 'image_height': info.height,
+        'image_width': info.width,
+        'image_height': info.height,
         'camera_name': sanitised_name(camera_name) or 'camera',
-        'camera_matrix': matrix(3, 3, info.k), 'distortion_model': info.distortion_model,
+        'camera_matrix': matrix(3, 3, info.k),
+        'distortion_model': info.distortion_model,
         'distortion_coefficients': matrix(1, len(info.d), info.d),
-        'rectification_matrix': matrix(3, 3, info.r), 'projection_matrix': matrix(3, 4, info.p)}
+        'rectification_matrix': matrix(3, 3, info.r),
+        'projection_matrix': matrix(3, 4, info.p),
+    }
     return yaml.safe_dump(document, sort_keys=False, default_flow_style=None)
 
 
@@ -59,10 +65,14 @@ def read_camera_info_fields(path: Path) -> CameraInfo:
 def _parse_camera_info(fields: Mapping[str, Any]) -> CameraInfo:
     model, sizes = _parse_model(fields)
     return CameraInfo(
-        width=_parse_pixel_count(fields, 'image_width', 'width'), height=_parse_pixel_count(fields, 'image_height', 'height'),
-        distortion_model=model, k=_parse_numbers(fields, (9,), 'camera_matrix', 'k'),
+        width=_parse_pixel_count(fields, 'image_width', 'width'),
+        height=_parse_pixel_count(fields, 'image_height', 'height'),
+        distortion_model=model,
+        k=_parse_numbers(fields, (9,), 'camera_matrix', 'k'),
         d=_parse_numbers(fields, sizes, 'distortion_coefficients', 'd'),
-        r=_parse_numbers(fields, (9,), 'rectification_matrix', 'r'), p=_parse_numbers(fields, (12,), 'projection_matrix', 'p'))
+        r=_parse_numbers(fields, (9,), 'rectification_matrix', 'r'),
+        p=_parse_numbers(fields, (12,), 'projection_matrix', 'p'),
+    )
 
 
 def read_camera_info(path: Path) -> Camera:
@@ -86,8 +96,11 @@ def _rectified_projection(fields: Mapping[str, Any]) -> np.ndarray | None:
     if not fields.keys() & {'projection_matrix', 'p'}:
         return None
     projection = np.array(_parse_numbers(fields, (12,), 'projection_matrix', 'p')).reshape(3, 4)
-    rectification = (np.array(_parse_numbers(fields, (9,), 'rectification_matrix', 'r')).reshape(3, 3)
-            if fields.keys() & {'rectification_matrix', 'r'} else np.eye(3))
+    rectification = (
+        np.array(_parse_numbers(fields, (9,), 'rectification_matrix', 'r')).reshape(3, 3)
+        if fields.keys() & {'rectification_matrix', 'r'}
+        else np.eye(3)
+    )
     is_valid = projection[0, 0] > 0 and projection[1, 1] > 0 and abs(np.linalg.det(rectification)) > 0.5
     return projection[:, :3] @ rectification if is_valid else None
 
@@ -120,7 +133,10 @@ def _fields(path: Path) -> Mapping[str, Any]:
 
 def lens_from_fields(fields: Mapping[str, Any]) -> OpencvLens:
     """Return the lens of a CameraInfo given by the names of its fields, lists as lists; InputError where it is none."""
-    width, height = _parse_pixel_count(fields, 'image_width', 'width'), _parse_pixel_count(fields, 'image_height', 'height')
+    width, height = (
+        _parse_pixel_count(fields, 'image_width', 'width'),
+        _parse_pixel_count(fields, 'image_height', 'height'),
+    )
     model, sizes = _parse_model(fields)
     matrix = np.array(_parse_numbers(fields, (9,), 'camera_matrix', 'k')).reshape(3, 3)
     _require_calibrated(matrix)
@@ -145,8 +161,10 @@ def _parse_model(fields: Mapping[str, Any]) -> tuple[str, tuple[int, ...]]:
     given = _first_field(fields, 'distortion_model', 'camera_model')
     name = given.strip().lower() if isinstance(given, str) else ''
     if name not in DISTORTION_MODELS:
-        raise InputError(f"its distortion model is {_abbreviated(given)}, and only {', '.join(DISTORTION_MODELS)} are read;"
-                         ' calibrate the camera anew with one of these, or leave the file out')
+        raise InputError(
+            f'its distortion model is {_abbreviated(given)}, and only {", ".join(DISTORTION_MODELS)} are read;'
+            ' calibrate the camera anew with one of these, or leave the file out'
+        )
     return name, DISTORTION_MODELS[name]
 
 
@@ -188,11 +206,14 @@ def _abbreviated(value: Any) -> str:
 
 def _require_calibrated(matrix: np.ndarray) -> None:
     if matrix[0, 0] == 0 or matrix[1, 1] == 0:
-        raise InputError('it is of a camera that is not calibrated, its focal length is 0:'
-                         ' calibrate the camera, or leave the file out')
+        raise InputError(
+            'it is of a camera that is not calibrated, its focal length is 0:'
+            ' calibrate the camera, or leave the file out'
+        )
     if min(matrix[0, 0], matrix[1, 1]) < 1 or matrix[1, 0] != 0 or matrix[2].tolist() != [0, 0, 1]:
-        raise InputError("its 'camera_matrix' is not of the form fx s cx, 0 fy cy, 0 0 1 with fx and fy in pixels;"
-                         f' {EXPECTED_INPUT}')
+        raise InputError(
+            f"its 'camera_matrix' is not of the form fx s cx, 0 fy cy, 0 0 1 with fx and fy in pixels; {EXPECTED_INPUT}"
+        )
 
 
 def _require_full_frame(fields: Mapping[str, Any], width: int, height: int) -> None:
@@ -201,5 +222,7 @@ def _require_full_frame(fields: Mapping[str, Any], width: int, height: int) -> N
     if not isinstance(region, Mapping) or not region.get('width') or not region.get('height'):
         return
     if (region['width'], region['height']) != (width, height):
-        raise InputError('it is of a camera that sends only a region of interest (roi);'
-                         ' give a calibration of the size of the images, without roi')
+        raise InputError(
+            'it is of a camera that sends only a region of interest (roi);'
+            ' give a calibration of the size of the images, without roi'
+        )

@@ -57,7 +57,10 @@ class OpencvLens:
 
     def grid(self) -> np.ndarray:
         """Return pixels all over the image, shape (n, 2)."""
-        across, down = np.linspace(0, self.width - 1, COMPARISON_GRID_SIDE), np.linspace(0, self.height - 1, COMPARISON_GRID_SIDE)
+        across, down = (
+            np.linspace(0, self.width - 1, COMPARISON_GRID_SIDE),
+            np.linspace(0, self.height - 1, COMPARISON_GRID_SIDE),
+        )
         return np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
 
     def unproject_and_reproject(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -87,16 +90,20 @@ def fit_kannala_brandt(lens: OpencvLens) -> Camera:
     pixels, valid = camera.project(bearings[invertible])
     error_px = np.where(valid, np.hypot(*(pixels - imaged[invertible]).T), np.inf).max()
     if not error_px <= MAX_MODEL_ERROR_PX:
-        raise InputError(f'the nearest Kannala-Brandt lens misses this one by up to {error_px:.2f} px, and more than'
-                         f' {MAX_MODEL_ERROR_PX:g} px would spoil the pose; {_misfit_cause(lens)}, or leave the file out')
+        raise InputError(
+            f'the nearest Kannala-Brandt lens misses this one by up to {error_px:.2f} px, and more than'
+            f' {MAX_MODEL_ERROR_PX:g} px would spoil the pose; {_misfit_cause(lens)}, or leave the file out'
+        )
     return camera
 
 
 def _require_coverage(lens: OpencvLens, share: float) -> None:
     """Raise InputError unless enough of the image is reached; a fisheye's picture may be a disc in the middle."""
     if share < (MIN_FISHEYE_COVERAGE if lens.equidistant else 1.0):
-        raise InputError(f'its distortion folds back and leaves {100 * (1 - share):.0f} % of the image empty;'
-                         ' calibrate the camera anew, with the pattern near the borders too or with a fisheye model')
+        raise InputError(
+            f'its distortion folds back and leaves {100 * (1 - share):.0f} % of the image empty;'
+            ' calibrate the camera anew, with the pattern near the borders too or with a fisheye model'
+        )
 
 
 def _require_field_of_view(bearings: np.ndarray) -> None:
@@ -104,16 +111,20 @@ def _require_field_of_view(bearings: np.ndarray) -> None:
     one, other = bearings[[0, -1]] / np.linalg.norm(bearings[[0, -1]], axis=1)[:, None]
     field_deg = np.degrees(np.arctan2(np.linalg.norm(np.cross(one, other)), one @ other))
     if field_deg < MIN_FIELD_OF_VIEW_DEG:
-        raise InputError(f'its lens sees {field_deg:.1g} degrees from corner to corner, which cannot be meant;'
-                         ' calibrate the camera anew, or leave the file out')
+        raise InputError(
+            f'its lens sees {field_deg:.1g} degrees from corner to corner, which cannot be meant;'
+            ' calibrate the camera anew, or leave the file out'
+        )
 
 
 def _misfit_cause(lens: OpencvLens) -> str:
     """Say what a Camera does not have, and how to calibrate so that it is not needed."""
     (fx, skew, _), (_, fy, _), _ = lens.matrix
-    causes = {f'two focal lengths, {fx:.1f} and {fy:.1f} px (--fix-aspect-ratio)': fx != fy,
-              'skewed axes': skew != 0.0,
-              'tangential distortion (--zero-tangent-dist)': not lens.equidistant and any(lens.coefficients[2:4])}
+    causes = {
+        f'two focal lengths, {fx:.1f} and {fy:.1f} px (--fix-aspect-ratio)': fx != fy,
+        'skewed axes': skew != 0.0,
+        'tangential distortion (--zero-tangent-dist)': not lens.equidistant and any(lens.coefficients[2:4]),
+    }
     found = [cause for cause, there in causes.items() if there]
     if not found:
         return 'its angle is too wide: calibrate the camera anew with a fisheye model'
@@ -132,8 +143,12 @@ def _fit_camera(lens: OpencvLens, bearings: np.ndarray, imaged: np.ndarray) -> C
     powers = np.arctan2(across, bearings[:, 2])[:, None] ** [1, 3, 5, 7, 9]
     outwards = bearings[:, :2] / np.maximum(across, 1e-12)[:, None]
     ones, zeros = np.ones(len(across)), np.zeros(len(across))
-    rows = np.concatenate([np.column_stack([ones, zeros, powers * outwards[:, :1]]),
-                           np.column_stack([zeros, ones, powers * outwards[:, 1:]])])
+    rows = np.concatenate(
+        [
+            np.column_stack([ones, zeros, powers * outwards[:, :1]]),
+            np.column_stack([zeros, ones, powers * outwards[:, 1:]]),
+        ]
+    )
     solution = np.linalg.lstsq(rows, imaged.T.ravel(), rcond=None)[0]
     return _camera(lens, solution[2], solution[:2], solution[3:] / solution[2])
 
@@ -142,7 +157,8 @@ def fit_opencv_coefficients(camera: Camera, *, rational: bool) -> tuple[tuple[fl
     """Return k1, k2, p1, p2, k3 to k6 of the OpenCV lens with the camera's K that comes nearest to it, and its error.
 
     The error is the largest distance in pixels between the images of one bearing in the two lenses, over the whole
-    image; infinite where the image shows bearings at `MAX_PINHOLE_ANGLE_RAD` from the axis or more, which have no slopes
+    image; infinite where the image shows bearings at `MAX_PINHOLE_ANGLE_RAD` from the axis or more, which have no
+    slopes
     to speak of. Without `rational`, k4 to k6 are 0.
     """
     field_rad = max_visible_angle_rad(camera)
@@ -185,7 +201,7 @@ def _radial_fit(normalised: np.ndarray, radii: np.ndarray, weights: np.ndarray, 
     powers = (normalised[:, None] / unit) ** exponents
     columns = np.hstack([normalised[:, None] * powers, *([-radii[:, None] * powers] if rational else [])])
     solution = np.linalg.lstsq(columns * weights[:, None], (radii - normalised) * weights, rcond=None)[0]
-    scaled = solution.reshape(-1, 3) / unit ** exponents
+    scaled = solution.reshape(-1, 3) / unit**exponents
     k1, k2, k3, *others = (float(value) for value in scaled.ravel())
     return (k1, k2, 0.0, 0.0, k3, *(others or (0.0,) * 3))
 
@@ -200,7 +216,9 @@ def _radial_error(normalised: np.ndarray, radii: np.ndarray, coefficients: tuple
 
 def distort(normalised: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
     """Return x', y' of slopes x, y, shape (n, 2)."""
-    return normalised * _radial(np.sum(normalised * normalised, axis=1), coefficients)[:, None] + _tangential(normalised, coefficients)
+    return normalised * _radial(np.sum(normalised * normalised, axis=1), coefficients)[:, None] + _tangential(
+        normalised, coefficients
+    )
 
 
 def undistort(ideal: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
@@ -223,15 +241,20 @@ def invertible_radii(coefficients: tuple[float, ...]) -> tuple[np.ndarray, np.nd
     return radius[:last], imaged[:last]
 
 
-def distortion_jacobian(normalised: np.ndarray, coefficients: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def distortion_jacobian(
+    normalised: np.ndarray, coefficients: tuple[float, ...]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return dx'/dx, dx'/dy = dy'/dx and dy'/dy of `distort` at slopes (n, 2), each (n,)."""
     k1, k2, p1, p2, k3, k4, k5, k6 = coefficients
     x, y = normalised.T
     r2 = x * x + y * y
     radial, below = _radial(r2, coefficients), _denominator(r2, coefficients)
     growth = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3) - radial * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / below
-    return (radial + growth * x * x + 2 * p1 * y + 6 * p2 * x, growth * x * y + 2 * p1 * x + 2 * p2 * y,
-            radial + growth * y * y + 6 * p1 * y + 2 * p2 * x)
+    return (
+        radial + growth * x * x + 2 * p1 * y + 6 * p2 * x,
+        growth * x * y + 2 * p1 * x + 2 * p2 * y,
+        radial + growth * y * y + 6 * p1 * y + 2 * p2 * x,
+    )
 
 
 def _radial(r2: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:

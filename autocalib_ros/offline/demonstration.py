@@ -45,10 +45,12 @@ class TruthErrors:
 
     def table(self) -> str:
         """Return the errors as lines for a terminal."""
-        rows = (('focal length', f'{self.focal_error_percent:+.2f} %', f'within {MAX_FOCAL_ERROR_PERCENT:g} %'),
-                ('ground normal', f'{self.normal_deg:.2f} degrees', f'within {MAX_NORMAL_ERROR_DEG:g} degree'),
-                ('camera height', f'{self.height_m:+.3f} m', self.height_note),
-                (f'distances within {MAX_COMPARED_RANGE_M:g} m', f'{self.distance_error_percent:.2f} %', 'median'))
+        rows = (
+            ('focal length', f'{self.focal_error_percent:+.2f} %', f'within {MAX_FOCAL_ERROR_PERCENT:g} %'),
+            ('ground normal', f'{self.normal_deg:.2f} degrees', f'within {MAX_NORMAL_ERROR_DEG:g} degree'),
+            ('camera height', f'{self.height_m:+.3f} m', self.height_note),
+            (f'distances within {MAX_COMPARED_RANGE_M:g} m', f'{self.distance_error_percent:.2f} %', 'median'),
+        )
         lines = [f'  {name + ":":<26}{error:<16}{note}' for name, error, note in rows]
         return '\n'.join(['Errors against the truth:', *lines])
 
@@ -70,9 +72,13 @@ def options_from_truth(truth: dict[str, Any], scale_from: str) -> Options:
     """Return the options of somebody who knows the height, a distance on the road, or the mean speed of a road."""
     if scale_from == 'distance':
         (x1, y1, *first), (x2, y2, *second) = _most_distant_pair(nearby_road_points(truth))
-        return Options(scale_from=scale_from, scale=ScaleOptions(
-            distance_px=' '.join(f'{value:.1f}' for value in (*first, *second)),
-            distance_m=float(np.hypot(x2 - x1, y2 - y1))))
+        return Options(
+            scale_from=scale_from,
+            scale=ScaleOptions(
+                distance_px=' '.join(f'{value:.1f}' for value in (*first, *second)),
+                distance_m=float(np.hypot(x2 - x1, y2 - y1)),
+            ),
+        )
     if scale_from == 'speed':
         return Options(scale_from=scale_from, scale=ScaleOptions(speed_km_h=3.6 * _mean_speed(truth)))
     return Options(camera_height=truth['camera']['height'])
@@ -93,7 +99,11 @@ def _mean_speed(truth: dict[str, Any]) -> float:
         way = rows[-1, 1:3] - rows[0, 1:3]
         length, path = np.hypot(*way), np.hypot(*np.diff(rows[:, 1:3], axis=0).T).sum()
         cosines = np.abs(np.array(truth['road_directions'])[:, :2] @ way) / max(length, 1e-9)
-        if length > MIN_DISPLACEMENT_M and path < MAX_DETOUR_RATIO * length and cosines.max() > np.cos(np.radians(MAX_ROAD_ANGLE_DEG)):
+        if (
+            length > MIN_DISPLACEMENT_M
+            and path < MAX_DETOUR_RATIO * length
+            and cosines.max() > np.cos(np.radians(MAX_ROAD_ANGLE_DEG))
+        ):
             # a loop somewhere on the way: each metre counts alike
             speeds[int(cosines.argmax())].append(float((rows[:, 4] ** 2).sum() / rows[:, 4].sum()))
     return float(np.mean(max(speeds, key=len)))
@@ -109,6 +119,10 @@ def compare_with_truth(result: Calibration | Refusal, truth: dict[str, Any]) -> 
     up = np.array(truth['camera']['R_world_from_camera'])[2]
     angle = angles_deg(result.ground.normal_in_camera, up)
     sigma = result.stddev.height_m
-    return TruthErrors(focal_error_percent, float(angle), result.ground.height_m - truth['camera']['height'],
-                      distance_error_percent(result.camera, result.ground, truth),
-                      'given' if sigma is None else f'stated +- {sigma:.2g} m')
+    return TruthErrors(
+        focal_error_percent,
+        float(angle),
+        result.ground.height_m - truth['camera']['height'],
+        distance_error_percent(result.camera, result.ground, truth),
+        'given' if sigma is None else f'stated +- {sigma:.2g} m',
+    )

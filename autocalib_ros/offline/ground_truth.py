@@ -67,14 +67,22 @@ def true_camera(truth: dict[str, Any]) -> SavedCamera:
     try:
         lens, pose = truth['lens'], truth['camera']
         if lens['model'] not in SUPPORTED_LENS_MODELS:
-            raise InputError(f"the lens of the truth is {lens['model']!r}, expected {' or '.join(SUPPORTED_LENS_MODELS)}")
-        camera = Camera(int(truth['width']), int(truth['height']), float(lens['f']), (float(lens['cx']),
-                        float(lens['cy'])), tuple(float(value) for value in lens['k']))
+            raise InputError(
+                f'the lens of the truth is {lens["model"]!r}, expected {" or ".join(SUPPORTED_LENS_MODELS)}'
+            )
+        camera = Camera(
+            int(truth['width']),
+            int(truth['height']),
+            float(lens['f']),
+            (float(lens['cx']), float(lens['cy'])),
+            tuple(float(value) for value in lens['k']),
+        )
         ground = GroundPlane(np.array(pose['R_world_from_camera'], float).reshape(3, 3), float(pose['height']))
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f'the truth is none of a simulation ({type(error).__name__}: {error})') from error
-    return SavedCamera(width=camera.width, height=camera.height, lens=camera, matrix=camera.matrix, k=camera.k,
-                       ground=ground)
+    return SavedCamera(
+        width=camera.width, height=camera.height, lens=camera, matrix=camera.matrix, k=camera.k, ground=ground
+    )
 
 
 def errors_against_truth(known: SavedCamera, truth: dict[str, Any]) -> dict[str, float | None]:
@@ -89,7 +97,13 @@ def errors_against_truth(known: SavedCamera, truth: dict[str, Any]) -> dict[str,
         'principal point, px': math.hypot(result.lens[1].difference, result.lens[2].difference),
         'rays, largest, deg': result.rays.largest_deg,
         'rays, best turned, largest, deg': result.rays_aligned.largest_deg,
-        'ground normal, deg': result.normal_deg, 'tilt, deg': pose.get('tilt'), 'roll, deg': pose.get('roll'),
+        'ground normal, deg': result.normal_deg,
+        'tilt, deg': pose.get('tilt'),
+        'roll, deg': pose.get('roll'),
         'height, m': pose.get('height'),
-        f'distances within {MAX_COMPARED_RANGE_M:g} m, median, %':
-            distance_error_percent(scaled.lens, scaled.ground, truth) if metric else None}
+        f'distances within {MAX_COMPARED_RANGE_M:g} m, median, %': distance_error_percent(
+            scaled.lens, scaled.ground, truth
+        )
+        if metric
+        else None,
+    }

@@ -43,14 +43,24 @@ def write_result(out_dir: Path, replayed: ReplayResult, source_name: str, name_o
 
     result = replayed.result
     if isinstance(result, Calibration):
-        write_camera_info_yaml(out_dir / CAMERA_INFO, result.camera, name_of_camera, result.distortion_model,
-                               result.rectified_balance)
+        write_camera_info_yaml(
+            out_dir / CAMERA_INFO, result.camera, name_of_camera, result.distortion_model, result.rectified_balance
+        )
     else:
         _remove(out_dir / CAMERA_INFO)
     write_calibration_json(out_dir / CALIBRATION, result, accepted_at_s=replayed.accepted_at_s)
-    write_report(out_dir / REPORT, ReportScene(
-        result=result, evidence=replayed.evidence, background=replayed.background, options=replayed.options,
-        source=source_name, accepted_at_s=replayed.accepted_at_s, moments=replayed.moments))
+    write_report(
+        out_dir / REPORT,
+        ReportScene(
+            result=result,
+            evidence=replayed.evidence,
+            background=replayed.background,
+            options=replayed.options,
+            source=source_name,
+            accepted_at_s=replayed.accepted_at_s,
+            moments=replayed.moments,
+        ),
+    )
     return ([CAMERA_INFO] if result else []) + [CALIBRATION, REPORT]
 
 

@@ -88,8 +88,9 @@ def parse_assignments(assignments: list[str]) -> dict[str, Any]:
 def override_options(options: Options, values: Mapping[str, Any]) -> Options:
     """Return `options` with values by full name; YAML takes `1e-05`, without a point, for text."""
     floats = {item.name for item in walk_options(options) if isinstance(item.default, float)}
-    return with_overrides(options, {name: _as_float(value) if name in floats else value
-                                 for name, value in values.items()})
+    return with_overrides(
+        options, {name: _as_float(value) if name in floats else value for name, value in values.items()}
+    )
 
 
 def _as_float(value: Any) -> Any:

@@ -40,8 +40,13 @@ class ReplayResult:
     """What the solutions on the way said, and the last."""
 
 
-def replay(source: Source, options: Options, on_progress: Callable[[int, str], None] | None = None,
-           lens: Camera | None = None, detector: VehicleDetector | None = None) -> ReplayResult:
+def replay(
+    source: Source,
+    options: Options,
+    on_progress: Callable[[int, str], None] | None = None,
+    lens: Camera | None = None,
+    detector: VehicleDetector | None = None,
+) -> ReplayResult:
     """Go through a recording and solve at its end; `on_progress` is told the frames done and a short note.
 
     The first word of the note is the state: collecting, solving, calibrated or refused. With a known `lens` only the
@@ -76,12 +81,20 @@ def replay(source: Source, options: Options, on_progress: Callable[[int, str], N
     report_progress(count, 'calibrated' if result else 'refused')
     if result and accepted_at_s is None:
         accepted_at_s = evidence.seconds
-    return ReplayResult(result=result, evidence=evidence, accepted_at_s=accepted_at_s,
-                        background=calibrator.background(), frames=count, options=options,
-                        moments=append_snapshot(moments, result))
+    return ReplayResult(
+        result=result,
+        evidence=evidence,
+        accepted_at_s=accepted_at_s,
+        background=calibrator.background(),
+        frames=count,
+        options=options,
+        moments=append_snapshot(moments, result),
+    )
 
 
-def _progress_note(calibrator: AutoCalibrator, latest: Calibration | Refusal | None, accepted_at_s: float | None) -> str:
+def _progress_note(
+    calibrator: AutoCalibrator, latest: Calibration | Refusal | None, accepted_at_s: float | None
+) -> str:
     """Say the state, how far the evidence has come, and what is missing."""
     if isinstance(latest, Calibration):
         return f'calibrated since {accepted_at_s:.0f} s: focal length {latest.camera.focal_px:.0f} px'
@@ -93,8 +106,14 @@ def _progress_note(calibrator: AutoCalibrator, latest: Calibration | Refusal | N
 
 def solve_evidence(evidence: Evidence, options: Options, lens: Camera | None = None) -> ReplayResult:
     """Solve saved evidence; it does not tell when it would first have been accepted, and has no picture."""
-    return ReplayResult(result=solve(evidence, options, lens=_scaled_lens(lens, evidence.image_size)), evidence=evidence,
-                        accepted_at_s=None, background=None, frames=evidence.frames, options=options)
+    return ReplayResult(
+        result=solve(evidence, options, lens=_scaled_lens(lens, evidence.image_size)),
+        evidence=evidence,
+        accepted_at_s=None,
+        background=None,
+        frames=evidence.frames,
+        options=options,
+    )
 
 
 def _scaled_lens(lens: Camera | None, image_size: tuple[int, int]) -> Camera | None:

@@ -35,8 +35,15 @@ class SourceSelection:
     duration_s: float | None = None
 
 
-def write_view(source: Path, out: Path, selection: SourceSelection, renderer_for: Callable[[int, int], Renderer], *, label: str,
-               quiet: bool = False) -> tuple[int, int]:
+def write_view(
+    source: Path,
+    out: Path,
+    selection: SourceSelection,
+    renderer_for: Callable[[int, int], Renderer],
+    *,
+    label: str,
+    quiet: bool = False,
+) -> tuple[int, int]:
     """Write what `renderer_for(width, height)` makes of the images; return the size of the picture or video.
 
     A file of that name is replaced once the new one is whole. UsageError where the names do not fit each other,
@@ -54,14 +61,18 @@ def write_view(source: Path, out: Path, selection: SourceSelection, renderer_for
 def _check(source: Path, out: Path, selection: SourceSelection) -> None:
     kind = out.suffix.lower()
     if kind not in (*PICTURE_SUFFIXES, *VIDEO_CODECS):
-        raise UsageError(f'{out} is neither a picture nor a video: name it {", ".join((*PICTURE_SUFFIXES, *VIDEO_CODECS))}')
+        raise UsageError(
+            f'{out} is neither a picture nor a video: name it {", ".join((*PICTURE_SUFFIXES, *VIDEO_CODECS))}'
+        )
     if out.is_dir():
         raise UsageError(f'{out} is a folder, not a file to write')
     if out.exists() and source.exists() and out.samefile(source):
         raise UsageError(f'{out} is the source itself: choose another name for the result')
     if source.suffix.lower() in IMAGE_SUFFIXES and (kind in VIDEO_CODECS or selection != SourceSelection()):
-        raise UsageError(f'{source} is one image: write one picture ({", ".join(PICTURE_SUFFIXES)}) of it, without --at,'
-                         ' --duration and --topic')
+        raise UsageError(
+            f'{source} is one image: write one picture ({", ".join(PICTURE_SUFFIXES)}) of it, without --at,'
+            ' --duration and --topic'
+        )
     if kind in PICTURE_SUFFIXES and selection.duration_s is not None:
         raise UsageError(f'{out} is one picture, and --duration is for videos: give --at alone')
 
@@ -91,8 +102,9 @@ def _write_picture(out: Path, picture: np.ndarray) -> tuple[int, int]:
     return picture.shape[1], picture.shape[0]
 
 
-def _write_video(recording: Source, out: Path, renderer_for: Callable[[int, int], Renderer], label: str,
-                 quiet: bool) -> tuple[int, int]:
+def _write_video(
+    recording: Source, out: Path, renderer_for: Callable[[int, int], Renderer], label: str, quiet: bool
+) -> tuple[int, int]:
     view = writer = size = None
     with _atomic_output(out) as unfinished, progress_bar(recording.total, 'images', label, quiet=quiet) as progress:
         try:
@@ -102,7 +114,7 @@ def _write_video(recording: Source, out: Path, renderer_for: Callable[[int, int]
                 if writer is None:
                     size = (picture.shape[1] // 2 * 2, picture.shape[0] // 2 * 2)  # codecs halve the colours
                     writer = _open_writer(out, unfinished, _frame_rate(recording), size)
-                writer.write(np.ascontiguousarray(picture[:size[1], :size[0]]))
+                writer.write(np.ascontiguousarray(picture[: size[1], : size[0]]))
                 progress.update_to(count)
         finally:
             if writer is not None:
@@ -114,8 +126,10 @@ def _open_writer(out: Path, unfinished: Path, rate: float, size: tuple[int, int]
     codec = VIDEO_CODECS[out.suffix.lower()]
     writer = cv2.VideoWriter(str(unfinished), cv2.VideoWriter_fourcc(*codec), rate, size)
     if not writer.isOpened():
-        raise InputError(f'cannot write {out}: this OpenCV cannot encode {codec} of {size[0]}x{size[1]} there; choose'
-                         ' .avi, or another folder')
+        raise InputError(
+            f'cannot write {out}: this OpenCV cannot encode {codec} of {size[0]}x{size[1]} there; choose'
+            ' .avi, or another folder'
+        )
     return writer
 
 

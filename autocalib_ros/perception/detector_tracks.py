@@ -65,8 +65,9 @@ class DetectorTracks:
             self._drop_stale_votes(vehicle_ids)
         self._time_s = time_s
 
-    def regions(self, moving: list[Region], shape: tuple[int, int],
-                excluded: np.ndarray | None = None) -> tuple[list[Region], np.ndarray]:
+    def regions(
+        self, moving: list[Region], shape: tuple[int, int], excluded: np.ndarray | None = None
+    ) -> tuple[list[Region], np.ndarray]:
         """Return what moves of each box, nearest first, and the vehicles (n,), given what moves in the image (H, W).
 
         No region reaches to where an image (H, W) is `excluded`, not 0.
@@ -74,12 +75,14 @@ class DetectorTracks:
         differs = np.zeros(shape, np.uint8)
         for region in moving:
             height, width = region.mask.shape
-            differs[region.y:region.y + height, region.x:region.x + width] |= region.mask
+            differs[region.y : region.y + height, region.x : region.x + width] |= region.mask
         found, free = [], np.full(shape, 255, np.uint8)
         if excluded is not None:
             free[excluded > 0] = 0
         # A person stands before the vehicle that its box overlaps; of two vehicles the lower one is nearer.
-        for box in sorted(self._boxes, key=lambda box: (self.kind(box.vehicle) is not TrackKind.PERSON, -box.edges_px[3])):
+        for box in sorted(
+            self._boxes, key=lambda box: (self.kind(box.vehicle) is not TrackKind.PERSON, -box.edges_px[3])
+        ):
             left, top, right, bottom = _pixel_bounds(box.edges_px, shape)
             if right <= left or bottom <= top:
                 continue
@@ -108,8 +111,9 @@ class DetectorTracks:
                 box.edges_px = box.edges_px + np.tile(step, 2)
                 box.speed_px_s = float(np.hypot(*step) / max(time_s - self._time_s, 1e-3))
 
-    def _associate(self, found: Detections, edges_px: np.ndarray, points: np.ndarray, vehicle_ids: np.ndarray,
-               time_s: float) -> None:
+    def _associate(
+        self, found: Detections, edges_px: np.ndarray, points: np.ndarray, vehicle_ids: np.ndarray, time_s: float
+    ) -> None:
         """Give each detection its box: the one that overlaps it most, else that of the points in it, else a new one."""
         matched = _greedy_iou_matches(edges_px, np.array([box.edges_px for box in self._boxes]).reshape(-1, 4))
         taken = {self._boxes[index].vehicle for index in matched.values()}
@@ -124,8 +128,9 @@ class DetectorTracks:
             speed = self._boxes[matched[row]].speed_px_s if row in matched else 0.0
             fresh.append(_Box(vehicle, edges, time_s, speed))
             self._votes[vehicle] = self._votes.get(vehicle, 0.0) + found.scores[row] * (-1 if found.people[row] else 1)
-        self._boxes = fresh + [box for box in unseen
-                               if box.vehicle not in taken and time_s - box.seen_s <= MAX_UNSEEN_S]
+        self._boxes = fresh + [
+            box for box in unseen if box.vehicle not in taken and time_s - box.seen_s <= MAX_UNSEEN_S
+        ]
 
     def _new_vehicle(self) -> int:
         self._vehicles += 1
@@ -162,7 +167,9 @@ def _ious(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 def _vehicle_of_points(edges: np.ndarray, points: np.ndarray, vehicle_ids: np.ndarray, taken: set[int]) -> int:
     """Return the vehicle of most points (n, 2) inside a box, those taken apart; 0 where there is none."""
     inside = ((points >= edges[:2]) & (points < edges[2:])).all(axis=1)
-    votes = np.bincount(np.array([owner for owner in vehicle_ids[inside].tolist() if owner not in taken], int), minlength=1)
+    votes = np.bincount(
+        np.array([owner for owner in vehicle_ids[inside].tolist() if owner not in taken], int), minlength=1
+    )
     return int(votes.argmax())
 
 

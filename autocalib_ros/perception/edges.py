@@ -46,10 +46,13 @@ class EdgeFinder:
         least = max(MIN_EDGE_LENGTH_PX, MIN_EDGE_LENGTH * grey.shape[1])
         if max(height, width) < least:
             return np.zeros((0, 4))
-        edges = self._detect_lines(grey[region.y:region.y + height, region.x:region.x + width])
+        edges = self._detect_lines(grey[region.y : region.y + height, region.x : region.x + width])
         length = np.hypot(edges[:, 2] - edges[:, 0], edges[:, 3] - edges[:, 1])
         on_edge, _ = _sample_points(edges)
-        edges = edges[(length >= least) & (_nearest_pixels(region.mask, on_edge) > 0).all(axis=1)] + [region.x, region.y] * 2
+        edges = (
+            edges[(length >= least) & (_nearest_pixels(region.mask, on_edge) > 0).all(axis=1)]
+            + [region.x, region.y] * 2
+        )
         edges = edges[self._is_moving(grey, edges)]
         length = np.hypot(edges[:, 2] - edges[:, 0], edges[:, 3] - edges[:, 1])
         return edges[np.argsort(-length, kind='stable')[:MAX_EDGES_PER_REGION]]
@@ -57,10 +60,17 @@ class EdgeFinder:
     def _detect_lines(self, crop: np.ndarray) -> np.ndarray:
         """Line segments (n, 4) in pixels of a crop (h, w)."""
         height, width = crop.shape
-        halvings = 0 if max(height, width) <= FULL_RESOLUTION_SIDE_PX else 1 if max(height, width) <= 2 * FULL_RESOLUTION_SIDE_PX else 2
+        halvings = (
+            0
+            if max(height, width) <= FULL_RESOLUTION_SIDE_PX
+            else 1
+            if max(height, width) <= 2 * FULL_RESOLUTION_SIDE_PX
+            else 2
+        )
         size = (max(1, width >> halvings), max(1, height >> halvings))
         found = self._detector.detect(
-            cv2.resize(crop, size, interpolation=cv2.INTER_AREA) if halvings else np.ascontiguousarray(crop))[0]
+            cv2.resize(crop, size, interpolation=cv2.INTER_AREA) if halvings else np.ascontiguousarray(crop)
+        )[0]
         if found is None:
             return np.zeros((0, 4))
         return (found.reshape(-1, 4).astype(float) + 0.5) * ([width / size[0], height / size[1]] * 2) - 0.5

@@ -42,8 +42,17 @@ class FrameStatus(Enum):
 class FrameGate:
     """Compares the pictures of one stream; what is `REPEATED` or `HIDDEN` is not to be used."""
 
-    def __init__(self, max_repeat_difference: float, level_shift_threshold: float = np.inf, min_spread_levels: float = MIN_SPREAD_LEVELS) -> None:
-        self._max_repeat_difference, self._level_shift_threshold, self._min_spread_levels = max_repeat_difference, level_shift_threshold, min_spread_levels
+    def __init__(
+        self,
+        max_repeat_difference: float,
+        level_shift_threshold: float = np.inf,
+        min_spread_levels: float = MIN_SPREAD_LEVELS,
+    ) -> None:
+        self._max_repeat_difference, self._level_shift_threshold, self._min_spread_levels = (
+            max_repeat_difference,
+            level_shift_threshold,
+            min_spread_levels,
+        )
         self._last: np.ndarray | None = None
         self._before = np.zeros((0, 0), np.float32)
         self._last_s = 0.0

@@ -48,8 +48,10 @@ def require_polygons_inside(polygons: Polygons, size: tuple[int, int]) -> None:
     """Raise UsageError when a polygon lies wholly outside images of `size` (width, height)."""
     for number, polygon in enumerate(polygons, start=1):
         if not ignored_mask((polygon,), size).any():
-            raise UsageError(f"polygon {number} of 'ignore_regions' lies wholly outside the images, which have "
-                             f'{size[0]}x{size[1]}: give pixels of the full image as the camera sends it')
+            raise UsageError(
+                f"polygon {number} of 'ignore_regions' lies wholly outside the images, which have "
+                f'{size[0]}x{size[1]}: give pixels of the full image as the camera sends it'
+            )
 
 
 class IgnoreMask:

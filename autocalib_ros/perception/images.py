@@ -19,16 +19,27 @@ from autocalib_ros.perception.intensity_normalisation import IntensityNormaliser
 LOG = logging.getLogger(__name__)
 
 COLOUR_CODES = {
-    'rgb': cv2.COLOR_RGB2BGR, 'bgr': None, 'rgba': cv2.COLOR_RGBA2BGR, 'bgra': cv2.COLOR_BGRA2BGR, 'mono': None,
+    'rgb': cv2.COLOR_RGB2BGR,
+    'bgr': None,
+    'rgba': cv2.COLOR_RGBA2BGR,
+    'bgra': cv2.COLOR_BGRA2BGR,
+    'mono': None,
     # OpenCV names a Bayer pattern by the second and third pixel of its second row, ROS by the first ones
-    'bayer_rggb': cv2.COLOR_BayerBG2BGR, 'bayer_bggr': cv2.COLOR_BayerRG2BGR,
-    'bayer_gbrg': cv2.COLOR_BayerGR2BGR, 'bayer_grbg': cv2.COLOR_BayerGB2BGR,
+    'bayer_rggb': cv2.COLOR_BayerBG2BGR,
+    'bayer_bggr': cv2.COLOR_BayerRG2BGR,
+    'bayer_gbrg': cv2.COLOR_BayerGR2BGR,
+    'bayer_grbg': cv2.COLOR_BayerGB2BGR,
 }
 CHANNELS = {'rgb': 3, 'bgr': 3, 'rgba': 4, 'bgra': 4}
 PACKED_ENCODINGS = {
     **{f'{order}{bits}': (order, bits) for order in COLOUR_CODES for bits in (8, 16)},
-    '8UC1': ('mono', 8), '8UC3': ('bgr', 8), '8UC4': ('bgra', 8), '16UC1': ('mono', 16), '16UC3': ('bgr', 16),
-    '16SC1': ('mono', 16), '32FC1': ('mono', 32),
+    '8UC1': ('mono', 8),
+    '8UC3': ('bgr', 8),
+    '8UC4': ('bgra', 8),
+    '16UC1': ('mono', 16),
+    '16UC3': ('bgr', 16),
+    '16SC1': ('mono', 16),
+    '32FC1': ('mono', 32),
 }
 """Encoding to the order of its channels and the bits of each; what has more than 8 is stretched.
 
@@ -39,14 +50,20 @@ boundary (Mono10p, BayerRG12Packed) are unpacked by their drivers.
 NUMBER_FORMATS = {'16SC1': 'i2', '32FC1': 'f4'}
 """Kinds of number that are not unsigned."""
 YUV422_ENCODINGS = {
-    'yuv422': cv2.COLOR_YUV2BGR_UYVY, 'uyvy': cv2.COLOR_YUV2BGR_UYVY,
-    'yuv422_yuy2': cv2.COLOR_YUV2BGR_YUY2, 'yuyv': cv2.COLOR_YUV2BGR_YUY2,
+    'yuv422': cv2.COLOR_YUV2BGR_UYVY,
+    'uyvy': cv2.COLOR_YUV2BGR_UYVY,
+    'yuv422_yuy2': cv2.COLOR_YUV2BGR_YUY2,
+    'yuyv': cv2.COLOR_YUV2BGR_YUY2,
 }
 ASSUMED_ENCODINGS = {'8UC1': 'mono8', '8UC3': 'bgr8', '8UC4': 'bgra8', '16UC3': 'bgr16'}
 """Encodings that do not say what they mean, and what they are taken for."""
-BT601 = np.array([[1.164, 2.018, 0.0, -16 * 1.164 - 128 * 2.018],
-                  [1.164, -0.391, -0.813, -16 * 1.164 + 128 * (0.391 + 0.813)],
-                  [1.164, 0.0, 1.596, -16 * 1.164 - 128 * 1.596]])
+BT601 = np.array(
+    [
+        [1.164, 2.018, 0.0, -16 * 1.164 - 128 * 2.018],
+        [1.164, -0.391, -0.813, -16 * 1.164 + 128 * (0.391 + 0.813)],
+        [1.164, 0.0, 1.596, -16 * 1.164 - 128 * 1.596],
+    ]
+)
 """ITU-R BT.601, limited range: B, G, R from Y, U, V, 1."""
 JPEG_END_WITHIN = 4096
 """Bytes at the end of a JPEG among which its end marker stands; some cameras pad their buffers."""
@@ -116,7 +133,9 @@ class ImageDecoder:
     def _warn_once(self, encoding: str) -> None:
         if encoding not in self._warned:
             self._warned.add(encoding)
-            LOG.warning("image encoding '%s' does not name its colours; taken for %s", encoding, ASSUMED_ENCODINGS[encoding])
+            LOG.warning(
+                "image encoding '%s' does not name its colours; taken for %s", encoding, ASSUMED_ENCODINGS[encoding]
+            )
 
 
 def image_rows(message: Any, row_bytes: int, planes: float) -> np.ndarray:
@@ -125,20 +144,29 @@ def image_rows(message: Any, row_bytes: int, planes: float) -> np.ndarray:
     `planes` is the number of rows in units of the image's height.
     """
     if message.step < row_bytes:
-        raise InputError(f"image of encoding '{message.encoding}' and width {message.width} needs rows of {row_bytes}"
-                         f' bytes, but its step is {message.step}')
+        raise InputError(
+            f"image of encoding '{message.encoding}' and width {message.width} needs rows of {row_bytes}"
+            f' bytes, but its step is {message.step}'
+        )
     data, rows = np.frombuffer(message.data, np.uint8), int(message.height * planes)
     expected = message.step * rows
     if len(data) < expected:
-        raise InputError(f"image of encoding '{message.encoding}' needs {expected} bytes ({rows} rows of"
-                         f' {message.step}), found {len(data)}')
+        raise InputError(
+            f"image of encoding '{message.encoding}' needs {expected} bytes ({rows} rows of"
+            f' {message.step}), found {len(data)}'
+        )
     return data[:expected].reshape(rows, message.step)[:, :row_bytes]
 
 
 def canonical_encoding(encoding: str) -> str:
     """Return the name of an encoding as it stands here: some drivers write NV12 or YUV420 in capitals."""
     lower = encoding.lower()
-    return lower if encoding not in PACKED_ENCODINGS and (lower in YUV422_ENCODINGS or lower in PLANAR_ENCODINGS or lower in PACKED_ENCODINGS) else encoding
+    return (
+        lower
+        if encoding not in PACKED_ENCODINGS
+        and (lower in YUV422_ENCODINGS or lower in PLANAR_ENCODINGS or lower in PACKED_ENCODINGS)
+        else encoding
+    )
 
 
 def _nv21(message: Any) -> np.ndarray:
@@ -161,11 +189,12 @@ def _yuv420(message: Any) -> np.ndarray:
     message = PlanarMessage(message, 1.5)
     height, width, step = message.height, message.width, message.step
     if height % 2 or width % 2 or step % 2:
-        raise InputError(f"image of encoding '{message.encoding}' needs an even size and step, found {width} x {height}"
-                         f' and {step}')
+        raise InputError(
+            f"image of encoding '{message.encoding}' needs an even size and step, found {width} x {height} and {step}"
+        )
     rows = image_rows(message, width, 1.5)
-    chroma = np.frombuffer(message.data, np.uint8)[step * height:step * height * 3 // 2].reshape(height, step // 2)
-    half = np.ascontiguousarray(chroma[:, :width // 2]).reshape(height // 2, width)
+    chroma = np.frombuffer(message.data, np.uint8)[step * height : step * height * 3 // 2].reshape(height, step // 2)
+    half = np.ascontiguousarray(chroma[:, : width // 2]).reshape(height // 2, width)
     return cv2.cvtColor(np.concatenate([rows[:height], half]), cv2.COLOR_YUV2BGR_I420)
 
 
@@ -175,13 +204,17 @@ def _nv24(message: Any) -> np.ndarray:
     height, width, step = message.height, message.width, message.step
     image_rows(message, width, 3)
     data = np.frombuffer(message.data, np.uint8)
-    luma = data[:step * height].reshape(height, step)[:, :width, None]
-    chroma = data[step * height:3 * step * height].reshape(height, 2 * step)[:, :2 * width].reshape(height, width, 2)
+    luma = data[: step * height].reshape(height, step)[:, :width, None]
+    chroma = data[step * height : 3 * step * height].reshape(height, 2 * step)[:, : 2 * width].reshape(height, width, 2)
     return cv2.transform(np.concatenate([luma, chroma], axis=2), BT601)
 
 
 PLANAR_ENCODINGS: dict[str, Callable[[Any], np.ndarray]] = {
-    'nv12': _nv12, 'nv21': _nv21, 'nv24': _nv24, 'yuv420': _yuv420}
+    'nv12': _nv12,
+    'nv21': _nv21,
+    'nv24': _nv24,
+    'yuv420': _yuv420,
+}
 
 
 class PlanarMessage:

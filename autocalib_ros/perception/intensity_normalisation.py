@@ -66,7 +66,9 @@ class IntensityNormaliser:
             self._reset()
         step_s = self._step_s(stamp_s)
         self._encoding, self._stamp_s, self._time_s = encoding, stamp_s, self._time_s + step_s
-        self._frame_gate = self._frame_gate or FrameGate(max_repeat_difference=0.0, min_spread_levels=self._min_span / 4)
+        self._frame_gate = self._frame_gate or FrameGate(
+            max_repeat_difference=0.0, min_spread_levels=self._min_span / 4
+        )
         seen = self._frame_gate.classify(samples, self._time_s)
         if seen in (FrameStatus.REPEATED, FrameStatus.HIDDEN):
             self._last_within_limits_s += step_s
@@ -76,7 +78,10 @@ class IntensityNormaliser:
         if unset or seen is FrameStatus.LEVEL_SHIFT or self._last_samples is None or self._clipped_too_long(samples):
             self._limits = self._target_limits = now
         else:
-            common, share = _common_change(self._last_samples, samples, self._quantum), 1 - np.exp(-step_s / TIME_CONSTANT_S)
+            common, share = (
+                _common_change(self._last_samples, samples, self._quantum),
+                1 - np.exp(-step_s / TIME_CONSTANT_S),
+            )
             self._target_limits = self._target_limits + common + share * (now - self._target_limits - common)
             self._limits = self._limits + common + share * (self._target_limits - self._limits - common)
         self._last_samples = samples

@@ -28,8 +28,10 @@ vehicle at 10 m/s that brakes hard misses that place by a fifth of the way.
 MAX_TURN_PX = 3.0
 MAX_TURN_FRACTION = 0.6
 MIN_STEP_RATIO, MAX_STEP_RATIO = 0.3, 2.3
-"""A step goes on from the one before, faster than `MAX_TURN_PX`, when it leaves its line by no more than `MAX_TURN_PX` or
-`MAX_TURN_FRACTION` of it, and is not much below half nor above twice as long: so much an image that came late or was lost
+"""A step goes on from the one before, faster than `MAX_TURN_PX`, when it leaves its line by no more than `MAX_TURN_PX`
+or
+`MAX_TURN_FRACTION` of it, and is not much below half nor above twice as long: so much an image that came late or was
+lost
 does to it. A point that stops dead holds on to what hides the vehicle; one that jumps has found something else.
 """
 
@@ -74,7 +76,9 @@ class PointTracker:
         found, followed = self._flow(before, after, start, start + predicted)
         step = found - start
         known = self._count[active] > 1
-        followed &= known & _near_prediction(predicted, step) if steps > 1 else ~(known & _is_discontinuous(predicted, step))
+        followed &= (
+            known & _near_prediction(predicted, step) if steps > 1 else ~(known & _is_discontinuous(predicted, step))
+        )
         kept = active[followed]
         self._history[kept, self._count[kept]] = np.column_stack([np.full(len(kept), time_s), found[followed]])
         self._count[kept] += 1
@@ -83,18 +87,33 @@ class PointTracker:
         finished = self._finish(ended)
         return finished + self._restart_full(np.flatnonzero(self._count == MAX_TRACK_SAMPLES))
 
-    def _flow(self, before: np.ndarray, after: np.ndarray, start: np.ndarray,
-              guess: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _flow(
+        self, before: np.ndarray, after: np.ndarray, start: np.ndarray, guess: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Follow forwards from a guess, then back at full resolution; both have to agree."""
         side = self._options.window_px
         criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.02)
         origin = _as_opencv_points(start)
         found, forward, _ = cv2.calcOpticalFlowPyrLK(
-            before, after, origin, _as_opencv_points(guess), winSize=(side, side),
-            maxLevel=self._options.pyramid_levels, criteria=criteria, flags=cv2.OPTFLOW_USE_INITIAL_FLOW)
+            before,
+            after,
+            origin,
+            _as_opencv_points(guess),
+            winSize=(side, side),
+            maxLevel=self._options.pyramid_levels,
+            criteria=criteria,
+            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        )
         back, backward, _ = cv2.calcOpticalFlowPyrLK(
-            after, before, found, origin.copy(), winSize=(side, side), maxLevel=0, criteria=criteria,
-            flags=cv2.OPTFLOW_USE_INITIAL_FLOW)
+            after,
+            before,
+            found,
+            origin.copy(),
+            winSize=(side, side),
+            maxLevel=0,
+            criteria=criteria,
+            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        )
         miss = np.hypot(*(back - origin)[:, 0].T)
         found = found[:, 0].astype(float)
         margin, (height, width) = side / 2, after.shape
@@ -134,8 +153,9 @@ class PointTracker:
         near, _ = self.positions()
         taken = {(int(x), int(y)) for x, y in near // spacing}
         free = iter(np.flatnonzero(self._count == 0))
-        for point, cell, vehicle in zip(points_px, np.floor(points_px / spacing).astype(int).tolist(), vehicles,
-                                        strict=True):
+        for point, cell, vehicle in zip(
+            points_px, np.floor(points_px / spacing).astype(int).tolist(), vehicles, strict=True
+        ):
             if tuple(cell) in taken:
                 continue
             slot = next(free, None)
@@ -180,7 +200,7 @@ class PointTracker:
 
     def _track(self, slot: int) -> Track | None:
         """Thin a point's path to samples spread evenly along it; None when it is too short to say anything."""
-        path = self._history[slot, :self._count[slot]]
+        path = self._history[slot, : self._count[slot]]
         width = self._grey.shape[1] if self._grey is not None else 1
         if len(path) < MIN_TRACK_SAMPLES or np.hypot(*(path[-1, 1:] - path[0, 1:])) < MIN_DISPLACEMENT * width:
             return None

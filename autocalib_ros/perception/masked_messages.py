@@ -30,12 +30,17 @@ def require_maskable(message: Any) -> None:
     """Raise UsageError unless `mask_message` knows the kind of a sensor_msgs Image or CompressedImage."""
     if hasattr(message, 'encoding'):
         encoding = canonical_encoding(message.encoding)
-        known, kind = encoding in PACKED_ENCODINGS or encoding in YUV422_ENCODINGS or encoding in PLANAR_ENCODINGS, f"encoding '{encoding}'"
+        known, kind = (
+            encoding in PACKED_ENCODINGS or encoding in YUV422_ENCODINGS or encoding in PLANAR_ENCODINGS,
+            f"encoding '{encoding}'",
+        )
     else:
         known, kind = 'compressedDepth' not in str(message.format), f"format '{message.format}'"
     if not known:
-        raise UsageError(f"'ignore_regions' cannot be made black in images of {kind}: write the bag without images, or "
-                         'leave the regions out')
+        raise UsageError(
+            f"'ignore_regions' cannot be made black in images of {kind}: write the bag without images, or "
+            'leave the regions out'
+        )
 
 
 def mask_message(message: Any, polygons: Polygons) -> np.ndarray:
@@ -48,14 +53,19 @@ def mask_message(message: Any, polygons: Polygons) -> np.ndarray:
         return _mask_compressed(message, polygons)
     data, pixels = np.frombuffer(message.data, np.uint8).copy(), message.width * message.height
     if not 0 < pixels <= len(data):
-        raise InputError(f"image of encoding '{message.encoding}' and {message.width} x {message.height} pixels has "
-                         f'{len(data)} bytes')
+        raise InputError(
+            f"image of encoding '{message.encoding}' and {message.width} x {message.height} pixels has "
+            f'{len(data)} bytes'
+        )
     mask, encoding = ignored_mask(polygons, (message.width, message.height)), canonical_encoding(message.encoding)
     if encoding in PACKED_ENCODINGS:
         _mask_packed(_MessageCopy(message, data), mask, encoding)
     elif encoding in YUV422_ENCODINGS:
-        _mask_yuv422(image_rows(_MessageCopy(message, data), 2 * message.width, 1), mask,
-                     luma_first=YUV422_ENCODINGS[encoding] == cv2.COLOR_YUV2BGR_YUY2)
+        _mask_yuv422(
+            image_rows(_MessageCopy(message, data), 2 * message.width, 1),
+            mask,
+            luma_first=YUV422_ENCODINGS[encoding] == cv2.COLOR_YUV2BGR_YUY2,
+        )
     else:
         _mask_planar(_MessageCopy(message, data), mask, encoding)
     return data
@@ -100,16 +110,17 @@ def _mask_planar(message: Any, mask: np.ndarray, encoding: str) -> None:
     message = PlanarMessage(message, planes)
     height, width, step = message.height, message.width, message.step
     image_rows(message, width, planes)[:height][mask] = BLACK_LUMA
-    chroma = message.data[step * height:int(step * height * planes)]
+    chroma = message.data[step * height : int(step * height * planes)]
     if encoding == 'nv24':
-        chroma.reshape(height, 2 * step)[:, :2 * width][np.repeat(mask, 2, axis=1)] = NO_CHROMA
+        chroma.reshape(height, 2 * step)[:, : 2 * width][np.repeat(mask, 2, axis=1)] = NO_CHROMA
         return
     if height % 2 or width % 2 or step % 2:
-        raise InputError(f"image of encoding '{message.encoding}' needs an even size and step, found {width} x {height}"
-                         f' and {step}')
+        raise InputError(
+            f"image of encoding '{message.encoding}' needs an even size and step, found {width} x {height} and {step}"
+        )
     half = mask[::2, ::2] | mask[1::2, ::2] | mask[::2, 1::2] | mask[1::2, 1::2]
     if encoding == 'yuv420':
-        chroma.reshape(height, step // 2)[:, :width // 2][np.concatenate([half, half])] = NO_CHROMA
+        chroma.reshape(height, step // 2)[:, : width // 2][np.concatenate([half, half])] = NO_CHROMA
     else:
         chroma.reshape(height // 2, step)[:, :width][np.repeat(half, 2, axis=1)] = NO_CHROMA
 
@@ -119,10 +130,11 @@ def _mask_compressed(message: Any, polygons: Polygons) -> np.ndarray:
     try:
         image = decompress(data, str(message.format))
     except cv2.error as error:  # a size that no memory holds
-        raise InputError(f"compressed image of format '{message.format}', {len(data)} bytes, cannot be decoded"
-                         ) from error
+        raise InputError(
+            f"compressed image of format '{message.format}', {len(data)} bytes, cannot be decoded"
+        ) from error
     mask = ignored_mask(polygons, image.shape[1::-1])
     dark = _with_dark_mask(image.reshape(*mask.shape, -1), mask).reshape(image.shape)
-    if data[0] == 0xff:
+    if data[0] == 0xFF:
         return cv2.imencode('.jpg', dark, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].ravel()
     return cv2.imencode('.png', dark, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].ravel()

@@ -31,8 +31,7 @@ class MotionMask:
 
     def __init__(self, options: MotionOptions) -> None:
         self._options = options
-        self._subtractor = cv2.createBackgroundSubtractorMOG2(
-            varThreshold=MOG2_VARIANCE_THRESHOLD, detectShadows=False)
+        self._subtractor = cv2.createBackgroundSubtractorMOG2(varThreshold=MOG2_VARIANCE_THRESHOLD, detectShadows=False)
         self._mask: np.ndarray | None = None
         self._size = (0, 0)
         self._newest_s = 0.0
@@ -41,8 +40,9 @@ class MotionMask:
         """Learn from a grey image (H, W); `time_s` is its time in seconds."""
         height, width = grey.shape
         reduced_width = min(self._options.width_px, width)
-        reduced = cv2.resize(grey, (reduced_width, max(1, round(height * reduced_width / width))),
-                             interpolation=cv2.INTER_AREA)
+        reduced = cv2.resize(
+            grey, (reduced_width, max(1, round(height * reduced_width / width))), interpolation=cv2.INTER_AREA
+        )
         first = self._mask is None
         rate = 1.0 if first else min(max((time_s - self._newest_s) / self._options.history_s, 1e-4), 0.2)
         foreground = self._subtractor.apply(reduced, learningRate=rate)
@@ -85,7 +85,7 @@ def exclude_pixels(regions: list[Region], excluded: np.ndarray | None) -> list[R
     left = []
     for region in regions:
         height, width = region.mask.shape
-        part = excluded[region.y:region.y + height, region.x:region.x + width]
+        part = excluded[region.y : region.y + height, region.x : region.x + width]
         mask = np.where(part > 0, np.uint8(0), region.mask)
         left += [Region(region.x, region.y, mask)] if mask.any() else []
     return left

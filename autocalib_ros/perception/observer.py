@@ -117,8 +117,12 @@ class Observer:
         order = np.lexsort((-keypoints.responses, of_person))  # the strongest first, and people last
         self._tracker.add_points(keypoints.points_px[order], of_keypoint[order])
         keypoints, of_keypoint = keypoints.subset(~of_person), of_keypoint[~of_person]
-        edges = self._find_edges(grey, [region for region, person in zip(regions, people, strict=True) if not person],
-                               vehicles[~people], time_s)
+        edges = self._find_edges(
+            grey,
+            [region for region, person in zip(regions, people, strict=True) if not person],
+            vehicles[~people],
+            time_s,
+        )
         before, self._keypoints = self._keypoints, keypoints
         if before is None:
             return None, edges, outlines
@@ -132,7 +136,11 @@ class Observer:
         if self._detector_tracks is None:
             return regions, self._assign_vehicles(regions), np.zeros(len(regions), bool)
         regions, vehicles = self._detector_tracks.regions(regions, shape, self._excluded)
-        return regions, vehicles, np.array([self._detector_tracks.kind(one) is TrackKind.PERSON for one in vehicles], bool)
+        return (
+            regions,
+            vehicles,
+            np.array([self._detector_tracks.kind(one) is TrackKind.PERSON for one in vehicles], bool),
+        )
 
     def _find_edges(self, grey: np.ndarray, regions: list[Region], vehicles: np.ndarray, time_s: float) -> Edges | None:
         """Look for straight edges in every `EDGE_SEARCH_PERIOD`th image with regions."""
@@ -142,13 +150,15 @@ class Observer:
         ends, of_edge = self._edge_finder.find(grey, regions)
         return Edges(time_s, vehicles[of_edge], self._to_full_pixels(ends.reshape(-1, 2)).reshape(-1, 4))
 
-    def _find_outlines(self, regions: list[Region], vehicles: np.ndarray, shape: tuple[int, int],
-                     time_s: float) -> Outlines | None:
+    def _find_outlines(
+        self, regions: list[Region], vehicles: np.ndarray, shape: tuple[int, int], time_s: float
+    ) -> Outlines | None:
         """Outline what moves; a detector tells cyclists by itself."""
         if self._detector_tracks is not None or not regions:
             return None
-        return Outlines(time_s, vehicles, outlines_of(regions, self._motion.dilation_px, shape, self._reduction,
-                                                      self._excluded))
+        return Outlines(
+            time_s, vehicles, outlines_of(regions, self._motion.dilation_px, shape, self._reduction, self._excluded)
+        )
 
     def _assign_vehicles(self, regions: list[Region]) -> np.ndarray:
         """Give each region (n,) the vehicle that most points followed inside it belong to, or a new one."""

@@ -45,14 +45,15 @@ def find_keypoints(grey: np.ndarray, regions: list[Region], sift: cv2.SIFT) -> K
         points_px=np.concatenate([points for points, _, _ in found] or [np.zeros((0, 2))]),
         responses=np.concatenate([responses for _, responses, _ in found] or [np.zeros(0)]),
         regions=np.concatenate(labels or [np.zeros(0)]).astype(int),
-        descriptors=np.concatenate(
-            [descriptors for _, _, descriptors in found] or [np.zeros((0, 128))]).astype(np.float32))
+        descriptors=np.concatenate([descriptors for _, _, descriptors in found] or [np.zeros((0, 128))]).astype(
+            np.float32
+        ),
+    )
 
 
-def _region_keypoints(grey: np.ndarray, region: Region,
-                      sift: cv2.SIFT) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _region_keypoints(grey: np.ndarray, region: Region, sift: cv2.SIFT) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     height, width = region.mask.shape
-    crop = grey[region.y:region.y + height, region.x:region.x + width]
+    crop = grey[region.y : region.y + height, region.x : region.x + width]
     mask = region.mask
     coarse = max(height, width) > FULL_RESOLUTION_SIDE_PX
     if coarse:

@@ -12,8 +12,13 @@ EXTREME_DIRECTIONS = np.array([(-1, -1), (1, 1), (-1, 1), (1, -1), (-1, 0), (1, 
 """In which an outline's points are its farthest, as `Outlines.ends_px` has them."""
 
 
-def outlines_of(regions: list[Region], dilation_px: tuple[float, float], shape: tuple[int, int], reduction: float,
-                excluded: np.ndarray | None = None) -> np.ndarray:
+def outlines_of(
+    regions: list[Region],
+    dilation_px: tuple[float, float],
+    shape: tuple[int, int],
+    reduction: float,
+    excluded: np.ndarray | None = None,
+) -> np.ndarray:
     """Outline each region of an image (H, W), without what it was `dilation_px` by; rows as `Outlines.ends_px`.
 
     The full image is `reduction` times as large. What is beside a place that is `excluded`, not 0 in an image (H, W),
@@ -33,7 +38,7 @@ def outlines_of(regions: list[Region], dilation_px: tuple[float, float], shape: 
 
 def _touches_excluded(region: Region, excluded: np.ndarray | None) -> bool:
     height, width = region.mask.shape
-    return excluded is not None and bool(excluded[region.y:region.y + height, region.x:region.x + width].any())
+    return excluded is not None and bool(excluded[region.y : region.y + height, region.x : region.x + width].any())
 
 
 def _extreme_points(region: Region) -> np.ndarray:

@@ -53,8 +53,9 @@ def draw_paths(picture: np.ndarray, paths: Sequence[np.ndarray] | np.ndarray, co
     if not len(paths):
         return
     steps = [_fixed_point(path) for path in paths] if isinstance(paths, (list, tuple)) else list(_fixed_point(paths))
-    cv2.polylines(picture, steps, False, bgr(colour) if isinstance(colour, str) else colour, width_px, cv2.LINE_AA,
-                  FRACTION_BITS)
+    cv2.polylines(
+        picture, steps, False, bgr(colour) if isinstance(colour, str) else colour, width_px, cv2.LINE_AA, FRACTION_BITS
+    )
 
 
 def draw_dots(picture: np.ndarray, points_px: np.ndarray, colour: str, width_px: int) -> None:
@@ -81,8 +82,16 @@ def stroke_px(text_height: float) -> int:
 def draw_text(picture: np.ndarray, text: str, left: float, top: float, text_height: float, colour: str) -> None:
     """Write one line whose upper left corner is given; OpenCV's font knows ASCII alone."""
     plain = text.encode('ascii', 'replace').decode()
-    cv2.putText(picture, plain, (round(left), round(top + 0.75 * text_height)), FONT, text_height / FONT_HEIGHT_PX, bgr(colour),
-                stroke_px(text_height), cv2.LINE_AA)
+    cv2.putText(
+        picture,
+        plain,
+        (round(left), round(top + 0.75 * text_height)),
+        FONT,
+        text_height / FONT_HEIGHT_PX,
+        bgr(colour),
+        stroke_px(text_height),
+        cv2.LINE_AA,
+    )
 
 
 def wrap_text(text: str, text_height: float, width_px: float, most: int) -> list[str]:
@@ -97,7 +106,7 @@ def wrap_text(text: str, text_height: float, width_px: float, most: int) -> list
         line = longer
     lines.append(line)
     if len(lines) > most:
-        lines = [*lines[:most - 1], f'{lines[most - 1]} ...']
+        lines = [*lines[: most - 1], f'{lines[most - 1]} ...']
     return [truncate_text(line, text_height, width_px) for line in lines]
 
 
@@ -127,7 +136,7 @@ class Overlay:
     def add_box(self, left: int, top: int, right: int, bottom: int, colour: str, opacity: float) -> None:
         """Add a filled rectangle; its right and bottom ends are left out."""
         mask = np.zeros(self._ink.shape[:2], np.uint8)
-        mask[max(top, 0):max(bottom, 0), max(left, 0):max(right, 0)] = 255
+        mask[max(top, 0) : max(bottom, 0), max(left, 0) : max(right, 0)] = 255
         self._cover(mask, np.array(bgr(colour), np.uint8), opacity)
 
     def add_text(self, text: str, left: float, top: float, text_height: float, colour: str) -> None:

@@ -28,14 +28,20 @@ def rectified_renderer(known: SavedCamera, balance: float | None) -> Callable[[n
     if matrix is None:
         matrix = rectified_matrix(known, balance or 0.0)
     if not np.isfinite(matrix).all():
-        raise InputError('the distortion folds back before the border of the image, so that a view without distortion'
-                         ' has no size: give a calibration that was taken with the pattern near the borders too')
+        raise InputError(
+            'the distortion folds back before the border of the image, so that a view without distortion'
+            ' has no size: give a calibration that was taken with the pattern near the borders too'
+        )
     sources = rectification_map(known, matrix)
     return lambda image: resample(image, sources)
 
 
-def choose_top_view(known: SavedCamera, px_per_m: float | None = None, x_m: tuple[float, float] | None = None,
-                y_m: tuple[float, float] | None = None) -> TopView:
+def choose_top_view(
+    known: SavedCamera,
+    px_per_m: float | None = None,
+    x_m: tuple[float, float] | None = None,
+    y_m: tuple[float, float] | None = None,
+) -> TopView:
     """Return the road from above: the ranges of x and y that are asked for, elsewhere what the image shows.
 
     InputError where there is no plane or no road to see, UsageError for ranges and scales that make no picture.
@@ -49,20 +55,27 @@ def choose_top_view(known: SavedCamera, px_per_m: float | None = None, x_m: tupl
         raise UsageError(f'--px-per-m is more than 0, got {px_per_m:g}')
     shown = TopView.of_image(known.lens, known.ground, LONGEST_PX)
     if shown is None and (x_m is None or y_m is None):
-        raise InputError(f'the image shows no road nearer than {MAX_DISTANCE_HEIGHTS:g} times the height of the camera:'
-                         ' say where to look by --x and --y')
+        raise InputError(
+            f'the image shows no road nearer than {MAX_DISTANCE_HEIGHTS:g} times the height of the camera:'
+            ' say where to look by --x and --y'
+        )
     spans = np.array([span or (shown.low_m[axis], shown.high_m[axis]) for axis, span in enumerate((x_m, y_m))])
     longest = LONGEST_PX if px_per_m is None else px_per_m * float((spans[:, 1] - spans[:, 0]).max())
     if not 2 <= longest <= MAX_SIDE_PX:
-        raise UsageError(f'the view would have {longest:.0f} pixels along its longer side, and 2 to {MAX_SIDE_PX} are'
-                         ' made: choose another --px-per-m, or other ranges')
+        raise UsageError(
+            f'the view would have {longest:.0f} pixels along its longer side, and 2 to {MAX_SIDE_PX} are'
+            ' made: choose another --px-per-m, or other ranges'
+        )
     return TopView.between(spans[:, 0], spans[:, 1], round(longest))
 
 
-def top_view_renderer(known: SavedCamera, view: TopView, *, grid: bool, scale_bar: bool) -> Callable[[np.ndarray], np.ndarray]:
+def top_view_renderer(
+    known: SavedCamera, view: TopView, *, grid: bool, scale_bar: bool
+) -> Callable[[np.ndarray], np.ndarray]:
     """Return what makes a view of images, with what is to be drawn over it."""
     sources = view.sources(known.lens, known.ground)
     drawings = [draw for draw, wanted in ((draw_metre_grid, grid), (draw_scale_bar, scale_bar)) if wanted]
-    overlay = PlotOverlay.render(view.columns, view.rows, lambda axes: [
-        draw(axes, view, length_unit(known.ground)) for draw in drawings])
+    overlay = PlotOverlay.render(
+        view.columns, view.rows, lambda axes: [draw(axes, view, length_unit(known.ground)) for draw in drawings]
+    )
     return lambda image: overlay.composite(resample(image, sources))

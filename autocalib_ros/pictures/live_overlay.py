@@ -67,15 +67,16 @@ class LabelledTracks:
     def of(self, label: int) -> list[np.ndarray]:
         """Return the paths (n, 2) of a label; where there are too many to draw, every so manieth."""
         indices = np.flatnonzero(self.labels == label)
-        indices = indices[::max(1, -(-len(indices) // MAX_PATHS))]
-        return [self.points_px[self.starts[index]:self.starts[index + 1]] for index in indices]
+        indices = indices[:: max(1, -(-len(indices) // MAX_PATHS))]
+        return [self.points_px[self.starts[index] : self.starts[index + 1]] for index in indices]
 
 
 class DebugPicture:
     """The camera's image with tracks, horizon, a grid on the road, and the state in words."""
 
-    def __init__(self, image_size: tuple[int, int], calibration: Calibration | None,
-                 labelled_tracks: LabelledTracks | None) -> None:
+    def __init__(
+        self, image_size: tuple[int, int], calibration: Calibration | None, labelled_tracks: LabelledTracks | None
+    ) -> None:
         """Take what is known for images of that size: nothing yet, or a lens, or a lens and the plane."""
         width, height = image_size
         self._overlay = Overlay(height, width)
@@ -144,8 +145,9 @@ class DebugPicture:
         for left, row, colour, name in places:
             line_top = top + gap / 2 + row * leading
             middle = line_top + text_height / 2
-            self._overlay.add_paths([np.array([[left, middle], [left + stroke, middle]])], colour,
-                                    2 * line_px(height) + 1)
+            self._overlay.add_paths(
+                [np.array([[left, middle], [left + stroke, middle]])], colour, 2 * line_px(height) + 1
+            )
             self._overlay.add_text(name, left + stroke + gap, line_top, text_height, PAPER)
 
 
@@ -185,7 +187,9 @@ class TopPicture:
         ahead = ground.rotation[:2, 2] * [1.0, -1.0]
         ahead = ahead / max(float(np.hypot(*ahead)), 1e-9)
         aside = np.array([-ahead[1], ahead[0]])
-        arrow = foot + 0.6 * text_height * np.array([1.5 * ahead, 0.8 * aside - ahead, -0.8 * aside - ahead, 1.5 * ahead])
+        arrow = foot + 0.6 * text_height * np.array(
+            [1.5 * ahead, 0.8 * aside - ahead, -0.8 * aside - ahead, 1.5 * ahead]
+        )
         self._overlay.add_paths([arrow], INK, 4 * width_px)
         self._overlay.add_paths([arrow], TRACKED_COLOUR, 2 * width_px)
         text, beside = 'camera', 1.5 * text_height
@@ -204,8 +208,9 @@ class TopPicture:
     def _write(self, text: str, left: float, top: float, text_height: float) -> None:
         """Write dark on a light box: what lies below may be anything."""
         width, height = text_size(text, text_height)
-        self._overlay.add_box(round(left) - 2, round(top) - 1, round(left) + width + 2, round(top) + height + 1, PAPER,
-                              0.75)
+        self._overlay.add_box(
+            round(left) - 2, round(top) - 1, round(left) + width + 2, round(top) + height + 1, PAPER, 0.75
+        )
         self._overlay.add_text(text, left, top, text_height, INK)
 
 

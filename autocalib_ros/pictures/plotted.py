@@ -65,18 +65,31 @@ def text_px(columns: int, rows: int) -> float:
 
 def draw_outlined_text(axes: Axes, x: float, y: float, text: str, size_px: float, **how: object) -> None:
     """Write white words with a dark rim at a pixel."""
-    rim = [matplotlib.patheffects.withStroke(linewidth=0.22 * size_px * POINTS_PER_PX, foreground=PLATE_COLOUR, alpha=0.75)]
+    rim = [
+        matplotlib.patheffects.withStroke(linewidth=0.22 * size_px * POINTS_PER_PX, foreground=PLATE_COLOUR, alpha=0.75)
+    ]
     axes.text(x, y, text, **{'color': WHITE, 'fontsize': size_px * POINTS_PER_PX, 'path_effects': rim, **how})
 
 
 def draw_plate(axes: Axes, left: float, top: float, right: float, bottom: float) -> None:
     """Darken a rectangle, so that what is written on it can be read on any picture."""
-    axes.add_patch(FancyBboxPatch((left, top), right - left, bottom - top, facecolor=PLATE_COLOUR, alpha=0.72, linewidth=0,
-                                  boxstyle='round,pad=0,rounding_size=4', mutation_aspect=1.0))
+    axes.add_patch(
+        FancyBboxPatch(
+            (left, top),
+            right - left,
+            bottom - top,
+            facecolor=PLATE_COLOUR,
+            alpha=0.72,
+            linewidth=0,
+            boxstyle='round,pad=0,rounding_size=4',
+            mutation_aspect=1.0,
+        )
+    )
 
 
-def draw_scale_bar(axes: Axes, view: TopView, length_unit: str, corner: tuple[float, float] | None = None,
-                   size_px: float | None = None) -> None:
+def draw_scale_bar(
+    axes: Axes, view: TopView, length_unit: str, corner: tuple[float, float] | None = None, size_px: float | None = None
+) -> None:
     """Draw a bar of a round length and write how long it is, above its corner (left, bottom) or in that of the view."""
     size = size_px or text_px(view.columns, view.rows)
     length = round_length(MAX_SCALE_BAR_FRACTION * view.columns / view.px_per_m)
@@ -84,11 +97,20 @@ def draw_scale_bar(axes: Axes, view: TopView, length_unit: str, corner: tuple[fl
     begin, level = left + 0.8 * size, bottom - 0.8 * size
     end = begin + length * view.px_per_m
     draw_plate(axes, left, level - 2.2 * size, end + 0.8 * size, bottom)
-    for ends in ([[begin, level], [end, level]], *([[x, level - 0.35 * size], [x, level + 0.35 * size]]
-                                                   for x in (begin, end))):
+    for ends in (
+        [[begin, level], [end, level]],
+        *([[x, level - 0.35 * size], [x, level + 0.35 * size]] for x in (begin, end)),
+    ):
         axes.plot(*np.transpose(ends), color=WHITE, linewidth=0.16 * size * POINTS_PER_PX, solid_capstyle='projecting')
-    axes.text((begin + end) / 2, level - 0.55 * size, f'{length:g} {length_unit}', color=WHITE, fontsize=size * POINTS_PER_PX,
-              ha='center', va='bottom')
+    axes.text(
+        (begin + end) / 2,
+        level - 0.55 * size,
+        f'{length:g} {length_unit}',
+        color=WHITE,
+        fontsize=size * POINTS_PER_PX,
+        ha='center',
+        va='bottom',
+    )
 
 
 def draw_metre_grid(axes: Axes, view: TopView, length_unit: str) -> None:
@@ -103,4 +125,6 @@ def draw_metre_grid(axes: Axes, view: TopView, length_unit: str) -> None:
             x, y = view.pixels(ends)[0]
             axes.plot(*view.pixels(ends).T, color=WHITE, linewidth=POINTS_PER_PX, alpha=0.55)
             place = (x, 0.5 * size, 'center', 'top') if axis == 0 else (view.columns - 0.8 * size, y, 'right', 'center')
-            draw_outlined_text(axes, place[0], place[1], f'{value + 0.0:g} {length_unit}', size, ha=place[2], va=place[3])
+            draw_outlined_text(
+                axes, place[0], place[1], f'{value + 0.0:g} {length_unit}', size, ha=place[2], va=place[3]
+            )

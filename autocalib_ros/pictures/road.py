@@ -72,14 +72,18 @@ def error_ellipses(result: Calibration) -> list[ErrorEllipse]:
     ahead = ground.rotation[:2, 2] / max(float(np.hypot(*ground.rotation[:2, 2])), 1e-9)
     centres = np.outer(GROUND_DISTANCES_M, ahead)
     pixels, visible = ground.pixels(centres)
-    visible &= (np.abs(pixels - np.array([camera.width - 1, camera.height - 1]) / 2)
-             <= np.array([camera.width, camera.height]) / 2).all(axis=1)
+    visible &= (
+        np.abs(pixels - np.array([camera.width - 1, camera.height - 1]) / 2)
+        <= np.array([camera.width, camera.height]) / 2
+    ).all(axis=1)
     found = ground.points(np.where(visible[:, None], pixels, 0.0))
     found_ellipses = []
     for index in np.flatnonzero(visible & found.valid):
         values, vectors = np.linalg.eigh(found.covariance_m2[index])
         axes = (vectors * np.sqrt(np.maximum(values, 0.0))).T
-        found_ellipses.append(ErrorEllipse(GROUND_DISTANCES_M[index], float(found.sigma_m[index]), centres[index], axes))
+        found_ellipses.append(
+            ErrorEllipse(GROUND_DISTANCES_M[index], float(found.sigma_m[index]), centres[index], axes)
+        )
     return found_ellipses
 
 
@@ -97,12 +101,16 @@ def view_frustum(camera: Camera, ground: GroundPlane) -> list[np.ndarray]:
     left, top, right, bottom = -0.5, -0.5, camera.width - 0.5, camera.height - 0.5
     corners = np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
     along = np.linspace(0.0, 1.0, POINTS_PER_SIDE, endpoint=False)[:, None]
-    border = np.concatenate([begin + along * (end - begin)
-                             for begin, end in zip(corners, np.roll(corners, -1, axis=0), strict=True)])
+    border = np.concatenate(
+        [begin + along * (end - begin) for begin, end in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
+    )
     bearings, valid = camera.unproject(border)
     reach = FRUSTUM_HEIGHTS * ground.height_m
     ends = ground.translation_m + reach * bearings @ ground.rotation.T
     around = ends[valid]
-    rays = [np.stack([ground.translation_m, ends[index]]) for index in range(0, len(border), POINTS_PER_SIDE)
-            if valid[index]]
+    rays = [
+        np.stack([ground.translation_m, ends[index]])
+        for index in range(0, len(border), POINTS_PER_SIDE)
+        if valid[index]
+    ]
     return [*rays, np.concatenate([around, around[:1]])] if len(around) else []

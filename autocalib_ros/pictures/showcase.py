@@ -53,7 +53,7 @@ def showcase(known: SavedCamera, image: np.ndarray) -> np.ndarray:
     view = _view(camera, ground, rows)
     page = np.full((rows + STRIP_PX, IMAGE_PX + GAP_PX + VIEW_PX, 3), bgr(PLATE_COLOUR), np.uint8)
     page[:rows, :IMAGE_PX] = cv2.resize(image, (IMAGE_PX, rows), interpolation=cv2.INTER_AREA)
-    page[:rows, IMAGE_PX + GAP_PX:] = _from_above(known, _upright(known.ground), image, view)
+    page[:rows, IMAGE_PX + GAP_PX :] = _from_above(known, _upright(known.ground), image, view)
     step = grid_step(ground)
     lines = _clipped_to_both(small, ground, view, grid_lines((np.array(view.low_m) + view.high_m) / 2, step))
 
@@ -64,9 +64,11 @@ def showcase(known: SavedCamera, image: np.ndarray) -> np.ndarray:
         for line in project_great_circle(camera, ground.normal_in_camera):
             _line(axes, np.where(in_image(small, line)[:, None], line, np.nan), HORIZON_COLOUR, HORIZON_PX)
         _name_horizon(axes, camera, ground)
-        draw_scale_bar(axes, view, 'm' if ground.metric else 'heights', (IMAGE_PX + GAP_PX + 14.0, rows - 14.0),
-                       SMALL_PX)
+        draw_scale_bar(
+            axes, view, 'm' if ground.metric else 'heights', (IMAGE_PX + GAP_PX + 14.0, rows - 14.0), SMALL_PX
+        )
         _captions(axes, small, step, rows)
+
     return PlotOverlay.render(page.shape[1], page.shape[0], draw).composite(page)
 
 
@@ -97,12 +99,22 @@ def _from_above(known: SavedCamera, ground: GroundPlane, image: np.ndarray, view
     return np.where(seen[..., None], resample(image, sources), np.array(bgr(PLATE_COLOUR), np.uint8))
 
 
-def _clipped_to_both(known: SavedCamera, ground: GroundPlane, view: TopView, lines: list[np.ndarray]) -> list[np.ndarray]:
+def _clipped_to_both(
+    known: SavedCamera, ground: GroundPlane, view: TopView, lines: list[np.ndarray]
+) -> list[np.ndarray]:
     """Return lines (n, 3) on the road with nan where they are not in the image and in the view from above."""
     low, high = np.array(view.low_m), np.array(view.high_m)
-    return [np.where((in_image(known, ground_to_image(known.lens, ground, line))
-                      & ((line[:, :2] > low) & (line[:, :2] < high)).all(axis=1))[:, None], line, np.nan)
-            for line in lines]
+    return [
+        np.where(
+            (
+                in_image(known, ground_to_image(known.lens, ground, line))
+                & ((line[:, :2] > low) & (line[:, :2] < high)).all(axis=1)
+            )[:, None],
+            line,
+            np.nan,
+        )
+        for line in lines
+    ]
 
 
 def _line(axes: Axes, points: np.ndarray, colour: str, width_px: float) -> None:
@@ -119,8 +131,15 @@ def _name_horizon(axes: Axes, camera: Camera, ground: GroundPlane) -> None:
         return
     x, y = inside[np.argmin(inside[:, 0])] + [14.0, 10.0]
     draw_plate(axes, x, y, x + 4.6 * SMALL_PX, y + 1.6 * SMALL_PX)
-    axes.text(x + 2.3 * SMALL_PX, y + 0.8 * SMALL_PX, 'horizon', color=HORIZON_COLOUR, fontsize=SMALL_PX * POINTS_PER_PX, ha='center',
-              va='center_baseline')
+    axes.text(
+        x + 2.3 * SMALL_PX,
+        y + 0.8 * SMALL_PX,
+        'horizon',
+        color=HORIZON_COLOUR,
+        fontsize=SMALL_PX * POINTS_PER_PX,
+        ha='center',
+        va='center_baseline',
+    )
 
 
 def _captions(axes: Axes, known: SavedCamera, step: float, rows: int) -> None:
@@ -128,11 +147,15 @@ def _captions(axes: Axes, known: SavedCamera, step: float, rows: int) -> None:
     tilt = float(np.degrees(np.arcsin(np.clip(-known.ground.normal_in_camera[2], -1, 1))))
     height = f' from {known.ground.height_m:.1f} m' if known.ground.metric else ''
     field = field_of_view_deg(known)[0]
-    left = (f'Lens, horizon and road found from the traffic: squares of {step:g} {length_unit(known.ground)}',
-            f'{field:.0f} degrees wide, looks {_with_sigma(tilt, sigma.tilt_deg)} degrees down{height}')
+    left = (
+        f'Lens, horizon and road found from the traffic: squares of {step:g} {length_unit(known.ground)}',
+        f'{field:.0f} degrees wide, looks {_with_sigma(tilt, sigma.tilt_deg)} degrees down{height}',
+    )
     right = ('The same moment from above', 'the same squares, to scale')
     for x, (title, words) in ((16.0, left), (IMAGE_PX + GAP_PX + 4.0, right)):
-        axes.text(x, rows + 34.0, title, color=WHITE, fontsize=TITLE_PX * POINTS_PER_PX, va='baseline', fontweight='medium')
+        axes.text(
+            x, rows + 34.0, title, color=WHITE, fontsize=TITLE_PX * POINTS_PER_PX, va='baseline', fontweight='medium'
+        )
         axes.text(x, rows + 70.0, words, color='#a9b6c2', fontsize=SMALL_PX * POINTS_PER_PX, va='baseline')
 
 

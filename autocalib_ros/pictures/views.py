@@ -45,8 +45,9 @@ def image_to_ground(camera: Camera, ground: GroundPlane, pixels: np.ndarray) -> 
     return rays[..., :2] * (-ground.height_m / down)[..., None]
 
 
-def nearby_road_points(camera: Camera, ground: GroundPlane, pixels: np.ndarray,
-                 heights: float = MAX_DISTANCE_HEIGHTS) -> np.ndarray:
+def nearby_road_points(
+    camera: Camera, ground: GroundPlane, pixels: np.ndarray, heights: float = MAX_DISTANCE_HEIGHTS
+) -> np.ndarray:
     """Return the points (m, 2) on the road of those pixels (n, 2) that show it within so many camera heights."""
     points = image_to_ground(camera, ground, pixels)
     return points[np.hypot(*points.T) < heights * ground.height_m]
@@ -67,7 +68,7 @@ def rectification_map(camera: Lens, matrix: np.ndarray) -> np.ndarray:
     view = np.empty((camera.height, camera.width, 2), np.float32)
     to_bearing = np.linalg.inv(matrix).T
     for top in range(0, camera.height, BAND_ROWS):
-        band = view[top:top + BAND_ROWS]
+        band = view[top : top + BAND_ROWS]
         x, y = np.meshgrid(np.arange(camera.width), np.arange(top, top + len(band)))
         sources, valid = camera.project(np.stack([x, y, np.ones_like(x)], axis=-1) @ to_bearing)
         band[:] = np.where(valid[..., None], sources, OUTSIDE_PX)
@@ -143,7 +144,11 @@ def project_great_circle(camera: Camera, normal: np.ndarray) -> list[np.ndarray]
 
 def project_road_lines(camera: Camera, ground: GroundPlane, lines_m: list[np.ndarray]) -> list[np.ndarray]:
     """Return lines (n, 3) in the ground frame as polylines in pixels in or near the image."""
-    return [part for line in lines_m for part in _parts_near_image(camera, ground_to_image(camera, ground, line), beyond=0.2)]
+    return [
+        part
+        for line in lines_m
+        for part in _parts_near_image(camera, ground_to_image(camera, ground, line), beyond=0.2)
+    ]
 
 
 def grid_step(ground: GroundPlane) -> float:

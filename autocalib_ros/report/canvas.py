@@ -20,8 +20,13 @@ from autocalib_ros.report.scene import NOT_USED, REJECTED, ReportScene
 
 WIDTH_IN, DPI = 7.0, 160
 """Letters stay readable on a telephone that shows a figure a third as wide as it is."""
-STYLE = {'font.size': 11.0, 'axes.labelsize': 11.0, 'legend.fontsize': 10.0, 'xtick.labelsize': 10.0,
-         'ytick.labelsize': 10.0}
+STYLE = {
+    'font.size': 11.0,
+    'axes.labelsize': 11.0,
+    'legend.fontsize': 10.0,
+    'xtick.labelsize': 10.0,
+    'ytick.labelsize': 10.0,
+}
 LEFT_IN, BELOW_IN, EDGE_IN = 0.85, 0.6, 0.12
 """Room for the letters beside and below a diagram, and at its other edges."""
 BAR_IN, BAR_ROOM_IN = 0.16, 0.75
@@ -51,8 +56,13 @@ def chart(height_in: float = 3.6, rows: int = 1) -> tuple[Figure, list[Axes]]:
     """Return a figure with axes for diagrams, one below the other, that share their x axis."""
     figure = Figure(figsize=(WIDTH_IN, height_in), dpi=DPI)
     panels = list(np.atleast_1d(figure.subplots(rows, 1, sharex=True)))
-    figure.subplots_adjust(left=LEFT_IN / WIDTH_IN, right=1 - EDGE_IN / WIDTH_IN, bottom=BELOW_IN / height_in,
-                           top=1 - EDGE_IN / height_in, hspace=0.12)
+    figure.subplots_adjust(
+        left=LEFT_IN / WIDTH_IN,
+        right=1 - EDGE_IN / WIDTH_IN,
+        bottom=BELOW_IN / height_in,
+        top=1 - EDGE_IN / height_in,
+        hspace=0.12,
+    )
     for axes in panels:
         axes.spines[['top', 'right']].set_visible(False)
         axes.grid(color=PANEL_COLOUR)
@@ -60,8 +70,9 @@ def chart(height_in: float = 3.6, rows: int = 1) -> tuple[Figure, list[Axes]]:
     return figure, panels
 
 
-def image_axes(scene: ReportScene, *, margin: float = 0.0, picture: np.ndarray | None = None,
-               fade: float = 0.25) -> tuple[Figure, Axes]:
+def image_axes(
+    scene: ReportScene, *, margin: float = 0.0, picture: np.ndarray | None = None, fade: float = 0.25
+) -> tuple[Figure, Axes]:
     """Return a figure that shows the road, lightened by `fade`, in pixel coordinates.
 
     `margin` is the share of the image that is shown around it.
@@ -76,8 +87,11 @@ def image_axes(scene: ReportScene, *, margin: float = 0.0, picture: np.ndarray |
         axes.imshow(faded_rgb(picture, fade), interpolation='bilinear')
     elif margin:
         axes.plot(*np.array([[0, 0], [width, 0], [width, height], [0, height], [0, 0]]).T - 0.5, color=MUTED_COLOUR)
-    axes.set(xlim=(-0.5 - margin * width, width - 0.5 + margin * width),
-             ylim=(height - 0.5 + margin * height, -0.5 - margin * height), aspect='equal')
+    axes.set(
+        xlim=(-0.5 - margin * width, width - 0.5 + margin * width),
+        ylim=(height - 0.5 + margin * height, -0.5 - margin * height),
+        aspect='equal',
+    )
     axes.set_axis_off()
     return figure, axes
 
@@ -88,12 +102,20 @@ def faded_rgb(picture: np.ndarray, fade: float) -> np.ndarray:
     return (rgb * (1 - fade) + 255 * fade).astype(np.uint8)
 
 
-def plot_paths(axes: Axes, paths: Sequence[np.ndarray], colour: str, label: str | None = None, *,
-               width: float = 1.1, alpha: float = 0.8) -> None:
+def plot_paths(
+    axes: Axes,
+    paths: Sequence[np.ndarray],
+    colour: str,
+    label: str | None = None,
+    *,
+    width: float = 1.1,
+    alpha: float = 0.8,
+) -> None:
     """Draw polylines (n, 2), with one entry in the legend."""
     if len(paths):
-        axes.add_collection(LineCollection(list(paths), colors=colour, linewidths=width, alpha=alpha, label=label),
-                            autolim=False)
+        axes.add_collection(
+            LineCollection(list(paths), colors=colour, linewidths=width, alpha=alpha, label=label), autolim=False
+        )
 
 
 def draw_legend(axes: Axes, place: str = 'upper right') -> None:
@@ -133,8 +155,15 @@ def cell_map(scene: ReportScene, values: np.ma.MaskedArray, scale: Normalize, la
     if scene.background is not None:
         axes.imshow(faded_rgb(scene.background, 0.25), interpolation='bilinear')
     rows, columns = values.shape
-    cells = axes.pcolormesh(np.linspace(0, width, columns + 1) - 0.5, np.linspace(0, height, rows + 1) - 0.5, values,
-                            norm=scale, cmap='viridis', alpha=0.6, edgecolors='none')
+    cells = axes.pcolormesh(
+        np.linspace(0, width, columns + 1) - 0.5,
+        np.linspace(0, height, rows + 1) - 0.5,
+        values,
+        norm=scale,
+        cmap='viridis',
+        alpha=0.6,
+        edgecolors='none',
+    )
     axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect='equal', xticks=[], yticks=[])
     bar = colour_bar(figure, cells, label, exceeded=bool(values.max() > scale.vmax))
     bar.xaxis.set_major_formatter('{x:g}')

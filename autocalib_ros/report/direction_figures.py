@@ -107,5 +107,11 @@ def _draw_direction(axes: Axes, camera: Camera, direction: np.ndarray, index: in
     size = np.array([camera.width, camera.height])
     ends = ends[valid & (np.abs(ends / size - 0.5) < 0.5 + MARGIN).all(axis=1)]
     if len(ends):
-        axes.plot(*ends.T, 'o', color=road_colour(index), markersize=9, markeredgecolor=WHITE,
-                  label=f'vanishing point{"s" if len(ends) > 1 else ""} of road {index + 1}')
+        axes.plot(
+            *ends.T,
+            'o',
+            color=road_colour(index),
+            markersize=9,
+            markeredgecolor=WHITE,
+            label=f'vanishing point{"s" if len(ends) > 1 else ""} of road {index + 1}',
+        )

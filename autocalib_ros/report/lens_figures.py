@@ -63,14 +63,21 @@ def straightness(scene: ReportScene) -> Figure | None:
     figure, (axes,) = chart(4.4)
     camera, ends = scene.calibration.camera, []
     for label in scene.roads:
-        errors = np.array([(line_error_px(path), line_error_px(camera.undistort(path)))
-                           for path in scene.paths(label)]).reshape(-1, 2)
+        errors = np.array(
+            [(line_error_px(path), line_error_px(camera.undistort(path))) for path in scene.paths(label)]
+        ).reshape(-1, 2)
         errors = np.maximum(errors[np.isfinite(errors).all(axis=1)], MIN_ERROR_PX)
         if len(errors):
             before, after = np.median(errors, axis=0)
             ends.append(errors)
-            axes.loglog(*errors.T, 'o', color=road_colour(label), alpha=0.6, markersize=4,
-                        label=f'{scene.road_name(label)}: median {before:.2f} px before, {after:.2f} px after')
+            axes.loglog(
+                *errors.T,
+                'o',
+                color=road_colour(label),
+                alpha=0.6,
+                markersize=4,
+                label=f'{scene.road_name(label)}: median {before:.2f} px before, {after:.2f} px after',
+            )
     if not ends:
         return None
     span = [np.concatenate(ends).min(), np.concatenate(ends).max()]
@@ -121,8 +128,19 @@ def _mark_focal(axes: Axes, calibration: Calibration) -> None:
     spread = f' ± {sigma:.1f}' if sigma else ''
     axes.axvline(focal, color=road_colour(0), linewidth=2, label=f'result: {focal:.1f}{spread} px')
     if sigma:
-        axes.axvspan(focal - 2 * sigma, focal + 2 * sigma, color=road_colour(0), alpha=0.2, linewidth=0,
-                     label=f'95 % interval: {focal - 2 * sigma:.1f} to {focal + 2 * sigma:.1f} px')
+        axes.axvspan(
+            focal - 2 * sigma,
+            focal + 2 * sigma,
+            color=road_colour(0),
+            alpha=0.2,
+            linewidth=0,
+            label=f'95 % interval: {focal - 2 * sigma:.1f} to {focal + 2 * sigma:.1f} px',
+        )
     if published:
-        axes.axvline(calibration.paper.focal_px, color=road_colour(1), linestyle='--', linewidth=1.6,
-                     label=f'by the published method: {calibration.paper.focal_px:.1f} px')
+        axes.axvline(
+            calibration.paper.focal_px,
+            color=road_colour(1),
+            linestyle='--',
+            linewidth=1.6,
+            label=f'by the published method: {calibration.paper.focal_px:.1f} px',
+        )

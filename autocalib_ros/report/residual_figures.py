@@ -28,8 +28,13 @@ def residuals(scene: ReportScene) -> Figure | None:
         distance = found.distance_px[found.roads == road]
         name = 'vehicles that turn' if road < 0 else f'road {road + 1}'
         share = np.histogram(distance, edges)[0] / len(distance)
-        axes.stairs(100 * share, edges, color=TURNING_COLOUR if road < 0 else road_colour(int(road)),
-                    linewidth=1.8, label=f'{name}: median {np.median(distance):.2f} px, {len(distance)} points')
+        axes.stairs(
+            100 * share,
+            edges,
+            color=TURNING_COLOUR if road < 0 else road_colour(int(road)),
+            linewidth=1.8,
+            label=f'{name}: median {np.median(distance):.2f} px, {len(distance)} points',
+        )
     axes.set_xlim(0, edges[-1])
     axes.set_xlabel('distance of an observed point from its place in the solution, px', color=INK)
     axes.set_ylabel('share of the points, %', color=INK)
@@ -51,5 +56,9 @@ def residual_map(scene: ReportScene) -> Figure | None:
             medians[index] = np.median(found.distance_px[cell == index])
     if not np.isfinite(medians).any():
         return None
-    return cell_map(scene, np.ma.masked_invalid(medians.reshape(rows, columns)),
-                    Normalize(0, np.nanquantile(medians, SHOWN_QUANTILE)), 'median distance in a cell, px')
+    return cell_map(
+        scene,
+        np.ma.masked_invalid(medians.reshape(rows, columns)),
+        Normalize(0, np.nanquantile(medians, SHOWN_QUANTILE)),
+        'median distance in a cell, px',
+    )

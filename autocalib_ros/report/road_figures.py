@@ -79,8 +79,9 @@ def ground_grid(scene: ReportScene) -> Figure | None:
     return figure
 
 
-def _mark(axes: Axes, scene: ReportScene, middle: np.ndarray, index: int, step: float, colour: str,
-          taken: list[np.ndarray]) -> None:
+def _mark(
+    axes: Axes, scene: ReportScene, middle: np.ndarray, index: int, step: float, colour: str, taken: list[np.ndarray]
+) -> None:
     """Write the coordinate where the grid crosses one of its middle lines, nearest first, where there is room."""
     camera, ground = scene.calibration.camera, scene.calibration.ground
     for offset in sorted(np.arange(-8, 9), key=abs):
@@ -92,8 +93,15 @@ def _mark(axes: Axes, scene: ReportScene, middle: np.ndarray, index: int, step: 
         if not inside or any(np.hypot(*(pixel - other)) < room for other in taken):
             continue
         taken.append(pixel)
-        axes.text(*pixel, f'{"xy"[index]} {place[index]:g}', color=colour, fontsize=9, ha='center', va='center',
-                  bbox={'boxstyle': 'square,pad=0.1', 'facecolor': WHITE, 'edgecolor': 'none', 'alpha': 0.8})
+        axes.text(
+            *pixel,
+            f'{"xy"[index]} {place[index]:g}',
+            color=colour,
+            fontsize=9,
+            ha='center',
+            va='center',
+            bbox={'boxstyle': 'square,pad=0.1', 'facecolor': WHITE, 'edgecolor': 'none', 'alpha': 0.8},
+        )
 
 
 def tracked_road_points(scene: ReportScene) -> np.ndarray:
@@ -106,16 +114,22 @@ def top_view(scene: ReportScene) -> Figure | None:
     if scene.calibration is None or scene.calibration.ground is None:
         return None
     camera, ground = scene.calibration.camera, scene.calibration.ground
-    view = TopView.around(tracked_road_points(scene), ground, TOP_VIEW_PX) or TopView.of_image(camera, ground, TOP_VIEW_PX)
+    view = TopView.around(tracked_road_points(scene), ground, TOP_VIEW_PX) or TopView.of_image(
+        camera, ground, TOP_VIEW_PX
+    )
     if view is None:
         return None
     figure, axes = ground_axes(view, ground)
     if scene.background is not None:
-        axes.imshow(faded_rgb(resample(scene.background, view.sources(camera, ground)), 0.1),
-                    extent=(view.low_m[0], view.high_m[0], view.low_m[1], view.high_m[1]), interpolation='bilinear')
+        axes.imshow(
+            faded_rgb(resample(scene.background, view.sources(camera, ground)), 0.1),
+            extent=(view.low_m[0], view.high_m[0], view.low_m[1], view.high_m[1]),
+            interpolation='bilinear',
+        )
     for _, label, tracks in scene.groups():
-        plot_paths(axes, [image_to_ground(camera, ground, path) for path in tracks], label_colour(label), width=0.7,
-                   alpha=0.35)
+        plot_paths(
+            axes, [image_to_ground(camera, ground, path) for path in tracks], label_colour(label), width=0.7, alpha=0.35
+        )
     _draw_contours(axes, scene, view)
     _draw_scale(axes, view, ground)
     if (np.array(view.low_m) < 0).all() and (np.array(view.high_m) > 0).all():
@@ -131,8 +145,9 @@ def ground_axes(view: TopView, ground: GroundPlane, below_in: float = 0.0) -> tu
     shown_in = min(width_in * (high_y - low_y) / (high_x - low_x), 1.2 * WIDTH_IN)
     height_in = shown_in + BELOW_IN + EDGE_IN + below_in
     figure = Figure(figsize=(WIDTH_IN, height_in), dpi=DPI)
-    axes = figure.add_axes((LEFT_IN / WIDTH_IN, (BELOW_IN + below_in) / height_in, width_in / WIDTH_IN,
-                            shown_in / height_in))
+    axes = figure.add_axes(
+        (LEFT_IN / WIDTH_IN, (BELOW_IN + below_in) / height_in, width_in / WIDTH_IN, shown_in / height_in)
+    )
     axes.set_facecolor(PANEL_COLOUR)
     axes.set(xlim=(low_x, high_x), ylim=(low_y, high_y), aspect='equal')
     axes.set_xlabel(f'x, along the main traffic, {length_unit(ground)}', color=INK)
@@ -162,8 +177,10 @@ def accuracy_note(scene: ReportScene) -> str:
 def _draw_contours(axes: Axes, scene: ReportScene, view: TopView) -> None:
     """Draw where a place on the road is known to so many metres."""
     size = np.array([view.columns, view.rows])
-    x, y = (np.linspace(view.low_m[axis], view.high_m[axis], count)
-            for axis, count in enumerate(np.maximum(CONTOUR_SAMPLES * size // size.max(), 2)))
+    x, y = (
+        np.linspace(view.low_m[axis], view.high_m[axis], count)
+        for axis, count in enumerate(np.maximum(CONTOUR_SAMPLES * size // size.max(), 2))
+    )
     sigma = position_sigma_m(scene, np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
     if sigma is None or not np.isfinite(sigma).any():
         return
@@ -171,8 +188,15 @@ def _draw_contours(axes: Axes, scene: ReportScene, view: TopView) -> None:
     levels = [level for level in CONTOURS_M if low < level < high][-MAX_CONTOURS:]
     if not levels:
         return
-    lines = axes.contour(x, y, np.ma.masked_invalid(sigma.reshape(len(y), len(x))), levels=levels, colors=CONTOUR_COLOUR,
-                         linewidths=1.4, linestyles='dashed')
+    lines = axes.contour(
+        x,
+        y,
+        np.ma.masked_invalid(sigma.reshape(len(y), len(x))),
+        levels=levels,
+        colors=CONTOUR_COLOUR,
+        linewidths=1.4,
+        linestyles='dashed',
+    )
     for letters in axes.clabel(lines, fmt='± %g m', fontsize=9, inline=False):
         letters.set_path_effects(HALO)
     axes.plot([], [], '--', color=CONTOUR_COLOUR, linewidth=1.4, label='a place is known to (1 sigma)')
@@ -184,6 +208,11 @@ def _draw_scale(axes: Axes, view: TopView, ground: GroundPlane) -> None:
     begin = low + 0.04 * (high - low)
     axes.plot([begin[0], begin[0] + length], [begin[1]] * 2, color=WHITE, linewidth=7, solid_capstyle='butt')
     axes.plot([begin[0], begin[0] + length], [begin[1]] * 2, color=INK, linewidth=4, solid_capstyle='butt')
-    axes.text(begin[0], begin[1] + 0.025 * (high[1] - low[1]), format_length(length, ground), va='bottom', color=INK,
-              bbox={'boxstyle': 'round,pad=0.2', 'facecolor': WHITE, 'edgecolor': 'none',
-                                            'alpha': 0.8})
+    axes.text(
+        begin[0],
+        begin[1] + 0.025 * (high[1] - low[1]),
+        format_length(length, ground),
+        va='bottom',
+        color=INK,
+        bbox={'boxstyle': 'round,pad=0.2', 'facecolor': WHITE, 'edgecolor': 'none', 'alpha': 0.8},
+    )

@@ -40,7 +40,9 @@ class SolutionSnapshot:
         return cls(seconds, result.camera.focal_px, sigma.focal_px, tilt, sigma.tilt_deg)
 
 
-def append_snapshot(moments: tuple[SolutionSnapshot, ...], result: Calibration | Refusal) -> tuple[SolutionSnapshot, ...]:
+def append_snapshot(
+    moments: tuple[SolutionSnapshot, ...], result: Calibration | Refusal
+) -> tuple[SolutionSnapshot, ...]:
     """Add a result to those before; of many every second one goes, and of two at one time the older."""
     latest = SolutionSnapshot.of(result)
     kept = tuple(moment for moment in moments if moment.seconds < latest.seconds)

@@ -19,8 +19,7 @@ def settling(scene: ReportScene) -> Figure | None:
     figure, panels = chart(4.4 if tilted else 2.8, 2 if tilted else 1)
     _draw(panels[0], [(m.seconds, m.focal_px, m.focal_sigma_px) for m in found], 'focal length, px', road_colour(0))
     if tilted:
-        _draw(panels[1], [(m.seconds, m.tilt_deg, m.tilt_sigma_deg) for m in tilted], 'tilt, degrees',
-              road_colour(1))
+        _draw(panels[1], [(m.seconds, m.tilt_deg, m.tilt_sigma_deg) for m in tilted], 'tilt, degrees', road_colour(1))
     _draw_refusals(panels, scene.moments)
     panels[-1].set_xlabel('seconds since the first image', color=INK)
     return figure
@@ -29,8 +28,16 @@ def settling(scene: ReportScene) -> Figure | None:
 def _draw(axes: Axes, rows: list[tuple[float, float, float | None]], label: str, colour: str) -> None:
     seconds, values, sigmas = zip(*rows, strict=True)
     known = np.array([np.nan if sigma is None else sigma for sigma in sigmas])
-    axes.errorbar(seconds, values, np.nan_to_num(known), fmt='o-', color=colour, capsize=4, linewidth=1.2,
-                  label='accepted, ± 1 sigma' if np.isfinite(known).any() else 'accepted')
+    axes.errorbar(
+        seconds,
+        values,
+        np.nan_to_num(known),
+        fmt='o-',
+        color=colour,
+        capsize=4,
+        linewidth=1.2,
+        label='accepted, ± 1 sigma' if np.isfinite(known).any() else 'accepted',
+    )
     axes.axhline(values[-1], color=MUTED_COLOUR, linewidth=0.8)
     axes.set_ylabel(label, color=INK)
 
@@ -40,6 +47,12 @@ def _draw_refusals(panels: list[Axes], moments: tuple[SolutionSnapshot, ...]) ->
     for axes in panels:
         axes.set_xlim(0, 1.05 * moments[-1].seconds)
         if refused:
-            axes.plot(refused, np.full(len(refused), 0.04), 'x', color=INK, transform=axes.get_xaxis_transform(),
-                      label='refused')
+            axes.plot(
+                refused,
+                np.full(len(refused), 0.04),
+                'x',
+                color=INK,
+                transform=axes.get_xaxis_transform(),
+                label='refused',
+            )
     draw_legend(panels[0], 'best')

@@ -62,7 +62,7 @@ def track_pieces_on_road(scene: ReportScene) -> TrackPieces | None:
         ends = np.linspace(times_s[0], times_s[-1], int((times_s[-1] - times_s[0]) / CHORD_S) + 1)
         at = np.unique(np.searchsorted(times_s, ends).clip(max=len(way) - 1))
         for begin, end in zip(at[:-1], at[1:], strict=True):
-            points.append(way[begin:end + 1])
+            points.append(way[begin : end + 1])
             times.append(times_s[end] - times_s[begin])
             tracks.append(index)
     if not points:
@@ -97,8 +97,14 @@ def speeds_above(scene: ReportScene) -> Figure | None:
     ground = scene.calibration.ground
     view = TopView.around(np.concatenate(pieces.points), ground, TOP_VIEW_PX)
     figure, axes = ground_axes(view, ground, below_in=BAR_ROOM_IN)
-    lines = LineCollection(pieces.points, array=pieces.speeds, cmap='viridis', linewidths=0.9, alpha=0.8,
-                           norm=Normalize(0, max(np.quantile(pieces.speeds, SCALE_QUANTILE), 1e-3)))
+    lines = LineCollection(
+        pieces.points,
+        array=pieces.speeds,
+        cmap='viridis',
+        linewidths=0.9,
+        alpha=0.8,
+        norm=Normalize(0, max(np.quantile(pieces.speeds, SCALE_QUANTILE), 1e-3)),
+    )
     axes.add_collection(lines, autolim=False)
     colour_bar(figure, lines, f'speed, {speed_unit(scene)}', exceeded=True)
     return figure
@@ -124,9 +130,13 @@ def speed_histogram(scene: ReportScene) -> Figure | None:
             name = scene.road_name(label) if label != NOT_USED else 'on no road' if named else 'all'
             counts = np.histogram(own, edges)[0]
             most = max(most, int(counts.max()))
-            axes.stairs(counts, edges, linewidth=1.8,
-                        color=label_colour(label),
-                        label=f'{name}: {len(own)} road users, median {np.median(own):.{digits}f} {speed_unit(scene)}')
+            axes.stairs(
+                counts,
+                edges,
+                linewidth=1.8,
+                color=label_colour(label),
+                label=f'{name}: {len(own)} road users, median {np.median(own):.{digits}f} {speed_unit(scene)}',
+            )
     axes.set(xlim=(0, edges[-1]), ylim=(0, 1.4 * most))  # room for the legend
     axes.yaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_xlabel(f'speed of a road user, averaged over the way, {speed_unit(scene)}', color=INK)
@@ -144,9 +154,13 @@ def speed_note(scene: ReportScene) -> str:
     """Say what the speeds rest on."""
     ground, given = scene.calibration.ground, scene.options.scale
     if not ground.metric:
-        return ('Tracked points are on vehicles, above the road, so that all speeds look too high by one factor, some'
-                ' 10 % under a camera 8 m high.')
+        return (
+            'Tracked points are on vehicles, above the road, so that all speeds look too high by one factor, some'
+            ' 10 % under a camera 8 m high.'
+        )
     spread = 100 * given.point_height_sigma_m / (ground.height_m - given.point_height_m)
-    return (f'Tracked points are on vehicles, above the road: they are taken to be {given.point_height_m:g} ±'
-            f' {given.point_height_sigma_m:g} m above it, which leaves the speeds unsure by {spread:.0f} %; a lorry'
-            ' looks faster than it is.')
+    return (
+        f'Tracked points are on vehicles, above the road: they are taken to be {given.point_height_m:g} ±'
+        f' {given.point_height_sigma_m:g} m above it, which leaves the speeds unsure by {spread:.0f} %; a lorry'
+        ' looks faster than it is.'
+    )

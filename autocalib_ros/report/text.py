@@ -71,12 +71,16 @@ def _lens_rows(result: Calibration) -> list[TableRow]:
     cx, cy = camera.principal_point_px
     point = '' if sigma.principal_point_px is None else '{:.2f}, {:.2f}'.format(*sigma.principal_point_px)
     across, down = field_of_view_deg(camera)
-    coefficients = [TableRow(f'k{index}', f'{value:.5f}', _number(sigma.k1, 5) if index == 1 else '')
-                    for index, value in enumerate(camera.k, start=1)]
-    return [TableRow('focal length', f'{camera.focal_px:.2f} px', _number(sigma.focal_px, 2)),
-            TableRow('principal point', f'{cx:.2f}, {cy:.2f} px', point),
-            *[row for row, value in zip(coefficients, camera.k, strict=True) if value or row.name == 'k1'],
-            TableRow('field of view', f'{across:.1f} x {down:.1f} degrees', note='between the middles of opposite borders')]
+    coefficients = [
+        TableRow(f'k{index}', f'{value:.5f}', _number(sigma.k1, 5) if index == 1 else '')
+        for index, value in enumerate(camera.k, start=1)
+    ]
+    return [
+        TableRow('focal length', f'{camera.focal_px:.2f} px', _number(sigma.focal_px, 2)),
+        TableRow('principal point', f'{cx:.2f}, {cy:.2f} px', point),
+        *[row for row, value in zip(coefficients, camera.k, strict=True) if value or row.name == 'k1'],
+        TableRow('field of view', f'{across:.1f} x {down:.1f} degrees', note='between the middles of opposite borders'),
+    ]
 
 
 def _ground_rows(result: Calibration) -> list[TableRow]:
@@ -85,46 +89,75 @@ def _ground_rows(result: Calibration) -> list[TableRow]:
     down, roll = tilt_and_roll_deg(result.ground.normal_in_camera)
     height = f'{result.ground.height_m:.2f} m' if result.ground.metric else '1 (unit)'
     note = next((text for text in result.assumptions if text.startswith('scale by ')), '')
-    return [TableRow('camera height', height, _number(result.stddev.height_m, 2), note),
-            TableRow('looks down by', f'{down:.2f} degrees', _number(result.stddev.tilt_deg, 2)),
-            TableRow('rolled by', f'{roll:.2f} degrees', _number(result.stddev.roll_deg, 2)),
-            *[TableRow(f'road {distance:g} m ahead', 'on the road', f'{sigma:.2f} m', 'of where a pixel meets it')
-              for distance, sigma in zip(GROUND_DISTANCES_M, result.stddev.ground_point_m, strict=False)
-              if sigma is not None]]
+    return [
+        TableRow('camera height', height, _number(result.stddev.height_m, 2), note),
+        TableRow('looks down by', f'{down:.2f} degrees', _number(result.stddev.tilt_deg, 2)),
+        TableRow('rolled by', f'{roll:.2f} degrees', _number(result.stddev.roll_deg, 2)),
+        *[
+            TableRow(f'road {distance:g} m ahead', 'on the road', f'{sigma:.2f} m', 'of where a pixel meets it')
+            for distance, sigma in zip(GROUND_DISTANCES_M, result.stddev.ground_point_m, strict=False)
+            if sigma is not None
+        ],
+    ]
 
 
 def _paper_rows(result: Calibration) -> list[TableRow]:
     if result.paper is None:
         return []
     before, after = result.paper.straightness_px2
-    return [TableRow("the paper's focal length", f'{result.paper.focal_px:.1f} px', note='Jain & Saunier, for comparison'),
-            TableRow("the paper's polynomial", ', '.join(f'{value:.4f}' for value in result.paper.polynomial_k),
-                note='k1, k2, k3 of x_u / x_d - 1; distorted to undistorted'),
-            TableRow('straightness', f'{before:.3g} before, {after:.3g} after, px²', note='mean squared line-fit error')]
+    return [
+        TableRow("the paper's focal length", f'{result.paper.focal_px:.1f} px', note='Jain & Saunier, for comparison'),
+        TableRow(
+            "the paper's polynomial",
+            ', '.join(f'{value:.4f}' for value in result.paper.polynomial_k),
+            note='k1, k2, k3 of x_u / x_d - 1; distorted to undistorted',
+        ),
+        TableRow('straightness', f'{before:.3g} before, {after:.3g} after, px²', note='mean squared line-fit error'),
+    ]
 
 
 def file_rows(result: Calibration | Refusal, evidence: Evidence) -> list[TableRow]:
     """List what programs read in the files, and how the solution was made."""
-    rows = [TableRow('background moved by', f'{evidence.drift_px:.2f} px', note='at most'), TableRow('method', result.method)]
+    rows = [
+        TableRow('background moved by', f'{evidence.drift_px:.2f} px', note='at most'),
+        TableRow('method', result.method),
+    ]
     if isinstance(result, Refusal):
         return rows
     rows.append(TableRow('grade', result.grade))
     residuals = result.figures.residuals
     if len(residuals.distance_px):
-        rows.append(TableRow('residual', f'{np.median(residuals.distance_px):.2f} px', note='median of all points used'))
-    rows += [TableRow(f'direction of road {index}', _list(direction, 4), note='in the camera: x right, y down, z forward')
-             for index, direction in enumerate(result.road_directions, start=1)]
+        rows.append(
+            TableRow('residual', f'{np.median(residuals.distance_px):.2f} px', note='median of all points used')
+        )
+    rows += [
+        TableRow(f'direction of road {index}', _list(direction, 4), note='in the camera: x right, y down, z forward')
+        for index, direction in enumerate(result.road_directions, start=1)
+    ]
     info = result.camera_info
-    rows += [TableRow('distortion_model', info.distortion_model), TableRow('camera_info K', _list(info.k, 2)),
-             TableRow('camera_info D', _list(info.d, 6)), TableRow('camera_info P', _list(info.p, 2))]
+    rows += [
+        TableRow('distortion_model', info.distortion_model),
+        TableRow('camera_info K', _list(info.k, 2)),
+        TableRow('camera_info D', _list(info.d, 6)),
+        TableRow('camera_info P', _list(info.p, 2)),
+    ]
     if result.ground is not None:
-        rows += [TableRow('ground_from_camera', f'{_list(result.ground.rotation_xyzw, 6)}', note='quaternion x, y, z, w'),
-                 TableRow('camera in the ground frame', f'{_list(result.ground.translation_m, 3)}'
-                     + (' m' if result.ground.metric else ''))]
+        rows += [
+            TableRow('ground_from_camera', f'{_list(result.ground.rotation_xyzw, 6)}', note='quaternion x, y, z, w'),
+            TableRow(
+                'camera in the ground frame',
+                f'{_list(result.ground.translation_m, 3)}' + (' m' if result.ground.metric else ''),
+            ),
+        ]
     paper = result.paper
     if paper is not None and paper.focal_from_vanishing_points_px is not None:
-        rows.append(TableRow("the paper's f_new", f'{paper.focal_from_vanishing_points_px:.1f} px',
-                        note='by its two vanishing points'))
+        rows.append(
+            TableRow(
+                "the paper's f_new",
+                f'{paper.focal_from_vanishing_points_px:.1f} px',
+                note='by its two vanishing points',
+            )
+        )
     if paper is not None and paper.translation_m is not None:
         rows.append(TableRow("the paper's t", _list(paper.translation_m, 3)))
     return rows
@@ -137,10 +170,13 @@ def _list(values: Iterable[float], digits: int) -> str:
 def _evidence_rows(result: Calibration | Refusal, accepted_at_s: float | None) -> list[TableRow]:
     evidence = result.evidence
     people = f' and {evidence.people} people' if evidence.people else ''
-    rows = [TableRow('recording', f'{evidence.seconds:.1f} s, {evidence.frames} images'),
-            TableRow('traffic', f'{evidence.tracks} tracks of {evidence.vehicles} vehicles{people}, '
-                           f'{evidence.segments} segments'),
-            TableRow('coverage', f'{100 * evidence.coverage:.0f} % of the image')]
+    rows = [
+        TableRow('recording', f'{evidence.seconds:.1f} s, {evidence.frames} images'),
+        TableRow(
+            'traffic', f'{evidence.tracks} tracks of {evidence.vehicles} vehicles{people}, {evidence.segments} segments'
+        ),
+        TableRow('coverage', f'{100 * evidence.coverage:.0f} % of the image'),
+    ]
     return rows + ([] if accepted_at_s is None else [TableRow('accepted after', f'{accepted_at_s:.1f} s')])
 
 
@@ -161,8 +197,11 @@ def how_sure(result: Calibration | Refusal) -> str:
         parts.append(f'focal length ± {100 * sigma.focal_px / result.camera.focal_px:.2g} %')
     if sigma.tilt_deg is not None and sigma.roll_deg is not None:
         parts.append(f'tilt ± {sigma.tilt_deg:.2f} and roll ± {sigma.roll_deg:.2f} degrees')
-    places = [f'± {sigma_m:.2f} m at {distance:g} m' for distance, sigma_m in zip(
-        GROUND_DISTANCES_M, sigma.ground_point_m, strict=False) if sigma_m is not None]
+    places = [
+        f'± {sigma_m:.2f} m at {distance:g} m'
+        for distance, sigma_m in zip(GROUND_DISTANCES_M, sigma.ground_point_m, strict=False)
+        if sigma_m is not None
+    ]
     parts += [f'a place on the road {", ".join(places)}'] if places else []
     return _sentence(_capital('; '.join(parts))) + ' (One standard deviation: two results in three are closer.)'
 
@@ -177,8 +216,10 @@ def next_step(result: Calibration | Refusal) -> str:
         return 'Give the height of the camera above the road to get metres.'
     check = 'Look whether the grid below lies flat along the markings of the road'
     if result.grade == 'assumed':
-        return (f'{check}; the ground plane rests on what is assumed, until traffic across the main road, or that '
-                'turns, is seen.')
+        return (
+            f'{check}; the ground plane rests on what is assumed, until traffic across the main road, or that '
+            'turns, is seen.'
+        )
     return f'{check}, and whether the speeds are those of this road; then use the files.'
 
 
@@ -193,12 +234,19 @@ class Requirement:
 
 
 MISSING_BY_CODE = {
-    'camera_moving': 'a camera that stands still', 'no_motion': 'traffic', 'too_few_tracks': 'tracks that are long',
-    'poor_coverage': 'traffic in enough of the image', 'one_direction': 'traffic in two directions, or that turns',
-    'no_direction': 'tracks along a common direction', 'no_agreement': 'agreement of the traffic',
-    'no_height': 'what tells the scale', 'one_centre': 'traffic that turns in more than one place',
-    'halves_disagree': 'agreement of both halves of the traffic', 'plane_uncertain': 'a ground plane that is sure',
-    'distortion_model': 'the distortion model that is asked for'}
+    'camera_moving': 'a camera that stands still',
+    'no_motion': 'traffic',
+    'too_few_tracks': 'tracks that are long',
+    'poor_coverage': 'traffic in enough of the image',
+    'one_direction': 'traffic in two directions, or that turns',
+    'no_direction': 'tracks along a common direction',
+    'no_agreement': 'agreement of the traffic',
+    'no_height': 'what tells the scale',
+    'one_centre': 'traffic that turns in more than one place',
+    'halves_disagree': 'agreement of both halves of the traffic',
+    'plane_uncertain': 'a ground plane that is sure',
+    'distortion_model': 'the distortion model that is asked for',
+}
 """What was missing, by the code of the refusal."""
 
 
@@ -209,14 +257,43 @@ def needs(result: Calibration | Refusal, evidence: Evidence, gate: GateOptions) 
         return []
     limit = drift_limit_px(evidence.image_size[0], gate)
     counted = (
-        (('camera_moving',), Requirement('the camera stands still', f'the background moved by {evidence.drift_px:.1f} px',
-                                  f'{limit:.1f} px at the most', evidence.drift_px <= limit)),
-        (('no_motion', 'too_few_tracks'), Requirement('tracks of moving traffic', f'{evidence.track_count}',
-                                               f'{gate.min_tracks} or more', evidence.track_count >= gate.min_tracks)),
-        (('poor_coverage',), Requirement('image crossed by traffic', f'{100 * evidence.coverage:.0f} %',
-                                  f'{100 * gate.min_coverage:.0f} % or more', evidence.coverage >= gate.min_coverage)))
+        (
+            ('camera_moving',),
+            Requirement(
+                'the camera stands still',
+                f'the background moved by {evidence.drift_px:.1f} px',
+                f'{limit:.1f} px at the most',
+                evidence.drift_px <= limit,
+            ),
+        ),
+        (
+            ('no_motion', 'too_few_tracks'),
+            Requirement(
+                'tracks of moving traffic',
+                f'{evidence.track_count}',
+                f'{gate.min_tracks} or more',
+                evidence.track_count >= gate.min_tracks,
+            ),
+        ),
+        (
+            ('poor_coverage',),
+            Requirement(
+                'image crossed by traffic',
+                f'{100 * evidence.coverage:.0f} %',
+                f'{100 * gate.min_coverage:.0f} % or more',
+                evidence.coverage >= gate.min_coverage,
+            ),
+        ),
+    )
     rows = [need for _, need in counted]
     if any(refusal.code in codes and not need.met for codes, need in counted):
         return rows
-    return [*rows, Requirement(MISSING_BY_CODE.get(refusal.code, refusal.code.replace('_', ' ')), _sentence(_capital(refusal.message)),
-                        '', False)]
+    return [
+        *rows,
+        Requirement(
+            MISSING_BY_CODE.get(refusal.code, refusal.code.replace('_', ' ')),
+            _sentence(_capital(refusal.message)),
+            '',
+            False,
+        ),
+    ]

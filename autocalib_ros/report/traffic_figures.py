@@ -32,11 +32,22 @@ def kept_tracks(scene: ReportScene) -> Figure | None:
     figure, axes = image_axes(scene)
     for label in (NOT_USED, REJECTED, *scene.roads):
         paths, used = scene.paths(label), label >= 0
-        plot_paths(axes, paths, label_colour(label),
-                   f'{scene.road_name(label)}: {len(paths)}', width=1.0 if used else 0.7, alpha=0.7 if used else 0.5)
+        plot_paths(
+            axes,
+            paths,
+            label_colour(label),
+            f'{scene.road_name(label)}: {len(paths)}',
+            width=1.0 if used else 0.7,
+            alpha=0.7 if used else 0.5,
+        )
     if len(scene.turning_px):
-        axes.plot(*scene.turning_px.T, '.', color=TURNING_COLOUR, markersize=2,
-                  label=f'on vehicles that turn: {len(scene.turning_px)} points')
+        axes.plot(
+            *scene.turning_px.T,
+            '.',
+            color=TURNING_COLOUR,
+            markersize=2,
+            label=f'on vehicles that turn: {len(scene.turning_px)} points',
+        )
     draw_legend(axes)
     return figure
 

@@ -13,8 +13,18 @@ from autocalib_ros.lens.camera_info import CameraInfo, camera_info
 
 GROUND_DISTANCES_M = (10.0, 20.0, 40.0)
 """Distances from the camera's foot at which the accuracy on the road is told."""
-COVARIANCE_PARAMETERS = ('focal_px', 'principal_point_x_px', 'principal_point_y_px', 'k1', 'k2', 'k3', 'k4', 'tilt_deg',
-                 'roll_deg', 'height_m')
+COVARIANCE_PARAMETERS = (
+    'focal_px',
+    'principal_point_x_px',
+    'principal_point_y_px',
+    'k1',
+    'k2',
+    'k3',
+    'k4',
+    'tilt_deg',
+    'roll_deg',
+    'height_m',
+)
 """Rows and columns of the covariance."""
 
 
@@ -117,8 +127,14 @@ class Refusal:
     @classmethod
     def from_reason(cls, reason: Reason, method: str, evidence: EvidenceSummary, figures: Figures) -> Refusal:
         """Make a refusal of a reason."""
-        return cls(code=reason.code, message=reason.message, remedy=reason.remedy, method=method, evidence=evidence,
-                   figures=figures)
+        return cls(
+            code=reason.code,
+            message=reason.message,
+            remedy=reason.remedy,
+            method=method,
+            evidence=evidence,
+            figures=figures,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -54,7 +54,9 @@ def calibration_from_json(document: Mapping[str, Any]) -> Calibration:
     if document.get('version') != JSON_VERSION:
         raise InputError(f'its version is {reprlib.repr(document.get("version"))}, and only {JSON_VERSION} is read')
     if document.get('state') != 'calibrated':
-        raise InputError(f'its state is {reprlib.repr(document.get("state"))}: it holds no calibration{_refusal_text(document)}')
+        raise InputError(
+            f'its state is {reprlib.repr(document.get("state"))}: it holds no calibration{_refusal_text(document)}'
+        )
     try:
         return _parse_calibration(document)
     except AutocalibError as error:
@@ -66,28 +68,48 @@ def calibration_from_json(document: Mapping[str, Any]) -> Calibration:
 def _refusal_text(document: Mapping[str, Any]) -> str:
     """Return the reason of a refusal in brackets, '' where none is given."""
     refusal = document.get('refusal')
-    return f' ({refusal["code"]}: {refusal["message"]})' if isinstance(refusal, Mapping) and {
-        'code', 'message'} <= refusal.keys() else ''
+    return (
+        f' ({refusal["code"]}: {refusal["message"]})'
+        if isinstance(refusal, Mapping) and {'code', 'message'} <= refusal.keys()
+        else ''
+    )
 
 
 def _parse_calibration(document: Mapping[str, Any]) -> Calibration:
     width, height = _numbers(document['image_size'], int, 2)
     lens, evidence, paper = document['camera'], document['evidence'], document['paper']
-    camera = Camera(width, height, float(lens['focal_px']), _numbers(lens['principal_point_px'], float, 2),
-                    _numbers(lens['k'], float, 4))
+    camera = Camera(
+        width,
+        height,
+        float(lens['focal_px']),
+        _numbers(lens['principal_point_px'], float, 2),
+        _numbers(lens['k'], float, 4),
+    )
     grade, pose, reason = str(document['grade']), document['ground_from_camera'], document['refusal']
     return Calibration(
-        method=str(document['method']), grade=grade, assumptions=tuple(map(str, document['assumptions'])),
-        checks=tuple(map(str, document['checks'])), camera=camera,
+        method=str(document['method']),
+        grade=grade,
+        assumptions=tuple(map(str, document['assumptions'])),
+        checks=tuple(map(str, document['checks'])),
+        camera=camera,
         ground=None if pose is None else _parse_ground(pose, metric=grade != 'unit_scale'),
         ground_refusal=None if reason is None else Reason(*(str(reason[name]) for name in Reason.__dataclass_fields__)),
         road_directions=np.array(document['road_directions_in_camera'], float).reshape(-1, 3),
-        stddev=_parse_stddev(document['stddev']), paper=None if paper is None else _parse_paper(paper),
+        stddev=_parse_stddev(document['stddev']),
+        paper=None if paper is None else _parse_paper(paper),
         evidence=EvidenceSummary(
-            image_size=(width, height), seconds=float(evidence['seconds']), frames=int(evidence['frames']),
-            tracks=int(evidence['tracks']), segments=int(evidence['segments']), vehicles=int(evidence['vehicles']),
-            coverage=float(evidence['coverage']), people=int(evidence.get('people', 0))),
-        newest_stamp_ns=int(document['newest_stamp_ns']), covariance=_parse_covariance(document.get('covariance')))
+            image_size=(width, height),
+            seconds=float(evidence['seconds']),
+            frames=int(evidence['frames']),
+            tracks=int(evidence['tracks']),
+            segments=int(evidence['segments']),
+            vehicles=int(evidence['vehicles']),
+            coverage=float(evidence['coverage']),
+            people=int(evidence.get('people', 0)),
+        ),
+        newest_stamp_ns=int(document['newest_stamp_ns']),
+        covariance=_parse_covariance(document.get('covariance')),
+    )
 
 
 def _parse_ground(pose: Mapping[str, Any], *, metric: bool) -> GroundPlane:
@@ -105,7 +127,8 @@ def _parse_stddev(sigma: Mapping[str, Any]) -> StandardDeviations:
     return StandardDeviations(
         **{name: _optional_float(sigma[name]) for name in ('focal_px', 'k1', 'k2', 'tilt_deg', 'roll_deg', 'height_m')},
         principal_point_px=None if point is None else _numbers(point, float, 2),
-        ground_point_m=tuple(_optional_float(value) for value in sigma['ground_point_m'].values()))
+        ground_point_m=tuple(_optional_float(value) for value in sigma['ground_point_m'].values()),
+    )
 
 
 def _parse_covariance(entry: Mapping[str, Any] | None) -> np.ndarray | None:
@@ -117,10 +140,12 @@ def _parse_covariance(entry: Mapping[str, Any] | None) -> np.ndarray | None:
 def _parse_paper(paper: Mapping[str, Any]) -> PaperReport:
     straightness, translation = paper['straightness_px2'], paper['translation_m']
     return PaperReport(
-        focal_px=float(paper['focal_px']), polynomial_k=_numbers(paper['polynomial_k'], float, 3),
+        focal_px=float(paper['focal_px']),
+        polynomial_k=_numbers(paper['polynomial_k'], float, 3),
         straightness_px2=(float(straightness['before']), float(straightness['after'])),
         focal_from_vanishing_points_px=_optional_float(paper['focal_from_vanishing_points_px']),
-        translation_m=None if translation is None else _numbers(translation, float, 3))
+        translation_m=None if translation is None else _numbers(translation, float, 3),
+    )
 
 
 def _optional_float(value: Any) -> float | None:
@@ -144,14 +169,33 @@ def to_json(result: Calibration | Refusal, *, accepted_at_s: float | None = None
     """Return the document of calibration.json, version 1."""
     evidence = result.evidence
     document: dict[str, Any] = {
-        'version': JSON_VERSION, 'state': 'calibrated' if result else 'refused', 'grade': None,
-        'method': result.method, 'assumptions': [], 'checks': [], 'refusal': None,
+        'version': JSON_VERSION,
+        'state': 'calibrated' if result else 'refused',
+        'grade': None,
+        'method': result.method,
+        'assumptions': [],
+        'checks': [],
+        'refusal': None,
         'image_size': list(evidence.image_size),
-        'camera': None, 'camera_info': None, 'ground_from_camera': None, 'road_directions_in_camera': [],
-        'stddev': None, 'covariance': None, 'paper': None, 'newest_stamp_ns': None,
-        'evidence': {'seconds': evidence.seconds, 'frames': evidence.frames, 'tracks': evidence.tracks,
-                     'segments': evidence.segments, 'vehicles': evidence.vehicles,
-                     'people': evidence.people, 'coverage': evidence.coverage, 'accepted_at_s': accepted_at_s}}
+        'camera': None,
+        'camera_info': None,
+        'ground_from_camera': None,
+        'road_directions_in_camera': [],
+        'stddev': None,
+        'covariance': None,
+        'paper': None,
+        'newest_stamp_ns': None,
+        'evidence': {
+            'seconds': evidence.seconds,
+            'frames': evidence.frames,
+            'tracks': evidence.tracks,
+            'segments': evidence.segments,
+            'vehicles': evidence.vehicles,
+            'people': evidence.people,
+            'coverage': evidence.coverage,
+            'accepted_at_s': accepted_at_s,
+        },
+    }
     if isinstance(result, Refusal):
         document['refusal'] = _refusal_json(result)
     else:
@@ -166,31 +210,52 @@ def _refusal_json(refusal: Refusal | Reason) -> dict[str, str]:
 def _calibration_json(result: Calibration) -> dict[str, Any]:
     camera, info, sigma = result.camera, result.camera_info, result.stddev
     return {
-        'grade': result.grade, 'assumptions': list(result.assumptions), 'checks': list(result.checks),
+        'grade': result.grade,
+        'assumptions': list(result.assumptions),
+        'checks': list(result.checks),
         'refusal': _refusal_json(result.ground_refusal) if result.ground_refusal else None,
-        'camera': {'model': 'kannala_brandt', 'focal_px': camera.focal_px,
-                   'principal_point_px': list(camera.principal_point_px), 'k': list(camera.k)},
-        'camera_info': {'distortion_model': info.distortion_model, 'k': info.k, 'd': info.d, 'r': info.r,
-                        'p': info.p},
-        'ground_from_camera': None if result.ground is None else {
+        'camera': {
+            'model': 'kannala_brandt',
+            'focal_px': camera.focal_px,
+            'principal_point_px': list(camera.principal_point_px),
+            'k': list(camera.k),
+        },
+        'camera_info': {'distortion_model': info.distortion_model, 'k': info.k, 'd': info.d, 'r': info.r, 'p': info.p},
+        'ground_from_camera': None
+        if result.ground is None
+        else {
             'translation_m': result.ground.translation_m.tolist(),
             'rotation_xyzw': result.ground.rotation_xyzw.tolist(),
-            'rotation': np.asarray(result.ground.rotation).tolist()},
+            'rotation': np.asarray(result.ground.rotation).tolist(),
+        },
         'newest_stamp_ns': result.newest_stamp_ns,
         'road_directions_in_camera': np.asarray(result.road_directions).tolist(),
-        'stddev': {'focal_px': sigma.focal_px,
-                   'principal_point_px': None if sigma.principal_point_px is None else list(sigma.principal_point_px),
-                   'k1': sigma.k1, 'tilt_deg': sigma.tilt_deg, 'roll_deg': sigma.roll_deg,
-                   'height_m': sigma.height_m, 'k2': sigma.k2,
-                   'ground_point_m': {f'{distance:g}': value for distance, value in zip(
-                       GROUND_DISTANCES_M, sigma.ground_point_m, strict=False)}},
-        'covariance': None if result.covariance is None else {
-            'of': list(COVARIANCE_PARAMETERS), 'matrix': result.covariance.tolist()},
-        'paper': None if result.paper is None else {
-            'focal_px': result.paper.focal_px, 'polynomial_k': list(result.paper.polynomial_k),
+        'stddev': {
+            'focal_px': sigma.focal_px,
+            'principal_point_px': None if sigma.principal_point_px is None else list(sigma.principal_point_px),
+            'k1': sigma.k1,
+            'tilt_deg': sigma.tilt_deg,
+            'roll_deg': sigma.roll_deg,
+            'height_m': sigma.height_m,
+            'k2': sigma.k2,
+            'ground_point_m': {
+                f'{distance:g}': value
+                for distance, value in zip(GROUND_DISTANCES_M, sigma.ground_point_m, strict=False)
+            },
+        },
+        'covariance': None
+        if result.covariance is None
+        else {'of': list(COVARIANCE_PARAMETERS), 'matrix': result.covariance.tolist()},
+        'paper': None
+        if result.paper is None
+        else {
+            'focal_px': result.paper.focal_px,
+            'polynomial_k': list(result.paper.polynomial_k),
             'straightness_px2': dict(zip(('before', 'after'), result.paper.straightness_px2, strict=True)),
             'focal_from_vanishing_points_px': result.paper.focal_from_vanishing_points_px,
-            'translation_m': None if result.paper.translation_m is None else list(result.paper.translation_m)}}
+            'translation_m': None if result.paper.translation_m is None else list(result.paper.translation_m),
+        },
+    }
 
 
 def calibration_json(result: Calibration | Refusal, *, accepted_at_s: float | None = None) -> str:

@@ -45,8 +45,17 @@ class SavedCamera:
     def of(cls, result: Calibration, rectified: np.ndarray | None = None) -> SavedCamera:
         """Return what a calibration tells."""
         camera = result.camera
-        return cls(width=camera.width, height=camera.height, lens=camera, matrix=camera.matrix, k=camera.k,
-                   rectified=rectified, ground=result.ground, stddev=result.stddev, covariance=result.covariance)
+        return cls(
+            width=camera.width,
+            height=camera.height,
+            lens=camera,
+            matrix=camera.matrix,
+            k=camera.k,
+            rectified=rectified,
+            ground=result.ground,
+            stddev=result.stddev,
+            covariance=result.covariance,
+        )
 
     @classmethod
     def from_opencv_lens(cls, lens: OpencvLens, rectified: np.ndarray | None = None) -> SavedCamera:
@@ -55,8 +64,14 @@ class SavedCamera:
             camera = fit_kannala_brandt(lens)
         except InputError:  # then there is no such lens; it is told by its rays all the same
             camera = None
-        return cls(width=lens.width, height=lens.height, lens=CameraInfoLens(lens), matrix=lens.matrix,
-                   k=None if camera is None else camera.k, rectified=rectified)
+        return cls(
+            width=lens.width,
+            height=lens.height,
+            lens=CameraInfoLens(lens),
+            matrix=lens.matrix,
+            k=None if camera is None else camera.k,
+            rectified=rectified,
+        )
 
     @property
     def focal_px(self) -> float:
@@ -86,18 +101,28 @@ class SavedCamera:
         # borders of the image are scaled, half a pixel outside the centres of its outer pixels
         scale = np.array([[across, 0, (across - 1) / 2], [0, down, (down - 1) / 2], [0, 0, 1]])
         matrix, focal = scale @ self.matrix, np.sqrt(across * down)
-        lens = (self.lens.scaled_to(width, height) if isinstance(self.lens, Camera) else
-                CameraInfoLens(replace(self.lens.full, width=width, height=height, matrix=matrix)))
+        lens = (
+            self.lens.scaled_to(width, height)
+            if isinstance(self.lens, Camera)
+            else CameraInfoLens(replace(self.lens.full, width=width, height=height, matrix=matrix))
+        )
         units = np.array([focal, across, down, *[1.0] * 7])
         point = self.stddev.principal_point_px
         stddev = replace(
-            self.stddev, focal_px=None if self.stddev.focal_px is None else focal * self.stddev.focal_px,
-            principal_point_px=None if point is None else (across * point[0], down * point[1]))
+            self.stddev,
+            focal_px=None if self.stddev.focal_px is None else focal * self.stddev.focal_px,
+            principal_point_px=None if point is None else (across * point[0], down * point[1]),
+        )
         return replace(
-            self, width=width, height=height, lens=lens, stddev=stddev,
+            self,
+            width=width,
+            height=height,
+            lens=lens,
+            stddev=stddev,
             matrix=lens.matrix if isinstance(lens, Camera) else matrix,
             rectified=None if self.rectified is None else scale @ self.rectified,
-            covariance=None if self.covariance is None else self.covariance * np.outer(units, units))
+            covariance=None if self.covariance is None else self.covariance * np.outer(units, units),
+        )
 
 
 def read_saved_camera(path: Path) -> SavedCamera:
@@ -108,8 +133,9 @@ def read_saved_camera(path: Path) -> SavedCamera:
     try:
         return SavedCamera.of(calibration_from_json(document), _rectified_projection(document))
     except InputError as error:
-        raise InputError(f'{path}: {error}; give a calibration.json, NAME.autocalib.json or camera_info.yaml'
-                         ) from error
+        raise InputError(
+            f'{path}: {error}; give a calibration.json, NAME.autocalib.json or camera_info.yaml'
+        ) from error
 
 
 def _rectified_projection(document: Mapping[str, Any]) -> np.ndarray | None:

@@ -87,8 +87,10 @@ def resolve_url(url: str, camera_name: str, environment: Mapping[str, str] = os.
         return Path(rest)
     if scheme.lower() == 'package' and package and inside and not inside.endswith('/'):
         return _share_folder(package, environment) / inside
-    raise UsageError(f"'camera_info_url' is {url!r}, which names no file: write file:///FOLDER/FILE.yaml, "
-                     'package://PACKAGE/FILE.yaml, or nothing for ' + DEFAULT_URL)
+    raise UsageError(
+        f"'camera_info_url' is {url!r}, which names no file: write file:///FOLDER/FILE.yaml, "
+        'package://PACKAGE/FILE.yaml, or nothing for ' + DEFAULT_URL
+    )
 
 
 def _share_folder(package: str, environment: Mapping[str, str]) -> Path:
@@ -97,8 +99,10 @@ def _share_folder(package: str, environment: Mapping[str, str]) -> Path:
     for prefix in map(Path, prefixes):
         if (prefix / 'share' / 'ament_index' / 'resource_index' / 'packages' / package).is_file():
             return prefix / 'share' / package
-    raise UsageError(f"'camera_info_url' names the package '{package}', which no ament index knows: source its "
-                     'workspace, or write file:///FOLDER/FILE.yaml')
+    raise UsageError(
+        f"'camera_info_url' names the package '{package}', which no ament index knows: source its "
+        'workspace, or write file:///FOLDER/FILE.yaml'
+    )
 
 
 class Store:
@@ -135,31 +139,48 @@ class Store:
         lens = _try_read(self.path, read_camera_info_fields)
         current, before = (_try_read(path, _read_stored_json) for path in (self.json_path, _backup(self.json_path)))
         if lens is None:
-            return LoadResult(StoreState.EMPTY, None, '' if current is None else
-                         f'{self.path} is missing beside {self.json_path.name}: nothing is restored')
+            return LoadResult(
+                StoreState.EMPTY,
+                None,
+                '' if current is None else f'{self.path} is missing beside {self.json_path.name}: nothing is restored',
+            )
         if _is_consistent(lens, current):
             return LoadResult(StoreState.INTACT, current)
         if _is_consistent(lens, before):
-            return LoadResult(StoreState.INTERRUPTED, before, f'{self.path} and {self.json_path.name} do not belong together, a write '
-                         'was cut off: the calibration before is taken')
+            return LoadResult(
+                StoreState.INTERRUPTED,
+                before,
+                f'{self.path} and {self.json_path.name} do not belong together, a write '
+                'was cut off: the calibration before is taken',
+            )
         fault = next((item for item in (lens, current) if isinstance(item, InputError)), None)
         if current is None or fault is None:
             why = f' ({lens})' if isinstance(lens, InputError) else ''
-            return LoadResult(StoreState.FOREIGN, None, f'{self.path} was not written by this node, or changed since{why}: it is '
-                         'not published. Give it as camera_info_file to use its lens')
+            return LoadResult(
+                StoreState.FOREIGN,
+                None,
+                f'{self.path} was not written by this node, or changed since{why}: it is '
+                'not published. Give it as camera_info_file to use its lens',
+            )
         if _is_consistent(_try_read(_backup(self.path), read_camera_info_fields), before):
-            return LoadResult(StoreState.CORRUPT, before, f'{fault}: the pair before, {_backup(self.path).name}, is taken')
+            return LoadResult(
+                StoreState.CORRUPT, before, f'{fault}: the pair before, {_backup(self.path).name}, is taken'
+            )
         return LoadResult(StoreState.CORRUPT, None, f'{fault}: nothing is restored')
 
     def _back_up_foreign(self, allowed: bool) -> None:
         """Keep somebody else's YAML, or raise InputError."""
         aside = self.path.with_name(self.path.name + '.orig')
         if not allowed:
-            raise InputError(f'{self.path} was not written by this node, or changed since, and is left alone: call '
-                             f'~/save to replace it and keep it as {aside.name}, or set camera_info_url')
+            raise InputError(
+                f'{self.path} was not written by this node, or changed since, and is left alone: call '
+                f'~/save to replace it and keep it as {aside.name}, or set camera_info_url'
+            )
         if aside.exists():
-            raise InputError(f'{self.path} was not written by this node, or changed since, and {aside.name} is there '
-                             'already: move one of them away')
+            raise InputError(
+                f'{self.path} was not written by this node, or changed since, and {aside.name} is there '
+                'already: move one of them away'
+            )
         keep_copy(self.path, aside)
 
 
@@ -190,8 +211,12 @@ def _read_stored_json(path: Path) -> StoredCalibration:
     whole = read_json(path)
     try:
         kept = whole['stored']
-        return StoredCalibration(calibration_from_json(whole), CameraInfo(**kept['camera_info']), str(kept['camera_name']),
-                      str(kept['image_frame']))
+        return StoredCalibration(
+            calibration_from_json(whole),
+            CameraInfo(**kept['camera_info']),
+            str(kept['camera_name']),
+            str(kept['image_frame']),
+        )
     except AutocalibError as error:
         raise InputError(f'{path}: {error}') from error
     except (KeyError, TypeError) as error:
@@ -206,8 +231,9 @@ def _is_consistent(lens: CameraInfo | InputError | None, stored: StoredCalibrati
     if (lens.width, lens.height, lens.distortion_model) != (ours.width, ours.height, ours.distortion_model):
         return False
     try:
-        return all(math.isclose(a, b, rel_tol=STORED_LENS_TOLERANCE, abs_tol=STORED_LENS_TOLERANCE)
-                   for a, b in zip((*lens.k, *lens.d, *lens.r, *lens.p), (*ours.k, *ours.d, *ours.r, *ours.p),
-                                   strict=True))
+        return all(
+            math.isclose(a, b, rel_tol=STORED_LENS_TOLERANCE, abs_tol=STORED_LENS_TOLERANCE)
+            for a, b in zip((*lens.k, *lens.d, *lens.r, *lens.p), (*ours.k, *ours.d, *ours.r, *ours.p), strict=True)
+        )
     except (TypeError, ValueError):  # other numbers of coefficients, or of another kind
         return False

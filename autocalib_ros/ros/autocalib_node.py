@@ -58,26 +58,52 @@ class AutocalibNode(Node):
         if self._lens is not None:
             camera_info(self._lens, self.options.distortion_model)  # a model that cannot say it is wrong usage at once
         detector = open_detector(self.options.detector)
-        self._headers = Headers(self.node_options, self.get_namespace(), self.get_logger().warning,
-                                lambda: self.get_clock().now().nanoseconds)
+        self._headers = Headers(
+            self.node_options,
+            self.get_namespace(),
+            self.get_logger().warning,
+            lambda: self.get_clock().now().nanoseconds,
+        )
         self._logged_at: dict[str, float] = {}
         self._unreadable = self._withdrawn = ''
         self._recent = RateCounter()
         self._driver = DriverInfo(self, self.node_options)
         self._store = self._open_store('')
-        self.store_writer = StoreWriter(lambda fault: self.get_logger().error(f'the calibration was not saved: {fault}'))
+        self.store_writer = StoreWriter(
+            lambda fault: self.get_logger().error(f'the calibration was not saved: {fault}')
+        )
         self._reports = ReportWriter(lambda text, good: self._say(text, good=good))
         self._upload = DriverUpload(self, self._say) if self.node_options.upload_to_driver else None
-        self.publication = CalibrationPublisher(self, self.options, self.node_options, self._headers, driver=self._driver,
-                                taken=self._on_accepted, withdrawn=self._on_withdrawn)
-        self._pictures = LivePictures(self, self.node_options.debug_rate_hz, self.publication, self._headers,
-                                      ignored=self.options.ignored_polygons, failed=self.failed,
-                                      progress=lambda: self._worker.progress)
+        self.publication = CalibrationPublisher(
+            self,
+            self.options,
+            self.node_options,
+            self._headers,
+            driver=self._driver,
+            taken=self._on_accepted,
+            withdrawn=self._on_withdrawn,
+        )
+        self._pictures = LivePictures(
+            self,
+            self.node_options.debug_rate_hz,
+            self.publication,
+            self._headers,
+            ignored=self.options.ignored_polygons,
+            failed=self.failed,
+            progress=lambda: self._worker.progress,
+        )
         solver = SolverProcess()
-        self._worker = CalibrationWorker(self.options, idle_solve_s=self.node_options.idle_solve_s,
-                                  decode=ImageDecoder().decode, solve=solve or solver, listener=self,
-                                  viewer=self._pictures, lens=self._lens, detector=detector,
-                                  stop_solving=solver.close)
+        self._worker = CalibrationWorker(
+            self.options,
+            idle_solve_s=self.node_options.idle_solve_s,
+            decode=ImageDecoder().decode,
+            solve=solve or solver,
+            listener=self,
+            viewer=self._pictures,
+            lens=self._lens,
+            detector=detector,
+            stop_solving=solver.close,
+        )
         if self._store is not None:
             self._restore(self._store)
         # While a caller waits for a solution or a disk, everything outside its group goes on.
@@ -85,10 +111,12 @@ class AutocalibNode(Node):
         self.create_service(Trigger, '~/save', self._on_save, callback_group=MutuallyExclusiveCallbackGroup())
         self.create_service(Trigger, '~/reset', self._on_reset, callback_group=MutuallyExclusiveCallbackGroup())
         self._input = ImageInput(self, self.node_options, self._on_image)
-        self._live_parameters = LiveParameters(self, self.options, self.node_options, self._change,
-                                    lambda: self.publication.image_size)
-        self._diagnostics = Diagnostics(self, self._situation, lambda: self._headers.camera_name(
-            self.publication.image_frame or DEFAULT_FRAME))
+        self._live_parameters = LiveParameters(
+            self, self.options, self.node_options, self._change, lambda: self.publication.image_size
+        )
+        self._diagnostics = Diagnostics(
+            self, self._situation, lambda: self._headers.camera_name(self.publication.image_frame or DEFAULT_FRAME)
+        )
         self.create_timer(PROGRESS_LOG_PERIOD_S, self._log_progress, clock=Clock(clock_type=ClockType.STEADY_TIME))
         if detector is not None:
             self.get_logger().info(f'vehicles by a {detector}')
@@ -122,8 +150,10 @@ class AutocalibNode(Node):
         self._worker.offer(self._headers.stamp_ns(message.header.stamp), message)
         foreign = self.publication.on_image(message, frame_id)
         if foreign is not None:
-            self.get_logger().warning(f"the restored calibration is of the frame '{foreign.image_frame}', and images "
-                                      f"are of '{frame_id}': it is withdrawn and collecting goes on")
+            self.get_logger().warning(
+                f"the restored calibration is of the frame '{foreign.image_frame}', and images "
+                f"are of '{frame_id}': it is withdrawn and collecting goes on"
+            )
         if self._store is None:
             store = self._store = self._open_store(frame_id)
             self.store_writer.run(lambda: self._restore(store))
@@ -134,8 +164,11 @@ class AutocalibNode(Node):
             return response
         result = await self._wrap_future(self._worker.solve_now())
         response.success = isinstance(result, Calibration)
-        response.message = ('no solution: a reset came in between, no image came since it, or see the log of the node'
-                            if result is None else describe(result))
+        response.message = (
+            'no solution: a reset came in between, no image came since it, or see the log of the node'
+            if result is None
+            else describe(result)
+        )
         return response
 
     async def _on_save(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -149,9 +182,12 @@ class AutocalibNode(Node):
         if error is None and self.publication.published is published:
             self.store_writer.withdraw()  # the same would be written once more
         response.success = error is None
-        response.message = (f'not saved: {error}' if error else
-                            f'saved the {state.value} calibration to {store.path} and {store.json_path}; '
-                            f'the report follows in {store.report}')
+        response.message = (
+            f'not saved: {error}'
+            if error
+            else f'saved the {state.value} calibration to {store.path} and {store.json_path}; '
+            f'the report follows in {store.report}'
+        )
         if error is None:
             self._report(published, store)
         return response
@@ -173,9 +209,11 @@ class AutocalibNode(Node):
         was = self.publication.withdraw()
         self._reports.forget()
         response.success = True
-        response.message = 'the evidence is forgotten' + (
-            '' if was is CalibrationState.NONE else f', the {was.value} calibration is withdrawn') + (
-            '; collecting starts anew')
+        response.message = (
+            'the evidence is forgotten'
+            + ('' if was is CalibrationState.NONE else f', the {was.value} calibration is withdrawn')
+            + ('; collecting starts anew')
+        )
         self.get_logger().info(f'reset: {response.message}')
         return response
 
@@ -198,29 +236,47 @@ class AutocalibNode(Node):
         counts = Counts(**vars(self._worker.counters), lost=self._input.lost)
         unsaved = f'the calibration is not saved: {self.store_writer.fault}' if self.store_writer.fault else ''
         return Situation(
-            topic=self._input.topic, counts=counts, rates_hz=self._recent.rates_hz(time.monotonic(), counts),
+            topic=self._input.topic,
+            counts=counts,
+            rates_hz=self._recent.rates_hz(time.monotonic(), counts),
             result=None if published is None else published.result,
-            restored=self.publication.state is CalibrationState.RESTORED, progress=self._worker.progress,
-            image_age_s=self._input.age_s, encoding=self._input.encoding, silence=self._input.silence,
-            unreadable=self._unreadable, errors=tuple(filter(None, [self._withdrawn, self.publication.conflict])),
-            warnings=tuple(filter(None, [self._other_publishers(), self._driver.check(self.publication.image_size),
-                                         self._input.several_publishers, unsaved])))
+            restored=self.publication.state is CalibrationState.RESTORED,
+            progress=self._worker.progress,
+            image_age_s=self._input.age_s,
+            encoding=self._input.encoding,
+            silence=self._input.silence,
+            unreadable=self._unreadable,
+            errors=tuple(filter(None, [self._withdrawn, self.publication.conflict])),
+            warnings=tuple(
+                filter(
+                    None,
+                    [
+                        self._other_publishers(),
+                        self._driver.check(self.publication.image_size),
+                        self._input.several_publishers,
+                        unsaved,
+                    ],
+                )
+            ),
+        )
 
     def _other_publishers(self) -> str:
         """Say who else publishes where our camera_info goes: two authorities on one lens."""
         topic = self.publication.topic
         if self.count_publishers(topic) < 2:
             return ''
-        names = {f'{info.node_namespace.rstrip("/")}/{info.node_name}' for info in
-                 self.get_publishers_info_by_topic(topic)} - {self.get_fully_qualified_name()}
-        words = (f'{", ".join(sorted(names)) or "a node of the same name"} publishes {topic} too: remap one of them, '
-                 '-r ~/camera_info:=... here')
+        names = {
+            f'{info.node_namespace.rstrip("/")}/{info.node_name}' for info in self.get_publishers_info_by_topic(topic)
+        } - {self.get_fully_qualified_name()}
+        words = (
+            f'{", ".join(sorted(names)) or "a node of the same name"} publishes {topic} too: remap one of them, '
+            '-r ~/camera_info:=... here'
+        )
         self._log_throttled('rivals', words, error=False)
         return words
 
     def _log_progress(self) -> None:
-        if (self.publication.state in (CalibrationState.NONE, CalibrationState.RESTORED)
-                and self._worker.counters.used):
+        if self.publication.state in (CalibrationState.NONE, CalibrationState.RESTORED) and self._worker.counters.used:
             self.get_logger().info(describe_progress(self._worker.progress))
 
     def _open_store(self, image_frame: str) -> Store | None:
@@ -246,8 +302,9 @@ class AutocalibNode(Node):
         self.get_logger().info(f'restored from {store.path}, not yet verified: {describe(restored)}')
 
     def _to_stored(self, published: Published) -> StoredCalibration:
-        return StoredCalibration(published.result, published.fields, self._headers.camera_name(published.image_frame),
-                      published.image_frame)
+        return StoredCalibration(
+            published.result, published.fields, self._headers.camera_name(published.image_frame), published.image_frame
+        )
 
     def _on_accepted(self, published: Published, save: bool) -> None:
         """Give a calibration that this run's traffic vouches for to the store and the driver, where that is wanted."""
@@ -271,8 +328,10 @@ class AutocalibNode(Node):
         if withdrawn is not None:
             state, published = withdrawn
             old_width, old_height = published.result.evidence.image_size
-            self._withdrawn = (f'the {state.value} calibration is of images of {old_width}x{old_height}, these have '
-                               f'{width}x{height}: it is withdrawn')
+            self._withdrawn = (
+                f'the {state.value} calibration is of images of {old_width}x{old_height}, these have '
+                f'{width}x{height}: it is withdrawn'
+            )
             self.get_logger().warning(f'{self._withdrawn} and collecting starts anew')
 
     def on_evidence_reset(self, why: str) -> None:

@@ -57,8 +57,9 @@ def camera_nodes(tree: Any, folder: Path) -> list[CameraNode]:
     _require_known(tree, ('defaults', 'cameras'))
     defaults = _camera(tree.get('defaults') or {}, 'defaults')
     cameras = [_camera(item, f'camera {number}') for number, item in enumerate(tree['cameras'], 1)]
-    cameras = [{**defaults, **camera, 'parameters': {**defaults['parameters'], **camera['parameters']}}
-               for camera in cameras]
+    cameras = [
+        {**defaults, **camera, 'parameters': {**defaults['parameters'], **camera['parameters']}} for camera in cameras
+    ]
     for number, camera in enumerate(cameras, 1):
         name = camera.get('namespace')
         if not isinstance(name, str) or not NAMESPACE.fullmatch(name):
@@ -82,8 +83,9 @@ def _require_known(given: Mapping[str, Any], known: tuple[str, ...]) -> None:
     for name in given:
         if name not in known:
             near = get_close_matches(str(name), known, n=1)
-            raise UsageError(f"unknown entry '{name}': " + (f"did you mean '{near[0]}'?" if near else
-                                                           f'one of {", ".join(known)}'))
+            raise UsageError(
+                f"unknown entry '{name}': " + (f"did you mean '{near[0]}'?" if near else f'one of {", ".join(known)}')
+            )
 
 
 def _require_unique(cameras: list[dict[str, Any]]) -> None:
@@ -93,8 +95,9 @@ def _require_unique(cameras: list[dict[str, Any]]) -> None:
         for camera in cameras:
             value = of_camera(camera)
             if value in seen:
-                raise UsageError(f"cameras '{seen[value]}' and '{camera['namespace']}' share the {what} '{value}': "
-                                 'give each its own')
+                raise UsageError(
+                    f"cameras '{seen[value]}' and '{camera['namespace']}' share the {what} '{value}': give each its own"
+                )
             seen[value] = camera['namespace']
 
 
@@ -103,7 +106,7 @@ def _name(camera: dict[str, Any]) -> str:
 
 
 def _resolved(camera: dict[str, Any], topic: str) -> str:
-    return topic if topic.startswith('/') else f"/{camera['namespace'].strip('/')}/{topic}"
+    return topic if topic.startswith('/') else f'/{camera["namespace"].strip("/")}/{topic}'
 
 
 UNIQUE_BY = {
@@ -120,8 +123,12 @@ def _node(camera: dict[str, Any], folder: Path) -> CameraNode:
     values = camera['parameters']
     if 'camera_height' in camera:
         values = {**values, 'camera_height': camera['camera_height']}
-    floats = {item.name for options in (Options(), NodeOptions()) for item in walk_options(options)
-              if isinstance(item.default, float)}
+    floats = {
+        item.name
+        for options in (Options(), NodeOptions())
+        for item in walk_options(options)
+        if isinstance(item.default, float)
+    }
     # ROS refuses 8 where 8.0 is meant; in a file of our own it is plain what is meant.
     values = {name: float(value) if name in floats and type(value) is int else value for name, value in values.items()}
     parameters: list[str | dict[str, Any]] = []

@@ -14,7 +14,7 @@ from autocalib_ros.errors import UsageError
 
 ROS_PARAMETERS = ('use_sim_time', 'start_type_description_service')
 """Parameters that rclpy declares for every node."""
-INT64_MAX = 2 ** 63 - 1
+INT64_MAX = 2**63 - 1
 
 
 def declare_parameters(node: Node) -> tuple[Options, NodeOptions]:
@@ -23,8 +23,11 @@ def declare_parameters(node: Node) -> tuple[Options, NodeOptions]:
     The node has to be created with `automatically_declare_parameters_from_overrides=True`: rclpy has no
     other public way to see a parameter that was given but that nobody declares, a misspelt one.
     """
-    given = {name: parameter.value for name, parameter in node.get_parameters_by_prefix('').items()
-             if name not in ROS_PARAMETERS and not name.startswith('qos_overrides.')}
+    given = {
+        name: parameter.value
+        for name, parameter in node.get_parameters_by_prefix('').items()
+        if name not in ROS_PARAMETERS and not name.startswith('qos_overrides.')
+    }
     options, node_options = read(given)
     for item in (*walk_options(Options()), *walk_options(NodeOptions())):
         if item.name in given:
@@ -41,8 +44,10 @@ def read(given: dict[str, Any]) -> tuple[Options, NodeOptions]:
             raise UsageError(unknown_parameter(name))
         require_float(items[name], value)
     of_node = {item.name for item in walk_options(NodeOptions())}
-    return (with_overrides(Options(), {name: value for name, value in given.items() if name not in of_node}),
-            with_overrides(NodeOptions(), {name: value for name, value in given.items() if name in of_node}))
+    return (
+        with_overrides(Options(), {name: value for name, value in given.items() if name not in of_node}),
+        with_overrides(NodeOptions(), {name: value for name, value in given.items() if name in of_node}),
+    )
 
 
 def unknown_parameter(name: str) -> str:

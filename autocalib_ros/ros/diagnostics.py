@@ -27,8 +27,16 @@ class Diagnostics:
 
     def _publish(self) -> None:
         told = status(self._situation())
-        message = DiagnosticArray(status=[DiagnosticStatus(
-            level=bytes([told.level]), name=self._name, message=told.message, hardware_id=self._hardware_id(),
-            values=[KeyValue(key=key, value=value) for key, value in told.values])])
+        message = DiagnosticArray(
+            status=[
+                DiagnosticStatus(
+                    level=bytes([told.level]),
+                    name=self._name,
+                    message=told.message,
+                    hardware_id=self._hardware_id(),
+                    values=[KeyValue(key=key, value=value) for key, value in told.values],
+                )
+            ]
+        )
         message.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(validated(message))

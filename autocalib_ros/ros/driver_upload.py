@@ -62,8 +62,10 @@ class DriverUpload:
         if not self._client.service_is_ready():
             if now - self._warned_at > NO_DRIVER_REMINDER_S:
                 self._warned_at = now
-                self._say(f'no driver serves {self._name}: remap it with '
-                          '-r set_camera_info:=/your/driver/set_camera_info', good=False)
+                self._say(
+                    f'no driver serves {self._name}: remap it with -r set_camera_info:=/your/driver/set_camera_info',
+                    good=False,
+                )
             return
         with self._lock:
             message, self._pending = self._pending, None

@@ -58,11 +58,14 @@ class GroundPointsNode(Node):
             return
         try:
             # A calibration may be replaced at any time. To build from it takes less time than to see whether it was.
-            ground = Ground.from_messages(self._info, self._transform,
-                                          camera_frame=self.get_parameter('camera_frame').value)
+            ground = Ground.from_messages(
+                self._info, self._transform, camera_frame=self.get_parameter('camera_frame').value
+            )
             if message.header.frame_id != self._info.header.frame_id:
-                raise InputError(f"their frame is '{message.header.frame_id}' and that of the calibration"
-                                 f" '{self._info.header.frame_id}': send them with the header of the image")
+                raise InputError(
+                    f"their frame is '{message.header.frame_id}' and that of the calibration"
+                    f" '{self._info.header.frame_id}': send them with the header of the image"
+                )
         except InputError as error:
             self._warn(f'pixels are left out: {error}')
             return
@@ -77,11 +80,21 @@ class GroundPointsNode(Node):
 def cloud(points_m: np.ndarray, cloud_header: Header) -> PointCloud2:
     """Return points (n, 3) as a PointCloud2 of x, y, z in single precision."""
     values = points_m.astype('<f4')
-    fields = [PointField(name=name, offset=4 * place, datatype=PointField.FLOAT32, count=1)
-              for place, name in enumerate('xyz')]
-    return PointCloud2(header=cloud_header, height=1, width=len(values), fields=fields, is_bigendian=False,
-                       point_step=12, row_step=12 * len(values), data=array('B', values.tobytes()),
-                       is_dense=bool(np.isfinite(values).all()))
+    fields = [
+        PointField(name=name, offset=4 * place, datatype=PointField.FLOAT32, count=1)
+        for place, name in enumerate('xyz')
+    ]
+    return PointCloud2(
+        header=cloud_header,
+        height=1,
+        width=len(values),
+        fields=fields,
+        is_bigendian=False,
+        point_step=12,
+        row_step=12 * len(values),
+        data=array('B', values.tobytes()),
+        is_dense=bool(np.isfinite(values).all()),
+    )
 
 
 def main(args: list[str] | None = None) -> int:

@@ -18,8 +18,9 @@ MAX_REPEATED_STAMPS = 30
 class Headers:
     """Stamps and frames of one camera; `warn` and `now_ns` come from the node."""
 
-    def __init__(self, options: NodeOptions, namespace: str, warn: Callable[[str], None],
-                 now_ns: Callable[[], int]) -> None:
+    def __init__(
+        self, options: NodeOptions, namespace: str, warn: Callable[[str], None], now_ns: Callable[[], int]
+    ) -> None:
         self._options, self._namespace, self._warn, self._now_ns = options, namespace.strip('/'), warn, now_ns
         self._warned: set[str] = set()
         self._given_ns, self._repeats = -1, 0
@@ -27,7 +28,8 @@ class Headers:
     def stamp_ns(self, stamp: Time) -> int:
         """Return the time of an image in nanoseconds.
 
-        That is the time of receipt when the driver sets none, and for good once it gave `MAX_REPEATED_STAMPS` images one.
+        That is the time of receipt when the driver sets none, and for good once it gave `MAX_REPEATED_STAMPS` images
+        one.
         """
         given_ns = stamp_ns(stamp)
         if not given_ns:
@@ -38,7 +40,9 @@ class Headers:
             self._given_ns = given_ns
         if self._repeats < MAX_REPEATED_STAMPS:
             return given_ns
-        self._warn_once(f'{MAX_REPEATED_STAMPS} images in a row carry one time stamp: the time of receipt is used from now on')
+        self._warn_once(
+            f'{MAX_REPEATED_STAMPS} images in a row carry one time stamp: the time of receipt is used from now on'
+        )
         return self._now_ns()
 
     def frame_id(self, given: str) -> str:

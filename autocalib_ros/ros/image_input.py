@@ -66,8 +66,14 @@ class ImageInput:
     def several_publishers(self) -> str:
         """Say that several publishers share the topic, '' where they do not: nothing tells their images apart."""
         names = sorted(offer.node for offer in self.offers if offer.type_name == self._type_name())
-        return '' if len(names) < 2 else (f'{len(names)} publishers share {self.topic} ({", ".join(names)}): images of '
-                                          'two cameras cannot be told apart')
+        return (
+            ''
+            if len(names) < 2
+            else (
+                f'{len(names)} publishers share {self.topic} ({", ".join(names)}): images of '
+                'two cameras cannot be told apart'
+            )
+        )
 
     def _check_publishers(self) -> None:
         publishers = self._node.get_publishers_info_by_topic(self.topic)
@@ -95,18 +101,22 @@ class ImageInput:
         profile = QoSProfile(depth=QUEUE_DEPTH, history=HistoryPolicy.KEEP_LAST, reliability=reliability)
         events = SubscriptionEventCallbacks(incompatible_qos=self._on_incompatible, message_lost=self._on_lost)
         self._subscription = self._node.create_subscription(
-            self._type, self.topic, self._take, profile, event_callbacks=events)
+            self._type, self.topic, self._take, profile, event_callbacks=events
+        )
         self._node.get_logger().info(f'subscribed to {self.topic} ({self._type_name()}, {reliability.name.lower()})')
 
     def _on_incompatible(self, event: Any) -> None:
         """Tell it: with image_reliability auto the next look at the publishers mends it, else a person has to."""
         policy = qos_policy_name_from_kind(event.last_policy_kind)
         if self._requested is None:
-            self._node.get_logger().info(f'a publisher of {self.topic} offers another {policy}: it is matched within '
-                                         f'{PUBLISHER_POLL_S:g} s')
+            self._node.get_logger().info(
+                f'a publisher of {self.topic} offers another {policy}: it is matched within {PUBLISHER_POLL_S:g} s'
+            )
         else:
-            self._node.get_logger().warning(f'a publisher of {self.topic} offers less {policy} than this node asks '
-                                            'for, and nothing comes from it: set image_reliability:=auto')
+            self._node.get_logger().warning(
+                f'a publisher of {self.topic} offers less {policy} than this node asks '
+                'for, and nothing comes from it: set image_reliability:=auto'
+            )
 
     def _on_lost(self, event: Any) -> None:
         self.lost += event.total_count_change
@@ -123,8 +133,12 @@ class ImageInput:
             return
         other_offers = self._node.get_publishers_info_by_topic(other_transport_topic(self.topic, self._type_name()))
         self.silence = diagnose(
-            self.topic, self._type_name(), self.offers, asks_reliable=self._reliability == ReliabilityPolicy.RELIABLE,
-            other_offers=[_offer(publisher) for publisher in other_offers])
+            self.topic,
+            self._type_name(),
+            self.offers,
+            asks_reliable=self._reliability == ReliabilityPolicy.RELIABLE,
+            other_offers=[_offer(publisher) for publisher in other_offers],
+        )
         words, warned_at = self._last_warning or ('', -NO_IMAGE_REMINDER_S)
         if words == self.silence.words and now - warned_at < NO_IMAGE_REMINDER_S:
             return

@@ -19,8 +19,14 @@ Changed = Callable[[Options, NodeOptions], None]
 class LiveParameters:
     """The options in force; `changed` is called with the new ones, `image_size` tells that of the images so far."""
 
-    def __init__(self, node: Node, options: Options, node_options: NodeOptions, changed: Changed,
-                 image_size: Callable[[], tuple[int, int] | None]) -> None:
+    def __init__(
+        self,
+        node: Node,
+        options: Options,
+        node_options: NodeOptions,
+        changed: Changed,
+        image_size: Callable[[], tuple[int, int] | None],
+    ) -> None:
         self.options, self.node_options = options, node_options
         self._node, self._changed, self._image_size = node, changed, image_size
         node.add_on_set_parameters_callback(self._check)
@@ -51,8 +57,9 @@ class LiveParameters:
             self._changed(options, node_options)
 
 
-def changed_options(options: Options, node_options: NodeOptions,
-                    values: Mapping[str, Any]) -> tuple[Options, NodeOptions]:
+def changed_options(
+    options: Options, node_options: NodeOptions, values: Mapping[str, Any]
+) -> tuple[Options, NodeOptions]:
     """Return the options with other values by full name; names that are no options are left to ROS.
 
     UsageError for what cannot change while the node runs, or cannot be used.
@@ -64,10 +71,14 @@ def changed_options(options: Options, node_options: NodeOptions,
             continue
         require_float(item, value)
         if not is_reconfigurable(name) and value != item.default:
-            raise UsageError(f"'{name}' cannot change while the node runs, what it holds rests on it: start the node "
-                             f'with -p {name}:={value}')
-    return (with_overrides(options, {name: value for name, value in values.items() if name in core}),
-            with_overrides(node_options, {name: value for name, value in values.items() if name in of_node}))
+            raise UsageError(
+                f"'{name}' cannot change while the node runs, what it holds rests on it: start the node "
+                f'with -p {name}:={value}'
+            )
+    return (
+        with_overrides(options, {name: value for name, value in values.items() if name in core}),
+        with_overrides(node_options, {name: value for name, value in values.items() if name in of_node}),
+    )
 
 
 def _values(parameters: list[Parameter]) -> dict[str, Any]:

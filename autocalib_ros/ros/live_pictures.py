@@ -56,8 +56,17 @@ class LivePictures:
     program.
     """
 
-    def __init__(self, node: Node, rate_hz: float, publication: CalibrationPublisher, headers: Headers, *, ignored: Polygons,
-                 progress: Callable[[], CalibrationProgress | None], failed: Callable[[Exception], None]) -> None:
+    def __init__(
+        self,
+        node: Node,
+        rate_hz: float,
+        publication: CalibrationPublisher,
+        headers: Headers,
+        *,
+        ignored: Polygons,
+        progress: Callable[[], CalibrationProgress | None],
+        failed: Callable[[Exception], None],
+    ) -> None:
         self.rate_hz, self._ignored = rate_hz, ignored
         self._publication, self._headers, self._progress, self._failed = publication, headers, progress, failed
         self._debug_image = _picture_publisher(node, '~/debug_image')
@@ -78,7 +87,8 @@ class LivePictures:
         """Take an image, grey or BGR, where somebody looks and it is time; it is not changed, nor copied here."""
         debug = self._debug_image.get_subscription_count() > 0
         views = self._publication.published is not None and (
-            self._top_view.get_subscription_count() > 0 or self._image_rect.get_subscription_count() > 0)
+            self._top_view.get_subscription_count() > 0 or self._image_rect.get_subscription_count() > 0
+        )
         now = time.monotonic()
         if not (debug or views) or now < self._due_s:
             return
@@ -93,8 +103,9 @@ class LivePictures:
     def solution_found(self, result: Calibration | Refusal, evidence: Evidence) -> None:
         """Show from now on what became of the tracks in a solution; a refusal says nothing of them."""
         if isinstance(result, Calibration):
-            self._labelled_tracks = LabelledTracks(evidence.image_size, evidence.points_px, evidence.track_starts,
-                                        result.figures.track_labels)
+            self._labelled_tracks = LabelledTracks(
+                evidence.image_size, evidence.points_px, evidence.track_starts, result.figures.track_labels
+            )
 
     def forget(self) -> None:
         """Show nothing of an earlier solution, nor an image from before."""
@@ -161,7 +172,8 @@ class _Cached:
     def of(self, *values: Any) -> Any:
         """Return what is made of values."""
         same = self._of is not None and all(
-            new is old or (isinstance(new, tuple) and new == old) for new, old in zip(values, self._of, strict=True))
+            new is old or (isinstance(new, tuple) and new == old) for new, old in zip(values, self._of, strict=True)
+        )
         if not same:
             self._made, self._of = None, None  # not both at a time: tables are large
             self._made, self._of = self._make(*values), values
@@ -175,7 +187,9 @@ def caption_of(state: CalibrationState, result: Calibration | None, progress: Ca
     numbers = ', '.join(describe_numbers(result))
     if state is CalibrationState.RESTORED:
         title, missing = _collecting(progress)
-        return Caption(f'RESTORED, not yet verified, grade {result.grade}', f'{numbers}; {title}: {missing}', WAITING_COLOUR)
+        return Caption(
+            f'RESTORED, not yet verified, grade {result.grade}', f'{numbers}; {title}: {missing}', WAITING_COLOUR
+        )
     return Caption(f'CALIBRATED, grade {result.grade}', numbers, VERIFIED_COLOUR)
 
 
@@ -191,8 +205,15 @@ def image_message(picture: np.ndarray, image_header: Header) -> Image:
     height, width = picture.shape[:2]
     data = array('B')
     data.frombytes(memoryview(np.ascontiguousarray(picture)).cast('B'))
-    return Image(header=image_header, height=height, width=width, encoding='mono8' if picture.ndim == 2 else 'bgr8',
-                 is_bigendian=0, step=picture.strides[0], data=data)
+    return Image(
+        header=image_header,
+        height=height,
+        width=width,
+        encoding='mono8' if picture.ndim == 2 else 'bgr8',
+        is_bigendian=0,
+        step=picture.strides[0],
+        data=data,
+    )
 
 
 def _picture_publisher(node: Node, topic: str) -> Publisher:

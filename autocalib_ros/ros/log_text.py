@@ -32,8 +32,10 @@ def describe_numbers(result: Calibration) -> list[str]:
     parts = [f'focal length {result.camera.focal_px:.2f} px{_sigma_text(sigma.focal_px)}']
     if result.ground is not None:
         unit = 'm' if result.ground.metric else '(units of the camera height)'
-        parts += [f'tilt {tilt_deg(result.ground):.2f} deg{_sigma_text(sigma.tilt_deg)}',
-                  f'height {result.ground.height_m:g} {unit}{_sigma_text(sigma.height_m)}']
+        parts += [
+            f'tilt {tilt_deg(result.ground):.2f} deg{_sigma_text(sigma.tilt_deg)}',
+            f'height {result.ground.height_m:g} {unit}{_sigma_text(sigma.height_m)}',
+        ]
     elif result.ground_refusal is not None:
         parts.append(f'no ground plane ({result.ground_refusal.code}): {result.ground_refusal.message}')
     info = result.camera_info

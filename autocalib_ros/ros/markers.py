@@ -19,7 +19,12 @@ LETTER_HEIGHT_HEIGHTS = 0.06
 """Width of lines and height of letters, units of the camera's height."""
 LIFT_HEIGHTS = 0.003
 """Ellipses are drawn so far above the grid, units of the camera's height, or both would flicker."""
-GRID_COLOUR, FIELD_OF_VIEW_COLOUR, UNCERTAINTY_COLOUR, TEXT_COLOUR = (0.8, 0.8, 0.8, 0.6), (1.0, 0.88, 0.3, 1.0), (1.0, 0.48, 0.84, 1.0), (1.0, 1.0, 1.0, 1.0)
+GRID_COLOUR, FIELD_OF_VIEW_COLOUR, UNCERTAINTY_COLOUR, TEXT_COLOUR = (
+    (0.8, 0.8, 0.8, 0.6),
+    (1.0, 0.88, 0.3, 1.0),
+    (1.0, 0.48, 0.84, 1.0),
+    (1.0, 1.0, 1.0, 1.0),
+)
 """Colours: red, green, blue, opacity."""
 
 
@@ -36,9 +41,14 @@ def markers(result: Calibration, ground_frame: str) -> MarkerArray:
     camera, ground = result.camera, result.ground
     shown, unit_m = error_ellipses(result), ground.height_m
     grid = GroundGrid.of(camera, ground)
-    made = [] if grid is None else [
-        _lines('grid', [line[[0, -1]] for line in grid.lines_m], GRID_COLOUR, 0.5 * LINE_WIDTH_HEIGHTS * unit_m)]
-    made.append(_lines('field_of_view', view_frustum(camera, ground), FIELD_OF_VIEW_COLOUR, LINE_WIDTH_HEIGHTS * unit_m))
+    made = (
+        []
+        if grid is None
+        else [_lines('grid', [line[[0, -1]] for line in grid.lines_m], GRID_COLOUR, 0.5 * LINE_WIDTH_HEIGHTS * unit_m)]
+    )
+    made.append(
+        _lines('field_of_view', view_frustum(camera, ground), FIELD_OF_VIEW_COLOUR, LINE_WIDTH_HEIGHTS * unit_m)
+    )
     made += _uncertainty(shown, unit_m)
     made.append(_text('state', 0, _words(result, grid, shown), ground.translation_m + [0, 0, 0.5 * unit_m], unit_m))
     for marker in made:
@@ -57,8 +67,9 @@ def _uncertainty(shown: Sequence[ErrorEllipse], unit_m: float) -> Iterator[Marke
         marker.points = _points(outline)
         yield marker
         place = np.array([*ellipse.centre_m, LETTER_HEIGHT_HEIGHTS * unit_m])
-        yield _text('uncertainty_text', number, f'{ellipse.distance_m:g} m: sigma {ellipse.sigma_m:.2g} m', place,
-                    unit_m)
+        yield _text(
+            'uncertainty_text', number, f'{ellipse.distance_m:g} m: sigma {ellipse.sigma_m:.2g} m', place, unit_m
+        )
 
 
 def _words(result: Calibration, grid: GroundGrid | None, shown: Sequence[ErrorEllipse]) -> str:
@@ -90,8 +101,9 @@ def _text(namespace: str, number: int, text: str, place_m: np.ndarray, unit_m: f
 
 def _marker(namespace: str, number: int, kind: int, colour: tuple[float, ...]) -> Marker:
     red, green, blue, opacity = colour
-    marker = Marker(ns=namespace, id=number, type=kind, action=Marker.ADD,
-                    color=ColorRGBA(r=red, g=green, b=blue, a=opacity))
+    marker = Marker(
+        ns=namespace, id=number, type=kind, action=Marker.ADD, color=ColorRGBA(r=red, g=green, b=blue, a=opacity)
+    )
     marker.pose.orientation.w = 1.0
     return marker
 

@@ -49,8 +49,9 @@ def header(stamp: Time, frame_id: str) -> Header:
     return Header(stamp=Time(sec=stamp.sec, nanosec=stamp.nanosec), frame_id=frame_id)
 
 
-def camera_info_message(fields: CameraInfoFields, stamp: Time, frame_id: str,
-                        driver: CameraInfo | None = None) -> CameraInfo:
+def camera_info_message(
+    fields: CameraInfoFields, stamp: Time, frame_id: str, driver: CameraInfo | None = None
+) -> CameraInfo:
     """Return the CameraInfo of an image with that stamp and frame.
 
     With the driver's own message its binning and region of interest are copied, and all else is in the full
@@ -60,31 +61,53 @@ def camera_info_message(fields: CameraInfoFields, stamp: Time, frame_id: str,
     if driver is not None:
         fields = to_full_resolution(fields, readout(driver))
         roi = driver.roi
-        operation = {'binning_x': driver.binning_x, 'binning_y': driver.binning_y, 'roi': RegionOfInterest(
-            x_offset=roi.x_offset, y_offset=roi.y_offset, height=roi.height, width=roi.width,
-            do_rectify=roi.do_rectify)}
+        operation = {
+            'binning_x': driver.binning_x,
+            'binning_y': driver.binning_y,
+            'roi': RegionOfInterest(
+                x_offset=roi.x_offset,
+                y_offset=roi.y_offset,
+                height=roi.height,
+                width=roi.width,
+                do_rectify=roi.do_rectify,
+            ),
+        }
     return CameraInfo(
-        header=header(stamp, frame_id), width=int(fields.width), height=int(fields.height),
-        distortion_model=str(fields.distortion_model), d=[float(value) for value in fields.d],
-        k=[float(value) for value in fields.k], r=[float(value) for value in fields.r],
-        p=[float(value) for value in fields.p], **operation)
+        header=header(stamp, frame_id),
+        width=int(fields.width),
+        height=int(fields.height),
+        distortion_model=str(fields.distortion_model),
+        d=[float(value) for value in fields.d],
+        k=[float(value) for value in fields.k],
+        r=[float(value) for value in fields.r],
+        p=[float(value) for value in fields.p],
+        **operation,
+    )
 
 
 def readout(driver: CameraInfo) -> Readout:
     """Return what a driver says about the pixels that it sends."""
-    return Readout(driver.width, driver.height, (driver.binning_x, driver.binning_y),
-                   (driver.roi.x_offset, driver.roi.y_offset), (driver.roi.width, driver.roi.height))
+    return Readout(
+        driver.width,
+        driver.height,
+        (driver.binning_x, driver.binning_y),
+        (driver.roi.x_offset, driver.roi.y_offset),
+        (driver.roi.width, driver.roi.height),
+    )
 
 
-def ground_transform_message(ground: GroundPlane, stamp: Time, ground_frame: str, camera_frame: str,
-                             tf_parent: str = 'ground') -> TransformStamped:
+def ground_transform_message(
+    ground: GroundPlane, stamp: Time, ground_frame: str, camera_frame: str, tf_parent: str = 'ground'
+) -> TransformStamped:
     """Return the pose between camera and ground: a point in the child's frame goes to the parent's."""
     pose = ground.transform(ground_frame, camera_frame, tf_parent)
     x, y, z = (float(value) for value in pose.translation_m)
     qx, qy, qz, qw = (float(value) for value in pose.rotation_xyzw)
     return TransformStamped(
-        header=header(stamp, pose.parent), child_frame_id=pose.child,
-        transform=Transform(translation=Vector3(x=x, y=y, z=z), rotation=Quaternion(x=qx, y=qy, z=qz, w=qw)))
+        header=header(stamp, pose.parent),
+        child_frame_id=pose.child,
+        transform=Transform(translation=Vector3(x=x, y=y, z=z), rotation=Quaternion(x=qx, y=qy, z=qz, w=qw)),
+    )
 
 
 def validated(message: Message) -> Message:
@@ -107,7 +130,7 @@ def _check_value(value: Any, kind: str, path: str) -> None:
         return  # it cannot hold anything else, and may be long
     if kind.startswith('sequence<'):
         for item in _listed(value, path):
-            _check_value(item, kind[len('sequence<'):-1].partition(',')[0], path)
+            _check_value(item, kind[len('sequence<') : -1].partition(',')[0], path)
     elif kind.endswith(']'):
         element, _, length = kind[:-1].partition('[')
         items = _listed(value, path)
@@ -127,7 +150,7 @@ def _check_scalar(value: Any, kind: str, path: str) -> None:
     elif kind in INTEGER_BITS:
         _require(type(value) is int, path, f'is a {type(value).__name__}, not an int')
         bits, unsigned = INTEGER_BITS[kind], kind.startswith('u')
-        low, high = (0, 2 ** bits) if unsigned else (-2 ** (bits - 1), 2 ** (bits - 1))
+        low, high = (0, 2**bits) if unsigned else (-(2 ** (bits - 1)), 2 ** (bits - 1))
         _require(low <= value < high, path, f'is {value}, which is not a {kind}')
     elif kind == 'boolean':
         _require(type(value) is bool, path, f'is a {type(value).__name__}, not a bool')
@@ -155,8 +178,11 @@ def _check_camera_info(info: CameraInfo) -> None:
     for field, matrix, columns in (('k', info.k, 3), ('p', info.p, 4)):
         _require(matrix[0] > 0 and matrix[columns + 1] > 0, f'{path}.{field}', 'has no positive focal length')
     roi = info.roi
-    _require(roi.x_offset + roi.width <= info.width and roi.y_offset + roi.height <= info.height, f'{path}.roi',
-             f'reaches beyond the {info.width}x{info.height} pixels of the sensor')
+    _require(
+        roi.x_offset + roi.width <= info.width and roi.y_offset + roi.height <= info.height,
+        f'{path}.roi',
+        f'reaches beyond the {info.width}x{info.height} pixels of the sensor',
+    )
 
 
 def _check_transform(stamped: TransformStamped) -> None:
@@ -165,7 +191,7 @@ def _check_transform(stamped: TransformStamped) -> None:
     _check_frame(stamped.child_frame_id, f'{path}.child_frame_id')
     _require(stamped.header.frame_id != stamped.child_frame_id, path, 'joins a frame with itself')
     q = stamped.transform.rotation
-    norm = math.sqrt(q.x ** 2 + q.y ** 2 + q.z ** 2 + q.w ** 2)
+    norm = math.sqrt(q.x**2 + q.y**2 + q.z**2 + q.w**2)
     _require(abs(norm - 1) < TF2_QUATERNION_TOLERANCE, f'{path}.transform.rotation', f'has the length {norm}')
 
 
@@ -186,5 +212,8 @@ def _require(holds: bool, path: str, what: str) -> None:
 
 
 SEMANTIC_CHECKS: dict[str, Callable[[Any], None]] = {
-    'CameraInfo': _check_camera_info, 'TransformStamped': _check_transform, 'TFMessage': _check_transforms}
+    'CameraInfo': _check_camera_info,
+    'TransformStamped': _check_transform,
+    'TFMessage': _check_transforms,
+}
 """What a message has to mean beyond the types of its fields."""

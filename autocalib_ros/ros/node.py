@@ -20,8 +20,10 @@ if TYPE_CHECKING:
     from autocalib_ros.ros.autocalib_node import AutocalibNode
 
 USAGE = 'usage: autocalib_node --ros-args -p camera_height:=METRES -r image:=IMAGE_TOPIC [--params-file FILE]'
-NO_ROS = ("autocalib_node: ROS 2 is not there ({}): pip install 'autocalib_ros[ros]', "
-          'or apt install ros-jazzy-ros-base and source /opt/ros/jazzy/setup.bash')
+NO_ROS = (
+    "autocalib_node: ROS 2 is not there ({}): pip install 'autocalib_ros[ros]', "
+    'or apt install ros-jazzy-ros-base and source /opt/ros/jazzy/setup.bash'
+)
 WRONG_USAGE = 2
 
 
@@ -48,6 +50,7 @@ def _run(args: list[str]) -> None:
     import rclpy
 
     from autocalib_ros.ros.autocalib_node import AutocalibNode
+
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
@@ -68,6 +71,7 @@ def _init(args: list[str]) -> None:
     import rclpy
     from rclpy.signals import SignalHandlerOptions
     from rclpy.utilities import remove_ros_args
+
     try:
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
         left = remove_ros_args(args)[1:]
@@ -80,6 +84,7 @@ def _init(args: list[str]) -> None:
 def _create(node_type: type[AutocalibNode]) -> AutocalibNode:
     """Create the node, or raise UsageError at a parameter that rclpy itself refuses."""
     from rclpy.exceptions import ParameterException
+
     try:
         return node_type()
     except ParameterException as error:
@@ -94,6 +99,7 @@ def _spin(node: AutocalibNode, stop: threading.Event) -> None:
     """
     from rclpy.executors import SingleThreadedExecutor
     from rclpy.task import Future
+
     executor, finished = SingleThreadedExecutor(), Future()
     executor.add_node(node)
     with ThreadPoolExecutor(max_workers=1) as pool:

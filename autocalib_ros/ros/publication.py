@@ -46,8 +46,17 @@ class CalibrationPublisher:
     new; `withdrawn()` that there is none any more. Both are called with the lock held, in the order of events.
     """
 
-    def __init__(self, node: Node, options: Options, node_options: NodeOptions, headers: Headers, *,
-                 driver: DriverInfo, taken: Callable[[Published, bool], None], withdrawn: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        node: Node,
+        options: Options,
+        node_options: NodeOptions,
+        headers: Headers,
+        *,
+        driver: DriverInfo,
+        taken: Callable[[Published, bool], None],
+        withdrawn: Callable[[], None],
+    ) -> None:
         self.options, self._headers = options, headers
         self._node, self._driver, self._taken, self._withdrawn = node, driver, taken, withdrawn
         self._per_image = node_options.camera_info_mode == 'per_image'
@@ -60,7 +69,9 @@ class CalibrationPublisher:
         """Of the newest image that was decoded."""
         self._camera_info = latched_publisher(node, CameraInfo, '~/camera_info')
         self._markers = latched_publisher(node, MarkerArray, '~/markers')
-        self._transforms = GroundTransformPublisher(node, tf_parent=options.tf_parent, publish_tf=node_options.publish_tf)
+        self._transforms = GroundTransformPublisher(
+            node, tf_parent=options.tf_parent, publish_tf=node_options.publish_tf
+        )
 
     def change(self, options: Options, node_options: NodeOptions) -> None:
         """Publish by other options from now on."""
@@ -91,7 +102,9 @@ class CalibrationPublisher:
 
     def _on_new_frame(self, image_frame: str) -> Published | None:
         self.image_frame = image_frame
-        self._transforms.announce_frames(self._headers.ground_frame(image_frame), self._headers.camera_frame(image_frame))
+        self._transforms.announce_frames(
+            self._headers.ground_frame(image_frame), self._headers.camera_frame(image_frame)
+        )
         published = self.published
         if self.state is not CalibrationState.RESTORED or published.image_frame == image_frame:
             return None
@@ -121,7 +134,9 @@ class CalibrationPublisher:
             decision = reconcile(state, before.result if before else None, result)
             new = decision.calibration is result
             # this may take a while, and images do not wait for it
-            published = self._make_messages(result, self.image_frame or DEFAULT_FRAME) if new or before is None else before
+            published = (
+                self._make_messages(result, self.image_frame or DEFAULT_FRAME) if new or before is None else before
+            )
             with self._lock:
                 if self.image_size not in (None, result.evidence.image_size):
                     return None
@@ -148,8 +163,11 @@ class CalibrationPublisher:
             if self.image_frame not in ('', image_frame):
                 raise InputError(f"it is of the frame '{image_frame}', and images are of '{self.image_frame}'")
             if self.image_size not in (None, result.evidence.image_size):
-                raise InputError('it is of images of {}x{}, and these have {}x{}'.format(
-                    *result.evidence.image_size, *self.image_size))
+                raise InputError(
+                    'it is of images of {}x{}, and these have {}x{}'.format(
+                        *result.evidence.image_size, *self.image_size
+                    )
+                )
             self._publish(CalibrationState.RESTORED, restored)
 
     def withdraw(self) -> CalibrationState:
@@ -194,8 +212,12 @@ class CalibrationPublisher:
         if ground is None or not (ground.metric or self.options.allow_unit_scale):
             return None
         return messages.ground_transform_message(
-            ground, messages.time_message(result.newest_stamp_ns), self._headers.ground_frame(image_frame),
-            self._headers.camera_frame(image_frame), self.options.tf_parent)
+            ground,
+            messages.time_message(result.newest_stamp_ns),
+            self._headers.ground_frame(image_frame),
+            self._headers.camera_frame(image_frame),
+            self.options.tf_parent,
+        )
 
     def _publish(self, state: CalibrationState, published: Published) -> None:
         self._camera_info.publish(self.camera_info(published))

@@ -63,8 +63,9 @@ class ReportWriter:
         with self._changed:
             self._moments, self._accepted = (), None
 
-    def scene(self, result: Calibration, seen: tuple[Evidence | None, np.ndarray | None], options: Options,
-              source: str) -> ReportScene:
+    def scene(
+        self, result: Calibration, seen: tuple[Evidence | None, np.ndarray | None], options: Options, source: str
+    ) -> ReportScene:
         """Put together what a report of a calibration shows, with what is `seen` now."""
         evidence, background = seen
         with self._changed:
@@ -73,8 +74,9 @@ class ReportWriter:
             moments = self._moments
         if evidence is None or evidence.image_size != result.evidence.image_size:
             evidence, background = _empty_evidence(result, options), None
-        return ReportScene(result=result, evidence=evidence, background=background, options=options, source=source,
-                     moments=moments)
+        return ReportScene(
+            result=result, evidence=evidence, background=background, options=options, source=source, moments=moments
+        )
 
     def write(self, place: ReportPaths, scene: ReportScene) -> None:
         """Write a report soon."""
@@ -108,14 +110,17 @@ class ReportWriter:
                 # Not forked: a fork would share the locks of the parent's threads and its middleware.
                 context = multiprocessing.get_context('spawn')
                 ours, theirs = context.Pipe(duplex=False)
-                process = self._process = context.Process(target=_write, args=(theirs, place, scene),
-                                                          name='autocalib report', daemon=True)
+                process = self._process = context.Process(
+                    target=_write, args=(theirs, place, scene), name='autocalib report', daemon=True
+                )
                 process.start()
             theirs.close()
             fault = self._wait_for(process, ours)
             if not self._closed:
-                self._tell(f'the report was not written: {fault}' if fault else f'the report is written: {place.page}',
-                           not fault)
+                self._tell(
+                    f'the report was not written: {fault}' if fault else f'the report is written: {place.page}',
+                    not fault,
+                )
 
     @staticmethod
     def _wait_for(process: BaseProcess, ours: Connection) -> str:
@@ -145,5 +150,10 @@ def _write(pipe: Connection, place: ReportPaths, scene: ReportScene) -> None:
 def _empty_evidence(result: Calibration, options: Options) -> Evidence:
     """Return evidence without traffic, for a calibration of an earlier run."""
     return EvidenceBuffer(options.buffer).snapshot(
-        image_size=result.evidence.image_size, first_stamp_ns=result.newest_stamp_ns,
-        newest_stamp_ns=result.newest_stamp_ns, frames=0, drift_px=0.0, unfinished=[])
+        image_size=result.evidence.image_size,
+        first_stamp_ns=result.newest_stamp_ns,
+        newest_stamp_ns=result.newest_stamp_ns,
+        frames=0,
+        drift_px=0.0,
+        unfinished=[],
+    )

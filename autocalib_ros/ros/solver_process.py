@@ -61,8 +61,10 @@ class SolverProcess:
         except (EOFError, OSError) as lost:
             process.join(PROCESS_EXIT_S)
             self._process = None
-            raise SolverDied(f'the process that solves ended with status {process.exitcode} before it gave a result; '
-                              'the next solution starts another: is there enough memory?') from lost
+            raise SolverDied(
+                f'the process that solves ended with status {process.exitcode} before it gave a result; '
+                'the next solution starts another: is there enough memory?'
+            ) from lost
         if error is not None:
             raise error from _ChildTraceback(told)
         return result

@@ -29,7 +29,12 @@ class NodeState(str, Enum):
     CALIBRATED = 'CALIBRATED'
 
 
-LEVELS = {NodeState.WAITING_FOR_IMAGES: WARN, NodeState.COLLECTING: WARN, NodeState.RESTORED: WARN, NodeState.CALIBRATED: OK}
+LEVELS = {
+    NodeState.WAITING_FOR_IMAGES: WARN,
+    NodeState.COLLECTING: WARN,
+    NodeState.RESTORED: WARN,
+    NodeState.CALIBRATED: OK,
+}
 
 
 @dataclass(frozen=True)
@@ -59,8 +64,12 @@ class RateCounter:
         since_s, before = self._seen[0]
         if now_s <= since_s:
             return None
-        return Counts(*((getattr(counts, name) - getattr(before, name)) / (now_s - since_s)
-                        for name in Counts.__dataclass_fields__))
+        return Counts(
+            *(
+                (getattr(counts, name) - getattr(before, name)) / (now_s - since_s)
+                for name in Counts.__dataclass_fields__
+            )
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,8 +137,13 @@ def _problems(situation: Situation) -> Iterator[tuple[int, str]]:
     yield from ((WARN, words) for words in situation.warnings)
     rates = situation.rates_hz
     if rates is not None and rates.dropped > MAX_DROPPED_FRACTION * rates.received:
-        yield WARN, (f'{rates.dropped:.1f} of {rates.received:.1f} images a second are dropped: lower the rate or size '
-                     'of the images, max_image_width or tracking.max_points')
+        yield (
+            WARN,
+            (
+                f'{rates.dropped:.1f} of {rates.received:.1f} images a second are dropped: lower the rate or size '
+                'of the images, max_image_width or tracking.max_points'
+            ),
+        )
     if rates is not None and rates.received > 0 and rates.late >= rates.received:
         yield WARN, 'no image is newer than those before: the time stamps of the images do not advance'
 

@@ -30,11 +30,15 @@ LISTEN_S = 2.0
 """Real seconds of listening before the first broadcast: a transform that tf2 has taken in cannot be taken back."""
 TF_QUEUE = 100
 """Messages of /tf and /tf_static that may wait: each static publisher latches one."""
-TF_STATIC_QOS = QoSProfile(depth=TF_QUEUE, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+TF_STATIC_QOS = QoSProfile(
+    depth=TF_QUEUE, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
+)
 TF_QOS = QoSProfile(depth=TF_QUEUE, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Best effort connects to every publisher of /tf, and what is lost there comes again."""
-TF2_MISSING = ('tf2_msgs is not there: the ground transform is published on {} but not on /tf_static '
-          '(apt install ros-jazzy-tf2-msgs, or see the README for ROS from pip; publish_tf:=false hides this line)')
+TF2_MISSING = (
+    'tf2_msgs is not there: the ground transform is published on {} but not on /tf_static '
+    '(apt install ros-jazzy-tf2-msgs, or see the README for ROS from pip; publish_tf:=false hides this line)'
+)
 
 
 class GroundTransformPublisher:
@@ -56,7 +60,9 @@ class GroundTransformPublisher:
             self._tf_static = node.create_publisher(TFMessage, '/tf_static', LATCHED)
             node.create_subscription(TFMessage, '/tf_static', self._on_tf, TF_STATIC_QOS)
             node.create_subscription(TFMessage, '/tf', self._on_moving_tf, TF_QOS, raw=True)
-            self._timer = node.create_timer(LISTEN_S, self._end_listening, clock=Clock(clock_type=ClockType.STEADY_TIME))
+            self._timer = node.create_timer(
+                LISTEN_S, self._end_listening, clock=Clock(clock_type=ClockType.STEADY_TIME)
+            )
         elif publish_tf:
             node.get_logger().warning(TF2_MISSING.format(self._ground_transform.topic_name))
 
@@ -99,8 +105,10 @@ class GroundTransformPublisher:
 
     def _on_tf(self, message: Any) -> None:
         """Note who hangs where; our own transforms come back too."""
-        edges = {(transform.header.frame_id.lstrip('/'), transform.child_frame_id.lstrip('/'))
-                 for transform in message.transforms}
+        edges = {
+            (transform.header.frame_id.lstrip('/'), transform.child_frame_id.lstrip('/'))
+            for transform in message.transforms
+        }
         with self._lock:
             new = edges - self._ours - self._foreign
             if new:
@@ -143,8 +151,11 @@ def conflict(parent: str, child: str, foreign: Set[tuple[str, str]], *, tf_paren
     others = sorted(above for above, below in foreign if below == child and above != parent)
     own_name = 'set ground_frame to a name of its own'
     if others:
-        remedy = (f"set tf_parent to 'camera', so that the ground hangs from '{child}'" if tf_parent == 'ground'
-                  else f"{own_name}, or tf_parent to 'ground'")
+        remedy = (
+            f"set tf_parent to 'camera', so that the ground hangs from '{child}'"
+            if tf_parent == 'ground'
+            else f"{own_name}, or tf_parent to 'ground'"
+        )
         broken = f"publishes '{others[0]}' as the parent of '{child}', and a second parent would break tf"
     elif child in _ancestors(parent, foreign):
         remedy, broken = own_name, f"hangs '{parent}' from '{child}', and the way back would be a loop in tf"

@@ -87,8 +87,10 @@ class Counters:
     used: int = 0
 
     def __str__(self) -> str:
-        return (f'images received {self.received}, used {self.used}, dropped {self.dropped}, '
-                f'unreadable {self.unreadable}, late {self.late}')
+        return (
+            f'images received {self.received}, used {self.used}, dropped {self.dropped}, '
+            f'unreadable {self.unreadable}, late {self.late}'
+        )
 
 
 @dataclass
@@ -106,9 +108,19 @@ class CalibrationWorker:
     `stop_solving` ends a solution that runs, when the pipeline is closed.
     """
 
-    def __init__(self, options: Options, *, idle_solve_s: float, decode: Callable[[Any], np.ndarray], solve: Solve,
-                 listener: Listener, viewer: Viewer | None = None, lens: Camera | None = None,
-                 detector: VehicleDetector | None = None, stop_solving: Callable[[], None] = lambda: None) -> None:
+    def __init__(
+        self,
+        options: Options,
+        *,
+        idle_solve_s: float,
+        decode: Callable[[Any], np.ndarray],
+        solve: Solve,
+        listener: Listener,
+        viewer: Viewer | None = None,
+        lens: Camera | None = None,
+        detector: VehicleDetector | None = None,
+        stop_solving: Callable[[], None] = lambda: None,
+    ) -> None:
         self._stop_solving = stop_solving
         self._options, self._idle_solve_s, self._lens, self._detector = options, idle_solve_s, lens, detector
         self._decode, self._solve, self._listener, self._viewer = decode, solve, listener, viewer
@@ -130,8 +142,10 @@ class CalibrationWorker:
         self.reported_evidence: Evidence | None = None
         """What the solution rests on that the listener is told of at the moment."""
         self._refused = ''
-        self._threads = [threading.Thread(target=run, name=name, daemon=True)
-                         for run, name in ((self._run_perception, 'perception'), (self._run_solver, 'solver'))]
+        self._threads = [
+            threading.Thread(target=run, name=name, daemon=True)
+            for run, name in ((self._run_perception, 'perception'), (self._run_solver, 'solver'))
+        ]
         for thread in self._threads:
             thread.start()
 
@@ -214,8 +228,10 @@ class CalibrationWorker:
         """Run the perception thread: the only one that touches the calibrator."""
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: (self._closed or self._images or self._requests or self._snapshot_requests
-                                                or self._changing), self._until_idle())
+                self._changed.wait_for(
+                    lambda: self._closed or self._images or self._requests or self._snapshot_requests or self._changing,
+                    self._until_idle(),
+                )
                 if self._closed:
                     return
                 generation = self._generation
@@ -227,15 +243,20 @@ class CalibrationWorker:
                 if len(self._images) in (0, IMAGE_QUEUE_SIZE - 1):
                     requests, self._requests = self._requests, []
             if generation != self._calibrator_generation:
-                self._calibrator, self._calibrator_generation = AutoCalibrator(self._options, self._detector), generation
+                self._calibrator, self._calibrator_generation = (
+                    AutoCalibrator(self._options, self._detector),
+                    generation,
+                )
             if changing:
                 self._calibrator.change(self._options)
                 self._unsolved_images += 1  # so that it takes effect even when no image comes any more
             if image is not None:
                 self._process_image(*image)
             if snapshot_requests:
-                self._resolve(snapshot_requests, self._guarded(lambda: (self._calibrator.snapshot(), self._calibrator.background()))
-                             or (None, None))
+                self._resolve(
+                    snapshot_requests,
+                    self._guarded(lambda: (self._calibrator.snapshot(), self._calibrator.background())) or (None, None),
+                )
             if requests or (image is None and self._until_idle() == 0.0):
                 self._submit(self._guarded(self._calibrator.snapshot), requests)
 
@@ -336,8 +357,11 @@ class CalibrationWorker:
         """Add why the last solution was refused: evidence may be enough to try and not to succeed."""
         if progress is None or not self._refused:
             return progress
-        return replace(progress, percent=min(progress.percent, MAX_REFUSED_PERCENT),
-                       missing=tuple(dict.fromkeys((*progress.missing, self._refused))))
+        return replace(
+            progress,
+            percent=min(progress.percent, MAX_REFUSED_PERCENT),
+            missing=tuple(dict.fromkeys((*progress.missing, self._refused))),
+        )
 
     def _lens_for(self, image_size: tuple[int, int]) -> Camera | None:
         """Return the known lens for images of that size; UsageError when they have another shape."""

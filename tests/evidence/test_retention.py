@@ -27,15 +27,20 @@ def drive(vehicle: int, begin_s: float, road: tuple, parts: int = 4) -> list[Tra
     tracks = []
     for number in range(POINTS):
         path = start + [5.0 * number, 3.0 * number] + along[:, None] * way
-        tracks += [Track(vehicle, begin_s + 8.0 * along[part:part + 9], path[part:part + 9])
-                   for part in range(0, 8 * parts, 8)]
+        tracks += [
+            Track(vehicle, begin_s + 8.0 * along[part : part + 9], path[part : part + 9])
+            for part in range(0, 8 * parts, 8)
+        ]
     return tracks
 
 
 def matches(tracks: list[Track]) -> Segments:
     """Return a segment for each track of one vehicle."""
-    return Segments(tracks[0].times_s[-1], np.array([track.vehicle for track in tracks]),
-                    np.array([np.concatenate([track.points_px[0], track.points_px[1]]) for track in tracks]))
+    return Segments(
+        tracks[0].times_s[-1],
+        np.array([track.vehicle for track in tracks]),
+        np.array([np.concatenate([track.points_px[0], track.points_px[1]]) for track in tracks]),
+    )
 
 
 def filled(buffer: EvidenceBuffer, vehicles: Iterable[list[Track]], most: int) -> EvidenceBuffer:
@@ -52,8 +57,9 @@ def busy(hours: float, every_s: float = 6.0, first: int = 0) -> list[list[Track]
 
 
 def snapshot(buffer: EvidenceBuffer) -> Evidence:
-    return buffer.snapshot(image_size=(1280, 720), first_stamp_ns=0, newest_stamp_ns=10**13, frames=1, drift_px=0.0,
-                           unfinished=[])
+    return buffer.snapshot(
+        image_size=(1280, 720), first_stamp_ns=0, newest_stamp_ns=10**13, frames=1, drift_px=0.0, unfinished=[]
+    )
 
 
 def test_a_lone_vehicle_of_the_second_road_outlives_hours_of_the_main_road() -> None:
@@ -79,8 +85,10 @@ def test_two_roads_come_to_have_equal_parts() -> None:
 
 def test_a_vehicle_goes_whole() -> None:
     generator = np.random.default_rng(3)
-    traffic = [drive(number, 6.0 * number, (generator.uniform(0, 700, 2), generator.uniform(-600, 600, 2)), parts)
-               for number, parts in enumerate(generator.integers(1, 6, 500))]
+    traffic = [
+        drive(number, 6.0 * number, (generator.uniform(0, 700, 2), generator.uniform(-600, 600, 2)), parts)
+        for number, parts in enumerate(generator.integers(1, 6, 500))
+    ]
     evidence = snapshot(filled(EvidenceBuffer(BufferOptions(max_tracks=500, max_segments=600)), traffic, 500))
     complete = np.array([len(tracks) for tracks in traffic])
     for owners in (evidence.track_vehicles, evidence.segment_vehicles):
@@ -135,8 +143,10 @@ def test_all_from_before_a_bump_is_forgotten_needed_or_not() -> None:
 
 def test_the_same_traffic_leaves_the_same_evidence_to_the_last_bit() -> None:
     generator = np.random.default_rng(0)
-    traffic = [drive(int(generator.integers(0, 400)), 6.0 * number, MAIN if generator.uniform() < 0.8 else SIDE)
-               for number in range(600)]
+    traffic = [
+        drive(int(generator.integers(0, 400)), 6.0 * number, MAIN if generator.uniform() < 0.8 else SIDE)
+        for number in range(600)
+    ]
     first, second = (snapshot(filled(EvidenceBuffer(BufferOptions(max_tracks=700)), traffic, 700)) for _ in range(2))
     for name in vars(first):
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name), err_msg=name)
@@ -157,8 +167,9 @@ def test_worth_is_counted_as_its_definition_says(seed: int) -> None:
     found = novelty(vehicles, newest, bins)
     for vehicle in np.unique(vehicles):
         rows = np.flatnonzero(vehicles == vehicle)
-        newer = [len({other for other in vehicles[bins == bins[row]] if newest[other] > newest[vehicle]})
-                 for row in rows]
+        newer = [
+            len({other for other in vehicles[bins == bins[row]] if newest[other] > newest[vehicle]}) for row in rows
+        ]
         assert found[vehicle] == pytest.approx(np.mean([1 / (1 + count) for count in newer]) * min(1, len(rows) / 3))
 
 

@@ -41,8 +41,9 @@ def outlines(time_s: float, vehicles: list[int]) -> Outlines:
 
 
 def snapshot(buffer: EvidenceBuffer) -> Evidence:
-    return buffer.snapshot(image_size=(640, 360), first_stamp_ns=0, newest_stamp_ns=2_000_000_000, frames=30,
-                           drift_px=0.1, unfinished=[])
+    return buffer.snapshot(
+        image_size=(640, 360), first_stamp_ns=0, newest_stamp_ns=2_000_000_000, frames=30, drift_px=0.1, unfinished=[]
+    )
 
 
 def test_a_snapshot_survives_its_file_to_the_last_bit(tmp_path: Path) -> None:
@@ -187,9 +188,19 @@ def test_without_still_lines_a_file_is_what_it_was_before_they_were_looked_for(t
     assert Evidence.load(tmp_path / 'evidence.npz').still_lines_px.shape == (0, 4)
 
 
-@pytest.mark.parametrize('lines', [
-    np.zeros(4), np.zeros((2, 3)), np.zeros((2, 2, 2)), np.zeros((2, 4), int), np.full((2, 4), np.inf),
-    np.array([[0.0, 1.0, np.nan, 3.0]]), np.full((2, 4), 'x'), np.array(1.0)])
+@pytest.mark.parametrize(
+    'lines',
+    [
+        np.zeros(4),
+        np.zeros((2, 3)),
+        np.zeros((2, 2, 2)),
+        np.zeros((2, 4), int),
+        np.full((2, 4), np.inf),
+        np.array([[0.0, 1.0, np.nan, 3.0]]),
+        np.full((2, 4), 'x'),
+        np.array(1.0),
+    ],
+)
 def test_still_lines_that_are_none_are_an_input_error(tmp_path: Path, lines: np.ndarray) -> None:
     path = tmp_path / 'evidence.npz'
     with_lines(3).save(path)
@@ -265,24 +276,28 @@ def test_a_damaged_byte_is_an_input_error_or_does_no_harm(tmp_path: Path, positi
         assert len(after.track(0).points_px) == 10
 
 
-@pytest.mark.parametrize(('changes', 'told'), [
-    ({'points_px': np.zeros((9, 2))}, 'times_s of float64'),
-    ({'points_px': np.zeros(10)}, 'points_px of float64'),
-    ({'points_px': np.full((10, 2), np.nan)}, 'points_px of float64'),
-    ({'points_px': np.full((10, 2), 'x')}, 'points_px of <U1'),
-    ({'points_px': np.array(3.0)}, 'not a file'),
-    ({'track_vehicles': np.zeros(3, int)}, 'track_starts of int64'),
-    ({'track_starts': np.array([0, 11])}, 'does not divide'),
-    ({'track_starts': np.array([-1, 10])}, 'does not divide'),
-    ({'times_s': np.full(10, 4.0)}, 'times_s does not increase'),
-    ({'track_starts': np.array([0.0, 10.0])}, 'track_starts of float64'),
-    ({'segments_px': np.zeros((0, 3))}, 'segments_px of float64'),
-    ({'segment_times_s': np.zeros(2)}, 'segment_times_s of float64'),
-    ({'image_size': np.array([0, 360])}, r'an image size of \(0, 360\)'),
-    ({'image_size': np.array([640])}, 'not a file'),
-    ({'stamps_ns': np.array([5, 1])}, 'in -4e-09 s'),
-    ({'drift_px': np.nan}, 'a drift of nan px'),
-    ({'frames': 'many'}, 'not a file')])
+@pytest.mark.parametrize(
+    ('changes', 'told'),
+    [
+        ({'points_px': np.zeros((9, 2))}, 'times_s of float64'),
+        ({'points_px': np.zeros(10)}, 'points_px of float64'),
+        ({'points_px': np.full((10, 2), np.nan)}, 'points_px of float64'),
+        ({'points_px': np.full((10, 2), 'x')}, 'points_px of <U1'),
+        ({'points_px': np.array(3.0)}, 'not a file'),
+        ({'track_vehicles': np.zeros(3, int)}, 'track_starts of int64'),
+        ({'track_starts': np.array([0, 11])}, 'does not divide'),
+        ({'track_starts': np.array([-1, 10])}, 'does not divide'),
+        ({'times_s': np.full(10, 4.0)}, 'times_s does not increase'),
+        ({'track_starts': np.array([0.0, 10.0])}, 'track_starts of float64'),
+        ({'segments_px': np.zeros((0, 3))}, 'segments_px of float64'),
+        ({'segment_times_s': np.zeros(2)}, 'segment_times_s of float64'),
+        ({'image_size': np.array([0, 360])}, r'an image size of \(0, 360\)'),
+        ({'image_size': np.array([640])}, 'not a file'),
+        ({'stamps_ns': np.array([5, 1])}, 'in -4e-09 s'),
+        ({'drift_px': np.nan}, 'a drift of nan px'),
+        ({'frames': 'many'}, 'not a file'),
+    ],
+)
 def test_evidence_that_does_not_fit_together_is_an_input_error(tmp_path: Path, changes: dict, told: str) -> None:
     buffer = EvidenceBuffer(BufferOptions())
     buffer.add_track(track(3, 5.0))

@@ -57,7 +57,9 @@ def test_distances_are_observed_pixels(place: tuple[float, float]) -> None:
     # a circle through one pixel, seen from the pixel two further along the image gradient
     rays = unproject_rays(CAMERA, np.array(place))
     normal, _ = orthonormal_basis(rays.bearings)
-    slope = np.array([unproject_rays(CAMERA, np.array(place) + step).bearings @ normal for step in 1e-3 * np.eye(2)]) / 1e-3
+    slope = (
+        np.array([unproject_rays(CAMERA, np.array(place) + step).bearings @ normal for step in 1e-3 * np.eye(2)]) / 1e-3
+    )
     moved = np.array(place) + 2.0 * slope / np.linalg.norm(slope)
     assert abs(unproject_rays(CAMERA, moved).distance_px(normal)) == pytest.approx(2.0, rel=0.01)
 

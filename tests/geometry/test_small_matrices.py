@@ -18,11 +18,15 @@ def scatters(least: tuple[float, float], middle: tuple[float, float]) -> np.ndar
     return (axes * values[:, None]) @ axes.transpose(0, 2, 1)
 
 
-@pytest.mark.parametrize(('least', 'middle'), [
-    ((0.0, 1e-9), (100.0, 1e4)),  # perfect paths
-    ((0.0, 4.0), (100.0, 1e4)),
-    ((4.0, 50.0), (100.0, 1e4)),  # paths that bend
-    ((0.0, 4.0), (1e5, 9e5))])  # paths from border to border
+@pytest.mark.parametrize(
+    ('least', 'middle'),
+    [
+        ((0.0, 1e-9), (100.0, 1e4)),  # perfect paths
+        ((0.0, 4.0), (100.0, 1e4)),
+        ((4.0, 50.0), (100.0, 1e4)),  # paths that bend
+        ((0.0, 4.0), (1e5, 9e5)),
+    ],
+)  # paths from border to border
 def test_least_axes_are_the_eigenvectors(least: tuple[float, float], middle: tuple[float, float]) -> None:
     matrix = scatters(least, middle)
     axes, values = smallest_eigenvectors(matrix)
@@ -45,7 +49,9 @@ def test_inverse_factors_whiten() -> None:
     root = np.random.default_rng(1).normal(size=(COUNT, 10, 10))
     covariance = root @ root.transpose(0, 2, 1) + np.eye(10)
     expected = np.linalg.inv(np.linalg.cholesky(covariance))
-    np.testing.assert_allclose(inverse_cholesky_factors(covariance.transpose(1, 2, 0)).transpose(2, 0, 1), expected, atol=1e-12)
+    np.testing.assert_allclose(
+        inverse_cholesky_factors(covariance.transpose(1, 2, 0)).transpose(2, 0, 1), expected, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize('shapes', [((3,), (3,)), ((7, 3), (3,)), ((7, 5, 3), (7, 1, 3)), ((7, 3), (7, 3))])

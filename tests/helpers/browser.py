@@ -52,8 +52,9 @@ class Browser:
 
     def open(self, path: Path, width: int, height: int = 900) -> None:
         """Show a file in a screen so wide, wait until it is loaded."""
-        self.send('Emulation.setDeviceMetricsOverride', width=width, height=height, deviceScaleFactor=1,
-                  mobile=width < 600)
+        self.send(
+            'Emulation.setDeviceMetricsOverride', width=width, height=height, deviceScaleFactor=1, mobile=width < 600
+        )
         self.send('Page.navigate', url=path.resolve().as_uri())
         deadline = time.monotonic() + PATIENCE_S
         while self.value('document.readyState + location.protocol') != 'completefile:':
@@ -101,11 +102,17 @@ def browser() -> Iterator[Browser]:
     (child_in, write), (read, child_out) = os.pipe(), os.pipe()
     with tempfile.TemporaryDirectory() as home:
         # the pipe is on descriptors 3 and 4 of the browser
-        command = (f'exec {chromium()} --headless=new --no-sandbox --disable-gpu --disable-dev-shm-usage --no-first-run'
-                   f' --disable-extensions --disable-background-networking --hide-scrollbars --user-data-dir={home}'
-                   f' --remote-debugging-pipe 3<&{child_in} 4>&{child_out}')
-        process = subprocess.Popen(['bash', '-c', command], pass_fds=(child_in, child_out),
-                                   stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        command = (
+            f'exec {chromium()} --headless=new --no-sandbox --disable-gpu --disable-dev-shm-usage --no-first-run'
+            f' --disable-extensions --disable-background-networking --hide-scrollbars --user-data-dir={home}'
+            f' --remote-debugging-pipe 3<&{child_in} 4>&{child_out}'
+        )
+        process = subprocess.Popen(
+            ['bash', '-c', command],
+            pass_fds=(child_in, child_out),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
         os.close(child_in)
         os.close(child_out)
         try:

@@ -62,8 +62,10 @@ class SeeingModel:
 
     def get_outputs(self) -> list[Any]:
         """Describe the outputs, the shapes as vaguely as some do."""
-        return [SimpleNamespace(name=name, shape=['?'], type='tensor(float)')
-                for name in self.encode([], self._size_or((64, 64)))]
+        return [
+            SimpleNamespace(name=name, shape=['?'], type='tensor(float)')
+            for name in self.encode([], self._size_or((64, 64)))
+        ]
 
     def get_modelmeta(self) -> Any:
         """Return the metadata."""
@@ -119,8 +121,12 @@ def yolox(found: Found, size: tuple[int, int]) -> dict[str, np.ndarray]:
             column, line = int(x / stride), int(y / stride)
             for shift, score, of_class in ((0, OBJECT, kind), (1, OBJECT - 0.1, 7 if kind == CAR else kind)):
                 cell = level[line, min(column + shift, columns - 1)]
-                cell[:4] = [x / stride - min(column + shift, columns - 1), y / stride - line,
-                            np.log(width / stride), np.log(height / stride)]
+                cell[:4] = [
+                    x / stride - min(column + shift, columns - 1),
+                    y / stride - line,
+                    np.log(width / stride),
+                    np.log(height / stride),
+                ]
                 cell[4], cell[5:] = score, _classes(of_class)
         rows.append(level.reshape(-1, 85))
     return {'output': np.concatenate(rows)[None].astype(np.float32)}
@@ -135,8 +141,10 @@ def yolox_decoded(found: Found, size: tuple[int, int]) -> dict[str, np.ndarray]:
 def yolov5(found: Found, size: tuple[int, int]) -> dict[str, np.ndarray]:
     """[1, 3 A, 85], and the raw heads that older exports leave behind it."""
     count = 3 * sum((size[0] // stride) * (size[1] // stride) for stride in (8, 16, 32))
-    heads = {f'head{stride}': np.zeros((1, 3, size[1] // stride, size[0] // stride, 85), np.float32)
-             for stride in (8, 16, 32)}
+    heads = {
+        f'head{stride}': np.zeros((1, 3, size[1] // stride, size[0] // stride, 85), np.float32)
+        for stride in (8, 16, 32)
+    }
     return {'output': _rows_with_objectness(found, size, count), **heads}
 
 
@@ -160,8 +168,10 @@ def yolov8(found: Found, size: tuple[int, int], classes: int = 80) -> dict[str, 
 def yolov8_with_masks(found: Found, size: tuple[int, int]) -> dict[str, np.ndarray]:
     """[1, 4 + C + 32, A] and [1, 32, h, w]; the coefficients of masks may be large."""
     plain = yolov8(found, size)['output0']
-    return {'output0': np.concatenate([plain, np.full((1, 32, plain.shape[2]), 3.0, np.float32)], axis=1),
-            'output1': np.zeros((1, 32, size[1] // 4, size[0] // 4), np.float32)}
+    return {
+        'output0': np.concatenate([plain, np.full((1, 32, plain.shape[2]), 3.0, np.float32)], axis=1),
+        'output1': np.zeros((1, 32, size[1] // 4, size[0] // 4), np.float32),
+    }
 
 
 def end_to_end(found: Found, size: tuple[int, int]) -> dict[str, np.ndarray]:
@@ -241,8 +251,12 @@ def tf_od(found: Found, size: tuple[int, int]) -> dict[str, np.ndarray]:
     for index, (edges, kind) in enumerate(found):
         boxes[0, index] = _shares(edges, size)[[1, 0, 3, 2]]
         scores[0, index], classes[0, index] = SCORE, COCO_91[kind]
-    arrays = {'num_detections': np.array([len(found)]), 'detection_boxes': boxes, 'detection_scores': scores,
-              'detection_classes': classes}
+    arrays = {
+        'num_detections': np.array([len(found)]),
+        'detection_boxes': boxes,
+        'detection_scores': scores,
+        'detection_classes': classes,
+    }
     return {f'{name}:0': array.astype(np.float32) for name, array in arrays.items()}
 
 

@@ -73,18 +73,26 @@ def _road(junction: Junction, angle: float, generator: np.random.Generator, pain
                 pieces += _edges([side * begin, lane], [side * (begin + DASH_M), lane], 0.0, generator, paint)
         askew = generator.normal(0.0, np.radians(paint.askew_deg))
         for place in np.arange(-ROAD_M + STRIPE_M, ROAD_M, 2 * STRIPE_M):
-            pieces += _edges([side * STRIPES_M[0], place], [side * STRIPES_M[1], place], askew, generator, paint,
-                             STRIPE_M)
+            pieces += _edges(
+                [side * STRIPES_M[0], place], [side * STRIPES_M[1], place], askew, generator, paint, STRIPE_M
+            )
         if paint.across:
             for lane in (0.0, LANE_M):
-                pieces += _edges([side * STOP_M, side * lane], [side * STOP_M, side * (lane + LANE_M)], 0.0, generator,
-                                 paint, 0.4)
+                pieces += _edges(
+                    [side * STOP_M, side * lane], [side * STOP_M, side * (lane + LANE_M)], 0.0, generator, paint, 0.4
+                )
     turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
     return [np.column_stack([piece @ turn + junction.centre_m, np.zeros(2)]) for piece in pieces]
 
 
-def _edges(begin: list[float], end: list[float], askew: float, generator: np.random.Generator, paint: Paint,
-           width_m: float = WIDTH_M) -> list[np.ndarray]:
+def _edges(
+    begin: list[float],
+    end: list[float],
+    askew: float,
+    generator: np.random.Generator,
+    paint: Paint,
+    width_m: float = WIDTH_M,
+) -> list[np.ndarray]:
     """Both edges (2, 2) of a painted line."""
     begin, end = np.array(begin), np.array(end)
     along = end - begin

@@ -36,8 +36,16 @@ def outline(junction: Junction, corners_m: np.ndarray) -> np.ndarray:
     return np.append(pixels[(pixels @ EXTREME_DIRECTIONS.T).argmax(axis=0)], GAP_PX)
 
 
-def driven(junction: Junction, number: int, start_s: float, size_m: tuple[float, float, float], start_m: np.ndarray,
-           heading: float, speed_m_s: float, generator: np.random.Generator) -> tuple[list[Track], list[Outlines]]:
+def driven(
+    junction: Junction,
+    number: int,
+    start_s: float,
+    size_m: tuple[float, float, float],
+    start_m: np.ndarray,
+    heading: float,
+    speed_m_s: float,
+    generator: np.random.Generator,
+) -> tuple[list[Track], list[Outlines]]:
     """Tracks of six points of a body that goes straight on for 12 s, and its outlines while it is all in view."""
     times = np.arange(0.0, 12.0, 0.2)
     places = start_m + np.outer(times * speed_m_s, [np.cos(heading), np.sin(heading)])
@@ -64,7 +72,12 @@ def with_outlines(evidence: Evidence, outlines: list[Outlines]) -> Evidence:
     buffer = EvidenceBuffer(BufferOptions())
     for each in sorted(outlines, key=lambda each: each.time_s):
         buffer.add_outlines(each)
-    held = buffer.snapshot(image_size=evidence.image_size, first_stamp_ns=0, newest_stamp_ns=0, frames=0, drift_px=0.0,
-                           unfinished=[])
-    return replace(evidence, outlines_px=held.outlines_px, outline_vehicles=held.outline_vehicles,
-                   outline_times_s=held.outline_times_s)
+    held = buffer.snapshot(
+        image_size=evidence.image_size, first_stamp_ns=0, newest_stamp_ns=0, frames=0, drift_px=0.0, unfinished=[]
+    )
+    return replace(
+        evidence,
+        outlines_px=held.outlines_px,
+        outline_vehicles=held.outline_vehicles,
+        outline_times_s=held.outline_times_s,
+    )

@@ -54,10 +54,16 @@ def junction_evidence(above_m: float = 0.0) -> Evidence:
     buffer = EvidenceBuffer(BufferOptions())
     for track in street_tracks(camera, ground, above_m):
         buffer.add_track(track)
-        buffer.add_segments(Segments(float(track.times_s[3]), np.array([track.vehicle]),
-                                     np.concatenate([track.points_px[0], track.points_px[3]])[None]))
-    return buffer.snapshot(image_size=(320, 180), first_stamp_ns=0, newest_stamp_ns=60_000_000_000, frames=600,
-                           drift_px=0.0, unfinished=[])
+        buffer.add_segments(
+            Segments(
+                float(track.times_s[3]),
+                np.array([track.vehicle]),
+                np.concatenate([track.points_px[0], track.points_px[3]])[None],
+            )
+        )
+    return buffer.snapshot(
+        image_size=(320, 180), first_stamp_ns=0, newest_stamp_ns=60_000_000_000, frames=600, drift_px=0.0, unfinished=[]
+    )
 
 
 def full_result(evidence: Evidence) -> Calibration:
@@ -67,32 +73,52 @@ def full_result(evidence: Evidence) -> Calibration:
     labels = evidence.track_vehicles % 2
     labels[:2] = -1, -2
     figures = Figures(
-        focal_sweep_px=np.stack([trials, 1 + (trials / 140 - 1)**2], axis=1), track_labels=labels,
+        focal_sweep_px=np.stack([trials, 1 + (trials / 140 - 1) ** 2], axis=1),
+        track_labels=labels,
         orientation_histogram=np.stack([np.arange(0.5, 180), np.arange(180) % 30], axis=1),
-        orientation_peaks_deg=(30.0, 135.0), paper_tracks=np.arange(3),
-        residuals=Residuals(evidence.points_px, np.full(len(evidence.points_px), 0.3),
-                            np.repeat(labels, np.diff(evidence.track_starts)).clip(-1)))
+        orientation_peaks_deg=(30.0, 135.0),
+        paper_tracks=np.arange(3),
+        residuals=Residuals(
+            evidence.points_px,
+            np.full(len(evidence.points_px), 0.3),
+            np.repeat(labels, np.diff(evidence.track_starts)).clip(-1),
+        ),
+    )
     sigmas = np.array([1.5, 1.0, 1.0, 0.01, 1e-6, 1e-6, 1e-6, 0.2, 0.1, 0.05])
     return Calibration(
-        method='joint', grade='full', assumptions=('the two roads are perpendicular',),
-        camera=Camera.equidistant(320, 180, 140.0), ground=ground, ground_refusal=None,
-        road_directions=ground.rotation[:2], newest_stamp_ns=evidence.newest_stamp_ns, evidence=evidence.summary(),
-        stddev=StandardDeviations(focal_px=1.5, tilt_deg=0.2, roll_deg=0.1, height_m=0.05), figures=figures,
+        method='joint',
+        grade='full',
+        assumptions=('the two roads are perpendicular',),
+        camera=Camera.equidistant(320, 180, 140.0),
+        ground=ground,
+        ground_refusal=None,
+        road_directions=ground.rotation[:2],
+        newest_stamp_ns=evidence.newest_stamp_ns,
+        evidence=evidence.summary(),
+        stddev=StandardDeviations(focal_px=1.5, tilt_deg=0.2, roll_deg=0.1, height_m=0.05),
+        figures=figures,
         covariance=np.diag(sigmas**2),
-        paper=PaperReport(focal_px=150.0, polynomial_k=(0.3, 0.0, 0.0), straightness_px2=(4.0, 0.5)))
+        paper=PaperReport(focal_px=150.0, polynomial_k=(0.3, 0.0, 0.0), straightness_px2=(4.0, 0.5)),
+    )
 
 
 def lens_result(full: Calibration) -> Calibration:
     """Return a calibration without a ground plane."""
     why = Reason(code='one_direction', message='one direction only', remedy='Aim at a crossing.')
-    return replace(full, grade='lens', ground=None, ground_refusal=why, covariance=None,
-                   road_directions=full.road_directions[:1])
+    return replace(
+        full, grade='lens', ground=None, ground_refusal=why, covariance=None, road_directions=full.road_directions[:1]
+    )
 
 
 def refusal(evidence: Evidence) -> Refusal:
     """Return a refusal of evidence."""
-    return Refusal(code='too_few_tracks', message='only 12 of 40 tracks were seen', method='joint',
-                   remedy='Record at a busier time.', evidence=evidence.summary())
+    return Refusal(
+        code='too_few_tracks',
+        message='only 12 of 40 tracks were seen',
+        method='joint',
+        remedy='Record at a busier time.',
+        evidence=evidence.summary(),
+    )
 
 
 def grey_road() -> np.ndarray:

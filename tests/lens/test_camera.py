@@ -43,7 +43,8 @@ def test_bearings_are_unit_vectors(camera: Camera, pixels: np.ndarray) -> None:
 def test_projection_agrees_with_opencv(camera: Camera) -> None:
     points = np.random.default_rng(1).uniform((-2, -1, 1), (2, 1, 3), (100, 3))
     expected, _ = cv2.fisheye.projectPoints(
-        points[:, None], np.zeros(3), np.zeros(3), camera.matrix, np.array(camera.k))
+        points[:, None], np.zeros(3), np.zeros(3), camera.matrix, np.array(camera.k)
+    )
     np.testing.assert_allclose(camera.project(points)[0], expected[:, 0], atol=1e-8)
 
 

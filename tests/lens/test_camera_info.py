@@ -39,8 +39,10 @@ def test_camera_info_has_the_lengths_of_the_message() -> None:
 @pytest.mark.parametrize('focal', [300.0, 560.0, 2000.0])
 def test_the_rectified_image_shows_no_empty_border(focal: float) -> None:
     camera = Camera(1280, 720, focal, (632.0, 364.0))
-    border = np.array([(x, y) for x in np.linspace(0, 1279, 30) for y in (0, 719)]
-                      + [(x, y) for x in (0, 1279) for y in np.linspace(0, 719, 30)])
+    border = np.array(
+        [(x, y) for x in np.linspace(0, 1279, 30) for y in (0, 719)]
+        + [(x, y) for x in (0, 1279) for y in np.linspace(0, 719, 30)]
+    )
     rays = np.column_stack([border, np.ones(len(border))]) @ np.linalg.inv(rectified_matrix(camera)).T
     pixels, _ = camera.project(rays)
     assert (pixels >= -0.5).all() and (pixels <= (1279.5, 719.5)).all()
@@ -49,8 +51,16 @@ def test_the_rectified_image_shows_no_empty_border(focal: float) -> None:
 def test_the_yaml_is_that_of_camera_info_manager(tmp_path: Path) -> None:
     write_camera_info_yaml(tmp_path / 'c.yaml', CAMERA, 'cam/1 é')
     document = yaml.safe_load((tmp_path / 'c.yaml').read_text())
-    assert list(document) == ['image_width', 'image_height', 'camera_name', 'camera_matrix', 'distortion_model',
-                              'distortion_coefficients', 'rectification_matrix', 'projection_matrix']
+    assert list(document) == [
+        'image_width',
+        'image_height',
+        'camera_name',
+        'camera_matrix',
+        'distortion_model',
+        'distortion_coefficients',
+        'rectification_matrix',
+        'projection_matrix',
+    ]
     assert document['camera_name'] == 'cam_1__'
     assert document['camera_matrix'] == {'rows': 3, 'cols': 3, 'data': camera_info(CAMERA).k}
     assert document['distortion_coefficients']['data'] == camera_info(CAMERA).d
@@ -64,9 +74,14 @@ def test_a_file_that_cannot_be_written_is_an_input_error(tmp_path: Path) -> None
 
 def document(**changes: Any) -> dict[str, Any]:
     """Return the content of a file of camera_info_manager."""
-    content = {'image_width': WIDTH, 'image_height': HEIGHT, 'camera_name': 'north',
-               'camera_matrix': {'rows': 3, 'cols': 3, 'data': SQUARE}, 'distortion_model': 'plumb_bob',
-               'distortion_coefficients': {'rows': 1, 'cols': 5, 'data': [-0.3, 0.1, 0.0, 0.0, 0.0]}}
+    content = {
+        'image_width': WIDTH,
+        'image_height': HEIGHT,
+        'camera_name': 'north',
+        'camera_matrix': {'rows': 3, 'cols': 3, 'data': SQUARE},
+        'distortion_model': 'plumb_bob',
+        'distortion_coefficients': {'rows': 1, 'cols': 5, 'data': [-0.3, 0.1, 0.0, 0.0, 0.0]},
+    }
     return {name: value for name, value in {**content, **changes}.items() if value is not None}
 
 
@@ -77,8 +92,14 @@ def written(tmp_path: Path, content: Any) -> Path:
 
 
 def lens(tmp_path: Path, model: str, matrix: list[float], coefficients: list[float]) -> Camera:
-    return read_camera_info(written(tmp_path, document(
-        distortion_model=model, camera_matrix={'data': matrix}, distortion_coefficients={'data': coefficients})))
+    return read_camera_info(
+        written(
+            tmp_path,
+            document(
+                distortion_model=model, camera_matrix={'data': matrix}, distortion_coefficients={'data': coefficients}
+            ),
+        )
+    )
 
 
 def seen(model: str, matrix: list[float], coefficients: list[float], field_deg: float) -> tuple[np.ndarray, np.ndarray]:
@@ -109,22 +130,30 @@ def worst_px(camera: Camera, bearings: np.ndarray, pixels: np.ndarray) -> float:
 def test_an_equidistant_lens_is_read_as_it_stands(tmp_path, name, coefficients):
     camera = lens(tmp_path, name, WIDE, coefficients)
     assert (camera.width, camera.height, camera.focal_px, camera.principal_point_px) == (
-        WIDTH, HEIGHT, 500.0, (645.0, 352.0))
+        WIDTH,
+        HEIGHT,
+        500.0,
+        (645.0, 352.0),
+    )
     assert worst_px(camera, *seen('equidistant', WIDE, coefficients, 85.0)) < READ_PX
 
 
-@pytest.mark.parametrize(('model', 'matrix', 'coefficients', 'field_deg'), [
-    ('plumb_bob', SQUARE, [-0.3, 0.1, 0.0, 0.0, 0.0], 50.0),
-    ('plumb_bob', SQUARE, [-0.3, 0.1, 0.0, 0.0], 50.0),
-    ('plumb_bob', SQUARE, [0.15, 0.05, 0.0, 0.0, 0.01], 50.0),
-    ('plumb_bob', SQUARE, [-0.28, 0.1, 0.0001, -0.0001, -0.02], 48.0),
-    ('plumb_bob', SQUARE, [0.0] * 5, 50.0),
-    ('plumb_bob', WIDE, [0.0] * 5, 65.0),
-    ('plumb_bob', [5000.0, *SQUARE[1:4], 5000.0, *SQUARE[5:]], [0.0] * 5, 12.0),
-    ('plumb_bob', [*SQUARE[:4], 900.8, *SQUARE[5:]], [-0.1, 0.01, 0.0, 0.0, 0.0], 50.0),
-    ('rational_polynomial', WIDE, [1.2, 0.3, 0.0, 0.0, 0.01, 1.5, 0.5, 0.03], 75.0),
-    ('rational_polynomial', SQUARE, [-0.3, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], 50.0),
-    ('equidistant', [*WIDE[:4], 500.3, *WIDE[5:]], [0.01, -0.004, 0.002, -0.0005], 85.0)])
+@pytest.mark.parametrize(
+    ('model', 'matrix', 'coefficients', 'field_deg'),
+    [
+        ('plumb_bob', SQUARE, [-0.3, 0.1, 0.0, 0.0, 0.0], 50.0),
+        ('plumb_bob', SQUARE, [-0.3, 0.1, 0.0, 0.0], 50.0),
+        ('plumb_bob', SQUARE, [0.15, 0.05, 0.0, 0.0, 0.01], 50.0),
+        ('plumb_bob', SQUARE, [-0.28, 0.1, 0.0001, -0.0001, -0.02], 48.0),
+        ('plumb_bob', SQUARE, [0.0] * 5, 50.0),
+        ('plumb_bob', WIDE, [0.0] * 5, 65.0),
+        ('plumb_bob', [5000.0, *SQUARE[1:4], 5000.0, *SQUARE[5:]], [0.0] * 5, 12.0),
+        ('plumb_bob', [*SQUARE[:4], 900.8, *SQUARE[5:]], [-0.1, 0.01, 0.0, 0.0, 0.0], 50.0),
+        ('rational_polynomial', WIDE, [1.2, 0.3, 0.0, 0.0, 0.01, 1.5, 0.5, 0.03], 75.0),
+        ('rational_polynomial', SQUARE, [-0.3, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], 50.0),
+        ('equidistant', [*WIDE[:4], 500.3, *WIDE[5:]], [0.01, -0.004, 0.002, -0.0005], 85.0),
+    ],
+)
 def test_another_lens_is_converted_within_half_a_pixel(tmp_path, model, matrix, coefficients, field_deg):
     camera = lens(tmp_path, model, matrix, coefficients)
     assert worst_px(camera, *seen(model, matrix, coefficients, field_deg)) < ALLOWED_PX
@@ -151,25 +180,34 @@ def test_a_slight_skew_is_shared_out(tmp_path):
     assert worst_px(camera, bearings, pixels) < ALLOWED_PX
 
 
-@pytest.mark.parametrize('camera', [
-    CAMERA, Camera(640, 480, 333.3333333333333, (320.1, 239.9), (0.1, -0.02, 3e-05, -1e-07)),
-    Camera(1920, 1080, 700.0, (900.0, 600.0), (1 / 3, 2 / 15, 17 / 315, 62 / 2835))])
+@pytest.mark.parametrize(
+    'camera',
+    [
+        CAMERA,
+        Camera(640, 480, 333.3333333333333, (320.1, 239.9), (0.1, -0.02, 3e-05, -1e-07)),
+        Camera(1920, 1080, 700.0, (900.0, 600.0), (1 / 3, 2 / 15, 17 / 315, 62 / 2835)),
+    ],
+)
 def test_what_is_written_is_read_to_the_last_bit(tmp_path, camera):
     write_camera_info_yaml(tmp_path / 'c.yaml', camera, 'north')
     assert read_camera_info(tmp_path / 'c.yaml') == camera
 
 
 def test_what_ros2_topic_echo_prints_is_read(tmp_path):
-    text = (b'header:\n  stamp:\n    sec: 1\n    nanosec: 2\n  frame_id: cam\nheight: 720\nwidth: 1280\n'
-            b'distortion_model: equidistant\nd:\n- 0.01\n- 0.0\n- 0.0\n- 1.0e-05\nk:\n- 500.0\n- 0.0\n- 645.0\n'
-            b'- 0.0\n- 500.0\n- 352.0\n- 0.0\n- 0.0\n- 1.0\nr: []\np: []\nbinning_x: 0\nbinning_y: 0\n'
-            b'roi:\n  x_offset: 0\n  y_offset: 0\n  height: 0\n  width: 0\n  do_rectify: false\n---\n')
+    text = (
+        b'header:\n  stamp:\n    sec: 1\n    nanosec: 2\n  frame_id: cam\nheight: 720\nwidth: 1280\n'
+        b'distortion_model: equidistant\nd:\n- 0.01\n- 0.0\n- 0.0\n- 1.0e-05\nk:\n- 500.0\n- 0.0\n- 645.0\n'
+        b'- 0.0\n- 500.0\n- 352.0\n- 0.0\n- 0.0\n- 1.0\nr: []\np: []\nbinning_x: 0\nbinning_y: 0\n'
+        b'roi:\n  x_offset: 0\n  y_offset: 0\n  height: 0\n  width: 0\n  do_rectify: false\n---\n'
+    )
     assert read_camera_info(written(tmp_path, text)) == Camera(1280, 720, 500.0, (645.0, 352.0), (0.01, 0.0, 0.0, 1e-5))
 
 
 def test_what_ros1_prints_is_read(tmp_path):
-    text = (b'height: 720\nwidth: 1280\ndistortion_model: "equidistant"\nD: [0.01, 0.0, 0.0, 1e-05]\n'
-            b'K: [500.0, 0.0, 645.0, 0.0, 500.0, 352.0, 0.0, 0.0, 1.0]\n---\n')
+    text = (
+        b'height: 720\nwidth: 1280\ndistortion_model: "equidistant"\nD: [0.01, 0.0, 0.0, 1e-05]\n'
+        b'K: [500.0, 0.0, 645.0, 0.0, 500.0, 352.0, 0.0, 0.0, 1.0]\n---\n'
+    )
     assert read_camera_info(written(tmp_path, text)) == Camera(1280, 720, 500.0, (645.0, 352.0), (0.01, 0.0, 0.0, 1e-5))
 
 
@@ -191,45 +229,86 @@ NAN, INF = float('nan'), float('inf')
 ODD = 'give the file of camera_info_manager'
 
 
-@pytest.mark.parametrize(('changes', 'told', 'remedy'), [
-    ({'camera_matrix': {'data': [0.0] * 9}}, 'not calibrated, its focal length is 0', 'calibrate the camera, or leave'),
-    ({'camera_matrix': {'data': [1.0] * 8}}, "'camera_matrix' holds 8 numbers, expected 9", ODD),
-    ({'camera_matrix': {'data': [NAN, *SQUARE[1:]]}}, "'camera_matrix' holds nan, not a finite number", ODD),
-    ({'camera_matrix': {'data': ['wide', *SQUARE[1:]]}}, "'camera_matrix' holds 'wide', not a finite number", ODD),
-    ({'camera_matrix': {'data': [-900.0, *SQUARE[1:]]}}, 'not of the form fx s cx', ODD),
-    ({'camera_matrix': {'data': [*SQUARE[:8], 2.0]}}, 'not of the form fx s cx', ODD),
-    ({'camera_matrix': {'rows': 3}}, "'camera_matrix' holds no list of numbers", ODD),
-    ({'camera_matrix': 'none'}, "'camera_matrix' holds no list of numbers", ODD),
-    ({'camera_matrix': None}, "has no 'camera_matrix' (nor 'k')", ODD),
-    ({'image_width': None}, "has no 'image_width' (nor 'width')", ODD),
-    ({'image_width': 0}, "'image_width' is 0, not a number of pixels", ODD),
-    ({'image_height': 719.5}, "'image_height' is 719.5, not a number of pixels", ODD),
-    ({'image_height': True}, "'image_height' holds True, not a finite number", ODD),
-    ({'distortion_model': None}, "has no 'distortion_model'", ODD),
-    ({'distortion_model': 'thin_prism'}, "distortion model is 'thin_prism', and only plumb_bob", 'calibrate the'),
-    ({'distortion_model': ''}, "distortion model is ''", 'or leave the file out'),
-    ({'distortion_model': 'rational_polynomial'}, 'holds 5 numbers, expected 8', ODD),
-    ({'distortion_model': 'equidistant'}, 'holds 5 numbers, expected 4 at the most', ODD),
-    ({'distortion_coefficients': {'data': [0.0] * 3}}, 'holds 3 numbers, expected 4 or 5', ODD),
-    ({'distortion_coefficients': {'data': [0.0, INF, 0.0, 0.0]}}, 'holds inf, not a finite number', ODD),
-    ({'distortion_coefficients': None}, "has no 'distortion_coefficients' (nor 'd')", ODD),
-    ({'distortion_coefficients': {'data': [-0.5, 0.0, 0.0, 0.0]}}, 'folds back and leaves 33 % of the image empty',
-     'near the borders'),
-    ({'distortion_model': 'equidistant', 'distortion_coefficients': {'data': [-9.0]}}, 'folds back and leaves',
-     'calibrate the camera anew'),
-    ({'distortion_model': 'equidistant', 'distortion_coefficients': {'data': [1e9]}}, 'degrees from corner to corner',
-     'calibrate the camera anew'),
-    ({'distortion_coefficients': {'data': [-0.3, 0.1, 0.002, 0.0]}}, 'tangential distortion', '--zero-tangent-dist'),
-    ({'camera_matrix': {'data': [*SQUARE[:4], 910.0, *SQUARE[5:]]}}, 'two focal lengths, 900.0 and 910.0 px',
-     '--fix-aspect-ratio'),
-    ({'camera_matrix': {'data': [900.0, 5.0, *SQUARE[2:]]}}, 'skewed axes', 'or leave the file out'),
-    ({'camera_matrix': {'data': [*WIDE[:4], 505.0, *WIDE[5:]]}, 'distortion_model': 'equidistant',
-      'distortion_coefficients': [0.01]}, 'two focal lengths, 500.0 and 505.0 px', '--fix-aspect-ratio'),
-    ({'camera_matrix': {'data': [500.0, 5.0, *WIDE[2:]]}, 'distortion_model': 'equidistant',
-      'distortion_coefficients': [0.01]}, 'skewed axes', 'or leave the file out'),
-    ({'camera_matrix': {'data': [250.0, *WIDE[1:4], 250.0, *WIDE[5:]]}, 'distortion_coefficients': [0.0] * 5},
-     'its angle is too wide', 'with a fisheye model'),
-    ({'roi': {'x_offset': 10, 'width': 640, 'height': 360}}, 'region of interest', 'without roi')])
+@pytest.mark.parametrize(
+    ('changes', 'told', 'remedy'),
+    [
+        (
+            {'camera_matrix': {'data': [0.0] * 9}},
+            'not calibrated, its focal length is 0',
+            'calibrate the camera, or leave',
+        ),
+        ({'camera_matrix': {'data': [1.0] * 8}}, "'camera_matrix' holds 8 numbers, expected 9", ODD),
+        ({'camera_matrix': {'data': [NAN, *SQUARE[1:]]}}, "'camera_matrix' holds nan, not a finite number", ODD),
+        ({'camera_matrix': {'data': ['wide', *SQUARE[1:]]}}, "'camera_matrix' holds 'wide', not a finite number", ODD),
+        ({'camera_matrix': {'data': [-900.0, *SQUARE[1:]]}}, 'not of the form fx s cx', ODD),
+        ({'camera_matrix': {'data': [*SQUARE[:8], 2.0]}}, 'not of the form fx s cx', ODD),
+        ({'camera_matrix': {'rows': 3}}, "'camera_matrix' holds no list of numbers", ODD),
+        ({'camera_matrix': 'none'}, "'camera_matrix' holds no list of numbers", ODD),
+        ({'camera_matrix': None}, "has no 'camera_matrix' (nor 'k')", ODD),
+        ({'image_width': None}, "has no 'image_width' (nor 'width')", ODD),
+        ({'image_width': 0}, "'image_width' is 0, not a number of pixels", ODD),
+        ({'image_height': 719.5}, "'image_height' is 719.5, not a number of pixels", ODD),
+        ({'image_height': True}, "'image_height' holds True, not a finite number", ODD),
+        ({'distortion_model': None}, "has no 'distortion_model'", ODD),
+        ({'distortion_model': 'thin_prism'}, "distortion model is 'thin_prism', and only plumb_bob", 'calibrate the'),
+        ({'distortion_model': ''}, "distortion model is ''", 'or leave the file out'),
+        ({'distortion_model': 'rational_polynomial'}, 'holds 5 numbers, expected 8', ODD),
+        ({'distortion_model': 'equidistant'}, 'holds 5 numbers, expected 4 at the most', ODD),
+        ({'distortion_coefficients': {'data': [0.0] * 3}}, 'holds 3 numbers, expected 4 or 5', ODD),
+        ({'distortion_coefficients': {'data': [0.0, INF, 0.0, 0.0]}}, 'holds inf, not a finite number', ODD),
+        ({'distortion_coefficients': None}, "has no 'distortion_coefficients' (nor 'd')", ODD),
+        (
+            {'distortion_coefficients': {'data': [-0.5, 0.0, 0.0, 0.0]}},
+            'folds back and leaves 33 % of the image empty',
+            'near the borders',
+        ),
+        (
+            {'distortion_model': 'equidistant', 'distortion_coefficients': {'data': [-9.0]}},
+            'folds back and leaves',
+            'calibrate the camera anew',
+        ),
+        (
+            {'distortion_model': 'equidistant', 'distortion_coefficients': {'data': [1e9]}},
+            'degrees from corner to corner',
+            'calibrate the camera anew',
+        ),
+        (
+            {'distortion_coefficients': {'data': [-0.3, 0.1, 0.002, 0.0]}},
+            'tangential distortion',
+            '--zero-tangent-dist',
+        ),
+        (
+            {'camera_matrix': {'data': [*SQUARE[:4], 910.0, *SQUARE[5:]]}},
+            'two focal lengths, 900.0 and 910.0 px',
+            '--fix-aspect-ratio',
+        ),
+        ({'camera_matrix': {'data': [900.0, 5.0, *SQUARE[2:]]}}, 'skewed axes', 'or leave the file out'),
+        (
+            {
+                'camera_matrix': {'data': [*WIDE[:4], 505.0, *WIDE[5:]]},
+                'distortion_model': 'equidistant',
+                'distortion_coefficients': [0.01],
+            },
+            'two focal lengths, 500.0 and 505.0 px',
+            '--fix-aspect-ratio',
+        ),
+        (
+            {
+                'camera_matrix': {'data': [500.0, 5.0, *WIDE[2:]]},
+                'distortion_model': 'equidistant',
+                'distortion_coefficients': [0.01],
+            },
+            'skewed axes',
+            'or leave the file out',
+        ),
+        (
+            {'camera_matrix': {'data': [250.0, *WIDE[1:4], 250.0, *WIDE[5:]]}, 'distortion_coefficients': [0.0] * 5},
+            'its angle is too wide',
+            'with a fisheye model',
+        ),
+        ({'roi': {'x_offset': 10, 'width': 640, 'height': 360}}, 'region of interest', 'without roi'),
+    ],
+)
 def test_an_unusable_file_is_told_with_a_remedy(tmp_path, changes, told, remedy):
     text = complaint(written(tmp_path, document(**changes)))
     assert told in text
@@ -238,22 +317,45 @@ def test_an_unusable_file_is_told_with_a_remedy(tmp_path, changes, told, remedy)
 
 def test_the_error_of_a_conversion_is_told_in_pixels(tmp_path):
     # keeping fx misses by 1 % of the 365 px to the upper border, keeping fy by 1 % of the 647 px to the right one
-    text = complaint(written(tmp_path, document(camera_matrix=[*SQUARE[:4], 909.0, *SQUARE[5:]],
-                                                distortion_coefficients=[0.0] * 5)))
+    text = complaint(
+        written(tmp_path, document(camera_matrix=[*SQUARE[:4], 909.0, *SQUARE[5:]], distortion_coefficients=[0.0] * 5))
+    )
     error_px = float(text.split('misses this one by up to ')[1].split(' px')[0])
     assert 1.0 < error_px < 6.47
     assert 'more than 0.5 px would spoil the pose' in text
 
 
 BOMB = b'a: &a [x, x, x, x, x, x, x, x, x]\n' + b''.join(
-    b'%c: &%c [%s]\n' % (code, code, b', '.join([b'*%c' % (code - 1)] * 9)) for code in range(ord('b'), ord('j')))
+    b'%c: &%c [%s]\n' % (code, code, b', '.join([b'*%c' % (code - 1)] * 9)) for code in range(ord('b'), ord('j'))
+)
 
 
-@pytest.mark.parametrize('content', [
-    b'', b'words only', b'[1, 2]', b'{', b'\x00\x01', b'\xff\xfe\x00', b'[' * 20000, b'&a [*a]', b'{[1]: 2}',
-    b'&a {image_width: *a}', BOMB + b'image_width: *i', b'!!python/object/apply:os.system [ls]',
-    b'image_width: !!int ""', b'image_width: ' + b'9' * 5000, b'image_width: ' + b'9' * 400,
-    b'image_width: 2020-13-45', b'!!timestamp x', b'!!bool x', b'<<: 3', b'a' * 2_000_000], ids=range(20))
+@pytest.mark.parametrize(
+    'content',
+    [
+        b'',
+        b'words only',
+        b'[1, 2]',
+        b'{',
+        b'\x00\x01',
+        b'\xff\xfe\x00',
+        b'[' * 20000,
+        b'&a [*a]',
+        b'{[1]: 2}',
+        b'&a {image_width: *a}',
+        BOMB + b'image_width: *i',
+        b'!!python/object/apply:os.system [ls]',
+        b'image_width: !!int ""',
+        b'image_width: ' + b'9' * 5000,
+        b'image_width: ' + b'9' * 400,
+        b'image_width: 2020-13-45',
+        b'!!timestamp x',
+        b'!!bool x',
+        b'<<: 3',
+        b'a' * 2_000_000,
+    ],
+    ids=range(20),
+)
 def test_hostile_yaml_is_one_clear_line(tmp_path, content):
     assert 'give the file of camera_info_manager' in complaint(written(tmp_path, content))
 

@@ -27,7 +27,11 @@ from autocalib_ros.lens.opencv_lens import MAX_MODEL_ERROR_PX, fit_opencv_coeffi
 
 WIDTH, HEIGHT = 1280, 720
 EQUIDISTANT, BARREL, NARROWING, TANGENT = (
-    (0.0,) * 4, (0.02, -0.005, 0.0, 0.0), (-0.03, 0.002, 0.0, 0.0), (1 / 3, 2 / 15, 17 / 315, 62 / 2835))
+    (0.0,) * 4,
+    (0.02, -0.005, 0.0, 0.0),
+    (-0.03, 0.002, 0.0, 0.0),
+    (1 / 3, 2 / 15, 17 / 315, 62 / 2835),
+)
 LENSES = (EQUIDISTANT, BARREL, NARROWING, TANGENT)
 EXACT_PX = 1e-5
 """The two ways of projecting agree to this, and a coefficient of 1e-9 that keeps D from being zero moves no more."""
@@ -65,9 +69,19 @@ def worst_px(info, camera: Camera) -> float:
 
 @pytest.mark.parametrize('offset_px', [(0.0, 0.0), (37.0, -21.0)])
 @pytest.mark.parametrize('k', LENSES)
-@pytest.mark.parametrize(('model', 'field_deg'), [
-    ('equidistant', 60), ('equidistant', 170), ('rational_polynomial', 60), ('rational_polynomial', 110),
-    ('rational_polynomial', 150), ('rational_polynomial', 162), ('plumb_bob', 60), ('plumb_bob', 90)])
+@pytest.mark.parametrize(
+    ('model', 'field_deg'),
+    [
+        ('equidistant', 60),
+        ('equidistant', 170),
+        ('rational_polynomial', 60),
+        ('rational_polynomial', 110),
+        ('rational_polynomial', 150),
+        ('rational_polynomial', 162),
+        ('plumb_bob', 60),
+        ('plumb_bob', 90),
+    ],
+)
 def test_the_error_that_is_told_is_that_of_opencv_over_the_whole_image(model, field_deg, k, offset_px):
     camera = lens(field_deg, k, offset_px)
     info = camera_info(camera, model)
@@ -88,8 +102,13 @@ def test_no_plumb_bob_comes_nearer_than_the_fitted_one(field_deg, k):
     slope, radius = np.tan(theta), camera.radius(theta)
     powers = camera.focal_px * slope[:, None] * (slope[:, None] / slope[-1]) ** [2, 4, 6]
     rest, one = radius - camera.focal_px * slope, np.ones((800, 1))
-    least = linprog([0, 0, 0, 1], np.block([[powers, -one], [-powers, -one]]), np.concatenate([rest, -rest]),
-                    bounds=[(None, None)] * 3 + [(0, None)], method='highs')
+    least = linprog(
+        [0, 0, 0, 1],
+        np.block([[powers, -one], [-powers, -one]]),
+        np.concatenate([rest, -rest]),
+        bounds=[(None, None)] * 3 + [(0, None)],
+        method='highs',
+    )
     error_px = fit_opencv_coefficients(camera, rational=False)[1]
     assert error_px <= 1.1 * least.fun + 1e-4
 
@@ -155,8 +174,9 @@ def test_the_rectified_camera_is_finite_and_positive_for_any_field(field_deg, k,
 def rectified_rays(camera: Camera, balance: float) -> np.ndarray:
     """Return the bearings of the pixels of the rectified image, shape (n, 3)."""
     pixels = np.stack(np.meshgrid(np.linspace(0, WIDTH - 1, 161), np.linspace(0, HEIGHT - 1, 91)), axis=-1)
-    return np.column_stack([pixels.reshape(-1, 2), np.ones(161 * 91)]) @ np.linalg.inv(
-        rectified_matrix(camera, balance)).T
+    return (
+        np.column_stack([pixels.reshape(-1, 2), np.ones(161 * 91)]) @ np.linalg.inv(rectified_matrix(camera, balance)).T
+    )
 
 
 @pytest.mark.parametrize('k', LENSES)
@@ -183,15 +203,19 @@ def test_the_balance_zooms_out_steadily():
 
 
 @pytest.mark.parametrize('k', LENSES)
-@pytest.mark.parametrize(('model', 'field_deg'), [('plumb_bob', 90), ('rational_polynomial', 90),
-                                                  ('rational_polynomial', 130), ('rational_polynomial', 150)])
+@pytest.mark.parametrize(
+    ('model', 'field_deg'),
+    [('plumb_bob', 90), ('rational_polynomial', 90), ('rational_polynomial', 130), ('rational_polynomial', 150)],
+)
 def test_what_the_lens_does_not_see_is_not_mirrored_into_the_rectified_image(model, field_deg, k):
     # a polynomial that bends back beyond the field would show the road twice
     camera = lens(field_deg, k)
     rays = rectified_rays(camera, 1.0)
     truth, found = camera.project(rays)[0], by_opencv(camera_info(camera, model), rays)
+
     def inside(pixels: np.ndarray) -> np.ndarray:
         return ((pixels >= 0) & (pixels <= (WIDTH - 1, HEIGHT - 1))).all(axis=1)
+
     assert np.hypot(*(found - truth)[inside(found)].T).max() <= MAX_MODEL_ERROR_PX
 
 
@@ -204,9 +228,17 @@ def as_image_geometry(matrix: list[float], columns: int, readout: Readout) -> np
     return rows
 
 
-@pytest.mark.parametrize('readout', [
-    Readout(1280, 720), Readout(2560, 1440, (2, 2)), Readout(2561, 1441, (2, 2)), Readout(2560, 720, (2, 0)),
-    Readout(1920, 1080, (1, 1), (300, 200), (1280, 720)), Readout(4000, 3000, (2, 2), (301, 200), (2560, 1440))])
+@pytest.mark.parametrize(
+    'readout',
+    [
+        Readout(1280, 720),
+        Readout(2560, 1440, (2, 2)),
+        Readout(2561, 1441, (2, 2)),
+        Readout(2560, 720, (2, 0)),
+        Readout(1920, 1080, (1, 1), (300, 200), (1280, 720)),
+        Readout(4000, 3000, (2, 2), (301, 200), (2560, 1440)),
+    ],
+)
 def test_a_message_in_full_resolution_is_the_calibration_in_the_image(readout):
     camera = lens(110, BARREL, (12.0, -7.0))
     info = camera_info(camera, 'rational_polynomial')
@@ -217,12 +249,17 @@ def test_a_message_in_full_resolution_is_the_calibration_in_the_image(readout):
     np.testing.assert_allclose(as_image_geometry(full.p, 4, readout), np.reshape(info.p, (3, 4)), rtol=1e-14)
 
 
-@pytest.mark.parametrize(('readout', 'told'), [
-    (Readout(1280, 720, (2, 2)), 'of images of 640x360, and these have 1280x720'),  # both scalings at once
-    (Readout(1920, 1080), 'of images of 1920x1080'), (Readout(0, 0), 'of images of 0x0'),
-    (Readout(1920, 1080, (1, 1), (0, 0), (640, 480)), 'of images of 640x480'),
-    (Readout(1920, 1080, (1, 1), (641, 0), (1280, 720)), 'reaches beyond its 1920x1080 pixels'),
-    (Readout(0, 0, (1, 1), (0, 0), (1280, 720)), 'reaches beyond its 0x0 pixels')])
+@pytest.mark.parametrize(
+    ('readout', 'told'),
+    [
+        (Readout(1280, 720, (2, 2)), 'of images of 640x360, and these have 1280x720'),  # both scalings at once
+        (Readout(1920, 1080), 'of images of 1920x1080'),
+        (Readout(0, 0), 'of images of 0x0'),
+        (Readout(1920, 1080, (1, 1), (0, 0), (640, 480)), 'of images of 640x480'),
+        (Readout(1920, 1080, (1, 1), (641, 0), (1280, 720)), 'reaches beyond its 1920x1080 pixels'),
+        (Readout(0, 0, (1, 1), (0, 0), (1280, 720)), 'reaches beyond its 0x0 pixels'),
+    ],
+)
 def test_a_readout_of_other_images_is_told(readout, told):
     with pytest.raises(InputError, match=told):
         to_full_resolution(camera_info(lens(100)), readout)

@@ -8,8 +8,13 @@ import pytest
 
 from autocalib_ros.lens.opencv_lens import distort, undistort
 
-LENSES = [(0.0,) * 8, (-0.3, 0.1, 0.0, 0.0, -0.02, 0.0, 0.0, 0.0), (0.0, 0.0, 0.003, -0.001, 0.0, 0.0, 0.0, 0.0),
-          (-0.3, 0.1, -0.002, 0.004, -0.02, 0.0, 0.0, 0.0), (1.2, 0.3, 0.001, 0.0005, 0.01, 1.5, 0.5, 0.03)]
+LENSES = [
+    (0.0,) * 8,
+    (-0.3, 0.1, 0.0, 0.0, -0.02, 0.0, 0.0, 0.0),
+    (0.0, 0.0, 0.003, -0.001, 0.0, 0.0, 0.0, 0.0),
+    (-0.3, 0.1, -0.002, 0.004, -0.02, 0.0, 0.0, 0.0),
+    (1.2, 0.3, 0.001, 0.0005, 0.01, 1.5, 0.5, 0.03),
+]
 
 
 @pytest.fixture
@@ -23,8 +28,9 @@ def normalised() -> np.ndarray:
 @pytest.mark.parametrize('coefficients', LENSES)
 def test_distortion_is_that_of_opencv(normalised, coefficients):
     still = np.zeros(3)
-    expected, _ = cv2.projectPoints(np.column_stack([normalised, np.ones(len(normalised))]), still, still, np.eye(3),
-                                    np.array(coefficients))
+    expected, _ = cv2.projectPoints(
+        np.column_stack([normalised, np.ones(len(normalised))]), still, still, np.eye(3), np.array(coefficients)
+    )
     np.testing.assert_allclose(distort(normalised, coefficients), expected[:, 0], atol=1e-12)
 
 

@@ -37,8 +37,15 @@ def header(stamp_ns: int, frame_id: str = 'cam1_optical', types: Any = TYPES) ->
 
 def raw_image(index: int, stamp_ns: int, types: Any = TYPES, **changes: Any) -> Any:
     """Return a mono8 sensor_msgs/Image."""
-    fields = {'header': header(stamp_ns, types=types), 'height': HEIGHT, 'width': WIDTH, 'encoding': 'mono8',
-              'is_bigendian': 0, 'step': WIDTH, 'data': picture(index).ravel()}
+    fields = {
+        'header': header(stamp_ns, types=types),
+        'height': HEIGHT,
+        'width': WIDTH,
+        'encoding': 'mono8',
+        'is_bigendian': 0,
+        'step': WIDTH,
+        'data': picture(index).ravel(),
+    }
     return types.types['sensor_msgs/msg/Image'](**{**fields, **changes})
 
 
@@ -51,8 +58,15 @@ def jpeg_image(index: int, stamp_ns: int) -> Any:
 @pytest.fixture
 def write_bag() -> Callable[..., Path]:
     """Return a function that writes a rosbag2 folder of (topic, recorded_ns, message)."""
-    def write(path: Path, messages: list[tuple[str, int, Any]], *, mcap: bool = False,
-              compression: str = 'NONE', topics: tuple[tuple[str, str], ...] = ()) -> Path:
+
+    def write(
+        path: Path,
+        messages: list[tuple[str, int, Any]],
+        *,
+        mcap: bool = False,
+        compression: str = 'NONE',
+        topics: tuple[tuple[str, str], ...] = (),
+    ) -> Path:
         writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP if mcap else StoragePlugin.SQLITE3)
         writer.set_compression(CompressionMode[compression], CompressionFormat.ZSTD)
         with writer:
@@ -61,12 +75,14 @@ def write_bag() -> Callable[..., Path]:
             for topic, recorded_ns, message in messages:
                 writer.write(connections[topic], recorded_ns, TYPES.serialize_cdr(message, message.__msgtype__))
         return path
+
     return write
 
 
 @pytest.fixture
 def write_bag1() -> Callable[..., Path]:
     """Return a function that writes a ROS 1 bag of (topic, recorded_ns, message)."""
+
     def write(path: Path, messages: list[tuple[str, int, Any]]) -> Path:
         with Writer1(path) as writer:
             kinds = dict.fromkeys((topic, message.__msgtype__) for topic, _, message in messages)
@@ -74,22 +90,31 @@ def write_bag1() -> Callable[..., Path]:
             for topic, recorded_ns, message in messages:
                 writer.write(connections[topic], recorded_ns, TYPES1.serialize_ros1(message, message.__msgtype__))
         return path
+
     return write
 
 
 @pytest.fixture
 def images() -> Callable[..., list[tuple[str, int, Any]]]:
     """Return a function that gives images at 10 Hz, recorded 5 ms after their stamps."""
-    def make(count: int = 8, topic: str = '/cam1/image_raw', make_one: Callable[..., Any] = raw_image,
-             begin_ns: int = 100 * SECOND, **changes: Any) -> list[tuple[str, int, Any]]:
+
+    def make(
+        count: int = 8,
+        topic: str = '/cam1/image_raw',
+        make_one: Callable[..., Any] = raw_image,
+        begin_ns: int = 100 * SECOND,
+        **changes: Any,
+    ) -> list[tuple[str, int, Any]]:
         stamps = [begin_ns + index * SECOND // 10 for index in range(count)]
         return [(topic, stamp + 5_000_000, make_one(index, stamp, **changes)) for index, stamp in enumerate(stamps)]
+
     return make
 
 
 @pytest.fixture
 def write_video() -> Callable[..., Path]:
     """Return a function that writes a small video of `count` frames."""
+
     def write(path: Path, count: int = 30, fps: float = 10.0, size: tuple[int, int] = (64, 48)) -> Path:
         code = {'.mp4': 'mp4v', '.avi': 'MJPG', '.mkv': 'MJPG'}[path.suffix]
         writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*code), fps, size)
@@ -98,6 +123,7 @@ def write_video() -> Callable[..., Path]:
             writer.write(np.roll(noise, index, axis=1))
         writer.release()
         return path
+
     return write
 
 
@@ -129,8 +155,9 @@ def a_header() -> Any:
 def full() -> ReplayResult:
     """Return a calibrated replay with everything that a report can show."""
     evidence = junction_evidence()
-    return ReplayResult(result=full_result(evidence), evidence=evidence, accepted_at_s=30.0, background=grey_road(),
-                        frames=600)
+    return ReplayResult(
+        result=full_result(evidence), evidence=evidence, accepted_at_s=30.0, background=grey_road(), frames=600
+    )
 
 
 @pytest.fixture

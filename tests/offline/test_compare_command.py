@@ -18,25 +18,29 @@ from autocalib_ros.results.calibration_json import calibration_json, write_calib
 from stored_results import calibration
 
 OURS = calibration()
-STATED = np.diag([1.0, 2.1, 1.9, 0.004, 0.001, 0, 0, 0.2, 0.21, 0.05])**2
+STATED = np.diag([1.0, 2.1, 1.9, 0.004, 0.001, 0, 0, 0.2, 0.21, 0.05]) ** 2
 
 
 @pytest.fixture
 def files(tmp_path):
     """Return a function that writes a calibration under a name and returns its path."""
+
     def write(name: str, result=OURS):
         path = tmp_path / name
         write_calibration_json(path, replace(result, covariance=STATED))
         return str(path)
+
     return write
 
 
 @pytest.fixture
 def compare(capsys):
     """Return a function that runs the command: status, stdout, stderr."""
+
     def run(*arguments: object):
         status = main(['compare', *map(str, arguments)])
         return status, *capsys.readouterr()
+
     return run
 
 
@@ -68,9 +72,19 @@ def test_a_camera_info_of_a_topic_and_of_a_file_are_read(files, compare, tmp_pat
     write_camera_info_yaml(tmp_path / 'lens.yaml', OURS.camera, 'north')
     assert compare(files('a.json'), tmp_path / 'lens.yaml')[0] == 0
     info = camera_info(OURS.camera)
-    echoed = {'header': {'frame_id': 'x'}, 'height': info.height, 'width': info.width,
-              'distortion_model': info.distortion_model, 'd': info.d, 'k': info.k, 'r': info.r, 'p': info.p,
-              'binning_x': 0, 'binning_y': 0, 'roi': {'x_offset': 0, 'y_offset': 0, 'height': 0, 'width': 0}}
+    echoed = {
+        'header': {'frame_id': 'x'},
+        'height': info.height,
+        'width': info.width,
+        'distortion_model': info.distortion_model,
+        'd': info.d,
+        'k': info.k,
+        'r': info.r,
+        'p': info.p,
+        'binning_x': 0,
+        'binning_y': 0,
+        'roi': {'x_offset': 0, 'y_offset': 0, 'height': 0, 'width': 0},
+    }
     (tmp_path / 'echo.yaml').write_text(yaml.safe_dump(echoed) + '---\n')
     status, stdout, _ = compare(tmp_path / 'echo.yaml', files('a.json'))
     assert status == 0
@@ -86,12 +100,23 @@ def truth(tmp_path):
     points = np.stack([x.ravel(), y.ravel(), np.zeros(36)], axis=1)
     rows = np.concatenate([points[:, :2], ground_to_image(camera, ground, points)], axis=1)
     path = tmp_path / 'truth.json'
-    path.write_text(json.dumps({
-        'width': camera.width, 'height': camera.height,
-        'lens': {'model': 'kannala_brandt', 'f': 303.0, 'k': list(camera.k), 'cx': camera.principal_point_px[0],
-                 'cy': camera.principal_point_px[1]},
-        'camera': {'R_world_from_camera': ground.rotation.tolist(), 'height': 8.4, 'position': [0, 0, 8.4]},
-        'ground_points': {'rows': rows.tolist()}}))
+    path.write_text(
+        json.dumps(
+            {
+                'width': camera.width,
+                'height': camera.height,
+                'lens': {
+                    'model': 'kannala_brandt',
+                    'f': 303.0,
+                    'k': list(camera.k),
+                    'cx': camera.principal_point_px[0],
+                    'cy': camera.principal_point_px[1],
+                },
+                'camera': {'R_world_from_camera': ground.rotation.tolist(), 'height': 8.4, 'position': [0, 0, 8.4]},
+                'ground_points': {'rows': rows.tolist()},
+            }
+        )
+    )
     return path
 
 
@@ -108,11 +133,14 @@ def test_both_are_compared_with_the_truth(files, compare, truth):
     assert 'against the truth' in compare(files('a.json'), files('b.json'), '--truth', truth)[1]
 
 
-@pytest.mark.parametrize(('name', 'text', 'told'), [
-    ('cut.json', calibration_json(OURS)[:500], 'it is not JSON'),
-    ('nowhere.json', None, 'cannot read'),
-    ('list.yaml', '[1, 2]', 'holds no names with values'),
-])
+@pytest.mark.parametrize(
+    ('name', 'text', 'told'),
+    [
+        ('cut.json', calibration_json(OURS)[:500], 'it is not JSON'),
+        ('nowhere.json', None, 'cannot read'),
+        ('list.yaml', '[1, 2]', 'holds no names with values'),
+    ],
+)
 def test_a_wrong_file_is_one_line_and_status_2(name, text, told, files, compare, tmp_path):
     if text is not None:
         (tmp_path / name).write_text(text)

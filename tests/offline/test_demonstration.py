@@ -22,8 +22,11 @@ def truth(full):
     x, y = np.meshgrid(np.linspace(2, 20, 6), np.linspace(2, 20, 6))
     points = np.stack([x.ravel(), y.ravel(), np.zeros(36)], axis=1)
     rows = np.concatenate([points[:, :2] + [5, -3], ground_to_image(camera, ground, points)], axis=1)
-    return {'lens': {'f': 140.0}, 'ground_points': {'rows': rows.tolist()},
-            'camera': {'R_world_from_camera': ground.rotation.tolist(), 'height': 8.0, 'position': [5, -3, 8]}}
+    return {
+        'lens': {'f': 140.0},
+        'ground_points': {'rows': rows.tolist()},
+        'camera': {'R_world_from_camera': ground.rotation.tolist(), 'height': 8.0, 'position': [5, -3, 8]},
+    }
 
 
 def test_the_truth_itself_has_no_error(full, truth):
@@ -51,8 +54,10 @@ def test_somebody_who_knows_a_distance_or_a_speed_is_given_the_truth(truth):
     along = [[0.2 * step, 2.0 * step, 0.1, 0.0, 10.0, 0, 0] for step in range(20)]
     waiting = [[10 + 0.2 * step, 40.0, 0.1, 0.0, 0.0, 0, 0] for step in range(20)]
     turning = [[20.0, 12 * np.cos(angle), 12 * np.sin(angle), angle, 5.0, 0, 0] for angle in np.linspace(0, 2, 20)]
-    truth |= {'road_directions': [[1, 0, 0], [0, 1, 0]],
-              'vehicles': {'tracks': [{'rows': along + waiting}, {'rows': turning}, {'rows': along}]}}
+    truth |= {
+        'road_directions': [[1, 0, 0], [0, 1, 0]],
+        'vehicles': {'tracks': [{'rows': along + waiting}, {'rows': turning}, {'rows': along}]},
+    }
     # waiting takes no way, and a loop on the way does not see it
     assert options_from_truth(truth, 'speed').scale.speed_km_h == pytest.approx(36.0)
 
@@ -60,7 +65,9 @@ def test_somebody_who_knows_a_distance_or_a_speed_is_given_the_truth(truth):
 def test_a_tilted_ground_is_not_good(full, truth):
     angle = np.radians(1.5)
     tilt = np.array([[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]])
-    comparison = compare_with_truth(replace(full.result, ground=GroundPlane(tilt @ full.result.ground.rotation, 8.0)), truth)
+    comparison = compare_with_truth(
+        replace(full.result, ground=GroundPlane(tilt @ full.result.ground.rotation, 8.0)), truth
+    )
     assert comparison.normal_deg == pytest.approx(1.5)
     assert not comparison.within_tolerance
 

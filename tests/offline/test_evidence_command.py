@@ -39,9 +39,11 @@ def lens_file(tmp_path) -> Path:
 @pytest.fixture
 def without_height(saved, capsys):
     """Return a function that runs the command: status, stdout and stderr."""
+
     def run(*arguments: object) -> tuple[int, str, str]:
         status = main(['evidence', str(saved), *map(str, arguments)])
         return status, *capsys.readouterr()
+
     return run
 
 
@@ -62,7 +64,11 @@ def test_a_calibration_is_summed_up_and_written(evidence, tmp_path):
     assert stdout.endswith(f'Written to {tmp_path / "out"}: camera_info.yaml, calibration.json, report.html\n')
     assert 'accepted after' not in stdout
     assert {path.name for path in (tmp_path / 'out').iterdir()} == {
-        'camera_info.yaml', 'calibration.json', 'report.html', 'figures'}
+        'camera_info.yaml',
+        'calibration.json',
+        'report.html',
+        'figures',
+    }
     figures = {path.stem for path in (tmp_path / 'out' / 'figures').iterdir()}
     assert {'all_tracks', 'kept_tracks', 'ground_grid', 'top_view', 'undistorted'} <= figures  # without a picture
     assert 'settling' not in figures  # saved evidence does not say what was known when
@@ -116,8 +122,12 @@ def test_a_known_lens_is_kept_and_the_pose_is_found(evidence, lens_file):
     status, stdout, _ = evidence('--json', '--camera-info', lens_file)
     assert status == 0
     found = document(stdout)
-    assert found['camera'] == {'model': 'kannala_brandt', 'focal_px': 560.0, 'principal_point_px': [639.5, 359.5],
-                               'k': [0.0, 0.0, 0.0, 0.0]}
+    assert found['camera'] == {
+        'model': 'kannala_brandt',
+        'focal_px': 560.0,
+        'principal_point_px': [639.5, 359.5],
+        'k': [0.0, 0.0, 0.0, 0.0],
+    }
     x, y, z, w = found['ground_from_camera']['rotation_xyzw']
     up_in_camera = np.array([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)])
     # with the true lens the normal is as good as 0.2 px at the ends of tracks of hundreds of pixels
@@ -181,16 +191,19 @@ def test_a_lens_of_another_shape_is_wrong_usage(evidence, tmp_path):
     assert stderr.startswith('autocalib: error: the lens was calibrated in images of 500x500') and '1280x720' in stderr
 
 
-@pytest.mark.parametrize(('name', 'told'), [
-    ('nowhere.yaml', 'cannot read'), ('evidence.npz', 'it is not YAML'), ('.', 'Is a directory')])
+@pytest.mark.parametrize(
+    ('name', 'told'), [('nowhere.yaml', 'cannot read'), ('evidence.npz', 'it is not YAML'), ('.', 'Is a directory')]
+)
 def test_an_unreadable_lens_is_one_line_and_status_2(evidence, saved, name, told):
     status, stdout, stderr = evidence('--camera-info', saved.parent / name)
     assert (status, stdout, stderr.count('\n')) == (2, '', 1)
     assert told in stderr and str(saved.parent) in stderr
 
 
-@pytest.mark.parametrize(('content', 'told'), [
-    (None, 'No such file'), (b'', 'is not a file of saved evidence'), (b'words', 'is not a file of saved evidence')])
+@pytest.mark.parametrize(
+    ('content', 'told'),
+    [(None, 'No such file'), (b'', 'is not a file of saved evidence'), (b'words', 'is not a file of saved evidence')],
+)
 def test_unreadable_evidence_is_one_line_and_status_2(content, told, tmp_path, capsys):
     if content is not None:
         (tmp_path / 'e.npz').write_bytes(content)
@@ -202,8 +215,9 @@ def test_unreadable_evidence_is_one_line_and_status_2(content, told, tmp_path, c
 
 def test_camera_info_is_in_the_distortion_model_that_is_asked_for(evidence):
     _, plain, _ = evidence('--method', 'paper', '--json')
-    status, stdout, _ = evidence('--method', 'paper', '--json', '-p', 'distortion_model=rational_polynomial',
-                                 '-p', 'rectified_balance=1.0')
+    status, stdout, _ = evidence(
+        '--method', 'paper', '--json', '-p', 'distortion_model=rational_polynomial', '-p', 'rectified_balance=1.0'
+    )
     assert status == 0
     before, found = document(plain), document(stdout)
     assert found['camera'] == before['camera']

@@ -13,6 +13,7 @@ import pytest
 
 from autocalib_ros.cli import main
 from autocalib_ros.evidence.snapshot import Evidence
+from autocalib_ros.offline.benchmark import golden
 from autocalib_ros.offline.benchmark.golden import (
     Case,
     Measured,
@@ -27,14 +28,14 @@ from autocalib_ros.offline.benchmark.golden import (
     told,
     write_cases,
 )
-from autocalib_ros.offline.benchmark.runtime import golden
 from synthetic_results import full_result, junction_evidence, lens_result, refusal
 
 STORED = Path(__file__).parents[1] / 'golden'
 CALIBRATED = {'state': 'calibrated', 'grade': 'full', 'refusal': None, 'ground_refusal': None, 'roads': 2, 'people': 0}
 REFUSED = {**dict.fromkeys(CALIBRATED), 'state': 'refused', 'refusal': 'no_motion'}
-EXPECTED = Outcome(CALIBRATED, {'focal_px': 560.0, 'k1': 0.01, 'k2': 0.0, 'height_m': 8.0},
-                   {'focal_px': 4.0, 'k1': 0.002, 'k2': 0.0})
+EXPECTED = Outcome(
+    CALIBRATED, {'focal_px': 560.0, 'k1': 0.01, 'k2': 0.0, 'height_m': 8.0}, {'focal_px': 4.0, 'k1': 0.002, 'k2': 0.0}
+)
 FULL = full_result(junction_evidence())
 NONE = refusal(junction_evidence())
 QUICK = ('bend', 'pedestrians', 'two_roads')
@@ -70,27 +71,31 @@ def corrupt_track(folder: Path, case: str, **changes: Any) -> None:
     path.write_text(json.dumps(document))
 
 
-@pytest.mark.parametrize(('found', 'moved'), [
-    (EXPECTED, []),
-    (with_numbers(focal_px=560.39), []),
-    (with_numbers(focal_px=559.59), ['focal_px']),
-    (with_numbers(k1=0.01019), []),
-    (with_numbers(k1=0.01021), ['k1']),
-    (with_numbers(k2=1e-10), []),  # held at zero, and still zero
-    (with_numbers(k2=1e-6), ['k2']),
-    (with_numbers(height_m=8.000007), []),  # without a sigma: a millionth of itself
-    (with_numbers(height_m=8.00001), ['height_m']),
-    (with_sigmas(focal_px=4.39), []),  # of a sigma, a tenth of itself
-    (with_sigmas(focal_px=3.59), ['sigma of focal_px']),
-    (with_sigmas(k2=1e-4), ['sigma of k2'])])
+@pytest.mark.parametrize(
+    ('found', 'moved'),
+    [
+        (EXPECTED, []),
+        (with_numbers(focal_px=560.39), []),
+        (with_numbers(focal_px=559.59), ['focal_px']),
+        (with_numbers(k1=0.01019), []),
+        (with_numbers(k1=0.01021), ['k1']),
+        (with_numbers(k2=1e-10), []),  # held at zero, and still zero
+        (with_numbers(k2=1e-6), ['k2']),
+        (with_numbers(height_m=8.000007), []),  # without a sigma: a millionth of itself
+        (with_numbers(height_m=8.00001), ['height_m']),
+        (with_sigmas(focal_px=4.39), []),  # of a sigma, a tenth of itself
+        (with_sigmas(focal_px=3.59), ['sigma of focal_px']),
+        (with_sigmas(k2=1e-4), ['sigma of k2']),
+    ],
+)
 def test_a_number_moves_when_it_leaves_a_tenth_of_its_sigma(found: Outcome, moved: list[str]) -> None:
     assert names(differences('case', EXPECTED, found)) == moved
 
 
 def test_the_change_is_told_in_expected_sigmas() -> None:
-    item, = differences('case', EXPECTED, with_numbers(focal_px=558.0))
+    (item,) = differences('case', EXPECTED, with_numbers(focal_px=558.0))
     assert item == Moved('case', 'focal_px', 560.0, 558.0, pytest.approx(-0.5))
-    item, = differences('case', EXPECTED, with_numbers(height_m=8.1))
+    (item,) = differences('case', EXPECTED, with_numbers(height_m=8.1))
     assert item.sigmas is None
 
 
@@ -107,8 +112,7 @@ def test_exact_compares_to_the_last_digit() -> None:
 
 
 def test_another_verdict_is_told_alone() -> None:
-    assert names(differences('case', EXPECTED, Outcome(REFUSED))) == [
-        'state', 'grade', 'refusal', 'roads', 'people']
+    assert names(differences('case', EXPECTED, Outcome(REFUSED))) == ['state', 'grade', 'refusal', 'roads', 'people']
     other = Outcome({**REFUSED, 'refusal': 'horizon'})
     assert differences('case', Outcome(REFUSED), other) == [Moved('case', 'refusal', 'no_motion', 'horizon')]
 
@@ -146,13 +150,18 @@ def test_lines_sum_up_what_moved() -> None:
     case = Case(name='a', description='', made='', evidence='a.npz', options={})
     assert lines(Measured((case,), {}, ())) == ['1 case: nothing moved']
     assert lines(Measured((case,) * 26, {}, ())) == ['26 cases: nothing moved']
-    moved = (Moved('a', 'focal_px', 560.0, 558.0, -0.5), Moved('a', 'grade', 'full', None),
-             Moved('a', 'k1', 0.01, 0.010000000001))
+    moved = (
+        Moved('a', 'focal_px', 560.0, 558.0, -0.5),
+        Moved('a', 'grade', 'full', None),
+        Moved('a', 'k1', 0.01, 0.010000000001),
+    )
     head, *rows, last = lines(Measured((case,) * 2, {}, moved))
     assert head.split() == ['case', 'quantity', 'expected', 'found', 'sigmas']
-    assert [row.split() for row in rows] == [['a', 'focal_px', '560', '558', '-0.5'],
-                                             ['a', 'grade', 'full', '-', '-'],
-                                             ['a', 'k1', '0.01', '0.010000000001000001', '-']]
+    assert [row.split() for row in rows] == [
+        ['a', 'focal_px', '560', '558', '-0.5'],
+        ['a', 'grade', 'full', '-', '-'],
+        ['a', 'k1', '0.01', '0.010000000001000001', '-'],
+    ]
     assert last == '2 cases: 3 values moved in 1'
 
 
@@ -167,7 +176,7 @@ def test_a_solver_that_fails_is_an_outcome(monkeypatch: pytest.MonkeyPatch) -> N
         raise np.linalg.LinAlgError('singular')
 
     monkeypatch.setattr(golden, 'solve', fail)
-    case, = chosen(read_cases(STORED), ['bend'])
+    (case,) = chosen(read_cases(STORED), ['bend'])
     assert outcome_of(STORED, case).words['state'] == 'crash:LinAlgError'
 
 
@@ -180,20 +189,26 @@ def test_what_is_written_reads_the_same(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize('text', ['{', '[]', '{"format": 1, "cases": {"a": {}}}', '{"format": 2, "cases": {}}'])
 def test_a_file_that_is_none_of_expected_values_is_wrong_input(
-        text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / golden.EXPECTED).write_text(text)
     assert main(['benchmark', 'golden', str(tmp_path)]) == 2
     told = capsys.readouterr().err
     assert golden.EXPECTED in told and told.count('\n') == 1
 
 
-@pytest.mark.parametrize(('arguments', 'message'), [
-    (['nowhere'], 'nowhere holds no golden evidence (no expected.json): give the folder that does, tests/golden'),
-    ([str(STORED), '--only', 'unheard_of'], "no golden case is called 'unheard_of'; there are bend"),
-    ([str(STORED), '--jobs', '0'], '--jobs is 1 or more; got 0'),
-    ([str(STORED), '--tolerance', '-1'], '--tolerance is 0 or more; got -1')])
+@pytest.mark.parametrize(
+    ('arguments', 'message'),
+    [
+        (['nowhere'], 'nowhere holds no golden evidence (no expected.json): give the folder that does, tests/golden'),
+        ([str(STORED), '--only', 'unheard_of'], "no golden case is called 'unheard_of'; there are bend"),
+        ([str(STORED), '--jobs', '0'], '--jobs is 1 or more; got 0'),
+        ([str(STORED), '--tolerance', '-1'], '--tolerance is 0 or more; got -1'),
+    ],
+)
 def test_wrong_usage_is_one_line_and_status_2(
-        arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(['benchmark', 'golden', *arguments]) == 2
     told = capsys.readouterr().err
     assert message in told and told.count('\n') == 1
@@ -213,7 +228,8 @@ def test_nothing_moved_is_status_0(folder: Path, capsys: pytest.CaptureFixture[s
 
 
 def test_what_moved_is_printed_and_status_3_until_it_is_expected(
-        folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     right = (folder / golden.EXPECTED).read_text()
     corrupt_track(folder, 'bend', refusal='horizon')
     corrupt_track(folder, 'pedestrians', refusal='horizon')
@@ -246,9 +262,14 @@ def test_stored_evidence_holds_what_later_methods_are_judged_by() -> None:
     assert any(evidence.track_kinds.any() for evidence in held)
 
 
-@pytest.mark.parametrize('case', [pytest.param(case, id=case.name) for case in read_cases(STORED)
-                                  if case.truth and case.expected.words['state'] == 'calibrated'
-                                  and case.options.get('method') != 'paper'])
+@pytest.mark.parametrize(
+    'case',
+    [
+        pytest.param(case, id=case.name)
+        for case in read_cases(STORED)
+        if case.truth and case.expected.words['state'] == 'calibrated' and case.options.get('method') != 'paper'
+    ],
+)
 def test_what_is_expected_of_stored_evidence_is_about_the_truth(case: Case) -> None:
     numbers, sigmas = case.expected.numbers, case.expected.stddev
     for name in ('focal_px', 'tilt_deg', 'roll_deg'):

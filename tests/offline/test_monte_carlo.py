@@ -42,15 +42,25 @@ from autocalib_ros.results.calibration import (
 
 JUNCTION = Junction()
 TASK = Task('standard', 0, 7, ('joint',))
-SUMMARY = EvidenceSummary(image_size=(1280, 720), seconds=60.0, frames=600, tracks=60, segments=0, vehicles=60,
-                          coverage=0.5)
+SUMMARY = EvidenceSummary(
+    image_size=(1280, 720), seconds=60.0, frames=600, tracks=60, segments=0, vehicles=60, coverage=0.5
+)
 
 
 def calibration(camera: Camera, ground: GroundPlane | None, stddev: StandardDeviations) -> Calibration:
     return Calibration(
-        method='joint', grade='full' if ground else 'lens', assumptions=(), camera=camera, ground=ground,
-        ground_refusal=None, road_directions=np.eye(3)[:2], stddev=stddev, paper=None, evidence=SUMMARY,
-        newest_stamp_ns=0)
+        method='joint',
+        grade='full' if ground else 'lens',
+        assumptions=(),
+        camera=camera,
+        ground=ground,
+        ground_refusal=None,
+        road_directions=np.eye(3)[:2],
+        stddev=stddev,
+        paper=None,
+        evidence=SUMMARY,
+        newest_stamp_ns=0,
+    )
 
 
 def plane(tilt_deg: float = 32.0, roll_deg: float = 1.0, heading_deg: float = 35.0) -> GroundPlane:
@@ -58,15 +68,31 @@ def plane(tilt_deg: float = 32.0, roll_deg: float = 1.0, heading_deg: float = 35
 
 
 def run(**changes: object) -> Run:
-    fields = {'family': 'standard', 'method': 'joint', 'run': 0, 'accepted': True, 'code': '', 'grade': 'full',
-              'focal_error': 0.01, 'focal_sigma': 0.01, 'rays_deg': 0.2, 'normal_deg': 0.5, 'tilt_error_deg': 0.3,
-              'tilt_sigma_deg': 0.2, 'roll_error_deg': 0.4, 'roll_sigma_deg': 0.5, 'distance_error': 0.02, 'cpu_s': 1.0}
+    fields = {
+        'family': 'standard',
+        'method': 'joint',
+        'run': 0,
+        'accepted': True,
+        'code': '',
+        'grade': 'full',
+        'focal_error': 0.01,
+        'focal_sigma': 0.01,
+        'rays_deg': 0.2,
+        'normal_deg': 0.5,
+        'tilt_error_deg': 0.3,
+        'tilt_sigma_deg': 0.2,
+        'roll_error_deg': 0.4,
+        'roll_sigma_deg': 0.5,
+        'distance_error': 0.02,
+        'cpu_s': 1.0,
+    }
     return Run(**{**fields, **changes})  # type: ignore[arg-type]
 
 
 def refused(code: str, **changes: object) -> Run:
-    return Run(**{'family': 'standard', 'method': 'joint', 'run': 0, 'accepted': False, 'code': code, 'cpu_s': 3.0,
-                  **changes})  # type: ignore[arg-type]
+    return Run(
+        **{'family': 'standard', 'method': 'joint', 'run': 0, 'accepted': False, 'code': code, 'cpu_s': 3.0, **changes}
+    )  # type: ignore[arg-type]
 
 
 def cells(text: str, block: str, name: str) -> list[str]:
@@ -77,9 +103,17 @@ def cells(text: str, block: str, name: str) -> list[str]:
 
 def test_the_truth_has_no_error() -> None:
     stddev = StandardDeviations(focal_px=5.6, tilt_deg=0.2, roll_deg=0.3)
-    found = compare_calibrations(TASK, 'joint', calibration(JUNCTION.camera, plane(heading_deg=10.0), stddev), JUNCTION, 1.5)
-    errors = (found.focal_error, found.rays_deg, found.normal_deg, found.tilt_error_deg, found.roll_error_deg,
-              found.distance_error)
+    found = compare_calibrations(
+        TASK, 'joint', calibration(JUNCTION.camera, plane(heading_deg=10.0), stddev), JUNCTION, 1.5
+    )
+    errors = (
+        found.focal_error,
+        found.rays_deg,
+        found.normal_deg,
+        found.tilt_error_deg,
+        found.roll_error_deg,
+        found.distance_error,
+    )
     np.testing.assert_allclose(errors, 0.0, atol=1e-6)  # the heading of the ground frame is free
     assert (found.family, found.run, found.grade, found.cpu_s) == ('standard', 7, 'full', 1.5)
     assert (found.focal_sigma, found.tilt_sigma_deg, found.roll_sigma_deg) == (pytest.approx(0.01), 0.2, 0.3)
@@ -126,8 +160,7 @@ def test_a_plane_tilted_by_a_degree_falsifies_distances_by_some_per_cent() -> No
     assert distance_error(JUNCTION.camera, plane(tilt_deg=-80.0), JUNCTION) == np.inf  # the road is above the horizon
 
 
-@pytest.mark.parametrize('family', [
-    'highway', 'long_bend', 'roundabout_arms', 'skew_turning', 'tee', 'sparse'])
+@pytest.mark.parametrize('family', ['highway', 'long_bend', 'roundabout_arms', 'skew_turning', 'tee', 'sparse'])
 def test_families_of_scenes_are_solved_without_a_crash(family: str) -> None:
     results = run_task(Task(family, 0, 0, ('paper', *(['joint'] if family == 'sparse' else []))))  # the quickest
     assert not any(result.code.startswith('crash') for result in results)
@@ -141,60 +174,109 @@ def test_a_run_can_be_drawn_again_alone() -> None:
     assert not np.array_equal(first.points_px[:20], draw_evidence('few', 4, 1)[1].points_px[:20])
 
 
-@pytest.mark.parametrize(('changes', 'wrong'), [
-    ({}, False),
-    ({'focal_error': -0.031}, True),
-    ({'focal_error': 0.06, 'focal_sigma': 0.05}, True),
-    ({'focal_error': 0.049, 'focal_sigma': float('nan')}, False),
-    ({'focal_error': -0.051, 'focal_sigma': float('nan')}, True),
-    ({'tilt_error_deg': -1.1}, True),
-    ({'tilt_error_deg': 0.9}, False),
-    ({'roll_error_deg': 1.4}, False),
-    ({'roll_error_deg': 1.6}, True),
-    ({'tilt_error_deg': 9.0, 'tilt_sigma_deg': float('nan')}, False)])
+@pytest.mark.parametrize(
+    ('changes', 'wrong'),
+    [
+        ({}, False),
+        ({'focal_error': -0.031}, True),
+        ({'focal_error': 0.06, 'focal_sigma': 0.05}, True),
+        ({'focal_error': 0.049, 'focal_sigma': float('nan')}, False),
+        ({'focal_error': -0.051, 'focal_sigma': float('nan')}, True),
+        ({'tilt_error_deg': -1.1}, True),
+        ({'tilt_error_deg': 0.9}, False),
+        ({'roll_error_deg': 1.4}, False),
+        ({'roll_error_deg': 1.6}, True),
+        ({'tilt_error_deg': 9.0, 'tilt_sigma_deg': float('nan')}, False),
+    ],
+)
 def test_false_is_what_its_own_sigmas_or_five_per_cent_forbid(changes: dict[str, object], wrong: bool) -> None:
     assert falsely_accepted(run(**changes)) is wrong
     assert not falsely_accepted(refused('no_motion', **{name: changes[name] for name in changes}))
 
 
-@pytest.mark.parametrize(('changes', 'beyond'), [
-    ({}, False),
-    ({'focal_error': 0.031}, True),
-    ({'focal_error': 0.06, 'focal_sigma': 0.05}, False),  # false all the same: more than five per cent
-    ({'tilt_error_deg': -0.61}, True),  # less than a degree, and three of its own sigmas
-    ({'roll_error_deg': 1.4}, False),
-    ({'roll_error_deg': -1.6}, True),
-    ({'focal_error': 0.4, 'focal_sigma': float('nan')}, False),
-    ({'tilt_error_deg': float('nan'), 'roll_error_deg': float('nan')}, False)])
+@pytest.mark.parametrize(
+    ('changes', 'beyond'),
+    [
+        ({}, False),
+        ({'focal_error': 0.031}, True),
+        ({'focal_error': 0.06, 'focal_sigma': 0.05}, False),  # false all the same: more than five per cent
+        ({'tilt_error_deg': -0.61}, True),  # less than a degree, and three of its own sigmas
+        ({'roll_error_deg': 1.4}, False),
+        ({'roll_error_deg': -1.6}, True),
+        ({'focal_error': 0.4, 'focal_sigma': float('nan')}, False),
+        ({'tilt_error_deg': float('nan'), 'roll_error_deg': float('nan')}, False),
+    ],
+)
 def test_beyond_is_what_its_own_sigmas_forbid(changes: dict[str, object], beyond: bool) -> None:
     assert is_overconfident(run(**changes)) is beyond
     assert not is_overconfident(refused('no_motion', **{name: changes[name] for name in changes}))
 
 
-@pytest.mark.parametrize(('family', 'title'), [('standard', 'determines the calibration: stated'),
-                                               ('roundabout', 'does not, or that misleads: stated')])
+@pytest.mark.parametrize(
+    ('family', 'title'),
+    [('standard', 'determines the calibration: stated'), ('roundabout', 'does not, or that misleads: stated')],
+)
 def test_table_flags_what_is_beyond_its_own_sigmas_in_either_list(family: str, title: str) -> None:
-    runs = [run(family=family), run(family=family, tilt_error_deg=0.7), run(family=family, focal_error=0.2),
-            refused('horizon', family=family)]
+    runs = [
+        run(family=family),
+        run(family=family, tilt_error_deg=0.7),
+        run(family=family, focal_error=0.2),
+        refused('horizon', family=family),
+    ]
     words = cells(format_tables(runs), title, family)
     assert words[4:6] == ['1', '2']
     assert re.search(r'false +beyond', format_tables(runs))
 
 
 def test_table_counts_acceptance_refusals_and_errors() -> None:
-    runs = [run(focal_error=0.03, normal_deg=0.5), run(focal_error=-0.01, normal_deg=1.5), refused('horizon'),
-            refused('no_motion'), refused('no_motion')]
+    runs = [
+        run(focal_error=0.03, normal_deg=0.5),
+        run(focal_error=-0.01, normal_deg=1.5),
+        refused('horizon'),
+        refused('no_motion'),
+        refused('no_motion'),
+    ]
     assert cells(format_tables(runs), 'determines the calibration: errors', 'standard') == [
-        'standard', 'joint', '5', '40', 'no_motion', '+1.00', '2.83', '2.00', '3.00', '1.00', '1.50', '0.200', '2.00']
+        'standard',
+        'joint',
+        '5',
+        '40',
+        'no_motion',
+        '+1.00',
+        '2.83',
+        '2.00',
+        '3.00',
+        '1.00',
+        '1.50',
+        '0.200',
+        '2.00',
+    ]
 
 
 def test_table_holds_errors_against_their_sigmas() -> None:
-    runs = [run(focal_error=0.01), run(focal_error=0.07), run(tilt_error_deg=0.5, roll_error_deg=-1.5),
-            run(normal_deg=float('nan'), tilt_error_deg=float('nan'), roll_error_deg=float('nan'), grade='lens'),
-            refused('horizon')]
+    runs = [
+        run(focal_error=0.01),
+        run(focal_error=0.07),
+        run(tilt_error_deg=0.5, roll_error_deg=-1.5),
+        run(normal_deg=float('nan'), tilt_error_deg=float('nan'), roll_error_deg=float('nan'), grade='lens'),
+        refused('horizon'),
+    ]
     # focal z 1, 7, 1, 1; tilt z 1.5, 1.5, 2.5; roll z 0.8, 0.8, -3
     assert cells(format_tables(runs), 'determines the calibration: stated', 'standard') == [
-        'standard', 'joint', '5', '80', '1', '1', '75', '75', '67', '67', '3.61', '1.89', '1.40']
+        'standard',
+        'joint',
+        '5',
+        '80',
+        '1',
+        '1',
+        '75',
+        '75',
+        '67',
+        '67',
+        '3.61',
+        '1.89',
+        '1.40',
+    ]
 
 
 def test_table_shows_a_dash_where_there_is_nothing() -> None:
@@ -204,8 +286,11 @@ def test_table_shows_a_dash_where_there_is_nothing() -> None:
 
 
 def test_methods_stand_beneath_each_other_and_lines_fit_a_terminal() -> None:
-    runs = [run(family=family, method=method, focal_error=-12.3456, normal_deg=123.456)
-            for family in ('lane_changes', 'distortion_free_skew') for method in ('joint', 'paper')]
+    runs = [
+        run(family=family, method=method, focal_error=-12.3456, normal_deg=123.456)
+        for family in ('lane_changes', 'distortion_free_skew')
+        for method in ('joint', 'paper')
+    ]
     runs.append(refused('crash:LinAlgError', family='noise', run=4))
     text = format_tables(runs)
     assert max(map(len, text.splitlines())) <= 120
@@ -247,14 +332,19 @@ def test_processes_do_not_change_the_result() -> None:
     assert [str(replace(item, cpu_s=0.0)) for item in alone] == [str(replace(item, cpu_s=0.0)) for item in shared]
 
 
-@pytest.mark.parametrize(('arguments', 'message'), [
-    (['--family', 'unheard_of'], "no family of evidence is called 'unheard_of'; there are standard, few"),
-    (['--runs', '0'], '--runs is 1 or more; got 0'),
-    (['--jobs', '0'], '--jobs is 1 or more; got 0'),
-    (['--seed', '-1'], '--seed is 0 or more; got -1'),
-    (['--method', 'magic'], "invalid choice: 'magic'")])
+@pytest.mark.parametrize(
+    ('arguments', 'message'),
+    [
+        (['--family', 'unheard_of'], "no family of evidence is called 'unheard_of'; there are standard, few"),
+        (['--runs', '0'], '--runs is 1 or more; got 0'),
+        (['--jobs', '0'], '--jobs is 1 or more; got 0'),
+        (['--seed', '-1'], '--seed is 0 or more; got -1'),
+        (['--method', 'magic'], "invalid choice: 'magic'"),
+    ],
+)
 def test_wrong_usage_is_one_line_and_status_2(
-        arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(['benchmark', 'accuracy', *arguments]) == 2
     told = capsys.readouterr().err
     assert message in told and told.count('\n') == 1
@@ -266,6 +356,12 @@ def test_the_cost_benchmark_is_still_there(capsys: pytest.CaptureFixture[str]) -
 
 
 def test_module_runs_the_benchmark_too() -> None:
-    done = subprocess.run([sys.executable, '-m', 'autocalib_ros.benchmark', 'accuracy', '--help'], capture_output=True,
-                          cwd=Path(autocalib_ros.__file__).parents[1], text=True, timeout=60, check=False)
+    done = subprocess.run(
+        [sys.executable, '-m', 'autocalib_ros.benchmark', 'accuracy', '--help'],
+        capture_output=True,
+        cwd=Path(autocalib_ros.__file__).parents[1],
+        text=True,
+        timeout=60,
+        check=False,
+    )
     assert done.returncode == 0 and done.stdout.startswith('usage: autocalib benchmark accuracy')

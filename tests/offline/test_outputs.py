@@ -23,8 +23,10 @@ SECOND = 1_000_000_000
 def written(path, store):
     """Return (topic, recorded_ns, message) of a bag, and the connections by topic."""
     with AnyReader([path], default_typestore=store) as reader:
-        messages = [(connection.topic, at, reader.deserialize(raw, connection.msgtype))
-                    for connection, at, raw in reader.messages()]
+        messages = [
+            (connection.topic, at, reader.deserialize(raw, connection.msgtype))
+            for connection, at, raw in reader.messages()
+        ]
         return messages, {connection.topic: connection for connection in reader.connections}
 
 
@@ -75,11 +77,18 @@ def test_the_new_bag_holds_images_calibration_and_transforms(tmp_path, full, sou
     write_bag(tmp_path / 'new', full.result, source)
     messages, connections = written(tmp_path / 'new', jazzy)
     assert {topic: connection.msgcount for topic, connection in connections.items()} == {
-        '/cam1/image_raw': 4, '/cam1/camera_info': 4, '/autocalib/ground_transform': 1, '/tf_static': 1}
+        '/cam1/image_raw': 4,
+        '/cam1/camera_info': 4,
+        '/autocalib/ground_transform': 1,
+        '/tf_static': 1,
+    }
     for topic in ('/cam1/camera_info', '/autocalib/ground_transform', '/tf_static'):
         assert connections[topic].ext.offered_qos_profiles[0].durability == QosDurability.TRANSIENT_LOCAL
-    pairs = zip([m for t, _, m in messages if t == '/cam1/image_raw'],
-                [m for t, _, m in messages if t == '/cam1/camera_info'], strict=True)
+    pairs = zip(
+        [m for t, _, m in messages if t == '/cam1/image_raw'],
+        [m for t, _, m in messages if t == '/cam1/camera_info'],
+        strict=True,
+    )
     assert all(image.header == info.header for image, info in pairs)
 
 
@@ -131,7 +140,8 @@ def test_images_of_ros1_become_images_of_ros2(tmp_path, full, write_bag1, images
     write_bag(tmp_path / 'new', full.result, old)
     again = open_source(tmp_path / 'new')
     assert [(f.stamp_ns, int(f.image[0, 0])) for f in again.frames()] == [
-        (100 * SECOND + index * SECOND // 10, 5 + 10 * index) for index in range(3)]
+        (100 * SECOND + index * SECOND // 10, 5 + 10 * index) for index in range(3)
+    ]
 
 
 CORNER = (((0.0, 0.0), (15.0, 0.0), (15.0, 7.0), (0.0, 7.0)),)
@@ -185,12 +195,15 @@ def test_an_existing_bag_is_left_alone(tmp_path, full, source):
     assert (tmp_path / 'new' / 'mine').exists()
 
 
-@pytest.mark.parametrize(('topic', 'kind', 'sibling', 'name'), [
-    ('/cam1/image_raw', 'Image', '/cam1/camera_info', 'cam1'),
-    ('/cam1/image_raw/compressed', 'CompressedImage', '/cam1/camera_info', 'cam1'),
-    ('/site/cam1/image', 'Image', '/site/cam1/camera_info', 'site_cam1'),
-    ('/image', 'Image', '/camera_info', 'optical'),
-])
+@pytest.mark.parametrize(
+    ('topic', 'kind', 'sibling', 'name'),
+    [
+        ('/cam1/image_raw', 'Image', '/cam1/camera_info', 'cam1'),
+        ('/cam1/image_raw/compressed', 'CompressedImage', '/cam1/camera_info', 'cam1'),
+        ('/site/cam1/image', 'Image', '/site/cam1/camera_info', 'site_cam1'),
+        ('/image', 'Image', '/camera_info', 'optical'),
+    ],
+)
 def test_topics_and_names_follow_the_image_topic(source, topic, kind, sibling, name):
     source.topic, source.image_type, source.camera_frame = topic, f'sensor_msgs/msg/{kind}', 'optical'
     assert camera_info_topic(source) == sibling

@@ -32,8 +32,10 @@ def test_a_nested_namespace_serves(tmp_path):
 
 
 def test_the_named_node_overrides_the_wildcard(tmp_path):
-    text = ('autocalib: {ros__parameters: {camera_height: 9.0}}\n'
-            '/**: {ros__parameters: {camera_height: 8.0, random_seed: 3}}')
+    text = (
+        'autocalib: {ros__parameters: {camera_height: 9.0}}\n'
+        '/**: {ros__parameters: {camera_height: 8.0, random_seed: 3}}'
+    )
     options = options_from(tmp_path, text)
     assert (options.camera_height, options.random_seed) == (9.0, 3)
 
@@ -50,8 +52,10 @@ def test_two_cameras_in_one_file_are_wrong_usage(tmp_path):
 
 
 def test_names_of_the_live_node_and_of_ros_are_ignored(tmp_path):
-    text = ('/**: {ros__parameters: {image_transport: raw, camera_name: cam1, use_sim_time: true, camera_height: 8.0,'
-            ' qos_overrides: {/tf: {publisher: {depth: 3}}}}}')
+    text = (
+        '/**: {ros__parameters: {image_transport: raw, camera_name: cam1, use_sim_time: true, camera_height: 8.0,'
+        ' qos_overrides: {/tf: {publisher: {depth: 3}}}}}'
+    )
     assert options_from(tmp_path, text) == Options(camera_height=8.0)
 
 
@@ -80,10 +84,17 @@ def test_a_float_that_yaml_takes_for_text_is_read(tmp_path):
     assert options.motion.min_area == 1e-5
 
 
-@pytest.mark.parametrize(('text', 'message'), [
-    ('', "has no 'ros__parameters'"), ('camera_height: 8.0', "has no 'ros__parameters'"), ('[1, 2]', 'has no'),
-    ('{', 'is not YAML'), ('/**: {ros__parameters: {camera_height: high}}', "takes a float, got 'high'"),
-    ('/**: {ros__parameters: {tracking: 3}}', "unknown option 'tracking'")])
+@pytest.mark.parametrize(
+    ('text', 'message'),
+    [
+        ('', "has no 'ros__parameters'"),
+        ('camera_height: 8.0', "has no 'ros__parameters'"),
+        ('[1, 2]', 'has no'),
+        ('{', 'is not YAML'),
+        ('/**: {ros__parameters: {camera_height: high}}', "takes a float, got 'high'"),
+        ('/**: {ros__parameters: {tracking: 3}}', "unknown option 'tracking'"),
+    ],
+)
 def test_a_broken_file_is_one_clear_line(tmp_path, text, message):
     with pytest.raises((InputError, UsageError), match=message) as raised:
         options_from(tmp_path, text)
@@ -107,8 +118,10 @@ def test_a_malformed_assignment_is_wrong_usage(text):
 
 
 def test_a_distance_stands_in_a_file_as_text(tmp_path):
-    options = options_from(tmp_path, "/**: {ros__parameters: {scale_from: distance, "
-                                     "scale: {distance_px: '412 530 888 530', distance_m: 12}}}")
+    options = options_from(
+        tmp_path,
+        "/**: {ros__parameters: {scale_from: distance, scale: {distance_px: '412 530 888 530', distance_m: 12}}}",
+    )
     assert options.scale.pixels == ((412.0, 530.0), (888.0, 530.0)) and options.scale.distance_m == 12.0
 
 

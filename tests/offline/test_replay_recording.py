@@ -31,7 +31,7 @@ class Drive:
     def frames(self):
         for index in range(self.total):
             image = self._road.copy()
-            image[50:74, 2 * index % 120:][:, :40] = self._box
+            image[50:74, 2 * index % 120 :][:, :40] = self._box
             image.flags.writeable = False
             yield Frame(index * 100_000_000, image)
 
@@ -70,6 +70,7 @@ def test_a_known_lens_goes_into_each_solution_in_the_size_of_the_images(monkeypa
     def told_solve(evidence, options, *, lens):
         told.append(lens)
         return solve(evidence, options)
+
     monkeypatch.setattr('autocalib_ros.offline.replay_recording.solve', told_solve)
     options = Options(first_solve_s=0.0, gate=GateOptions(min_tracks=4))
     replay(Drive(150), options, lens=Camera.equidistant(320, 240, 200.0))
@@ -98,11 +99,13 @@ def test_a_tiny_bag_goes_all_the_way(tmp_path, write_bag, images):
 
 def test_a_refused_solution_is_what_is_missing_and_then_since_when_it_is_calibrated(monkeypatch, full):
     accepted = replace(full.result, camera=Camera.equidistant(160, 120, 100.0))
-    refusal = Refusal(code='x', message='the halves disagree', remedy='wait', method='joint',
-                      evidence=full.evidence.summary())
+    refusal = Refusal(
+        code='x', message='the halves disagree', remedy='wait', method='joint', evidence=full.evidence.summary()
+    )
     results = iter([refusal])
-    monkeypatch.setattr('autocalib_ros.offline.replay_recording.solve',
-                        lambda due, options, lens: next(results, accepted))
+    monkeypatch.setattr(
+        'autocalib_ros.offline.replay_recording.solve', lambda due, options, lens: next(results, accepted)
+    )
     told = []
     # the box is all that there is to see, so that the background seems to drift by up to 100 px
     gate = GateOptions(min_tracks=4, min_coverage=0.0, max_drift_px=1000.0)

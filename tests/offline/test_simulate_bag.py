@@ -17,8 +17,7 @@ from autocalib_ros.offline.simulate.options import SCENES, SimulationOptions
 from autocalib_ros.offline.simulate.simulation import Simulation
 
 # One road is quickest to draw.
-TINY = {'width_px': 160, 'height_px': 90, 'focal_px': 70.0, 'rate_hz': 5.0, 'duration_s': 0.6,
-        'one_way': True}
+TINY = {'width_px': 160, 'height_px': 90, 'focal_px': 70.0, 'rate_hz': 5.0, 'duration_s': 0.6, 'one_way': True}
 
 
 def _messages(path, topic):
@@ -35,7 +34,9 @@ def _pixels(message) -> np.ndarray:
 @pytest.mark.parametrize(
     ('storage', 'zstd', 'thermal'),
     [
-        ('sqlite3', False, False), ('sqlite3', True, True), ('mcap', False, True),
+        ('sqlite3', False, False),
+        ('sqlite3', True, True),
+        ('mcap', False, True),
         ('mcap', True, False),
     ],
 )
@@ -52,9 +53,7 @@ def test_raw_bag_holds_the_frames(tmp_path, storage, zstd, thermal):
     assert np.array_equal(_pixels(messages[2]).squeeze(), simulation.frame(2))
 
 
-@pytest.mark.parametrize(
-    ('thermal', 'prefix', 'worst'), [(False, 'bgr8; jpeg', 5.0), (True, 'mono16; png', 0.0)]
-)
+@pytest.mark.parametrize(('thermal', 'prefix', 'worst'), [(False, 'bgr8; jpeg', 5.0), (True, 'mono16; png', 0.0)])
 def test_compressed_bag_holds_the_frames(tmp_path, thermal, prefix, worst):
     options = SimulationOptions(**TINY, compressed=True, storage='mcap', thermal=thermal)
     path = write_bag(tmp_path / 'bag', options, workers=1)

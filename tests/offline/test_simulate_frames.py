@@ -133,9 +133,7 @@ def test_another_seed_gives_another_picture(day):
     assert not np.array_equal(day.frame(0), _simulation(seed=5).frame(0))
 
 
-@pytest.mark.parametrize(
-    'given', [{'one_way': True}, {'scene': 'road'}, {'road_angle_deg': 60.0}], ids=str
-)
+@pytest.mark.parametrize('given', [{'one_way': True}, {'scene': 'road'}, {'road_angle_deg': 60.0}], ids=str)
 def test_other_networks_can_be_drawn(given):
     simulation = _simulation(**given)
     assert simulation.frame(2).std() > 20

@@ -29,9 +29,7 @@ def test_lens_projects_its_own_bearings_back_to_the_pixel(k):
 def test_lens_follows_its_polynomial():
     lens = KannalaBrandtLens(500.0, (0.1, -0.02, 0.003, -0.001), (0.0, 0.0))
     theta = 0.8
-    radius = 500.0 * (
-        theta + 0.1 * theta**3 - 0.02 * theta**5 + 0.003 * theta**7 - 0.001 * theta**9
-    )
+    radius = 500.0 * (theta + 0.1 * theta**3 - 0.02 * theta**5 + 0.003 * theta**7 - 0.001 * theta**9)
     pixel, _ = lens.project(np.array([math.sin(theta), 0.0, math.cos(theta)]))
     assert pixel == pytest.approx((radius, 0.0), abs=1e-9)
 
@@ -96,8 +94,20 @@ def truth() -> dict:
 
 def test_truth_has_the_keys_of_the_scenes(truth):
     assert {
-        'case', 'scene', 'width', 'height', 'fps', 'duration_s', 'mode', 'pixel_convention', 'lens',
-        'camera', 'world', 'road_directions', 'ground_points', 'vehicles',
+        'case',
+        'scene',
+        'width',
+        'height',
+        'fps',
+        'duration_s',
+        'mode',
+        'pixel_convention',
+        'lens',
+        'camera',
+        'world',
+        'road_directions',
+        'ground_points',
+        'vehicles',
     } <= truth.keys()
     assert truth['lens'].keys() == {'model', 'f', 'k', 'cx', 'cy', 'note'}
     assert truth['vehicles']['columns'] == ['t', 'X', 'Y', 'heading_rad', 'speed_mps', 'u', 'v']
@@ -110,9 +120,7 @@ def _worst_projection_px(truth: dict, camera: dict, rows: np.ndarray) -> float:
     world = np.pad(rows[:, :2], ((0, 0), (0, 1)))
     points = (world - camera['position']) @ np.array(camera['R_world_from_camera'])
     zero = np.zeros(3)
-    pixels, _ = cv2.fisheye.projectPoints(
-        points[:, None], zero, zero, matrix, np.array(lens['k'], float)
-    )
+    pixels, _ = cv2.fisheye.projectPoints(points[:, None], zero, zero, matrix, np.array(lens['k'], float))
     return float(np.abs(pixels[:, 0] - rows[:, 2:]).max())
 
 

@@ -126,8 +126,9 @@ def test_vehicles_of_no_scene_overlap(scene: str, seed: int) -> None:
     traffic = driven(scene)[1] if seed == 0 else simulate_traffic(build_network(options), options)
     for t in TIMES_S:
         there = [(v, s) for v in traffic.vehicles if (s := v.state(t)) is not None]
-        assert not [(a[0].number, b[0].number) for i, a in enumerate(there) for b in there[:i]
-                    if overlap(a, b) or overlap(b, a)]
+        assert not [
+            (a[0].number, b[0].number) for i, a in enumerate(there) for b in there[:i] if overlap(a, b) or overlap(b, a)
+        ]
 
 
 @each_scene
@@ -154,9 +155,17 @@ def test_every_scene_has_asphalt_and_white_paint_under_its_lanes(scene: str) -> 
     assert (grey > 0.75 * np.mean(DAY.marking)).mean() > 0.002
 
 
-@pytest.mark.parametrize(('scene', 'headings_deg'), [
-    ('highway', {0}), ('skew', {0, 65}), ('tee', {0, 90}), ('sparse', {0, 90}), ('roundabout', {0, 90}),
-    ('bend', {-40, 40})])
+@pytest.mark.parametrize(
+    ('scene', 'headings_deg'),
+    [
+        ('highway', {0}),
+        ('skew', {0, 65}),
+        ('tee', {0, 90}),
+        ('sparse', {0, 90}),
+        ('roundabout', {0, 90}),
+        ('bend', {-40, 40}),
+    ],
+)
 def test_truth_names_the_directions_of_straight_roads(scene: str, headings_deg: set[int]) -> None:
     directions = driven(scene)[0].directions()
     assert {round(math.degrees(math.atan2(y, x))) for x, y in directions} == headings_deg
@@ -186,8 +195,10 @@ def test_a_ring_is_driven_anticlockwise_on_its_radius_by_who_entered_and_leaves(
 
 def test_vehicles_slow_down_for_the_ring_and_wait_for_it() -> None:
     _, traffic = driven('roundabout')
-    on_ring = [float(v.speeds_mps[(v.s > v.route.ring.entry_s) & (v.s < v.route.ring.exit_s)].max(initial=0.0))
-               for v in traffic.vehicles]
+    on_ring = [
+        float(v.speeds_mps[(v.s > v.route.ring.entry_s) & (v.s < v.route.ring.exit_s)].max(initial=0.0))
+        for v in traffic.vehicles
+    ]
     assert 4.0 < max(on_ring) < 7.0  # metres per second; two m/s^2 to the side on 19 m are 6.2
     assert any((v.speeds_mps[(v.s > 70) & (v.s < v.route.stop_s)] < 0.5).any() for v in traffic.vehicles)
 

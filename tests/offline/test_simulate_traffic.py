@@ -36,9 +36,9 @@ def _crossing_time(vehicle: Vehicle) -> float | None:
 
 def _crossings(traffic: SimulatedTraffic, movement: str) -> list[Vehicle]:
     return [
-        v for v in traffic.vehicles
-        if v.route.movement == movement
-        and (t := _crossing_time(v)) is not None and 0 <= t < MINUTE.duration_s
+        v
+        for v in traffic.vehicles
+        if v.route.movement == movement and (t := _crossing_time(v)) is not None and 0 <= t < MINUTE.duration_s
     ]
 
 

@@ -15,8 +15,15 @@ from autocalib_ros.offline.simulate.options import SimulationOptions
 from autocalib_ros.offline.simulate.simulation import Simulation
 from autocalib_ros.offline.simulate.weather import GroundBuffer, box_corners
 
-SMALL = {'width_px': 320, 'height_px': 180, 'focal_px': 140.0, 'rate_hz': 10.0, 'duration_s': 40.0, 'noise_sigma': 0.0,
-         'pedestrians': 0}
+SMALL = {
+    'width_px': 320,
+    'height_px': 180,
+    'focal_px': 140.0,
+    'rate_hz': 10.0,
+    'duration_s': 40.0,
+    'noise_sigma': 0.0,
+    'pedestrians': 0,
+}
 
 
 @cache
@@ -84,8 +91,12 @@ def test_a_wet_road_mirrors_lamps_as_far_below_it_as_they_are_above():
     wet, dry = _simulation(trouble='wet', night=True), _simulation(night=True)
     index = 150
     added = wet.frame(index).astype(int).max(-1) - dry.frame(index).max(-1)
-    near = [pixel for vehicle, state in dry.states(dry.time_s(index)) for lamp in vehicle_lamps(vehicle, state)
-            if (pixel := _mirrored(dry, lamp)) is not None]
+    near = [
+        pixel
+        for vehicle, state in dry.states(dry.time_s(index))
+        for lamp in vehicle_lamps(vehicle, state)
+        if (pixel := _mirrored(dry, lamp)) is not None
+    ]
     bright = [added[int(round(y)), int(round(x))] for x, y in near]
     assert np.quantile(bright, 0.9) > 40
     # And not above the road: nothing is added over the horizon.
@@ -103,9 +114,14 @@ def _mirrored(simulation: Simulation, lamp) -> np.ndarray | None:
     return pixel if valid and (pixel > 1).all() and (pixel < np.array(size) - 1).all() and towards > 0.3 else None
 
 
-@pytest.mark.parametrize(('given', 'words'), [
-    ({'trouble': 'snow'}, "unknown trouble 'snow'"), ({'trouble': 'wet'}, 'needs night'),
-    ({'trouble': 'trees', 'thermal': True}, 'leave out trouble or thermal')])
+@pytest.mark.parametrize(
+    ('given', 'words'),
+    [
+        ({'trouble': 'snow'}, "unknown trouble 'snow'"),
+        ({'trouble': 'wet'}, 'needs night'),
+        ({'trouble': 'trees', 'thermal': True}, 'leave out trouble or thermal'),
+    ],
+)
 def test_what_cannot_be_drawn_is_said(given, words):
     with pytest.raises(UsageError, match=words):
         replace(SimulationOptions(), **given)

@@ -46,9 +46,13 @@ from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_e
 FAMILIES = tuple(families())
 TRACKS = {'standard': 60, 'few': 40, 'many': 400}
 CLEAN = Junction(turning_fraction=0.0, wander_m=0.0, noise_px=0.0)
-NETWORKS = {'highway': highway(one_way=True, changing_fraction=1.0), 'bend': bend(one_way=False),
-            'roundabout': roundabout(turning_fraction=0.5), 'skew': crossing(np.radians(65.0), turning_fraction=1.0),
-            'tee': crossing(np.pi / 2, turning_fraction=0.5, tee=True)}
+NETWORKS = {
+    'highway': highway(one_way=True, changing_fraction=1.0),
+    'bend': bend(one_way=False),
+    'roundabout': roundabout(turning_fraction=0.5),
+    'skew': crossing(np.radians(65.0), turning_fraction=1.0),
+    'tee': crossing(np.pi / 2, turning_fraction=0.5, tee=True),
+}
 each_network = pytest.mark.parametrize('network', NETWORKS.values(), ids=NETWORKS)
 
 
@@ -110,9 +114,15 @@ def test_tracks_are_shared_among_vehicles(name: str, least_vehicles: int) -> Non
     assert len(counts) >= least_vehicles and counts.max() <= junction.points_per_vehicle
 
 
-@pytest.mark.parametrize('camera', [
-    Camera.equidistant(1280, 720, 560.0), Camera(1280, 720, 610.0, (655.0, 345.0), (-0.05, 0.0, 0.0, 0.0)),
-    draw_distortion_free_lens(rng())], ids=['equidistant', 'kannala_brandt', 'distortion_free'])
+@pytest.mark.parametrize(
+    'camera',
+    [
+        Camera.equidistant(1280, 720, 560.0),
+        Camera(1280, 720, 610.0, (655.0, 345.0), (-0.05, 0.0, 0.0, 0.0)),
+        draw_distortion_free_lens(rng()),
+    ],
+    ids=['equidistant', 'kannala_brandt', 'distortion_free'],
+)
 def test_parallel_noise_free_tracks_meet_in_the_true_direction(camera: Camera) -> None:
     junction = replace(CLEAN, camera=camera, camera_from_ground=pose(30.0, -1.5, 40.0), road_angles_deg=(20.0,))
     normals, worst = circles(junction, synthetic_evidence(junction, rng()))
@@ -169,9 +179,14 @@ def test_a_lane_change_goes_one_lane_sideways_over_thirty_to_fifty_metres(seed: 
     assert np.abs(slip).max() < 0.02  # metres a step: the body points where it goes
 
 
-@pytest.mark.parametrize('drive', [
-    lambda junction, generator: drive_bend(junction, generator, radius_m=30.0, towards_rad=0.7),
-    lambda junction, generator: drive_ring(junction, generator, radius_m=20.0)], ids=['bend', 'ring'])
+@pytest.mark.parametrize(
+    'drive',
+    [
+        lambda junction, generator: drive_bend(junction, generator, radius_m=30.0, towards_rad=0.7),
+        lambda junction, generator: drive_ring(junction, generator, radius_m=20.0),
+    ],
+    ids=['bend', 'ring'],
+)
 def test_curved_traffic_keeps_its_radius_and_points_along_it(drive) -> None:
     path, heading = drive(CLEAN, rng())
     middle = _centre_of_circle(path)
@@ -228,8 +243,10 @@ def test_a_network_can_be_turned_scaled_and_placed() -> None:
     assert abs(np.sin(2 * (heading[0] - 0.5))) < 1e-6  # arms are square to each other, and turned
 
 
-@pytest.mark.parametrize(('name', 'vehicles'), [
-    ('highway', 40), ('long_bend', 40), ('roundabout_arms', 40), ('skew_turning', 40), ('tee', 40)])
+@pytest.mark.parametrize(
+    ('name', 'vehicles'),
+    [('highway', 40), ('long_bend', 40), ('roundabout_arms', 40), ('skew_turning', 40), ('tee', 40)],
+)
 def test_vehicles_of_scenes_have_up_to_eight_points(name: str, vehicles: int) -> None:
     _, evidence = drawn(name)
     numbers, counts = np.unique(evidence.track_vehicles, return_counts=True)
@@ -238,8 +255,10 @@ def test_vehicles_of_scenes_have_up_to_eight_points(name: str, vehicles: int) ->
 
 def test_sparse_traffic_is_a_vehicle_every_twelve_seconds() -> None:
     _, evidence = drawn('sparse')
-    begins = [min(track.times_s[0] for track in evidence.tracks() if track.vehicle == vehicle)
-              for vehicle in np.unique(evidence.track_vehicles)]
+    begins = [
+        min(track.times_s[0] for track in evidence.tracks() if track.vehicle == vehicle)
+        for vehicle in np.unique(evidence.track_vehicles)
+    ]
     assert 5 <= len(begins) <= 20 and np.median(np.diff(begins)) > 8.0
 
 
@@ -283,8 +302,9 @@ def test_a_sway_moves_the_tracks_with_the_camera() -> None:
     turn = pose(90.0, 0.0, 0.0) @ pose(89.0, 0.0, 0.0).T  # one degree about the camera's x, all the time
     turned = replace(CLEAN, sway=lambda times: np.broadcast_to(turn, (len(times), 3, 3)))
     again = replace(CLEAN, camera_from_ground=turn @ CLEAN.camera_from_ground)
-    np.testing.assert_allclose(synthetic_evidence(turned, rng()).points_px, synthetic_evidence(again, rng()).points_px,
-                               atol=1e-9)
+    np.testing.assert_allclose(
+        synthetic_evidence(turned, rng()).points_px, synthetic_evidence(again, rng()).points_px, atol=1e-9
+    )
 
 
 def test_a_road_out_of_view_is_told() -> None:

@@ -17,15 +17,18 @@ class Terminal(io.StringIO):
         return True
 
 
-@pytest.mark.parametrize(('environment', 'on_terminal', 'elsewhere'), [
-    ({}, True, False),
-    ({'NO_COLOR': '1'}, False, False),
-    ({'NO_COLOR': '0'}, False, False),
-    ({'NO_COLOR': ''}, True, False),
-    ({'TERM': 'dumb'}, False, False),
-    ({'FORCE_COLOR': '1'}, True, True),
-    ({'FORCE_COLOR': '1', 'NO_COLOR': '1'}, False, False),
-])
+@pytest.mark.parametrize(
+    ('environment', 'on_terminal', 'elsewhere'),
+    [
+        ({}, True, False),
+        ({'NO_COLOR': '1'}, False, False),
+        ({'NO_COLOR': '0'}, False, False),
+        ({'NO_COLOR': ''}, True, False),
+        ({'TERM': 'dumb'}, False, False),
+        ({'FORCE_COLOR': '1'}, True, True),
+        ({'FORCE_COLOR': '1', 'NO_COLOR': '1'}, False, False),
+    ],
+)
 def test_colours_are_for_terminals_that_want_them(environment, on_terminal, elsewhere, monkeypatch):
     for name in ('NO_COLOR', 'FORCE_COLOR'):
         monkeypatch.delenv(name, raising=False)
@@ -44,7 +47,11 @@ def test_a_painted_text_ends_its_colour(monkeypatch):
 def test_green_is_what_was_asked_for_yellow_a_part_of_it_red_nothing(full, lens_only, refused):
     assumed = replace(full.result, grade='assumed')
     assert [state_colour(result) for result in (full.result, assumed, lens_only.result, refused.result)] == [
-        'green', 'yellow', 'yellow', 'red']
+        'green',
+        'yellow',
+        'yellow',
+        'red',
+    ]
 
 
 @pytest.mark.parametrize(('columns', 'shown'), [(20, 'three tracks, of 40'), (13, 'three tracks…'), (1, '…'), (-3, '')])

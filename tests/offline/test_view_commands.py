@@ -62,9 +62,11 @@ def video(saved) -> Path:
 @pytest.fixture
 def command(saved, capsys):
     """Return a function that runs a command in the folder: status, stdout, stderr."""
+
     def run(name: str, *arguments: object):
         status = main([name, str(saved / 'calibration.json'), *map(str, arguments)])
         return status, *capsys.readouterr()
+
     return run
 
 
@@ -82,8 +84,9 @@ def squares_are_square(picture: np.ndarray, low_m: tuple[float, float], px_per_m
 
 @pytest.mark.parametrize('image', ['image.png', 'half.png'])
 def test_the_road_from_above_is_to_scale_in_images_of_any_size(image, command, saved):
-    status, stdout, _ = command('topview', saved / image, saved / 'top.png', '--px-per-m', 20, '--x', 6, 16, '--y', -4,
-                                4, '--no-scale-bar')
+    status, stdout, _ = command(
+        'topview', saved / image, saved / 'top.png', '--px-per-m', 20, '--x', 6, 16, '--y', -4, 4, '--no-scale-bar'
+    )
     assert (status, stdout) == (0, f'Written to {saved / "top.png"}: 200x160\n')
     assert squares_are_square(cv2.imread(str(saved / 'top.png')), (6.0, -4.0), 20.0)
 
@@ -177,23 +180,26 @@ def test_the_picture_shows_image_and_view_from_above_with_the_same_squares(comma
     assert np.median(middle[:, 0]) == pytest.approx((178 - LENS.radius(DIP)) / 640 * 1080, abs=2)
 
 
-@pytest.mark.parametrize(('arguments', 'told'), [
-    (['image.png', 'out.gif'], 'is neither a picture nor a video'),
-    (['image.png', 'image.png'], 'is the source itself'),
-    (['image.png', 'out.mp4'], 'is one image'),
-    (['image.png', 'out.png', '--at', '3'], 'is one image'),
-    (['image.png', '.'], 'is neither a picture'),
-    (['clip.avi', 'out.png', '--duration', '3'], '--duration is for videos'),
-    (['clip.avi', 'out.png', '--at', '99'], 'no image 99 s after the start'),
-    (['clip.avi', 'out.png', '--at', '-1'], 'zero seconds or later'),
-    (['nowhere.mp4', 'out.png'], 'does not exist'),
-    (['nowhere.png', 'out.png'], 'cannot read'),
-    (['words.png', 'out.png'], 'is not an image that can be read'),
-    (['words.mp4', 'out.png'], 'is not a video that can be read'),
-    (['empty.png', 'out.png'], 'is not an image that can be read'),
-    (['square.png', 'out.png'], 'these images have 300x300, another shape'),
-    (['image.png', 'words.png/out.png'], 'cannot write'),
-])
+@pytest.mark.parametrize(
+    ('arguments', 'told'),
+    [
+        (['image.png', 'out.gif'], 'is neither a picture nor a video'),
+        (['image.png', 'image.png'], 'is the source itself'),
+        (['image.png', 'out.mp4'], 'is one image'),
+        (['image.png', 'out.png', '--at', '3'], 'is one image'),
+        (['image.png', '.'], 'is neither a picture'),
+        (['clip.avi', 'out.png', '--duration', '3'], '--duration is for videos'),
+        (['clip.avi', 'out.png', '--at', '99'], 'no image 99 s after the start'),
+        (['clip.avi', 'out.png', '--at', '-1'], 'zero seconds or later'),
+        (['nowhere.mp4', 'out.png'], 'does not exist'),
+        (['nowhere.png', 'out.png'], 'cannot read'),
+        (['words.png', 'out.png'], 'is not an image that can be read'),
+        (['words.mp4', 'out.png'], 'is not a video that can be read'),
+        (['empty.png', 'out.png'], 'is not an image that can be read'),
+        (['square.png', 'out.png'], 'these images have 300x300, another shape'),
+        (['image.png', 'words.png/out.png'], 'cannot write'),
+    ],
+)
 def test_what_does_not_fit_is_one_line_and_status_2(arguments, told, command, saved, video, monkeypatch):
     monkeypatch.chdir(saved)
     Path('words.png').write_text('only words\n' * 50)
@@ -207,12 +213,15 @@ def test_what_does_not_fit_is_one_line_and_status_2(arguments, told, command, sa
     assert sorted(saved.iterdir()) == before
 
 
-@pytest.mark.parametrize(('arguments', 'told'), [
-    (['topview', '--x', '5', '5'], '--x takes the lower and then the higher end'),
-    (['topview', '--px-per-m', '0'], '--px-per-m is more than 0'),
-    (['topview', '--px-per-m', '100000'], 'choose another --px-per-m'),
-    (['rectify', '--balance', '2'], 'the balance lies between 0'),
-])
+@pytest.mark.parametrize(
+    ('arguments', 'told'),
+    [
+        (['topview', '--x', '5', '5'], '--x takes the lower and then the higher end'),
+        (['topview', '--px-per-m', '0'], '--px-per-m is more than 0'),
+        (['topview', '--px-per-m', '100000'], 'choose another --px-per-m'),
+        (['rectify', '--balance', '2'], 'the balance lies between 0'),
+    ],
+)
 def test_wrong_numbers_are_told(arguments, told, command, saved):
     status, _, stderr = command(arguments[0], saved / 'image.png', saved / 'out.png', *arguments[1:])
     assert status == 2 and told in stderr
@@ -238,9 +247,17 @@ def test_a_plane_without_metres_is_shown_in_heights_of_the_camera(command, saved
 
 
 def test_a_lens_that_folds_back_inside_the_image_cannot_be_undistorted(saved, capsys):
-    (saved / 'fold.yaml').write_text(yaml.safe_dump({
-        'width': 640, 'height': 360, 'distortion_model': 'plumb_bob', 'k': [300.0, 0, 320, 0, 300, 180, 0, 0, 1],
-        'd': [-0.9, 0.0, 0.0, 0.0, 0.0]}))
+    (saved / 'fold.yaml').write_text(
+        yaml.safe_dump(
+            {
+                'width': 640,
+                'height': 360,
+                'distortion_model': 'plumb_bob',
+                'k': [300.0, 0, 320, 0, 300, 180, 0, 0, 1],
+                'd': [-0.9, 0.0, 0.0, 0.0, 0.0],
+            }
+        )
+    )
     assert main(['rectify', str(saved / 'fold.yaml'), str(saved / 'image.png'), str(saved / 'out.png')]) == 2
     assert 'the distortion folds back before the border' in capsys.readouterr().err
 
@@ -250,8 +267,25 @@ def test_ignored_regions_are_black_in_images_of_any_size(image, command, saved):
     corners = ground_to_image(LENS, POSE, np.array([[9.0, -2, 0], [9, 2, 0], [13, 2, 0], [13, -2, 0]]))
     polygon = ' '.join(f'{value:.1f}' for value in corners.ravel())
     (saved / 'p.yaml').write_text(f"/**: {{ros__parameters: {{ignore_regions: '{polygon}'}}}}")
-    assert command('topview', saved / image, saved / 'top.png', '--px-per-m', 20, '--x', 6, 16, '--y', -4, 4,
-                   '--no-scale-bar', '--params-file', saved / 'p.yaml')[0] == 0
+    assert (
+        command(
+            'topview',
+            saved / image,
+            saved / 'top.png',
+            '--px-per-m',
+            20,
+            '--x',
+            6,
+            16,
+            '--y',
+            -4,
+            4,
+            '--no-scale-bar',
+            '--params-file',
+            saved / 'p.yaml',
+        )[0]
+        == 0
+    )
     black = cv2.imread(str(saved / 'top.png')).max(axis=2) < 20
     # y 4 to -4 from top to bottom, x 6 to 16 from left to right, at 20 pixels a metre
     assert black[46:114, 66:134].all()
@@ -284,7 +318,9 @@ def test_a_bag_is_a_source_too(tmp_path, write_bag, images):
 
 def test_help_of_the_new_commands_imports_nothing_heavy():
     for name in ('compare', 'rectify', 'topview', 'picture'):
-        code = (f'import sys; from autocalib_ros.cli import main; main(["{name}", "--help"]);'
-                'print(sorted({"cv2", "numpy", "matplotlib", "scipy"} & set(sys.modules)))')
+        code = (
+            f'import sys; from autocalib_ros.cli import main; main(["{name}", "--help"]);'
+            'print(sorted({"cv2", "numpy", "matplotlib", "scipy"} & set(sys.modules)))'
+        )
         done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True)
         assert done.stdout.endswith('[]\n')

@@ -59,8 +59,9 @@ def test_a_layout_is_told_and_its_boxes_are_where_they_were_drawn(name: str) -> 
     expected = [*BOXES[CAR], *BOXES[PERSON]]
     order = np.lexsort((found.edges_px[:, 0], found.people))
     assert len(found.scores) == 3
-    np.testing.assert_allclose(found.edges_px[order], sorted(expected[:2]) + expected[2:],
-                               atol=2.5)  # px of the image: one and a half of the smallest input
+    np.testing.assert_allclose(
+        found.edges_px[order], sorted(expected[:2]) + expected[2:], atol=2.5
+    )  # px of the image: one and a half of the smallest input
     np.testing.assert_array_equal(found.people[order], [False, False, True])
     np.testing.assert_allclose(found.scores, SCORE, atol=1e-5)
 
@@ -117,10 +118,16 @@ def test_grey_images_are_taken() -> None:
     assert len(VehicleDetector(model('yolox'), DetectorOptions()).detect(np.ascontiguousarray(image)).scores) == 0
 
 
-@pytest.mark.parametrize(('how', 'says'), [
-    ({'channel_order': 'rgb'}, 'rgb up to 255'), ({'input_scale': 1.0}, 'bgr up to 1,'),
-    ({'mean_std': 'imagenet'}, 'normalised by ImageNet'), ({'resize_mode': 'centred'}, 'centred'),
-    ({'layout': 'yolox_decoded'}, 'layout yolox_decoded')])
+@pytest.mark.parametrize(
+    ('how', 'says'),
+    [
+        ({'channel_order': 'rgb'}, 'rgb up to 255'),
+        ({'input_scale': 1.0}, 'bgr up to 1,'),
+        ({'mean_std': 'imagenet'}, 'normalised by ImageNet'),
+        ({'resize_mode': 'centred'}, 'centred'),
+        ({'layout': 'yolox_decoded'}, 'layout yolox_decoded'),
+    ],
+)
 def test_what_is_set_wins_over_what_is_told(how: dict, says: str) -> None:
     assert says in str(VehicleDetector(model('yolox'), DetectorOptions(**how)))
 
@@ -132,33 +139,45 @@ def test_colours_in_another_order_are_other_classes() -> None:
 
 def test_names_in_the_model_say_what_is_a_vehicle() -> None:
     names = {0: 'Van', 1: 'tree', 2: 'pedestrian'}
-    seeing = SeeingModel(lambda found, size: seeing_models.yolov8(
-        [(edges, 2 if kind == PERSON else 0) for edges, kind in found], size, 3), meta={'names': repr(names)})
+    seeing = SeeingModel(
+        lambda found, size: seeing_models.yolov8(
+            [(edges, 2 if kind == PERSON else 0) for edges, kind in found], size, 3
+        ),
+        meta={'names': repr(names)},
+    )
     detector = VehicleDetector(seeing, DetectorOptions())
     assert 'vehicles are classes 0, people 2' in str(detector)
-    assert sorted(detector.detect(picture((416, 416), {CAR: [(9, 9, 99, 80)], PERSON: [(200, 9, 220, 80)]})).people
-                  ) == [False, True]
+    assert sorted(
+        detector.detect(picture((416, 416), {CAR: [(9, 9, 99, 80)], PERSON: [(200, 9, 220, 80)]})).people
+    ) == [False, True]
 
 
-@pytest.mark.parametrize(('end2end', 'values', 'layout'), [
-    ('True', 0.5, 'end_to_end'), ('', 1.0, 'end_to_end'), ('', 0.5, 'ultralytics_rtdetr')])
+@pytest.mark.parametrize(
+    ('end2end', 'values', 'layout'),
+    [('True', 0.5, 'end_to_end'), ('', 1.0, 'end_to_end'), ('', 0.5, 'ultralytics_rtdetr')],
+)
 def test_six_columns_are_classes_or_probabilities(end2end: str, values: float, layout: str) -> None:
-    seeing = SeeingModel(lambda found, size: {'output0': np.full((1, 300, 6), values, np.float32)},
-                         meta={'names': "['car', 'bus']", 'end2end': end2end})
+    seeing = SeeingModel(
+        lambda found, size: {'output0': np.full((1, 300, 6), values, np.float32)},
+        meta={'names': "['car', 'bus']", 'end2end': end2end},
+    )
     assert VehicleDetector(seeing, DetectorOptions()).layout == layout
 
 
-@pytest.mark.parametrize(('outputs', 'options', 'says'), [
-    ({'a': (1, 255, 52, 52), 'b': (1, 255, 26, 26), 'c': (1, 255, 13, 13)}, {}, r'raw heads.*\[1, 255, 52, 52\].*'),
-    ({'a': (1, 10)}, {}, r'layout is unknown.*a \[1, 10\].*detector.layout'),
-    ({'a': (1, 5000, 85)}, {}, r'layout is unknown.*\[1, 5000, 85\]'),
-    ({'a': (1, 84, 3549)}, {'layout': 'tf_od'}, r'not of the layout tf_od.*\[1, 84, 3549\]'),
-    ({'a': (1, 84, 3549)}, {'layout': 'yolox'}, r'not of the layout yolox '),
-    ({'a': (1, 12, 3549)}, {}, "does not name its classes, 8 of them: set 'detector.class_ids'"),
-    ({'a': (1, 1, 200, 7)}, {}, "does not name its classes: set 'detector.class_ids'"),
-    ({'a': (1, 12, 3549)}, {'class_ids': '8'}, "class 8 of 'detector.class_ids' is not in the model"),
-    ({'a': (1, 84, 3549)}, {'input_size': 640}, 'this one takes 416x416'),
-])
+@pytest.mark.parametrize(
+    ('outputs', 'options', 'says'),
+    [
+        ({'a': (1, 255, 52, 52), 'b': (1, 255, 26, 26), 'c': (1, 255, 13, 13)}, {}, r'raw heads.*\[1, 255, 52, 52\].*'),
+        ({'a': (1, 10)}, {}, r'layout is unknown.*a \[1, 10\].*detector.layout'),
+        ({'a': (1, 5000, 85)}, {}, r'layout is unknown.*\[1, 5000, 85\]'),
+        ({'a': (1, 84, 3549)}, {'layout': 'tf_od'}, r'not of the layout tf_od.*\[1, 84, 3549\]'),
+        ({'a': (1, 84, 3549)}, {'layout': 'yolox'}, r'not of the layout yolox '),
+        ({'a': (1, 12, 3549)}, {}, "does not name its classes, 8 of them: set 'detector.class_ids'"),
+        ({'a': (1, 1, 200, 7)}, {}, "does not name its classes: set 'detector.class_ids'"),
+        ({'a': (1, 12, 3549)}, {'class_ids': '8'}, "class 8 of 'detector.class_ids' is not in the model"),
+        ({'a': (1, 84, 3549)}, {'input_size': 640}, 'this one takes 416x416'),
+    ],
+)
 def test_what_is_not_understood_is_wrong_usage_at_the_start(outputs: dict, options: dict, says: str) -> None:
     seeing = SeeingModel(lambda found, size: {name: np.zeros(shape, np.float32) for name, shape in outputs.items()})
     with pytest.raises(UsageError, match=says):
@@ -202,11 +221,17 @@ def test_without_onnxruntime_one_line_says_what_to_do(tmp_path: Path, monkeypatc
     assert len(str(caught.value).splitlines()) == 1
 
 
-@pytest.mark.parametrize(('how', 'says'), [
-    ({}, 'cannot be loaded'),
-    ({'providers': 'TensorrtExecutionProvider, NoSuchExecutionProvider'},
-     r'asks for \w+ExecutionProvider; this onnxruntime has .*CPUExecutionProvider'),
-    ({'providers': ''}, 'asks for none; this onnxruntime has')])
+@pytest.mark.parametrize(
+    ('how', 'says'),
+    [
+        ({}, 'cannot be loaded'),
+        (
+            {'providers': 'TensorrtExecutionProvider, NoSuchExecutionProvider'},
+            r'asks for \w+ExecutionProvider; this onnxruntime has .*CPUExecutionProvider',
+        ),
+        ({'providers': ''}, 'asks for none; this onnxruntime has'),
+    ],
+)
 def test_what_onnxruntime_cannot_run_is_wrong_usage(tmp_path: Path, how: dict, says: str) -> None:
     pytest.importorskip('onnxruntime', reason='onnxruntime is not installed')
     (tmp_path / 'model.onnx').write_bytes(b'no model at all')

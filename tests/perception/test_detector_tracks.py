@@ -39,8 +39,13 @@ def noisy(image: np.ndarray, seed: int) -> np.ndarray:
 class World:
     """Boxes that move, drawn, and a detector that knows where they are; `people` and `missed` are indices."""
 
-    def __init__(self, starts: list[tuple[float, float]], speeds: list[float], people: tuple[int, ...] = (),
-                 missed: tuple[int, ...] = ()) -> None:
+    def __init__(
+        self,
+        starts: list[tuple[float, float]],
+        speeds: list[float],
+        people: tuple[int, ...] = (),
+        missed: tuple[int, ...] = (),
+    ) -> None:
         self.starts, self.speeds, self.people, self.missed = starts, speeds, people, missed
         self.time_s, self.calls = 0.0, 0
 
@@ -65,12 +70,16 @@ class World:
         corners = self.at(self.time_s)
         edges = np.hstack([corners + 0.5, corners + 0.5 + CAR[::-1]]) * scale
         seen = np.array([index not in self.missed for index in range(len(edges))], bool)
-        return Detections(edges[seen], np.full(seen.sum(), 0.9),
-                          np.array([index in self.people for index in range(len(edges))], bool)[seen])
+        return Detections(
+            edges[seen],
+            np.full(seen.sum(), 0.9),
+            np.array([index in self.people for index in range(len(edges))], bool)[seen],
+        )
 
 
-def watched(world: World, seconds: float, scale: int = 1, missed_between: tuple[float, float] = (9e9, 9e9)) -> tuple[
-        list[Track], list, list]:
+def watched(
+    world: World, seconds: float, scale: int = 1, missed_between: tuple[float, float] = (9e9, 9e9)
+) -> tuple[list[Track], list, list]:
     """All tracks, segments and edges of a world; the road is empty for the first two seconds."""
     observer = Observer(Options(max_image_width=SIZE[1]), (SIZE[1] * scale, SIZE[0] * scale), world)
     tracks, segments, edges = [], [], []
@@ -151,7 +160,7 @@ def at(world: World, time_s: float, vehicles: DetectorTracks, tracker: PointTrac
 def test_between_detections_a_box_goes_with_its_points() -> None:
     world = World([(20, 100)], [60.0])
     vehicles, tracker = DetectorTracks(world, DetectorOptions(every_s=5.0)), PointTracker(Options().tracking)
-    vehicle, = at(world, 0.0, vehicles, tracker)
+    (vehicle,) = at(world, 0.0, vehicles, tracker)
     x, y = np.meshgrid(np.arange(30, 90, 12.0), np.arange(110, 140, 12.0))
     tracker.add_points(np.column_stack([x.ravel(), y.ravel()]), np.full(x.size, vehicle))
     for index in range(1, 31):
@@ -181,6 +190,7 @@ def test_evidence_by_a_detector_knows_kinds_and_says_so_when_solved() -> None:
     assert evidence is not None
     assert {TrackKind.VEHICLE, TrackKind.PERSON} <= set(evidence.track_kinds.tolist())
     of_people = int((evidence.track_kinds == TrackKind.PERSON).sum())
-    assert evidence.summary().vehicles == len(set(evidence.track_vehicles[
-        evidence.track_kinds == TrackKind.VEHICLE].tolist()))
+    assert evidence.summary().vehicles == len(
+        set(evidence.track_vehicles[evidence.track_kinds == TrackKind.VEHICLE].tolist())
+    )
     assert f'{evidence.track_count - of_people} of' in str(calibrator.progress())

@@ -18,7 +18,7 @@ def _street(generator: np.random.Generator) -> np.ndarray:
     street = np.full((HEIGHT, WIDTH), 22.0, np.float32)
     for _ in range(120):
         x, y = generator.integers(0, (WIDTH - 40, HEIGHT - 20))
-        street[y:y + generator.integers(4, 20), x:x + generator.integers(6, 40)] += generator.uniform(-8, 18)
+        street[y : y + generator.integers(4, 20), x : x + generator.integers(6, 40)] += generator.uniform(-8, 18)
     return cv2.GaussianBlur(street, (0, 0), 0.8)
 
 
@@ -28,8 +28,9 @@ def _night(seconds: float, turned_px: float = 0.0) -> float:
     street, stillness = _street(generator), DriftMonitor(600.0)
     for time_s in np.arange(0.0, seconds, 0.5):
         shift = turned_px * (time_s > seconds / 2)
-        scene = cv2.warpAffine(street, np.float32([[1, 0, shift], [0, 1, 0]]), (WIDTH, HEIGHT),
-                               borderMode=cv2.BORDER_REFLECT)
+        scene = cv2.warpAffine(
+            street, np.float32([[1, 0, shift], [0, 1, 0]]), (WIDTH, HEIGHT), borderMode=cv2.BORDER_REFLECT
+        )
         for lane in range(4):
             y = 120 + 50 * lane
             for place in range(4):

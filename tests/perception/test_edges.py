@@ -105,8 +105,14 @@ def test_edges_reach_the_evidence_with_their_vehicle_in_full_pixels(width: int) 
         observed = observer.observe(still if index < 12 else scene(index - 12), 0.1 * index)
         if observed.edges is not None:
             buffer.add_edges(observed.edges)
-    evidence = buffer.snapshot(image_size=(SIZE[1], SIZE[0]), first_stamp_ns=0, newest_stamp_ns=7_000_000_000,
-                               frames=70, drift_px=0.0, unfinished=observer.unfinished())
+    evidence = buffer.snapshot(
+        image_size=(SIZE[1], SIZE[0]),
+        first_stamp_ns=0,
+        newest_stamp_ns=7_000_000_000,
+        frames=70,
+        drift_px=0.0,
+        unfinished=observer.unfinished(),
+    )
     assert len(evidence.edges_px) > 10
     middles = (evidence.edges_px[:, :2] + evidence.edges_px[:, 2:]) / 2
     x = 60 + SPEED_PX * (evidence.edge_times_s / 0.1 - 12)
@@ -119,10 +125,12 @@ def test_the_buffer_keeps_no_more_edges_than_allowed() -> None:
     buffer = EvidenceBuffer(BufferOptions(max_edges=100))
     for index in range(50):
         buffer.add_edges(Edges(float(index), np.arange(30), np.ones((30, 4))))
-    evidence = buffer.snapshot(image_size=(640, 360), first_stamp_ns=0, newest_stamp_ns=1, frames=1, drift_px=0.0,
-                               unfinished=[])
+    evidence = buffer.snapshot(
+        image_size=(640, 360), first_stamp_ns=0, newest_stamp_ns=1, frames=1, drift_px=0.0, unfinished=[]
+    )
     assert 80 < len(evidence.edges_px) <= 100 and evidence.edge_times_s.max() == 49.0
     buffer.forget_before(48.5)
-    again = buffer.snapshot(image_size=(640, 360), first_stamp_ns=0, newest_stamp_ns=1, frames=1, drift_px=0.0,
-                            unfinished=[])
+    again = buffer.snapshot(
+        image_size=(640, 360), first_stamp_ns=0, newest_stamp_ns=1, frames=1, drift_px=0.0, unfinished=[]
+    )
     assert set(again.edge_times_s) == {49.0}

@@ -31,7 +31,7 @@ def texture(seed: int, shape: tuple[int, int], sigma: float) -> np.ndarray:
 ROAD = 6000 + 30 * texture(0, (HEIGHT, WIDTH), 6.0)
 for left in range(10, WIDTH, 40):  # windows of the houses beside the road
     for top in (4, 100, 118, 212):
-        ROAD[top:top + 14, left:left + 18] -= 300
+        ROAD[top : top + 14, left : left + 18] -= 300
 CARS = [250 + 120 * texture(seed, (50, 80), 2.0) for seed in (1, 2)]
 PATTERN = 10 * texture(3, (HEIGHT, WIDTH), 60.0)
 """What the correction changes slowly over the image, counts."""
@@ -58,10 +58,15 @@ def sent(index: int, shows: str, offset: float) -> np.ndarray:
 def as_16_bits(image: np.ndarray, index: int) -> SimpleNamespace:
     stamp_ns = round(index * 1e9 / RATE_HZ)
     data = np.round(image).astype('<u2')
-    return SimpleNamespace(encoding='mono16', width=WIDTH, height=HEIGHT, step=2 * WIDTH, is_bigendian=0,
-                           data=data.reshape(-1).view(np.uint8),
-                           header=SimpleNamespace(stamp=SimpleNamespace(sec=stamp_ns // 10**9,
-                                                                        nanosec=stamp_ns % 10**9)))
+    return SimpleNamespace(
+        encoding='mono16',
+        width=WIDTH,
+        height=HEIGHT,
+        step=2 * WIDTH,
+        is_bigendian=0,
+        data=data.reshape(-1).view(np.uint8),
+        header=SimpleNamespace(stamp=SimpleNamespace(sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)),
+    )
 
 
 def pictures(bits: int, shows: str, offset: float) -> list[np.ndarray]:
@@ -126,24 +131,33 @@ def test_the_camera_has_neither_moved_nor_been_blind(watched) -> None:
 @pytest.mark.parametrize(('shows', 'offset'), [('frozen', 150.0), ('flat', -120.0)])
 def test_the_road_keeps_its_grey_levels(shows, offset) -> None:
     road = (slice(100, 140), slice(0, WIDTH))
-    before, *_, after = pictures(16, shows, offset)[SHUT[0] - 1:SHUT[1] + 1]
+    before, *_, after = pictures(16, shows, offset)[SHUT[0] - 1 : SHUT[1] + 1]
     change = after[road].astype(int) - before[road]
     assert abs(np.median(change)) <= 4  # the pattern's share: ten counts; the offset alone would be 50 levels
 
 
 def test_pictures_of_the_shutter_are_hidden_and_repeated_ones_repeated() -> None:
     view = FrameGate(4.0, LEVEL_SHIFT_THRESHOLD)
-    seen = [view.classify(cv2.resize(image, (320, 160)), index / RATE_HZ)
-            for index, image in enumerate(pictures(8, 'flat', 0.0))]
+    seen = [
+        view.classify(cv2.resize(image, (320, 160)), index / RATE_HZ)
+        for index, image in enumerate(pictures(8, 'flat', 0.0))
+    ]
     assert [seen[index] for index in range(*SHUT)] == [FrameStatus.HIDDEN] * (SHUT[1] - SHUT[0])
-    assert set(seen[:SHUT[0]] + seen[SHUT[1]:]) == {FrameStatus.NEW}
+    assert set(seen[: SHUT[0]] + seen[SHUT[1] :]) == {FrameStatus.NEW}
 
 
 def test_another_view_that_lasts_is_taken_after_two_seconds() -> None:
-    view, there, elsewhere = FrameGate(4.0, LEVEL_SHIFT_THRESHOLD), *(128 + 40 * texture(seed, (90, 160), 8.0) for seed in (5, 6))
+    view, there, elsewhere = (
+        FrameGate(4.0, LEVEL_SHIFT_THRESHOLD),
+        *(128 + 40 * texture(seed, (90, 160), 8.0) for seed in (5, 6)),
+    )
     seen = [view.classify((there if index < 10 else elsewhere) + index % 2 * 5, 0.2 * index) for index in range(30)]
     assert seen[1:10] == [FrameStatus.NEW] * 9
-    assert set(seen[10:19]) == {FrameStatus.HIDDEN} and FrameStatus.LEVEL_SHIFT in seen[19:22] and set(seen[23:]) == {FrameStatus.NEW}
+    assert (
+        set(seen[10:19]) == {FrameStatus.HIDDEN}
+        and FrameStatus.LEVEL_SHIFT in seen[19:22]
+        and set(seen[23:]) == {FrameStatus.NEW}
+    )
 
 
 def test_what_follows_a_flat_start_is_taken_at_once() -> None:
@@ -195,6 +209,6 @@ def test_a_bright_vehicle_on_a_road_that_shows_little_hides_nothing(dark):
     seen = []
     for column in range(0, 240, 40):
         picture = road.copy()
-        picture[80:140, column:column + 60] = 230.0
+        picture[80:140, column : column + 60] = 230.0
         seen.append(view.classify(picture.astype(np.uint8), column / 200.0))
     assert set(seen) == {FrameStatus.NEW}

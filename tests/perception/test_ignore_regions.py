@@ -29,11 +29,13 @@ def texture(seed: int, shape: tuple[int, int], sigma: float = 1.5) -> np.ndarray
 ROAD, CAR = texture(0, (HEIGHT, WIDTH)) * 0.4 + 60, texture(1, (40, 60))
 
 
-def scene(time_s: float, places: tuple[tuple[float, float], ...], speed: tuple[float, float] = (45.0, 0.0),
-          shift: float = 0.0) -> np.ndarray:
+def scene(
+    time_s: float, places: tuple[tuple[float, float], ...], speed: tuple[float, float] = (45.0, 0.0), shift: float = 0.0
+) -> np.ndarray:
     """Cars (x, y) that drive over a road, which a camera that moved by `shift` sees elsewhere; grey uint8."""
-    image = cv2.warpAffine(ROAD, np.array([[1.0, 0, shift], [0, 1.0, 0]]), (WIDTH, HEIGHT),
-                           borderMode=cv2.BORDER_REFLECT)
+    image = cv2.warpAffine(
+        ROAD, np.array([[1.0, 0, shift], [0, 1.0, 0]]), (WIDTH, HEIGHT), borderMode=cv2.BORDER_REFLECT
+    )
     for x, y in places:
         place = np.array([[1.0, 0, x + speed[0] * time_s + shift], [0, 1.0, y + speed[1] * time_s]])
         mask = cv2.warpAffine(np.ones_like(CAR), place, (WIDTH, HEIGHT))
@@ -115,8 +117,10 @@ def test_blacking_out_leaves_the_image_given_alone() -> None:
     assert black_out(image, ()) is image
 
 
-@pytest.mark.parametrize('text', ['1 2 3 4', '1 2 3 4 5', 'here', '0 0 1 1 nan 2', '0 0 9 0 9 9;; 0 0 9 0 9 9',
-                                  '0 0 1 1 1e9 2', '0 0 9 0 9 9; 4 4'])
+@pytest.mark.parametrize(
+    'text',
+    ['1 2 3 4', '1 2 3 4 5', 'here', '0 0 1 1 nan 2', '0 0 9 0 9 9;; 0 0 9 0 9 9', '0 0 1 1 1e9 2', '0 0 9 0 9 9; 4 4'],
+)
 def test_a_wrong_text_is_wrong_usage(text) -> None:
     with pytest.raises(UsageError, match="'ignore_regions' is polygons of at least three pixels"):
         Options(ignore_regions=text)
@@ -125,7 +129,11 @@ def test_a_wrong_text_is_wrong_usage(text) -> None:
 @pytest.mark.parametrize('text', ['', ' ', '1 2 3 4 5 6', '1,2 3,4 5,6;', ' 1 2 3 4 5 6 ; 7 8 9 10 11 12 13 14 '])
 def test_a_right_text_is_read(text) -> None:
     assert [len(polygon) for polygon in Options(ignore_regions=text).ignored_polygons] == {
-        '': [], ' ': [], '1 2 3 4 5 6': [3], '1,2 3,4 5,6;': [3]}.get(text, [3, 4])
+        '': [],
+        ' ': [],
+        '1 2 3 4 5 6': [3],
+        '1,2 3,4 5,6;': [3],
+    }.get(text, [3, 4])
 
 
 def test_a_polygon_outside_the_image_is_told_at_the_first_image() -> None:
@@ -143,13 +151,33 @@ def message(encoding: str, row_bytes: int, rows: int, padding: int = 4, is_bigen
     """A message of noise, that of 16 bits well above zero."""
     data = np.random.default_rng(0).integers(60, 200, (rows, row_bytes + padding), np.uint8)
     data.flags.writeable = False
-    return SimpleNamespace(encoding=encoding, width=COLUMNS, height=ROWS, step=row_bytes + padding,
-                           is_bigendian=is_bigendian, data=data.ravel())
+    return SimpleNamespace(
+        encoding=encoding,
+        width=COLUMNS,
+        height=ROWS,
+        step=row_bytes + padding,
+        is_bigendian=is_bigendian,
+        data=data.ravel(),
+    )
 
 
-KINDS = [('mono8', 16, 12), ('bgr8', 48, 12), ('rgba8', 64, 12), ('8UC4', 64, 12), ('mono16', 32, 12),
-         ('rgb16', 96, 12), ('bayer_rggb8', 16, 12), ('bayer_gbrg16', 32, 12), ('16SC1', 32, 12), ('yuv422', 32, 12),
-         ('yuyv', 32, 12), ('nv21', 16, 18), ('nv12', 16, 18), ('nv24', 16, 36), ('yuv420', 16, 18)]
+KINDS = [
+    ('mono8', 16, 12),
+    ('bgr8', 48, 12),
+    ('rgba8', 64, 12),
+    ('8UC4', 64, 12),
+    ('mono16', 32, 12),
+    ('rgb16', 96, 12),
+    ('bayer_rggb8', 16, 12),
+    ('bayer_gbrg16', 32, 12),
+    ('16SC1', 32, 12),
+    ('yuv422', 32, 12),
+    ('yuyv', 32, 12),
+    ('nv21', 16, 18),
+    ('nv12', 16, 18),
+    ('nv24', 16, 36),
+    ('yuv420', 16, 18),
+]
 
 
 @pytest.mark.parametrize('is_bigendian', [0, 1])
@@ -167,16 +195,33 @@ def test_images_of_every_encoding_are_black_there_and_nowhere_else(encoding, row
         core[:] = False
         core[4:6, 5:9] = True
     assert now[core].max() <= 8  # the darkest of the rest, stretched, may lie a little above the first percentile
-    if encoding in ('mono8', 'bgr8', 'rgba8', '8UC4', 'bayer_rggb8', 'yuv422', 'yuyv', 'nv21', 'nv12', 'nv24',
-                    'yuv420'):
+    if encoding in (
+        'mono8',
+        'bgr8',
+        'rgba8',
+        '8UC4',
+        'bayer_rggb8',
+        'yuv422',
+        'yuyv',
+        'nv21',
+        'nv12',
+        'nv24',
+        'yuv420',
+    ):
         assert np.array_equal(now[far], was[far])
 
 
 def test_temperatures_get_the_coldest_of_the_rest() -> None:
     kelvin = np.random.default_rng(0).uniform(280, 300, (ROWS, COLUMNS)).astype('<f4')
     kelvin[0, 0], kelvin[4, 5] = np.nan, 250.0
-    msg = SimpleNamespace(encoding='32FC1', width=COLUMNS, height=ROWS, step=4 * COLUMNS, is_bigendian=0,
-                          data=kelvin.ravel().view(np.uint8))
+    msg = SimpleNamespace(
+        encoding='32FC1',
+        width=COLUMNS,
+        height=ROWS,
+        step=4 * COLUMNS,
+        is_bigendian=0,
+        data=kelvin.ravel().view(np.uint8),
+    )
     after = mask_message(msg, SMALL).view('<f4').reshape(ROWS, COLUMNS)
     assert (after[3:7, 4:10] == np.nanmin(np.delete(kelvin, 4, axis=0))).all() or after[4, 5] >= 280
     assert np.isnan(after[0, 0]) and np.array_equal(after[8:], kelvin[8:])
@@ -210,5 +255,7 @@ def test_what_cannot_be_made_black_is_told() -> None:
 
 def test_a_size_that_the_data_cannot_have_is_told_before_it_takes_memory() -> None:
     with pytest.raises(InputError, match='4294967295 x 4294967295 pixels has 768 bytes'):
-        mask_message(SimpleNamespace(**{**vars(message('mono16', 32, 12, padding=32)), 'width': 2**32 - 1,
-                                       'height': 2**32 - 1}), SMALL)
+        mask_message(
+            SimpleNamespace(**{**vars(message('mono16', 32, 12, padding=32)), 'width': 2**32 - 1, 'height': 2**32 - 1}),
+            SMALL,
+        )

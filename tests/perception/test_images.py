@@ -21,15 +21,29 @@ def scene() -> np.ndarray:
     return np.stack([40 + 10 * x, 60 + 12 * y, 200 - 5 * x - 3 * y], axis=-1).astype(np.uint8)
 
 
-def message(encoding: str, rows: np.ndarray, *, padding: int = 0, width: int = WIDTH, height: int = HEIGHT,
-            is_bigendian: int = 0, as_array: bool = False) -> SimpleNamespace:
+def message(
+    encoding: str,
+    rows: np.ndarray,
+    *,
+    padding: int = 0,
+    width: int = WIDTH,
+    height: int = HEIGHT,
+    is_bigendian: int = 0,
+    as_array: bool = False,
+) -> SimpleNamespace:
     """Return a message of rows (n, bytes), each followed by `padding` bytes."""
     rows = np.ascontiguousarray(rows).view(np.uint8).reshape(len(rows), -1)
     step = rows.shape[1] + padding
     data = np.pad(rows, ((0, 0), (0, padding)), constant_values=77).ravel()
     data.flags.writeable = False
-    return SimpleNamespace(encoding=encoding, width=width, height=height, step=step, is_bigendian=is_bigendian,
-                           data=array.array('B', data.tobytes()) if as_array else data)
+    return SimpleNamespace(
+        encoding=encoding,
+        width=width,
+        height=height,
+        step=step,
+        is_bigendian=is_bigendian,
+        data=array.array('B', data.tobytes()) if as_array else data,
+    )
 
 
 def decoded(msg: SimpleNamespace) -> np.ndarray:
@@ -41,9 +55,18 @@ def decoded(msg: SimpleNamespace) -> np.ndarray:
 
 @pytest.mark.parametrize('as_array', [False, True])
 @pytest.mark.parametrize('padding', [0, 5])
-@pytest.mark.parametrize(('encoding', 'order'), [('bgr8', [0, 1, 2]), ('rgb8', [2, 1, 0]), ('8UC3', [0, 1, 2]),
-                                                 ('bgra8', [0, 1, 2, 0]), ('rgba8', [2, 1, 0, 0]),
-                                                 ('8UC4', [0, 1, 2, 0]), ('BGR8', [0, 1, 2])])
+@pytest.mark.parametrize(
+    ('encoding', 'order'),
+    [
+        ('bgr8', [0, 1, 2]),
+        ('rgb8', [2, 1, 0]),
+        ('8UC3', [0, 1, 2]),
+        ('bgra8', [0, 1, 2, 0]),
+        ('rgba8', [2, 1, 0, 0]),
+        ('8UC4', [0, 1, 2, 0]),
+        ('BGR8', [0, 1, 2]),
+    ],
+)
 def test_colours_are_put_in_order(encoding, order, padding, as_array):
     image = decoded(message(encoding, scene()[:, :, order], padding=padding, as_array=as_array))
     assert np.array_equal(image, scene())
@@ -74,8 +97,16 @@ def test_16_bit_grey_fills_the_range(encoding, padding, is_bigendian):
 
 
 @pytest.mark.parametrize('is_bigendian', [0, 1])
-@pytest.mark.parametrize(('encoding', 'order'), [('bgr16', [0, 1, 2]), ('rgb16', [2, 1, 0]), ('16UC3', [0, 1, 2]),
-                                                 ('bgra16', [0, 1, 2, 0]), ('rgba16', [2, 1, 0, 0])])
+@pytest.mark.parametrize(
+    ('encoding', 'order'),
+    [
+        ('bgr16', [0, 1, 2]),
+        ('rgb16', [2, 1, 0]),
+        ('16UC3', [0, 1, 2]),
+        ('bgra16', [0, 1, 2, 0]),
+        ('rgba16', [2, 1, 0, 0]),
+    ],
+)
 def test_16_bit_colours_keep_their_proportion(encoding, order, is_bigendian):
     wide = scene().astype(int) * 257
     low, high = np.percentile(wide, [1, 99])
@@ -88,8 +119,9 @@ def test_16_bit_colours_keep_their_proportion(encoding, order, is_bigendian):
 @pytest.mark.parametrize('padding', [0, 6])
 def test_signed_counts_fill_the_range(padding, is_bigendian):
     grey = np.linspace(-300, 900, HEIGHT * WIDTH).reshape(HEIGHT, WIDTH)  # tenths of a degree Celsius
-    image = decoded(message('16SC1', grey.astype('>i2' if is_bigendian else '<i2'), padding=padding,
-                            is_bigendian=is_bigendian))
+    image = decoded(
+        message('16SC1', grey.astype('>i2' if is_bigendian else '<i2'), padding=padding, is_bigendian=is_bigendian)
+    )
     low, high = np.percentile(grey.astype(int), [1, 99])
     assert np.abs(image - np.clip((grey - low) / (high - low) * 255, 0, 255)).max() <= 1
 
@@ -101,8 +133,9 @@ def test_temperatures_fill_the_range_and_what_is_none_is_black(padding, is_bigen
     low, high = np.percentile(kelvin, [1, 99])
     holes = kelvin.copy()
     holes[3, 5:8] = np.nan, np.nan, -np.inf
-    image = decoded(message('32FC1', holes.astype('>f4' if is_bigendian else '<f4'), padding=padding,
-                            is_bigendian=is_bigendian))
+    image = decoded(
+        message('32FC1', holes.astype('>f4' if is_bigendian else '<f4'), padding=padding, is_bigendian=is_bigendian)
+    )
     assert (image[3, 5:8] == 0).all()
     there = np.isfinite(holes)
     # the holes move the percentiles by a pixel or two
@@ -200,8 +233,9 @@ def bgr_of(y: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize('padding', [0, 4])
-@pytest.mark.parametrize(('encoding', 'layout'), [('yuv422', 'uyvy'), ('uyvy', 'uyvy'), ('yuv422_yuy2', 'yuyv'),
-                                                  ('yuyv', 'yuyv')])
+@pytest.mark.parametrize(
+    ('encoding', 'layout'), [('yuv422', 'uyvy'), ('uyvy', 'uyvy'), ('yuv422_yuy2', 'yuyv'), ('yuyv', 'yuyv')]
+)
 def test_yuv422_in_both_orders(encoding, layout, padding):
     y, u, v = yuv_of_scene()
     planes = {'y': iter((y[:, 0::2], y[:, 1::2])), 'u': iter((u[:, ::2],)), 'v': iter((v[:, ::2],))}
@@ -231,8 +265,8 @@ def test_nv12(padding, name):
 @pytest.mark.parametrize('padding', [0, 4])
 def test_yuv420(padding):
     y, u, v = yuv_of_scene()
-    u[:, WIDTH // 2:] += 30  # a mix-up of planes would put the change elsewhere
-    v[HEIGHT // 2:] += 30
+    u[:, WIDTH // 2 :] += 30  # a mix-up of planes would put the change elsewhere
+    v[HEIGHT // 2 :] += 30
     half = np.pad(np.concatenate([u[::2, ::2], v[::2, ::2]]), ((0, 0), (0, padding // 2)))
     msg = message('yuv420', np.concatenate([np.pad(y, ((0, 0), (0, padding))).ravel(), half.ravel()])[None])
     msg.step = WIDTH + padding
@@ -281,15 +315,18 @@ def test_a_compressed_bayer_mosaic_is_coloured():
     assert (image == [40, 120, 200]).all()
 
 
-@pytest.mark.parametrize(('change', 'reason'), [
-    ({'encoding': '32FC2'}, "image encoding '32FC2' is not supported"),
-    ({'encoding': ''}, "image encoding '' is not supported"),
-    ({'data': b'\0' * 100}, r"'bgr8' needs 576 bytes \(12 rows of 48\), found 100"),
-    ({'data': b''}, r"'bgr8' needs 576 bytes \(12 rows of 48\), found 0"),
-    ({'step': 16}, 'needs rows of 48 bytes, but its step is 16'),
-    ({'width': 0}, "'bgr8' has no pixels: 0 x 12"),
-    ({'height': 0}, "'bgr8' has no pixels: 16 x 0"),
-])
+@pytest.mark.parametrize(
+    ('change', 'reason'),
+    [
+        ({'encoding': '32FC2'}, "image encoding '32FC2' is not supported"),
+        ({'encoding': ''}, "image encoding '' is not supported"),
+        ({'data': b'\0' * 100}, r"'bgr8' needs 576 bytes \(12 rows of 48\), found 100"),
+        ({'data': b''}, r"'bgr8' needs 576 bytes \(12 rows of 48\), found 0"),
+        ({'step': 16}, 'needs rows of 48 bytes, but its step is 16'),
+        ({'width': 0}, "'bgr8' has no pixels: 0 x 12"),
+        ({'height': 0}, "'bgr8' has no pixels: 16 x 0"),
+    ],
+)
 def test_a_broken_image_is_refused_with_the_reason(change, reason):
     msg = message('bgr8', scene())
     vars(msg).update(change)
@@ -306,13 +343,16 @@ def test_a_short_planar_image_is_refused_with_the_lengths(encoding):
 JPEG = cv2.imencode('.jpg', scene())[1].tobytes()
 
 
-@pytest.mark.parametrize(('data', 'said', 'reason'), [
-    (JPEG, '16UC1; compressedDepth png', 'holds depths'),
-    (JPEG[:len(JPEG) // 2], 'jpeg', 'is a JPEG cut off after'),
-    (b'GIF89a' + bytes(20), 'jpeg', 'neither JPEG nor PNG, it begins with 47 49 46'),
-    (b'', 'jpeg', 'it begins with nothing'),
-    (b'\x89PNG\r\n\x1a\n' + bytes(50), 'png', 'cannot be decoded'),
-])
+@pytest.mark.parametrize(
+    ('data', 'said', 'reason'),
+    [
+        (JPEG, '16UC1; compressedDepth png', 'holds depths'),
+        (JPEG[: len(JPEG) // 2], 'jpeg', 'is a JPEG cut off after'),
+        (b'GIF89a' + bytes(20), 'jpeg', 'neither JPEG nor PNG, it begins with 47 49 46'),
+        (b'', 'jpeg', 'it begins with nothing'),
+        (b'\x89PNG\r\n\x1a\n' + bytes(50), 'png', 'cannot be decoded'),
+    ],
+)
 def test_a_broken_compressed_image_is_refused_with_the_reason(data, said, reason):
     with pytest.raises(InputError, match=reason):
         ImageDecoder().decode(compressed(data, said))
@@ -323,4 +363,5 @@ def test_an_encoding_without_colours_is_warned_of_once(caplog):
     for _ in range(3):
         decoder.decode(message('8UC3', scene()))
     assert [record.message for record in caplog.records] == [
-        "image encoding '8UC3' does not name its colours; taken for bgr8"]
+        "image encoding '8UC3' does not name its colours; taken for bgr8"
+    ]

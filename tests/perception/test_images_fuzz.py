@@ -25,14 +25,25 @@ def mutations(draw) -> SimpleNamespace:
     """Draw a whole image of any encoding, of which some fields are then changed."""
     encoding, width, height = draw(st.sampled_from(ENCODINGS)), draw(st.integers(1, 20)), draw(st.integers(1, 20))
     step = width * (PACKED_ENCODINGS[encoding][1] // 8 * 4 if encoding in PACKED_ENCODINGS else 2)
-    whole = {'encoding': encoding, 'width': width, 'height': height, 'step': step, 'length': 3 * step * height,
-             'is_bigendian': 0}
-    changes = {'encoding': st.one_of(st.sampled_from(ENCODINGS), st.text(max_size=12)), 'width': NUMBER_FORMATS,
-               'height': NUMBER_FORMATS, 'step': NUMBER_FORMATS, 'length': st.integers(0, len(PIXELS)),
-               'is_bigendian': st.integers(0, 255)}
+    whole = {
+        'encoding': encoding,
+        'width': width,
+        'height': height,
+        'step': step,
+        'length': 3 * step * height,
+        'is_bigendian': 0,
+    }
+    changes = {
+        'encoding': st.one_of(st.sampled_from(ENCODINGS), st.text(max_size=12)),
+        'width': NUMBER_FORMATS,
+        'height': NUMBER_FORMATS,
+        'step': NUMBER_FORMATS,
+        'length': st.integers(0, len(PIXELS)),
+        'is_bigendian': st.integers(0, 255),
+    }
     for name in draw(st.sets(st.sampled_from(sorted(changes)), max_size=3)):
         whole[name] = draw(changes[name])
-    return SimpleNamespace(**whole, data=PIXELS[:whole['length']])
+    return SimpleNamespace(**whole, data=PIXELS[: whole['length']])
 
 
 @settings(max_examples=10_000, deadline=None, suppress_health_check=list(HealthCheck))
@@ -43,13 +54,20 @@ def test_any_header_gives_an_image_of_its_size_or_an_error(message):
     except InputError as error:
         assert str(error)
         return
-    assert image.dtype == np.uint8 and image.shape in ((message.height, message.width),
-                                                       (message.height, message.width, 3))
+    assert image.dtype == np.uint8 and image.shape in (
+        (message.height, message.width),
+        (message.height, message.width, 3),
+    )
 
 
 @settings(max_examples=2_000, deadline=None, suppress_health_check=list(HealthCheck))
-@given(file=st.sampled_from(FILES), cut=st.integers(0, 3000), place=st.integers(0, 3000), byte=st.integers(0, 255),
-       said=st.text(max_size=12))
+@given(
+    file=st.sampled_from(FILES),
+    cut=st.integers(0, 3000),
+    place=st.integers(0, 3000),
+    byte=st.integers(0, 255),
+    said=st.text(max_size=12),
+)
 def test_any_bytes_give_an_image_or_an_error(file, cut, place, byte, said):
     broken = bytearray(file[:cut] if cut < len(file) else file)
     if place < len(broken):

@@ -17,8 +17,12 @@ from autocalib_ros.perception.observer import Observer
 WIDTH, HEIGHT = 640, 360
 FINE = 8
 """Drawn so many times finer, and reduced."""
-STRIPES = np.array([[[60 + 50 * n, 240], [80 + 50 * n, 240], [100 + 50 * n, 330], [76 + 50 * n, 330]]
-                    for n in range(6)], float) + 0.3
+STRIPES = (
+    np.array(
+        [[[60 + 50 * n, 240], [80 + 50 * n, 240], [100 + 50 * n, 330], [76 + 50 * n, 330]] for n in range(6)], float
+    )
+    + 0.3
+)
 """Corners (6, 4, 2) of white stripes."""
 CAR_ROWS = (100, 170)
 """Rows that a rectangle passes, away from the stripes."""
@@ -42,7 +46,7 @@ def picture(shift: float = 0.0, car_x: float | None = None, seed: int = 0, facto
     image = street(shift, factor).copy()
     if car_x is not None:
         left, right = (int(np.clip(x, 0, WIDTH)) * factor for x in (car_x, car_x + 90))
-        image[CAR_ROWS[0] * factor:CAR_ROWS[1] * factor, left:right] = 240
+        image[CAR_ROWS[0] * factor : CAR_ROWS[1] * factor, left:right] = 240
     noise = np.random.default_rng(seed).normal(0.0, 2.0, image.shape)
     return np.clip(image + noise, 0, 255).astype(np.uint8)
 
@@ -108,8 +112,10 @@ def test_a_mask_leaves_out_lines_that_only_cross_it() -> None:
     mask[280:290] = 255
     finder = LineSegmentDetector(mask)
     finder.find(picture(), (0.0,))
-    assert len(finder.lines_px) and not ((finder.lines_px[:, 1::2].min(axis=1) < 280)
-                                         & (finder.lines_px[:, 1::2].max(axis=1) > 290)).any()
+    assert (
+        len(finder.lines_px)
+        and not ((finder.lines_px[:, 1::2].min(axis=1) < 280) & (finder.lines_px[:, 1::2].max(axis=1) > 290)).any()
+    )
 
 
 def test_wide_images_are_reduced_and_lines_come_in_pixels_of_the_full_size() -> None:
@@ -154,7 +160,7 @@ def test_no_more_lines_are_held_than_allowed() -> None:
     finder, rows = LineSegmentDetector(None), np.zeros((1000, 1000), np.uint8)
     for y in range(0, 1000, 12):
         for x in range(0, 1000, 40):
-            rows[y:y + 6, x:x + 28] = 200
+            rows[y : y + 6, x : x + 28] = 200
     finder.find(rows, (0.0,))
     assert len(finder.lines_px) == MAX_LINES
 
@@ -164,8 +170,9 @@ def bumped() -> AutoCalibrator:
     """Who saw the stripes for 20 s, then 8 px beside for 20 s."""
     calibrator = AutoCalibrator(Options())
     for index in range(80):
-        calibrator.add_image(int(0.5e9 * index), picture(shift=0.0 if index < 40 else 8.0, car_x=20.0 * index - 90.0,
-                                                         seed=index))
+        calibrator.add_image(
+            int(0.5e9 * index), picture(shift=0.0 if index < 40 else 8.0, car_x=20.0 * index - 90.0, seed=index)
+        )
     return calibrator
 
 

@@ -67,8 +67,11 @@ def watched() -> tuple[list, list, Observer]:
 
 def test_tracks_go_the_way_of_their_cars(watched: tuple[list, list, Observer]) -> None:
     tracks, _, _ = watched
-    speeds = [(track.points_px[-1] - track.points_px[0]) / (track.times_s[-1] - track.times_s[0]) for track in tracks
-              if track.times_s[-1] - track.times_s[0] > 1.0]
+    speeds = [
+        (track.points_px[-1] - track.points_px[0]) / (track.times_s[-1] - track.times_s[0])
+        for track in tracks
+        if track.times_s[-1] - track.times_s[0] > 1.0
+    ]
     assert len(speeds) > 10
     right = [abs(y) < 1.0 and min(abs(x - 45.0), abs(x + 40.0)) < 1.0 for x, y in speeds]  # px/s
     assert np.mean(right) > 0.9  # the rest slid along an outline, which a later stage has to bear
@@ -97,8 +100,11 @@ def test_a_wide_image_is_tracked_reduced_and_reported_in_full_pixels() -> None:
         tracks += wide.observe(scene(max(0.0, 0.1 * (index - 10)), cars=2 if index > 10 else 0), 0.1 * index).tracks
     tracks += wide.unfinished()
     assert max(track.points_px[:, 0].max() for track in tracks) > 330
-    speeds = [np.diff(track.points_px[[0, -1], 0])[0] / (track.times_s[-1] - track.times_s[0]) for track in tracks
-              if track.times_s[-1] - track.times_s[0] > 1.0]
+    speeds = [
+        np.diff(track.points_px[[0, -1], 0])[0] / (track.times_s[-1] - track.times_s[0])
+        for track in tracks
+        if track.times_s[-1] - track.times_s[0] > 1.0
+    ]
     assert np.median(np.abs(np.abs(speeds) - 42.5)) < 4.0
     newest = wide.followed(16)[:, -1]
     ends = np.array([track.points_px[-1] for track in wide.unfinished()])
@@ -110,15 +116,20 @@ def test_stillness_measures_how_far_the_background_moved(shift: tuple[float, flo
     stillness = DriftMonitor(600.0)
     for index in range(60):
         share = float(index >= 30)
-        moved = cv2.warpAffine(ROAD, np.array([[1.0, 0, share * shift[0]], [0, 1.0, share * shift[1]]]), SIZE[::-1],
-                               borderMode=cv2.BORDER_REFLECT)
+        moved = cv2.warpAffine(
+            ROAD,
+            np.array([[1.0, 0, share * shift[0]], [0, 1.0, share * shift[1]]]),
+            SIZE[::-1],
+            borderMode=cv2.BORDER_REFLECT,
+        )
         stillness.update(moved.astype(np.uint8), float(index))
     assert stillness.drift_px == pytest.approx(np.hypot(*shift), abs=0.4)
 
 
 def road_moved(shift: tuple[float, float]) -> np.ndarray:
-    moved = cv2.warpAffine(ROAD, np.array([[1.0, 0, shift[0]], [0, 1.0, shift[1]]]), SIZE[::-1],
-                           borderMode=cv2.BORDER_REFLECT)
+    moved = cv2.warpAffine(
+        ROAD, np.array([[1.0, 0, shift[0]], [0, 1.0, shift[1]]]), SIZE[::-1], borderMode=cv2.BORDER_REFLECT
+    )
     return moved.astype(np.uint8)
 
 

@@ -64,7 +64,7 @@ def scene(time_s: float) -> np.ndarray:
     image = np.full(SHAPE, 60, np.uint8)
     if time_s >= 2.0:
         left = round(100 + 45 * (time_s - 2.0))
-        image[120:210, left:left + 60] = 200
+        image[120:210, left : left + 60] = 200
     return image
 
 

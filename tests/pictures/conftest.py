@@ -17,12 +17,29 @@ def looking_down(dip_deg: float) -> GroundPlane:
 
 
 def calibration(camera: Camera, ground: GroundPlane | None, **more) -> Calibration:
-    evidence = EvidenceSummary(image_size=(camera.width, camera.height), seconds=60.0, frames=900, tracks=100,
-                               segments=0, vehicles=20, coverage=0.5)
+    evidence = EvidenceSummary(
+        image_size=(camera.width, camera.height),
+        seconds=60.0,
+        frames=900,
+        tracks=100,
+        segments=0,
+        vehicles=20,
+        coverage=0.5,
+    )
     return Calibration(
-        method='joint', grade='lens' if ground is None else 'full', assumptions=(), camera=camera, ground=ground,
-        ground_refusal=None, road_directions=np.zeros((0, 3)), stddev=StandardDeviations(focal_px=1.0), paper=None,
-        evidence=evidence, newest_stamp_ns=1, **more)
+        method='joint',
+        grade='lens' if ground is None else 'full',
+        assumptions=(),
+        camera=camera,
+        ground=ground,
+        ground_refusal=None,
+        road_directions=np.zeros((0, 3)),
+        stddev=StandardDeviations(focal_px=1.0),
+        paper=None,
+        evidence=evidence,
+        newest_stamp_ns=1,
+        **more,
+    )
 
 
 @pytest.fixture(name='calibration')

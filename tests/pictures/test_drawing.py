@@ -21,8 +21,10 @@ from autocalib_ros.pictures.drawing import (
 )
 
 SIZES = [(320, 240), (640, 360), (1280, 720), (1920, 1080)]
-LONG = ('17 of 40 tracks; too little traffic across the main road yet: 3 of 10 tracks; traffic covers 9 % of the image,'
-        ' 15 % are needed; about 6 min more at this rate ') * 6
+LONG = (
+    '17 of 40 tracks; too little traffic across the main road yet: 3 of 10 tracks; traffic covers 9 % of the image,'
+    ' 15 % are needed; about 6 min more at this rate '
+) * 6
 
 
 @pytest.mark.parametrize('size', SIZES)

@@ -27,7 +27,9 @@ def test_a_scale_bar_is_as_long_as_it_says(monkeypatch):
     view = TopView((0.0, 0.0), 12.0, 600, 400)
     told = []
     monkeypatch.setattr('matplotlib.axes.Axes.text', lambda axes, x, y, words, **how: told.append(words))
-    laid = PlotOverlay.render(600, 400, lambda axes: draw_scale_bar(axes, view, 'm')).composite(np.zeros((400, 600), np.uint8))
+    laid = PlotOverlay.render(600, 400, lambda axes: draw_scale_bar(axes, view, 'm')).composite(
+        np.zeros((400, 600), np.uint8)
+    )
     assert told == ['10 m']
     white = np.argwhere(laid[..., 0] > 200)
     row = np.bincount(white[:, 0]).argmax()

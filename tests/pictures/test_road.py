@@ -15,7 +15,7 @@ HEIGHT_SIGMA_M = 0.1
 @pytest.fixture
 def with_height_unsure(calibration):
     covariance = np.zeros((len(COVARIANCE_PARAMETERS),) * 2)
-    covariance[-1, -1] = HEIGHT_SIGMA_M ** 2
+    covariance[-1, -1] = HEIGHT_SIGMA_M**2
     return lambda camera, ground: calibration(camera, ground, covariance=covariance)
 
 

@@ -74,8 +74,10 @@ def test_undistorted_the_lines_of_the_road_are_straight(ground):
     matrix = rectified_matrix(CAMERA)
     line = np.column_stack([np.full(30, 9.0), np.linspace(-4, 4, 30), np.zeros(30)])
     sources = rectification_map(CAMERA, matrix)
-    found = [np.unravel_index(np.argmin(np.hypot(*(sources - pixel).T).T), sources.shape[:2])
-             for pixel in ground_to_image(CAMERA, ground, line)]
+    found = [
+        np.unravel_index(np.argmin(np.hypot(*(sources - pixel).T).T), sources.shape[:2])
+        for pixel in ground_to_image(CAMERA, ground, line)
+    ]
     columns, rows = np.array(found, float)[:, ::-1].T
     misfit = rows - np.polyval(np.polyfit(columns, rows, 1), columns)
     assert np.abs(misfit).max() < 1.0  # a whole pixel is the grain of this look-up

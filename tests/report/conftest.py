@@ -13,23 +13,38 @@ from autocalib_ros.report.page import write_report
 from autocalib_ros.report.scene import ReportScene, SolutionSnapshot
 from synthetic_results import full_result, grey_road, junction_evidence, lens_result, refusal
 
-MOMENTS = (SolutionSnapshot(10.0, code='too_few_tracks'), SolutionSnapshot(20.0, 146.0, 4.0, 39.0, 0.5),
-           SolutionSnapshot(60.0, 140.0, 1.5, 40.0, 0.2))
+MOMENTS = (
+    SolutionSnapshot(10.0, code='too_few_tracks'),
+    SolutionSnapshot(20.0, 146.0, 4.0, 39.0, 0.5),
+    SolutionSnapshot(60.0, 140.0, 1.5, 40.0, 0.2),
+)
 
 
 @pytest.fixture(scope='session')
 def full() -> ReportScene:
     """Return a calibration with everything that a report can show."""
     evidence = junction_evidence()
-    return ReportScene(result=full_result(evidence), evidence=evidence, background=grey_road(), accepted_at_s=20.0,
-                 options=Options(camera_height=8.0), source='clip <1>.mp4', moments=MOMENTS)
+    return ReportScene(
+        result=full_result(evidence),
+        evidence=evidence,
+        background=grey_road(),
+        accepted_at_s=20.0,
+        options=Options(camera_height=8.0),
+        source='clip <1>.mp4',
+        moments=MOMENTS,
+    )
 
 
 @pytest.fixture(scope='session')
 def refused(full: ReportScene) -> ReportScene:
     """Return a refusal of a recording with a long name."""
-    return replace(full, result=refusal(full.evidence), accepted_at_s=None, moments=MOMENTS[:1],
-                   source='a/' + 200 * 'very_long_name')
+    return replace(
+        full,
+        result=refusal(full.evidence),
+        accepted_at_s=None,
+        moments=MOMENTS[:1],
+        source='a/' + 200 * 'very_long_name',
+    )
 
 
 @pytest.fixture(scope='session')
@@ -48,4 +63,5 @@ def written(request, tmp_path_factory) -> Callable[[str], Path]:
             pages[kind] = tmp_path_factory.mktemp(kind) / 'report.html'
             write_report(pages[kind], request.getfixturevalue(kind))
         return pages[kind]
+
     return page

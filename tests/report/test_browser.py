@@ -13,8 +13,10 @@ from browser import Browser, browser, chromium
 pytestmark = pytest.mark.skipif(chromium() is None, reason='no Chromium: apt-get install chromium')
 WIDTHS = {'desktop': 1280, 'telephone': 390}
 UNDECODED = '[...document.images].filter(image => !(image.complete && image.naturalWidth)).length'
-TOO_WIDE = ('[...document.querySelectorAll("body *")].filter(one => !one.closest("figure label") && '
-            'one.getBoundingClientRect().right > innerWidth + 0.5).map(one => one.tagName + ": " + one.textContent)')
+TOO_WIDE = (
+    '[...document.querySelectorAll("body *")].filter(one => !one.closest("figure label") && '
+    'one.getBoundingClientRect().right > innerWidth + 0.5).map(one => one.tagName + ": " + one.textContent)'
+)
 
 
 @pytest.fixture(scope='module')

@@ -116,8 +116,11 @@ def test_the_paper_s_method_shows_the_tracks_it_kept_and_knows_no_sigma(full):
 
 def test_traffic_that_only_turns_shows_what_it_rests_on(full):
     told = full.result.figures
-    turning = replace(told, track_labels=np.full(full.evidence.track_count, -1),
-                      residuals=replace(told.residuals, roads=np.full(len(told.residuals.roads), -1)))
+    turning = replace(
+        told,
+        track_labels=np.full(full.evidence.track_count, -1),
+        residuals=replace(told.residuals, roads=np.full(len(told.residuals.roads), -1)),
+    )
     scene = replace(full, result=replace(full.result, road_directions=np.zeros((0, 3)), figures=turning))
     assert drawn(scene) == ALL - {'straightness'}
     words = [text.get_text() for text in kept_tracks(scene).findobj(Text)]
@@ -126,8 +129,9 @@ def test_traffic_that_only_turns_shows_what_it_rests_on(full):
 
 @pytest.mark.parametrize('background', [True, False])
 def test_without_a_scale_nothing_is_in_metres(full, background):
-    result = replace(full.result, grade='unit_scale', covariance=None,
-                     ground=GroundPlane(full.result.ground.rotation, 1.0, False))
+    result = replace(
+        full.result, grade='unit_scale', covariance=None, ground=GroundPlane(full.result.ground.rotation, 1.0, False)
+    )
     scene = replace(full, result=result, background=full.background if background else None)
     assert drawn(scene) == ALL
     assert 'Give the height of the camera' in next_step(result)
@@ -140,7 +144,8 @@ def test_without_a_scale_nothing_is_in_metres(full, background):
 def test_a_restored_calibration_without_traffic_shows_the_ground(full):
     nothing = full.evidence.select_tracks(np.zeros(0, int))
     assert {'ground_grid', 'top_view', 'undistorted', 'directions'} <= drawn(
-        replace(full, evidence=nothing, moments=()))
+        replace(full, evidence=nothing, moments=())
+    )
 
 
 def test_no_traffic_at_all_still_gives_a_page(tmp_path, refused):
@@ -154,8 +159,10 @@ def test_the_page_is_self_contained_and_holds_the_figures(written):
     text = written('full').read_text()
     assert not re.findall(r'(?:src|href)="(?!data:|#)', text)
     assert 'http' not in re.sub('base64,[^"]+', '', text)
-    shown = [cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)
-             for data in re.findall('base64,([^"]+)"', text)]
+    shown = [
+        cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)
+        for data in re.findall('base64,([^"]+)"', text)
+    ]
     for one, entry in zip(shown, ENTRIES, strict=True):
         other = cv2.imread(str(written('full').parent / 'figures' / f'{entry.name}.png'))
         assert one.shape == other.shape and one.shape[1] > 900
@@ -167,10 +174,14 @@ def test_the_same_scene_gives_the_same_page(tmp_path, refused, written):
     assert (tmp_path / 'report.html').read_bytes() == written('refused').read_bytes()
 
 
-@pytest.mark.parametrize(('code', 'change', 'missing'), [
-    ('camera_moving', {'drift_px': 9.0}, 'the camera stands still'),
-    ('too_few_tracks', {}, 'tracks of moving traffic'),
-    ('no_agreement', {}, 'agreement of the traffic')])
+@pytest.mark.parametrize(
+    ('code', 'change', 'missing'),
+    [
+        ('camera_moving', {'drift_px': 9.0}, 'the camera stands still'),
+        ('too_few_tracks', {}, 'tracks of moving traffic'),
+        ('no_agreement', {}, 'agreement of the traffic'),
+    ],
+)
 def test_what_is_missing_stands_in_a_table(full, code, change, missing):
     evidence = replace(full.evidence, **change)
     if code == 'no_agreement':  # enough of everything

@@ -15,15 +15,25 @@ from autocalib_ros.results.calibration import Calibration, EvidenceSummary, Reas
 from autocalib_ros.results.calibration_json import to_json, write_calibration_json
 
 CAMERA = Camera(1280, 720, 560.0, (639.5, 359.5))
-EVIDENCE = EvidenceSummary(image_size=(1280, 720), seconds=60.0, frames=900, tracks=300, segments=4000, vehicles=70,
-                           coverage=0.6)
+EVIDENCE = EvidenceSummary(
+    image_size=(1280, 720), seconds=60.0, frames=900, tracks=300, segments=4000, vehicles=70, coverage=0.6
+)
 
 
 def calibration(ground: GroundPlane | None) -> Calibration:
     return Calibration(
-        method='joint', grade='full', assumptions=('square pixels',), camera=CAMERA, ground=ground, ground_refusal=None,
-        road_directions=np.eye(3)[:2], stddev=StandardDeviations(focal_px=5.0, tilt_deg=0.3), paper=None,
-        evidence=EVIDENCE, newest_stamp_ns=1)
+        method='joint',
+        grade='full',
+        assumptions=('square pixels',),
+        camera=CAMERA,
+        ground=ground,
+        ground_refusal=None,
+        road_directions=np.eye(3)[:2],
+        stddev=StandardDeviations(focal_px=5.0, tilt_deg=0.3),
+        paper=None,
+        evidence=EVIDENCE,
+        newest_stamp_ns=1,
+    )
 
 
 def test_a_refusal_is_false_and_a_calibration_true() -> None:
@@ -41,6 +51,7 @@ def test_json_of_a_refusal_keeps_code_message_and_remedy() -> None:
 
 def test_json_says_why_a_calibrated_lens_has_no_plane() -> None:
     from dataclasses import replace
+
     result = replace(calibration(None), grade='lens', ground_refusal=Reason('no_height', 'none given', 'give it'))
     document = to_json(result)
     assert document['state'] == 'calibrated' and document['ground_from_camera'] is None

@@ -18,8 +18,11 @@ CASES = {
     'whole': WHOLE,
     'lens only': replace(lens_only(WHOLE), ground_refusal=Reason('no_height', 'none given', 'give it'), paper=None),
     'unit scale': replace(WHOLE, grade='unit_scale', ground=replace(WHOLE.ground, height_m=1.0, metric=False)),
-    'no roads, no deviations': replace(lens_only(WHOLE), road_directions=np.zeros((0, 3)),
-                                       stddev=replace(lens_only(WHOLE).stddev, principal_point_px=None, k2=None)),
+    'no roads, no deviations': replace(
+        lens_only(WHOLE),
+        road_directions=np.zeros((0, 3)),
+        stddev=replace(lens_only(WHOLE).stddev, principal_point_px=None, k2=None),
+    ),
 }
 
 
@@ -57,17 +60,20 @@ def broken(**changes) -> dict:
 POSE = broken()['ground_from_camera']
 
 
-@pytest.mark.parametrize(('document', 'told'), [
-    (broken(version=2), 'version is 2'),
-    (broken(state='refused'), "state is 'refused'"),
-    (broken(camera=None), 'no whole calibration.json'),
-    (broken(image_size=[640]), 'not 2 numbers'),
-    (broken(newest_stamp_ns=None), 'no whole calibration.json'),
-    (broken(camera={**broken()['camera'], 'focal_px': -1.0}), 'positive focal length'),
-    (broken(ground_from_camera={**POSE, 'rotation': np.diag([1.0, 1.0, 1.1]).tolist()}), 'rotation is none'),
-    (broken(ground_from_camera={**POSE, 'rotation': np.diag([1.0, 1.0, -1.0]).tolist()}), 'rotation is none'),
-    (broken(ground_from_camera={**POSE, 'translation_m': [0.0, 0.0, -8.0]}), 'above the road'),
-])
+@pytest.mark.parametrize(
+    ('document', 'told'),
+    [
+        (broken(version=2), 'version is 2'),
+        (broken(state='refused'), "state is 'refused'"),
+        (broken(camera=None), 'no whole calibration.json'),
+        (broken(image_size=[640]), 'not 2 numbers'),
+        (broken(newest_stamp_ns=None), 'no whole calibration.json'),
+        (broken(camera={**broken()['camera'], 'focal_px': -1.0}), 'positive focal length'),
+        (broken(ground_from_camera={**POSE, 'rotation': np.diag([1.0, 1.0, 1.1]).tolist()}), 'rotation is none'),
+        (broken(ground_from_camera={**POSE, 'rotation': np.diag([1.0, 1.0, -1.0]).tolist()}), 'rotation is none'),
+        (broken(ground_from_camera={**POSE, 'translation_m': [0.0, 0.0, -8.0]}), 'above the road'),
+    ],
+)
 def test_document_that_cannot_be_used_says_why(document, told):
     with pytest.raises(InputError, match=told):
         calibration_from_json(document)
@@ -79,10 +85,18 @@ def test_refusal_is_no_calibration():
         calibration_from_json(json.loads(calibration_json(refusal)))
 
 
-@pytest.mark.parametrize(('text', 'told'), [
-    ('', 'not JSON'), ('{"version": 1', 'not JSON'), ('[]', 'no names with values'), ('{"a": NaN}', 'NaN is no number'),
-    ('[' * 100_000, 'not JSON'), (' ' * 1_000_001, 'longer than'), ('\x00\xff', 'not JSON'),
-])
+@pytest.mark.parametrize(
+    ('text', 'told'),
+    [
+        ('', 'not JSON'),
+        ('{"version": 1', 'not JSON'),
+        ('[]', 'no names with values'),
+        ('{"a": NaN}', 'NaN is no number'),
+        ('[' * 100_000, 'not JSON'),
+        (' ' * 1_000_001, 'longer than'),
+        ('\x00\xff', 'not JSON'),
+    ],
+)
 def test_file_that_is_no_calibration_says_why(tmp_path, text, told):
     path = tmp_path / 'c.json'
     path.write_bytes(text.encode('latin-1'))

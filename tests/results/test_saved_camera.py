@@ -23,11 +23,15 @@ from stored_results import calibration, stored
 WHOLE = calibration()
 PIXELS = np.stack(np.meshgrid(np.linspace(0, 639, 9), np.linspace(0, 359, 7)), axis=-1)
 CHECKERBOARD = {
-    'image_width': 640, 'image_height': 480, 'camera_name': 'x', 'distortion_model': 'plumb_bob',
+    'image_width': 640,
+    'image_height': 480,
+    'camera_name': 'x',
+    'distortion_model': 'plumb_bob',
     'camera_matrix': {'rows': 3, 'cols': 3, 'data': [400.0, 0, 322.0, 0, 404.0, 238.0, 0, 0, 1]},
     'distortion_coefficients': {'rows': 1, 'cols': 5, 'data': [-0.2, 0.04, 0.003, -0.002, 0.0]},
     'rectification_matrix': {'rows': 3, 'cols': 3, 'data': [1.0, 0, 0, 0, 1, 0, 0, 0, 1]},
-    'projection_matrix': {'rows': 3, 'cols': 4, 'data': [350.0, 0, 320, 0, 0, 350, 240, 0, 0, 0, 1, 0]}}
+    'projection_matrix': {'rows': 3, 'cols': 4, 'data': [350.0, 0, 320, 0, 0, 350, 240, 0, 0, 0, 1, 0]},
+}
 
 
 @pytest.fixture(params=['calibration.json', 'north.autocalib.json', 'camera_info.yaml'])
@@ -51,7 +55,9 @@ def test_our_own_files_give_the_same_lens(ours):
     assert bearings == pytest.approx(expected, abs=1e-9)
     assert known.project(bearings)[0] == pytest.approx(PIXELS, abs=1e-6)
     assert (known.focal_px, known.principal_point_px) == (
-        pytest.approx(300.0), pytest.approx(WHOLE.camera.principal_point_px))
+        pytest.approx(300.0),
+        pytest.approx(WHOLE.camera.principal_point_px),
+    )
     assert known.k == pytest.approx(WHOLE.camera.k, abs=1e-12)
     assert known.rectified == pytest.approx(rectified_matrix(WHOLE.camera))
     told = ours.suffix == '.json'
@@ -66,8 +72,10 @@ def test_a_checkerboards_file_keeps_what_a_kannala_brandt_lens_has_not(tmp_path)
     slopes = np.array([0.3, -0.2])
     r2 = slopes @ slopes
     radial = 1 - 0.2 * r2 + 0.04 * r2**2
-    tangential = [2 * 0.003 * slopes[0] * slopes[1] - 0.002 * (r2 + 2 * slopes[0]**2),
-                  0.003 * (r2 + 2 * slopes[1]**2) - 2 * 0.002 * slopes[0] * slopes[1]]
+    tangential = [
+        2 * 0.003 * slopes[0] * slopes[1] - 0.002 * (r2 + 2 * slopes[0] ** 2),
+        0.003 * (r2 + 2 * slopes[1] ** 2) - 2 * 0.002 * slopes[0] * slopes[1],
+    ]
     pixel, _ = known.project(np.array([*slopes, 1.0]))
     assert pixel == pytest.approx((slopes * radial + tangential) * [400, 404] + [322, 238])
 
@@ -90,15 +98,27 @@ def test_images_of_another_shape_are_wrong_usage(ours):
         read_saved_camera(ours).scaled_to(640, 480)
 
 
-@pytest.mark.parametrize(('name', 'text', 'told'), [
-    ('cut.json', calibration_json(WHOLE)[:900], 'it is not JSON'),
-    ('other.json', '{"a": 1}', 'its version is None'),
-    ('refused.json', json.dumps({'version': 1, 'state': 'refused', 'refusal': {
-        'code': 'no_motion', 'message': 'nothing moved', 'remedy': ''}}), 'no_motion: nothing moved'),
-    ('words.yaml', 'only words', 'holds no names with values'),
-    ('empty.yaml', '', 'holds no names with values'),
-    ('cut.yaml', yaml.safe_dump(CHECKERBOARD, sort_keys=False)[:200], 'it is not YAML'),
-])
+@pytest.mark.parametrize(
+    ('name', 'text', 'told'),
+    [
+        ('cut.json', calibration_json(WHOLE)[:900], 'it is not JSON'),
+        ('other.json', '{"a": 1}', 'its version is None'),
+        (
+            'refused.json',
+            json.dumps(
+                {
+                    'version': 1,
+                    'state': 'refused',
+                    'refusal': {'code': 'no_motion', 'message': 'nothing moved', 'remedy': ''},
+                }
+            ),
+            'no_motion: nothing moved',
+        ),
+        ('words.yaml', 'only words', 'holds no names with values'),
+        ('empty.yaml', '', 'holds no names with values'),
+        ('cut.yaml', yaml.safe_dump(CHECKERBOARD, sort_keys=False)[:200], 'it is not YAML'),
+    ],
+)
 def test_a_wrong_file_is_told_by_name(name, text, told, tmp_path):
     (tmp_path / name).write_text(text)
     with pytest.raises(InputError, match=told) as error:

@@ -31,13 +31,16 @@ def number_of(found) -> int:
     return found.stored.calibration.evidence.frames
 
 
-@pytest.mark.parametrize(('url', 'path'), [
-    ('', '/ros/camera_info/cam_1.yaml'),
-    ('file:///etc/${NAME}/lens.yaml', '/etc/cam_1/lens.yaml'),
-    ('FILE:///lens.yaml', '/lens.yaml'),
-    ('file://${ROS_HOME}/x.yaml', '/ros/x.yaml'),
-    ('package://some_robot/config/${NAME}.yaml', '{share}/config/cam_1.yaml'),
-])
+@pytest.mark.parametrize(
+    ('url', 'path'),
+    [
+        ('', '/ros/camera_info/cam_1.yaml'),
+        ('file:///etc/${NAME}/lens.yaml', '/etc/cam_1/lens.yaml'),
+        ('FILE:///lens.yaml', '/lens.yaml'),
+        ('file://${ROS_HOME}/x.yaml', '/ros/x.yaml'),
+        ('package://some_robot/config/${NAME}.yaml', '{share}/config/cam_1.yaml'),
+    ],
+)
 def test_url_names_a_file_as_camera_info_manager_reads_it(quick_path, url, path):
     marker = quick_path / 'share' / 'ament_index' / 'resource_index' / 'packages' / 'some_robot'
     marker.parent.mkdir(parents=True)
@@ -51,11 +54,18 @@ def test_default_folder_is_in_the_home_without_ros_home():
     assert resolve_url('', 'cam', {'HOME': '/home/ann'}) == Path('/home/ann/.ros/camera_info/cam.yaml')
 
 
-@pytest.mark.parametrize(('url', 'told'), [
-    ('/etc/lens.yaml', 'write file:///FOLDER/FILE.yaml'), ('file://lens.yaml', 'names no file'),
-    ('file:///folder/', 'names no file'), ('http://host/x.yaml', 'names no file'), ('package://x', 'names no file'),
-    ('file:///${CAMERA}.yaml', r'holds \$\{CAMERA\}: only'), ('package://no_such/x.yaml', "package 'no_such'"),
-])
+@pytest.mark.parametrize(
+    ('url', 'told'),
+    [
+        ('/etc/lens.yaml', 'write file:///FOLDER/FILE.yaml'),
+        ('file://lens.yaml', 'names no file'),
+        ('file:///folder/', 'names no file'),
+        ('http://host/x.yaml', 'names no file'),
+        ('package://x', 'names no file'),
+        ('file:///${CAMERA}.yaml', r'holds \$\{CAMERA\}: only'),
+        ('package://no_such/x.yaml', "package 'no_such'"),
+    ],
+)
 def test_url_that_names_no_file_is_wrong_usage(url, told):
     with pytest.raises(UsageError, match=told):
         resolve_url(url, 'cam', {'HOME': '/home/ann'})
@@ -112,8 +122,14 @@ def test_what_killed_writers_left_is_removed(store):
 
 def test_files_are_never_broken_whenever_the_writer_is_killed(quick_path):
     script = Path(__file__).parents[1] / 'helpers' / 'kill_saves.py'
-    done = subprocess.run([sys.executable, str(script), str(quick_path), str(KILLS)], capture_output=True, text=True,
-                          timeout=120, check=False, env={**os.environ, 'PYTHONPATH': str(Path(__file__).parents[2])})
+    done = subprocess.run(
+        [sys.executable, str(script), str(quick_path), str(KILLS)],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+        env={**os.environ, 'PYTHONPATH': str(Path(__file__).parents[2])},
+    )
     assert done.returncode == 0, done.stderr
     kills, saves = map(int, re.findall(r'\d+', done.stdout)[:2])
     assert kills == KILLS
@@ -159,8 +175,11 @@ def test_removed_yaml_means_that_nothing_is_kept(store):
 
 def test_yaml_that_a_driver_wrote_of_our_numbers_with_fewer_digits_is_ours(store):
     store.save(FIRST)
-    rounded = re.sub(r'\d+\.\d+', lambda match: f'{float(match[0]):.10g}' if '.' in f'{float(match[0]):.10g}'
-                     else match[0], store.path.read_text())
+    rounded = re.sub(
+        r'\d+\.\d+',
+        lambda match: f'{float(match[0]):.10g}' if '.' in f'{float(match[0]):.10g}' else match[0],
+        store.path.read_text(),
+    )
     assert rounded != store.path.read_text()
     store.path.write_text(rounded)
     assert store.load().kind is StoreState.INTACT

@@ -37,8 +37,9 @@ def wait_for(condition, what: str, patience_s: float = PATIENCE_S):
     raise AssertionError(f'waited {patience_s:.0f} s in vain for {what}')
 
 
-def image(stamp_ns: int, *, frame_id: str = 'cam_optical', size: tuple[int, int] = SIZE,
-          encoding: str = 'mono8') -> Image:
+def image(
+    stamp_ns: int, *, frame_id: str = 'cam_optical', size: tuple[int, int] = SIZE, encoding: str = 'mono8'
+) -> Image:
     message = Image(width=size[0], height=size[1], step=size[0], encoding=encoding)
     message.header.stamp, message.header.frame_id = time_message(stamp_ns), frame_id
     message.data.frombytes(np.resize(PIXELS, (size[1], size[0])).tobytes())
@@ -50,14 +51,28 @@ def calibration(evidence, focal_px: float = 300.0, *, height_m: float | None = 8
     camera = replace(Camera.equidistant(*evidence.image_size, focal_px), k=(0.01, 0.0, 0.0, 0.0))
     ground = None if height_m is None else GroundPlane(ROTATION, height_m, metric)
     return Calibration(
-        method='joint', grade='lens' if ground is None else 'full', assumptions=(), camera=camera, ground=ground,
-        ground_refusal=None, road_directions=np.zeros((0, 3)), stddev=StandardDeviations(focal_px=1.0), paper=None,
-        evidence=evidence.summary(), newest_stamp_ns=evidence.newest_stamp_ns)
+        method='joint',
+        grade='lens' if ground is None else 'full',
+        assumptions=(),
+        camera=camera,
+        ground=ground,
+        ground_refusal=None,
+        road_directions=np.zeros((0, 3)),
+        stddev=StandardDeviations(focal_px=1.0),
+        paper=None,
+        evidence=evidence.summary(),
+        newest_stamp_ns=evidence.newest_stamp_ns,
+    )
 
 
 def refusal(evidence) -> Refusal:
-    return Refusal(code='too_few_tracks', message='12 tracks of the 40 needed.', remedy='wait for traffic.',
-                   method='joint', evidence=evidence.summary())
+    return Refusal(
+        code='too_few_tracks',
+        message='12 tracks of the 40 needed.',
+        remedy='wait for traffic.',
+        method='joint',
+        evidence=evidence.summary(),
+    )
 
 
 class Bench:

@@ -1,6 +1,6 @@
 """A camera in a process of its own, for tests: plays phases of images, the next one at each line it is sent.
 
-    camera.py TOPIC '[{"reliable": true, "compressed": false, "width": 320, "height": 240}, ...]'
+camera.py TOPIC '[{"reliable": true, "compressed": false, "width": 320, "height": 240}, ...]'
 """
 
 import json
@@ -31,8 +31,9 @@ def play(node: Node, topic: str, phase: dict) -> None:
     """Publish images until a line comes."""
     reliability = ReliabilityPolicy.RELIABLE if phase.get('reliable', True) else ReliabilityPolicy.BEST_EFFORT
     compressed = phase.get('compressed', False)
-    publisher = node.create_publisher(CompressedImage if compressed else Image, topic,
-                                      QoSProfile(depth=5, reliability=reliability))
+    publisher = node.create_publisher(
+        CompressedImage if compressed else Image, topic, QoSProfile(depth=5, reliability=reliability)
+    )
     size = (phase.get('height', 240), phase.get('width', 320))
     message = picture_message(np.random.default_rng(0).integers(0, 255, size, dtype=np.uint8), compressed)
     message.header.frame_id = 'optical'

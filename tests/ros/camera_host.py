@@ -26,7 +26,7 @@ class Camera:
     def _send(self) -> None:
         if self._publisher.get_subscription_count() and self._sent < IMAGES:
             self._sent += 1
-            self._publisher.publish(image(10 ** 18 + self._sent * 10 ** 8))
+            self._publisher.publish(image(10**18 + self._sent * 10**8))
 
 
 def solve(evidence, options, focal_px: float, lens=None):
@@ -35,8 +35,13 @@ def solve(evidence, options, focal_px: float, lens=None):
 
 def main(focal_px: float) -> None:
     rclpy.init()
-    node = AutocalibNode(solve=partial(solve, focal_px=focal_px), parameter_overrides=[
-        rclpy.parameter.Parameter('camera_height', value=8.0), rclpy.parameter.Parameter('idle_solve_s', value=0.2)])
+    node = AutocalibNode(
+        solve=partial(solve, focal_px=focal_px),
+        parameter_overrides=[
+            rclpy.parameter.Parameter('camera_height', value=8.0),
+            rclpy.parameter.Parameter('idle_solve_s', value=0.2),
+        ],
+    )
     camera = rclpy.create_node('camera')
     Camera(camera)
     executor = SingleThreadedExecutor()

@@ -39,6 +39,7 @@ def ros_home(quick_path, monkeypatch):
 def bench():
     """Yield a running executor to put nodes on, with a client node beside them."""
     from bench import Bench
+
     running = Bench()
     yield running
     running.close()

@@ -52,6 +52,7 @@ def drive(options: argparse.Namespace) -> dict:
     import rclpy
     from rclpy.qos import QoSProfile, ReliabilityPolicy
     from sensor_msgs.msg import Image
+
     capture, messages = cv2.VideoCapture(str(options.video)), []
     step = max(1, round(capture.get(cv2.CAP_PROP_FPS) / options.rate))
     while len(messages) < FRAMES and capture.grab():
@@ -93,10 +94,12 @@ def watch(options: argparse.Namespace) -> dict:
     from rclpy.executors import ExternalShutdownException
     from rclpy.qos import QoSProfile
     from sensor_msgs.msg import Image
+
     rclpy.init()
     node = rclpy.create_node('watcher', namespace=options.namespace)
     ages_ms: dict[str, list[float]] = {topic: [] for topic in options.watch.split(',')}
     for topic, ages in ages_ms.items():
+
         def take(message: Image, ages=ages) -> None:
             stamp = message.header.stamp
             ages.append(1e3 * (time.time() - stamp.sec - stamp.nanosec * 1e-9))
@@ -145,17 +148,23 @@ class Timed:
 
 def quantiles(values: list[float]) -> dict:
     median, p99 = np.percentile(values, (50, 99))
-    return {'n': len(values), 'median': round(float(median), 2), 'p99': round(float(p99), 2),
-            'max': round(max(values), 2)}
+    return {
+        'n': len(values),
+        'median': round(float(median), 2),
+        'p99': round(float(p99), 2),
+        'max': round(max(values), 2),
+    }
 
 
 def run_node(options: argparse.Namespace) -> dict:
     """Run a node with clocks in it until it is interrupted."""
     from autocalib_ros.util.threads import limit_blas_threads
+
     limit_blas_threads()
     from autocalib_ros.ros import autocalib_node, diagnostics, image_input, node
     from autocalib_ros.ros import solver_process as solver
     from autocalib_ros.ros import worker as pipeline
+
     timed, latencies_ms, solved_s, ends = Timed(), [], [], []
     if options.depth:
         image_input.QUEUE_DEPTH = options.depth
@@ -177,8 +186,14 @@ def run_node(options: argparse.Namespace) -> dict:
     if options.watch:
         from autocalib_ros.pictures import live_overlay as live
         from autocalib_ros.ros.live_pictures import LivePictures
-        for owner, name in ((LivePictures, 'image_used'), (LivePictures, '_show'), (live.DebugPicture, 'draw'),
-                            (live.TopPicture, 'draw'), (live.RectifiedPicture, 'draw')):
+
+        for owner, name in (
+            (LivePictures, 'image_used'),
+            (LivePictures, '_show'),
+            (live.DebugPicture, 'draw'),
+            (live.TopPicture, 'draw'),
+            (live.RectifiedPicture, 'draw'),
+        ):
             timed.wrap(owner, name)
     if options.bare:
         pipeline.CalibrationWorker._process_image = lambda self, stamp_ns, message: None
@@ -217,12 +232,18 @@ def run_node(options: argparse.Namespace) -> dict:
     (began, cpu_before), (ended, cpu_after) = start[0], ends[0]
     counters = nodes[0]._worker.counters
     child = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return {**vars(counters), 'lost_by_dds': nodes[0]._input.lost, 'cores': (cpu_after - cpu_before) / (ended - began),
-            'ms_of_processor_for_an_image_used': round(1e3 * (cpu_after - cpu_before) / max(counters.used, 1), 2),
-            'cores_solving': (child.ru_utime + child.ru_stime) / (ended - began),
-            'state': 'calibrated' if nodes[0].publication.published else 'collecting',
-            'solutions_s': quantiles(solved_s or [0.0]), 'latency_ms': quantiles(latencies_ms), 'ms': timed.summary(),
-            'memory_mb': resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024}
+    return {
+        **vars(counters),
+        'lost_by_dds': nodes[0]._input.lost,
+        'cores': (cpu_after - cpu_before) / (ended - began),
+        'ms_of_processor_for_an_image_used': round(1e3 * (cpu_after - cpu_before) / max(counters.used, 1), 2),
+        'cores_solving': (child.ru_utime + child.ru_stime) / (ended - began),
+        'state': 'calibrated' if nodes[0].publication.published else 'collecting',
+        'solutions_s': quantiles(solved_s or [0.0]),
+        'latency_ms': quantiles(latencies_ms),
+        'ms': timed.summary(),
+        'memory_mb': resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+    }
 
 
 def processor_shares() -> np.ndarray:
@@ -232,8 +253,11 @@ def processor_shares() -> np.ndarray:
 
 def measure(options: argparse.Namespace) -> None:
     """Start all processes, wait for the drivers, interrupt the nodes, print what each of them tells."""
-    environment = {**os.environ, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
-                   'ROS_DOMAIN_ID': str(os.getpid() % 100 + 1)}
+    environment = {
+        **os.environ,
+        'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+        'ROS_DOMAIN_ID': str(os.getpid() % 100 + 1),
+    }
 
     def start(role: str, number: int) -> subprocess.Popen:
         command = [sys.executable, __file__, *sys.argv[1:], '--role', role, '--namespace', f'/cam{number}']
@@ -256,10 +280,12 @@ def measure(options: argparse.Namespace) -> None:
         if node.returncode or not sent or not told:
             sys.exit(f'{complaint}\n{log}')
         driver, node_told = json.loads(sent), json.loads(told)
-        print(f"cam{number}: sent {driver['sent']}, lost on the way {driver['sent'] - node_told['received']}, "
-              f"dropped by the node {node_told['dropped']}, node {node_told['cores']:.2f} cores and "
-              f"{node_told['cores_solving']:.2f} for solutions, "
-              f"driver {driver['cores']:.2f} cores, at most {driver['latest_s'] * 1e3:.0f} ms late")
+        print(
+            f'cam{number}: sent {driver["sent"]}, lost on the way {driver["sent"] - node_told["received"]}, '
+            f'dropped by the node {node_told["dropped"]}, node {node_told["cores"]:.2f} cores and '
+            f'{node_told["cores_solving"]:.2f} for solutions, '
+            f'driver {driver["cores"]:.2f} cores, at most {driver["latest_s"] * 1e3:.0f} ms late'
+        )
         for key, value in node_told.items():
             print(f'  {key}: {json.dumps(value) if key != "ms" else ""}')
             for name, times in value.items() if key == 'ms' else ():

@@ -1,7 +1,7 @@
 """A neighbour on /tf in a process of its own, until its standard input is closed.
 
-    neighbour.py listen                     prints a line of JSON for each message of /tf_static and ~/ground_transform
-    neighbour.py hang CHILD PARENT TOPIC    publishes a transform that hangs CHILD from PARENT
+neighbour.py listen                     prints a line of JSON for each message of /tf_static and ~/ground_transform
+neighbour.py hang CHILD PARENT TOPIC    publishes a transform that hangs CHILD from PARENT
 """
 
 import json
@@ -28,8 +28,9 @@ def listen(node: Node) -> None:
         print(json.dumps([topic, [described(stamped) for stamped in transforms]]), flush=True)
 
     node.create_subscription(TFMessage, '/tf_static', lambda message: tell('/tf_static', message.transforms), LATCHED)
-    node.create_subscription(TransformStamped, '/autocalib/ground_transform',
-                             lambda message: tell('ground_transform', [message]), LATCHED)
+    node.create_subscription(
+        TransformStamped, '/autocalib/ground_transform', lambda message: tell('ground_transform', [message]), LATCHED
+    )
 
 
 def hang(node: Node, child: str, parent: str, topic: str) -> None:

@@ -22,37 +22,59 @@ def test_camera_needs_no_more_than_a_namespace():
 
 
 def test_camera_gets_its_file_values_and_remappings():
-    node, = nodes({'namespace': 'site/cam1', 'image': '/driver/image', 'camera_height': 8, 'camera_info': 'camera_info',
-                   'params_file': 'thermal.yaml', 'parameters': {'gate': {'min_tracks': 60}, 'joint.noise_px': 1}})
+    (node,) = nodes(
+        {
+            'namespace': 'site/cam1',
+            'image': '/driver/image',
+            'camera_height': 8,
+            'camera_info': 'camera_info',
+            'params_file': 'thermal.yaml',
+            'parameters': {'gate': {'min_tracks': 60}, 'joint.noise_px': 1},
+        }
+    )
     assert node.namespace == 'site/cam1'
-    assert node.parameters == ('/etc/cameras/thermal.yaml',
-                               {'gate.min_tracks': 60, 'joint.noise_px': 1.0, 'camera_height': 8.0})
+    assert node.parameters == (
+        '/etc/cameras/thermal.yaml',
+        {'gate.min_tracks': 60, 'joint.noise_px': 1.0, 'camera_height': 8.0},
+    )
     assert [type(value) for value in node.parameters[1].values()] == [int, float, float]
     assert node.remappings == (('image', '/driver/image'), ('~/camera_info', 'camera_info'))
 
 
 def test_defaults_hold_where_a_camera_says_nothing():
     defaults = {'params_file': 'low_power.yaml', 'parameters': {'gate.min_tracks': 30, 'random_seed': 7}}
-    first, second = nodes({'namespace': 'a', 'parameters': {'gate.min_tracks': 60}},
-                          {'namespace': 'b', 'params_file': '/thermal.yaml'}, defaults=defaults)
+    first, second = nodes(
+        {'namespace': 'a', 'parameters': {'gate.min_tracks': 60}},
+        {'namespace': 'b', 'params_file': '/thermal.yaml'},
+        defaults=defaults,
+    )
     assert first.parameters == ('/etc/cameras/low_power.yaml', {'gate.min_tracks': 60, 'random_seed': 7})
     assert second.parameters == ('/thermal.yaml', {'gate.min_tracks': 30, 'random_seed': 7})
 
 
-@pytest.mark.parametrize(('cameras', 'told'), [
-    ([{'namespace': 'a'}, {'namespace': '/a'}], "share the namespace 'a'"),
-    ([{'namespace': 'site/a'}, {'namespace': 'site_a'}], "share the name for frames and files 'site_a'"),
-    ([{'namespace': 'a'}, {'namespace': 'b', 'parameters': {'camera_name': 'a'}}], 'share the name for frames'),
-    ([{'namespace': 'a'}, {'namespace': 'b', 'parameters': {'ground_frame': 'a_ground'}}], 'share the ground frame'),
-    ([{'namespace': 'a', 'image': '/image'}, {'namespace': 'b', 'image': '/image'}], "the image topic '/image'"),
-    ([{'namespace': 'a', 'camera_info': '/i'}, {'namespace': 'b', 'camera_info': '/i'}], "the camera_info topic '/i'"),
-    ([{'image': 'image'}], "camera 1 has the namespace None: give it one of its own, 'cam1' say"),
-    ([{'namespace': '1 pole'}], "namespace '1 pole'"),
-    ([{'namespace': 'a', 'camera_hight': 8.0}], "unknown entry 'camera_hight': did you mean 'camera_height'?"),
-    ([{'namespace': 'a', 'parameters': [1]}], "'parameters' of camera 1"),
-    (['cam1'], "camera 1 is 'cam1'"),
-    ([], 'at least one camera'),
-])
+@pytest.mark.parametrize(
+    ('cameras', 'told'),
+    [
+        ([{'namespace': 'a'}, {'namespace': '/a'}], "share the namespace 'a'"),
+        ([{'namespace': 'site/a'}, {'namespace': 'site_a'}], "share the name for frames and files 'site_a'"),
+        ([{'namespace': 'a'}, {'namespace': 'b', 'parameters': {'camera_name': 'a'}}], 'share the name for frames'),
+        (
+            [{'namespace': 'a'}, {'namespace': 'b', 'parameters': {'ground_frame': 'a_ground'}}],
+            'share the ground frame',
+        ),
+        ([{'namespace': 'a', 'image': '/image'}, {'namespace': 'b', 'image': '/image'}], "the image topic '/image'"),
+        (
+            [{'namespace': 'a', 'camera_info': '/i'}, {'namespace': 'b', 'camera_info': '/i'}],
+            "the camera_info topic '/i'",
+        ),
+        ([{'image': 'image'}], "camera 1 has the namespace None: give it one of its own, 'cam1' say"),
+        ([{'namespace': '1 pole'}], "namespace '1 pole'"),
+        ([{'namespace': 'a', 'camera_hight': 8.0}], "unknown entry 'camera_hight': did you mean 'camera_height'?"),
+        ([{'namespace': 'a', 'parameters': [1]}], "'parameters' of camera 1"),
+        (['cam1'], "camera 1 is 'cam1'"),
+        ([], 'at least one camera'),
+    ],
+)
 def test_file_that_cannot_be_used_is_refused_with_the_reason(cameras, told):
     with pytest.raises(UsageError, match=told):
         nodes(*cameras)
@@ -89,8 +111,14 @@ def launch_file(request, monkeypatch):
     """Return a loader of launch files on stand-ins for launch and launch_ros."""
     for name in ('launch', 'launch.actions', 'launch.substitutions', 'launch_ros', 'launch_ros.actions'):
         module = ModuleType(name)
-        for kept in ('LaunchContext', 'LaunchDescription', 'DeclareLaunchArgument', 'OpaqueFunction',
-                     'LaunchConfiguration', 'Node'):
+        for kept in (
+            'LaunchContext',
+            'LaunchDescription',
+            'DeclareLaunchArgument',
+            'OpaqueFunction',
+            'LaunchConfiguration',
+            'Node',
+        ):
             setattr(module, kept, type(kept, (Kept,), {}))
         monkeypatch.setitem(sys.modules, name, module)
 
@@ -110,12 +138,17 @@ def test_launch_file_starts_a_process_for_each_camera(launch_file, tmp_path):
     assert argument.given == ('cameras',)
     started = opaque.named['function']({'cameras': str(tmp_path / 'cameras.yaml')})
     assert [(node.named['namespace'], node.named['name'], node.named['parameters']) for node in started] == [
-        ('a', 'autocalib', [{'camera_height': 8.0}]), ('b', 'autocalib', [])]
+        ('a', 'autocalib', [{'camera_height': 8.0}]),
+        ('b', 'autocalib', []),
+    ]
 
 
 def test_launch_file_of_one_camera_passes_what_is_given_and_nothing_else(launch_file):
     module = launch_file('autocalib')
     given = {name: default for name, default, _ in module.ARGUMENTS}
-    node, = module.start_node({**given, 'namespace': 'cam1', 'camera_height': '8'})
+    (node,) = module.start_node({**given, 'namespace': 'cam1', 'camera_height': '8'})
     assert (node.named['namespace'], node.named['parameters'], node.named['remappings']) == (
-        'cam1', [{'camera_height': 8.0}], [('image', 'image_raw')])
+        'cam1',
+        [{'camera_height': 8.0}],
+        [('image', 'image_raw')],
+    )

@@ -25,6 +25,7 @@ def told(monkeypatch) -> list[str]:
 @pytest.fixture
 def driver(bench):
     """Serve set_camera_info as a driver does; return what it was sent and its next answers."""
+
     class Driver:
         received: list = []
         answers: list = []
@@ -45,7 +46,7 @@ def test_calibration_is_sent_once(bench, driver, told):
     node, publisher = calibrated(bench, upload_to_driver=True)
     wait_for(lambda: any('took the calibration' in line for line in told), 'the line of the log')
     fields = camera_info(node.publication.published.result.camera)
-    sent, = driver.received
+    (sent,) = driver.received
     assert (list(sent.k), list(sent.d), sent.width) == (fields.k, fields.d, fields.width)
     before = node._worker.counters.used
     publish_until(publisher, lambda: node._worker.counters.used > before + 3, 'more images')
@@ -72,8 +73,12 @@ def test_restored_calibration_is_sent_only_when_the_traffic_confirms_it(bench, d
     node, publisher = calibrated(bench, camera_name='north')
     wait_for((ros_home / 'camera_info' / 'north.yaml').exists, 'the file')
     bench.stop(node)
-    node = bench.start(lambda evidence, options, lens: calibration(evidence), camera_name='north',
-                       upload_to_driver=True, idle_solve_s=1000.0)
+    node = bench.start(
+        lambda evidence, options, lens: calibration(evidence),
+        camera_name='north',
+        upload_to_driver=True,
+        idle_solve_s=1000.0,
+    )
     assert node.publication.state is CalibrationState.RESTORED
     publish_until(publisher, lambda: node._worker.counters.used, 'an image')
     assert not threading.Event().wait(2 * driver_upload.UPLOAD_POLL_S)

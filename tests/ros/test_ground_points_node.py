@@ -30,8 +30,9 @@ def lens_message() -> CameraInfo:
 
 
 def transform_message(height_m: float = 8.0, camera_frame: str = 'cam') -> TransformStamped:
-    return messages.ground_transform_message(GroundPlane(pose(32.0, 1.0, 35.0).T, height_m),
-                                             messages.time_message(STAMP_NS - 5), 'cam_ground', camera_frame)
+    return messages.ground_transform_message(
+        GroundPlane(pose(32.0, 1.0, 35.0).T, height_m), messages.time_message(STAMP_NS - 5), 'cam_ground', camera_frame
+    )
 
 
 def pixel_message(points=PIXELS, number: int = 0, frame: str = 'cam') -> PolygonStamped:
@@ -143,7 +144,7 @@ def test_a_transform_of_another_camera_gives_no_points(calibrated, capfd):
     calibrated.answer()
     calibrated.transform.publish(transform_message(camera_frame='other'))
     wait_for(lambda: calibrated.node._transform.child_frame_id == 'other', 'the transform of another camera')
-    asked = pixel_message(number=10 ** 6)
+    asked = pixel_message(number=10**6)
     calibrated.node._on_pixels(asked)  # here and now: what was sent before may still be on its way
     assert "one of the two should be the camera's frame 'cam'" in capfd.readouterr().err
     calibrated.transform.publish(transform_message())

@@ -31,7 +31,9 @@ def test_zero_stamp_becomes_the_time_of_receipt_with_one_warning(warnings):
 
 def test_stamp_that_stands_still_becomes_the_time_of_receipt_for_good_with_one_warning(warnings):
     read = headers(warnings)
-    assert [read.stamp_ns(Time(sec=7)) for _ in range(MAX_REPEATED_STAMPS - 1)] == [7_000_000_000] * (MAX_REPEATED_STAMPS - 1)
+    assert [read.stamp_ns(Time(sec=7)) for _ in range(MAX_REPEATED_STAMPS - 1)] == [7_000_000_000] * (
+        MAX_REPEATED_STAMPS - 1
+    )
     assert not warnings
     assert [read.stamp_ns(Time(sec=7)), read.stamp_ns(Time(sec=8))] == [42, 42]
     assert len(warnings) == 1
@@ -60,11 +62,14 @@ def test_leading_slash_is_left_out_with_one_warning(warnings):
     assert len(warnings) == 1
 
 
-@pytest.mark.parametrize(('namespace', 'options', 'ground'), [
-    ('/', {}, 'cam_1_optical_ground'),
-    ('/site/cam1', {}, 'site_cam1_ground'),
-    ('/cam1', {'camera_name': 'north pole'}, 'north_pole_ground'),
-    ('/cam1', {'ground_frame': 'road'}, 'road'),
-])
+@pytest.mark.parametrize(
+    ('namespace', 'options', 'ground'),
+    [
+        ('/', {}, 'cam_1_optical_ground'),
+        ('/site/cam1', {}, 'site_cam1_ground'),
+        ('/cam1', {'camera_name': 'north pole'}, 'north_pole_ground'),
+        ('/cam1', {'ground_frame': 'road'}, 'road'),
+    ],
+)
 def test_ground_frame_holds_the_name_of_the_camera(warnings, namespace, options, ground):
     assert headers(warnings, namespace, **options).ground_frame('cam-1/optical') == ground

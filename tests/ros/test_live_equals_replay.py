@@ -35,9 +35,19 @@ pytestmark = pytest.mark.slow
 def bag(tmp_path_factory) -> Path:
     """Return a small simulated recording of a junction."""
     path = tmp_path_factory.mktemp('live') / 'recording'
-    write_bag(path, SimulationOptions(
-        width_px=640, height_px=360, focal_px=280.0, principal_point_offset_px=(3.0, -2.0), camera_height_m=HEIGHT_M,
-        duration_s=30.0, rate_hz=10.0, topic=TOPIC))
+    write_bag(
+        path,
+        SimulationOptions(
+            width_px=640,
+            height_px=360,
+            focal_px=280.0,
+            principal_point_offset_px=(3.0, -2.0),
+            camera_height_m=HEIGHT_M,
+            duration_s=30.0,
+            rate_hz=10.0,
+            topic=TOPIC,
+        ),
+    )
     return path
 
 
@@ -45,8 +55,22 @@ def bag(tmp_path_factory) -> Path:
 def replayed(bag) -> dict:
     """Return the calibration.json of a replay."""
     out = bag.parent / 'replayed'
-    command = [sys.executable, '-m', 'autocalib_ros', 'replay', str(bag), '--topic', TOPIC, '--camera-height',
-               str(HEIGHT_M), '-p', f'first_solve_s={ONLY_AT_THE_END_S}', '--out', str(out), '--quiet']
+    command = [
+        sys.executable,
+        '-m',
+        'autocalib_ros',
+        'replay',
+        str(bag),
+        '--topic',
+        TOPIC,
+        '--camera-height',
+        str(HEIGHT_M),
+        '-p',
+        f'first_solve_s={ONLY_AT_THE_END_S}',
+        '--out',
+        str(out),
+        '--quiet',
+    ]
     done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S, check=False)
     assert done.returncode == 0, done.stderr
     return json.loads((out / 'calibration.json').read_text(encoding='utf-8'))
@@ -56,15 +80,27 @@ def stamps_of(bag: Path) -> list[int]:
     store = get_typestore(Stores.ROS2_JAZZY)
     with AnyReader([bag], default_typestore=store) as reader:
         images = [connection for connection in reader.connections if connection.topic == TOPIC]
-        return [stamp_ns(reader.deserialize(raw, connection.msgtype).header.stamp)
-                for connection, _, raw in reader.messages(images)]
+        return [
+            stamp_ns(reader.deserialize(raw, connection.msgtype).header.stamp)
+            for connection, _, raw in reader.messages(images)
+        ]
 
 
 @contextmanager
 def live_node(log: Path):
     """Run the node as a process of its own that writes its log to a file; interrupted at the end."""
-    command = [sys.executable, '-m', 'autocalib_ros.ros.node', '--ros-args', '-p', f'camera_height:={HEIGHT_M}',
-               '-p', f'first_solve_s:={ONLY_AT_THE_END_S}', '-r', f'image:={TOPIC}']
+    command = [
+        sys.executable,
+        '-m',
+        'autocalib_ros.ros.node',
+        '--ros-args',
+        '-p',
+        f'camera_height:={HEIGHT_M}',
+        '-p',
+        f'first_solve_s:={ONLY_AT_THE_END_S}',
+        '-r',
+        f'image:={TOPIC}',
+    ]
     with log.open('w') as stream, subprocess.Popen(command, stderr=stream) as process:
         try:
             yield process
@@ -87,8 +123,11 @@ def received_live(bench: Bench, bag: Path, last_ns: int, interval_s: float) -> t
     with live_node(log):
         solutions = bench.collect(TransformStamped, '/autocalib/ground_transform', latched=True)
         play(bag, interval_s)
-        wait_for(lambda: solutions and stamp_ns(solutions[-1].header.stamp) == last_ns,
-                 f'the solution of all images; the log so far:\n{log.read_text()}', LIMIT_S)
+        wait_for(
+            lambda: solutions and stamp_ns(solutions[-1].header.stamp) == last_ns,
+            f'the solution of all images; the log so far:\n{log.read_text()}',
+            LIMIT_S,
+        )
         infos = bench.collect(CameraInfo, '/autocalib/camera_info', latched=True)
         transforms = bench.collect(TransformStamped, '/autocalib/ground_transform', latched=True)
         wait_for(lambda: infos and transforms, 'both latched messages')

@@ -32,8 +32,13 @@ class Stream:
     def __init__(self, bench, solve=None, **parameters):
         self.bench, self._sent = bench, 0
         solve = solve or (lambda evidence, options, lens: calibration(evidence))
-        self.node = bench.start(solve, camera_height=8.0, idle_solve_s=1000.0, camera_name='north',
-                                **{'debug_rate_hz': 1000.0, **parameters})
+        self.node = bench.start(
+            solve,
+            camera_height=8.0,
+            idle_solve_s=1000.0,
+            camera_name='north',
+            **{'debug_rate_hz': 1000.0, **parameters},
+        )
         self.publisher = bench.connected(bench.publisher())
 
     def send_until(self, condition, what: str):
@@ -58,8 +63,9 @@ class Stream:
     def look(self, topic: str, reliability=ReliabilityPolicy.RELIABLE) -> list:
         """Subscribe a picture and return the list that fills."""
         received: list = []
-        self.bench.client.create_subscription(Image, f'/autocalib/{topic}', received.append,
-                                              QoSProfile(depth=10, reliability=reliability))
+        self.bench.client.create_subscription(
+            Image, f'/autocalib/{topic}', received.append, QoSProfile(depth=10, reliability=reliability)
+        )
         publisher = getattr(self.node._pictures, f'_{topic}')
         wait_for(lambda: publisher.get_subscription_count() > 0, f'the subscription of {topic}')
         return received
@@ -114,8 +120,9 @@ def test_only_what_is_looked_at_is_drawn(bench, drawn, topic):
 def test_drawing_ends_with_the_last_subscriber(bench, drawn):
     stream = Stream(bench).calibrated()
     stream.seen('debug_image')
-    bench.client.destroy_subscription(next(iter(
-        found for found in bench.client.subscriptions if found.topic_name.endswith('debug_image'))))
+    bench.client.destroy_subscription(
+        next(iter(found for found in bench.client.subscriptions if found.topic_name.endswith('debug_image')))
+    )
     wait_for(lambda: not stream.node._pictures._debug_image.get_subscription_count(), 'the end of the subscription')
     stream.used(1)
     wait_for(lambda: stream.node._pictures._pending is None, 'what was still to be drawn')
@@ -125,10 +132,14 @@ def test_drawing_ends_with_the_last_subscriber(bench, drawn):
     assert drawn == []
 
 
-@pytest.mark.parametrize(('topic', 'frame', 'encoding', 'reliability'), [
-    ('debug_image', 'cam_optical', 'bgr8', ReliabilityPolicy.RELIABLE),
-    ('image_rect', 'cam_optical', 'mono8', ReliabilityPolicy.BEST_EFFORT),
-    ('top_view', 'north_ground', 'bgr8', ReliabilityPolicy.RELIABLE)])
+@pytest.mark.parametrize(
+    ('topic', 'frame', 'encoding', 'reliability'),
+    [
+        ('debug_image', 'cam_optical', 'bgr8', ReliabilityPolicy.RELIABLE),
+        ('image_rect', 'cam_optical', 'mono8', ReliabilityPolicy.BEST_EFFORT),
+        ('top_view', 'north_ground', 'bgr8', ReliabilityPolicy.RELIABLE),
+    ],
+)
 def test_pictures_bear_the_header_of_their_image(bench, topic, frame, encoding, reliability):
     stream = Stream(bench).calibrated()
     message = validated(stream.seen(topic, reliability=reliability))
@@ -145,8 +156,12 @@ def test_image_rect_goes_with_camera_info(bench):
     infos = bench.collect(CameraInfo, '/autocalib/camera_info')
     bench.listening('/autocalib/camera_info')
     pictures = stream.look('image_rect')
-    stream.send_until(lambda: {stamp_ns(info.header.stamp) for info in infos}
-                      & {stamp_ns(picture.header.stamp) for picture in pictures}, 'a pair')
+    stream.send_until(
+        lambda: (
+            {stamp_ns(info.header.stamp) for info in infos} & {stamp_ns(picture.header.stamp) for picture in pictures}
+        ),
+        'a pair',
+    )
     published = stream.node.publication.published
     assert list(infos[-1].p) == published.fields.p
     expected = live.RectifiedPicture(published.result).draw(pixels(image(0))[..., 0])
@@ -220,8 +235,8 @@ def test_an_ignored_region_is_black_in_pictures_of_the_image(bench):
     half = SIZE[0] // 2
     stream = Stream(bench, ignore_regions=f'-1 -1 {half} -1 {half} {SIZE[1]} -1 {SIZE[1]}').calibrated()
     rectified = pixels(stream.seen('image_rect'))
-    assert not rectified[:, :half // 2].any()
-    assert rectified[:, -half // 2:].any()
+    assert not rectified[:, : half // 2].any()
+    assert rectified[:, -half // 2 :].any()
 
 
 def test_what_became_of_the_tracks_is_shown_until_the_next_solution_or_a_reset(bench):
@@ -245,13 +260,16 @@ def test_a_picture_as_a_message_is_the_picture():
     np.testing.assert_array_equal(pixels(message), picture[:, ::-1])
 
 
-PROGRESS = CalibrationProgress(42.0, ('17 of 40 tracks', 'traffic covers 9 % of the image'), 'about 6 min more at this rate')
+PROGRESS = CalibrationProgress(
+    42.0, ('17 of 40 tracks', 'traffic covers 9 % of the image'), 'about 6 min more at this rate'
+)
 
 
 def result(**more):
     """A calibration that looks 30 degrees down."""
-    summary = EvidenceSummary(image_size=SIZE, seconds=60.0, frames=900, tracks=100, segments=0, vehicles=20,
-                              coverage=0.5)
+    summary = EvidenceSummary(
+        image_size=SIZE, seconds=60.0, frames=900, tracks=100, segments=0, vehicles=20, coverage=0.5
+    )
     made = calibration(SimpleNamespace(image_size=SIZE, newest_stamp_ns=1, summary=lambda: summary), **more)
     return made if made.ground is None else replace(made, ground=GroundPlane(pose(30.0, 0.0, 0.0).T, 8.0))
 

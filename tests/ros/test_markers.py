@@ -23,9 +23,13 @@ def result():
     """A calibration that looks down at the road, its height good to 0.9 %."""
     made = calibration(synthetic_evidence(Junction(), np.random.default_rng(0)))
     covariance = np.zeros((len(COVARIANCE_PARAMETERS),) * 2)
-    covariance[-1, -1] = 0.072 ** 2
-    return replace(made, camera=Camera(1280, 720, 560.0, (630.0, 371.0)),
-                   ground=GroundPlane(pose(32.0, 1.0, 0.0).T, 8.0), covariance=covariance)
+    covariance[-1, -1] = 0.072**2
+    return replace(
+        made,
+        camera=Camera(1280, 720, 560.0, (630.0, 371.0)),
+        ground=GroundPlane(pose(32.0, 1.0, 0.0).T, 8.0),
+        covariance=covariance,
+    )
 
 
 def by_namespace(array: MarkerArray) -> dict[str, list[Marker]]:
@@ -47,16 +51,24 @@ def test_all_is_valid_and_in_the_ground_frame(result):
 
 
 def test_names_and_numbers_are_unique_and_stay(result):
-    names = [[(marker.ns, marker.id) for marker in markers(calibrated, 'cam_ground').markers]
-             for calibrated in (result, replace(result, camera=replace(result.camera, focal_px=500.0)))]
+    names = [
+        [(marker.ns, marker.id) for marker in markers(calibrated, 'cam_ground').markers]
+        for calibrated in (result, replace(result, camera=replace(result.camera, focal_px=500.0)))
+    ]
     assert len(set(names[0])) == len(names[0])
     assert names[0] == names[1]
-    assert set(by_namespace(markers(result, 'g'))) == {'', 'grid', 'field_of_view', 'uncertainty', 'uncertainty_text',
-                                                       'state'}
+    assert set(by_namespace(markers(result, 'g'))) == {
+        '',
+        'grid',
+        'field_of_view',
+        'uncertainty',
+        'uncertainty_text',
+        'state',
+    }
 
 
 def test_rays_of_the_camera_start_at_its_place(result):
-    field, = by_namespace(markers(result, 'g'))['field_of_view']
+    (field,) = by_namespace(markers(result, 'g'))['field_of_view']
     for ray in range(4):
         begin = field.points[2 * ray]
         assert (begin.x, begin.y, begin.z) == (0.0, 0.0, 8.0)
@@ -65,8 +77,11 @@ def test_rays_of_the_camera_start_at_its_place(result):
 def test_ellipses_and_words_tell_the_uncertainty_in_metres(result):
     found = by_namespace(markers(result, 'g'))
     assert [marker.text for marker in found['uncertainty_text']] == [
-        '10 m: sigma 0.09 m', '20 m: sigma 0.18 m', '40 m: sigma 0.36 m']  # 0.072 m of 8 m
-    state, = found['state']
+        '10 m: sigma 0.09 m',
+        '20 m: sigma 0.18 m',
+        '40 m: sigma 0.36 m',
+    ]  # 0.072 m of 8 m
+    (state,) = found['state']
     assert 'grade full' in state.text and 'focal length 560.00 px (sigma 1)' in state.text
     assert 'squares of 5 m' in state.text and 'enlarged 10 times' in state.text
     ellipse = np.array([[point.x, point.y] for point in found['uncertainty'][1].points])
@@ -81,7 +96,7 @@ def test_without_a_covariance_there_are_no_ellipses(result):
 
 def test_in_units_of_the_height_no_metres_are_told(result):
     unit = replace(result, ground=GroundPlane(result.ground.rotation, 1.0, metric=False), covariance=None)
-    state, = by_namespace(validated(markers(unit, 'g')))['state']
+    (state,) = by_namespace(validated(markers(unit, 'g')))['state']
     assert 'squares of 0.5 camera heights' in state.text
 
 
@@ -98,8 +113,12 @@ def test_numbers_that_are_none_are_found(result):
 
 
 def start(bench, **more):
-    node = bench.start(lambda evidence, options, lens: calibration(evidence, **more), camera_height=8.0,
-                       idle_solve_s=1000.0, camera_name='north')
+    node = bench.start(
+        lambda evidence, options, lens: calibration(evidence, **more),
+        camera_height=8.0,
+        idle_solve_s=1000.0,
+        camera_name='north',
+    )
     publisher, number = bench.connected(bench.publisher()), 0
 
     def step():

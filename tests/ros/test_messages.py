@@ -43,8 +43,14 @@ def unchecked(message, field: str, value):
     return message
 
 
-@given(st.integers(16, 4096), st.integers(16, 4096), st.floats(50, 5000), st.floats(-0.02, 0.02), st.floats(0, 1),
-       st.sampled_from(['auto', 'equidistant', 'rational_polynomial', 'plumb_bob']))
+@given(
+    st.integers(16, 4096),
+    st.integers(16, 4096),
+    st.floats(50, 5000),
+    st.floats(-0.02, 0.02),
+    st.floats(0, 1),
+    st.sampled_from(['auto', 'equidistant', 'rational_polynomial', 'plumb_bob']),
+)
 @settings(deadline=None)
 def test_camera_info_of_any_lens_is_valid_and_survives_the_wire(width, height, focal_px, k1, balance, model):
     camera = Camera(width, height, focal_px, ((width - 1) / 2, (height - 1) / 2), (k1, 0.0, 0.0, 0.0))
@@ -61,8 +67,15 @@ def test_camera_info_of_any_lens_is_valid_and_survives_the_wire(width, height, f
 
 def test_camera_info_converts_numpy_numbers():
     fields = camera_info(Camera.equidistant(640, 360, 300.0))
-    numpy_fields = type(fields)(np.int64(640), np.int64(360), fields.distortion_model, np.array(fields.k, np.float32),
-                                np.array(fields.d), np.array(fields.r, int), np.array(fields.p))
+    numpy_fields = type(fields)(
+        np.int64(640),
+        np.int64(360),
+        fields.distortion_model,
+        np.array(fields.k, np.float32),
+        np.array(fields.d),
+        np.array(fields.r, int),
+        np.array(fields.p),
+    )
     assert list(validated(camera_info_message(numpy_fields, STAMP, 'cam')).r) == fields.r
 
 
@@ -123,22 +136,25 @@ def test_stamp_keeps_every_nanosecond():
     assert stamp_ns(time_message(1_700_000_000_123_456_789)) == 1_700_000_000_123_456_789
 
 
-@pytest.mark.parametrize(('field', 'value', 'told'), [
-    ('k', [1.0] * 8, 'CameraInfo.k holds 8 numbers, not 9'),
-    ('k', np.eye(3), 'CameraInfo.k has more than one dimension'),
-    ('k', np.array([300.0, 0, 160, 0, np.nan, 120, 0, 0, 1]), 'CameraInfo.k is nan'),
-    ('k', [1] * 9, 'CameraInfo.k is a int, not a float'),
-    ('k', [0.0] * 9, 'CameraInfo.k has no positive focal length'),
-    ('p', [0.0] * 12, 'CameraInfo.p has no positive focal length'),
-    ('d', [0.1] * 5, 'CameraInfo.d holds 5 numbers, not 4'),
-    ('d', [0.0] * 4, 'CameraInfo.d is all zero'),
-    ('d', [float('inf'), 0.0, 0.0, 0.0], 'CameraInfo.d is inf'),
-    ('width', np.int64(640), 'CameraInfo.width is a int64, not an int'),
-    ('width', 640.0, 'CameraInfo.width is a float, not an int'),
-    ('width', 0, 'CameraInfo has the size 0x360'),
-    ('height', -1, 'CameraInfo.height is -1, which is not a uint32'),
-    ('distortion_model', 'fisheye', "CameraInfo.distortion_model is 'fisheye'"),
-])
+@pytest.mark.parametrize(
+    ('field', 'value', 'told'),
+    [
+        ('k', [1.0] * 8, 'CameraInfo.k holds 8 numbers, not 9'),
+        ('k', np.eye(3), 'CameraInfo.k has more than one dimension'),
+        ('k', np.array([300.0, 0, 160, 0, np.nan, 120, 0, 0, 1]), 'CameraInfo.k is nan'),
+        ('k', [1] * 9, 'CameraInfo.k is a int, not a float'),
+        ('k', [0.0] * 9, 'CameraInfo.k has no positive focal length'),
+        ('p', [0.0] * 12, 'CameraInfo.p has no positive focal length'),
+        ('d', [0.1] * 5, 'CameraInfo.d holds 5 numbers, not 4'),
+        ('d', [0.0] * 4, 'CameraInfo.d is all zero'),
+        ('d', [float('inf'), 0.0, 0.0, 0.0], 'CameraInfo.d is inf'),
+        ('width', np.int64(640), 'CameraInfo.width is a int64, not an int'),
+        ('width', 640.0, 'CameraInfo.width is a float, not an int'),
+        ('width', 0, 'CameraInfo has the size 0x360'),
+        ('height', -1, 'CameraInfo.height is -1, which is not a uint32'),
+        ('distortion_model', 'fisheye', "CameraInfo.distortion_model is 'fisheye'"),
+    ],
+)
 def test_broken_camera_info_is_refused_by_name(field, value, told):
     with pytest.raises(InvalidMessage, match=told.replace('.', r'\.')):
         validated(unchecked(info_message(), field, value))
@@ -159,11 +175,14 @@ def test_camera_info_with_a_frame_that_tf2_rejects_is_refused(frame):
         validated(message)
 
 
-@pytest.mark.parametrize(('field', 'value', 'told'), [
-    ('x', 1, 'rotation.x is a int, not a float'),
-    ('x', np.float32(1), 'rotation.x is a float32, not a float'),
-    ('w', 2.0, 'rotation has the length'),
-])
+@pytest.mark.parametrize(
+    ('field', 'value', 'told'),
+    [
+        ('x', 1, 'rotation.x is a int, not a float'),
+        ('x', np.float32(1), 'rotation.x is a float32, not a float'),
+        ('w', 2.0, 'rotation has the length'),
+    ],
+)
 def test_broken_rotation_is_refused(field, value, told):
     message = transform_message(GroundPlane(ROTATION, 8.0))
     unchecked(message.transform.rotation, field, value)

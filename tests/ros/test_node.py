@@ -72,7 +72,7 @@ def test_publisher_that_comes_late_is_found_and_matched(bench, reliability):
     wait_for(lambda: bench.client.count_publishers(INFO) > 0, 'the node')
     publisher = bench.connected(bench.publisher(reliability=reliability))
     publish_until(publisher, lambda: used(node), 'an image')
-    subscriber, = bench.client.get_subscriptions_info_by_topic('image')
+    (subscriber,) = bench.client.get_subscriptions_info_by_topic('image')
     assert subscriber.qos_profile.reliability == reliability
 
 
@@ -90,10 +90,10 @@ def test_each_image_gets_camera_info_with_exactly_its_header(bench):
     infos = bench.collect(CameraInfo, INFO)
     _, publisher = calibrated(bench)
     bench.listening(INFO)
-    sent = image(START_NS + 10 ** 12)
+    sent = image(START_NS + 10**12)
     publisher.publish(sent)
     wait_for(lambda: infos and infos[-1].header == sent.header, 'camera_info with the header of the image')
-    assert (sent.header.frame_id, stamp_ns(sent.header.stamp)) == ('cam_optical', START_NS + 10 ** 12)
+    assert (sent.header.frame_id, stamp_ns(sent.header.stamp)) == ('cam_optical', START_NS + 10**12)
 
 
 def test_camera_info_holds_the_lens(bench):
@@ -107,8 +107,9 @@ def test_camera_info_holds_the_lens(bench):
 
 def test_late_joiner_gets_both_latched_messages(bench):
     calibrated(bench, camera_name='north')
-    infos, transforms = (bench.collect(kind, topic, latched=True)
-                         for kind, topic in ((CameraInfo, INFO), (TransformStamped, GROUND)))
+    infos, transforms = (
+        bench.collect(kind, topic, latched=True) for kind, topic in ((CameraInfo, INFO), (TransformStamped, GROUND))
+    )
     wait_for(lambda: infos and transforms, 'both messages')
     assert (transforms[0].header.frame_id, transforms[0].child_frame_id) == ('north_ground', 'cam_optical')
     assert transforms[0].transform.translation.z == 8.0
@@ -136,7 +137,7 @@ def test_images_services_and_parameters_do_not_wait_for_a_solution(bench):
         release.wait(PATIENCE_S)
         return calibration(evidence, 400.0)
 
-    node_frames = {'first': 10 ** 9}
+    node_frames = {'first': 10**9}
     infos = bench.collect(CameraInfo, INFO)
     node, publisher = calibrated(bench, slow)
     bench.listening(INFO)
@@ -164,8 +165,9 @@ def test_a_lens_without_plane_does_not_replace_one_with_its_plane(bench):
         return calibration(evidence, **(found.pop(0) if len(found) > 1 else found[0]))
 
     node, _ = calibrated(bench, solve)
-    infos, transforms = (bench.collect(kind, topic, latched=True)
-                         for kind, topic in ((CameraInfo, INFO), (TransformStamped, GROUND)))
+    infos, transforms = (
+        bench.collect(kind, topic, latched=True) for kind, topic in ((CameraInfo, INFO), (TransformStamped, GROUND))
+    )
     wait_for(lambda: infos and transforms, 'lens and plane')
     assert 'focal length 310' in bench.calibrate().message  # what was found is told, and not published
     assert bench.calibrate().success
@@ -227,16 +229,24 @@ def test_driver_without_stamp_and_frame_is_served(bench):
     infos = bench.collect(CameraInfo, INFO)
     node, publisher = calibrated(bench, make=lambda stamp: image(0, frame_id=''))
     bench.listening(INFO)
-    publish_until(publisher, lambda: infos and not stamp_ns(infos[-1].header.stamp), 'camera_info of an image',
-                  lambda stamp: image(0, frame_id=''))
+    publish_until(
+        publisher,
+        lambda: infos and not stamp_ns(infos[-1].header.stamp),
+        'camera_info of an image',
+        lambda stamp: image(0, frame_id=''),
+    )
     assert infos[-1].header.frame_id == 'camera_optical_frame'
     assert node.publication.published.result.evidence.frames >= 1
 
 
 def test_image_that_cannot_be_decoded_does_not_stop_the_stream(bench):
     node, publisher = calibrated(bench)
-    publish_until(publisher, lambda: node._worker.counters.unreadable > 0, 'an unreadable image',
-                  lambda stamp: image(stamp, encoding='no_such_encoding'))
+    publish_until(
+        publisher,
+        lambda: node._worker.counters.unreadable > 0,
+        'an unreadable image',
+        lambda stamp: image(stamp, encoding='no_such_encoding'),
+    )
     before = node._worker.counters.used
     publish_until(publisher, lambda: node._worker.counters.used > before, 'a readable image')
 
@@ -257,8 +267,12 @@ def test_calibration_of_another_image_size_is_withdrawn(bench):
     node, publisher = calibrated(bench)
     infos = bench.collect(CameraInfo, INFO)
     bench.listening(INFO)
-    publish_until(publisher, lambda: node.publication.published is None, 'the withdrawal',
-                  lambda stamp: image(stamp, size=(160, 120)))
+    publish_until(
+        publisher,
+        lambda: node.publication.published is None,
+        'the withdrawal',
+        lambda stamp: image(stamp, size=(160, 120)),
+    )
     assert not infos
 
 
@@ -270,8 +284,11 @@ def test_solution_is_tried_when_the_images_end(bench):
 
 def test_known_lens_is_read_and_given_to_the_solver_in_the_size_of_the_images(bench, tmp_path):
     write_camera_info_yaml(tmp_path / 'lens.yaml', Camera.equidistant(2 * SIZE[0], 2 * SIZE[1], 512.0), 'cam')
-    node, _ = calibrated(bench, lambda evidence, options, lens: replace(calibration(evidence), camera=lens),
-                         camera_info_file=str(tmp_path / 'lens.yaml'))
+    node, _ = calibrated(
+        bench,
+        lambda evidence, options, lens: replace(calibration(evidence), camera=lens),
+        camera_info_file=str(tmp_path / 'lens.yaml'),
+    )
     assert node.publication.published.result.camera == Camera.equidistant(*SIZE, 256.0)
 
 
@@ -314,10 +331,16 @@ def test_lens_that_the_asked_model_cannot_say_is_refused_and_nothing_is_publishe
 
 
 def test_reliability_of_a_publisher_is_overridden_by_a_parameter(bench):
-    node = AutocalibNode(context=bench.context, parameter_overrides=[
-        Parameter('qos_overrides./autocalib/camera_info.publisher.reliability', value='best_effort')])
+    node = AutocalibNode(
+        context=bench.context,
+        parameter_overrides=[
+            Parameter('qos_overrides./autocalib/camera_info.publisher.reliability', value='best_effort')
+        ],
+    )
     bench.adopt(node)
-    offered = [wait_for(lambda topic=topic: bench.client.get_publishers_info_by_topic(topic), topic)[0].qos_profile
-               for topic in (INFO, GROUND)]
+    offered = [
+        wait_for(lambda topic=topic: bench.client.get_publishers_info_by_topic(topic), topic)[0].qos_profile
+        for topic in (INFO, GROUND)
+    ]
     assert [profile.reliability for profile in offered] == [ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE]
     assert all(profile.durability is DurabilityPolicy.TRANSIENT_LOCAL for profile in offered)

@@ -113,9 +113,11 @@ def test_binning_and_region_of_the_driver_are_published_where_they_are_of_these_
     node, publisher = fed(bench, camera_height=8.0, use_driver_camera_info=True)
     bench.connected(driver)
     region = RegionOfInterest(x_offset=100, y_offset=50, width=2 * SIZE[0], height=2 * SIZE[1])
-    readouts = (CameraInfo(width=1920, height=1080, binning_x=2, binning_y=2, roi=region),
-                CameraInfo(width=700, height=480, roi=RegionOfInterest(x_offset=500, width=SIZE[0], height=SIZE[1])),
-                CameraInfo(width=7, height=7))
+    readouts = (
+        CameraInfo(width=1920, height=1080, binning_x=2, binning_y=2, roi=region),
+        CameraInfo(width=700, height=480, roi=RegionOfInterest(x_offset=500, width=SIZE[0], height=SIZE[1])),
+        CameraInfo(width=7, height=7),
+    )
     wait_for(lambda: node.publication.published, 'the calibration')
     for number, told_by_driver in enumerate(readouts, 10):
         driver.publish(told_by_driver)
@@ -132,16 +134,19 @@ def test_binning_and_region_of_the_driver_are_published_where_they_are_of_these_
     np.testing.assert_allclose((np.array(binned.k[:6:2]) - [0, 100, 0]) / 2, infos[-1].k[:6:2])
 
 
-@pytest.mark.parametrize(('info', 'fits'), [
-    (CameraInfo(width=640, height=480), True),
-    (CameraInfo(width=1280, height=960, binning_x=2, binning_y=2), True),
-    (CameraInfo(width=1281, height=961, binning_x=2, binning_y=2), True),
-    (CameraInfo(width=1920, height=1080, roi=RegionOfInterest(x_offset=9, width=640, height=480)), True),
-    (CameraInfo(), True),  # a driver that knows no size
-    (CameraInfo(width=1280, height=960), False),
-    (CameraInfo(width=1000, height=720, roi=RegionOfInterest(x_offset=600, width=640, height=480)), False),
-    (CameraInfo(width=640, height=480, binning_x=2, binning_y=2), False),
-])
+@pytest.mark.parametrize(
+    ('info', 'fits'),
+    [
+        (CameraInfo(width=640, height=480), True),
+        (CameraInfo(width=1280, height=960, binning_x=2, binning_y=2), True),
+        (CameraInfo(width=1281, height=961, binning_x=2, binning_y=2), True),
+        (CameraInfo(width=1920, height=1080, roi=RegionOfInterest(x_offset=9, width=640, height=480)), True),
+        (CameraInfo(), True),  # a driver that knows no size
+        (CameraInfo(width=1280, height=960), False),
+        (CameraInfo(width=1000, height=720, roi=RegionOfInterest(x_offset=600, width=640, height=480)), False),
+        (CameraInfo(width=640, height=480, binning_x=2, binning_y=2), False),
+    ],
+)
 def test_size_of_the_drivers_message_is_compared_with_the_images(info, fits):
     assert (check_size(info, (640, 480)) == '') is fits
 
@@ -156,9 +161,13 @@ def test_camera_height_that_changes_is_solved_with_at_once(bench):
 
 def test_pixel_outside_the_images_is_refused_once_their_size_is_known(bench):
     node, _ = fed(bench)
-    refused = node.set_parameters_atomically([
-        Parameter('scale_from', value='distance'), Parameter('scale.distance_m', value=5.0),
-        Parameter('scale.distance_px', value='10 10 900 10')])
+    refused = node.set_parameters_atomically(
+        [
+            Parameter('scale_from', value='distance'),
+            Parameter('scale.distance_m', value=5.0),
+            Parameter('scale.distance_px', value='10 10 900 10'),
+        ]
+    )
     assert not refused.successful and 'lies outside the images' in refused.reason
 
 
@@ -173,8 +182,9 @@ def test_recording_that_loops_begins_the_evidence_anew_and_keeps_the_calibration
     wait_for(lambda: node.publication.published.result.evidence.frames == 1, 'the evidence of the second time')
 
 
-@pytest.mark.parametrize(('focal_px', 'state', 'in_force_px'),
-                         [(305.0, 'VERIFIED', 300.0), (400.0, 'CALIBRATED', 400.0)])
+@pytest.mark.parametrize(
+    ('focal_px', 'state', 'in_force_px'), [(305.0, 'VERIFIED', 300.0), (400.0, 'CALIBRATED', 400.0)]
+)
 def test_after_a_loop_a_surer_calibration_stays_unless_the_traffic_contradicts_it(bench, focal_px, state, in_force_px):
     def solve(evidence, options, lens):
         if evidence.frames > 3:
@@ -212,10 +222,10 @@ def test_images_without_stamps_take_their_time_from_the_clock_of_the_recording(b
     publisher = bench.connected(bench.publisher())
     counters = node._worker.counters
     for second in (5000, 5001, 20):  # the clock steps back, as where a recording is played in a loop
-        clock.publish(Clock(clock=time_message(second * 10 ** 9)))
-        wait_for(lambda now=second: node.get_clock().now().nanoseconds == now * 10 ** 9, 'the clock')
+        clock.publish(Clock(clock=time_message(second * 10**9)))
+        wait_for(lambda now=second: node.get_clock().now().nanoseconds == now * 10**9, 'the clock')
         before = counters.used
         publisher.publish(image(0))
         wait_for(lambda before=before: counters.used == before + 1, 'an image')
-    wait_for(lambda: (now := node.publication.published) and now.result.newest_stamp_ns == 20 * 10 ** 9, 'the solution')
+    wait_for(lambda: (now := node.publication.published) and now.result.newest_stamp_ns == 20 * 10**9, 'the solution')
     assert node.publication.published.result.evidence.frames == 1

@@ -20,8 +20,12 @@ from bench import PATIENCE_S, Bench, wait_for
 
 OPTIONS = [*walk_options(Options()), *walk_options(NodeOptions())]
 NODE = [sys.executable, '-m', 'autocalib_ros.ros.node', '--ros-args']
-PARAMETER_TYPE = {bool: ParameterType.PARAMETER_BOOL, int: ParameterType.PARAMETER_INTEGER,
-                  float: ParameterType.PARAMETER_DOUBLE, str: ParameterType.PARAMETER_STRING}
+PARAMETER_TYPE = {
+    bool: ParameterType.PARAMETER_BOOL,
+    int: ParameterType.PARAMETER_INTEGER,
+    float: ParameterType.PARAMETER_DOUBLE,
+    str: ParameterType.PARAMETER_STRING,
+}
 
 
 def run_node(*arguments: str) -> subprocess.CompletedProcess:
@@ -33,8 +37,10 @@ def test_every_option_is_a_described_parameter(bench: Bench):
     for item in OPTIONS:
         descriptor = node.describe_parameter(item.name)
         assert node.get_parameter(item.name).value == item.default
-        assert (descriptor.type, descriptor.read_only) == (PARAMETER_TYPE[type(item.default)],
-                                                           not is_reconfigurable(item.name))
+        assert (descriptor.type, descriptor.read_only) == (
+            PARAMETER_TYPE[type(item.default)],
+            not is_reconfigurable(item.name),
+        )
         assert descriptor.description == item.doc
 
 
@@ -58,25 +64,40 @@ def test_a_distance_is_a_parameter_of_text(bench: Bench):
     assert node.get_parameter('scale.distance_px').value == '412 530 888 530'
 
 
-@pytest.mark.parametrize(('name', 'expected'), [
-    ('camera_height', True), ('gate.min_tracks', True), ('scale.speed_km_h', True), ('joint.noise_px', True),
-    ('camera_info_mode', True), ('tracking.max_points', False), ('buffer.seconds', False), ('max_image_width', False),
-    ('image_transport', False), ('camera_frame', False), ('camera_info_file', False), ('gate_of_another', False),
-])
+@pytest.mark.parametrize(
+    ('name', 'expected'),
+    [
+        ('camera_height', True),
+        ('gate.min_tracks', True),
+        ('scale.speed_km_h', True),
+        ('joint.noise_px', True),
+        ('camera_info_mode', True),
+        ('tracking.max_points', False),
+        ('buffer.seconds', False),
+        ('max_image_width', False),
+        ('image_transport', False),
+        ('camera_frame', False),
+        ('camera_info_file', False),
+        ('gate_of_another', False),
+    ],
+)
 def test_what_is_read_at_each_solution_may_change_and_what_shapes_the_evidence_may_not(name, expected):
     assert is_reconfigurable(name) is expected
 
 
-@pytest.mark.parametrize(('given', 'told'), [
-    ({'camera_height': 9}, 'write camera_height:=9.0, not 9'),
-    ({'camera_height': -1.0}, "'camera_height' lies between 0 and 500"),
-    ({'camera_height': None}, "'camera_height' takes a float"),
-    ({'gate.min_tracks': 3.5}, "'min_tracks' takes a int"),
-    ({'camera_info_mode': 'never'}, 'one of per_image, latched_only'),
-    ({'scale_from': 'speed'}, "needs 'scale.speed_km_h'"),
-    ({'tracking.max_points': 100}, "'tracking.max_points' cannot change while the node runs"),
-    ({'image_transport': 'compressed'}, 'start the node with -p image_transport:=compressed'),
-])
+@pytest.mark.parametrize(
+    ('given', 'told'),
+    [
+        ({'camera_height': 9}, 'write camera_height:=9.0, not 9'),
+        ({'camera_height': -1.0}, "'camera_height' lies between 0 and 500"),
+        ({'camera_height': None}, "'camera_height' takes a float"),
+        ({'gate.min_tracks': 3.5}, "'min_tracks' takes a int"),
+        ({'camera_info_mode': 'never'}, 'one of per_image, latched_only'),
+        ({'scale_from': 'speed'}, "needs 'scale.speed_km_h'"),
+        ({'tracking.max_points': 100}, "'tracking.max_points' cannot change while the node runs"),
+        ({'image_transport': 'compressed'}, 'start the node with -p image_transport:=compressed'),
+    ],
+)
 def test_change_that_cannot_be_is_refused_with_the_reason(given, told):
     with pytest.raises(UsageError, match=told):
         changed_options(Options(), NodeOptions(), given)
@@ -84,9 +105,16 @@ def test_change_that_cannot_be_is_refused_with_the_reason(given, told):
 
 def test_change_gives_new_options_and_leaves_other_parameters_to_ros():
     options, node_options = changed_options(
-        Options(camera_height=7.5), NodeOptions(),
-        {'camera_height': 9.0, 'gate.min_tracks': 60, 'camera_info_mode': 'latched_only', 'use_sim_time': True,
-         'tracking.max_points': Options().tracking.max_points})
+        Options(camera_height=7.5),
+        NodeOptions(),
+        {
+            'camera_height': 9.0,
+            'gate.min_tracks': 60,
+            'camera_info_mode': 'latched_only',
+            'use_sim_time': True,
+            'tracking.max_points': Options().tracking.max_points,
+        },
+    )
     assert (options.camera_height, options.gate.min_tracks, node_options.camera_info_mode) == (9.0, 60, 'latched_only')
 
 
@@ -100,23 +128,29 @@ def set_remotely(bench: Bench, *parameters: Parameter, atomically: bool = False)
     return [answer.result().result] if atomically else list(answer.result().results)
 
 
-@pytest.mark.parametrize(('name', 'value', 'told'), [
-    ('camera_height', 9, 'write camera_height:=9.0, not 9'),
-    ('camera_height', 900.0, 'lies between 0 and 500'),
-    ('buffer.seconds', 60.0, 'cannot change while the node runs'),
-    ('camera_hight', 9.0, "unknown parameter 'camera_hight': did you mean 'camera_height'?"),
-])
+@pytest.mark.parametrize(
+    ('name', 'value', 'told'),
+    [
+        ('camera_height', 9, 'write camera_height:=9.0, not 9'),
+        ('camera_height', 900.0, 'lies between 0 and 500'),
+        ('buffer.seconds', 60.0, 'cannot change while the node runs'),
+        ('camera_hight', 9.0, "unknown parameter 'camera_hight': did you mean 'camera_height'?"),
+    ],
+)
 def test_ros_param_set_is_refused_in_words_that_help(bench: Bench, name, value, told):
     bench.start(camera_height=7.5)
-    result, = set_remotely(bench, Parameter(name, value=value))
+    (result,) = set_remotely(bench, Parameter(name, value=value))
     assert not result.successful
     assert told in result.reason
 
 
 def test_source_of_the_scale_changes_at_once_or_not_at_all(bench: Bench):
     node = bench.start(camera_height=7.5)
-    changes = [Parameter('scale_from', value='speed'), Parameter('scale.speed_km_h', value=50.0),
-               Parameter('camera_height', value=0.0)]
+    changes = [
+        Parameter('scale_from', value='speed'),
+        Parameter('scale.speed_km_h', value=50.0),
+        Parameter('camera_height', value=0.0),
+    ]
     assert not set_remotely(bench, *changes[:2], atomically=True)[0].successful
     assert (node.options.scale_from, node.get_parameter('scale_from').value) == ('height', 'height')
     assert set_remotely(bench, *changes, atomically=True)[0].successful
@@ -151,31 +185,37 @@ def test_node_reads_an_example_file(request, name):
     assert ended_by(signal.SIGINT, '--params-file', str(file)) == 0
 
 
-@pytest.mark.parametrize(('given', 'told'), [
-    ({'camera_height': 8}, 'camera_height:=8.0, not 8'),
-    ({'camera_hight': 8.0}, "unknown parameter 'camera_hight': did you mean 'camera_height'"),
-    ({'image_transprt': 'raw'}, "did you mean 'image_transport'"),
-    ({'zzz': 1}, r'config/autocalib\.yaml lists all of them'),
-    ({'camera_height': -1.0}, "'camera_height' lies between 0 and 500"),
-    ({'tracking.max_points': 3.5}, "'max_points' takes a int"),
-    ({'method': 'magic'}, 'one of joint, paper'),
-    ({'scale_from': 'distance'}, "needs 'scale.distance_px'"),
-    ({'scale.speed_km_h': 50.0}, "'scale.speed_km_h' is given too"),
-    ({'scale.distance_px': [412.0, 530.0, 888.0, 530.0]}, 'four numbers in one text'),
-    ({'scale.distance_m': 12}, 'scale.distance_m:=12.0, not 12'),
-])
+@pytest.mark.parametrize(
+    ('given', 'told'),
+    [
+        ({'camera_height': 8}, 'camera_height:=8.0, not 8'),
+        ({'camera_hight': 8.0}, "unknown parameter 'camera_hight': did you mean 'camera_height'"),
+        ({'image_transprt': 'raw'}, "did you mean 'image_transport'"),
+        ({'zzz': 1}, r'config/autocalib\.yaml lists all of them'),
+        ({'camera_height': -1.0}, "'camera_height' lies between 0 and 500"),
+        ({'tracking.max_points': 3.5}, "'max_points' takes a int"),
+        ({'method': 'magic'}, 'one of joint, paper'),
+        ({'scale_from': 'distance'}, "needs 'scale.distance_px'"),
+        ({'scale.speed_km_h': 50.0}, "'scale.speed_km_h' is given too"),
+        ({'scale.distance_px': [412.0, 530.0, 888.0, 530.0]}, 'four numbers in one text'),
+        ({'scale.distance_m': 12}, 'scale.distance_m:=12.0, not 12'),
+    ],
+)
 def test_unusable_parameter_is_refused_with_what_would_be_accepted(given, told):
     with pytest.raises(UsageError, match=told):
         read(given)
 
 
-@pytest.mark.parametrize(('argument', 'told'), [
-    ('camera_height:=8', 'write camera_height:=8.0, not 8'),
-    ('camera_height:=501.0', 'lies between 0 and 500'),
-    ('camera_hight:=8.0', "did you mean 'camera_height'?"),
-    ('scale.distance_px:=412 530 888 530', "'scale.distance_px' is given too"),
-    ('scale.distance_px:=[412.0, 530.0, 888.0, 530.0]', 'four numbers in one text'),
-])
+@pytest.mark.parametrize(
+    ('argument', 'told'),
+    [
+        ('camera_height:=8', 'write camera_height:=8.0, not 8'),
+        ('camera_height:=501.0', 'lies between 0 and 500'),
+        ('camera_hight:=8.0', "did you mean 'camera_height'?"),
+        ('scale.distance_px:=412 530 888 530', "'scale.distance_px' is given too"),
+        ('scale.distance_px:=[412.0, 530.0, 888.0, 530.0]', 'four numbers in one text'),
+    ],
+)
 def test_node_ends_with_status_2_and_one_line_at_an_unusable_parameter(argument, told):
     done = run_node('-p', argument)
     assert done.returncode == 2
@@ -183,10 +223,13 @@ def test_node_ends_with_status_2_and_one_line_at_an_unusable_parameter(argument,
     assert len(done.stderr.splitlines()) == 1
 
 
-@pytest.mark.parametrize(('content', 'told'), [
-    (None, 'No such file or directory'),
-    ('image_width: 640', "it has no 'image_height'"),
-])
+@pytest.mark.parametrize(
+    ('content', 'told'),
+    [
+        (None, 'No such file or directory'),
+        ('image_width: 640', "it has no 'image_height'"),
+    ],
+)
 def test_node_ends_with_status_2_and_one_line_at_an_unusable_camera_info_file(tmp_path, content, told):
     path = tmp_path / 'lens.yaml'
     if content is not None:

@@ -43,6 +43,7 @@ def evidence():
     from autocalib_ros.calibrator import AutoCalibrator
     from autocalib_ros.config import Options
     from bench import PIXELS
+
     calibrator = AutoCalibrator(Options())
     calibrator.add_image(START_NS, PIXELS)
     return calibrator.snapshot()
@@ -91,7 +92,7 @@ def test_images_of_the_restored_calibration_get_camera_info(bench, kept):
     infos = bench.collect(CameraInfo, INFO)
     bench.listening(INFO)
     publisher = first_image(bench, node)
-    sent = image(START_NS + 10 ** 12)
+    sent = image(START_NS + 10**12)
     publisher.publish(sent)
     wait_for(lambda: infos and infos[-1].header == sent.header, 'camera_info with the header of the image')
     assert node.publication.state is RESTORED
@@ -106,8 +107,9 @@ def test_store_named_after_the_frame_is_found_with_the_first_image(bench, kept, 
     wait_for(lambda: node.publication.state is RESTORED, 'the restored calibration')
 
 
-@pytest.mark.parametrize('make', [lambda stamp: image(stamp, size=(160, 120)),
-                                  lambda stamp: image(stamp, frame_id='another_optical')])
+@pytest.mark.parametrize(
+    'make', [lambda stamp: image(stamp, size=(160, 120)), lambda stamp: image(stamp, frame_id='another_optical')]
+)
 def test_restored_calibration_of_another_size_or_frame_is_withdrawn(bench, kept, make):
     node = bench.start(never, camera_name='north')
     infos = bench.collect(CameraInfo, INFO)
@@ -130,11 +132,25 @@ def test_calibration_that_agrees_but_is_less_sure_verifies_the_restored_one(benc
 
     def vague(evidence, options, lens):
         result = calibration(evidence, 302.0)
-        return replace(result, stddev=replace(kept.calibration.stddev, focal_px=5.0, tilt_deg=9.0, roll_deg=9.0,
-                                              principal_point_px=(1.0, 1.0), k1=0.1, k2=0.1))
+        return replace(
+            result,
+            stddev=replace(
+                kept.calibration.stddev,
+                focal_px=5.0,
+                tilt_deg=9.0,
+                roll_deg=9.0,
+                principal_point_px=(1.0, 1.0),
+                k1=0.1,
+                k2=0.1,
+            ),
+        )
 
-    sure = replace(kept.calibration, stddev=replace(
-        kept.calibration.stddev, principal_point_px=(1.0, 1.0), k1=0.1, k2=0.1, tilt_deg=0.1, roll_deg=0.1))
+    sure = replace(
+        kept.calibration,
+        stddev=replace(
+            kept.calibration.stddev, principal_point_px=(1.0, 1.0), k1=0.1, k2=0.1, tilt_deg=0.1, roll_deg=0.1
+        ),
+    )
     Store(Path(os.environ['ROS_HOME']) / 'camera_info' / 'north.yaml').save(replace(kept, calibration=sure))
     node, _ = calibrated(bench, vague, camera_name='north')
     assert (node.publication.state, node.publication.published.result.camera.focal_px) == (VERIFIED, 300.0)
@@ -229,7 +245,7 @@ def test_reset_withdraws_what_is_published_and_leaves_what_is_stored(bench, stor
     assert node.publication.state is NONE
     wait_for(lambda: nothing_latched(bench), 'the end of the latched messages', 5.0)
     assert store.load().stored.calibration.camera.focal_px == 311.0
-    publisher.publish(image(START_NS + 10 ** 12))
+    publisher.publish(image(START_NS + 10**12))
     wait_for(lambda: bench.calibrate().success, 'a calibration after the reset')
     infos, transforms = latched(bench)
     wait_for(lambda: infos and transforms, 'both messages')
@@ -257,8 +273,13 @@ def test_solution_that_runs_during_a_reset_is_not_published(bench, store):
 
 
 def test_wrong_url_ends_the_node_with_status_2_and_one_line():
-    done = subprocess.run([sys.executable, '-m', 'autocalib_ros.ros.node', '--ros-args', '-p',
-                           'camera_info_url:=/etc/lens.yaml'], capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(
+        [sys.executable, '-m', 'autocalib_ros.ros.node', '--ros-args', '-p', 'camera_info_url:=/etc/lens.yaml'],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
     assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
     assert 'write file:///FOLDER/FILE.yaml' in done.stderr
 
@@ -267,8 +288,18 @@ def test_wrong_url_ends_the_node_with_status_2_and_one_line():
 def process(log: Path, focal_px: float, seconds: float = 0.0, **parameters):
     """Run a node of camera /cam1 in a process of its own; killed at the end."""
     more = [text for name, value in {'camera_height': 8.0, **parameters}.items() for text in ('-p', f'{name}:={value}')]
-    command = [sys.executable, str(Path(__file__).with_name('fake_node.py')), str(focal_px), str(seconds),
-               '--ros-args', '-r', '__ns:=/cam1', '-r', 'image:=/image', *more]
+    command = [
+        sys.executable,
+        str(Path(__file__).with_name('fake_node.py')),
+        str(focal_px),
+        str(seconds),
+        '--ros-args',
+        '-r',
+        '__ns:=/cam1',
+        '-r',
+        'image:=/image',
+        *more,
+    ]
     # the package may not be installed
     environment = {**os.environ, 'PYTHONPATH': str(Path(__file__).parents[2])}
     with log.open('w') as stream, subprocess.Popen(command, stderr=stream, env=environment) as run:
@@ -296,8 +327,12 @@ def test_killed_node_leaves_its_calibration_to_the_next_which_tells_that_it_is_n
         assert (infos[-1].k[0], (infos[-1].width, infos[-1].height)) == (311.0, SIZE)
         wait_for(lambda: 'not yet verified' in (tmp_path / 'second').read_text(), 'the line of the log')
         bench.connected(publisher)
-        publish_until(publisher, lambda: stamp_ns(infos[-1].header.stamp) > START_NS + 10 ** 10,
-                      'camera_info of an image', lambda stamp: image(stamp + 10 ** 10))
+        publish_until(
+            publisher,
+            lambda: stamp_ns(infos[-1].header.stamp) > START_NS + 10**10,
+            'camera_info of an image',
+            lambda stamp: image(stamp + 10**10),
+        )
         assert infos[-1].k[0] == 311.0
         wait_for(lambda: bench.ask('calibrate', '/cam1/autocalib').success, 'a calibration')
         wait_for(lambda: infos[-1].k[0] == 350.0, 'the new calibration')

@@ -71,7 +71,7 @@ def test_a_report_that_cannot_be_written_is_told(reports, told, tmp_path):
     scene = reports.scene(full_result(junction_evidence()), (None, None), OPTIONS, '')
     reports.write(ReportPaths(tmp_path / 'file' / 'page.html', tmp_path / 'file' / 'figures'), scene)
     wait_for(lambda: told, 'the complaint', 120.0)
-    (text, good), = told
+    ((text, good),) = told
     assert text.startswith('the report was not written: InputError: cannot write') and not good
 
 
@@ -83,7 +83,9 @@ def test_a_node_that_ends_gives_the_report_up(reports, told, tmp_path):
 
 
 def test_the_node_starts_without_what_only_the_report_needs():
-    program = ('import sys, autocalib_ros.ros.autocalib_node\n'
-               'print(sorted({"matplotlib", "jinja2", "autocalib_ros.report.scene"} & set(sys.modules)))')
+    program = (
+        'import sys, autocalib_ros.ros.autocalib_node\n'
+        'print(sorted({"matplotlib", "jinja2", "autocalib_ros.report.scene"} & set(sys.modules)))'
+    )
     done = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True, timeout=120, check=True)
     assert done.stdout == "['autocalib_ros.report.scene']\n"

@@ -40,8 +40,12 @@ def test_process_gives_the_result_that_the_solver_gives(solver):
 
 
 def test_exception_of_the_solver_is_raised_here_with_its_traceback(solver):
-    outside = replace(OPTIONS, camera_height=0.0, scale_from='distance',
-                      scale=ScaleOptions(distance_px='10 10 9000 10', distance_m=5.0))
+    outside = replace(
+        OPTIONS,
+        camera_height=0.0,
+        scale_from='distance',
+        scale=ScaleOptions(distance_px='10 10 9000 10', distance_m=5.0),
+    )
     with pytest.raises(UsageError, match='lies outside the images') as raised:
         solver(snapshot(), outside, lens=None)
     assert 'require_inside' in str(raised.value.__cause__)

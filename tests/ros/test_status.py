@@ -28,25 +28,42 @@ COS, SIN = np.cos(np.radians(TILT_DEG)), np.sin(np.radians(TILT_DEG))
 TILTED = np.array([[0.0, -SIN, COS], [-1.0, 0.0, 0.0], [0.0, -COS, -SIN]])
 """ground_from_camera of a camera that looks along the road, down by TILT_DEG."""
 RESULT = Calibration(
-    method='joint', grade='full', assumptions=('right angle',), camera=Camera.equidistant(1280, 720, 512.346),
-    ground=GroundPlane(TILTED, 8.0), ground_refusal=None, road_directions=np.zeros((0, 3)),
-    stddev=StandardDeviations(focal_px=2.5, tilt_deg=0.125, roll_deg=0.25, height_m=0.1), paper=None,
-    evidence=EvidenceSummary(image_size=(1280, 720), seconds=60.0, frames=900, tracks=80, segments=300, vehicles=40,
-                             coverage=0.4), newest_stamp_ns=1_700_000_000_250_000_000)
+    method='joint',
+    grade='full',
+    assumptions=('right angle',),
+    camera=Camera.equidistant(1280, 720, 512.346),
+    ground=GroundPlane(TILTED, 8.0),
+    ground_refusal=None,
+    road_directions=np.zeros((0, 3)),
+    stddev=StandardDeviations(focal_px=2.5, tilt_deg=0.125, roll_deg=0.25, height_m=0.1),
+    paper=None,
+    evidence=EvidenceSummary(
+        image_size=(1280, 720), seconds=60.0, frames=900, tracks=80, segments=300, vehicles=40, coverage=0.4
+    ),
+    newest_stamp_ns=1_700_000_000_250_000_000,
+)
 WAITING = Situation(topic='/cam1/image', counts=Counts())
-COLLECTING = replace(WAITING, counts=Counts(received=50, used=49, dropped=1), image_age_s=0.04, encoding='bgr8',
-                     progress=CalibrationProgress(42.4, ('17 of 40 tracks', 'another'), 'about 6 min more at this rate'),
-                     rates_hz=Counts(received=10.0, used=9.8, dropped=0.2))
+COLLECTING = replace(
+    WAITING,
+    counts=Counts(received=50, used=49, dropped=1),
+    image_age_s=0.04,
+    encoding='bgr8',
+    progress=CalibrationProgress(42.4, ('17 of 40 tracks', 'another'), 'about 6 min more at this rate'),
+    rates_hz=Counts(received=10.0, used=9.8, dropped=0.2),
+)
 CALIBRATED = replace(COLLECTING, result=RESULT, progress=CalibrationProgress(100.0, ()))
 
 
-@pytest.mark.parametrize(('situation', 'state', 'level'), [
-    (WAITING, NodeState.WAITING_FOR_IMAGES, WARN),
-    (replace(WAITING, counts=Counts(received=9, unreadable=9)), NodeState.WAITING_FOR_IMAGES, WARN),
-    (COLLECTING, NodeState.COLLECTING, WARN),
-    (CALIBRATED, NodeState.CALIBRATED, OK),
-    (replace(CALIBRATED, restored=True), NodeState.RESTORED, WARN),
-])
+@pytest.mark.parametrize(
+    ('situation', 'state', 'level'),
+    [
+        (WAITING, NodeState.WAITING_FOR_IMAGES, WARN),
+        (replace(WAITING, counts=Counts(received=9, unreadable=9)), NodeState.WAITING_FOR_IMAGES, WARN),
+        (COLLECTING, NodeState.COLLECTING, WARN),
+        (CALIBRATED, NodeState.CALIBRATED, OK),
+        (replace(CALIBRATED, restored=True), NodeState.RESTORED, WARN),
+    ],
+)
 def test_state_and_its_level(situation, state, level):
     assert state_of(situation) is state
     told = status(situation)
@@ -54,15 +71,22 @@ def test_state_and_its_level(situation, state, level):
     assert dict(told.values)['state'] == state.value
 
 
-@pytest.mark.parametrize(('changes', 'level', 'told'), [
-    ({'silence': NoImageDiagnosis('nobody publishes', False)}, WARN, 'nobody publishes'),
-    ({'silence': NoImageDiagnosis('another type', True)}, ERROR, 'another type'),
-    ({'unreadable': "image encoding 'x' is not supported"}, ERROR, "images cannot be used: image encoding 'x'"),
-    ({'errors': ('the image size changed',)}, ERROR, 'the image size changed'),
-    ({'warnings': ('two publishers',)}, WARN, 'two publishers'),
-    ({'rates_hz': Counts(received=30.0, used=20.0, dropped=10.0)}, WARN, '10.0 of 30.0 images a second are dropped'),
-    ({'rates_hz': Counts(received=30.0, late=30.0)}, WARN, 'time stamps of the images do not advance'),
-])
+@pytest.mark.parametrize(
+    ('changes', 'level', 'told'),
+    [
+        ({'silence': NoImageDiagnosis('nobody publishes', False)}, WARN, 'nobody publishes'),
+        ({'silence': NoImageDiagnosis('another type', True)}, ERROR, 'another type'),
+        ({'unreadable': "image encoding 'x' is not supported"}, ERROR, "images cannot be used: image encoding 'x'"),
+        ({'errors': ('the image size changed',)}, ERROR, 'the image size changed'),
+        ({'warnings': ('two publishers',)}, WARN, 'two publishers'),
+        (
+            {'rates_hz': Counts(received=30.0, used=20.0, dropped=10.0)},
+            WARN,
+            '10.0 of 30.0 images a second are dropped',
+        ),
+        ({'rates_hz': Counts(received=30.0, late=30.0)}, WARN, 'time stamps of the images do not advance'),
+    ],
+)
 def test_trouble_raises_the_level_of_a_calibrated_node_and_is_told(changes, level, told):
     trouble = status(replace(CALIBRATED, **changes))
     assert trouble.level == level
@@ -83,27 +107,55 @@ def test_progress_is_told_in_the_message_and_in_values():
     assert '42 %: 17 of 40 tracks; another, about 6 min more' in told.message
     values = dict(told.values)
     assert (values['evidence_percent'], values['missing'], values['outlook']) == (
-        '42', '17 of 40 tracks; another', 'about 6 min more at this rate')
+        '42',
+        '17 of 40 tracks; another',
+        'about 6 min more at this rate',
+    )
 
 
 def test_numbers_of_the_stream_are_told():
     values = dict(status(COLLECTING).values)
-    expected = {'image_topic': '/cam1/image', 'encoding': 'bgr8', 'image_age_s': '0.0', 'received_hz': '10.0',
-                'used_hz': '9.8', 'received': '50', 'used': '49', 'dropped': '1', 'unreadable': '0', 'late': '0'}
+    expected = {
+        'image_topic': '/cam1/image',
+        'encoding': 'bgr8',
+        'image_age_s': '0.0',
+        'received_hz': '10.0',
+        'used_hz': '9.8',
+        'received': '50',
+        'used': '49',
+        'dropped': '1',
+        'unreadable': '0',
+        'late': '0',
+    }
     assert {name: values[name] for name in expected} == expected
 
 
 def test_numbers_of_the_calibration_are_told():
     values = dict(status(CALIBRATED).values)
-    expected = {'grade': 'full', 'focal_px': '512.35', 'focal_sigma_px': '2.5', 'tilt_deg': '30.00',
-                'tilt_sigma_deg': '0.125', 'roll_sigma_deg': '0.25', 'height_m': '8.000', 'height_sigma_m': '0.1',
-                'assumptions': 'right angle', 'no_ground_plane': '', 'newest_stamp_s': '1700000000.250'}
+    expected = {
+        'grade': 'full',
+        'focal_px': '512.35',
+        'focal_sigma_px': '2.5',
+        'tilt_deg': '30.00',
+        'tilt_sigma_deg': '0.125',
+        'roll_sigma_deg': '0.25',
+        'height_m': '8.000',
+        'height_sigma_m': '0.1',
+        'assumptions': 'right angle',
+        'no_ground_plane': '',
+        'newest_stamp_s': '1700000000.250',
+    }
     assert {name: values[name] for name in expected} == expected
 
 
 def test_lens_alone_says_why_there_is_no_plane():
-    lens = replace(RESULT, grade='lens', ground=None, ground_refusal=Reason('no_height', 'no height given.', 'give it'),
-                   stddev=StandardDeviations(focal_px=2.5))
+    lens = replace(
+        RESULT,
+        grade='lens',
+        ground=None,
+        ground_refusal=Reason('no_height', 'no height given.', 'give it'),
+        stddev=StandardDeviations(focal_px=2.5),
+    )
     values = dict(status(replace(CALIBRATED, result=lens)).values)
     assert (values['no_ground_plane'], values['tilt_deg'], values['height_m']) == ('no height given.', '', '')
 

@@ -45,6 +45,7 @@ def running_node(log: Path, *arguments: str):
 def running_camera(topic: str, *phases: dict):
     """Yield a function that sends the camera into its next phase."""
     with subprocess.Popen([*CAMERA, topic, json.dumps(phases)], stdin=subprocess.PIPE, text=True) as process:
+
         def go_on():
             process.stdin.write('\n')
             process.stdin.flush()
@@ -83,8 +84,10 @@ def test_camera_that_starts_late_and_changes_its_reliability_twice_is_heard(told
 
 
 def test_compressed_images_are_heard(told, tmp_path):
-    with running_node(tmp_path / 'log', '-p', 'image_transport:=compressed'), running_camera(
-            '/camera/image/compressed', COMPRESSED):
+    with (
+        running_node(tmp_path / 'log', '-p', 'image_transport:=compressed'),
+        running_camera('/camera/image/compressed', COMPRESSED),
+    ):
         wait_for(lambda: told.used() > 3, 'images', PATIENCE_S)
     assert told.newest()['encoding'] == 'jpeg'
 
@@ -93,16 +96,23 @@ def test_resolution_that_changes_in_mid_stream_begins_the_evidence_anew(told, tm
     with running_node(tmp_path / 'log'), running_camera('/camera/image', RAW, {'width': 160, 'height': 120}) as go_on:
         wait_for(lambda: told.used() > 3, 'images', PATIENCE_S)
         go_on()
-        wait_for(lambda: 'the image size changed: the evidence is collected anew' in (tmp_path / 'log').read_text(),
-                 'the news', PATIENCE_S)
+        wait_for(
+            lambda: 'the image size changed: the evidence is collected anew' in (tmp_path / 'log').read_text(),
+            'the news',
+            PATIENCE_S,
+        )
         before = told.used()
         wait_for(lambda: told.used() > before + 3, 'images of the other size', PATIENCE_S)
 
 
-@pytest.mark.parametrize(('arguments', 'topic', 'phase', 'words'), [
-    ((), '/camera/image', COMPRESSED, 'publishes /camera/image as sensor_msgs/msg/CompressedImage'),
-    (('-p', 'image_reliability:=reliable'), '/camera/image', LOSSY, 'set image_reliability:=auto'),
-], ids=['type', 'reliability'])
+@pytest.mark.parametrize(
+    ('arguments', 'topic', 'phase', 'words'),
+    [
+        ((), '/camera/image', COMPRESSED, 'publishes /camera/image as sensor_msgs/msg/CompressedImage'),
+        (('-p', 'image_reliability:=reliable'), '/camera/image', LOSSY, 'set image_reliability:=auto'),
+    ],
+    ids=['type', 'reliability'],
+)
 def test_stream_that_cannot_be_heard_is_told_as_an_error(told, tmp_path, arguments, topic, phase, words):
     with running_node(tmp_path / 'log', *arguments), running_camera(topic, phase):
         wait_for(lambda: told and words in told[-1].status[0].message, 'the reason', PATIENCE_S)

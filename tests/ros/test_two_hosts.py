@@ -69,7 +69,10 @@ class Process:
         environment = {**os.environ, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET', 'FASTDDS_BUILTIN_TRANSPORTS': 'UDPv4'}
         self._process = subprocess.Popen(
             ['ip', 'netns', 'exec', host, sys.executable, str(HERE / script), *arguments],
-            env=environment, stdout=subprocess.PIPE, text=True)
+            env=environment,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
         self.told: list[list] = []
         self._reader = threading.Thread(target=self._read)
         self._reader.start()

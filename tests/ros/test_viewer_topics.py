@@ -13,8 +13,11 @@ from autocalib_ros.ros.ground_points_node import GroundPointsNode
 from bench import wait_for
 
 CONFIG = Path(__file__).parent.parent.parent / 'config'
-TYPES = {'Image': 'sensor_msgs/msg/Image', 'MarkerArray': 'visualization_msgs/msg/MarkerArray',
-         'PointCloud2': 'sensor_msgs/msg/PointCloud2'}
+TYPES = {
+    'Image': 'sensor_msgs/msg/Image',
+    'MarkerArray': 'visualization_msgs/msg/MarkerArray',
+    'PointCloud2': 'sensor_msgs/msg/PointCloud2',
+}
 
 
 @pytest.fixture
@@ -34,10 +37,10 @@ def test_displays_of_rviz_match_their_publishers(bench, published):
             continue
         topic = display['Topic']
         assert published[topic['Value']] == [TYPES[display['Class'].partition('/')[2]]]
-        offer, = (info.qos_profile for info in bench.client.get_publishers_info_by_topic(topic['Value']))
+        (offer,) = (info.qos_profile for info in bench.client.get_publishers_info_by_topic(topic['Value']))
         assert topic['Reliability Policy'] == 'Best Effort' or offer.reliability == ReliabilityPolicy.RELIABLE
         assert topic['Durability Policy'] == 'Volatile' or offer.durability == DurabilityPolicy.TRANSIENT_LOCAL
-    node, = bench.nodes
+    (node,) = bench.nodes
     assert manager['Global Options']['Fixed Frame'] == node._headers.ground_frame('any')
 
 
@@ -49,7 +52,9 @@ def test_panels_of_foxglove_name_what_is_published(bench, published):
             assert published[panel['imageMode']['imageTopic']] == [TYPES['Image']]
         elif kind == '3D':
             assert {kind for topic in panel['topics'] for kind in published[topic]} == {
-                TYPES['MarkerArray'], TYPES['PointCloud2']}
+                TYPES['MarkerArray'],
+                TYPES['PointCloud2'],
+            }
             assert panel['followTf'] == bench.nodes[0]._headers.ground_frame('any')
         elif kind == 'RawMessages':
             assert panel['topicPath'] in published
@@ -59,7 +64,7 @@ def test_panels_of_foxglove_name_what_is_published(bench, published):
 
 def test_the_details_that_foxglove_opens_are_those_of_this_camera(bench, published):
     settings = json.loads((CONFIG / 'foxglove_layout.json').read_text(encoding='utf-8'))['configById']
-    panel, = (panel for name, panel in settings.items() if name.startswith('DiagnosticStatusPanel'))
+    (panel,) = (panel for name, panel in settings.items() if name.startswith('DiagnosticStatusPanel'))
     received = bench.collect(DiagnosticArray, '/diagnostics')
-    status, = wait_for(lambda: received, 'diagnostics')[-1].status
+    (status,) = wait_for(lambda: received, 'diagnostics')[-1].status
     assert (panel['selectedName'], panel['selectedHardwareId']) == (status.name, status.hardware_id)

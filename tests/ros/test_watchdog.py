@@ -11,20 +11,31 @@ POINTS = PublisherOffer('/lidar', 'sensor_msgs/msg/PointCloud2', True)
 T, C = '/cam/image', '/cam/image/compressed'
 
 
-@pytest.mark.parametrize(('topic', 'kind', 'offers', 'other_offers', 'reliable', 'told', 'lasting'), [
-    (T, IMAGE, [], [], True, 'nobody publishes /cam/image: start the camera, or remap', False),
-    (T, IMAGE, [], [PACKED], True, '/cam/image/compressed: set image_transport:=compressed', True),
-    (C, COMPRESSED, [], [RAW], True, 'publishes /cam/image: set image_transport:=raw', True),
-    (C + '/compressed', COMPRESSED, [], [PACKED], True, 'remap without it, -r image:=/cam/image', True),
-    (C, IMAGE, [PACKED], [], True, 'set image_transport:=compressed, and remap -r image:=/cam/image', True),
-    (T, IMAGE, [PACKED], [], True, 'republish it on /cam/image/compressed', True),
-    (C, COMPRESSED, [RAW], [], True, 'set image_transport:=raw, and remap -r image:=/cam/image/compressed', True),
-    (T, IMAGE, [POINTS], [], True, 'as sensor_msgs/msg/PointCloud2, and this node takes sensor_msgs/msg/Image', True),
-    (T, IMAGE, [LOSSY], [], True, 'incompatible QoS): set image_reliability:=auto', True),
-    (T, IMAGE, [LOSSY, RAW], [], True, 'nothing arrives: is the camera running?', False),
-    (T, IMAGE, [LOSSY], [], False, 'best effort loses large images', False),
-    (T, IMAGE, [RAW], [], False, 'is the camera running?', False),
-])
+@pytest.mark.parametrize(
+    ('topic', 'kind', 'offers', 'other_offers', 'reliable', 'told', 'lasting'),
+    [
+        (T, IMAGE, [], [], True, 'nobody publishes /cam/image: start the camera, or remap', False),
+        (T, IMAGE, [], [PACKED], True, '/cam/image/compressed: set image_transport:=compressed', True),
+        (C, COMPRESSED, [], [RAW], True, 'publishes /cam/image: set image_transport:=raw', True),
+        (C + '/compressed', COMPRESSED, [], [PACKED], True, 'remap without it, -r image:=/cam/image', True),
+        (C, IMAGE, [PACKED], [], True, 'set image_transport:=compressed, and remap -r image:=/cam/image', True),
+        (T, IMAGE, [PACKED], [], True, 'republish it on /cam/image/compressed', True),
+        (C, COMPRESSED, [RAW], [], True, 'set image_transport:=raw, and remap -r image:=/cam/image/compressed', True),
+        (
+            T,
+            IMAGE,
+            [POINTS],
+            [],
+            True,
+            'as sensor_msgs/msg/PointCloud2, and this node takes sensor_msgs/msg/Image',
+            True,
+        ),
+        (T, IMAGE, [LOSSY], [], True, 'incompatible QoS): set image_reliability:=auto', True),
+        (T, IMAGE, [LOSSY, RAW], [], True, 'nothing arrives: is the camera running?', False),
+        (T, IMAGE, [LOSSY], [], False, 'best effort loses large images', False),
+        (T, IMAGE, [RAW], [], False, 'is the camera running?', False),
+    ],
+)
 def test_fault_is_named_with_what_mends_it(topic, kind, offers, other_offers, reliable, told, lasting):
     silence = diagnose(topic, kind, offers, asks_reliable=reliable, other_offers=other_offers)
     assert told in silence.words

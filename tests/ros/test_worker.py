@@ -69,11 +69,15 @@ def start(heard):
 
     def make(solve, idle_solve_s: float = NEVER_S, **more) -> CalibrationWorker:
         """`solve` takes the evidence, and the lens too where one is given."""
+
         def adapted(evidence, options, *, lens):
             return solve(evidence) if lens is None else solve(evidence, lens)
 
-        started.append(CalibrationWorker(Options(), idle_solve_s=idle_solve_s, decode=decode, solve=adapted, listener=heard,
-                                **more))
+        started.append(
+            CalibrationWorker(
+                Options(), idle_solve_s=idle_solve_s, decode=decode, solve=adapted, listener=heard, **more
+            )
+        )
         return started[-1]
 
     yield make
@@ -247,8 +251,10 @@ def test_image_of_another_shape_than_the_known_lens_is_left_out_and_told(start, 
     pipeline = start(lambda evidence, lens: calibration(evidence), lens=Camera.equidistant(width, height, 250.0))
     pipeline.offer(0, np.zeros((height, 2 * width), np.uint8))
     wait_for(lambda: heard.unreadable, 'the complaint')
-    assert heard.unreadable == [f'the lens was calibrated in images of {width}x{height}, and these images have '
-                                f'{2 * width}x{height}, another shape: give a calibration of their size']
+    assert heard.unreadable == [
+        f'the lens was calibrated in images of {width}x{height}, and these images have '
+        f'{2 * width}x{height}, another shape: give a calibration of their size'
+    ]
     feed(pipeline, heard, 1)
     assert (heard.sizes, heard.faults) == ([(width, height)], [])
 
@@ -324,8 +330,9 @@ def test_image_that_is_looked_at_during_a_reset_is_no_evidence_after_it(start, h
 
 def test_reset_returns_when_nothing_is_told_any_more(start, heard, monkeypatch):
     telling, release = threading.Event(), threading.Event()
-    monkeypatch.setattr(heard, 'solved', lambda result: (telling.set(), release.wait(PATIENCE_S),
-                                                         heard.results.append(result)))
+    monkeypatch.setattr(
+        heard, 'solved', lambda result: (telling.set(), release.wait(PATIENCE_S), heard.results.append(result))
+    )
     pipeline = start(calibration)
     feed(pipeline, heard, 1)
     pipeline.solve_now()

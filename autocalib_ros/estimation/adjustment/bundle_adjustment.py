@@ -81,19 +81,35 @@ BLOCK_COUNT = 3
 class Problem:
     """Labelled tracks and vehicles that turn, at a state: residuals, and their derivatives by a step from there."""
 
-    def __init__(self, base: AdjustmentState, tracks: TrackSet, labels: np.ndarray, config: AdjustmentConfig,
-                 warm_start: WarmStart = (None, None, None), unprojected: UnprojectedTracks | None = None) -> None:
+    def __init__(
+        self,
+        base: AdjustmentState,
+        tracks: TrackSet,
+        labels: np.ndarray,
+        config: AdjustmentConfig,
+        warm_start: WarmStart = (None, None, None),
+        unprojected: UnprojectedTracks | None = None,
+    ) -> None:
         self.parameters = Parameterisation(base, config)
         self.used = np.flatnonzero(labels >= 0)
         """Indices of the tracks that are on a road: the first rows; windows and lives follow."""
         unprojected = unprojected or UnprojectedTracks.through(base.camera, tracks)
         vehicle_weight = tracks.kish_weight(config.vehicle_correlation)[self.used]
         self.blocks: list[StraightTrackBlock | PlanarMotionBlock | RigidBodyBlock] = [
-            StraightTrackBlock(self.parameters, tracks.subset(self.used), labels[self.used], unprojected.subset(self.used), vehicle_weight),
-            PlanarMotionBlock(self.parameters, warm_start[1])]
+            StraightTrackBlock(
+                self.parameters,
+                tracks.subset(self.used),
+                labels[self.used],
+                unprojected.subset(self.used),
+                vehicle_weight,
+            ),
+            PlanarMotionBlock(self.parameters, warm_start[1]),
+        ]
         if config.bundle is not None:
             self.blocks.append(RigidBodyBlock(self.parameters, config.bundle, warm_start[2]))
-        self.block_of_row = np.repeat(np.arange(len(self.blocks)), [len(block_of_row.dof) for block_of_row in self.blocks])
+        self.block_of_row = np.repeat(
+            np.arange(len(self.blocks)), [len(block_of_row.dof) for block_of_row in self.blocks]
+        )
         """Index of the kind of each row, shape (rows,)."""
         self.dof = np.concatenate([block_of_row.dof for block_of_row in self.blocks])
         self.vehicle_weight = np.concatenate([block_of_row.vehicle_weight for block_of_row in self.blocks])
@@ -123,13 +139,23 @@ class Problem:
     def linearise(self) -> LinearisedRows:
         """Sums over the residuals at the base and their derivatives by the parameters."""
         parts = [block_of_row.linearise() for block_of_row in self.blocks]
-        return LinearisedRows(*(np.concatenate([getattr(part, name) for part in parts])
-                      for name in ('squared', 'gradient', 'curvature', 'influence')))
+        return LinearisedRows(
+            *(
+                np.concatenate([getattr(part, name) for part in parts])
+                for name in ('squared', 'gradient', 'curvature', 'influence')
+            )
+        )
 
     def scales(self, squared: np.ndarray) -> np.ndarray:
         """Median of the mean squared distances (rows,) over each kind of row, 1 where there is none; (kinds,)."""
-        return np.array([max(float(np.median(squared[self.block_of_row == block_of_row])), MIN_RESIDUAL_SCALE)
-                         if (self.block_of_row == block_of_row).any() else 1.0 for block_of_row in range(BLOCK_COUNT)])
+        return np.array(
+            [
+                max(float(np.median(squared[self.block_of_row == block_of_row])), MIN_RESIDUAL_SCALE)
+                if (self.block_of_row == block_of_row).any()
+                else 1.0
+                for block_of_row in range(BLOCK_COUNT)
+            ]
+        )
 
 
 @dataclass(frozen=True)
@@ -184,16 +210,20 @@ class Adjustment:
 
     def sigma(self, function: Callable[[AdjustmentState], np.ndarray]) -> np.ndarray:
         """Standard deviation of a function of the state, shape of its result."""
-        return propagate_sigma(lambda step: function(self.problem.parameters.state(step)), self.problem.parameters.size,
-                         self.covariance)
+        return propagate_sigma(
+            lambda step: function(self.problem.parameters.state(step)), self.problem.parameters.size, self.covariance
+        )
 
     def covariance_of(self, function: Callable[[AdjustmentState], np.ndarray]) -> np.ndarray:
         """Covariance (n, n) of a function of the state with n results."""
-        return propagate_covariance(lambda step: function(self.problem.parameters.state(step)), self.problem.parameters.size,
-                          self.covariance)
+        return propagate_covariance(
+            lambda step: function(self.problem.parameters.state(step)), self.problem.parameters.size, self.covariance
+        )
 
 
-def assign_roads(state: AdjustmentState, unprojected: UnprojectedTracks, limit_px: float = ROAD_OUTLIER_PX) -> tuple[np.ndarray, np.ndarray]:
+def assign_roads(
+    state: AdjustmentState, unprojected: UnprojectedTracks, limit_px: float = ROAD_OUTLIER_PX
+) -> tuple[np.ndarray, np.ndarray]:
     """Give each track its nearest road (-2 beyond `limit_px`) and its mean squared distance in px^2, inf for none."""
     if not len(state.angles_rad):
         return np.full(len(unprojected.matrix), -2), np.full(len(unprojected.matrix), np.inf)
@@ -203,8 +233,14 @@ def assign_roads(state: AdjustmentState, unprojected: UnprojectedTracks, limit_p
     return np.where(least < limit_px**2, nearest, -2), least
 
 
-def adjust(start: AdjustmentState, tracks: TrackSet, config: AdjustmentConfig, *, refine: bool = False,
-                warm_start: WarmStart = (None, None, None)) -> Adjustment:
+def adjust(
+    start: AdjustmentState,
+    tracks: TrackSet,
+    config: AdjustmentConfig,
+    *,
+    refine: bool = False,
+    warm_start: WarmStart = (None, None, None),
+) -> Adjustment:
     """Alternate between assigning tracks to roads and a robust Gauss-Newton step, from a start.
 
     With `refine` the start is a solution already, and nothing is loosened first; `warm_start` is what was solved inside
@@ -241,7 +277,9 @@ def _gauss_newton_step(problem: Problem, robust_limit: float) -> tuple[np.ndarra
 
     def cost(squared: np.ndarray, camera: Camera) -> float:
         deviations = prior.deviations(camera)
-        return float((vehicle_weight * problem.dof * loss(squared, robust_limit * scale)).sum() + deviations @ deviations)
+        return float(
+            (vehicle_weight * problem.dof * loss(squared, robust_limit * scale)).sum() + deviations @ deviations
+        )
 
     here = cost(rows.squared, problem.parameters.base.camera)
     for _ in range(MAX_BACKTRACKS):
@@ -271,7 +309,7 @@ def bounded_loss(squared: np.ndarray, limit: float) -> np.ndarray:
 
 def _converged(step: np.ndarray, prior: LensPrior) -> bool:
     limit = np.full(len(step), CONVERGED_STEP)
-    limit[:len(prior.free)][np.isfinite(prior.sigma[prior.free])] = CONVERGED_STEP_SIGMAS
+    limit[: len(prior.free)][np.isfinite(prior.sigma[prior.free])] = CONVERGED_STEP_SIGMAS
     return bool((np.abs(step) < limit).all())
 
 
@@ -279,7 +317,11 @@ def _evaluate(last: Problem, state: AdjustmentState, warm_start: WarmStart, trac
     """Measure a solution: distances, cost, covariance and information."""
     unprojected = UnprojectedTracks.through(state.camera, tracks)
     labels, distance2 = assign_roads(state, unprojected)
-    problem = Problem(state, tracks, labels, last.config, warm_start, unprojected) if _enough_rows(labels, last.config) else last
+    problem = (
+        Problem(state, tracks, labels, last.config, warm_start, unprojected)
+        if _enough_rows(labels, last.config)
+        else last
+    )
     rows, dof = problem.linearise(), problem.dof
     scales = problem.scales(rows.squared)
     scale = scales[problem.block_of_row]
@@ -297,17 +339,25 @@ def _evaluate(last: Problem, state: AdjustmentState, warm_start: WarmStart, trac
     pulls = rows.gradient[road] * np.sqrt(influence(rows.squared, limit)[road])[:, None]
     pulls = pulls / np.sqrt(np.maximum(np.diag(information), 1e-12))
     return Adjustment(
-        state=state, labels=labels, distance_px=np.sqrt(distance2), whitened2=whitened2, turning2=rows.squared[~road],
-        scales=scales, problem=problem, covariance=covariance, information=information,
+        state=state,
+        labels=labels,
+        distance_px=np.sqrt(distance2),
+        whitened2=whitened2,
+        turning2=rows.squared[~road],
+        scales=scales,
+        problem=problem,
+        covariance=covariance,
+        information=information,
         turning_information=np.tensordot(weight[~road], rows.curvature[~road], 1),
-        vehicle_correlation=intraclass_correlation(problem.vehicle_ids[road], pulls))
+        vehicle_correlation=intraclass_correlation(problem.vehicle_ids[road], pulls),
+    )
 
 
 def _unmodelled(parameters: Parameterisation) -> np.ndarray:
     """Standard deviation (parameters,) of each parameter that the residuals know nothing of."""
     sigma = np.zeros(parameters.size)
-    sigma[:parameters.lens][parameters.config.prior.free == 0] = UNMODELLED_FOCAL
-    sigma[parameters.lens:parameters.lens + len(parameters.axes)] = UNMODELLED_RAD
+    sigma[: parameters.lens][parameters.config.prior.free == 0] = UNMODELLED_FOCAL
+    sigma[parameters.lens : parameters.lens + len(parameters.axes)] = UNMODELLED_RAD
     return sigma
 
 
@@ -327,7 +377,9 @@ def evaluate_with(fit: Adjustment, tracks: TrackSet, config: AdjustmentConfig) -
     return _evaluate(Problem(fit.state, tracks, fit.labels, config, warm_start), fit.state, warm_start, tracks)
 
 
-def evaluate_at(state: AdjustmentState, tracks: TrackSet, config: AdjustmentConfig, covariance: np.ndarray) -> Adjustment:
+def evaluate_at(
+    state: AdjustmentState, tracks: TrackSet, config: AdjustmentConfig, covariance: np.ndarray
+) -> Adjustment:
     """See how tracks follow the roads of a state that was found otherwise, with the covariance that it has from there.
 
     Its parameters are those of `Parameterisation(state, setting)`.

@@ -17,13 +17,21 @@ NOISE_PRIOR_VEHICLES = 5
 a dozen agree by chance to a third of their spread once in some dozens."""
 
 
-def jackknife_covariance(gradients: np.ndarray, curvatures: np.ndarray, weight: np.ndarray, second_order: np.ndarray,
-                       vehicle_ids: np.ndarray, prior: np.ndarray) -> np.ndarray:
+def jackknife_covariance(
+    gradients: np.ndarray,
+    curvatures: np.ndarray,
+    weight: np.ndarray,
+    second_order: np.ndarray,
+    vehicle_ids: np.ndarray,
+    prior: np.ndarray,
+) -> np.ndarray:
     """Covariance of a robust estimate by leaving out one vehicle at a time, shape (parameters, parameters).
 
     `gradients` g = J^T r (rows, parameters) and `curvatures` J^T J (rows, parameters, parameters) are of whitened
-    residuals r; `weight` (rows,) is the derivative of a row's loss by half its squared distance, `second_order` (rows,) the
-    factor of g g^T in the second derivative; `vehicle_ids` (rows,) are the vehicles, `prior` (parameters,) is the prior's
+    residuals r; `weight` (rows,) is the derivative of a row's loss by half its squared distance, `second_order`
+    (rows,) the
+    factor of g g^T in the second derivative; `vehicle_ids` (rows,) are the vehicles, `prior` (parameters,) is the
+    prior's
     information. One Newton step from the solution stands for each vehicle's solution without it: the cluster
     jackknife, CR3 of Bell & McCaffrey (2002), for an M-estimate. Few vehicles widen it, above all where they agree
     better than their noise lets them; the prior's own spread is added. Undetermined directions get an infinite
@@ -75,7 +83,7 @@ def small_sample_factor(moves: np.ndarray) -> np.ndarray:
     the squared moves has by Satterthwaite (1946): about the number of vehicles that matter.
     """
     squares = moves**2
-    dof = 3.0 * squares.sum(axis=0)**2 / np.maximum((squares**2).sum(axis=0), 1e-300)
+    dof = 3.0 * squares.sum(axis=0) ** 2 / np.maximum((squares**2).sum(axis=0), 1e-300)
     return stats.t.ppf(0.975, np.maximum(dof, 1.0)) / stats.norm.ppf(0.975)
 
 
@@ -101,8 +109,12 @@ def propagate_covariance(function: Callable[[np.ndarray], np.ndarray], size: int
     results = len(np.atleast_1d(function(np.zeros(size))))
     if not np.isfinite(covariance).all():
         return np.full((results, results), np.inf)
-    slopes = np.array([(np.atleast_1d(function(step * unit)) - np.atleast_1d(function(-step * unit))) / (2 * step)
-                       for unit in np.eye(size)]).reshape(size, results)
+    slopes = np.array(
+        [
+            (np.atleast_1d(function(step * unit)) - np.atleast_1d(function(-step * unit))) / (2 * step)
+            for unit in np.eye(size)
+        ]
+    ).reshape(size, results)
     return slopes.T @ covariance @ slopes
 
 

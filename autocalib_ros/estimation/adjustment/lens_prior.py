@@ -60,15 +60,19 @@ class LensPrior:
         change[self.free] = step * self.units
         cx, cy = camera.principal_point_px
         k1, k2, k3, k4 = camera.k
-        return replace(camera, focal_px=camera.focal_px * float(np.exp(np.clip(change[0], -1.0, 1.0))),
-                       principal_point_px=(float(cx + change[1]), float(cy + change[2])),
-                       k=(float(k1 + change[3]), float(k2 + change[4]), k3, k4))
+        return replace(
+            camera,
+            focal_px=camera.focal_px * float(np.exp(np.clip(change[0], -1.0, 1.0))),
+            principal_point_px=(float(cx + change[1]), float(cy + change[2])),
+            k=(float(k1 + change[3]), float(k2 + change[4]), k3, k4),
+        )
 
     def step(self, camera: Camera, other: Camera) -> np.ndarray:
         """Return the step of the free parameters, in their units, by which `moved` takes a camera to another."""
         shift = np.subtract(other.principal_point_px, camera.principal_point_px)
-        change = np.array([np.log(other.focal_px / camera.focal_px), *shift,
-                           other.k[0] - camera.k[0], other.k[1] - camera.k[1]])
+        change = np.array(
+            [np.log(other.focal_px / camera.focal_px), *shift, other.k[0] - camera.k[0], other.k[1] - camera.k[1]]
+        )
         return change[self.free] / self.units
 
     def deviations(self, camera: Camera) -> np.ndarray:
@@ -118,8 +122,11 @@ def lens_priors(image_size: tuple[int, int], options: JointOptions) -> list[Lens
     families = {
         'equidistant': (EQUIDISTANT, (options.k1_sigma, 0.0)),
         'distortion_free': (DISTORTION_FREE, (options.k1_sigma, 0.0)),
-        'kannala_brandt': (KANNALA_BRANDT, KANNALA_BRANDT_SIGMA)}
+        'kannala_brandt': (KANNALA_BRANDT, KANNALA_BRANDT_SIGMA),
+    }
     names = families if options.lens_prior == 'auto' else [options.lens_prior]
     centre = Camera(*image_size, focal if focal > 0 else float(width), image_centre(*image_size))
-    return [LensPrior(name, replace(centre, k=families[name][0]),
-                      np.array([log_focal, point, point, *families[name][1]])) for name in names]
+    return [
+        LensPrior(name, replace(centre, k=families[name][0]), np.array([log_focal, point, point, *families[name][1]]))
+        for name in names
+    ]

@@ -40,7 +40,13 @@ def noise_cost(fit: Adjustment, tracks: TrackSet, *, drifting: bool) -> float:
     parameters = Parameterisation(fit.state, replace(fit.problem.config, drifting=drifting))
     used = labels >= 0
     on_roads = tracks.subset(used)
-    rows = StraightTrackBlock(parameters, on_roads, labels[used], UnprojectedTracks.through(fit.state.camera, on_roads), np.ones(len(on_roads)))
+    rows = StraightTrackBlock(
+        parameters,
+        on_roads,
+        labels[used],
+        UnprojectedTracks.through(fit.state.camera, on_roads),
+        np.ones(len(on_roads)),
+    )
     _, squared = rows.at(np.zeros(parameters.size))
     scale = max(float(np.median(squared)), MIN_RESIDUAL_SCALE)
     return float((rows.dof * np.log(scale) - 2.0 * rows.log_density()).sum())
@@ -54,7 +60,9 @@ def laplace_cost(fit: Adjustment, tracks: TrackSet, scales: np.ndarray) -> float
     """
     problem, turning = fit.problem, fit.problem.block_of_row > 0
     dof = np.concatenate([np.maximum((tracks.weights > 0).sum(axis=1) - 1, 1), problem.dof[turning]])
-    vehicle_weight = np.concatenate([tracks.kish_weight(problem.config.vehicle_correlation), problem.vehicle_weight[turning]])
+    vehicle_weight = np.concatenate(
+        [tracks.kish_weight(problem.config.vehicle_correlation), problem.vehicle_weight[turning]]
+    )
     scale = np.concatenate([np.full(len(tracks), scales[0]), scales[problem.block_of_row[turning]]])
     squared = np.concatenate([fit.whitened2, fit.turning2])
     deviations, prior = problem.parameters.prior_gradient(fit.state.camera)

@@ -34,22 +34,31 @@ class RoadPositions:
     """Metres along the road, shape (tracks, samples)."""
 
 
-def locate_on_road(rays: Rays, normals: np.ndarray, directions: np.ndarray, up: np.ndarray, height_m: float) -> RoadPositions:
+def locate_on_road(
+    rays: Rays, normals: np.ndarray, directions: np.ndarray, up: np.ndarray, height_m: float
+) -> RoadPositions:
     """Place tracks on the road: circle normals and road directions (tracks, 3), ground normal `up` (3,)."""
-    below = np.maximum(-(rays.bearings @ up), MIN_DEPRESSION_NOISE_RAD) / (height_m if height_m > 0 else DEFAULT_CAMERA_HEIGHT_M)
+    below = np.maximum(-(rays.bearings @ up), MIN_DEPRESSION_NOISE_RAD) / (
+        height_m if height_m > 0 else DEFAULT_CAMERA_HEIGHT_M
+    )
     across = np.abs(dot(normals, cross(directions, up)))[:, None]
-    return RoadPositions(across * rays.pixel_scale(normals[:, None]) * below, dot(rays.bearings, directions[:, None]) / below)
+    return RoadPositions(
+        across * rays.pixel_scale(normals[:, None]) * below, dot(rays.bearings, directions[:, None]) / below
+    )
 
 
-def whitening_matrices(pixels: np.ndarray, mask: np.ndarray, road: RoadPositions, options: JointOptions, *,
-              drifting: bool) -> np.ndarray:
+def whitening_matrices(
+    pixels: np.ndarray, mask: np.ndarray, road: RoadPositions, options: JointOptions, *, drifting: bool
+) -> np.ndarray:
     """Return W (tracks, samples, samples) with W^T W the inverse covariance of the distances from the circles.
 
     W is lower triangular. Samples where `mask` (tracks, samples) is false get zero rows and columns.
     """
     mask, along_m, px_per_m = (np.ascontiguousarray(part.T) for part in (mask, road.along_m, road.px_per_m))
     wander = options.wander_m * px_per_m
-    covariance = np.exp(-0.5 * ((along_m[:, None] - along_m) / WANDER_CORRELATION_LENGTH_M) ** 2) * (wander[:, None] * wander)
+    covariance = np.exp(-0.5 * ((along_m[:, None] - along_m) / WANDER_CORRELATION_LENGTH_M) ** 2) * (
+        wander[:, None] * wander
+    )
     if drifting:
         lever = along_m - (along_m * mask).sum(axis=0) / np.maximum(mask.sum(axis=0), 1)
         heading = np.radians(options.heading_deg) * lever * px_per_m

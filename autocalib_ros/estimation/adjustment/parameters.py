@@ -102,14 +102,17 @@ class Parameterisation:
         turns = self.lens + len(self.axes)
         angles = self.base.angles_rad.copy()
         angles[list(self.free_angles)] += step[turns:]
-        return AdjustmentState(self.camera(step[:self.lens]), self.base.rotation @ self.turned(step[self.lens:turns]), angles)
+        return AdjustmentState(
+            self.camera(step[: self.lens]), self.base.rotation @ self.turned(step[self.lens : turns]), angles
+        )
 
     def step_to(self, state: AdjustmentState) -> np.ndarray:
         """Return the step (parameters,) from the base to a state near it, as far as the parameters reach."""
         turn = Rotation.from_matrix(self.base.rotation.T @ state.rotation).as_rotvec()
         angles = np.angle(np.exp(1j * (state.angles_rad - self.base.angles_rad)))
-        return np.concatenate([self.config.prior.step(self.base.camera, state.camera), self.axes @ turn,
-                               angles[list(self.free_angles)]])
+        return np.concatenate(
+            [self.config.prior.step(self.base.camera, state.camera), self.axes @ turn, angles[list(self.free_angles)]]
+        )
 
     def camera(self, step: np.ndarray) -> Camera:
         """Return the lens at a step (lens,) of its own parameters."""
@@ -122,8 +125,8 @@ class Parameterisation:
     def prior_gradient(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
         """Gradient (parameters,) and information (parameters,) of the prior at a camera."""
         gradient, information = np.zeros(self.size), np.zeros(self.size)
-        gradient[:self.lens] = self.config.prior.deviations(camera)
-        information[:self.lens] = self.config.prior.information
+        gradient[: self.lens] = self.config.prior.deviations(camera)
+        information[: self.lens] = self.config.prior.information
         return gradient, information
 
 

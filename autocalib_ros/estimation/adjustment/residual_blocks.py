@@ -47,15 +47,25 @@ class LinearisedRows:
     def of(cls, residuals: np.ndarray, slopes: np.ndarray, dof: np.ndarray, influence: np.ndarray) -> LinearisedRows:
         """Sum up residuals (rows, samples) and slopes (rows, samples, parameters)."""
         transposed = slopes.transpose(0, 2, 1)
-        return cls((residuals**2).sum(axis=1) / dof, (transposed @ residuals[..., None])[..., 0],
-                   transposed @ slopes, influence)
+        return cls(
+            (residuals**2).sum(axis=1) / dof,
+            (transposed @ residuals[..., None])[..., 0],
+            transposed @ slopes,
+            influence,
+        )
 
 
 class StraightTrackBlock:
     """Labelled tracks, each on a great circle through the direction of its road."""
 
-    def __init__(self, parameters: Parameterisation, tracks: TrackSet, labels: np.ndarray, unprojected: UnprojectedTracks,
-                 vehicle_weight: np.ndarray) -> None:
+    def __init__(
+        self,
+        parameters: Parameterisation,
+        tracks: TrackSet,
+        labels: np.ndarray,
+        unprojected: UnprojectedTracks,
+        vehicle_weight: np.ndarray,
+    ) -> None:
         self._parameters, self._tracks, self._labels = parameters, tracks, labels
         self.vehicle_ids, self.vehicle_weight = tracks.vehicles, vehicle_weight
         self._mask = tracks.weights > 0
@@ -67,7 +77,9 @@ class StraightTrackBlock:
         self._scale = self._rays.pixel_scale(normals[:, None])
         self._up = upward_normal(base, config, self._rays)
         self._road = locate_on_road(self._rays, normals, self._directions, self._up, config.height_m)
-        self.whiten = whitening_matrices(tracks.pixels, self._mask, self._road, config.options, drifting=config.drifting)
+        self.whiten = whitening_matrices(
+            tracks.pixels, self._mask, self._road, config.options, drifting=config.drifting
+        )
         self._normals = self._circles(base, self._rays)
         self._scale = self._rays.pixel_scale(self._normals[:, None])
         self._normals = self._circles(base, self._rays)
@@ -83,7 +95,7 @@ class StraightTrackBlock:
         state = self._parameters.state(step)
         rays = unproject_rays(state.camera, self._tracks.pixels)
         distance = rays.distance_px(self._circles(state, rays)[:, None])
-        return None, ((self.whiten @ distance[..., None])[..., 0]**2).sum(axis=1) / self.dof
+        return None, ((self.whiten @ distance[..., None])[..., 0] ** 2).sum(axis=1) / self.dof
 
     def distances_px(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Observed pixels (n, 2), their distances from the circles (n,), and their tracks (n,), at the base."""
@@ -109,20 +121,27 @@ class StraightTrackBlock:
         columns = [(self._distance(unit, normals) - here) / DIFFERENTIATION_STEP for unit in np.eye(parameters.lens)]
         across = here * scale
         # distance over gradient: the second term is how the gradient itself turns with the normal
-        pull = rays.bearings - across[..., None] * (dot(rays.radial, normals)[..., None] * rays.radial
-                                                    + dot(rays.tangential, normals)[..., None] * rays.tangential)
+        pull = rays.bearings - across[..., None] * (
+            dot(rays.radial, normals)[..., None] * rays.radial
+            + dot(rays.tangential, normals)[..., None] * rays.tangential
+        )
         pull *= scale[..., None]
         free = (pull @ cross(self._directions, self._normals)[..., None])[..., 0]
-        columns += [(pull @ (-dot(self._normals, turn)[:, None] * self._directions)[..., None])[..., 0]
-                    for turn in self._turns()]
+        columns += [
+            (pull @ (-dot(self._normals, turn)[:, None] * self._directions)[..., None])[..., 0]
+            for turn in self._turns()
+        ]
         slopes = self.whiten @ np.stack([free, *columns], axis=-1)
         free, slopes = slopes[..., :1], slopes[..., 1:]
         along = (free * slopes).sum(axis=1, keepdims=True) / np.maximum((free * free).sum(axis=1, keepdims=True), 1e-12)
-        return LinearisedRows.of((self.whiten @ here[..., None])[..., 0], slopes - free * along, self.dof,
-                       self._lane_keeping_weights(here))
+        return LinearisedRows.of(
+            (self.whiten @ here[..., None])[..., 0], slopes - free * along, self.dof, self._lane_keeping_weights(here)
+        )
 
     def _distance(self, unit: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        return unproject_rays(self._parameters.camera(DIFFERENTIATION_STEP * unit), self._tracks.pixels).distance_px(normals)
+        return unproject_rays(self._parameters.camera(DIFFERENTIATION_STEP * unit), self._tracks.pixels).distance_px(
+            normals
+        )
 
     def _turns(self) -> list[np.ndarray]:
         """Change (tracks, 3) of each track's direction with each parameter of the roads."""
@@ -160,7 +179,7 @@ class PlanarMotionBlock:
         """Motion at a step and mean squared distances, shape (windows,)."""
         view = self._view(self._parameters.state(step))
         motion = refined(view, self.warm_start)
-        return motion, ((self._root * view.distances(motion))**2).sum(axis=1) / self.dof
+        return motion, ((self._root * view.distances(motion)) ** 2).sum(axis=1) / self.dof
 
     def linearise(self) -> LinearisedRows:
         """Residuals at the base and their derivatives, by differences; the window's own motion projected out."""
@@ -183,8 +202,11 @@ class PlanarMotionBlock:
         lens, turns = self._parameters.lens, self._parameters.lens + len(self._parameters.axes)
         if unit[turns:].any():
             return self._here  # the angle of a road is nothing to a window
-        view = self._base.turned(self._parameters.turned(DIFFERENTIATION_STEP * unit[lens:turns])) if unit[lens:].any() else (
-            self._view(self._parameters.state(DIFFERENTIATION_STEP * unit)))
+        view = (
+            self._base.turned(self._parameters.turned(DIFFERENTIATION_STEP * unit[lens:turns]))
+            if unit[lens:].any()
+            else (self._view(self._parameters.state(DIFFERENTIATION_STEP * unit)))
+        )
         return view.distances(self.warm_start)
 
 
@@ -194,8 +216,11 @@ class RigidBodyBlock:
     def __init__(self, parameters: Parameterisation, bundle: TrackletBundle, shapes: StructureAndMotion | None) -> None:
         self._parameters, self._bundle, base = parameters, bundle, parameters.base
         self.vehicle_ids, self.vehicle_weight, self.dof = bundle.lives.bodies, bundle.lives.body_weights, bundle.dof
-        self.warm_start = (bundle.initialised(base.camera, base.rotation) if shapes is None
-                      else bundle.refined(base.camera, base.rotation, shapes))
+        self.warm_start = (
+            bundle.initialised(base.camera, base.rotation)
+            if shapes is None
+            else bundle.refined(base.camera, base.rotation, shapes)
+        )
         here = bundle.residuals(base.camera, base.rotation, self.warm_start)
         self._root = np.sqrt(bundle.robust_weight(here))[:, :, None, None]
         self._here = here
@@ -215,8 +240,10 @@ class RigidBodyBlock:
         parameters, bundle, base = self._parameters, self._bundle, self._parameters.base
         slopes, by_place = bundle.slopes(base.camera, base.rotation, self.warm_start)
         lenses = [parameters.camera(DIFFERENTIATION_STEP * unit) for unit in np.eye(parameters.lens)]
-        columns = [change / DIFFERENTIATION_STEP
-                   for change in bundle.residual_changes(lenses, base.camera, base.rotation, self.warm_start)]
+        columns = [
+            change / DIFFERENTIATION_STEP
+            for change in bundle.residual_changes(lenses, base.camera, base.rotation, self.warm_start)
+        ]
         columns += [bundle.rotation_jacobian(axis, by_place, self.warm_start) for axis in parameters.axes]
         columns += [np.zeros(self._here.shape)] * len(parameters.free_angles)
         own, here = bundle.weighted_system(slopes, self._here)

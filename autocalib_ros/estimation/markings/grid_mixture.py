@@ -94,9 +94,11 @@ class _GridState:
     def moved(self, step: np.ndarray, prior: LensPrior) -> _GridState:
         """Return the pose after a step of the lens, of turns about the axes of the plane, and of the angle."""
         lens = len(prior.free)
-        return _GridState(prior.moved(self.camera, step[:lens]),
-                     self.rotation @ Rotation.from_rotvec(step[lens:lens + 3]).as_matrix(),
-                     self.skew_rad + float(step[lens + 3]))
+        return _GridState(
+            prior.moved(self.camera, step[:lens]),
+            self.rotation @ Rotation.from_rotvec(step[lens : lens + 3]).as_matrix(),
+            self.skew_rad + float(step[lens + 3]),
+        )
 
 
 class _GridMixture:
@@ -105,7 +107,9 @@ class _GridMixture:
     def __init__(self, lines: RoadSegments, prior: LensPrior) -> None:
         self.lines, self.prior, self.weights, self._noise = lines, prior, lines.weights, _noise_rad(lines)
         self.fractions, self.scale = START_FRACTIONS[:, 0], 1.0
-        self._through = lru_cache(maxsize=LENS_CACHE_SIZE)(partial(ProjectedSegments.from_camera, ends_px=lines.ends_px))
+        self._through = lru_cache(maxsize=LENS_CACHE_SIZE)(
+            partial(ProjectedSegments.from_camera, ends_px=lines.ends_px)
+        )
 
     def residuals(self, pose: _GridState) -> np.ndarray:
         """Of each direction, shape (3, n)."""
@@ -128,7 +132,9 @@ class _GridMixture:
 
     def fit_fractions(self, responsibilities: np.ndarray) -> None:
         """One round of maximisation for the shares."""
-        fractions = np.clip(responsibilities @ self.weights / self.weights.sum(), MIN_DIRECTION_FRACTION, MAX_DIRECTION_FRACTION)
+        fractions = np.clip(
+            responsibilities @ self.weights / self.weights.sum(), MIN_DIRECTION_FRACTION, MAX_DIRECTION_FRACTION
+        )
         self.fractions = fractions * min(1.0, MAX_ALIGNED_FRACTION / fractions.sum())
 
     def fit_scale(self, responsibilities: np.ndarray, residuals: np.ndarray, sigmas: np.ndarray) -> None:
@@ -138,14 +144,21 @@ class _GridMixture:
         self.scale *= float(np.sqrt(trusted.sum() / max(held.sum(), 1e-12)))
         self.scale = float(np.clip(self.scale, MIN_NOISE_SCALE, MAX_NOISE_SCALE))
 
-    def linearised(self, pose: _GridState, responsibilities: np.ndarray, sigmas: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def linearised(
+        self, pose: _GridState, responsibilities: np.ndarray, sigmas: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Gradient (n, p) and information (n, p, p) of each line by the parameters, their weights aside."""
         here, size = self.residuals(pose), len(self.prior.free) + 4
-        slopes = np.stack([wrap_undirected(self.residuals(pose.moved(GRID_DERIVATIVE_STEP * unit, self.prior)) - here) / GRID_DERIVATIVE_STEP
-                           for unit in np.eye(size)], axis=-1)
+        slopes = np.stack(
+            [
+                wrap_undirected(self.residuals(pose.moved(GRID_DERIVATIVE_STEP * unit, self.prior)) - here)
+                / GRID_DERIVATIVE_STEP
+                for unit in np.eye(size)
+            ],
+            axis=-1,
+        )
         pull = responsibilities * student_weight(here, sigmas) / sigmas**2
-        return (((pull * here)[..., None] * slopes).sum(axis=0),
-                np.einsum('kn,kni,knj->nij', pull, slopes, slopes))
+        return (((pull * here)[..., None] * slopes).sum(axis=0), np.einsum('kn,kni,knj->nij', pull, slopes, slopes))
 
     def known(self, pose: _GridState) -> tuple[np.ndarray, np.ndarray]:
         """Gradient (p,) and information (p,) of what is known before of lens and angle."""
@@ -156,8 +169,9 @@ class _GridMixture:
         return gradient, information
 
 
-def refine_grid(lines: RoadSegments, prior: LensPrior, camera: Camera, rotation: np.ndarray,
-                 widths_rad: tuple[float, ...]) -> MarkingGrid:
+def refine_grid(
+    lines: RoadSegments, prior: LensPrior, camera: Camera, rotation: np.ndarray, widths_rad: tuple[float, ...]
+) -> MarkingGrid:
     """Solve from a start: shares, scale, and damped Gauss-Newton steps on the mixture's probability."""
     mixture, pose = _GridMixture(lines, prior), _GridState(camera, rotation)
     for width_rad in widths_rad:
@@ -181,11 +195,22 @@ def refine_grid(lines: RoadSegments, prior: LensPrior, camera: Camera, rotation:
     covariance = jackknife_covariance(gradients, curvatures, lines.weights, np.zeros(len(lines)), lines.groups, known)
     units = np.append(np.ones(len(known) - 1), RIGHT_ANGLE_SIGMA_RAD)
     information = (np.tensordot(lines.weights, curvatures, 1) + np.diag(known + 1e-9)) * np.outer(units, units)
-    return MarkingGrid(prior, pose.camera, pose.rotation, pose.skew_rad, cost, mixture.fractions, responsibilities,
-                float(0.5 * np.linalg.slogdet(information)[1]), covariance)
+    return MarkingGrid(
+        prior,
+        pose.camera,
+        pose.rotation,
+        pose.skew_rad,
+        cost,
+        mixture.fractions,
+        responsibilities,
+        float(0.5 * np.linalg.slogdet(information)[1]),
+        covariance,
+    )
 
 
-def _damped_step(mixture: _GridMixture, pose: _GridState, sigmas: np.ndarray, damping: float) -> tuple[_GridState, float, float] | None:
+def _damped_step(
+    mixture: _GridMixture, pose: _GridState, sigmas: np.ndarray, damping: float
+) -> tuple[_GridState, float, float] | None:
     """Return the pose after a step that lowers the cost, its size and the next damping; None where none does."""
     cost, responsibilities = mixture.cost(pose, sigmas)
     gradients, curvatures = mixture.linearised(pose, responsibilities, sigmas)

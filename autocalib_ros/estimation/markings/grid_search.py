@@ -58,8 +58,10 @@ def find_grids(lines: RoadSegments, priors: list[LensPrior]) -> list[MarkingGrid
     for prior in priors[1:] if best else []:
         near = replace(prior.start(best.camera.focal_px), principal_point_px=best.camera.principal_point_px)
         rarer.append(refine_grid(lines, prior, near, best.rotation, ANNEALING_WIDTHS_RAD))
-    return sorted([*grids, *rarer], key=lambda grid: grid.negative_log_evidence + (
-        MIN_EVIDENCE_GAIN_NATS if grid.prior is not priors[0] else 0.0))
+    return sorted(
+        [*grids, *rarer],
+        key=lambda grid: grid.negative_log_evidence + (MIN_EVIDENCE_GAIN_NATS if grid.prior is not priors[0] else 0.0),
+    )
 
 
 def find_grids_near(lines: RoadSegments, prior: LensPrior, camera: Camera, normal: np.ndarray) -> list[MarkingGrid]:
@@ -75,9 +77,16 @@ def find_grids_near(lines: RoadSegments, prior: LensPrior, camera: Camera, norma
 def _retry_focal_lengths(lines: RoadSegments, best: MarkingGrid) -> list[MarkingGrid]:
     """Solutions from other focal lengths than that of the best, if it is free."""
     prior = best.prior
-    return [] if prior.focal_known or not len(prior.free) else [
-        refine_grid(lines, prior, prior.start(ratio * best.camera.focal_px), best.rotation, ANNEALING_WIDTHS_RAD[-2:])
-        for ratio in FOCAL_RETRY_RATIOS]
+    return (
+        []
+        if prior.focal_known or not len(prior.free)
+        else [
+            refine_grid(
+                lines, prior, prior.start(ratio * best.camera.focal_px), best.rotation, ANNEALING_WIDTHS_RAD[-2:]
+            )
+            for ratio in FOCAL_RETRY_RATIOS
+        ]
+    )
 
 
 def _is_determined(lines: RoadSegments, prior: LensPrior) -> bool:
@@ -85,12 +94,17 @@ def _is_determined(lines: RoadSegments, prior: LensPrior) -> bool:
     return len(lines) >= len(prior.free) + 4
 
 
-def keep_lines_near_traffic(lines: RoadSegments, grid: MarkingGrid, evidence: Evidence) -> tuple[RoadSegments, MarkingGrid] | None:
+def keep_lines_near_traffic(
+    lines: RoadSegments, grid: MarkingGrid, evidence: Evidence
+) -> tuple[RoadSegments, MarkingGrid] | None:
     """Keep the lines that are beside traffic on the plane of a grid, and settle it with them; None where few are."""
     places, points = (_on_plane(grid, pixels) for pixels in (traffic_cells(evidence), sample_segments(lines.ends_px)))
     there = np.isfinite(points).all(axis=(1, 2))
-    kept = there & all_within(np.where(there[:, None, None], points, 0.0), places[np.isfinite(places).all(axis=1)],
-                           MAX_DISTANCE_TO_TRAFFIC_HEIGHTS)
+    kept = there & all_within(
+        np.where(there[:, None, None], points, 0.0),
+        places[np.isfinite(places).all(axis=1)],
+        MAX_DISTANCE_TO_TRAFFIC_HEIGHTS,
+    )
     # posts stand anywhere
     kept |= grid.responsibilities[2] > 0.5
     if not _is_determined(lines.subset(kept), grid.prior):
@@ -132,11 +146,16 @@ def _best_starts(lines: RoadSegments, prior: LensPrior) -> list[tuple[Camera, np
     for focal in [prior.centre.focal_px] if prior.focal_known else diagonal * GRID_FOCAL_DIAGONALS:
         camera = prior.start(focal)
         costs = annealed_costs(lines, camera, planes, ANNEALING_WIDTHS_RAD[0])
-        found += [(costs[index], camera, planes[index]) for index in np.argsort(costs, kind='stable')[:5 * MAX_GRID_STARTS]]
+        found += [
+            (costs[index], camera, planes[index]) for index in np.argsort(costs, kind='stable')[: 5 * MAX_GRID_STARTS]
+        ]
     chosen: list[tuple[Camera, np.ndarray]] = []
     for _, camera, plane in sorted(found, key=lambda start: start[0]):
-        if not any(abs(np.log(camera.focal_px / other.focal_px)) < MIN_START_LOG_FOCAL
-                   and plane[:, 2] @ elsewhere[:, 2] > np.cos(MIN_START_NORMAL_RAD) for other, elsewhere in chosen):
+        if not any(
+            abs(np.log(camera.focal_px / other.focal_px)) < MIN_START_LOG_FOCAL
+            and plane[:, 2] @ elsewhere[:, 2] > np.cos(MIN_START_NORMAL_RAD)
+            for other, elsewhere in chosen
+        ):
             chosen.append((camera, plane))
         if len(chosen) == MAX_GRID_STARTS:
             break

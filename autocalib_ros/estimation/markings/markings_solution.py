@@ -37,8 +37,9 @@ MAX_SKEW_SIGMAS = 2.5
 """Markings are square when the angle between them differs by no more from a right one."""
 
 
-def fit_to_markings(evidence: Evidence, tracks: TrackSet, priors: list[LensPrior], config: AdjustmentConfig,
-                    gate: GateOptions) -> tuple[Adjustment, str] | Reason:
+def fit_to_markings(
+    evidence: Evidence, tracks: TrackSet, priors: list[LensPrior], config: AdjustmentConfig, gate: GateOptions
+) -> tuple[Adjustment, str] | Reason:
     """Estimate lens and plane from the lines on the road; with what was assumed in words, or a reason why not."""
     every = segments_on_road(evidence)
     grids = find_grids(every, priors)
@@ -49,12 +50,15 @@ def fit_to_markings(evidence: Evidence, tracks: TrackSet, priors: list[LensPrior
     state = AdjustmentState(best.camera, best.rotation, np.array([0.0, np.pi / 2 + best.skew_rad]))
     fit = evaluate_at(state, tracks, replace(config, prior=best.prior, crossing_rad=None), best.covariance)
     if not fit.focal_sigma <= gate.max_sigma_focal_rel:
-        return _no_markings(f'the focal length to {min(fit.focal_sigma, 9.99):.1%}, {gate.max_sigma_focal_rel:.0%} is needed')
+        return _no_markings(
+            f'the focal length to {min(fit.focal_sigma, 9.99):.1%}, {gate.max_sigma_focal_rel:.0%} is needed'
+        )
     return check_markings_view(fit, tracks) or (fit, _describe(lines, best))
 
 
-def refine_with_markings(fit: Adjustment, evidence: Evidence, tracks: TrackSet, prior: LensPrior,
-              gate: GateOptions) -> tuple[Adjustment, str] | Reason:
+def refine_with_markings(
+    fit: Adjustment, evidence: Evidence, tracks: TrackSet, prior: LensPrior, gate: GateOptions
+) -> tuple[Adjustment, str] | Reason:
     """Return the lens and plane near those of a solution to which the lines on the road lead, with its roads.
 
     With what was assumed in words, or a reason why not.
@@ -92,8 +96,10 @@ def _upward_normal(fit: Adjustment) -> np.ndarray:
 def _describe(lines: RoadSegments, grid: MarkingGrid) -> str:
     told = grid.responsibilities[:2].max(axis=0) > 0.5
     places, tested_deg = len(np.unique(lines.groups[told])), 90.0 + np.degrees(grid.skew_rad)
-    return (f'{told.sum()} lines in {places} places on the road taken as parallel or square to each other: '
-            f'90 +- {np.degrees(RIGHT_ANGLE_SIGMA_RAD):g} degrees (tested: {tested_deg:.1f})')
+    return (
+        f'{told.sum()} lines in {places} places on the road taken as parallel or square to each other: '
+        f'90 +- {np.degrees(RIGHT_ANGLE_SIGMA_RAD):g} degrees (tested: {tested_deg:.1f})'
+    )
 
 
 def condition_on_lens(fit: Adjustment) -> Adjustment:
@@ -104,8 +110,9 @@ def condition_on_lens(fit: Adjustment) -> Adjustment:
     return replace(fit, covariance=covariance)
 
 
-def _accepted_grid(every: RoadSegments, grids: list[MarkingGrid], evidence: Evidence, gate: GateOptions,
-               min_places: int) -> tuple[RoadSegments, MarkingGrid] | Reason:
+def _accepted_grid(
+    every: RoadSegments, grids: list[MarkingGrid], evidence: Evidence, gate: GateOptions, min_places: int
+) -> tuple[RoadSegments, MarkingGrid] | Reason:
     """Return the lines beside traffic and the best grid by them, or what speaks against it."""
     if not grids:
         return _no_markings(f'there are {len(every)}')
@@ -135,7 +142,9 @@ def _normal_difference_deg(lines: RoadSegments, one: MarkingGrid, other: Marking
 
     A principal point farther down is an axis that looks farther down: that is no other plane.
     """
-    turn, _ = Rotation.align_vectors(*(ProjectedSegments.from_camera(grid.camera, lines.ends_px).bearings for grid in (one, other)))
+    turn, _ = Rotation.align_vectors(
+        *(ProjectedSegments.from_camera(grid.camera, lines.ends_px).bearings for grid in (one, other))
+    )
     return unsigned_angle_deg(one.rotation[:, 2], turn.apply(other.rotation[:, 2]))
 
 
@@ -144,8 +153,10 @@ def _check_axes(lines: RoadSegments, grid: MarkingGrid, min_places: int) -> Reas
     places = min(len(np.unique(lines.groups[mask])) for mask in grid.responsibilities[:2] > 0.5)
     share = grid.fractions[:2].min()
     if share < MIN_ALIGNED_FRACTION or places < min_places:
-        return _no_markings(f'{share:.0%} of them, in {places} places, are along the second of two directions; '
-                     f'{MIN_ALIGNED_FRACTION:.0%} in {min_places} places are needed')
+        return _no_markings(
+            f'{share:.0%} of them, in {places} places, are along the second of two directions; '
+            f'{MIN_ALIGNED_FRACTION:.0%} in {min_places} places are needed'
+        )
     if abs(grid.skew_rad) > MAX_SKEW_SIGMAS * RIGHT_ANGLE_SIGMA_RAD:
         return _no_markings(f'they cross at {90 + np.degrees(grid.skew_rad):.1f} degrees, not at a right angle')
     return None

@@ -67,7 +67,9 @@ class WindowRays:
     """Standard deviation of a tracked point over the window, shape (windows, points)."""
 
     @classmethod
-    def of(cls, windows: TwoFrameWindows, camera: Camera, camera_from_plane: np.ndarray, options: JointOptions) -> WindowRays:
+    def of(
+        cls, windows: TwoFrameWindows, camera: Camera, camera_from_plane: np.ndarray, options: JointOptions
+    ) -> WindowRays:
         """See windows with a camera over a plane (3, 3)."""
         rays = unproject_rays(camera, np.stack([windows.first_px, windows.second_px]))
         first, second = (Rays(rays.bearings[at], rays.radial[at], rays.tangential[at]) for at in (0, 1))
@@ -78,8 +80,10 @@ class WindowRays:
 
     def turned(self, rotation: np.ndarray) -> WindowRays:
         """Return the view in a frame that is turned, old_from_new (3, 3)."""
-        first, second = (Rays(rays.bearings @ rotation, rays.radial @ rotation, rays.tangential @ rotation)
-                         for rays in (self.first, self.second))
+        first, second = (
+            Rays(rays.bearings @ rotation, rays.radial @ rotation, rays.tangential @ rotation)
+            for rays in (self.first, self.second)
+        )
         return replace(self, first=first, second=second)
 
     def distances(self, motion: PlanarMotion) -> np.ndarray:
@@ -92,17 +96,30 @@ class WindowRays:
         # the epipolar line of the first point, t x R a, and that of the second, R^T (b x t)
         line = np.stack([across * z, -along * z, along * turned[1] - across * turned[0]], axis=-1)
         back = (-w * across, w * along)
-        line_back = np.stack([cosine * back[0] + sine * back[1], cosine * back[1] - sine * back[0],
-                              u * across - v * along], axis=-1)
-        gradient2 = (dot(self.second.radial, line)**2 + dot(self.second.tangential, line)**2
-                     + dot(self.first.radial, line_back)**2 + dot(self.first.tangential, line_back)**2)
+        line_back = np.stack(
+            [cosine * back[0] + sine * back[1], cosine * back[1] - sine * back[0], u * across - v * along], axis=-1
+        )
+        gradient2 = (
+            dot(self.second.radial, line) ** 2
+            + dot(self.second.tangential, line) ** 2
+            + dot(self.first.radial, line_back) ** 2
+            + dot(self.first.tangential, line_back) ** 2
+        )
         apart = u * line[..., 0] + v * line[..., 1] + w * line[..., 2]
         return self.mask * apart / (np.sqrt(np.maximum(gradient2, 1e-18)) * self.sigma_px)
 
     def slopes(self, motion: PlanarMotion, here: np.ndarray) -> np.ndarray:
         """Derivatives of the distances `here` by turn and heading, shape (windows, points, 2)."""
-        return np.stack([self.distances(motion.moved(DERIVATIVE_STEP, 0.0)) - here,
-                         self.distances(motion.moved(0.0, DERIVATIVE_STEP)) - here], axis=-1) / DERIVATIVE_STEP
+        return (
+            np.stack(
+                [
+                    self.distances(motion.moved(DERIVATIVE_STEP, 0.0)) - here,
+                    self.distances(motion.moved(0.0, DERIVATIVE_STEP)) - here,
+                ],
+                axis=-1,
+            )
+            / DERIVATIVE_STEP
+        )
 
 
 def turn_sigma(view: WindowRays, motion: PlanarMotion) -> np.ndarray:
@@ -117,8 +134,14 @@ def _normal_matrix(slopes: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, 
     return tuple((weight * slopes[..., i] * slopes[..., j]).sum(axis=1) for i, j in ((0, 0), (0, 1), (1, 1)))
 
 
-def without_side_slip(windows: TwoFrameWindows, view: WindowRays, motion: PlanarMotion, camera: Camera, camera_from_plane: np.ndarray,
-              height_m: float) -> tuple[np.ndarray, np.ndarray]:
+def without_side_slip(
+    windows: TwoFrameWindows,
+    view: WindowRays,
+    motion: PlanarMotion,
+    camera: Camera,
+    camera_from_plane: np.ndarray,
+    height_m: float,
+) -> tuple[np.ndarray, np.ndarray]:
     """Which windows show a vehicle that goes as it points, and which of them that it turns, shape (windows,) each.
 
     Two vehicles side by side that were taken for one seem to turn when one is faster, on straight paths. How far the
@@ -128,7 +151,9 @@ def without_side_slip(windows: TwoFrameWindows, view: WindowRays, motion: Planar
     path_deg, body_deg = _path_and_body_turns_deg(point_turns_deg, motion)
     path_sigma_deg = (point_turns_deg.std(axis=1) / np.sqrt(np.maximum(windows.mask.sum(axis=1), 1))).filled(0.0)
     sigma_deg = np.degrees(turn_sigma(view, motion))
-    alike = np.abs(body_deg - path_deg) < MAX_SIDE_SLIP_DEG + MAX_SIDE_SLIP_FRACTION * np.abs(path_deg) + 2.0 * sigma_deg
+    alike = (
+        np.abs(body_deg - path_deg) < MAX_SIDE_SLIP_DEG + MAX_SIDE_SLIP_FRACTION * np.abs(path_deg) + 2.0 * sigma_deg
+    )
     sure = sigma_deg < MAX_TURN_SIGMA_DEG
     way = np.hypot(*np.moveaxis(before, -1, 0)) + np.hypot(*np.moveaxis(after, -1, 0))
     path_m = height_m * np.ma.median(np.ma.array(way, mask=~windows.mask), axis=1).filled(0.0)
@@ -136,7 +161,9 @@ def without_side_slip(windows: TwoFrameWindows, view: WindowRays, motion: Planar
     course = alike & sure & driven & ~windows.from_segments
     turning = course & (np.abs(path_deg) > MIN_TURN_DEG + 2.0 * path_sigma_deg)
     for row in np.flatnonzero(windows.from_segments & sure):
-        near = (windows.bodies == windows.bodies[row]) & (np.abs(windows.times_s - windows.times_s[row]) < MAX_SEGMENT_TIME_DIFFERENCE_S)
+        near = (windows.bodies == windows.bodies[row]) & (
+            np.abs(windows.times_s - windows.times_s[row]) < MAX_SEGMENT_TIME_DIFFERENCE_S
+        )
         near &= ~windows.from_segments
         course[row], turning[row] = (near & course).any(), (near & turning).any()
     return course, turning
@@ -159,8 +186,9 @@ def _path_and_body_turns_deg(point_turns_deg: np.ma.MaskedArray, motion: PlanarM
     return np.ma.median(point_turns_deg, axis=1).filled(0.0), np.degrees(np.angle(np.exp(1j * motion.turn_rad)))
 
 
-def _chords_and_turns(windows: TwoFrameWindows, camera: Camera,
-           camera_from_plane: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ma.MaskedArray]:
+def _chords_and_turns(
+    windows: TwoFrameWindows, camera: Camera, camera_from_plane: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ma.MaskedArray]:
     """Ways (windows, points, 2) on the plane to and from the middle, and how far each point's path turns, degrees."""
     first, middle, second = paths(windows, camera, camera_from_plane)
     before, after = middle - first, second - middle
@@ -172,16 +200,21 @@ def _chords_and_turns(windows: TwoFrameWindows, camera: Camera,
 
 def paths(windows: TwoFrameWindows, camera: Camera, camera_from_plane: np.ndarray) -> tuple[np.ndarray, ...]:
     """Where the points of windows are on the plane, at three instants, in heights; shape (windows, points, 2) each."""
-    return tuple(_on_plane(unproject_rays(camera, np.nan_to_num(pixels)).bearings @ camera_from_plane)
-                 for pixels in (windows.first_px, windows.middle_px, windows.second_px))
+    return tuple(
+        _on_plane(unproject_rays(camera, np.nan_to_num(pixels)).bearings @ camera_from_plane)
+        for pixels in (windows.first_px, windows.middle_px, windows.second_px)
+    )
 
 
-def turning_centres(windows: TwoFrameWindows, camera: Camera, camera_from_plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def turning_centres(
+    windows: TwoFrameWindows, camera: Camera, camera_from_plane: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Centre (windows, 2) about which each window of tracks turns, in heights, and its distance (windows,)."""
     seen = windows.subset(np.flatnonzero(~windows.from_segments))
     share = seen.mask / np.maximum(seen.mask.sum(axis=1, keepdims=True), 1)
-    first, middle, second = ((share[..., None] * places).sum(axis=1)
-                             for places in paths(seen, camera, camera_from_plane))
+    first, middle, second = (
+        (share[..., None] * places).sum(axis=1) for places in paths(seen, camera, camera_from_plane)
+    )
     # the centre of the circle through three points
     a, b = middle - first, second - first
     across = 2.0 * (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
@@ -213,20 +246,24 @@ def initial_motion(view: WindowRays) -> PlanarMotion:
     best = np.full(count, np.inf)
     found = PlanarMotion(np.zeros(count), np.zeros(count))
     for turn in np.radians([*START_TURNS_DEG, *(-turn for turn in START_TURNS_DEG[1:])]):
-        rotated = view.first.bearings @ np.array([[np.cos(turn), np.sin(turn), 0.0],
-                                                  [-np.sin(turn), np.cos(turn), 0.0], [0.0, 0.0, 1.0]])
+        rotated = view.first.bearings @ np.array(
+            [[np.cos(turn), np.sin(turn), 0.0], [-np.sin(turn), np.cos(turn), 0.0], [0.0, 0.0, 1.0]]
+        )
         # b . (t x R a) = t . (R a x b)
         a, b = rotated, view.second.bearings
         x, y = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1], a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
-        size = view.mask / np.maximum(np.sqrt(x * x + y * y + (a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])**2), 1e-3)
+        size = view.mask / np.maximum(
+            np.sqrt(x * x + y * y + (a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]) ** 2), 1e-3
+        )
         x, y = x * size, y * size
         heading = 0.5 * np.arctan2(2 * (x * y).sum(axis=1), (x * x - y * y).sum(axis=1)) + np.pi / 2
         trial = PlanarMotion(np.full(count, turn), heading)
         cost = point_cost(view.distances(trial))
         better = cost < best
         best = np.where(better, cost, best)
-        found = PlanarMotion(np.where(better, trial.turn_rad, found.turn_rad),
-                       np.where(better, trial.heading_rad, found.heading_rad))
+        found = PlanarMotion(
+            np.where(better, trial.turn_rad, found.turn_rad), np.where(better, trial.heading_rad, found.heading_rad)
+        )
     return refined(view, found, 2 * WARM_START_ROUNDS)
 
 
@@ -242,14 +279,16 @@ def refined(view: WindowRays, motion: PlanarMotion, rounds: int = WARM_START_ROU
         lift = damping * (a + d) + 1e-9
         a, d = a + lift, d + lift
         determinant = a * d - b * b
-        trial = motion.moved(np.clip((b * q - d * p) / determinant, -0.2, 0.2),
-                             np.clip((b * p - a * q) / determinant, -0.2, 0.2))
+        trial = motion.moved(
+            np.clip((b * q - d * p) / determinant, -0.2, 0.2), np.clip((b * p - a * q) / determinant, -0.2, 0.2)
+        )
         there = view.distances(trial)
         cost_there = point_cost(there)
         better = cost_there <= cost
         gain = np.max(cost - cost_there, initial=0.0, where=better)
-        motion = PlanarMotion(np.where(better, trial.turn_rad, motion.turn_rad),
-                        np.where(better, trial.heading_rad, motion.heading_rad))
+        motion = PlanarMotion(
+            np.where(better, trial.turn_rad, motion.turn_rad), np.where(better, trial.heading_rad, motion.heading_rad)
+        )
         here, cost = np.where(better[:, None], there, here), np.where(better, cost_there, cost)
         damping = np.where(better, np.maximum(damping / 10, 1e-6), np.minimum(damping * 20, 1e3))
         if better.all() and gain < 1e-4:

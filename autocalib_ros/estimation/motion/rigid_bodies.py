@@ -44,9 +44,12 @@ class StructureAndMotion:
     def stepped(self, step: np.ndarray) -> StructureAndMotion:
         """Return the shapes moved by a step (lives, 3 points + 3 instants)."""
         lives, points, _ = self.points.shape
-        poses = step[:, 3 * points:].reshape(lives, -1, 3)
-        return StructureAndMotion(self.points + step[:, :3 * points].reshape(lives, points, 3), self.translations + poses[..., :2],
-                      self.turns_rad + poses[..., 2])
+        poses = step[:, 3 * points :].reshape(lives, -1, 3)
+        return StructureAndMotion(
+            self.points + step[:, : 3 * points].reshape(lives, points, 3),
+            self.translations + poses[..., :2],
+            self.turns_rad + poses[..., 2],
+        )
 
     def subset(self, keep: np.ndarray) -> StructureAndMotion:
         """Return the shapes of the lives that `keep` selects."""
@@ -54,9 +57,11 @@ class StructureAndMotion:
 
     def where(self, better: np.ndarray, other: StructureAndMotion) -> StructureAndMotion:
         """Return these shapes with those lives (lives,) from the other."""
-        return StructureAndMotion(np.where(better[:, None, None], other.points, self.points),
-                      np.where(better[:, None, None], other.translations, self.translations),
-                      np.where(better[:, None], other.turns_rad, self.turns_rad))
+        return StructureAndMotion(
+            np.where(better[:, None, None], other.points, self.points),
+            np.where(better[:, None, None], other.translations, self.translations),
+            np.where(better[:, None], other.turns_rad, self.turns_rad),
+        )
 
 
 class TrackletBundle:
@@ -104,7 +109,9 @@ class TrackletBundle:
         slopes, _ = self.slopes(camera, camera_from_plane, shapes)
         slopes = slopes.reshape(len(self.lives), -1, slopes.shape[-1])
         eigenvalues = np.linalg.eigvalsh(slopes.transpose(0, 2, 1) @ slopes)
-        volume = np.log(np.where(eigenvalues > MIN_EIGENVALUE_FRACTION * eigenvalues[:, -1:], eigenvalues, 1.0)).sum(axis=1)
+        volume = np.log(np.where(eigenvalues > MIN_EIGENVALUE_FRACTION * eigenvalues[:, -1:], eigenvalues, 1.0)).sum(
+            axis=1
+        )
         return float((self.dof * np.log(max(scale, 1e-9)) - 2.0 * density + volume).sum())
 
     def initial_guess(self, camera: Camera, camera_from_plane: np.ndarray) -> StructureAndMotion:
@@ -113,12 +120,16 @@ class TrackletBundle:
         side = float(np.sign(np.median(bearings[..., 2][self.mask]))) if self.mask.any() else 1.0
         ground = bearings[..., :2] / np.maximum(side * bearings[..., 2:], START_MIN_DEPRESSION_RAD)
         count, points, instants = self.mask.shape
-        shapes = StructureAndMotion(np.zeros((count, points, 3)), np.zeros((count, instants, 2)), np.zeros((count, instants)))
+        shapes = StructureAndMotion(
+            np.zeros((count, points, 3)), np.zeros((count, instants, 2)), np.zeros((count, instants))
+        )
         shapes.points[..., 2] = side
         for tracklet in range(count):
             placed = np.full((points, 2), np.nan)
-            for instant in sorted(np.flatnonzero(self.mask[tracklet].any(axis=0)),
-                                  key=lambda other, near=self.reference[tracklet]: abs(int(other) - int(near))):
+            for instant in sorted(
+                np.flatnonzero(self.mask[tracklet].any(axis=0)),
+                key=lambda other, near=self.reference[tracklet]: abs(int(other) - int(near)),
+            ):
                 here, seen = ground[tracklet, :, instant], self.mask[tracklet, :, instant]
                 known = seen & np.isfinite(placed[:, 0])
                 turn, move = _rigid_transform(placed[known], here[known]) if known.sum() >= 2 else (0.0, np.zeros(2))
@@ -132,7 +143,9 @@ class TrackletBundle:
         """Whitened residuals (lives, points, instants, 2)."""
         return self.whiten @ self.reprojection_errors_px(camera, camera_from_plane, shapes)
 
-    def reprojection_errors_px(self, camera: Camera, camera_from_plane: np.ndarray, shapes: StructureAndMotion) -> np.ndarray:
+    def reprojection_errors_px(
+        self, camera: Camera, camera_from_plane: np.ndarray, shapes: StructureAndMotion
+    ) -> np.ndarray:
         """From each observed pixel to where its point should be seen, shape (lives, points, instants, 2)."""
         pixels, _ = camera.project(self._positions(shapes) @ camera_from_plane.T)
         return (pixels - self.lives.pixels) * self.mask[..., None]
@@ -142,8 +155,9 @@ class TrackletBundle:
         cosine, sine = np.cos(shapes.turns_rad)[:, None], np.sin(shapes.turns_rad)[:, None]
         x, y, z = (shapes.points[:, :, None, axis] for axis in range(3))
         right, ahead = (shapes.translations[:, None, :, axis] for axis in range(2))
-        return np.stack([cosine * x - sine * y + right, sine * x + cosine * y + ahead,
-                         np.broadcast_to(z, self.mask.shape)], axis=-1)
+        return np.stack(
+            [cosine * x - sine * y + right, sine * x + cosine * y + ahead, np.broadcast_to(z, self.mask.shape)], axis=-1
+        )
 
     def robust_weight(self, residuals: np.ndarray, cauchy_scale: float = CAUCHY_SCALE) -> np.ndarray:
         """Influence (lives, points) of points by their mean squared residuals."""
@@ -151,12 +165,16 @@ class TrackletBundle:
 
     def cost(self, residuals: np.ndarray, cauchy_scale: float = CAUCHY_SCALE) -> np.ndarray:
         """Cost (lives,) whose influence is `robust_weight`."""
-        return (self.point_freedom * cauchy_scale**2 * np.log1p(self._scaled_squares(residuals, cauchy_scale))).sum(axis=1)
+        return (self.point_freedom * cauchy_scale**2 * np.log1p(self._scaled_squares(residuals, cauchy_scale))).sum(
+            axis=1
+        )
 
     def _scaled_squares(self, residuals: np.ndarray, cauchy_scale: float) -> np.ndarray:
         return (residuals**2).sum(axis=(2, 3)) / self.point_freedom / cauchy_scale**2
 
-    def slopes(self, camera: Camera, camera_from_plane: np.ndarray, shapes: StructureAndMotion) -> tuple[np.ndarray, np.ndarray]:
+    def slopes(
+        self, camera: Camera, camera_from_plane: np.ndarray, shapes: StructureAndMotion
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Derivatives of the residuals by the unknowns of each life, and of the pixels by the positions.
 
         Shapes (lives, points, instants, 2, 3 points + 3 instants) and (lives, points, instants, 2, 3).
@@ -165,8 +183,13 @@ class TrackletBundle:
         in_camera = placed @ camera_from_plane.T
         here, _ = camera.project(in_camera)
         # a step of a millionth of the distance, whatever the size of the body
-        by_place = np.stack([camera.project(in_camera + DERIVATIVE_STEP * axis)[0] - here for axis in camera_from_plane.T],
-                            axis=-1) / DERIVATIVE_STEP * self.mask[..., None, None]
+        by_place = (
+            np.stack(
+                [camera.project(in_camera + DERIVATIVE_STEP * axis)[0] - here for axis in camera_from_plane.T], axis=-1
+            )
+            / DERIVATIVE_STEP
+            * self.mask[..., None, None]
+        )
         cosine, sine = (part[:, None, :, None] for part in (np.cos(shapes.turns_rad), np.sin(shapes.turns_rad)))
         x, y, z = np.moveaxis(by_place, -1, 0)
         by_point = self._whitened(np.stack([x * cosine + y * sine, y * cosine - x * sine, z], axis=-1))
@@ -175,11 +198,11 @@ class TrackletBundle:
         lives, points, instants = self.mask.shape
         slopes = np.zeros((lives, points, instants, 2, 3 * points + 3 * instants))
         for point in range(points):
-            slopes[:, point, ..., 3 * point:3 * point + 3] = by_point[:, point]
+            slopes[:, point, ..., 3 * point : 3 * point + 3] = by_point[:, point]
         poses = self.whiten[..., None, None] * by_pose[:, :, None]
         # the body stands where it is at its reference instant
         poses[np.arange(lives), :, :, self.reference] = 0.0
-        slopes[..., 3 * points:] = np.moveaxis(poses, 3, 4).reshape(lives, points, instants, 2, -1)
+        slopes[..., 3 * points :] = np.moveaxis(poses, 3, 4).reshape(lives, points, instants, 2, -1)
         return slopes, by_place
 
     def _whitened(self, slopes: np.ndarray) -> np.ndarray:
@@ -187,8 +210,9 @@ class TrackletBundle:
         lives, points, instants = self.mask.shape
         return (self.whiten @ slopes.reshape(lives, points, instants, -1)).reshape(slopes.shape)
 
-    def residual_changes(self, cameras: list[Camera], camera: Camera, camera_from_plane: np.ndarray,
-                shapes: StructureAndMotion) -> list[np.ndarray]:
+    def residual_changes(
+        self, cameras: list[Camera], camera: Camera, camera_from_plane: np.ndarray, shapes: StructureAndMotion
+    ) -> list[np.ndarray]:
         """Whitened change (lives, points, instants, 2) of the residuals from one camera to each of others."""
         in_camera = self._positions(shapes) @ camera_from_plane.T
         here, _ = camera.project(in_camera)
@@ -206,8 +230,14 @@ class TrackletBundle:
             shapes = self.refined(camera, camera_from_plane, shapes, COLD_START_ROUNDS, cauchy_scale)
         return shapes
 
-    def refined(self, camera: Camera, camera_from_plane: np.ndarray, shapes: StructureAndMotion, rounds: int = WARM_START_ROUNDS,
-                cauchy_scale: float = CAUCHY_SCALE) -> StructureAndMotion:
+    def refined(
+        self,
+        camera: Camera,
+        camera_from_plane: np.ndarray,
+        shapes: StructureAndMotion,
+        rounds: int = WARM_START_ROUNDS,
+        cauchy_scale: float = CAUCHY_SCALE,
+    ) -> StructureAndMotion:
         """Improve the shapes by Levenberg-Marquardt rounds of each life's own."""
         damping = np.full(len(self.lives), START_DAMPING)
         here = self.residuals(camera, camera_from_plane, shapes)
@@ -229,8 +259,9 @@ class TrackletBundle:
                 break
         return shapes
 
-    def weighted_system(self, slopes: np.ndarray, residuals: np.ndarray,
-             cauchy_scale: float = CAUCHY_SCALE) -> tuple[np.ndarray, np.ndarray]:
+    def weighted_system(
+        self, slopes: np.ndarray, residuals: np.ndarray, cauchy_scale: float = CAUCHY_SCALE
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Slopes (lives, residuals, n) and residuals (lives, residuals), each point by the root of its trust."""
         root = np.sqrt(self.robust_weight(residuals, cauchy_scale))[:, :, None, None]
         count = len(self.lives)

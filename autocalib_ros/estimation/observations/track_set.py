@@ -39,8 +39,9 @@ class TrackSet:
 
     def subset(self, keep: np.ndarray) -> TrackSet:
         """Return the tracks that `keep`, a mask or indices, selects."""
-        return TrackSet(self.pixels[keep], self.weights[keep], self.vehicles[keep], self.sample_times_s[keep],
-                        self.indices[keep])
+        return TrackSet(
+            self.pixels[keep], self.weights[keep], self.vehicles[keep], self.sample_times_s[keep], self.indices[keep]
+        )
 
     @property
     def times_s(self) -> np.ndarray:
@@ -123,7 +124,8 @@ def count_earlier(*keys: np.ndarray) -> np.ndarray:
     _, group, counts = np.unique(np.column_stack(keys), axis=0, return_inverse=True, return_counts=True)
     earlier = np.empty(len(group), int)
     earlier[np.argsort(group, kind='stable', axis=None)] = np.arange(len(group)) - np.repeat(
-        np.cumsum(counts) - counts, counts)
+        np.cumsum(counts) - counts, counts
+    )
     return earlier
 
 
@@ -132,8 +134,13 @@ def _track_set(evidence: Evidence, indices: np.ndarray) -> TrackSet:
     chosen = np.round(np.linspace(0, ends - starts - 1, SAMPLES_PER_TRACK, axis=1)).astype(int)
     first = np.diff(chosen, axis=1, prepend=-1) > 0
     points = starts[:, None] + chosen
-    return TrackSet(evidence.points_px[points], first / first.sum(axis=1, keepdims=True),
-                    evidence.track_vehicles[indices].astype(int), evidence.times_s[points], indices)
+    return TrackSet(
+        evidence.points_px[points],
+        first / first.sum(axis=1, keepdims=True),
+        evidence.track_vehicles[indices].astype(int),
+        evidence.times_s[points],
+        indices,
+    )
 
 
 @dataclass(frozen=True)

@@ -53,8 +53,12 @@ class Tracklets:
 
 def no_tracklets() -> Tracklets:
     """Return none at all."""
-    return Tracklets(np.zeros((0, SAMPLES_PER_TRACK, MAX_INSTANTS, 2)), np.zeros((0, SAMPLES_PER_TRACK, MAX_INSTANTS), bool), np.zeros(0, int),
-                 np.zeros(0))
+    return Tracklets(
+        np.zeros((0, SAMPLES_PER_TRACK, MAX_INSTANTS, 2)),
+        np.zeros((0, SAMPLES_PER_TRACK, MAX_INSTANTS), bool),
+        np.zeros(0, int),
+        np.zeros(0),
+    )
 
 
 def find_tracklets(windows: TwoFrameWindows, instants: ResampledTracks, limit: int) -> Tracklets:
@@ -67,7 +71,9 @@ def find_tracklets(windows: TwoFrameWindows, instants: ResampledTracks, limit: i
         for begin in range(middles.min() - 1, middles.max() + 1, MAX_INSTANTS - 1):
             tracklet = _tracklet(tracks, np.arange(begin, min(begin + MAX_INSTANTS, middles.max() + 2)), instants)
             if tracklet is not None:
-                found.append((int(windows.bodies[members[0]]), *tracklet, (begin + 0.5 * MAX_INSTANTS) * RESAMPLING_INTERVAL_S))
+                found.append(
+                    (int(windows.bodies[members[0]]), *tracklet, (begin + 0.5 * MAX_INSTANTS) * RESAMPLING_INTERVAL_S)
+                )
     if not found:
         return no_tracklets()
     bodies, pixels, mask, times = (np.array(column) for column in zip(*found, strict=True))

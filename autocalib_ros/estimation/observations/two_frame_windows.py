@@ -62,8 +62,16 @@ class TwoFrameWindows:
 
     def subset(self, keep: np.ndarray) -> TwoFrameWindows:
         """Return the windows that `keep`, a mask or indices, selects."""
-        return TwoFrameWindows(self.first_px[keep], self.second_px[keep], self.middle_px[keep], self.mask[keep],
-                       self.bodies[keep], self.times_s[keep], self.duration_s[keep], self.tracks[keep])
+        return TwoFrameWindows(
+            self.first_px[keep],
+            self.second_px[keep],
+            self.middle_px[keep],
+            self.mask[keep],
+            self.bodies[keep],
+            self.times_s[keep],
+            self.duration_s[keep],
+            self.tracks[keep],
+        )
 
     @property
     def from_segments(self) -> np.ndarray:
@@ -114,8 +122,9 @@ class _PointGroup:
 
     def subset(self, keep: np.ndarray) -> _PointGroup:
         """Return the points with these indices."""
-        return _PointGroup(self.first[keep], self.second[keep], self.middle[keep], self.tracks[keep], self.time_s,
-                      self.duration_s)
+        return _PointGroup(
+            self.first[keep], self.second[keep], self.middle[keep], self.tracks[keep], self.time_s, self.duration_s
+        )
 
 
 def _track_groups(evidence: Evidence, grid: ResampledTracks) -> Iterator[_PointGroup]:
@@ -124,13 +133,22 @@ def _track_groups(evidence: Evidence, grid: ResampledTracks) -> Iterator[_PointG
     for length in WINDOW_LENGTHS:
         half = length // 2
         # only instants that hold tracks: between two vehicles of a quiet road lie thousands that do not
-        steps, owners = _expand_ranges(-((first_of_all - grid.begin) // half), (grid.end - length - first_of_all) // half)
+        steps, owners = _expand_ranges(
+            -((first_of_all - grid.begin) // half), (grid.end - length - first_of_all) // half
+        )
         for together in group_indices(steps, MIN_POINTS):
             begin, seen = first_of_all + steps[together[0]] * half, owners[together]
             for members in group_indices(evidence.track_vehicles[seen], MIN_POINTS):
                 tracks = seen[members]
                 first, middle, second = (grid.at(tracks, begin + step) for step in (0, half, length))
-                yield _PointGroup(first, second, middle, tracks, (begin + half) * RESAMPLING_INTERVAL_S, length * RESAMPLING_INTERVAL_S)
+                yield _PointGroup(
+                    first,
+                    second,
+                    middle,
+                    tracks,
+                    (begin + half) * RESAMPLING_INTERVAL_S,
+                    length * RESAMPLING_INTERVAL_S,
+                )
 
 
 def _expand_ranges(first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -146,8 +164,13 @@ def _segment_groups(evidence: Evidence) -> Iterator[_PointGroup]:
     labels = instant.ravel() * (evidence.segment_vehicles.max(initial=0) + 1) + evidence.segment_vehicles
     for members in group_indices(labels, MIN_POINTS):
         first, second = evidence.segments_px[members, :2], evidence.segments_px[members, 2:]
-        yield _PointGroup(first, second, np.full(first.shape, np.nan), np.full(len(members), -1),
-                     float(evidence.segment_times_s[members[0]]))
+        yield _PointGroup(
+            first,
+            second,
+            np.full(first.shape, np.nan),
+            np.full(len(members), -1),
+            float(evidence.segment_times_s[members[0]]),
+        )
 
 
 def group_indices(labels: np.ndarray, least: int = 1) -> list[np.ndarray]:
@@ -174,8 +197,11 @@ class ResampledTracks:
         steps[starts[1:] - 1] = 1.0
         along = np.concatenate([[0.0], np.cumsum(steps)])
         # not along chords: a turning vehicle's lie inside its way by several pixels
-        way = CubicHermiteSpline(along, evidence.points_px, _velocities(along, evidence.points_px, starts, ends)) if (
-            len(track)) else np.zeros_like
+        way = (
+            CubicHermiteSpline(along, evidence.points_px, _velocities(along, evidence.points_px, starts, ends))
+            if (len(track))
+            else np.zeros_like
+        )
         self._places = way(along[starts[track]] + wanted - evidence.times_s[starts[track]]).reshape(-1, 2)
 
     def at(self, tracks: np.ndarray, instant: int) -> np.ndarray:
@@ -211,16 +237,27 @@ def _split_into_bodies(groups: list[_PointGroup], width: int) -> list[_PointGrou
         moves = group.second - group.first
         far = np.hypot(moves[:, 0], moves[:, 1])
         moving = far > MIN_DISPLACEMENT * width
-        together = ((_pairwise_distances(group.first) < MAX_NEIGHBOUR_DISTANCE * width) & (_pairwise_distances(group.second) < MAX_NEIGHBOUR_DISTANCE * width)
-                    & (_pairwise_distances(moves) < MAX_MOTION_DIFFERENCE * np.maximum(far[:, None], far) + MAX_MOTION_DIFFERENCE_PX) & moving[:, None] & moving)
+        together = (
+            (_pairwise_distances(group.first) < MAX_NEIGHBOUR_DISTANCE * width)
+            & (_pairwise_distances(group.second) < MAX_NEIGHBOUR_DISTANCE * width)
+            & (
+                _pairwise_distances(moves)
+                < MAX_MOTION_DIFFERENCE * np.maximum(far[:, None], far) + MAX_MOTION_DIFFERENCE_PX
+            )
+            & moving[:, None]
+            & moving
+        )
         edges.append(np.array(np.nonzero(together)) + start)
         start += len(far)
     pairs = np.concatenate(edges, axis=1)
     graph = coo_matrix((np.ones(pairs.shape[1], bool), pairs), shape=(start, start))
     _, labels = connected_components(graph, directed=False)
     starts = np.cumsum([0, *(len(group.tracks) for group in groups)])
-    return [group.subset(farthest_points(body, group.first)) for number, group in enumerate(groups)
-            for body in group_indices(labels[starts[number]:starts[number + 1]], MIN_POINTS)]
+    return [
+        group.subset(farthest_points(body, group.first))
+        for number, group in enumerate(groups)
+        for body in group_indices(labels[starts[number] : starts[number + 1]], MIN_POINTS)
+    ]
 
 
 def _pairwise_distances(places: np.ndarray) -> np.ndarray:
@@ -250,15 +287,24 @@ def _stack(groups: list[_PointGroup], width: int) -> TwoFrameWindows:
             array[row], array[row, :points] = places[0], places
         mask[row, :points], tracks[row, :points] = True, group.tracks
     times = np.array([group.time_s for group in groups])
-    return TwoFrameWindows(first, second, middle, mask, _body_ids(tracks, times, first[:, 0], MAX_NEIGHBOUR_DISTANCE * width), times,
-                   np.array([group.duration_s for group in groups]), tracks)
+    return TwoFrameWindows(
+        first,
+        second,
+        middle,
+        mask,
+        _body_ids(tracks, times, first[:, 0], MAX_NEIGHBOUR_DISTANCE * width),
+        times,
+        np.array([group.duration_s for group in groups]),
+        tracks,
+    )
 
 
 def _body_ids(tracks: np.ndarray, times: np.ndarray, places: np.ndarray, reach: float) -> np.ndarray:
     """Number the bodies: windows of tracks by the tracks that they share, those of segments by time and place."""
     rows, columns = np.nonzero(tracks >= 0)
-    members = coo_matrix((np.ones(len(rows)), (rows, tracks[rows, columns])),
-                         shape=(len(tracks), int(tracks.max(initial=-1)) + 1)).tocsr()
+    members = coo_matrix(
+        (np.ones(len(rows)), (rows, tracks[rows, columns])), shape=(len(tracks), int(tracks.max(initial=-1)) + 1)
+    ).tocsr()
     common = (members @ members.T).tocoo()
     same = common.data >= MIN_SHARED_TRACKS
     graph = coo_matrix((np.ones(same.sum()), (common.row[same], common.col[same])), shape=(len(tracks), len(tracks)))

@@ -52,8 +52,11 @@ def group_into_bodies(tracks: TrackSet, ground_m: np.ndarray) -> np.ndarray:
         end_one, end_other = (_interpolate(times, ground_m, rows, until) for rows in (ones, others))
         moved_one, moved_other = end_one - begin_one, end_other - begin_other
         far = np.maximum(np.hypot(*moved_one.T), np.hypot(*moved_other.T))
-        alike = ((np.hypot(*(begin_other - begin_one).T) < MAX_NEIGHBOUR_M) & (np.hypot(*(end_other - end_one).T) < MAX_NEIGHBOUR_M)
-                 & (np.hypot(*(moved_other - moved_one).T) < MAX_PATH_DIFFERENCE * far + MAX_PATH_DIFFERENCE_M))
+        alike = (
+            (np.hypot(*(begin_other - begin_one).T) < MAX_NEIGHBOUR_M)
+            & (np.hypot(*(end_other - end_one).T) < MAX_NEIGHBOUR_M)
+            & (np.hypot(*(moved_other - moved_one).T) < MAX_PATH_DIFFERENCE * far + MAX_PATH_DIFFERENCE_M)
+        )
         edges = np.hstack([edges, [ones[alike], others[alike]]])
     graph = coo_matrix((np.ones(edges.shape[1]), edges), shape=(len(tracks), len(tracks)))
     return connected_components(graph, directed=False)[1]
@@ -68,7 +71,7 @@ def _overlapping_pairs(first: np.ndarray, last: np.ndarray) -> Iterator[tuple[np
     places = np.arange(len(order))
     ends = np.searchsorted(first[order], last[order] - MIN_OVERLAP_S, side='right')
     for begin in range(0, len(order), TRACKS_PER_BLOCK):
-        block = places[begin:begin + TRACKS_PER_BLOCK]
+        block = places[begin : begin + TRACKS_PER_BLOCK]
         ones, others = np.nonzero((places > block[:, None]) & (places < ends[block, None]))
         ones, others = order[block[ones]], order[others]
         long = np.minimum(last[ones], last[others]) - first[others] >= MIN_OVERLAP_S
@@ -83,8 +86,9 @@ def _interpolate(times: np.ndarray, places: np.ndarray, rows: np.ndarray, when: 
     return places[rows, after - 1] * (1 - part) + places[rows, after] * part
 
 
-def heading_error_deg(distance_px: np.ndarray, px_per_m: np.ndarray, along_m: np.ndarray,
-                    mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def heading_error_deg(
+    distance_px: np.ndarray, px_per_m: np.ndarray, along_m: np.ndarray, mask: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """How far each track's heading is off its road's, in degrees, and its error for a pixel of noise; (tracks,) each.
 
     From the line in a parabola through the distances (tracks, samples) along the road.
@@ -104,10 +108,13 @@ def heading_error_deg(distance_px: np.ndarray, px_per_m: np.ndarray, along_m: np
     return np.degrees(fitted[:, 1] / length), np.degrees(np.sqrt(inverse[:, 1, 1]) / length)
 
 
-def corroboration_weights(off_deg: np.ndarray, error_deg: np.ndarray, vehicles: np.ndarray, roads: np.ndarray) -> np.ndarray:
+def corroboration_weights(
+    off_deg: np.ndarray, error_deg: np.ndarray, vehicles: np.ndarray, roads: np.ndarray
+) -> np.ndarray:
     """Influence (tracks,) by whether each track's vehicle, all its tracks on one road together, keeps to the road."""
-    groups, inverse, counts = np.unique(np.column_stack([vehicles, roads]), axis=0, return_inverse=True,
-                                        return_counts=True)
+    groups, inverse, counts = np.unique(
+        np.column_stack([vehicles, roads]), axis=0, return_inverse=True, return_counts=True
+    )
     inverse = inverse.ravel()
     median = _weighted_medians(off_deg, 1.0 / (error_deg**2 + HEADING_NOISE_DEG**2), inverse, len(groups))
     sure = counts >= MIN_CORROBORATING_TRACKS

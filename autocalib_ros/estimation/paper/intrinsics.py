@@ -48,15 +48,22 @@ def paper_intervals(evidence: Evidence, options: PaperOptions) -> list[ObservedI
     points, times = evidence.points_px, evidence.times_s
     first, last = starts[:-1], starts[1:] - 1
     displacement = np.hypot(*(points[last] - points[first]).T)
-    kept = ((last - first > 1) & (times[last] - times[first] >= options.min_lifetime * options.window_s)
-            & (displacement > 0) & (path_lengths(points, starts) <= options.max_path_ratio * displacement))
+    kept = (
+        (last - first > 1)
+        & (times[last] - times[first] >= options.min_lifetime * options.window_s)
+        & (displacement > 0)
+        & (path_lengths(points, starts) <= options.max_path_ratio * displacement)
+    )
     longest = []
     for window in np.unique(windows[kept]):
         inside = np.flatnonzero(kept & (windows == window))
-        longest.append(inside[np.argsort(-displacement[inside], kind='stable')[:options.longest]])
+        longest.append(inside[np.argsort(-displacement[inside], kind='stable')[: options.longest]])
     fullest = max(map(len, longest), default=0)
-    return [ObservedInterval([points[starts[part]:starts[part + 1]] for part in parts], tracks[parts].tolist())
-            for parts in longest if len(parts) == fullest]
+    return [
+        ObservedInterval([points[starts[part] : starts[part + 1]] for part in parts], tracks[parts].tolist())
+        for parts in longest
+        if len(parts) == fullest
+    ]
 
 
 def _split_by_interval(evidence: Evidence, window_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -88,8 +95,11 @@ def paper_intrinsics(evidence: Evidence, options: PaperOptions) -> PaperIntrinsi
     camera = Camera.equidistant(*evidence.image_size, focal)
     before = np.mean([_line_fit_errors(path) / len(path) for path in paths])
     after = np.mean([_line_fit_errors(camera.undistort(path)) / len(path) for path in paths])
-    report = PaperReport(focal_px=camera.focal_px, polynomial_k=distortion_polynomial(camera),
-                         straightness_px2=(float(before), float(after)))
+    report = PaperReport(
+        focal_px=camera.focal_px,
+        polynomial_k=distortion_polynomial(camera),
+        straightness_px2=(float(before), float(after)),
+    )
     return PaperIntrinsics(report, sweeps[median], np.array(intervals[median].tracks, int))
 
 

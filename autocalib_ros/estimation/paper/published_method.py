@@ -25,26 +25,42 @@ from autocalib_ros.geometry.ground_plane import (
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.results.calibration import Calibration, Figures, Reason, StandardDeviations
 
-PAPER_ASSUMPTIONS = ('equidistant lens with the principal point at the image centre', 'the two roads are perpendicular',
-               'the published method gives no uncertainty')
+PAPER_ASSUMPTIONS = (
+    'equidistant lens with the principal point at the image centre',
+    'the two roads are perpendicular',
+    'the published method gives no uncertainty',
+)
 
 
-def solve_paper(evidence: Evidence, options: Options, intrinsics: PaperIntrinsics | None,
-                figures: Figures) -> Calibration | Reason:
+def solve_paper(
+    evidence: Evidence, options: Options, intrinsics: PaperIntrinsics | None, figures: Figures
+) -> Calibration | Reason:
     """Run both stages; the reason instead when a stage has nothing to work on."""
     if intrinsics is None:
         paper = options.paper
         return Reason(
-            'too_few_tracks', f'no track lived for {paper.min_lifetime:.0%} of an interval of {paper.window_s:g} s '
+            'too_few_tracks',
+            f'no track lived for {paper.min_lifetime:.0%} of an interval of {paper.window_s:g} s '
             f'with a path of at most {paper.max_path_ratio:g} x its displacement',
-            'record slower traffic, shorten paper.window_s, or use method joint')
+            'record slower traffic, shorten paper.window_s, or use method joint',
+        )
     camera = Camera.equidistant(*evidence.image_size, intrinsics.report.focal_px)
     found = segment_orientations(camera, evidence.segments_px, options.paper)
     figures = replace(figures, orientation_histogram=found.histogram, orientation_peaks_deg=found.peaks_deg)
     result = Calibration(
-        method='paper', grade='lens', assumptions=PAPER_ASSUMPTIONS, camera=camera, ground=None, ground_refusal=None,
-        road_directions=np.zeros((0, 3)), stddev=StandardDeviations(), paper=intrinsics.report,
-        evidence=evidence.summary(), newest_stamp_ns=evidence.newest_stamp_ns, figures=figures)
+        method='paper',
+        grade='lens',
+        assumptions=PAPER_ASSUMPTIONS,
+        camera=camera,
+        ground=None,
+        ground_refusal=None,
+        road_directions=np.zeros((0, 3)),
+        stddev=StandardDeviations(),
+        paper=intrinsics.report,
+        evidence=evidence.summary(),
+        newest_stamp_ns=evidence.newest_stamp_ns,
+        figures=figures,
+    )
     return _with_ground(result, found, evidence, options)
 
 
@@ -52,15 +68,25 @@ def _with_ground(result: Calibration, found: SegmentOrientations, evidence: Evid
     """Add the extrinsic stage to the lens, or say why it has none."""
     points = vote_vanishing_points(found, result.camera.focal_px, options.paper)
     if len(points) < 2:
-        return replace(result, ground_refusal=Reason(
-            'one_direction', f'the orientation histogram of {len(evidence.segments_px)} segments has '
-            f'{len(points)} peaks, not two', 'wait for traffic on a second road'))
+        return replace(
+            result,
+            ground_refusal=Reason(
+                'one_direction',
+                f'the orientation histogram of {len(evidence.segments_px)} segments has {len(points)} peaks, not two',
+                'wait for traffic on a second road',
+            ),
+        )
     focal = focal_from_vanishing_points(*points)
     if focal is None or result.paper is None:
-        return replace(result, ground_refusal=Reason(
-            'vanishing_points_disagree', 'no focal length makes the two vanishing points perpendicular '
-            f'(orientations {found.peaks_deg[0]:.0f} and {found.peaks_deg[1]:.0f} degrees)',
-            'the roads are not perpendicular or the lens is wrong: use method joint'))
+        return replace(
+            result,
+            ground_refusal=Reason(
+                'vanishing_points_disagree',
+                'no focal length makes the two vanishing points perpendicular '
+                f'(orientations {found.peaks_deg[0]:.0f} and {found.peaks_deg[1]:.0f} degrees)',
+                'the roads are not perpendicular or the lens is wrong: use method joint',
+            ),
+        )
     rotation = rotation_from_vanishing_points(*points, focal)
     bearings, _ = result.camera.unproject(evidence.points_px)
     normal, _ = orient_upward(rotation[:, 2], bearings)
@@ -70,7 +96,10 @@ def _with_ground(result: Calibration, found: SegmentOrientations, evidence: Evid
         return replace(result, ground_refusal=scale, paper=report, road_directions=roads)
     height = scale.height(result.camera, normal)
     return replace(
-        result, grade='full' if scale.metric else 'unit_scale',
+        result,
+        grade='full' if scale.metric else 'unit_scale',
         assumptions=(*result.assumptions, *scale.assumption(height)),
-        ground=ground_plane(normal, rotation[:, 0], height, metric=scale.metric), road_directions=roads,
-        paper=replace(report, translation_m=paper_translation(rotation, height)))
+        ground=ground_plane(normal, rotation[:, 0], height, metric=scale.metric),
+        road_directions=roads,
+        paper=replace(report, translation_m=paper_translation(rotation, height)),
+    )

@@ -41,14 +41,21 @@ def segment_orientations(camera: Camera, segments_px: np.ndarray, options: Paper
     orientation = np.degrees(np.arctan2(step[:, 1], step[:, 0])) % 180.0
     counts, edges = np.histogram(orientation, bins=HISTOGRAM_BINS, range=(0.0, 180.0))
     centres = (edges[:-1] + edges[1:]) / 2
-    return SegmentOrientations(ends, orientation, np.column_stack([centres, counts]),
-                        _peaks(centres, counts, options.min_separation_deg))
+    return SegmentOrientations(
+        ends, orientation, np.column_stack([centres, counts]), _peaks(centres, counts, options.min_separation_deg)
+    )
 
 
 def vote_vanishing_points(found: SegmentOrientations, focal_px: float, options: PaperOptions) -> np.ndarray:
     """Run step 9 of the paper: vanishing points (peaks, 2) in undistorted pixels about the principal point."""
-    points = [_vote_vanishing_point(found.ends_px[_orientation_difference(found.orientation_deg, peak) <= options.cluster_deg], focal_px, options)
-              for peak in found.peaks_deg]
+    points = [
+        _vote_vanishing_point(
+            found.ends_px[_orientation_difference(found.orientation_deg, peak) <= options.cluster_deg],
+            focal_px,
+            options,
+        )
+        for peak in found.peaks_deg
+    ]
     return np.array(points).reshape(-1, 2)
 
 

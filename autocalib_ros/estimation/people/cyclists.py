@@ -71,14 +71,25 @@ def cyclists(evidence: Evidence, camera: Camera, normal: np.ndarray, height_m: f
             continue
         mine = of_step == owners[rows[0]]
         ways, ways_s = steps[mine], at_s[mine]
-        if not len(ways) or not WALKING_SPEED_M_S < np.quantile(np.hypot(*ways.T), SPEED_QUANTILE) / RESAMPLING_INTERVAL_S < MAX_CYCLING_SPEED_M_S:
+        if (
+            not len(ways)
+            or not WALKING_SPEED_M_S
+            < np.quantile(np.hypot(*ways.T), SPEED_QUANTILE) / RESAMPLING_INTERVAL_S
+            < MAX_CYCLING_SPEED_M_S
+        ):
             continue
         headings = _headings(ways, ways_s, times[known])
         sure = np.isfinite(headings)
         across = np.abs(np.sin(headings[sure] - sizes.azimuth[known[sure]]))
-        broadest_m = RIDER_WIDTH_TOLERANCE * (RIDER_SIZE_M[0] * across + RIDER_SIZE_M[1] * np.sqrt(1.0 - across**2)) + grain_m[known[sure]]
-        if len(across) >= MIN_SILHOUETTES and np.quantile(sizes.width[known[sure]] / broadest_m, WIDTH_QUANTILE) < 1.0 and (
-                RIDER_HEIGHT_M[0] < np.median(sizes.height[known[sure]]) < RIDER_HEIGHT_M[1]):
+        broadest_m = (
+            RIDER_WIDTH_TOLERANCE * (RIDER_SIZE_M[0] * across + RIDER_SIZE_M[1] * np.sqrt(1.0 - across**2))
+            + grain_m[known[sure]]
+        )
+        if (
+            len(across) >= MIN_SILHOUETTES
+            and np.quantile(sizes.width[known[sure]] / broadest_m, WIDTH_QUANTILE) < 1.0
+            and (RIDER_HEIGHT_M[0] < np.median(sizes.height[known[sure]]) < RIDER_HEIGHT_M[1])
+        ):
             found.append(int(owners[rows[0]]))
     return np.array(found, int)
 
@@ -89,8 +100,9 @@ def _fragmented(owners: np.ndarray, times: np.ndarray) -> np.ndarray:
     return counts[kinds.ravel()] > 1
 
 
-def _displacements(evidence: Evidence, camera: Camera, normal: np.ndarray,
-           height_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _displacements(
+    evidence: Evidence, camera: Camera, normal: np.ndarray, height_m: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Ways on the road (n, 2) of all points from one instant to the next, their times (n,) and vehicles (n,)."""
     instants = ResampledTracks(evidence)
     pixels, starts = instants.all()
@@ -99,7 +111,11 @@ def _displacements(evidence: Evidence, camera: Camera, normal: np.ndarray,
     tracks = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
     begin = np.flatnonzero((tracks[1:] == tracks[:-1]) & near[1:] & near[:-1])
     ordinal = instants.begin[tracks[begin]] + begin - starts[tracks[begin]]
-    return places[begin + 1] - places[begin], (ordinal + 0.5) * RESAMPLING_INTERVAL_S, evidence.track_vehicles[tracks[begin]]
+    return (
+        places[begin + 1] - places[begin],
+        (ordinal + 0.5) * RESAMPLING_INTERVAL_S,
+        evidence.track_vehicles[tracks[begin]],
+    )
 
 
 def _headings(ways: np.ndarray, ways_s: np.ndarray, times: np.ndarray) -> np.ndarray:
@@ -109,5 +125,7 @@ def _headings(ways: np.ndarray, ways_s: np.ndarray, times: np.ndarray) -> np.nda
         around = np.abs(ways_s - time_s) < HEADING_WINDOW_S
         if around.any():
             x, y = np.median(ways[around], axis=0)
-            headings[row] = np.arctan2(y, x) if np.hypot(x, y) > MIN_HEADING_SPEED_M_S * RESAMPLING_INTERVAL_S else np.nan
+            headings[row] = (
+                np.arctan2(y, x) if np.hypot(x, y) > MIN_HEADING_SPEED_M_S * RESAMPLING_INTERVAL_S else np.nan
+            )
     return headings

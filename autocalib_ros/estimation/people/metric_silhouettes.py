@@ -26,7 +26,9 @@ class SilhouetteSizes:
     """Of what is upright there and reaches as far up in the image; deeper bodies seem higher."""
 
 
-def measure_silhouettes(outlines_px: np.ndarray, camera: Camera, normal: np.ndarray, height_m: float) -> SilhouetteSizes:
+def measure_silhouettes(
+    outlines_px: np.ndarray, camera: Camera, normal: np.ndarray, height_m: float
+) -> SilhouetteSizes:
     """Measure outlines (n, OUTLINE_COLUMNS), as `Outlines.ends_px`, of what stands on the road."""
     bearings = camera.unproject(outlines_px[:, :-1].astype(float).reshape(-1, 2))[0].reshape(-1, 8, 3)
     ahead = np.array([0.0, 0.0, 1.0]) - normal[2] * normal
@@ -37,4 +39,6 @@ def measure_silhouettes(outlines_px: np.ndarray, camera: Camera, normal: np.ndar
     azimuths = np.arctan2(np.sin(turned), np.cos(turned))
     slope = z / np.maximum(np.hypot(x, y), 1e-9)
     distance = height_m / np.maximum(-slope.min(axis=1), 1e-6)
-    return SilhouetteSizes(middle, distance, np.ptp(azimuths, axis=1) * distance, height_m + distance * slope.max(axis=1))
+    return SilhouetteSizes(
+        middle, distance, np.ptp(azimuths, axis=1) * distance, height_m + distance * slope.max(axis=1)
+    )

@@ -51,7 +51,9 @@ class MovingObject:
 
 def people(evidence: Evidence, camera: Camera, normal: np.ndarray, height_m: float) -> np.ndarray:
     """Numbers of those, of `evidence.track_vehicles`, that walk or cycle, ascending."""
-    return np.union1d(find_pedestrians(evidence, camera, normal, height_m), cyclists(evidence, camera, normal, height_m))
+    return np.union1d(
+        find_pedestrians(evidence, camera, normal, height_m), cyclists(evidence, camera, normal, height_m)
+    )
 
 
 def find_pedestrians(evidence: Evidence, camera: Camera, normal: np.ndarray, height_m: float) -> np.ndarray:
@@ -70,8 +72,14 @@ def find_pedestrians(evidence: Evidence, camera: Camera, normal: np.ndarray, hei
     moving_objects = [_measure(places, times, [paths[track] for track in tracks]) for tracks in groups]
     speeds = np.array([moving.speed_m_s for moving in moving_objects if moving.speed_m_s > 0])
     flows = len(speeds) > 0 and bool(np.quantile(speeds, FLOW_QUANTILE) > MIN_FLOW_RATIO * WALKING_SPEED_M_S)
-    return np.array([evidence.track_vehicles[tracks[0]] for tracks, moving in zip(groups, moving_objects, strict=True)
-                     if moving.is_pedestrian(groups=flows)], int)
+    return np.array(
+        [
+            evidence.track_vehicles[tracks[0]]
+            for tracks, moving in zip(groups, moving_objects, strict=True)
+            if moving.is_pedestrian(groups=flows)
+        ],
+        int,
+    )
 
 
 def _measure(places: np.ndarray, times: np.ndarray, paths: list[np.ndarray]) -> MovingObject:
@@ -80,7 +88,11 @@ def _measure(places: np.ndarray, times: np.ndarray, paths: list[np.ndarray]) -> 
     for path in paths:
         if len(path) > SPEED_INTERVALS:
             steps = np.hypot(*(places[path[SPEED_INTERVALS:]] - places[path[:-SPEED_INTERVALS]]).T)
-            speed = max(speed, float((steps / (times[path[SPEED_INTERVALS:]] - times[path[:-SPEED_INTERVALS]])).max()) / RESAMPLING_INTERVAL_S)
+            speed = max(
+                speed,
+                float((steps / (times[path[SPEED_INTERVALS:]] - times[path[:-SPEED_INTERVALS]])).max())
+                / RESAMPLING_INTERVAL_S,
+            )
             way = max(way, float(np.hypot(*(places[path[-1]] - places[path[0]]))))
     own = np.concatenate(paths)
     spans = [_width_across(places[own[together]]) for together in group_indices(times[own], 2)]

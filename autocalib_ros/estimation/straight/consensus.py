@@ -27,8 +27,13 @@ SEARCH_OFFSETS = np.array([(np.cos(turn), np.sin(turn)) for turn in np.arange(8)
 """Ways to go from a direction in search of a better one."""
 
 
-def consensus_directions(camera: Camera, tracks: TrackSet, generator: np.random.Generator,
-                         count: int = 2, inlier_px: float = CONSENSUS_INLIER_PX) -> RoadDirections:
+def consensus_directions(
+    camera: Camera,
+    tracks: TrackSet,
+    generator: np.random.Generator,
+    count: int = 2,
+    inlier_px: float = CONSENSUS_INLIER_PX,
+) -> RoadDirections:
     """Find up to `count` directions, strongest first, that tracks' great circles share.
 
     A track counts by its surprise: minus the logarithm of the share of random directions that it would
@@ -40,7 +45,9 @@ def consensus_directions(camera: Camera, tracks: TrackSet, generator: np.random.
     probes /= np.linalg.norm(probes, axis=1, keepdims=True)
     forms = _quadratic_forms(matrix)
     chance = _support(forms, probes, inlier_px).mean(axis=0)
-    surprise = -np.log(np.clip(chance, 1.0 / RANDOM_DIRECTIONS, 1.0)) * np.sqrt(tracks.vehicle_weight) * (own < inlier_px**2)
+    surprise = (
+        -np.log(np.clip(chance, 1.0 / RANDOM_DIRECTIONS, 1.0)) * np.sqrt(tracks.vehicle_weight) * (own < inlier_px**2)
+    )
     found: list[np.ndarray] = []
     labels = np.full(len(tracks), -2)
     score = 0.0
@@ -62,8 +69,14 @@ def _support(forms: np.ndarray, directions: np.ndarray, inlier_px: float) -> np.
     return np.maximum(0.0, 1.0 - _squared_distances(forms, directions) / inlier_px**2)
 
 
-def _strongest(normals: np.ndarray, forms: np.ndarray, surprise: np.ndarray, found: list[np.ndarray],
-               generator: np.random.Generator, inlier_px: float) -> np.ndarray | None:
+def _strongest(
+    normals: np.ndarray,
+    forms: np.ndarray,
+    surprise: np.ndarray,
+    found: list[np.ndarray],
+    generator: np.random.Generator,
+    inlier_px: float,
+) -> np.ndarray | None:
     """Return the direction with the most support among intersections of pairs of great circles."""
     total = surprise.sum()
     if np.count_nonzero(surprise) < 3:

@@ -25,7 +25,9 @@ MIN_ROAD_SEPARATION_DEG = 15.0
 """Roads that differ by less are one road seen with errors."""
 
 
-def solve_from_consensus(subsample: TrackSet, config: AdjustmentConfig, generator: np.random.Generator) -> tuple[Adjustment, float] | None:
+def solve_from_consensus(
+    subsample: TrackSet, config: AdjustmentConfig, generator: np.random.Generator
+) -> tuple[Adjustment, float] | None:
     """Solve from the directions on which the tracks agree at trial focal lengths; the most probable solution.
 
     And the contrast: how much better the best trial agreed than the middling one. None without any agreement.
@@ -37,21 +39,31 @@ def solve_from_consensus(subsample: TrackSet, config: AdjustmentConfig, generato
         return None
     best = select_model(fits, subsample)
     if best.inliers().mean() < MIN_INLIER_FRACTION:
-        best = select_model([best, *_from_trials(subsample, config, generator, LOOSE_INLIER_FACTOR * CONSENSUS_INLIER_PX)[0]], subsample)
+        best = select_model(
+            [best, *_from_trials(subsample, config, generator, LOOSE_INLIER_FACTOR * CONSENSUS_INLIER_PX)[0]], subsample
+        )
     return best, np.inf if config.prior.focal_known else float(scores.max() / max(np.median(scores), 1e-9))
 
 
-def _from_trials(subsample: TrackSet, config: AdjustmentConfig, generator: np.random.Generator,
-                 inlier_px: float) -> tuple[list[Adjustment], np.ndarray]:
+def _from_trials(
+    subsample: TrackSet, config: AdjustmentConfig, generator: np.random.Generator, inlier_px: float
+) -> tuple[list[Adjustment], np.ndarray]:
     """Solutions from the trial focal lengths of best agreement, and the scores of all trials, shape (trials,)."""
     prior = config.prior
     size = (prior.centre.width, prior.centre.height)
     trials = [prior.centre.focal_px] if prior.focal_known else focal_trials(subsample, size, FOCAL_TRIALS)
-    solve_from_consensus = [consensus_directions(prior.start(trial), subsample, generator, inlier_px=inlier_px) for trial in trials]
-    starts = [initial_state(prior.start(trials[index]), solve_from_consensus[index]) for index in _peaks(solve_from_consensus)[:MAX_STARTS]]
+    solve_from_consensus = [
+        consensus_directions(prior.start(trial), subsample, generator, inlier_px=inlier_px) for trial in trials
+    ]
+    starts = [
+        initial_state(prior.start(trials[index]), solve_from_consensus[index])
+        for index in _peaks(solve_from_consensus)[:MAX_STARTS]
+    ]
     fits = [adjust(start, subsample, config) for start in starts]
     # two roads that fell together describe one road twice, and its errors the better for it
-    return [fit for fit in fits if roads_separated(fit)] or fits, np.array([item.score for item in solve_from_consensus])
+    return [fit for fit in fits if roads_separated(fit)] or fits, np.array(
+        [item.score for item in solve_from_consensus]
+    )
 
 
 def roads_separated(fit: Adjustment) -> bool:
@@ -65,7 +77,9 @@ def select_lens_family(fit: Adjustment, priors: list[LensPrior], subsample: Trac
     if not fit.plane_known or not priors:
         return fit
     usual = adjust(fit.state, subsample, fit.problem.config, refine=True)
-    best = select_model([usual, *(_solve_in_family(usual, prior, subsample) for prior in priors)], subsample, MODEL_SELECTION_MARGIN)
+    best = select_model(
+        [usual, *(_solve_in_family(usual, prior, subsample) for prior in priors)], subsample, MODEL_SELECTION_MARGIN
+    )
     return fit if best is usual else adjust(best.state, tracks, best.problem.config)
 
 

@@ -29,7 +29,9 @@ MAX_NOISE_RATIO = 4.0
 turns that look alike."""
 
 
-def drop_unsupported_roads(fit: Adjustment, support: list[np.ndarray], tracks: TrackSet, gate: GateOptions) -> Adjustment:
+def drop_unsupported_roads(
+    fit: Adjustment, support: list[np.ndarray], tracks: TrackSet, gate: GateOptions
+) -> Adjustment:
     """Solve again with the one road that explains most vehicles when a second has too little behind it."""
     if _all_supported(fit, support, tracks, gate):
         return fit
@@ -37,8 +39,9 @@ def drop_unsupported_roads(fit: Adjustment, support: list[np.ndarray], tracks: T
     counts = [len(np.unique(tracks.vehicles[inliers & (fit.labels == road)])) for road in range(len(support))]
     direction = fit.state.directions[int(np.argmax(counts))]
     config = fit.problem.config
-    alone = initial_state(config.prior.start(fit.state.camera.focal_px),
-                          RoadDirections(direction[None], np.zeros(0, int), 0.0))
+    alone = initial_state(
+        config.prior.start(fit.state.camera.focal_px), RoadDirections(direction[None], np.zeros(0, int), 0.0)
+    )
     return adjust(alone, tracks, config)
 
 

@@ -26,7 +26,9 @@ MIN_LANE_CHANGING_VEHICLES = 8
 MAX_LANE_CHANGE_WINDOWS = 300
 
 
-def refine_with_lane_changes(fit: Adjustment, tracks: TrackSet, windows: TwoFrameWindows) -> tuple[Adjustment, int] | None:
+def refine_with_lane_changes(
+    fit: Adjustment, tracks: TrackSet, windows: TwoFrameWindows
+) -> tuple[Adjustment, int] | None:
     """Solve again with the vehicles that leave their lanes on the one road of a solution; None where they are few.
 
     With the number of those vehicles.
@@ -37,7 +39,9 @@ def refine_with_lane_changes(fit: Adjustment, tracks: TrackSet, windows: TwoFram
     up = upward_normal(fit.state, config, unproject_rays(camera, tracks.pixels))
     plane = np.column_stack([road, np.cross(up, road), up])
     view = WindowRays.of(windows, camera, plane, config.options)
-    course, _ = without_side_slip(windows, view, initial_motion(view), camera, plane, config.height_m or DEFAULT_CAMERA_HEIGHT_M)
+    course, _ = without_side_slip(
+        windows, view, initial_motion(view), camera, plane, config.height_m or DEFAULT_CAMERA_HEIGHT_M
+    )
     chosen = np.flatnonzero(course & ~windows.from_segments)
     first, _, second = paths(windows.subset(chosen), camera, plane)
     away = ~windows.mask[chosen]

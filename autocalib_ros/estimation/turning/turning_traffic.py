@@ -57,8 +57,11 @@ def fit_turning_traffic(tracks: TrackSet, windows: TwoFrameWindows, config: Adju
     centre = config.prior.centre
     diagonal = np.hypot(centre.width, centre.height)
     lenses = [config.prior.start(diagonal * share) for share in START_FOCAL_DIAGONALS]
-    starts = [AdjustmentState(lens, _level_plane(tilt), np.zeros(0))
-              for lens in (lenses[:1] if config.prior.focal_known else lenses) for tilt in START_TILTS_DEG]
+    starts = [
+        AdjustmentState(lens, _level_plane(tilt), np.zeros(0))
+        for lens in (lenses[:1] if config.prior.focal_known else lenses)
+        for tilt in START_TILTS_DEG
+    ]
     best = select_model([adjust(start, nothing, few) for start in starts], nothing)
     turning = refine_with_turning(best, nothing, windows)
     return refine_with_turning(turning, tracks, windows) if turning else None
@@ -69,12 +72,14 @@ def refine_with_turning(fit: Adjustment, tracks: TrackSet, windows: TwoFrameWind
     chosen = _turning_windows(fit, windows)
     if chosen is None:
         return None
-    return adjust(fit.state, tracks, replace(fit.problem.config, windows=chosen.balanced_subset(MAX_TURNING_WINDOWS)),
-                       refine=True)
+    return adjust(
+        fit.state, tracks, replace(fit.problem.config, windows=chosen.balanced_subset(MAX_TURNING_WINDOWS)), refine=True
+    )
 
 
-def refine_with_tracklets(fit: Adjustment, tracks: TrackSet, windows: TwoFrameWindows,
-               instants: ResampledTracks) -> tuple[Adjustment, AdjustmentState | None]:
+def refine_with_tracklets(
+    fit: Adjustment, tracks: TrackSet, windows: TwoFrameWindows, instants: ResampledTracks
+) -> tuple[Adjustment, AdjustmentState | None]:
     """Solve a last time with those vehicles over their lives, where they are followed, and how they correlate.
 
     Windows and lives are cut from the same tracks: solutions by the one and by the other that differ by more than
@@ -84,10 +89,22 @@ def refine_with_tracklets(fit: Adjustment, tracks: TrackSet, windows: TwoFrameWi
     config = replace(fit.problem.config, vehicle_correlation=fit.vehicle_correlation)
     chosen = _turning_windows(fit, windows) if config.turning else None
     lives = no_tracklets() if chosen is None else find_tracklets(chosen, instants, MAX_TRACKLETS)
-    tracklet_state = None if chosen is None or not len(lives) else _adjust_with_tracklets(fit, tracks, replace(
-        config, windows=chosen.subset(chosen.from_segments).balanced_subset(MAX_TURNING_WINDOWS),
-        bundle=TrackletBundle(lives, config.options.noise_px, config.options.drift_px)))
-    if tracklet_state is not None and not compare_solutions(fit, tracklet_state).exceeds(MAX_TRACKLET_DIFFERENCE_SIGMAS):
+    tracklet_state = (
+        None
+        if chosen is None or not len(lives)
+        else _adjust_with_tracklets(
+            fit,
+            tracks,
+            replace(
+                config,
+                windows=chosen.subset(chosen.from_segments).balanced_subset(MAX_TURNING_WINDOWS),
+                bundle=TrackletBundle(lives, config.options.noise_px, config.options.drift_px),
+            ),
+        )
+    )
+    if tracklet_state is not None and not compare_solutions(fit, tracklet_state).exceeds(
+        MAX_TRACKLET_DIFFERENCE_SIGMAS
+    ):
         return tracklet_state, None
     window_fit = adjust(fit.state, tracks, config, refine=True, warm_start=fit.problem.warm_start)
     return window_fit, None if tracklet_state is None else tracklet_state.state
@@ -101,8 +118,13 @@ def _adjust_with_tracklets(fit: Adjustment, tracks: TrackSet, config: Adjustment
         return solved
     without_drift, camera, plane = drifting.without_drift(), solved.state.camera, solved.state.rotation
     if without_drift.noise_cost(camera, plane, shapes) < drifting.noise_cost(camera, plane, shapes):
-        solved = adjust(solved.state, tracks, replace(config, bundle=without_drift), refine=True,
-                             warm_start=solved.problem.warm_start)
+        solved = adjust(
+            solved.state,
+            tracks,
+            replace(config, bundle=without_drift),
+            refine=True,
+            warm_start=solved.problem.warm_start,
+        )
     return restart_tracklets(solved, tracks)
 
 
@@ -118,12 +140,19 @@ def restart_tracklets(fit: Adjustment, tracks: TrackSet) -> Adjustment:
             return fit
         camera, plane = fit.state.camera, fit.state.rotation
         restarted = bundle.initialised(camera, plane)
-        carried_cost, restarted_cost = (bundle.cost(bundle.residuals(camera, plane, each)) for each in (shapes, restarted))
+        carried_cost, restarted_cost = (
+            bundle.cost(bundle.residuals(camera, plane, each)) for each in (shapes, restarted)
+        )
         better = restarted_cost < carried_cost - MIN_RESTART_GAIN
         if not better.any():
             return fit
-        fit = adjust(fit.state, tracks, fit.problem.config, refine=True,
-                          warm_start=(None, motion, shapes.where(better, restarted)))
+        fit = adjust(
+            fit.state,
+            tracks,
+            fit.problem.config,
+            refine=True,
+            warm_start=(None, motion, shapes.where(better, restarted)),
+        )
     return fit
 
 
@@ -151,10 +180,12 @@ def check_turning_centres(fit: Adjustment, windows: TwoFrameWindows) -> Reason |
     if not len(radii) or np.median(distances) > MAX_CENTRE_SPREAD * np.median(radii):
         return None
     return Reason(
-        'one_centre', f'all vehicles turn about one point, as on one ring or bend (half of their centres lie within '
+        'one_centre',
+        f'all vehicles turn about one point, as on one ring or bend (half of their centres lie within '
         f'{np.median(distances) / np.median(radii):.0%} of the radius), and tell the focal length to {sigma:.1%}; '
         f'{MAX_SIGMA_FOCAL_ONE_CENTRE:.0%} is needed there',
-        'wait for more traffic, above all such that turns elsewhere, enters or leaves, or drives straight')
+        'wait for more traffic, above all such that turns elsewhere, enters or leaves, or drives straight',
+    )
 
 
 def widen_by_point_slip(fit: Adjustment, windows: TwoFrameWindows) -> Adjustment:
@@ -167,7 +198,9 @@ def widen_by_point_slip(fit: Adjustment, windows: TwoFrameWindows) -> Adjustment
     view = WindowRays.of(chosen, state.camera, state.rotation, fit.problem.config.options)
     covariance = fit.covariance.copy()
     focal = int(np.flatnonzero(prior.free == 0)[0])
-    covariance[focal, focal] += (POINT_SLIP_SIGMA_FOCAL * point_slip(chosen, initial_motion(view), state.camera, state.rotation)) ** 2
+    covariance[focal, focal] += (
+        POINT_SLIP_SIGMA_FOCAL * point_slip(chosen, initial_motion(view), state.camera, state.rotation)
+    ) ** 2
     return replace(fit, covariance=covariance)
 
 

@@ -86,7 +86,9 @@ def find_transverse_peak(observed: EdgeTurns, vehicles: np.ndarray, generator: n
     lever, bulge_sigma = mixture.bulge_effect(pulls[0])
     common = np.array([fractions[0] * lever * bulge_sigma, *(fractions * SYSTEMATIC_SIGMA_RAD)])
     in_peaks = np.minimum(2.0 * np.bincount(owners, responsibilities.sum(axis=0)), 1.0)
-    return TransversePeak(turn, float(np.sqrt(np.mean(residuals**2) + common @ common)), pulls.sum(axis=0), int(in_peaks.sum()))
+    return TransversePeak(
+        turn, float(np.sqrt(np.mean(residuals**2) + common @ common)), pulls.sum(axis=0), int(in_peaks.sum())
+    )
 
 
 @dataclass(frozen=True)
@@ -154,7 +156,7 @@ class _EdgeMixture:
 def _peak_position(at: np.ndarray, values: np.ndarray) -> float:
     """Where values (n,) on an even grid are highest, by a parabola through three."""
     top = int(np.clip(np.argmax(values), 1, len(at) - 2))
-    before, here, after = values[top - 1:top + 2]
+    before, here, after = values[top - 1 : top + 2]
     bend = before - 2 * here + after
     shift = np.clip(0.5 * (before - after) / bend, -1.0, 1.0) if bend < 0 else 0.0
     return float(at[top] + shift * (at[1] - at[0]))

@@ -90,8 +90,13 @@ def edge_turns(camera: Camera, along: np.ndarray, across: np.ndarray, ends_px: n
     ahead, (beside, above) = rays.bearings @ along, basis @ rays.bearings.T
     beside, above = np.cos(turns) * beside + np.sin(turns) * above, np.cos(turns) * above - np.sin(turns) * beside
     oblique = beside / np.maximum(np.hypot(ahead, beside), 1e-9)
-    return EdgeTurns(turns, np.abs(p * slope_q - q * slope_p) / aside2 * EDGE_END_SIGMA_PX * np.sqrt(2.0) / length,
-                 np.arccos(np.minimum(cosine, 1.0)), leverage, oblique * np.sign(above) * leverage)
+    return EdgeTurns(
+        turns,
+        np.abs(p * slope_q - q * slope_p) / aside2 * EDGE_END_SIGMA_PX * np.sqrt(2.0) / length,
+        np.arccos(np.minimum(cosine, 1.0)),
+        leverage,
+        oblique * np.sign(above) * leverage,
+    )
 
 
 @dataclass(frozen=True)
@@ -118,25 +123,32 @@ class TransverseDirection:
         along = state.directions[0]
         across = self.origin - (self.origin @ along) * along
         across /= np.linalg.norm(across)
-        moved = wrap_undirected(edge_turns(state.camera, along, across, self.edges.ends_px).turns_rad - self.reference_turns_rad)
+        moved = wrap_undirected(
+            edge_turns(state.camera, along, across, self.edges.ends_px).turns_rad - self.reference_turns_rad
+        )
         turn = float(self.weights @ moved) / float(self.weights.sum()) + self.turn_rad + step_rad
         return np.cos(turn) * across + np.sin(turn) * np.cross(along, across)
 
     @property
     def description(self) -> str:
         """What is assumed."""
-        return (f'edges of {self.vehicles} vehicles taken as square to it{self.besides}: '
-                f'+- {np.degrees(self.step_sigma_rad):.1f} degrees about the road')
+        return (
+            f'edges of {self.vehicles} vehicles taken as square to it{self.besides}: '
+            f'+- {np.degrees(self.step_sigma_rad):.1f} degrees about the road'
+        )
 
 
-def find_transverse_direction(evidence: Evidence, fit: Adjustment, tracks: TrackSet,
-                    generator: np.random.Generator) -> TransverseDirection | None:
+def find_transverse_direction(
+    evidence: Evidence, fit: Adjustment, tracks: TrackSet, generator: np.random.Generator
+) -> TransverseDirection | None:
     """Find the direction across the first road by edges of the vehicles that follow it; None where they do not tell."""
     following = tracks.subset(fit.inliers() & (fit.labels == 0))
     return transverse_direction_at(select_vehicle_edges(evidence, following), fit.state, generator)
 
 
-def transverse_direction_at(edges: VehicleEdges, state: AdjustmentState, generator: np.random.Generator) -> TransverseDirection | None:
+def transverse_direction_at(
+    edges: VehicleEdges, state: AdjustmentState, generator: np.random.Generator
+) -> TransverseDirection | None:
     """Find the direction across the first road of a state by edges on its vehicles; None where they do not tell."""
     along = state.directions[0]
     # turns are counted from where a camera without roll has that direction

@@ -43,8 +43,11 @@ class SolutionDifference:
 def compare_solutions(first: Adjustment, second: Adjustment) -> SolutionDifference:
     """Compare two solutions."""
     focal = abs(float(np.log(first.state.camera.focal_px / second.state.camera.focal_px)))
-    return SolutionDifference(focal, unsigned_angle_deg(first.state.rotation[:, 2], second.state.rotation[:, 2]),
-                       np.array([_focal_and_normal_sigma(fit.sigma(_change_from(fit))) for fit in (first, second)]))
+    return SolutionDifference(
+        focal,
+        unsigned_angle_deg(first.state.rotation[:, 2], second.state.rotation[:, 2]),
+        np.array([_focal_and_normal_sigma(fit.sigma(_change_from(fit))) for fit in (first, second)]),
+    )
 
 
 def expected_half_differences(whole: Adjustment, *halves: Adjustment) -> np.ndarray:
@@ -53,17 +56,25 @@ def expected_half_differences(whole: Adjustment, *halves: Adjustment) -> np.ndar
     Two halves that tell alike differ by twice the whole's deviation, unequal ones by more; how unequal they are, the
     curvature of their costs tells, which rests on more than the few vehicles of a half.
     """
-    in_whole, *in_halves = (_focal_and_normal_sigma(propagate_sigma(
-        lambda step, fit=fit: _change_from(fit)(fit.problem.parameters.state(step)), fit.problem.parameters.size,
-        _curvature_covariance(fit))) for fit in (whole, *halves))
-    return _focal_and_normal_sigma(whole.sigma(_change_from(whole))) * np.hypot(*in_halves) / np.maximum(in_whole, 1e-12)
+    in_whole, *in_halves = (
+        _focal_and_normal_sigma(
+            propagate_sigma(
+                lambda step, fit=fit: _change_from(fit)(fit.problem.parameters.state(step)),
+                fit.problem.parameters.size,
+                _curvature_covariance(fit),
+            )
+        )
+        for fit in (whole, *halves)
+    )
+    return (
+        _focal_and_normal_sigma(whole.sigma(_change_from(whole))) * np.hypot(*in_halves) / np.maximum(in_whole, 1e-12)
+    )
 
 
 def _change_from(fit: Adjustment) -> Callable[[AdjustmentState], np.ndarray]:
     """Log focal length, and how the normal has moved from that of a fit in degrees, shape (4,)."""
     normal = fit.state.rotation[:, 2]
-    return lambda state: np.array([np.log(state.camera.focal_px),
-                                   *np.degrees(np.cross(normal, state.rotation[:, 2]))])
+    return lambda state: np.array([np.log(state.camera.focal_px), *np.degrees(np.cross(normal, state.rotation[:, 2]))])
 
 
 def _focal_and_normal_sigma(sigmas: np.ndarray) -> np.ndarray:

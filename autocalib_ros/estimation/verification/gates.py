@@ -69,26 +69,40 @@ def check_straight_traffic(fit: Adjustment, contrast: float, tracks: TrackSet) -
         return _turning_traffic_reason(fit, share, MIN_STRAIGHT_FRACTION)
     if contrast < MIN_FOCAL_CONTRAST and not (prior.family == 'distortion_free' and len(fit.state.angles_rad) > 1):
         return Reason(
-            'no_agreement', f'no focal length stands out: with the best one {contrast:.2f} times as much traffic '
+            'no_agreement',
+            f'no focal length stands out: with the best one {contrast:.2f} times as much traffic '
             f'follows straight roads as with a middling one, {MIN_FOCAL_CONTRAST:g} times is needed',
             'wait for straight traffic, above all near the borders of the image; the traffic may be turning, or the '
-            'lens may have no distortion: then give joint.road_angle or joint.focal_prior_px')
+            'lens may have no distortion: then give joint.road_angle or joint.focal_prior_px',
+        )
     return _check_horizon(fit, tracks)
 
 
-def check_lens(fit: Adjustment, tracks: TrackSet, evidence: Evidence, gate: GateOptions, *,
-               turned: bool, driving: np.ndarray | None = None) -> Reason | None:
+def check_lens(
+    fit: Adjustment,
+    tracks: TrackSet,
+    evidence: Evidence,
+    gate: GateOptions,
+    *,
+    turned: bool,
+    driving: np.ndarray | None = None,
+) -> Reason | None:
     """Say why the lens cannot be trusted, if so; `turned` where the solution started from traffic that turns.
 
     `tracks` are those that were chosen out of the evidence; where `driving`, a mask (tracks,), is given, the others are
     of people, who need not keep to a road.
     """
-    failed_check = _check_horizon(fit, tracks) or _check_focal_length(fit, gate, turned=turned) or _check_lens_model(fit)
+    failed_check = (
+        _check_horizon(fit, tracks) or _check_focal_length(fit, gate, turned=turned) or _check_lens_model(fit)
+    )
     if failed_check or turned and motion_constrains_focal(fit):
         return failed_check
     needed = MIN_STRAIGHT_FRACTION if len(fit.state.angles_rad) > 1 else MIN_ONE_ROAD_FRACTION
     share = _straight_fraction(fit, tracks, driving)
-    if needed == MIN_ONE_ROAD_FRACTION > share > MIN_KEPT_ROAD_FRACTION and lane_keeping_fraction(fit, evidence) > MIN_LANE_KEEPING_FRACTION:
+    if (
+        needed == MIN_ONE_ROAD_FRACTION > share > MIN_KEPT_ROAD_FRACTION
+        and lane_keeping_fraction(fit, evidence) > MIN_LANE_KEEPING_FRACTION
+    ):
         return None
     return _turning_traffic_reason(fit, share, needed) if share < needed else None
 
@@ -107,8 +121,10 @@ def _check_horizon(fit: Adjustment, tracks: TrackSet) -> Reason | None:
 
 def _above_horizon_reason(fraction_below_horizon: float) -> Reason:
     return Reason(
-        'horizon', f'{1 - fraction_below_horizon:.0%} of the tracked points lie above the horizon of the plane found',
-        'the traffic found does not belong to one plane: wait for more of it')
+        'horizon',
+        f'{1 - fraction_below_horizon:.0%} of the tracked points lie above the horizon of the plane found',
+        'the traffic found does not belong to one plane: wait for more of it',
+    )
 
 
 def motion_constrains_focal(fit: Adjustment) -> bool:
@@ -139,9 +155,11 @@ def lane_keeping_fraction(fit: Adjustment, evidence: Evidence) -> float:
 def _turning_traffic_reason(fit: Adjustment, share: float, needed: float) -> Reason:
     where = 'best straight roads' if len(fit.state.angles_rad) > 1 else 'one straight road that was found'
     return Reason(
-        'turning_traffic', f'only {share:.0%} of the vehicles follow the {where}, {needed:.0%} '
+        'turning_traffic',
+        f'only {share:.0%} of the vehicles follow the {where}, {needed:.0%} '
         'are needed: the traffic turns, or the road bends',
-        'wait for straight traffic, or turn the camera towards a straight road')
+        'wait for straight traffic, or turn the camera towards a straight road',
+    )
 
 
 def _check_focal_length(fit: Adjustment, gate: GateOptions, *, turned: bool) -> Reason | None:
@@ -152,18 +170,24 @@ def _check_focal_length(fit: Adjustment, gate: GateOptions, *, turned: bool) -> 
     # without distortion only an angle between roads tells the focal length, and one that was found by that focal
     # length proves nothing
     circular = prior.family == 'distortion_free' and not (
-        prior.focal_known or fit.problem.config.options.crossing_deg is not None)
+        prior.focal_known or fit.problem.config.options.crossing_deg is not None
+    )
     needed = min(gate.max_sigma_focal_rel, MAX_TURNING_FOCAL_SIGMA) if turned else gate.max_sigma_focal_rel
     if not (too_long or circular or not sigma <= needed):
         return None
     found = f'focal length {camera.focal_px:.0f} px +- {min(sigma, 9.99):.1%}, {needed:.0%} is needed'
     if turned:
-        return Reason('too_little_turning', f'traffic that turns tells too little of the lens: {found}',
-                      'wait for more vehicles that turn, or for straight traffic')
+        return Reason(
+            'too_little_turning',
+            f'traffic that turns tells too little of the lens: {found}',
+            'wait for more vehicles that turn, or for straight traffic',
+        )
     return Reason(
-        'too_little_curvature', f'straight traffic shows too little lens curvature: {found}',
+        'too_little_curvature',
+        f'straight traffic shows too little lens curvature: {found}',
         'wait for traffic nearer the borders of the image; a lens without distortion needs the angle between two '
-        'roads (joint.road_angle) or its focal length (joint.focal_prior_px)')
+        'roads (joint.road_angle) or its focal length (joint.focal_prior_px)',
+    )
 
 
 def _check_lens_model(fit: Adjustment) -> Reason | None:
@@ -173,8 +197,10 @@ def _check_lens_model(fit: Adjustment) -> Reason | None:
     off = abs(camera.k[0] - prior.centre.k[0]) / prior.sigma[3]
     if off > MAX_K1_SIGMAS:
         return Reason(
-            'lens_model', f'the lens is not close to {prior.family}: k1 = {camera.k[0]:.3f}, {off:.1f} sigmas off',
-            'widen joint.k1_sigma if the lens is known to differ')
+            'lens_model',
+            f'the lens is not close to {prior.family}: k1 = {camera.k[0]:.3f}, {off:.1f} sigmas off',
+            'widen joint.k1_sigma if the lens is known to differ',
+        )
     return None
 
 
@@ -182,15 +208,20 @@ def check_plane(plane: PlaneEstimate, gate: GateOptions, *, assumed: bool = Fals
     """Say why the ground plane cannot be trusted, if so; one that is `assumed` may be less sure."""
     sigma = plane.worst_sigma_deg
     if isinstance(plane.assumed, LevelCamera) and not plane.assumed.constrains_plane(plane.fit.state):
-        return Reason('plane_uncertain', 'the road leads level across the image, where the roll of the camera tells '
-                      'nothing of the plane', 'wait for traffic across the road, or that turns')
+        return Reason(
+            'plane_uncertain',
+            'the road leads level across the image, where the roll of the camera tells nothing of the plane',
+            'wait for traffic across the road, or that turns',
+        )
     if plane.assumed is not None and plane.fraction_below_horizon < MIN_FRACTION_BELOW_HORIZON:
         return _above_horizon_reason(plane.fraction_below_horizon)
     needed = gate.max_sigma_tilt_deg * (ASSUMED_PLANE_SIGMA_FACTOR if assumed or plane.assumed is not None else 1.0)
     if not sigma <= needed:
         return Reason(
-            'plane_uncertain', f'the ground normal is known to {min(sigma, 90.0):.1f} degrees, {needed:g} are needed',
-            'wait for more traffic on the quieter road')
+            'plane_uncertain',
+            f'the ground normal is known to {min(sigma, 90.0):.1f} degrees, {needed:g} are needed',
+            'wait for more traffic on the quieter road',
+        )
     return None
 
 
@@ -198,8 +229,11 @@ def check_halves(fit: Adjustment, tracks: TrackSet, gate: GateOptions) -> Reason
     """Solve the earlier and the later half of the vehicles; they have to agree within what they know."""
     config = replace(fit.problem.config, vehicle_correlation=fit.vehicle_correlation)
     lives = no_tracklets() if config.bundle is None else config.bundle.lives
-    early, lived, windows = _earlier_half((tracks.vehicles, tracks.times_s), (lives.bodies, lives.times_s),
-                                     (config.windows.bodies, config.windows.times_s))
+    early, lived, windows = _earlier_half(
+        (tracks.vehicles, tracks.times_s),
+        (lives.bodies, lives.times_s),
+        (config.windows.bodies, config.windows.times_s),
+    )
     fits = []
     for half, seen, living in ((early, windows, lived), (~early, ~windows, ~lived)):
         part, bundle = tracks.subset(half), config.bundle and config.bundle.subset(living)
@@ -214,12 +248,17 @@ def check_halves(fit: Adjustment, tracks: TrackSet, gate: GateOptions) -> Reason
     apart = compare_solutions(*fits)
     focal, turn = apart.focal, apart.normal_deg if fit.plane_known else 0.0  # one road leaves the normal free
     # what either half says of itself is no excuse where the whole claims to know better
-    focal_limit, turn_limit = np.maximum((HALVES_FOCAL_TOLERANCE, HALVES_NORMAL_TOLERANCE_DEG), np.minimum(
-        MAX_HALVES_SIGMAS * apart.sigmas, MAX_WHOLE_SIGMAS * expected_half_differences(fit, *fits)))
+    focal_limit, turn_limit = np.maximum(
+        (HALVES_FOCAL_TOLERANCE, HALVES_NORMAL_TOLERANCE_DEG),
+        np.minimum(MAX_HALVES_SIGMAS * apart.sigmas, MAX_WHOLE_SIGMAS * expected_half_differences(fit, *fits)),
+    )
     if focal > focal_limit or turn > turn_limit:
         return Reason(
-            'halves_disagree', f'the earlier and the later half of the traffic disagree: focal length by {focal:.1%}, '
-            f'ground normal by {turn:.1f} degrees', 'record for longer; check that the camera is firmly fixed')
+            'halves_disagree',
+            f'the earlier and the later half of the traffic disagree: focal length by {focal:.1%}, '
+            f'ground normal by {turn:.1f} degrees',
+            'record for longer; check that the camera is firmly fixed',
+        )
     normal = f' and {turn:.1f} degrees in the ground normal' if fit.plane_known else ''
     return f'the earlier and the later half of the traffic differ by {focal:.1%} in focal length{normal}'
 
@@ -230,7 +269,9 @@ def _earlier_half(*seen: tuple[np.ndarray, np.ndarray]) -> list[np.ndarray]:
     The middle is that of all that are seen, each as often as it has owners.
     """
     means = [_mean_times(vehicle_ids, times_s) for vehicle_ids, times_s in seen]
-    each = [mean[np.unique(vehicle_ids, return_index=True)[1]] for mean, (vehicle_ids, _) in zip(means, seen, strict=True)]
+    each = [
+        mean[np.unique(vehicle_ids, return_index=True)[1]] for mean, (vehicle_ids, _) in zip(means, seen, strict=True)
+    ]
     middle = np.median(np.concatenate(each))
     return [mean <= middle for mean in means]
 

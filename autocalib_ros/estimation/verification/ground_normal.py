@@ -52,7 +52,9 @@ class LevelCamera:
         return f'a camera that is not rolled: roll = 0 +- {self.sigma_deg:g} degrees'
 
 
-def combine_assumptions(level: LevelCamera, square: TransverseDirection, state: AdjustmentState) -> tuple[TransverseDirection | None, float]:
+def combine_assumptions(
+    level: LevelCamera, square: TransverseDirection, state: AdjustmentState
+) -> tuple[TransverseDirection | None, float]:
     """Join two assumptions by their variances, None where they contradict each other; and their difference in degrees.
 
     The difference is a rotation about the road, nan where the roll does not tell the plane.
@@ -69,8 +71,12 @@ def combine_assumptions(level: LevelCamera, square: TransverseDirection, state: 
 
     sigma = level.step_sigma_rad * abs(turn(STEP_RAD) - turn(-STEP_RAD)) / (2 * STEP_RAD)
     both = float(np.hypot(sigma, square.step_sigma_rad))
-    joined = replace(square, turn_rad=turn(0.0) * (square.step_sigma_rad / both) ** 2,
-                     step_sigma_rad=square.step_sigma_rad * sigma / both, besides=f', and {level.description}')
+    joined = replace(
+        square,
+        turn_rad=turn(0.0) * (square.step_sigma_rad / both) ** 2,
+        step_sigma_rad=square.step_sigma_rad * sigma / both,
+        besides=f', and {level.description}',
+    )
     return joined if abs(turn(0.0)) <= AGREEMENT_SIGMAS * both else None, float(np.degrees(abs(turn(0.0))))
 
 
@@ -87,7 +93,9 @@ class PlaneEstimate:
     """Share of the tracked points below the horizon."""
 
     @classmethod
-    def of(cls, fit: Adjustment, tracks: TrackSet, assumed: LevelCamera | TransverseDirection | None = None) -> PlaneEstimate:
+    def of(
+        cls, fit: Adjustment, tracks: TrackSet, assumed: LevelCamera | TransverseDirection | None = None
+    ) -> PlaneEstimate:
         """Return the plane of a solution, the side of the traffic below."""
         plane = cls(fit, 1.0, assumed)
         normal = plane.normal(fit.state)

@@ -17,8 +17,13 @@ def release_k2(fit: Adjustment, tracks: TrackSet) -> Adjustment:
     config = fit.problem.config
     if config.prior.family != 'equidistant' or config.prior.sigma[3] <= 0 or not fit.plane_known:
         return fit
-    bent = adjust(fit.state, tracks, replace(config, prior=config.prior.with_free_k2()), refine=True,
-                       warm_start=fit.problem.warm_start)
+    bent = adjust(
+        fit.state,
+        tracks,
+        replace(config, prior=config.prior.with_free_k2()),
+        refine=True,
+        warm_start=fit.problem.warm_start,
+    )
     return select_model([fit, bent], tracks, MODEL_SELECTION_MARGIN)
 
 
@@ -31,8 +36,13 @@ def fix_unidentifiable(fit: Adjustment, tracks: TrackSet) -> tuple[Adjustment, t
     camera = fit.state.camera
     for name in fixed:
         camera = _restored(camera, at_prior, name)
-    solved = adjust(replace(fit.state, camera=camera), tracks,
-                         replace(config, prior=config.prior.with_fixed(fixed)), refine=True, warm_start=fit.problem.warm_start)
+    solved = adjust(
+        replace(fit.state, camera=camera),
+        tracks,
+        replace(config, prior=config.prior.with_fixed(fixed)),
+        refine=True,
+        warm_start=fit.problem.warm_start,
+    )
     return evaluate_with(solved, tracks, config), fixed
 
 
@@ -52,7 +62,9 @@ def _restored(camera: Camera, prior: Camera, name: str) -> Camera:
         'focal length': {'focal_px': prior.focal_px},
         'principal point x': {'principal_point_px': (prior.principal_point_px[0], cy)},
         'principal point y': {'principal_point_px': (cx, prior.principal_point_px[1])},
-        'k1': {'k': (prior.k[0], k2, *rest)}, 'k2': {'k': (k1, prior.k[1], *rest)}}
+        'k1': {'k': (prior.k[0], k2, *rest)},
+        'k2': {'k': (k1, prior.k[1], *rest)},
+    }
     return replace(camera, **values[name])
 
 
@@ -61,8 +73,11 @@ def lens_assumptions(fit: Adjustment, fixed: tuple[str, ...]) -> tuple[str, ...]
     prior = fit.problem.config.prior
     if prior.family == 'known':
         return ('the lens is as given: only the pose was solved',)
-    words = {'equidistant': 'lens near equidistant: k1 = 0', 'distortion_free': 'lens free of distortion: k1 = 1/3',
-             'kannala_brandt': 'lens between equidistant and free of distortion: k1 = 1/6'}
+    words = {
+        'equidistant': 'lens near equidistant: k1 = 0',
+        'distortion_free': 'lens free of distortion: k1 = 1/3',
+        'kannala_brandt': 'lens between equidistant and free of distortion: k1 = 1/6',
+    }
     told = [f'{words[prior.family]} +- {prior.sigma[3]:.3g}']
     point = prior.sigma[1]
     told.append('principal point at the image centre' + (f' +- {point:.0f} px' if point > 0 else ''))

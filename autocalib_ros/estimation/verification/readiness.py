@@ -38,9 +38,16 @@ def drift_limit_px(image_width: int, gate: GateOptions) -> float:
 def check_steady(evidence: Evidence, gate: GateOptions) -> Reason | None:
     """Say how far the camera moved, where that is too far."""
     limit = drift_limit_px(evidence.image_size[0], gate)
-    return None if evidence.drift_px <= limit else Reason(
-        'camera_moving', f'the camera moves: the background drifted by {evidence.drift_px:.1f} px, and up to '
-        f'{limit:.1f} px pass for standing still', 'fix the camera to something rigid and record again')
+    return (
+        None
+        if evidence.drift_px <= limit
+        else Reason(
+            'camera_moving',
+            f'the camera moves: the background drifted by {evidence.drift_px:.1f} px, and up to '
+            f'{limit:.1f} px pass for standing still',
+            'fix the camera to something rigid and record again',
+        )
+    )
 
 
 def check_readiness(evidence: Evidence, gate: GateOptions) -> Reason | None:
@@ -50,26 +57,37 @@ def check_readiness(evidence: Evidence, gate: GateOptions) -> Reason | None:
         return moving
     if not evidence.track_count:
         return Reason(
-            'no_motion', f'nothing moved in {evidence.frames} images over {evidence.seconds:.0f} s',
-            'check that the camera sees traffic and that the images are not frozen or dark')
+            'no_motion',
+            f'nothing moved in {evidence.frames} images over {evidence.seconds:.0f} s',
+            'check that the camera sees traffic and that the images are not frozen or dark',
+        )
     if evidence.track_count < gate.min_tracks:
         return Reason(
-            'too_few_tracks', f'{evidence.track_count} tracks of the {gate.min_tracks} needed after '
-            f'{evidence.seconds:.0f} s', 'wait for more traffic, or record for longer')
+            'too_few_tracks',
+            f'{evidence.track_count} tracks of the {gate.min_tracks} needed after {evidence.seconds:.0f} s',
+            'wait for more traffic, or record for longer',
+        )
     if evidence.coverage < gate.min_coverage:
         return Reason(
-            'poor_coverage', f'traffic crossed {evidence.coverage:.0%} of the image, {gate.min_coverage:.0%} is needed',
-            'turn the camera so that the road fills more of the image, or choose a longer lens')
+            'poor_coverage',
+            f'traffic crossed {evidence.coverage:.0%} of the image, {gate.min_coverage:.0%} is needed',
+            'turn the camera so that the road fills more of the image, or choose a longer lens',
+        )
     return None
 
 
 def requirements(evidence: Evidence, gate: GateOptions, first_solve_s: float) -> list[Requirement]:
     """Return what a first solution needs."""
     tracks, coverage, seconds = evidence.track_count, evidence.coverage, evidence.seconds
-    return [Requirement(tracks, gate.min_tracks, f'{tracks} of {gate.min_tracks} tracks'),
-            Requirement(coverage, gate.min_coverage,
-                        f'traffic crossed {coverage:.0%} of the image, {gate.min_coverage:.0%} is needed'),
-            Requirement(seconds, first_solve_s, f'{seconds:.0f} s of the first {first_solve_s:g} s watched')]
+    return [
+        Requirement(tracks, gate.min_tracks, f'{tracks} of {gate.min_tracks} tracks'),
+        Requirement(
+            coverage,
+            gate.min_coverage,
+            f'traffic crossed {coverage:.0%} of the image, {gate.min_coverage:.0%} is needed',
+        ),
+        Requirement(seconds, first_solve_s, f'{seconds:.0f} s of the first {first_solve_s:g} s watched'),
+    ]
 
 
 def outlook(evidence: Evidence, fraction: float) -> str:

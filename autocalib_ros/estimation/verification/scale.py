@@ -74,9 +74,11 @@ def known_scale(options: Options, camera: Camera, normal: np.ndarray, flow: Trac
     if options.allow_unit_scale:
         return Scale(lambda *_: 1.0, 0.0, False, '')
     return Reason(
-        'no_height', 'the ground plane needs the height of the camera above the road, which was not given',
+        'no_height',
+        'the ground plane needs the height of the camera above the road, which was not given',
         'give camera_height in metres; or a distance on the road or the mean speed of the traffic (scale_from); or '
-        'allow_unit_scale for a plane in units of the height')
+        'allow_unit_scale for a plane in units of the height',
+    )
 
 
 def check_scale(height: float, sigma: float, gate: GateOptions) -> Reason | None:
@@ -84,10 +86,12 @@ def check_scale(height: float, sigma: float, gate: GateOptions) -> Reason | None
     if sigma <= gate.max_sigma_height_rel * height:
         return None
     return Reason(
-        'scale_uncertain', f'the scale is too uncertain: camera height {height:.2f} m +- '
+        'scale_uncertain',
+        f'the scale is too uncertain: camera height {height:.2f} m +- '
         f'{min(sigma / height, 9.99):.0%}, {gate.max_sigma_height_rel:.0%} is needed',
         'give it more surely: a longer distance on the road nearer to the camera, the mean speed of more traffic, or '
-        'the camera height')
+        'the camera height',
+    )
 
 
 def is_unusual(height_m: float) -> bool:
@@ -104,27 +108,38 @@ def _scale_from_distance(given: ScaleOptions, camera: Camera, normal: np.ndarray
         if not there or sine < MIN_DEPRESSION_SCALE_SINE:
             degrees, needed = np.degrees(np.arcsin([sine, MIN_DEPRESSION_SCALE_SINE]))
             side = 'below' if degrees > 0 else 'above'
-            where = f'lies {abs(degrees):.1f} degrees {side} the horizon of the plane found' if there else (
-                'lies where the lens found shows nothing')
+            where = (
+                f'lies {abs(degrees):.1f} degrees {side} the horizon of the plane found'
+                if there
+                else ('lies where the lens found shows nothing')
+            )
             return Reason(
-                'scale_off_road', f'pixel ({u:g}, {v:g}) of scale.distance_px is not on the road: it {where}, at least '
-                f'{needed:.1f} degrees below is needed', 'give two pixels on the surface of the road, near to the '
-                'camera')
+                'scale_off_road',
+                f'pixel ({u:g}, {v:g}) of scale.distance_px is not on the road: it {where}, at least '
+                f'{needed:.1f} degrees below is needed',
+                'give two pixels on the surface of the road, near to the camera',
+            )
 
     def length(lens: Camera, up: np.ndarray, at: np.ndarray = pixels) -> float:
         return float(np.hypot(*np.subtract(*ground_points(lens, up, 1.0, at))))
 
     heights = length(camera, normal)
     steps = STEP_PX * np.eye(4).reshape(4, 2, 2)
-    slopes = np.array([length(camera, normal, pixels + step) - length(camera, normal, pixels - step)
-                       for step in steps]) / (2 * STEP_PX)
-    relative = np.hypot(given.distance_sigma_m / given.distance_m,
-                        given.pixel_sigma_px * np.linalg.norm(slopes) / heights)
+    slopes = np.array(
+        [length(camera, normal, pixels + step) - length(camera, normal, pixels - step) for step in steps]
+    ) / (2 * STEP_PX)
+    relative = np.hypot(
+        given.distance_sigma_m / given.distance_m, given.pixel_sigma_px * np.linalg.norm(slopes) / heights
+    )
     between = ' and '.join(f'({u:g}, {v:g})' for u, v in given.pixels)
     return Scale(
-        lambda lens, up: given.distance_m / length(lens, up), float(given.distance_m / heights * relative), True,
+        lambda lens, up: given.distance_m / length(lens, up),
+        float(given.distance_m / heights * relative),
+        True,
         f'{given.distance_m:g} +- {given.distance_sigma_m:g} m on the road between the pixels {between}, each '
-        f'+- {given.pixel_sigma_px:g} px (given)', derived=True)
+        f'+- {given.pixel_sigma_px:g} px (given)',
+        derived=True,
+    )
 
 
 def _scale_from_speed(given: ScaleOptions, camera: Camera, normal: np.ndarray, flow: TrackSet) -> Scale | Reason:
@@ -139,20 +154,27 @@ def _scale_from_speed(given: ScaleOptions, camera: Camera, normal: np.ndarray, f
     vehicles = len(np.unique(tracks.vehicles))
     if vehicles < MIN_SPEED_VEHICLES:
         return Reason(
-            'too_few_vehicles', f'{vehicles} vehicles drive straight along the busiest road, {MIN_SPEED_VEHICLES} are '
-            'needed to compare their speed with the mean that was given', 'wait for more traffic, or record for longer')
+            'too_few_vehicles',
+            f'{vehicles} vehicles drive straight along the busiest road, {MIN_SPEED_VEHICLES} are '
+            'needed to compare their speed with the mean that was given',
+            'wait for more traffic, or record for longer',
+        )
     speeds = _vehicle_speeds(camera, normal, tracks)
     mean, error = trimmed_mean(speeds)
     varying = MAD_TO_SIGMA * float(np.median(np.abs(speeds - np.median(speeds)))) / mean
     above = given.speed_km_h * M_S_PER_KM_H / mean
     relative = np.linalg.norm([given.speed_sigma_km_h / given.speed_km_h, error / mean, varying**2])
     return Scale(
-        lambda lens, up: (given.speed_km_h * M_S_PER_KM_H / trimmed_mean(_vehicle_speeds(lens, up, tracks))[0]
-                          + given.point_height_m),
-        float(np.hypot(above * relative, given.point_height_sigma_m)), True,
+        lambda lens, up: (
+            given.speed_km_h * M_S_PER_KM_H / trimmed_mean(_vehicle_speeds(lens, up, tracks))[0] + given.point_height_m
+        ),
+        float(np.hypot(above * relative, given.point_height_sigma_m)),
+        True,
         f'a mean speed of {given.speed_km_h:g} +- {given.speed_sigma_km_h:g} km/h (given) of {vehicles} vehicles on '
         f'the busiest road, which vary by {varying:.0%}, seen {given.point_height_m:g} +- '
-        f'{given.point_height_sigma_m:g} m above it', derived=True)
+        f'{given.point_height_sigma_m:g} m above it',
+        derived=True,
+    )
 
 
 def _flowing(camera: Camera, normal: np.ndarray, flow: TrackSet) -> TrackSet:
@@ -189,4 +211,4 @@ def trimmed_mean(values: np.ndarray) -> tuple[float, float]:
     low, high = ordered[cut], ordered[len(values) - 1 - cut]
     spread = np.clip(ordered, low, high).std(ddof=1)
     kept = len(values) - 2 * cut
-    return float(ordered[cut:len(values) - cut].mean()), float(spread * np.sqrt(len(values)) / kept)
+    return float(ordered[cut : len(values) - cut].mean()), float(spread * np.sqrt(len(values)) / kept)

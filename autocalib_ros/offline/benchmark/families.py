@@ -55,14 +55,21 @@ def standard_junction(generator: np.random.Generator, heading_deg: tuple[float, 
     reach = generator.uniform(1.1, 1.7) * height / np.tan(np.radians(tilt))
     bearing = np.radians(generator.uniform(-8, 8) - heading)
     return Junction(
-        camera=draw_lens(generator), camera_from_ground=pose(tilt, roll, heading), height_m=float(height),
-        centre_m=(float(reach * np.cos(bearing)), float(reach * np.sin(bearing))), tracks=60, points_per_vehicle=1)
+        camera=draw_lens(generator),
+        camera_from_ground=pose(tilt, roll, heading),
+        height_m=float(height),
+        centre_m=(float(reach * np.cos(bearing)), float(reach * np.sin(bearing))),
+        tracks=60,
+        points_per_vehicle=1,
+    )
 
 
 def draw_lens(generator: np.random.Generator) -> Camera:
     """Draw a lens near equidistant whose principal point is off the image centre."""
-    focal, k1, right, down = generator.uniform([FOCAL_PX[0], -MAX_K1, -MAX_CENTRE_OFFSET_PX, -MAX_CENTRE_OFFSET_PX],
-                                               [FOCAL_PX[1], MAX_K1, MAX_CENTRE_OFFSET_PX, MAX_CENTRE_OFFSET_PX])
+    focal, k1, right, down = generator.uniform(
+        [FOCAL_PX[0], -MAX_K1, -MAX_CENTRE_OFFSET_PX, -MAX_CENTRE_OFFSET_PX],
+        [FOCAL_PX[1], MAX_K1, MAX_CENTRE_OFFSET_PX, MAX_CENTRE_OFFSET_PX],
+    )
     cx, cy = image_centre(WIDTH, HEIGHT)
     return Camera(WIDTH, HEIGHT, float(focal), (float(cx + right), float(cy + down)), (float(k1), 0.0, 0.0, 0.0))
 
@@ -74,6 +81,7 @@ def draw_distortion_free_lens(generator: np.random.Generator) -> Camera:
 
 def family_of(junction_of: Callable[[np.random.Generator], Junction]) -> Family:
     """Make a family of junctions that are drawn and then driven through."""
+
     def family(generator: np.random.Generator) -> tuple[Junction, Evidence]:
         junction = junction_of(generator)
         return junction, synthetic_evidence(junction, generator)
@@ -104,7 +112,11 @@ def three_roads(generator: np.random.Generator) -> Junction:
 
 def one_road(generator: np.random.Generator) -> Junction:
     """One road, straight, passing off the optical axis: the lens alone can be had."""
-    return replace(_random_track_count(standard_junction(generator, (40.0, 75.0)), generator), road_angles_deg=(0.0,), turning_fraction=0.0)
+    return replace(
+        _random_track_count(standard_junction(generator, (40.0, 75.0)), generator),
+        road_angles_deg=(0.0,),
+        turning_fraction=0.0,
+    )
 
 
 def distortion_free(generator: np.random.Generator) -> Junction:
@@ -116,8 +128,9 @@ def radial(generator: np.random.Generator) -> Junction:
     """One road straight ahead: each track runs through the distortion centre, where no lens bends it."""
     junction = _random_track_count(standard_junction(generator, (-1.0, 1.0)), generator)
     lanes = (0.0, float(generator.uniform(0.3, 1.5)))
-    return replace(junction, centre_m=(junction.centre_m[0], 0.0), road_angles_deg=(0.0,), lanes_m=lanes,
-                   turning_fraction=0.0)
+    return replace(
+        junction, centre_m=(junction.centre_m[0], 0.0), road_angles_deg=(0.0,), lanes_m=lanes, turning_fraction=0.0
+    )
 
 
 def bend(generator: np.random.Generator) -> Junction:
@@ -138,8 +151,14 @@ def turning(generator: np.random.Generator) -> Junction:
     The principal point is the image centre: turns tell less of it than of all else.
     """
     junction = _with_centred_lens(standard_junction(generator), generator)
-    return replace(junction, drive=partial(drive_arc, radii_m=(12.0, 60.0)), tracks=None, vehicles=25,
-                   points_per_vehicle=8, merged_fraction=0.2)
+    return replace(
+        junction,
+        drive=partial(drive_arc, radii_m=(12.0, 60.0)),
+        tracks=None,
+        vehicles=25,
+        points_per_vehicle=8,
+        merged_fraction=0.2,
+    )
 
 
 def turning_off_centre(generator: np.random.Generator) -> Junction:
@@ -157,8 +176,12 @@ def motorway(generator: np.random.Generator) -> Junction:
 def long_bend(generator: np.random.Generator) -> Junction:
     """A road with lanes both ways that bends by 80 degrees on 64 to 112 m: in view, mostly about one point."""
     junction = _with_centred_lens(standard_junction(generator), generator)
-    return _with_traffic_on(junction, road_bend(one_way=False), rotation_rad=generator.uniform(0, 2 * np.pi),
-                      scale=generator.uniform(0.8, 1.4))
+    return _with_traffic_on(
+        junction,
+        road_bend(one_way=False),
+        rotation_rad=generator.uniform(0, 2 * np.pi),
+        scale=generator.uniform(0.8, 1.4),
+    )
 
 
 def roundabout_arms(generator: np.random.Generator) -> Junction:
@@ -167,8 +190,12 @@ def roundabout_arms(generator: np.random.Generator) -> Junction:
     scale = generator.uniform(0.8, 1.3)
     direction = np.array(junction.centre_m) / np.hypot(*junction.centre_m)
     x, y = (scale * RING_RADIUS_M + generator.uniform(6.0, 14.0)) * direction
-    return _with_traffic_on(replace(junction, centre_m=(float(x), float(y))), ring_roads(turning_fraction=0.5),
-                      rotation_rad=generator.uniform(0, 2 * np.pi), scale=scale)
+    return _with_traffic_on(
+        replace(junction, centre_m=(float(x), float(y))),
+        ring_roads(turning_fraction=0.5),
+        rotation_rad=generator.uniform(0, 2 * np.pi),
+        scale=scale,
+    )
 
 
 def skew_turning(generator: np.random.Generator) -> Junction:
@@ -189,7 +216,9 @@ def sparse(generator: np.random.Generator) -> Junction:
     return replace(junction, vehicles=int(generator.integers(10, 21)), headway_s=12.0)
 
 
-def _with_traffic_on(junction: Junction, network: Network, *, rotation_rad: float = 0.0, scale: float = 1.0) -> Junction:
+def _with_traffic_on(
+    junction: Junction, network: Network, *, rotation_rad: float = 0.0, scale: float = 1.0
+) -> Junction:
     """Let 40 vehicles with eight points each drive the routes of a network."""
     drive = partial(drive_route, network=network, rotation_rad=rotation_rad, scale=scale)
     return replace(junction, drive=drive, tracks=None, vehicles=40, points_per_vehicle=8)
@@ -197,8 +226,10 @@ def _with_traffic_on(junction: Junction, network: Network, *, rotation_rad: floa
 
 def _with_centred_lens(junction: Junction, generator: np.random.Generator) -> Junction:
     """Give the camera a lens nearer equidistant, with its principal point at the image centre."""
-    camera = replace(Camera.equidistant(WIDTH, HEIGHT, junction.camera.focal_px),
-                     k=(float(generator.uniform(-TURNING_K1, TURNING_K1)), 0.0, 0.0, 0.0))
+    camera = replace(
+        Camera.equidistant(WIDTH, HEIGHT, junction.camera.focal_px),
+        k=(float(generator.uniform(-TURNING_K1, TURNING_K1)), 0.0, 0.0, 0.0),
+    )
     return replace(junction, camera=camera)
 
 
@@ -210,8 +241,12 @@ def pedestrians(generator: np.random.Generator) -> Junction:
 def short_piece(generator: np.random.Generator) -> Junction:
     """One road from the side, of which only a short piece is in view."""
     left = generator.uniform(0.2, 0.6) * WIDTH
-    return replace(_random_track_count(standard_junction(generator, (75.0, 105.0)), generator), road_angles_deg=(0.0,),
-                   turning_fraction=0.0, visible_columns_px=(left, left + generator.uniform(0.15, 0.3) * WIDTH))
+    return replace(
+        _random_track_count(standard_junction(generator, (75.0, 105.0)), generator),
+        road_angles_deg=(0.0,),
+        turning_fraction=0.0,
+        visible_columns_px=(left, left + generator.uniform(0.15, 0.3) * WIDTH),
+    )
 
 
 def distortion_free_skew(generator: np.random.Generator) -> Junction:

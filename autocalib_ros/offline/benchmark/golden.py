@@ -91,8 +91,15 @@ class Measured:
     moved: tuple[Moved, ...]
 
 
-def measure(folder: Path, only: Sequence[str] = (), *, tolerance: float = 0.1, exact: bool = False, jobs: int = 1,
-            quiet: bool = False) -> Measured:
+def measure(
+    folder: Path,
+    only: Sequence[str] = (),
+    *,
+    tolerance: float = 0.1,
+    exact: bool = False,
+    jobs: int = 1,
+    quiet: bool = False,
+) -> Measured:
     """Solve the cases of a folder, or `only` some of them by name, in the order of their names."""
     if jobs < 1:
         raise UsageError(f'--jobs is 1 or more; got {jobs}')
@@ -104,8 +111,11 @@ def measure(folder: Path, only: Sequence[str] = (), *, tolerance: float = 0.1, e
         for case, outcome in zip(cases, in_order(partial(outcome_of, folder), cases, jobs), strict=True):
             found[case.name] = outcome
             progress.update_to(len(found), case.name)
-    moved = [item for case in cases
-             for item in differences(case.name, case.expected, found[case.name], tolerance=tolerance, exact=exact)]
+    moved = [
+        item
+        for case in cases
+        for item in differences(case.name, case.expected, found[case.name], tolerance=tolerance, exact=exact)
+    ]
     return Measured(tuple(cases), found, tuple(moved))
 
 
@@ -113,8 +123,13 @@ def update(folder: Path, measured: Measured) -> None:
     """Expect what was found from now on, of the cases in which something moved; all else stays as it is."""
     changed = {item.case for item in measured.moved}
     if changed:
-        write_cases(folder, [replace(case, expected=measured.found[case.name]) if case.name in changed else case
-                             for case in read_cases(folder)])
+        write_cases(
+            folder,
+            [
+                replace(case, expected=measured.found[case.name]) if case.name in changed else case
+                for case in read_cases(folder)
+            ],
+        )
 
 
 def chosen(cases: Sequence[Case], names: Sequence[str]) -> list[Case]:
@@ -129,8 +144,13 @@ def chosen(cases: Sequence[Case], names: Sequence[str]) -> list[Case]:
 def outcome_of(folder: Path, case: Case) -> Outcome:
     """Solve a case; a solver that fails is an outcome too, and does not end the benchmark."""
     evidence, options = Evidence.load(folder / case.evidence), override_options(Options(), case.options)
-    lens = None if case.lens is None else Camera(
-        *evidence.image_size, case.lens['focal_px'], tuple(case.lens['principal_point_px']), tuple(case.lens['k']))
+    lens = (
+        None
+        if case.lens is None
+        else Camera(
+            *evidence.image_size, case.lens['focal_px'], tuple(case.lens['principal_point_px']), tuple(case.lens['k'])
+        )
+    )
     try:
         return told(solve(evidence, options, lens=lens))
     except AutocalibError:
@@ -148,26 +168,45 @@ def told(result: Calibration | Refusal) -> Outcome:
     if isinstance(result, Refusal):
         return Outcome(_words(state='refused', refusal=result.code))
     camera, ground, sigma = result.camera, result.ground, result.stddev
-    words = _words(state='calibrated', grade=result.grade, roads=len(result.road_directions),
-                   ground_refusal=result.ground_refusal.code if result.ground_refusal else None,
-                   people=result.evidence.people)
+    words = _words(
+        state='calibrated',
+        grade=result.grade,
+        roads=len(result.road_directions),
+        ground_refusal=result.ground_refusal.code if result.ground_refusal else None,
+        people=result.evidence.people,
+    )
     pose = (None,) * 3 if ground is None else (*tilt_and_roll_deg(ground.normal_in_camera), ground.height_m)
     numbers = (camera.focal_px, *camera.principal_point_px, *camera.k, *pose)
     point = sigma.principal_point_px or (None, None)
-    deviations = (sigma.focal_px, *point, sigma.k1, sigma.k2, None, None, sigma.tilt_deg, sigma.roll_deg,
-                  sigma.height_m)
-    ahead = {f'ground_point_{distance:g}_m': value
-             for distance, value in zip(GROUND_DISTANCES_M, sigma.ground_point_m, strict=False)}
-    return Outcome(words, _given(dict(zip(COVARIANCE_PARAMETERS, numbers, strict=True))),
-                   _given({**dict(zip(COVARIANCE_PARAMETERS, deviations, strict=True)), **ahead}))
+    deviations = (
+        sigma.focal_px,
+        *point,
+        sigma.k1,
+        sigma.k2,
+        None,
+        None,
+        sigma.tilt_deg,
+        sigma.roll_deg,
+        sigma.height_m,
+    )
+    ahead = {
+        f'ground_point_{distance:g}_m': value
+        for distance, value in zip(GROUND_DISTANCES_M, sigma.ground_point_m, strict=False)
+    }
+    return Outcome(
+        words,
+        _given(dict(zip(COVARIANCE_PARAMETERS, numbers, strict=True))),
+        _given({**dict(zip(COVARIANCE_PARAMETERS, deviations, strict=True)), **ahead}),
+    )
 
 
 def _given(values: Mapping[str, float | None]) -> dict[str, float]:
     return {name: float(value) for name, value in values.items() if value is not None}
 
 
-def differences(case: str, expected: Outcome | None, found: Outcome, *, tolerance: float = 0.1,
-                exact: bool = False) -> list[Moved]:
+def differences(
+    case: str, expected: Outcome | None, found: Outcome, *, tolerance: float = 0.1, exact: bool = False
+) -> list[Moved]:
     """Return what moved; where the verdict is another, that alone.
 
     A number may differ by `tolerance` of its expected sigma, and a sigma by that part of itself; without a sigma, or
@@ -175,8 +214,11 @@ def differences(case: str, expected: Outcome | None, found: Outcome, *, toleranc
     """
     if expected is None:
         return [Moved(case, 'state', 'new', found.words['state'])]
-    moved = [Moved(case, name, expected.words[name], found.words[name]) for name in WORDS
-             if expected.words[name] != found.words[name]]
+    moved = [
+        Moved(case, name, expected.words[name], found.words[name])
+        for name in WORDS
+        if expected.words[name] != found.words[name]
+    ]
     if any(item.quantity in WORDS[:3] for item in moved):
         return moved
     allowed = {name: tolerance * sigma for name, sigma in expected.stddev.items()}
@@ -204,8 +246,15 @@ def lines(measured: Measured) -> list[str]:
     if not moved:
         return [f'{cases}: nothing moved']
     rows = [('case', 'quantity', 'expected', 'found', 'sigmas')]
-    rows += [(item.case, item.quantity, *_cells(item.expected, item.found),
-              '-' if item.sigmas is None else f'{item.sigmas:+.2g}') for item in moved]
+    rows += [
+        (
+            item.case,
+            item.quantity,
+            *_cells(item.expected, item.found),
+            '-' if item.sigmas is None else f'{item.sigmas:+.2g}',
+        )
+        for item in moved
+    ]
     touched = len({item.case for item in moved})
     return [*align_columns(rows), f'{cases}: {len(moved)} value{"" if len(moved) == 1 else "s"} moved in {touched}']
 
@@ -213,8 +262,10 @@ def lines(measured: Measured) -> list[str]:
 def _cells(expected: str | float | None, found: str | float | None) -> tuple[str, str]:
     """Return two values in as many digits as tell them apart."""
     for digits in (6, 10, 17):
-        cells = tuple(f'{value:.{digits}g}' if isinstance(value, float) else '-' if value is None else str(value)
-                      for value in (expected, found))
+        cells = tuple(
+            f'{value:.{digits}g}' if isinstance(value, float) else '-' if value is None else str(value)
+            for value in (expected, found)
+        )
         if cells[0] != cells[1]:
             break
     return cells[0], cells[1]
@@ -224,8 +275,10 @@ def read_cases(folder: Path) -> list[Case]:
     """Read the cases of a folder in the order of their names, or raise InputError."""
     path = folder / EXPECTED
     if not path.is_file():
-        raise InputError(f'{folder} holds no golden evidence (no {EXPECTED}): give the folder that does, tests/golden '
-                         'in the sources of this program')
+        raise InputError(
+            f'{folder} holds no golden evidence (no {EXPECTED}): give the folder that does, tests/golden '
+            'in the sources of this program'
+        )
     try:
         document = json.loads(path.read_text(encoding='utf-8'))
         if document['format'] != FORMAT:
@@ -240,10 +293,17 @@ def read_cases(folder: Path) -> list[Case]:
 def _case(name: str, entry: Mapping[str, Any]) -> Case:
     expected = entry['expected']
     return Case(
-        name=name, description=entry['description'], made=entry['made'], evidence=entry['evidence'],
-        options=entry['options'], lens=entry.get('lens'), truth=entry.get('truth'),
-        expected=None if expected is None else Outcome(
-            _words(**{word: expected[word] for word in WORDS}), expected['numbers'], expected['stddev']))
+        name=name,
+        description=entry['description'],
+        made=entry['made'],
+        evidence=entry['evidence'],
+        options=entry['options'],
+        lens=entry.get('lens'),
+        truth=entry.get('truth'),
+        expected=None
+        if expected is None
+        else Outcome(_words(**{word: expected[word] for word in WORDS}), expected['numbers'], expected['stddev']),
+    )
 
 
 def write_cases(folder: Path, cases: Sequence[Case]) -> None:
@@ -255,6 +315,13 @@ def write_cases(folder: Path, cases: Sequence[Case]) -> None:
 def _entry(case: Case) -> dict[str, Any]:
     expected = case.expected
     optional = {name: value for name, value in (('lens', case.lens), ('truth', case.truth)) if value is not None}
-    return {'description': case.description, 'made': case.made, 'evidence': case.evidence, 'options': case.options,
-            **optional, 'expected': None if expected is None else {
-                **expected.words, 'numbers': expected.numbers, 'stddev': expected.stddev}}
+    return {
+        'description': case.description,
+        'made': case.made,
+        'evidence': case.evidence,
+        'options': case.options,
+        **optional,
+        'expected': None
+        if expected is None
+        else {**expected.words, 'numbers': expected.numbers, 'stddev': expected.stddev},
+    }

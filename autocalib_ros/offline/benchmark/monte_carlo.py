@@ -77,8 +77,16 @@ class Task:
     methods: tuple[str, ...]
 
 
-def run_monte_carlo(names: Sequence[str], methods: Sequence[str], runs: int, *, seed: int = 0, jobs: int = 1,
-            out: Path | None = None, quiet: bool = False) -> list[Run]:
+def run_monte_carlo(
+    names: Sequence[str],
+    methods: Sequence[str],
+    runs: int,
+    *,
+    seed: int = 0,
+    jobs: int = 1,
+    out: Path | None = None,
+    quiet: bool = False,
+) -> list[Run]:
     """Solve `runs` draws of each family by each method; write a row a run to `out` as they come."""
     for name, value, least in (('runs', runs, 1), ('jobs', jobs, 1), ('seed', seed, 0)):
         if value < least:
@@ -120,24 +128,38 @@ def run_method(task: Task, method: str, junction: Junction, evidence: Evidence) 
     try:
         result = solve(evidence, Options(camera_height=junction.height_m, method=method))
     except Exception as error:
-        return Run(family=task.family, method=method, run=task.run, accepted=False,
-                   code=f'crash:{type(error).__name__}')
+        return Run(
+            family=task.family, method=method, run=task.run, accepted=False, code=f'crash:{type(error).__name__}'
+        )
     return compare_calibrations(task, method, result, junction, time.process_time() - began)
 
 
-def compare_calibrations(task: Task, method: str, result: Calibration | Refusal, junction: Junction, cpu_s: float) -> Run:
+def compare_calibrations(
+    task: Task, method: str, result: Calibration | Refusal, junction: Junction, cpu_s: float
+) -> Run:
     """Return how far a result is from the truth."""
     if isinstance(result, Refusal):
         return Run(family=task.family, method=method, run=task.run, accepted=False, code=result.code, cpu_s=cpu_s)
     true, sigma = junction.camera, result.stddev
     tilt, roll, normal = _pose_errors_deg(result.ground, junction.normal_in_camera)
     return Run(
-        family=task.family, method=method, run=task.run, accepted=True, code='', grade=result.grade,
-        focal_error=result.camera.focal_px / true.focal_px - 1, focal_sigma=_nan_if_none(sigma.focal_px) / true.focal_px,
-        rays_deg=mean_ray_error_deg(result.camera, true), normal_deg=normal,
-        tilt_error_deg=tilt, tilt_sigma_deg=_nan_if_none(sigma.tilt_deg),
-        roll_error_deg=roll, roll_sigma_deg=_nan_if_none(sigma.roll_deg),
-        distance_error=distance_error(result.camera, result.ground, junction), cpu_s=cpu_s)
+        family=task.family,
+        method=method,
+        run=task.run,
+        accepted=True,
+        code='',
+        grade=result.grade,
+        focal_error=result.camera.focal_px / true.focal_px - 1,
+        focal_sigma=_nan_if_none(sigma.focal_px) / true.focal_px,
+        rays_deg=mean_ray_error_deg(result.camera, true),
+        normal_deg=normal,
+        tilt_error_deg=tilt,
+        tilt_sigma_deg=_nan_if_none(sigma.tilt_deg),
+        roll_error_deg=roll,
+        roll_sigma_deg=_nan_if_none(sigma.roll_deg),
+        distance_error=distance_error(result.camera, result.ground, junction),
+        cpu_s=cpu_s,
+    )
 
 
 def _nan_if_none(value: float | None) -> float:
@@ -162,7 +184,7 @@ def mean_ray_error_deg(camera: Camera, true: Camera) -> float:
 
 
 def distance_error(camera: Camera, ground: GroundPlane | None, junction: Junction) -> float:
-    """Median relative error of distances between points of the road in view, up to `MAX_COMPARED_RANGE_M` from the camera."""
+    """Median relative error of distances between road points in view, up to `MAX_COMPARED_RANGE_M` away."""
     if ground is None:
         return NAN
     true_m, pixels = _road_points(junction)
@@ -204,5 +226,6 @@ def open_csv(path: Path | None) -> Iterator[Callable[[Sequence[Run]], None]]:
 
 
 def _row(run: Run) -> dict[str, object]:
-    return {name: '' if isinstance(value, float) and math.isnan(value) else value
-            for name, value in asdict(run).items()}
+    return {
+        name: '' if isinstance(value, float) and math.isnan(value) else value for name, value in asdict(run).items()
+    }

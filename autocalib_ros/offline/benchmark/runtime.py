@@ -40,12 +40,16 @@ def cost(path: Path, duration_s: float | None) -> str:
     mean, bare = 1e3 * float(np.mean(spent)), 1e3 * bare_optical_flow_s(images)
     height, width = images[0].shape[:2]
     after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    return '\n'.join([
-        f'{width}x{height}, {len(spent)} frames of {source.name}, one thread',
-        f'processor time per frame: mean {mean:.1f} ms, 95 % of frames below {1e3 * np.quantile(spent, 0.95):.1f} ms',
-        f'bare optical flow of {FLOW_POINTS} points: {bare:.1f} ms; a frame costs {mean / bare:.1f} times that',
-        f'one solution: {solution:.1f} s of processor time ({"calibrated" if result else "refused"})',
-        f'largest memory of the process: {memory:.0f} MB before the solution, {after:.0f} MB after'])
+    return '\n'.join(
+        [
+            f'{width}x{height}, {len(spent)} frames of {source.name}, one thread',
+            f'processor time per frame: mean {mean:.1f} ms, 95 % of frames '
+            f'below {1e3 * np.quantile(spent, 0.95):.1f} ms',
+            f'bare optical flow of {FLOW_POINTS} points: {bare:.1f} ms; a frame costs {mean / bare:.1f} times that',
+            f'one solution: {solution:.1f} s of processor time ({"calibrated" if result else "refused"})',
+            f'largest memory of the process: {memory:.0f} MB before the solution, {after:.0f} MB after',
+        ]
+    )
 
 
 def bare_optical_flow_s(images: list[np.ndarray]) -> float:
@@ -56,4 +60,3 @@ def bare_optical_flow_s(images: list[np.ndarray]) -> float:
     for _ in range(FLOW_REPEATS):
         cv2.calcOpticalFlowPyrLK(before, after, points, None, winSize=(15, 15), maxLevel=3)
     return (time.thread_time() - began) / FLOW_REPEATS
-

@@ -24,8 +24,11 @@ def format_tables(runs: Sequence[Run]) -> str:
     """Return the errors of the families, their standard deviations held against them, and the crashes."""
     determined = [run for run in runs if run.family not in UNDERDETERMINED]
     doubtful = [run for run in runs if run.family in UNDERDETERMINED]
-    blocks = [*_blocks('Evidence that determines the calibration', determined),
-              *_blocks('Evidence that does not, or that misleads', doubtful), *_crashes(runs)]
+    blocks = [
+        *_blocks('Evidence that determines the calibration', determined),
+        *_blocks('Evidence that does not, or that misleads', doubtful),
+        *_crashes(runs),
+    ]
     return '\n\n'.join(blocks)
 
 
@@ -40,8 +43,11 @@ def falsely_accepted(run: Run) -> bool:
 
 def is_overconfident(run: Run) -> bool:
     """Whether a published focal length, tilt or roll is wrong by more than three of its own standard deviations."""
-    pairs = ((run.focal_error, run.focal_sigma), (run.tilt_error_deg, run.tilt_sigma_deg),
-             (run.roll_error_deg, run.roll_sigma_deg))
+    pairs = (
+        (run.focal_error, run.focal_sigma),
+        (run.tilt_error_deg, run.tilt_sigma_deg),
+        (run.roll_error_deg, run.roll_sigma_deg),
+    )
     return run.accepted and any(abs(error) > FALSE_ACCEPT_SIGMAS * sigma for error, sigma in pairs)
 
 
@@ -54,8 +60,10 @@ def _blocks(title: str, runs: Sequence[Run]) -> list[str]:
         return []
     groups = list(dict.fromkeys((run.family, run.method) for run in runs))
     grouped = [[run for run in runs if (run.family, run.method) == group] for group in groups]
-    return [_block(f'{title}: errors', ERROR_HEADERS, map(_errors, grouped)),
-            _block(f'{title}: stated standard deviations against errors', SIGMA_HEADERS, map(_sigmas, grouped))]
+    return [
+        _block(f'{title}: errors', ERROR_HEADERS, map(_errors, grouped)),
+        _block(f'{title}: stated standard deviations against errors', SIGMA_HEADERS, map(_sigmas, grouped)),
+    ]
 
 
 def _block(title: str, heads: Sequence[str], lines: Iterable[str]) -> str:
@@ -63,33 +71,57 @@ def _block(title: str, heads: Sequence[str], lines: Iterable[str]) -> str:
 
 
 ERROR_HEADERS = (
-    ERRORS_FORMAT.format('', '', '', 'acc.', 'most common', 'focal', 'length', '%', '', 'normal', 'deg', 'rays', 'dist.'),
-    ERRORS_FORMAT.format('family', '', 'runs', '%', 'refusal', 'bias', 'spread', 'mean', 'worst', 'mean', 'worst', 'deg', '%'))
+    ERRORS_FORMAT.format(
+        '', '', '', 'acc.', 'most common', 'focal', 'length', '%', '', 'normal', 'deg', 'rays', 'dist.'
+    ),
+    ERRORS_FORMAT.format(
+        'family', '', 'runs', '%', 'refusal', 'bias', 'spread', 'mean', 'worst', 'mean', 'worst', 'deg', '%'
+    ),
+)
 SIGMA_HEADERS = (
-    SIGMAS_FORMAT.format('', '', '', 'acc.', 'false', 'beyond', 'plane', 'in 95 %', 'inter-', 'val, %', 'rms', 'z', 'solve'),
-    SIGMAS_FORMAT.format('family', '', 'runs', '%', 'acc.', '3 sig', '%', 'focal', 'tilt', 'roll', 'focal', 'tilt', 'cpu s'))
+    SIGMAS_FORMAT.format(
+        '', '', '', 'acc.', 'false', 'beyond', 'plane', 'in 95 %', 'inter-', 'val, %', 'rms', 'z', 'solve'
+    ),
+    SIGMAS_FORMAT.format(
+        'family', '', 'runs', '%', 'acc.', '3 sig', '%', 'focal', 'tilt', 'roll', 'focal', 'tilt', 'cpu s'
+    ),
+)
 
 
 def _errors(runs: Sequence[Run]) -> str:
     accepted = [run for run in runs if run.accepted]
     focal, normal = 100 * _column(accepted, 'focal_error'), _column(accepted, 'normal_deg')
     return ERRORS_FORMAT.format(
-        *_label_cells(runs), _common_refusal(runs), _format_statistic(focal, np.mean, '+.2f'), _format_statistic(focal, _spread, '.2f'),
-        _format_statistic(np.abs(focal), np.mean, '.2f'), _format_statistic(np.abs(focal), np.max, '.2f'), _format_statistic(normal, np.mean, '.2f'),
-        _format_statistic(normal, np.max, '.2f'), _format_statistic(_column(accepted, 'rays_deg'), np.mean, '.3f'),
-        _format_statistic(100 * _column(accepted, 'distance_error'), np.median, '.2f')).rstrip()
+        *_label_cells(runs),
+        _common_refusal(runs),
+        _format_statistic(focal, np.mean, '+.2f'),
+        _format_statistic(focal, _spread, '.2f'),
+        _format_statistic(np.abs(focal), np.mean, '.2f'),
+        _format_statistic(np.abs(focal), np.max, '.2f'),
+        _format_statistic(normal, np.mean, '.2f'),
+        _format_statistic(normal, np.max, '.2f'),
+        _format_statistic(_column(accepted, 'rays_deg'), np.mean, '.3f'),
+        _format_statistic(100 * _column(accepted, 'distance_error'), np.median, '.2f'),
+    ).rstrip()
 
 
 def _sigmas(runs: Sequence[Run]) -> str:
     accepted = [run for run in runs if run.accepted]
     planes = np.isfinite([run.normal_deg for run in accepted]).astype(float)
-    focal, tilt, roll = (_z_scores(accepted, 'focal_error', 'focal_sigma'), _z_scores(accepted, 'tilt_error_deg', 'tilt_sigma_deg'),
-                         _z_scores(accepted, 'roll_error_deg', 'roll_sigma_deg'))
+    focal, tilt, roll = (
+        _z_scores(accepted, 'focal_error', 'focal_sigma'),
+        _z_scores(accepted, 'tilt_error_deg', 'tilt_sigma_deg'),
+        _z_scores(accepted, 'roll_error_deg', 'roll_sigma_deg'),
+    )
     return SIGMAS_FORMAT.format(
-        *_label_cells(runs), sum(map(falsely_accepted, runs)), sum(map(is_overconfident, runs)),
+        *_label_cells(runs),
+        sum(map(falsely_accepted, runs)),
+        sum(map(is_overconfident, runs)),
         _format_statistic(100 * planes, np.mean, '.0f'),
-        *(_format_statistic(z, _coverage, '.0f') for z in (focal, tilt, roll)), *(_format_statistic(z, _rms, '.2f') for z in (focal, tilt)),
-        _format_statistic(_column(runs, 'cpu_s'), np.mean, '.2f')).rstrip()
+        *(_format_statistic(z, _coverage, '.0f') for z in (focal, tilt, roll)),
+        *(_format_statistic(z, _rms, '.2f') for z in (focal, tilt)),
+        _format_statistic(_column(runs, 'cpu_s'), np.mean, '.2f'),
+    ).rstrip()
 
 
 def _label_cells(runs: Sequence[Run]) -> tuple[str, str, int, str]:
@@ -103,8 +135,11 @@ def _common_refusal(runs: Sequence[Run]) -> str:
 
 
 def _crashes(runs: Sequence[Run]) -> list[str]:
-    crashed = [f'{run.family} {run.run} ({run.method}, {run.code.partition(":")[2]})' for run in runs
-               if run.code.startswith('crash:')]
+    crashed = [
+        f'{run.family} {run.run} ({run.method}, {run.code.partition(":")[2]})'
+        for run in runs
+        if run.code.startswith('crash:')
+    ]
     return ['\n'.join([f'{len(crashed)} solutions crashed:', *(f'  {text}' for text in crashed)])] if crashed else []
 
 

@@ -77,8 +77,9 @@ class BagSource:
         if broken and not decoded:
             raise InputError(f'none of the {broken} images on {self.topic} of {self.name} can be decoded: {reason}')
         if broken:
-            LOG.warning('%d of %d images could not be decoded and were skipped; the first: %s', broken,
-                        broken + decoded, reason)
+            LOG.warning(
+                '%d of %d images could not be decoded and were skipped; the first: %s', broken, broken + decoded, reason
+            )
         if order.late:
             LOG.warning('%d images came late or twice and were skipped', order.late)
 
@@ -151,7 +152,8 @@ class BagSource:
         stamp = message.header.stamp
         fields = {name: value for name, value in vars(message).items() if name not in ('header', '__msgtype__')}
         copied = types.types[self.image_type](
-            header=header(stamp=time(sec=stamp.sec, nanosec=stamp.nanosec), frame_id=message.header.frame_id), **fields)
+            header=header(stamp=time(sec=stamp.sec, nanosec=stamp.nanosec), frame_id=message.header.frame_id), **fields
+        )
         return types.serialize_cdr(copied, self.image_type)
 
 
@@ -177,14 +179,16 @@ class _Topics:
         if not images:
             raise InputError(f'{self._name} holds no images; its topics: {self._describe(self.counts)}')
         if topic is None and len(images) > 1:
-            raise UsageError(f'{self._name} has {len(images)} image topics, choose one with --topic:'
-                             f' {self._describe(images)}')
+            raise UsageError(
+                f'{self._name} has {len(images)} image topics, choose one with --topic: {self._describe(images)}'
+            )
         chosen = images[0] if topic is None else '/' + topic.lstrip('/')
         if chosen not in self.counts:
             raise UsageError(f'{self._name} has no topic {chosen}; its image topics: {self._describe(images)}')
         if chosen not in images:
-            raise UsageError(f'{chosen} holds no images but {self._describe([chosen])}; image topics:'
-                             f' {self._describe(images)}')
+            raise UsageError(
+                f'{chosen} holds no images but {self._describe([chosen])}; image topics: {self._describe(images)}'
+            )
         return chosen, self._types[chosen]
 
     def _describe(self, topics: Any) -> str:
@@ -212,8 +216,10 @@ class _StampFilter:
 def _open_readers(path: Path) -> Iterator[list[Any]]:
     """Open all files of a recording; a folder without metadata.yaml is what a recorder leaves that was killed."""
     with ExitStack() as stack:
-        readers = [stack.enter_context(Reader1(part) if _is_ros1(part) else Reader2(readable_path(part)))
-                   for part in _recording_files(path)]
+        readers = [
+            stack.enter_context(Reader1(part) if _is_ros1(part) else Reader2(readable_path(part)))
+            for part in _recording_files(path)
+        ]
         yield sorted(readers, key=lambda reader: reader.start_time)
 
 

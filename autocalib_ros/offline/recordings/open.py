@@ -8,8 +8,9 @@ from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.offline.recordings.sources import BAG_SUFFIXES, Source, TimeWindow
 
 
-def open_source(path: str | Path, topic: str | None = None, start_s: float = 0.0,
-                duration_s: float | None = None) -> Source:
+def open_source(
+    path: str | Path, topic: str | None = None, start_s: float = 0.0, duration_s: float | None = None
+) -> Source:
     """Open a rosbag2 folder, a lone .mcap or .db3, a ROS 1 .bag or a video file.
 
     Raises UsageError when the topic has to be chosen or is not there, InputError when the file cannot be read.
@@ -18,13 +19,17 @@ def open_source(path: str | Path, topic: str | None = None, start_s: float = 0.0
     _check_readable(path)
     if path.is_dir() or path.suffix.lower() in BAG_SUFFIXES:
         from autocalib_ros.offline.recordings.bags import BagSource  # imported late: a video needs no rosbags
+
         return BagSource(path, topic, window)
     if path.suffix == '.zstd':
-        raise InputError(f'{path} is a compressed part of a recording: give the folder with its metadata.yaml,'
-                         ' or unpack it first (zstd -d)')
+        raise InputError(
+            f'{path} is a compressed part of a recording: give the folder with its metadata.yaml,'
+            ' or unpack it first (zstd -d)'
+        )
     if topic is not None:
         raise UsageError(f'{path} is a video: it has no topics to choose from')
     from autocalib_ros.offline.recordings.videos import VideoSource
+
     return VideoSource(path, window)
 
 

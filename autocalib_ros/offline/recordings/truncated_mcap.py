@@ -102,8 +102,8 @@ class _StreamWithFooter(io.RawIOBase):
             data = self._stream.read(min(len(buffer), self._complete_bytes - self._position))
         else:
             behind = self._position - self._complete_bytes
-            data = FOOTER[behind:behind + len(buffer)]
-        buffer[:len(data)] = data
+            data = FOOTER[behind : behind + len(buffer)]
+        buffer[: len(data)] = data
         self._position += len(data)
         return len(data)
 

@@ -79,8 +79,9 @@ class VideoSource:
         capture = cv2.VideoCapture(str(self._path))
         try:
             if not capture.isOpened():
-                raise InputError(f'{self.name} is not a video that can be read: it is damaged, cut off or of another'
-                                 ' kind')
+                raise InputError(
+                    f'{self.name} is not a video that can be read: it is damaged, cut off or of another kind'
+                )
             yield capture
         finally:
             capture.release()

@@ -28,12 +28,22 @@ BAG_VERSION = 9
 DEFAULT_FRAME = 'camera_optical_frame'
 GROUND_TOPIC = '/autocalib/ground_transform'
 INFINITE_DURATION = QosTime(2147483647, 4294967295)
-LATCHED_QOS = Qos(QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL, INFINITE_DURATION, INFINITE_DURATION,
-              QosLiveliness.AUTOMATIC, INFINITE_DURATION, False)
+LATCHED_QOS = Qos(
+    QosHistory.KEEP_LAST,
+    1,
+    QosReliability.RELIABLE,
+    QosDurability.TRANSIENT_LOCAL,
+    INFINITE_DURATION,
+    INFINITE_DURATION,
+    QosLiveliness.AUTOMATIC,
+    INFINITE_DURATION,
+    False,
+)
 
 
-def write_bag(path: Path, result: Calibration, source: Source, tf_parent: str = 'ground',
-              ignored: Polygons = ()) -> None:
+def write_bag(
+    path: Path, result: Calibration, source: Source, tf_parent: str = 'ground', ignored: Polygons = ()
+) -> None:
     """Write a new bag: the images, a CameraInfo with the header of each, and the ground transform where there is one.
 
     CameraInfo goes to the sibling of the image topic. All but the images are latched, so that a node that
@@ -61,8 +71,7 @@ def camera_info_topic(source: Source) -> str:
 class _BagWriter:
     """The connections and messages of one new bag."""
 
-    def __init__(self, writer: Writer, result: Calibration, source: Source, tf_parent: str,
-                 ignored: Polygons) -> None:
+    def __init__(self, writer: Writer, result: Calibration, source: Source, tf_parent: str, ignored: Polygons) -> None:
         self._ignored, self._broken = ignored, 0
         self._writer, self._result, self._source, self._tf_parent = writer, result, source, tf_parent
         self._store = get_typestore(Stores.ROS2_JAZZY)
@@ -79,8 +88,10 @@ class _BagWriter:
             if images is not None and (cdr := self._image(stored.cdr)) is not None:
                 self._writer.write(images, stored.recorded_ns, cdr)
         if self._broken:
-            LOG.warning('%d images cannot be decoded and so not be made black where asked: they are left out of the '
-                        'bag', self._broken)
+            LOG.warning(
+                '%d images cannot be decoded and so not be made black where asked: they are left out of the bag',
+                self._broken,
+            )
 
     def _image(self, cdr: bytes | memoryview) -> bytes | memoryview | None:
         """Return an image as it is to be written; None where its regions cannot be made black."""
@@ -104,23 +115,35 @@ class _BagWriter:
 
     def _camera_info(self, stored: StoredImage) -> Any:
         info = self._result.camera_info
-        region = self._make('sensor_msgs/msg/RegionOfInterest', x_offset=0, y_offset=0, height=0, width=0,
-                            do_rectify=False)
+        region = self._make(
+            'sensor_msgs/msg/RegionOfInterest', x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
+        )
         lists = {name: np.array(getattr(info, name), float) for name in 'dkrp'}
-        return self._make('sensor_msgs/msg/CameraInfo', header=self._header(stored.stamp_ns, stored.frame_id),
-                          height=info.height, width=info.width, distortion_model=info.distortion_model, **lists,
-                          binning_x=0, binning_y=0, roi=region)
+        return self._make(
+            'sensor_msgs/msg/CameraInfo',
+            header=self._header(stored.stamp_ns, stored.frame_id),
+            height=info.height,
+            width=info.width,
+            distortion_model=info.distortion_model,
+            **lists,
+            binning_x=0,
+            binning_y=0,
+            roi=region,
+        )
 
     def _transform(self, ground: GroundPlane, camera_frame: str) -> Any:
         """Return the transform between ground and camera, as the live node publishes it."""
         pose = ground.transform(self._ground_frame, camera_frame, self._tf_parent)
         vector = self._make('geometry_msgs/msg/Vector3', **dict(zip('xyz', _floats(pose.translation_m), strict=True)))
-        quaternion = self._make('geometry_msgs/msg/Quaternion',
-                                **dict(zip('xyzw', _floats(pose.rotation_xyzw), strict=True)))
-        return self._make('geometry_msgs/msg/TransformStamped',
-                          header=self._header(self._result.newest_stamp_ns, pose.parent),
-                          child_frame_id=pose.child,
-                          transform=self._make('geometry_msgs/msg/Transform', translation=vector, rotation=quaternion))
+        quaternion = self._make(
+            'geometry_msgs/msg/Quaternion', **dict(zip('xyzw', _floats(pose.rotation_xyzw), strict=True))
+        )
+        return self._make(
+            'geometry_msgs/msg/TransformStamped',
+            header=self._header(self._result.newest_stamp_ns, pose.parent),
+            child_frame_id=pose.child,
+            transform=self._make('geometry_msgs/msg/Transform', translation=vector, rotation=quaternion),
+        )
 
     def _header(self, stamp_ns: int, frame_id: str) -> Any:
         stamp = self._make('builtin_interfaces/msg/Time', sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)

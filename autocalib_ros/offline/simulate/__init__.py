@@ -9,9 +9,7 @@ from autocalib_ros.offline.simulate.command import add_arguments, options_from, 
 from autocalib_ros.offline.simulate.options import SimulationOptions
 from autocalib_ros.offline.simulate.simulation import Simulation
 
-__all__ = [
-    'Simulation', 'SimulationOptions', 'add_arguments', 'options_from', 'run', 'write_bag'
-]
+__all__ = ['Simulation', 'SimulationOptions', 'add_arguments', 'options_from', 'run', 'write_bag']
 
 
 def write_bag(

@@ -14,7 +14,10 @@ _HAZE_LENGTH_M = 260.0
 
 
 def draw_backdrop(
-    canvas: Canvas, pose: CameraPose, grounds: tuple[GroundMap, ...], scenery: Faces,
+    canvas: Canvas,
+    pose: CameraPose,
+    grounds: tuple[GroundMap, ...],
+    scenery: Faces,
     palette: Palette,
 ) -> None:
     """Draw sky, ground (coarse maps first) and scenery into an empty canvas."""
@@ -39,9 +42,7 @@ def _draw_sky(canvas: Canvas, rays: np.ndarray, palette: Palette) -> None:
     canvas.colour[..., 3] = 255
 
 
-def _draw_ground(
-    canvas: Canvas, places: np.ndarray, distance: np.ndarray, height: float, ground: GroundMap
-) -> None:
+def _draw_ground(canvas: Canvas, places: np.ndarray, distance: np.ndarray, height: float, ground: GroundMap) -> None:
     """Colour the samples that look at the ground map, each from the level that suits it."""
     inside = np.isfinite(distance) & (np.abs(places) < ground.half_m).all(-1)
     # Footprint of a sample: the mean of its width and of its length along the line of sight.
@@ -55,11 +56,14 @@ def _draw_ground(
         picture = ground.levels[i]
         scale = picture.shape[0] / (2 * ground.half_m)
         rows, columns = np.nonzero(here)
-        part = np.s_[rows.min():rows.max() + 1, columns.min():columns.max() + 1]
+        part = np.s_[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
         x = (places[part][..., 0] + ground.half_m) * scale - 0.5
         y = (ground.half_m - places[part][..., 1]) * scale - 0.5
         picked = cv2.remap(
-            picture, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR,
+            picture,
+            x.astype(np.float32),
+            y.astype(np.float32),
+            cv2.INTER_LINEAR,
             borderMode=cv2.BORDER_REPLICATE,
         )
         canvas.colour[part][..., :3][here[part]] = picked[here[part]]

@@ -69,9 +69,7 @@ def _clear_target(path: Path, overwrite: bool) -> None:
         path.rmdir()
         return
     if not overwrite:
-        raise UsageError(
-            f'{path} exists already: choose another name, or --overwrite to replace the bag'
-        )
+        raise UsageError(f'{path} exists already: choose another name, or --overwrite to replace the bag')
     if not (path / 'metadata.yaml').is_file():
         raise UsageError(
             f'{path} is not a bag (no metadata.yaml in it), so it is not overwritten: '
@@ -97,16 +95,16 @@ def _core_count() -> int:
 
 
 def _write_messages(
-    writer: Writer, simulation: Simulation, workers: int,
+    writer: Writer,
+    simulation: Simulation,
+    workers: int,
     progress: Callable[[int, int], None] | None,
 ) -> None:
     options, store = simulation.options, _typestore()
     kind = 'CompressedImage' if options.compressed else 'Image'
     topic = options.topic + '/compressed' * options.compressed
     images = writer.add_connection(topic, f'sensor_msgs/msg/{kind}', typestore=store)
-    infos = writer.add_connection(
-        options.truth_topic, 'sensor_msgs/msg/CameraInfo', typestore=store
-    )
+    infos = writer.add_connection(options.truth_topic, 'sensor_msgs/msg/CameraInfo', typestore=store)
     with _rendered_images(simulation, min(workers, options.frame_count)) as messages:
         for index, message in enumerate(messages):
             recorded_ns = simulation.stamp_ns(index) + _LATENCY_NS
@@ -173,8 +171,11 @@ def _image(simulation: Simulation, index: int) -> bytes:
     else:
         name = 'Image'
         fields = {
-            'height': frame.shape[0], 'width': frame.shape[1], 'encoding': encoding,
-            'is_bigendian': 0, 'step': frame.strides[0],
+            'height': frame.shape[0],
+            'width': frame.shape[1],
+            'encoding': encoding,
+            'is_bigendian': 0,
+            'step': frame.strides[0],
             'data': np.ascontiguousarray(frame).reshape(-1).view(np.uint8),
         }
     name = f'sensor_msgs/msg/{name}'
@@ -195,15 +196,20 @@ def _camera_info(simulation: Simulation, index: int) -> bytes | memoryview:
     store, options, lens = _typestore(), simulation.options, simulation.lens
     (cx, cy), f = lens.centre_px, lens.focal_px
     name = 'sensor_msgs/msg/CameraInfo'
-    roi = store.types['sensor_msgs/msg/RegionOfInterest'](
-        x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
-    )
+    roi = store.types['sensor_msgs/msg/RegionOfInterest'](x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
     # Readers take all-zero coefficients of this model for "no distortion at all".
     d = [k or 1e-9 if i == 0 else k for i, k in enumerate(lens.k)]
     message = store.types[name](
-        header=_header(simulation, index), height=options.height_px, width=options.width_px,
-        distortion_model='equidistant', d=np.array(d), k=np.array([f, 0, cx, 0, f, cy, 0, 0, 1.0]),
-        r=np.eye(3).reshape(-1), p=np.array([f, 0, cx, 0, 0, f, cy, 0, 0, 0, 1.0, 0]),
-        binning_x=0, binning_y=0, roi=roi,
+        header=_header(simulation, index),
+        height=options.height_px,
+        width=options.width_px,
+        distortion_model='equidistant',
+        d=np.array(d),
+        k=np.array([f, 0, cx, 0, f, cy, 0, 0, 1.0]),
+        r=np.eye(3).reshape(-1),
+        p=np.array([f, 0, cx, 0, 0, f, cy, 0, 0, 0, 1.0, 0]),
+        binning_x=0,
+        binning_y=0,
+        roi=roi,
     )
     return store.serialize_cdr(message, name)

@@ -126,7 +126,7 @@ class _BodyPainter:
     def _dirt(self, picture: np.ndarray) -> None:
         height, width = picture.shape[:2]
         row, column = (int(self.rng.integers(_DIRT_BANK_TEXELS - n)) for n in (height, width))
-        dirt = _dirt_bank()[row:row + height, column:column + width]
+        dirt = _dirt_bank()[row : row + height, column : column + width]
         paint.add_noise(picture, dirt * np.float32(self.palette.texture))
 
     def _shade(self, part: float) -> tuple[int, ...]:
@@ -153,9 +153,7 @@ class _BodyPainter:
         if part.lettering:
             self._lettering(picture, part, texels, front, rear)
 
-    def _lettering(
-        self, picture: np.ndarray, part: BodyPart, texels: _Texels, front: float, rear: float
-    ) -> None:
+    def _lettering(self, picture: np.ndarray, part: BodyPart, texels: _Texels, front: float, rear: float) -> None:
         end = min([x for w in part.windows for x, _ in w] or [front]) - 0.2
         low, high, first = 0.62 * part.top_m, 0.85 * part.top_m, end
         if len(part.windows) > 1:  # below the windows, not behind them
@@ -192,8 +190,7 @@ class _BodyPainter:
             paint.disc(picture, (cx, cy), 0.6 * radius * self.scale, (*self.palette.hub, 255))
             paint.disc(alpha, (cx, cy), radius * self.scale, (255,))
 
-    def _box(self, picture: np.ndarray, x0: float, y0: float, x1: float, y1: float,
-             colour: tuple[int, ...]) -> None:
+    def _box(self, picture: np.ndarray, x0: float, y0: float, x1: float, y1: float, colour: tuple[int, ...]) -> None:
         """Fill a box given in fractions of the picture."""
         height, width = picture.shape[:2]
         box = np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)]) * (width, height)
@@ -244,9 +241,7 @@ class _BodyPainter:
 
     def _glass(self, picture: np.ndarray, frame: float) -> None:
         height, width = picture.shape[:2]
-        outline = np.array(
-            [(frame, 0.06), (1 - frame, 0.06), (1 - frame, 0.94), (frame, 0.94)]
-        )
+        outline = np.array([(frame, 0.06), (1 - frame, 0.06), (1 - frame, 0.94), (frame, 0.94)])
         self._window(picture, outline * (width, height))
 
     def _roof(self, picture: np.ndarray) -> None:
@@ -273,7 +268,9 @@ class _BodyPainter:
         for x in (0.30, 0.62):
             self._box(picture, x, 0.1, x + 0.03, 0.85, self._shade(0.5))
         paint.draw_text(
-            picture, '24 H', (0.15 * width, 0.2 * height, 0.85 * width, 0.5 * height),
+            picture,
+            '24 H',
+            (0.15 * width, 0.2 * height, 0.85 * width, 0.5 * height),
             self.palette.ink,
         )
         for x in (0.02, 0.86):

@@ -29,11 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def options_from(args: argparse.Namespace) -> SimulationOptions:
     """Return the options that the arguments ask for; what was not given keeps its default."""
-    given = {
-        field.name: getattr(args, field.name)
-        for field in fields(SimulationOptions)
-        if hasattr(args, field.name)
-    }
+    given = {field.name: getattr(args, field.name) for field in fields(SimulationOptions) if hasattr(args, field.name)}
     if hasattr(args, 'size'):
         given['width_px'], given['height_px'] = args.size
     k = list(SimulationOptions.k)
@@ -53,7 +49,10 @@ def run(args: argparse.Namespace) -> int:
     options = options_from(args)
     with progress_bar(options.frame_count, unit='frame', label='simulating') as bar:
         path = write_bag(
-            args.bag, options, workers=args.workers, overwrite=args.overwrite,
+            args.bag,
+            options,
+            workers=args.workers,
+            overwrite=args.overwrite,
             progress=lambda done, total: bar.update_to(done),
         )
     print(f'wrote {path} and {path / TRUTH_FILE_NAME}')
@@ -63,19 +62,23 @@ def run(args: argparse.Namespace) -> int:
 def _add_lens_and_size(parser: argparse.ArgumentParser) -> None:
     size = f'{SimulationOptions.width_px}x{SimulationOptions.height_px}'
     parser.add_argument(
-        '--size', type=_size, metavar='WxH', default=argparse.SUPPRESS,
+        '--size',
+        type=_size,
+        metavar='WxH',
+        default=argparse.SUPPRESS,
         help=f'image size (default {size})',
     )
     for i, default in enumerate(SimulationOptions.k, 1):
         parser.add_argument(
-            f'--k{i}', type=float, default=argparse.SUPPRESS, metavar='K',
+            f'--k{i}',
+            type=float,
+            default=argparse.SUPPRESS,
+            metavar='K',
             help=f'lens coefficient of theta^{2 * i + 1} (default {default:g})',
         )
 
 
-def _add_option(
-    parser: argparse.ArgumentParser, name: str, kind: Any, default: Any, text: str
-) -> None:
+def _add_option(parser: argparse.ArgumentParser, name: str, kind: Any, default: Any, text: str) -> None:
     """Add one option; its flag is the field's name without the unit."""
     flag = '--' + _UNIT.sub('', name).replace('_', '-')
     if default is MISSING:

@@ -54,11 +54,19 @@ def _cyclist(network: Network, rng: np.random.Generator) -> Cyclist:
     road = network.roads[int(rng.integers(len(network.roads)))]
     forward = bool(rng.integers(2))
     right = road.half_width_m + (-_FROM_KERB_M if rng.integers(2) else rng.uniform(0.8, 1.6))
-    return Cyclist(road, -right if forward else right, forward, float(rng.uniform(4.0, 7.0)),
-                   -float(rng.uniform(0.0, 30.0)), int(rng.integers(15)))
+    return Cyclist(
+        road,
+        -right if forward else right,
+        forward,
+        float(rng.uniform(4.0, 7.0)),
+        -float(rng.uniform(0.0, 30.0)),
+        int(rng.integers(15)),
+    )
 
 
-def figure_faces(cyclist: Cyclist, place: tuple[float, float, float, float], viewer_xy: np.ndarray, thermal: bool) -> Faces:
+def figure_faces(
+    cyclist: Cyclist, place: tuple[float, float, float, float], viewer_xy: np.ndarray, thermal: bool
+) -> Faces:
     """Return a flat bicycle, seen from both sides, and upright rectangles of its rider that face the viewer (2,)."""
     x, y, heading, phase = place
     ride = np.array([math.cos(heading), math.sin(heading)])
@@ -68,7 +76,8 @@ def figure_faces(cyclist: Cyclist, place: tuple[float, float, float, float], vie
     here = np.array([x, y])
     front, rear = here + ride * _BICYCLE_LENGTH_M / 2, here - ride * _BICYCLE_LENGTH_M / 2
     corners = [
-        [(*start, _BICYCLE_HEIGHT_M), (*(end - start), 0.0), (0.0, 0.0, -_BICYCLE_HEIGHT_M)] for start, end in ((front, rear), (rear, front))
+        [(*start, _BICYCLE_HEIGHT_M), (*(end - start), 0.0), (0.0, 0.0, -_BICYCLE_HEIGHT_M)]
+        for start, end in ((front, rear), (rear, front))
     ]
     swing = 0.17 * math.sin(phase)
     for ahead_low, aside_low, low, ahead_high, aside_high, high, width in (
@@ -94,11 +103,17 @@ def _textures(clothes: int, thermal: bool) -> tuple[Texture, ...]:
     bicycle = Texture(_bicycle(palette.tyre, palette.bodies[clothes % len(palette.bodies)]))
     pictures = []
     for colour, size in (
-        (legs, (44, 10)), (paint.mix_colours(legs, palette.trim, 0.3), (44, 10)), (coat, (36, 26)), (coat, (32, 7)),
-        (coat, (32, 7)), (palette.skin, (17, 13)),
+        (legs, (44, 10)),
+        (paint.mix_colours(legs, palette.trim, 0.3), (44, 10)),
+        (coat, (36, 26)),
+        (coat, (32, 7)),
+        (coat, (32, 7)),
+        (palette.skin, (17, 13)),
     ):
         picture = paint.filled_image(*size, colour)
-        paint.add_noise(picture, paint.octave_noise(*size, ((2.0, 6.0 * palette.texture), (8.0, 8.0 * palette.texture)), rng))
+        paint.add_noise(
+            picture, paint.octave_noise(*size, ((2.0, 6.0 * palette.texture), (8.0, 8.0 * palette.texture)), rng)
+        )
         pictures.append(picture)
     return bicycle, bicycle, *(Texture(picture) for picture in pictures)
 
@@ -114,8 +129,14 @@ def _bicycle(tyre: tuple[int, int, int], frame: tuple[int, int, int]) -> np.ndar
         paint.disc(alpha, wheel, _WHEEL_RADIUS_M * _TEXELS_PER_M, (255,))
         paint.disc(alpha, wheel, (_WHEEL_RADIUS_M - 0.06) * _TEXELS_PER_M, (70,))
     saddle, bar, pedals = (0.62 * width, 0.1 * height), (0.27 * width, 0.08 * height), (0.5 * width, hub)
-    for start, end in ((wheels[0], bar), (wheels[1], saddle), (bar, pedals), (saddle, pedals), (saddle, bar),
-                       (pedals, wheels[1])):
+    for start, end in (
+        (wheels[0], bar),
+        (wheels[1], saddle),
+        (bar, pedals),
+        (saddle, pedals),
+        (saddle, bar),
+        (pedals, wheels[1]),
+    ):
         paint.line(alpha, start, end, (255,), 4)
         paint.line(picture, start, end, (*frame, 255), 4)
     picture[..., 3] = alpha

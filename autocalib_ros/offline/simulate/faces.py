@@ -113,8 +113,10 @@ class PixelRect:
         """Return the window that holds all drawings."""
         windows = [w for d in drawings for w in d.windows]
         return cls(
-            min(w.x0 for w in windows), min(w.y0 for w in windows),
-            max(w.x1 for w in windows), max(w.y1 for w in windows),
+            min(w.x0 for w in windows),
+            min(w.y0 for w in windows),
+            max(w.x1 for w in windows),
+            max(w.y1 for w in windows),
         )
 
     def pixels(self) -> tuple[slice, slice]:
@@ -124,7 +126,8 @@ class PixelRect:
     def samples(self) -> tuple[slice, slice]:
         """Index of the samples."""
         return (
-            slice(self.y0 * SAMPLES_PER_PIXEL, self.y1 * SAMPLES_PER_PIXEL), slice(self.x0 * SAMPLES_PER_PIXEL, self.x1 * SAMPLES_PER_PIXEL)
+            slice(self.y0 * SAMPLES_PER_PIXEL, self.y1 * SAMPLES_PER_PIXEL),
+            slice(self.x0 * SAMPLES_PER_PIXEL, self.x1 * SAMPLES_PER_PIXEL),
         )
 
 
@@ -158,9 +161,7 @@ class Canvas:
         self.distance = np.full(shape, np.inf, np.float32)
         # One cell more on every side, so that interpolation never runs out of cells.
         rows, columns = (np.arange(-1, -(-n // _CELL_SAMPLES) + 1) for n in shape)
-        self._cell_bearings = self._bearings(
-            (columns + 0.5) * _CELL_SAMPLES - 0.5, (rows + 0.5) * _CELL_SAMPLES - 0.5
-        )
+        self._cell_bearings = self._bearings((columns + 0.5) * _CELL_SAMPLES - 0.5, (rows + 0.5) * _CELL_SAMPLES - 0.5)
 
     def bearings(self) -> np.ndarray:
         """Return the rays (h, w, 3) float32 of all samples, in the optical frame."""
@@ -180,9 +181,7 @@ class Canvas:
         other.distance = np.full_like(self.distance, np.inf)
         return other
 
-    def project_faces(
-        self, bodies: Sequence[Faces], pose: CameraPose, gain: bool = False
-    ) -> list[list[Drawing]]:
+    def project_faces(self, bodies: Sequence[Faces], pose: CameraPose, gain: bool = False) -> list[list[Drawing]]:
         """Find the faces of each body that are seen from a pose, and where.
 
         gain: do not cover the picture but multiply it by texture / 100, leaving distances.
@@ -261,9 +260,7 @@ class Canvas:
         if not seen.any():
             return
         texels = _refined(np.clip(places[..., :2] * inverse[..., None], -3e4, 3e4), inner)
-        picked = cv2.remap(
-            drawing.texture, texels, NO_MAP, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT
-        )
+        picked = cv2.remap(drawing.texture, texels, NO_MAP, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
         # Alpha is the highest byte: a set sign bit means more than one half.
         seen &= picked.view(np.int32)[..., 0] < 0
         mask, colour = seen.view(np.uint8), self.colour[samples]
@@ -290,9 +287,7 @@ def _refined(values: np.ndarray, inner: tuple[slice, slice]) -> np.ndarray:
     return cv2.resize(values, None, fx=_CELL_SAMPLES, fy=_CELL_SAMPLES)[inner]
 
 
-def _band_extents(
-    rim: np.ndarray, low: np.ndarray, high: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _band_extents(rim: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the least and greatest x of a closed line (n, 2) between rows low and high (m,)."""
     start, end = rim, np.roll(rim, -1, axis=0)
     rise = end[:, 1] - start[:, 1]
@@ -302,9 +297,7 @@ def _band_extents(
     x = start[:, 0] + fractions * (end[:, 0] - start[:, 0])
     top, bottom = np.minimum(start[:, 1], end[:, 1]), np.maximum(start[:, 1], end[:, 1])
     meets = (bottom >= low[:, None]) & (top <= high[:, None])
-    return (
-        np.where(meets, x.min(0), np.inf).min(1), np.where(meets, x.max(0), -np.inf).max(1)
-    )
+    return (np.where(meets, x.min(0), np.inf).min(1), np.where(meets, x.max(0), -np.inf).max(1))
 
 
 def _mip_levels(pixels: np.ndarray, textures: list[Texture]) -> tuple[list[list[int]], np.ndarray]:
@@ -322,9 +315,7 @@ def _mip_levels(pixels: np.ndarray, textures: list[Texture]) -> tuple[list[list[
     return levels.tolist(), area > _MIN_AREA_PX2
 
 
-def _ray_matrices(
-    corners: np.ndarray, normals: np.ndarray, shapes: list[tuple[int, ...]]
-) -> np.ndarray:
+def _ray_matrices(corners: np.ndarray, normals: np.ndarray, shapes: list[tuple[int, ...]]) -> np.ndarray:
     """Return matrices (n, 3, 3) from rays to (texel x, texel y, 1), homogeneous.
 
     normals (n, 3) are unit vectors, so the divisor is the cosine at which the ray meets the plane.

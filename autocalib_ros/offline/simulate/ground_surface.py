@@ -31,9 +31,7 @@ class GroundMap:
     texel_m: float
 
 
-def paint_ground(
-    network: Network, palette: Palette, half_m: float, texel_m: float, seed: int
-) -> GroundMap:
+def paint_ground(network: Network, palette: Palette, half_m: float, texel_m: float, seed: int) -> GroundMap:
     """Paint the ground around the origin."""
     size = round(2 * half_m / texel_m)
     texel_m = 2 * half_m / size
@@ -113,8 +111,9 @@ class _MapPainter:
         """Fill a polygon of ground points (n, 2)."""
         paint.polygon(self.picture, self.texels(np.asarray(xy, float)), colour)
 
-    def strip(self, road: Road, along: tuple[float, float], aside: tuple[float, float],
-              colour: tuple[int, ...]) -> None:
+    def strip(
+        self, road: Road, along: tuple[float, float], aside: tuple[float, float], colour: tuple[int, ...]
+    ) -> None:
         """Fill a strip given along a road and to the left of its axis."""
         pieces = 1 if road.straight else max(1, round(abs(along[1] - along[0]) / _CURVE_STEP_M))
         way = np.linspace(*along, pieces + 1)
@@ -155,8 +154,9 @@ def _on_asphalt(network: Network, xy: np.ndarray) -> bool:
     return bool((edge_distance(network, xy) <= 0).all())
 
 
-def _paint_crack(view: _MapPainter, edge: np.ndarray, colour: tuple[int, ...], reach: float,
-           rng: np.random.Generator) -> None:
+def _paint_crack(
+    view: _MapPainter, edge: np.ndarray, colour: tuple[int, ...], reach: float, rng: np.random.Generator
+) -> None:
     point, heading = rng.uniform(-reach, reach, 2), rng.uniform(0, 2 * np.pi)
     for _ in range(25):
         heading += rng.normal(0, 0.35)
@@ -207,8 +207,7 @@ def _paint_island_line(view: _MapPainter, ring: Roundabout) -> None:
     view.ring((ring.island_m + 0.3, ring.island_m + 0.45), (255,))
 
 
-def _paint_line(view: _MapPainter, road: Road, sign: int, span: tuple[float, float], aside: float,
-                kind: str) -> None:
+def _paint_line(view: _MapPainter, road: Road, sign: int, span: tuple[float, float], aside: float, kind: str) -> None:
     white = (255,)
     if kind == 'dash':
         for along in np.arange(span[0], span[1], 6.0):
@@ -220,8 +219,9 @@ def _paint_line(view: _MapPainter, road: Road, sign: int, span: tuple[float, flo
     view.strip(road, (sign * span[0], sign * span[1]), (aside - 0.06, aside + 0.06), white)
 
 
-def _blend_markings(picture: np.ndarray, marks: np.ndarray, palette: Palette, texel_m: float,
-           rng: np.random.Generator) -> None:
+def _blend_markings(
+    picture: np.ndarray, marks: np.ndarray, palette: Palette, texel_m: float, rng: np.random.Generator
+) -> None:
     """Lay worn paint over the picture, in place."""
     octaves = ((max(0.06 / texel_m, 1), 0.12), (max(0.4 / texel_m, 1), 0.10))
     wear = np.clip(0.85 + paint.octave_noise(marks.shape[0], marks.shape[1], octaves, rng), 0.3, 1.0)

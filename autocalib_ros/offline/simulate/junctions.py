@@ -46,9 +46,7 @@ def junction(angle: float, turning_fraction: float, tee: bool = False) -> Networ
     aside = half + 7.5
     foot = -(half + 4.0 + aside * math.cos(angle)) / math.sin(angle), -aside
     yaw = math.degrees(math.atan2(-foot[1], -foot[0])) + 6.0
-    return Network(
-        roads, tuple(routes), phases, stop_m, foot, yaw, crossing_m=stop_m - 2.0 - CROSSING_WIDTH_M
-    )
+    return Network(roads, tuple(routes), phases, stop_m, foot, yaw, crossing_m=stop_m - 2.0 - CROSSING_WIDTH_M)
 
 
 def _is_among(heading: float, headings: tuple[float, ...]) -> bool:
@@ -56,7 +54,11 @@ def _is_among(heading: float, headings: tuple[float, ...]) -> bool:
 
 
 def _arm_routes(
-    heading: float, road: int, angle: float, stop_m: float, turning_fraction: float,
+    heading: float,
+    road: int,
+    angle: float,
+    stop_m: float,
+    turning_fraction: float,
     arms: tuple[float, ...],
 ) -> list[Route]:
     """Return the routes, to arms that are there, of the traffic that enters with a heading."""

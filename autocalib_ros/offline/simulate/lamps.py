@@ -69,7 +69,9 @@ def vehicle_lamps(vehicle: Vehicle, state: VehicleState) -> Iterator[Lamp]:
 
 
 def add_lamps(
-    picture: np.ndarray, canvas: Canvas, pose: CameraPose,
+    picture: np.ndarray,
+    canvas: Canvas,
+    pose: CameraPose,
     vehicles: list[tuple[Vehicle, VehicleState]],
 ) -> None:
     """Add the blobs of all lamps that are turned to the camera and not hidden, in place."""

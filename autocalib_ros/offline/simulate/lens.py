@@ -100,9 +100,7 @@ def look_rotation(yaw_deg: float, pitch_deg: float, roll_deg: float) -> np.ndarr
     Positive roll turns the camera clockwise as seen from behind it.
     """
     yaw, pitch, roll = np.radians([yaw_deg, pitch_deg, roll_deg])
-    forward = np.array(
-        [np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)]
-    )
+    forward = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)])
     right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])
     down = np.cross(forward, right)
     level = np.stack([right, down, forward], 1)

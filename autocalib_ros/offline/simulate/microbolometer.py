@@ -39,8 +39,10 @@ class Microbolometer:
         square = ((x - width / 2) / (width / 2)) ** 2 + ((y - height / 2) / (height / 2)) ** 2
         self._shading = (square / 2).astype(np.float32)
 
-    def counts(self, picture: np.ndarray, time_s: float, noise: np.ndarray, *, shutter_closed: bool = False) -> np.ndarray:
-        """Return mono16 counts (h, w) of a heat picture (h, w, 3) and noise (h, w, 1); `shutter_closed` sees the shutter."""
+    def counts(
+        self, picture: np.ndarray, time_s: float, noise: np.ndarray, *, shutter_closed: bool = False
+    ) -> np.ndarray:
+        """Return mono16 counts (h, w) of a heat picture (h, w, 3), or of the closed shutter, and noise (h, w, 1)."""
         event, since_s = self._shutter_state(time_s)
         self._redraw_pattern(event)
         heat = cv2.GaussianBlur(np.ascontiguousarray(picture[..., 0]).astype(np.float32), (0, 0), 0.6)

@@ -40,14 +40,18 @@ def highway(one_way: bool, changing_fraction: float) -> Network:
     ]
     barriers = (-half + 0.4, half - 0.4) + (() if one_way else (0.0,))
     return Network(
-        (straight_road(0.0, half, edges),), tuple(routes), (), None, (-14.0, -half - 4.0), 52.0,
-        rural=True, barriers_m=barriers,
+        (straight_road(0.0, half, edges),),
+        tuple(routes),
+        (),
+        None,
+        (-14.0, -half - 4.0),
+        52.0,
+        rural=True,
+        barriers_m=barriers,
     )
 
 
-def _motorway_routes(
-    heading: float, offsets: list[float], index: int, changing_fraction: float
-) -> list[Route]:
+def _motorway_routes(heading: float, offsets: list[float], index: int, changing_fraction: float) -> list[Route]:
     """Return the routes that begin in a lane: on in it, and into the lanes beside it."""
     lane = straight_lane(heading, offsets[index], MOTORWAY_HALF_LENGTH_M)
     names = [f'lane {math.degrees(heading):.0f} {offset:+.1f}' for offset in offsets]
@@ -55,15 +59,30 @@ def _motorway_routes(
     targets = [i for i in (index - 1, index + 1) if 0 <= i < len(offsets)]
     share = MOTORWAY_TRAFFIC_FACTOR * changing_fraction / (len(targets) * len(LANE_CHANGE_STARTS_M))
     routes = [
-        Route(Path((lane,)), names[index], names[index], 'straight',
-              MOTORWAY_TRAFFIC_FACTOR * (1.0 - changing_fraction), stop_s=0.0, speed_mps=speed)
+        Route(
+            Path((lane,)),
+            names[index],
+            names[index],
+            'straight',
+            MOTORWAY_TRAFFIC_FACTOR * (1.0 - changing_fraction),
+            stop_s=0.0,
+            speed_mps=speed,
+        )
     ]
     for target in targets:
         for begin_s in LANE_CHANGE_STARTS_M:
             aside = offsets[target] - offsets[index]
             path = lane_change(lane, begin_s, LANE_CHANGE_LENGTH_M, aside)
             routes.append(
-                Route(path, names[index], names[target], 'lane change', share, stop_s=0.0,
-                      diverge_s=begin_s + 0.75 * LANE_CHANGE_LENGTH_M, speed_mps=speed)
+                Route(
+                    path,
+                    names[index],
+                    names[target],
+                    'lane change',
+                    share,
+                    stop_s=0.0,
+                    diverge_s=begin_s + 0.75 * LANE_CHANGE_LENGTH_M,
+                    speed_mps=speed,
+                )
             )
     return routes

@@ -124,8 +124,7 @@ class Road:
         if math.isinf(self.begin_m):
             return beside
         before = self.begin_m - (dx * c + dy * s)
-        return np.hypot(np.maximum(beside, 0.0), np.maximum(before, 0.0)) + np.minimum(
-            np.maximum(beside, before), 0.0)
+        return np.hypot(np.maximum(beside, 0.0), np.maximum(before, 0.0)) + np.minimum(np.maximum(beside, before), 0.0)
 
     @cached_property
     def _axis_tree(self) -> cKDTree:
@@ -133,7 +132,9 @@ class Road:
 
 
 def straight_road(
-    heading: float, half_width_m: float, lane_edges_m: tuple[tuple[float, str], ...],
+    heading: float,
+    half_width_m: float,
+    lane_edges_m: tuple[tuple[float, str], ...],
     begin_m: float = -math.inf,
 ) -> Road:
     """Return a road through the origin."""

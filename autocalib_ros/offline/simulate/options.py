@@ -38,12 +38,8 @@ class SimulationOptions:
     duration_s: float = _option(60.0, 'length of the recording')
 
     focal_px: float = _option(560.0, 'focal length of the lens')
-    k: tuple[float, float, float, float] = _option(
-        (0.01, 0.0, 0.0, 0.0), 'Kannala-Brandt coefficients k1..k4'
-    )
-    principal_point_offset_px: tuple[float, float] = _option(
-        (6.0, -4.0), 'principal point minus image centre'
-    )
+    k: tuple[float, float, float, float] = _option((0.01, 0.0, 0.0, 0.0), 'Kannala-Brandt coefficients k1..k4')
+    principal_point_offset_px: tuple[float, float] = _option((6.0, -4.0), 'principal point minus image centre')
 
     camera_height_m: float = _option(8.0, 'height of the camera above the road')
     pitch_deg: float = _option(32.0, 'how far the camera looks down')
@@ -51,9 +47,7 @@ class SimulationOptions:
         None, 'heading of the optical axis from the first road; default: towards the traffic'
     )
     roll_deg: float = _option(0.8, 'roll about the optical axis')
-    position_m: tuple[float, float] | None = _option(
-        None, 'foot point of the camera; default: beside the road'
-    )
+    position_m: tuple[float, float] | None = _option(None, 'foot point of the camera; default: beside the road')
 
     density: float = _option(9.0, 'vehicles a minute and lane; of scene sparse a fifteenth of them')
     turning_fraction: float = _option(0.18, 'part of the vehicles that turn, or change lanes')
@@ -71,8 +65,9 @@ class SimulationOptions:
     night: bool = _option(False, 'darkness, head lamps, more noise')
     thermal: bool = _option(False, 'thermal camera: mono16 instead of bgr8')
     shutter_every_s: float | None = _option(
-        None, 'seconds between two closings of the shutter of a thermal camera, half a second each, after which its '
-        'offset and pattern are others; default: never'
+        None,
+        'seconds between two closings of the shutter of a thermal camera, half a second each, after which its '
+        'offset and pattern are others; default: never',
     )
     shutter_shows: str = _option(
         'frozen', 'what a thermal camera sends while its shutter is closed: the last picture, or the shutter'
@@ -123,16 +118,12 @@ class SimulationOptions:
     def _check_names(self) -> None:
         for name, allowed in (('scene', SCENES), ('storage', STORAGES), ('shutter_shows', SHUTTER_SHOWS)):
             if getattr(self, name) not in allowed:
-                raise UsageError(
-                    f'unknown {name} {getattr(self, name)!r}: choose {" or ".join(allowed)}'
-                )
+                raise UsageError(f'unknown {name} {getattr(self, name)!r}: choose {" or ".join(allowed)}')
         for name in sorted(self.troubles - frozenset(TROUBLES)):
             raise UsageError(f'unknown trouble {name!r}: choose of {", ".join(TROUBLES)}, with commas between')
         for name in ('topic', 'truth_topic'):
             if not getattr(self, name).startswith('/'):
-                raise UsageError(
-                    f'{name} {getattr(self, name)!r} is not absolute: begin it with a "/"'
-                )
+                raise UsageError(f'{name} {getattr(self, name)!r} is not absolute: begin it with a "/"')
         if self.topic == self.truth_topic:
             raise UsageError(f'topic and truth_topic are both {self.topic!r}: name two topics')
 
@@ -146,9 +137,7 @@ class SimulationOptions:
         if 'wet' in self.troubles and not self.night:
             raise UsageError('a wet road mirrors lamps: trouble wet needs night')
         if self.one_way and self.scene not in ONE_WAY_SCENES:
-            raise UsageError(
-                f'scene {self.scene!r} has no one_way: choose {" or ".join(ONE_WAY_SCENES)}'
-            )
+            raise UsageError(f'scene {self.scene!r} has no one_way: choose {" or ".join(ONE_WAY_SCENES)}')
         if self.bump_at_s is not None and not 0.0 < self.bump_at_s < self.duration_s:
             raise UsageError(
                 f'bump_at_s is {self.bump_at_s:g}, outside the recording: '
@@ -160,9 +149,7 @@ class SimulationOptions:
             raise UsageError(f'k has {len(self.k)} numbers, not four: give k1 k2 k3 k4')
         lens = self.lens
         corner_px = max(
-            math.dist(lens.centre_px, (x, y))
-            for x in (0, self.width_px - 1)
-            for y in (0, self.height_px - 1)
+            math.dist(lens.centre_px, (x, y)) for x in (0, self.width_px - 1) for y in (0, self.height_px - 1)
         )
         if corner_px > lens.radius_limit_px:
             raise UsageError(

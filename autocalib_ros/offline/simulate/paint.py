@@ -48,26 +48,25 @@ def polygon(picture: np.ndarray, points: np.ndarray, colour: tuple[int, ...]) ->
 
 
 def line(
-    picture: np.ndarray, start: tuple[float, float], end: tuple[float, float],
-    colour: tuple[int, ...], width: int = 1,
+    picture: np.ndarray,
+    start: tuple[float, float],
+    end: tuple[float, float],
+    colour: tuple[int, ...],
+    width: int = 1,
 ) -> None:
     """Draw a line between two points given in texels."""
     ends = [tuple(int(round((c - 0.5) * (1 << _FIXED_POINT_BITS))) for c in p) for p in (start, end)]
     cv2.line(picture, ends[0], ends[1], colour, width, cv2.LINE_AA, _FIXED_POINT_BITS)
 
 
-def disc(
-    picture: np.ndarray, centre: tuple[float, float], radius: float, colour: tuple[int, ...]
-) -> None:
+def disc(picture: np.ndarray, centre: tuple[float, float], radius: float, colour: tuple[int, ...]) -> None:
     """Fill a circle given in texels."""
     x, y = (int(round((c - 0.5) * (1 << _FIXED_POINT_BITS))) for c in centre)
     radius_fixed = int(round(radius * (1 << _FIXED_POINT_BITS)))
     cv2.circle(picture, (x, y), radius_fixed, colour, -1, cv2.LINE_AA, _FIXED_POINT_BITS)
 
 
-def draw_text(
-    picture: np.ndarray, text: str, box: tuple[float, float, float, float], colour: Colour
-) -> None:
+def draw_text(picture: np.ndarray, text: str, box: tuple[float, float, float, float], colour: Colour) -> None:
     """Write a text as large as it fits into the box (x0, y0, x1, y1) of texels."""
     x0, y0, x1, y1 = box
     (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_DUPLEX, 1.0, 2)
@@ -76,9 +75,7 @@ def draw_text(
         return
     place = (round((x0 + x1 - scale * width) / 2), round((y0 + y1 + scale * height) / 2))
     thickness = max(1, round(3 * scale))
-    cv2.putText(
-        picture, text, place, cv2.FONT_HERSHEY_DUPLEX, scale, (*colour, 255), thickness, cv2.LINE_AA
-    )
+    cv2.putText(picture, text, place, cv2.FONT_HERSHEY_DUPLEX, scale, (*colour, 255), thickness, cv2.LINE_AA)
 
 
 def mix_colours(a: Colour, b: Colour, part: float) -> Colour:

@@ -106,7 +106,9 @@ class Path:
         ]
 
 
-def straight_lane(heading: float, offset: float, reach_m: float, about: tuple[float, float] = (0.0, 0.0)) -> PathSegment:
+def straight_lane(
+    heading: float, offset: float, reach_m: float, about: tuple[float, float] = (0.0, 0.0)
+) -> PathSegment:
     """Return a lane: parallel to a heading through a point, offset to its left, reach_m both ways."""
     c, s = math.cos(heading), math.sin(heading)
     x, y = about[0] - reach_m * c - offset * s, about[1] - reach_m * s + offset * c
@@ -175,5 +177,7 @@ def lane_change(lane: PathSegment, begin_s: float, length: float, aside_m: float
 def _swerve(start: Pose, length: float, curvature: float) -> tuple[PathSegment, ...]:
     """Return four clothoids that turn one way and back again."""
     quarter = length / 4
-    return chain_segments(start, [(quarter, 0.0, curvature), (quarter, curvature, 0.0),
-                           (quarter, 0.0, -curvature), (quarter, -curvature, 0.0)])
+    return chain_segments(
+        start,
+        [(quarter, 0.0, curvature), (quarter, curvature, 0.0), (quarter, 0.0, -curvature), (quarter, -curvature, 0.0)],
+    )

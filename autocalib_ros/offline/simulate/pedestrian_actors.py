@@ -61,9 +61,7 @@ def spawn_pedestrians(
     return tuple(walkers + crossing)
 
 
-def figure_faces(
-    person: Pedestrian, place: tuple[float, float, float], viewer_xy: np.ndarray, thermal: bool
-) -> Faces:
+def figure_faces(person: Pedestrian, place: tuple[float, float, float], viewer_xy: np.ndarray, thermal: bool) -> Faces:
     """Return upright rectangles that face the viewer (2,): legs, trunk, arms, head."""
     x, y, step = place
     to_viewer = math.atan2(viewer_xy[1] - y, viewer_xy[0] - x)
@@ -104,8 +102,12 @@ def _textures(clothes: int, thermal: bool) -> tuple[Texture, ...]:
     legs = palette.clothes[(clothes * 3 + 1) % len(palette.clothes)]
     pictures = []
     for colour, size in (
-        (legs, (40, 10)), (paint.mix_colours(legs, palette.trim, 0.3), (40, 10)), (coat, (36, 24)),
-        (coat, (32, 8)), (coat, (32, 8)), (palette.skin, (14, 12)),
+        (legs, (40, 10)),
+        (paint.mix_colours(legs, palette.trim, 0.3), (40, 10)),
+        (coat, (36, 24)),
+        (coat, (32, 8)),
+        (coat, (32, 8)),
+        (palette.skin, (14, 12)),
     ):
         picture = paint.filled_image(*size, colour)
         octaves = ((2.0, 6.0 * palette.texture), (8.0, 8.0 * palette.texture))
@@ -140,9 +142,13 @@ def _walker(network: Network, rng: np.random.Generator) -> Pedestrian:
     speed = float(rng.uniform(1.0, 1.6))
     return Pedestrian(
         tuple(road.at(begin, offset).tolist()),
-        road.heading(begin) + (0 if forward else math.pi), length, speed,
-        -float(rng.uniform(0, length / speed)), length / speed,
-        float(rng.uniform(1.55, 1.9)), int(rng.integers(15)),
+        road.heading(begin) + (0 if forward else math.pi),
+        length,
+        speed,
+        -float(rng.uniform(0, length / speed)),
+        length / speed,
+        float(rng.uniform(1.55, 1.9)),
+        int(rng.integers(15)),
     )
 
 
@@ -157,7 +163,12 @@ def _crosser(network: Network, green: str, start_s: float, rng: np.random.Genera
     across = side * (road.half_width_m + 0.5)
     heading = road.heading(along) + (-side) * math.pi / 2
     return Pedestrian(
-        tuple(road.at(along, across).tolist()), heading, 2 * road.half_width_m + 1.0,
-        float(rng.uniform(1.3, 1.7)), start_s + float(rng.uniform(0.0, 2.0)), None,
-        float(rng.uniform(1.55, 1.9)), int(rng.integers(15)),
+        tuple(road.at(along, across).tolist()),
+        heading,
+        2 * road.half_width_m + 1.0,
+        float(rng.uniform(1.3, 1.7)),
+        start_s + float(rng.uniform(0.0, 2.0)),
+        None,
+        float(rng.uniform(1.55, 1.9)),
+        int(rng.integers(15)),
     )

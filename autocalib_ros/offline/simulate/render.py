@@ -65,9 +65,7 @@ class _Backdrop:
 class Renderer:
     """Draws frames; holds the large arrays, which are built once in each process."""
 
-    def __init__(
-        self, options: SimulationOptions, network: Network, pose: CameraPose, bumped: CameraPose
-    ) -> None:
+    def __init__(self, options: SimulationOptions, network: Network, pose: CameraPose, bumped: CameraPose) -> None:
         self._options = options
         self._network = network
         self._lens = options.lens
@@ -80,8 +78,11 @@ class Renderer:
         self._backdrops: dict[bool, _Backdrop] = {}
         troubles, size = options.troubles, (options.width_px, options.height_px)
         self._weather = Weather(options, network, self._poses) if troubles else None
-        self._roadside = MovingScenery(
-            troubles, network, pose, self._lens, size, palette_for(options.thermal), options.seed) if troubles else None
+        self._roadside = (
+            MovingScenery(troubles, network, pose, self._lens, size, palette_for(options.thermal), options.seed)
+            if troubles
+            else None
+        )
 
     def frame(self, scene: SceneState) -> np.ndarray:
         """Return BGR (h, w, 3) uint8, or for a thermal camera counts (h, w) uint16."""
@@ -91,7 +92,14 @@ class Renderer:
         picture, windows = self._picture(scene, pose)
         view = None
         if self._weather is not None:
-            view = FrameContext(picture, self._depth(scene, windows), pose, self._visible_vehicles(scene, pose), scene.index, scene.time_s)
+            view = FrameContext(
+                picture,
+                self._depth(scene, windows),
+                pose,
+                self._visible_vehicles(scene, pose),
+                scene.index,
+                scene.time_s,
+            )
             self._weather.apply_ground_effects(view, scene.bumped)
         noise = self._noise.of(scene.index)
         if self._options.thermal:
@@ -119,7 +127,7 @@ class Renderer:
         """Return the distance (h, w) of what each pixel shows, movers included; shake left out."""
         size = (self._options.height_px, self._options.width_px)
         inner = slice(self._margin * SAMPLES_PER_PIXEL, None, SAMPLES_PER_PIXEL)
-        depth = self._backdrop(scene.bumped).canvas.distance[inner, inner][:size[0], :size[1]].copy()
+        depth = self._backdrop(scene.bumped).canvas.distance[inner, inner][: size[0], : size[1]].copy()
         for window in windows:
             rows, columns = (slice(s.start, s.stop, SAMPLES_PER_PIXEL) for s in window.samples())
             depth[window.pixels()] = self._canvas.distance[rows, columns]
@@ -141,9 +149,7 @@ class Renderer:
             picture[window.pixels()] = self._canvas.resolve(window)
         return picture, windows
 
-    def _project_movers(
-        self, scene: SceneState, pose: CameraPose
-    ) -> tuple[list[list[Drawing]], list[list[Drawing]]]:
+    def _project_movers(self, scene: SceneState, pose: CameraPose) -> tuple[list[list[Drawing]], list[list[Drawing]]]:
         """Return the drawings of shadows and beams, and those of the movers themselves."""
         thermal = self._options.thermal
         solids, flats = [], []
@@ -164,9 +170,7 @@ class Renderer:
             solids += self._roadside.at(scene.time_s)
         return self._canvas.project_faces(flats, pose, gain=True), self._canvas.project_faces(solids, pose)
 
-    def _visible_vehicles(
-        self, scene: SceneState, pose: CameraPose
-    ) -> list[tuple[Vehicle, VehicleState]]:
+    def _visible_vehicles(self, scene: SceneState, pose: CameraPose) -> list[tuple[Vehicle, VehicleState]]:
         """Return the vehicles that are near enough and may reach into the picture."""
         if not scene.vehicles:
             return []
@@ -207,9 +211,7 @@ class Renderer:
 class _FrameBackdrop:
     """The backdrop as the camera sees it in one frame, turned a little when it shakes."""
 
-    def __init__(
-        self, backdrop: _Backdrop, lens: KannalaBrandtLens, margin: int, shake: np.ndarray | None
-    ) -> None:
+    def __init__(self, backdrop: _Backdrop, lens: KannalaBrandtLens, margin: int, shake: np.ndarray | None) -> None:
         self._backdrop, self._lens, self._margin, self._shake = backdrop, lens, margin, shake
         self._shift: np.ndarray | None = None
 

@@ -41,8 +41,15 @@ def roundabout(turning_fraction: float) -> Network:
     foot = -ring.outer_m - 1.0, -ring.outer_m + 4.0
     yaw = math.degrees(math.atan2(-foot[1], -foot[0])) + 4.0
     return Network(
-        tuple(straight_road(h, half, edges) for h in (0.0, math.pi / 2)), tuple(routes), (), stop_m,
-        foot, yaw, crossing_m=stop_m + 6.0, corner_radius_m=10.0, roundabout=ring,
+        tuple(straight_road(h, half, edges) for h in (0.0, math.pi / 2)),
+        tuple(routes),
+        (),
+        stop_m,
+        foot,
+        yaw,
+        crossing_m=stop_m + 6.0,
+        corner_radius_m=10.0,
+        roundabout=ring,
     )
 
 
@@ -63,12 +70,16 @@ def _ring_route(heading: float, exits: int, share: float, stop_m: float) -> Rout
     exit_s = entry_s + around * RING_RADIUS_M
     leave = heading + math.pi + exits * math.pi / 2
     return Route(
-        path=path, approach=f'in {math.degrees(heading):.0f}',
+        path=path,
+        approach=f'in {math.degrees(heading):.0f}',
         leave=f'out {math.degrees(leave) % 360:.0f}',
-        movement={1: 'right', 2: 'straight', 3: 'left'}[exits], share=share,
-        stop_s=ARM_LENGTH_M - stop_m, diverge_s=exit_s + 4.0,
-        ring=Circulation(entry_s, exit_s, (heading + math.pi + joined_rad) * RING_RADIUS_M,
-                         2 * math.pi * RING_RADIUS_M),
+        movement={1: 'right', 2: 'straight', 3: 'left'}[exits],
+        share=share,
+        stop_s=ARM_LENGTH_M - stop_m,
+        diverge_s=exit_s + 4.0,
+        ring=Circulation(
+            entry_s, exit_s, (heading + math.pi + joined_rad) * RING_RADIUS_M, 2 * math.pi * RING_RADIUS_M
+        ),
         narrow=True,
     )
 
@@ -81,8 +92,7 @@ def _entry(offset: float) -> tuple[list[tuple[float, float, float]], float, floa
     entering, circling = -1 / ENTRY_RADIUS_M, 1 / RING_RADIUS_M
 
     def spans(arc_m: float) -> list[tuple[float, float, float]]:
-        return [(ENTRY_SPIRAL_M, 0.0, entering), (arc_m, entering, entering),
-                (RING_SPIRAL_M, entering, circling)]
+        return [(ENTRY_SPIRAL_M, 0.0, entering), (arc_m, entering, entering), (RING_SPIRAL_M, entering, circling)]
 
     def centre(arc_m: float) -> tuple[float, float, float]:
         """Return the middle of the ring as seen from where the spans begin, and their turn."""

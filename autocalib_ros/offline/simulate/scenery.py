@@ -20,9 +20,7 @@ _BARRIER_REACH_M = 300.0
 _BARRIER_PANEL_M = 6.0
 
 
-def build_scenery(
-    network: Network, viewpoint: np.ndarray, palette: Palette, seed: int
-) -> Faces:
+def build_scenery(network: Network, viewpoint: np.ndarray, palette: Palette, seed: int) -> Faces:
     """Return all standing things; viewpoint (2,) is the foot of the camera, kept in the clear."""
     rng = np.random.default_rng([seed, 4])
     parts: list[Faces] = []
@@ -37,8 +35,9 @@ def build_scenery(
     return concatenate_faces(parts)
 
 
-def _is_unobstructed(network: Network, viewpoint: np.ndarray, points: np.ndarray, kerb_m: float,
-           camera_m: float) -> bool:
+def _is_unobstructed(
+    network: Network, viewpoint: np.ndarray, points: np.ndarray, kerb_m: float, camera_m: float
+) -> bool:
     """Tell whether points (n, 2) keep off the roads, the camera and its view of the centre."""
     if edge_distance(network, points).min() < kerb_m:
         return False
@@ -50,8 +49,9 @@ def _is_unobstructed(network: Network, viewpoint: np.ndarray, points: np.ndarray
     return not bool(((along > 0) & (along < np.hypot(*viewpoint)) & (aside < 12.0)).any())
 
 
-def _buildings(road: Road, side: int, network: Network, viewpoint: np.ndarray, palette: Palette,
-               rng: np.random.Generator) -> list[Faces]:
+def _buildings(
+    road: Road, side: int, network: Network, viewpoint: np.ndarray, palette: Palette, rng: np.random.Generator
+) -> list[Faces]:
     parts = []
     for along in np.arange(-110.0, 111.0, 24.0):
         length, depth = rng.uniform(14, 22), rng.uniform(10, 14)
@@ -69,8 +69,7 @@ def _rectangle(centre: np.ndarray, heading: float, length: float, depth: float) 
     """Return the four corners (4, 2) of a rectangle, counter-clockwise."""
     axis = np.array([math.cos(heading), math.sin(heading)]) * length / 2
     normal = np.array([-math.sin(heading), math.cos(heading)]) * depth / 2
-    return np.array([centre - axis - normal, centre + axis - normal, centre + axis + normal,
-                     centre - axis + normal])
+    return np.array([centre - axis - normal, centre + axis - normal, centre + axis + normal, centre - axis + normal])
 
 
 def _perimeter_points(ring: np.ndarray) -> np.ndarray:
@@ -79,8 +78,9 @@ def _perimeter_points(ring: np.ndarray) -> np.ndarray:
     return np.concatenate([ring + f * (following - ring) for f in (0, 0.25, 0.5, 0.75)])
 
 
-def _building(ring: np.ndarray, height: float, wall: tuple[int, int, int], palette: Palette,
-           rng: np.random.Generator) -> Faces:
+def _building(
+    ring: np.ndarray, height: float, wall: tuple[int, int, int], palette: Palette, rng: np.random.Generator
+) -> Faces:
     """Return a building: walls in panels a few metres wide, and a flat roof."""
     corners, textures = [], []
     panel = _wall_texture(height, wall, palette, rng)
@@ -96,8 +96,7 @@ def _building(ring: np.ndarray, height: float, wall: tuple[int, int, int], palet
     return Faces(np.array(corners, float), tuple(textures))
 
 
-def _wall_texture(height: float, wall: tuple[int, int, int], palette: Palette,
-                  rng: np.random.Generator) -> Texture:
+def _wall_texture(height: float, wall: tuple[int, int, int], palette: Palette, rng: np.random.Generator) -> Texture:
     """Paint one panel with two windows to the storey."""
     rows, columns = round(height * _TEXELS_PER_M), round(_PANEL_M * _TEXELS_PER_M)
     picture = paint.filled_image(rows, columns, wall)
@@ -117,26 +116,38 @@ def _wall_texture(height: float, wall: tuple[int, int, int], palette: Palette,
     return Texture(picture)
 
 
-def billboard(place: np.ndarray, viewpoint: np.ndarray, width: float, low: float,
-             high: float) -> list[tuple[float, ...]]:
+def billboard(
+    place: np.ndarray, viewpoint: np.ndarray, width: float, low: float, high: float
+) -> list[tuple[float, ...]]:
     """Return an upright rectangle that faces the camera."""
     away = place - viewpoint
     across = np.array([away[1], -away[0]]) / max(float(np.hypot(*away)), 1e-6) * width
     return [(*(place - across / 2), high), (*across, 0.0), (0.0, 0.0, low - high)]
 
 
-def _trees(road: Road, side: int, network: Network, viewpoint: np.ndarray, palette: Palette,
-           crowns: list[Texture], rng: np.random.Generator) -> list[Faces]:
+def _trees(
+    road: Road,
+    side: int,
+    network: Network,
+    viewpoint: np.ndarray,
+    palette: Palette,
+    crowns: list[Texture],
+    rng: np.random.Generator,
+) -> list[Faces]:
     parts = []
     for along in np.arange(-100.0, 101.0, 11.0):
         aside = side * (road.half_width_m + PAVEMENT_WIDTH_M + rng.uniform(0.5, 2.0))
         place = road.at(along + rng.uniform(-3, 3), aside)
         height = rng.uniform(4.5, 8.0)
-        if not road.reaches(along) or not _is_unobstructed(network, viewpoint, place[None], PAVEMENT_WIDTH_M - 0.2, 14.0):
+        if not road.reaches(along) or not _is_unobstructed(
+            network, viewpoint, place[None], PAVEMENT_WIDTH_M - 0.2, 14.0
+        ):
             continue
         width = 0.7 * height
-        corners = [billboard(place, viewpoint, 0.25, 0.0, 0.5 * height),
-                   billboard(place, viewpoint, width, 0.3 * height, height)]
+        corners = [
+            billboard(place, viewpoint, 0.25, 0.0, 0.5 * height),
+            billboard(place, viewpoint, width, 0.3 * height, height),
+        ]
         trunk = Texture(paint.filled_image(32, 4, palette.trunk))
         parts.append(Faces(np.array(corners), (trunk, crowns[int(rng.integers(len(crowns)))])))
     return parts
@@ -160,8 +171,7 @@ def foliage_texture(palette: Palette, rng: np.random.Generator) -> Texture:
     return Texture(picture)
 
 
-def _poles(road: Road, side: int, network: Network, viewpoint: np.ndarray,
-           palette: Palette) -> list[Faces]:
+def _poles(road: Road, side: int, network: Network, viewpoint: np.ndarray, palette: Palette) -> list[Faces]:
     """Street lamps along the road and signal posts at the stop lines."""
     metal = Texture(paint.filled_image(32, 4, palette.pole))
     head = paint.filled_image(48, 16, palette.trim)
@@ -194,7 +204,9 @@ def _barriers(network: Network, palette: Palette) -> list[Faces]:
             a, b = network.roads[0].at(np.array([along, along + _BARRIER_PANEL_M]), aside)
             left = (b - a)[::-1] * (-1, 1) / _BARRIER_PANEL_M * 0.15
             step = (*(b - a), 0.0)
-            faces = [[(*(a + side * left), _BARRIER_HEIGHT_M), step, (0.0, 0.0, -_BARRIER_HEIGHT_M)] for side in (1, -1)]
+            faces = [
+                [(*(a + side * left), _BARRIER_HEIGHT_M), step, (0.0, 0.0, -_BARRIER_HEIGHT_M)] for side in (1, -1)
+            ]
             faces.append([(*(a + left), _BARRIER_HEIGHT_M), step, (*(-2 * left), 0.0)])
             parts.append(Faces(np.array(faces), (concrete,) * 3))
     return parts

@@ -54,9 +54,7 @@ def single_road(one_way: bool) -> Network:
         name = f'lane{i:+g}'
         routes.append(Route(Path((lane,)), name, name, 'straight', 1.0))
     # Near enough to fill the picture, and looking across the road, not along it.
-    return Network(
-        (straight_road(0.0, half, edges),), tuple(routes), (), None, (-8.0, -half - 5.0), 52.0
-    )
+    return Network((straight_road(0.0, half, edges),), tuple(routes), (), None, (-8.0, -half - 5.0), 52.0)
 
 
 def _lanes(one_way: bool, width_m: float) -> tuple[list[float], float, tuple[tuple[float, str], ...]]:
@@ -88,9 +86,7 @@ def bend(one_way: bool) -> Network:
         name = f'lane{i:+g}'
         path = _bend_lane(i * RURAL_LANE_WIDTH_M, along, forward)
         routes.append(Route(path, name, name, 'straight', 1.0))
-    return Network(
-        (Road(axis, half + 0.6, edges),), tuple(routes), (), None, (-6.0, -half - 7.0), 66.0, rural=True
-    )
+    return Network((Road(axis, half + 0.6, edges),), tuple(routes), (), None, (-6.0, -half - 7.0), 66.0, rural=True)
 
 
 def _bend_lane(aside_m: float, apex_m: float, forward: bool) -> Path:

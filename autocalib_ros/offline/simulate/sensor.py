@@ -32,7 +32,7 @@ class SensorNoise:
         """Return the noise (h, w, channels) int16 of a frame."""
         rng = np.random.default_rng([self._seed, 7, index])
         y, x = (int(n) for n in rng.integers(0, _NOISE_MARGIN_PX, 2))
-        crop = self._bank[y:y + self._size[0], x:x + self._size[1]]
+        crop = self._bank[y : y + self._size[0], x : x + self._size[1]]
         return cv2.flip(crop, int(rng.integers(-1, 2))).reshape(*self._size, -1)
 
 
@@ -43,9 +43,7 @@ def darken(picture: np.ndarray) -> np.ndarray:
     return cv2.LUT(picture, table[None])
 
 
-def add_glow(
-    picture: np.ndarray, pixel: np.ndarray, radius_px: float, colour: tuple[int, int, int]
-) -> None:
+def add_glow(picture: np.ndarray, pixel: np.ndarray, radius_px: float, colour: tuple[int, int, int]) -> None:
     """Add a soft bright blob around a pixel (2,) to a BGR picture, in place."""
     reach = max(2.0, 3.0 * radius_px)
     x0, y0 = (max(0, math.floor(c - reach)) for c in pixel)

@@ -54,16 +54,19 @@ class VehicleShape:
 
 def _windows(*spans: tuple[float, float], low: float, high: float, slant: float = 0.0) -> tuple:
     """Return side windows over the spans (rear, front) of x between two heights."""
-    return tuple(
-        ((front, low), (front - slant, high), (rear + slant, high), (rear, low))
-        for rear, front in spans
-    )
+    return tuple(((front, low), (front - slant, high), (rear + slant, high), (rear, low)) for rear, front in spans)
 
 
 _SEDAN = BodyPart(
     profile=(
-        (2.25, 0.28), (2.27, 0.68), (1.22, 0.92), (0.48, 1.40), (-0.85, 1.44), (-1.55, 1.02),
-        (-2.24, 0.96), (-2.25, 0.30),
+        (2.25, 0.28),
+        (2.27, 0.68),
+        (1.22, 0.92),
+        (0.48, 1.40),
+        (-0.85, 1.44),
+        (-1.55, 1.02),
+        (-2.24, 0.96),
+        (-2.25, 0.30),
     ),
     labels=('front', 'bonnet', 'screen', 'roof', 'rear_screen', 'boot', 'rear'),
     width_m=1.78,
@@ -74,7 +77,12 @@ _SEDAN = BodyPart(
 )
 _HATCH = BodyPart(
     profile=(
-        (1.95, 0.28), (1.98, 0.72), (1.12, 0.98), (0.40, 1.46), (-1.35, 1.50), (-1.86, 0.95),
+        (1.95, 0.28),
+        (1.98, 0.72),
+        (1.12, 0.98),
+        (0.40, 1.46),
+        (-1.35, 1.50),
+        (-1.86, 0.95),
         (-1.95, 0.30),
     ),
     labels=('front', 'bonnet', 'screen', 'roof', 'rear_screen', 'rear'),
@@ -86,7 +94,12 @@ _HATCH = BodyPart(
 )
 _WAGON = BodyPart(
     profile=(
-        (2.30, 0.35), (2.34, 0.92), (1.30, 1.12), (0.62, 1.66), (-1.95, 1.70), (-2.26, 1.12),
+        (2.30, 0.35),
+        (2.34, 0.92),
+        (1.30, 1.12),
+        (0.62, 1.66),
+        (-1.95, 1.70),
+        (-2.26, 1.12),
         (-2.32, 0.36),
     ),
     labels=('front', 'bonnet', 'screen', 'roof', 'rear_screen', 'rear'),
@@ -99,7 +112,12 @@ _WAGON = BodyPart(
 )
 _VAN = BodyPart(
     profile=(
-        (2.60, 0.35), (2.62, 1.02), (1.95, 1.24), (1.25, 2.02), (-2.52, 2.10), (-2.58, 0.36),
+        (2.60, 0.35),
+        (2.62, 1.02),
+        (1.95, 1.24),
+        (1.25, 2.02),
+        (-2.52, 2.10),
+        (-2.58, 0.36),
     ),
     labels=('front', 'bonnet', 'screen', 'roof', 'doors'),
     width_m=1.98,
@@ -123,8 +141,15 @@ _COACH = BodyPart(
     labels=('front', 'screen', 'bus_roof', 'rear'),
     width_m=2.50,
     windows=_windows(
-        (-5.30, -3.95), (-3.80, -2.30), (-2.15, -0.65), (-0.50, 1.00), (1.15, 2.65), (2.80, 4.20),
-        (4.40, 5.35), low=1.35, high=2.45,
+        (-5.30, -3.95),
+        (-3.80, -2.30),
+        (-2.15, -0.65),
+        (-0.50, 1.00),
+        (1.15, 2.65),
+        (2.80, 4.20),
+        (4.40, 5.35),
+        low=1.35,
+        high=2.45,
     ),
     lettering='LINE 7 HARBOUR',
 )
@@ -137,11 +162,27 @@ SHAPES = {
         VehicleShape('wagon', 4.6, 1.88, 2.75, 0.35, (_WAGON,), 0.20, 1.7),
         VehicleShape('van', 5.2, 1.98, 3.20, 0.33, (_VAN,), 0.15, 1.5),
         VehicleShape(
-            'truck', 7.5, 2.40, 4.20, 0.45, (_CAB, _CARGO), 0.09, 1.0, fits_narrow_turns=False,
+            'truck',
+            7.5,
+            2.40,
+            4.20,
+            0.45,
+            (_CAB, _CARGO),
+            0.09,
+            1.0,
+            fits_narrow_turns=False,
             top_speed_mps=24.0,
         ),
         VehicleShape(
-            'bus', 11.4, 2.50, 5.80, 0.46, (_COACH,), 0.05, 1.0, fits_narrow_turns=False,
+            'bus',
+            11.4,
+            2.50,
+            5.80,
+            0.46,
+            (_COACH,),
+            0.05,
+            1.0,
+            fits_narrow_turns=False,
             top_speed_mps=27.0,
         ),
     )

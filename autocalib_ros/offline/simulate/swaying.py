@@ -33,11 +33,20 @@ _SIGN_BEAT_HZ = 1.3
 
 def wind_strength(time_s: float) -> float:
     """Return the strength of the wind at a time, 0.4 to 1."""
-    return 0.7 + 0.3 * math.sin(2 * math.pi * time_s / _GUST_PERIOD_S) * math.cos(2 * math.pi * time_s / (2.3 * _GUST_PERIOD_S))
+    return 0.7 + 0.3 * math.sin(2 * math.pi * time_s / _GUST_PERIOD_S) * math.cos(
+        2 * math.pi * time_s / (2.3 * _GUST_PERIOD_S)
+    )
 
 
-def roadside_positions(network: Network, pose: CameraPose, lens: KannalaBrandtLens, size: tuple[int, int], beyond_m: float,
-             rng: np.random.Generator, count: int) -> list[np.ndarray]:
+def roadside_positions(
+    network: Network,
+    pose: CameraPose,
+    lens: KannalaBrandtLens,
+    size: tuple[int, int],
+    beyond_m: float,
+    rng: np.random.Generator,
+    count: int,
+) -> list[np.ndarray]:
     """Draw places (2,) beside the road that the camera sees, at `beyond_m` from the asphalt and up to 3 m more."""
     places: list[np.ndarray] = []
     for _ in range(4000):
@@ -70,8 +79,10 @@ class Tree:
         """Return its faces at a time."""
         wave = np.sin(2 * np.pi * self.rates_hz * time_s + self.phases)
         angles = self.swings_rad * wind_strength(time_s) * (0.4 + 0.6 * wave)
-        return Faces(np.stack([_rotated_in_plane(*row) for row in zip(self.branches, self.pivots_m, angles, strict=True)]),
-                     self.textures)
+        return Faces(
+            np.stack([_rotated_in_plane(*row) for row in zip(self.branches, self.pivots_m, angles, strict=True)]),
+            self.textures,
+        )
 
 
 def _rotated_in_plane(corners: np.ndarray, pivot: np.ndarray, angle: float) -> np.ndarray:
@@ -100,12 +111,23 @@ def tree(place: np.ndarray, viewer: np.ndarray, palette: Palette, rng: np.random
         pivots.append((*place, 0.3 * height))
         swings.append(rng.uniform(0.02, 0.07))
         rates.append(rng.uniform(0.35, 1.4))
-    textures = (Texture(paint.filled_image(32, 4, palette.trunk)), *(foliage_texture(palette, rng) for _ in range(_BRANCH_COUNT)))
-    return Tree(np.array(corners, float), np.array(pivots), np.array(swings), np.array(rates),
-                rng.uniform(0, 2 * np.pi, len(swings)), textures)
+    textures = (
+        Texture(paint.filled_image(32, 4, palette.trunk)),
+        *(foliage_texture(palette, rng) for _ in range(_BRANCH_COUNT)),
+    )
+    return Tree(
+        np.array(corners, float),
+        np.array(pivots),
+        np.array(swings),
+        np.array(rates),
+        rng.uniform(0, 2 * np.pi, len(swings)),
+        textures,
+    )
 
 
-def near_branch(pose: CameraPose, lens: KannalaBrandtLens, size: tuple[int, int], palette: Palette, rng: np.random.Generator) -> Tree:
+def near_branch(
+    pose: CameraPose, lens: KannalaBrandtLens, size: tuple[int, int], palette: Palette, rng: np.random.Generator
+) -> Tree:
     """Return leaves on the end of a bough, close before the camera, that hang into an upper corner of the picture."""
     viewer = pose.position_m[:2]
     column = rng.choice([0.12, 0.88]) * size[0]
@@ -117,9 +139,14 @@ def near_branch(pose: CameraPose, lens: KannalaBrandtLens, size: tuple[int, int]
         low = z - _NEAR_FOLIAGE_SIZE_M / 2
         corners.append(billboard(np.array([x, y]), viewer, _NEAR_FOLIAGE_SIZE_M, low, low + _NEAR_FOLIAGE_SIZE_M))
         pivots.append((x, y, z + 1.5))
-    return Tree(np.array(corners, float), np.array(pivots), rng.uniform(0.08, 0.2, _BRANCH_COUNT),
-                rng.uniform(0.3, 0.9, _BRANCH_COUNT), rng.uniform(0, 2 * np.pi, _BRANCH_COUNT),
-                tuple(foliage_texture(palette, rng) for _ in range(_BRANCH_COUNT)))
+    return Tree(
+        np.array(corners, float),
+        np.array(pivots),
+        rng.uniform(0.08, 0.2, _BRANCH_COUNT),
+        rng.uniform(0.3, 0.9, _BRANCH_COUNT),
+        rng.uniform(0, 2 * np.pi, _BRANCH_COUNT),
+        tuple(foliage_texture(palette, rng) for _ in range(_BRANCH_COUNT)),
+    )
 
 
 @dataclass(frozen=True)
@@ -141,7 +168,9 @@ class Flag:
         corners = [billboard(self.place, viewer, 0.09, 0.0, self.top_m + 0.1)]
         for i in range(_STRIP_COUNT):
             along = (i + 0.5) * step
-            wave = 2 * np.pi * (along - _FLAG_WAVE_MPS * wind_strength(time_s) * time_s) / _FLAG_WAVELENGTH_M + self.phase
+            wave = (
+                2 * np.pi * (along - _FLAG_WAVE_MPS * wind_strength(time_s) * time_s) / _FLAG_WAVELENGTH_M + self.phase
+            )
             heading = self.heading + 0.7 * min(1.0, along) * math.cos(wave)
             way = step * np.array([math.cos(heading), math.sin(heading)])
             facing = way[0] * (foot - viewer)[1] - way[1] * (foot - viewer)[0] > 0
@@ -162,12 +191,18 @@ def flag(place: np.ndarray, viewer: np.ndarray, palette: Palette, rng: np.random
     for i in range(_STRIP_COUNT):
         picture = paint.filled_image(rows, columns, stripes[0])
         for band, colour in enumerate(stripes):
-            picture[band * rows // 3:(band + 1) * rows // 3, :, :3] = colour
+            picture[band * rows // 3 : (band + 1) * rows // 3, :, :3] = colour
         if abs(i - emblem) < 2:
             picture[20:44, :, :3] = (230, 230, 230) if i % 2 else (30, 30, 30)
         strips.append(Texture(picture))
-    return Flag(place, heading, rng.uniform(4.0, 6.0), rng.uniform(0, 2 * np.pi), tuple(strips),
-                Texture(paint.filled_image(32, 4, palette.pole)))
+    return Flag(
+        place,
+        heading,
+        rng.uniform(4.0, 6.0),
+        rng.uniform(0, 2 * np.pi),
+        tuple(strips),
+        Texture(paint.filled_image(32, 4, palette.pole)),
+    )
 
 
 @dataclass(frozen=True)
@@ -205,8 +240,16 @@ def sign(place: np.ndarray, viewer: np.ndarray, rng: np.random.Generator) -> Led
 class MovingScenery:
     """All that sways and blinks beside the road of one recording."""
 
-    def __init__(self, troubles: frozenset[str], network: Network, pose: CameraPose, lens: KannalaBrandtLens,
-                 size: tuple[int, int], palette: Palette, seed: int) -> None:
+    def __init__(
+        self,
+        troubles: frozenset[str],
+        network: Network,
+        pose: CameraPose,
+        lens: KannalaBrandtLens,
+        size: tuple[int, int],
+        palette: Palette,
+        seed: int,
+    ) -> None:
         rng = np.random.default_rng([seed, 10])
         self._viewer = viewer = pose.position_m[:2]
 
@@ -222,5 +265,8 @@ class MovingScenery:
 
     def at(self, time_s: float) -> list[Faces]:
         """Return the faces of each of them at a time."""
-        return [*(tree.at(time_s) for tree in self._trees), *(flag.at(time_s, self._viewer) for flag in self._flags),
-                *(sign.at(time_s) for sign in self._signs)]
+        return [
+            *(tree.at(time_s) for tree in self._trees),
+            *(flag.at(time_s, self._viewer) for flag in self._flags),
+            *(sign.at(time_s) for sign in self._signs),
+        ]

@@ -45,8 +45,14 @@ class _Driver:
     def vehicle(self) -> Vehicle:
         trace = np.array(self.trace)
         return Vehicle(
-            self.number, self.shape.kind, self.colour, self.route, self.wander, self.start_s,
-            trace[:, 0], trace[:, 1],
+            self.number,
+            self.shape.kind,
+            self.colour,
+            self.route,
+            self.wander,
+            self.start_s,
+            trace[:, 0],
+            trace[:, 1],
         )
 
 
@@ -76,9 +82,7 @@ def simulate_traffic(network: Network, options: SimulationOptions) -> SimulatedT
 class _Arrivals:
     """Vehicles that arrive at random and enter as soon as their lane has room."""
 
-    def __init__(
-        self, routes: tuple[Route, ...], options: SimulationOptions, rng: np.random.Generator
-    ) -> None:
+    def __init__(self, routes: tuple[Route, ...], options: SimulationOptions, rng: np.random.Generator) -> None:
         self._rng = rng
         self._wander_m = options.wander_m
         self._count = 0
@@ -106,9 +110,16 @@ class _Arrivals:
         safe = max(0.0, min(cruise, leader_mps + 0.1 * (room_m - 20.0)))
         self._count += 1
         return _Driver(
-            self._count, shape, int(rng.integers(COLOUR_COUNT)), route,
-            Wander.draw(self._wander_m, rng, route.speed_mps), cruise, float(rng.uniform(1.0, 1.5)), now,
-            shape.length_m / 2, safe,
+            self._count,
+            shape,
+            int(rng.integers(COLOUR_COUNT)),
+            route,
+            Wander.draw(self._wander_m, rng, route.speed_mps),
+            cruise,
+            float(rng.uniform(1.0, 1.5)),
+            now,
+            shape.length_m / 2,
+            safe,
         )
 
 
@@ -140,9 +151,7 @@ def _step_drivers(drivers: list[_Driver], signals: SignalController) -> None:
     strength = np.array([d.shape.acceleration_mps2 for d in drivers])
     headway = np.array([d.headway_s for d in drivers])
     free = 1 - (v / wish) ** 4
-    desired = STANDSTILL_GAP_M + np.maximum(
-        0.0, v * headway + v * (v - leader_v) / (2 * np.sqrt(strength * 2.2))
-    )
+    desired = STANDSTILL_GAP_M + np.maximum(0.0, v * headway + v * (v - leader_v) / (2 * np.sqrt(strength * 2.2)))
     acceleration = strength * (free - (desired / np.maximum(gap, 0.1)) ** 2)
     new_v = np.maximum(0.0, v + np.clip(acceleration, -7.0, None) * STEP_S)
     new_v[(new_v < 0.02) & (gap < STANDSTILL_GAP_M + 0.5)] = 0.0
@@ -210,8 +219,11 @@ def _ring_distance(driver: _Driver, other: _Driver) -> float:
 
 def _is_on_ring(driver: _Driver) -> bool:
     ring, half_m = driver.route.ring, driver.shape.length_m / 2
-    return ring is not None and driver.s + half_m > driver.route.stop_s and driver.s < (
-        ring.exit_s + half_m + _EXIT_CLEARANCE_M)
+    return (
+        ring is not None
+        and driver.s + half_m > driver.route.stop_s
+        and driver.s < (ring.exit_s + half_m + _EXIT_CLEARANCE_M)
+    )
 
 
 def _must_yield(driver: _Driver, drivers: list[_Driver]) -> bool:

@@ -40,10 +40,8 @@ def truth_of(simulation: Simulation) -> dict[str, Any]:
         'pixel_convention': 'OpenCV: centre of the top-left pixel is (0,0)',
         'lens': _lens(simulation),
         'camera': _camera(simulation.pose),
-        'world': 'X,Y on the ground (z=0), Z up, metres; '
-                 'camera optical frame x right, y down, z forward',
-        'road_directions': [[*direction, 0.0]
-                            for direction in simulation.network.directions().round(9).tolist()],
+        'world': 'X,Y on the ground (z=0), Z up, metres; camera optical frame x right, y down, z forward',
+        'road_directions': [[*direction, 0.0] for direction in simulation.network.directions().round(9).tolist()],
         'ground_points': _ground_points(simulation, bumped=False),
         'vehicles': _vehicles(simulation),
         'people': _people(simulation),
@@ -131,8 +129,8 @@ def _vehicles(simulation: Simulation) -> dict[str, Any]:
     return {
         'columns': _TRACK_COLUMNS,
         'note': f'ground-plane centre of the vehicle footprint, {TRACK_RATE_HZ} Hz, only while in '
-                f'view, within {_TRACK_RANGE_M:.0f} m and not hidden by static objects (may be hidden '
-                'by other vehicles); shake of the camera not included',
+        f'view, within {_TRACK_RANGE_M:.0f} m and not hidden by static objects (may be hidden '
+        'by other vehicles); shake of the camera not included',
         'tracks': tracks,
     }
 
@@ -140,8 +138,10 @@ def _vehicles(simulation: Simulation) -> dict[str, Any]:
 def _people(simulation: Simulation) -> dict[str, Any]:
     """Return the tracks of who walks and who cycles, each with a gap where it begins anew."""
     tracks = []
-    for kind, everybody, state in (('pedestrian', simulation.people, _pedestrian_state),
-                                   ('cyclist', simulation.cyclists, _cyclist_state)):
+    for kind, everybody, state in (
+        ('pedestrian', simulation.people, _pedestrian_state),
+        ('cyclist', simulation.cyclists, _cyclist_state),
+    ):
         for number, person in enumerate(everybody, 1):
             rows = _track_rows(simulation, lambda t, person=person, state=state: state(person, t))
             if rows:

@@ -26,9 +26,7 @@ class Wander:
     phases: np.ndarray
 
     @classmethod
-    def draw(
-        cls, stddev_m: float, rng: np.random.Generator, speed_mps: float = CITY_SPEED_MPS
-    ) -> Wander:
+    def draw(cls, stddev_m: float, rng: np.random.Generator, speed_mps: float = CITY_SPEED_MPS) -> Wander:
         """Draw a wander of a standard deviation; at its speed it is correlated over seconds."""
         count = 4
         return cls(

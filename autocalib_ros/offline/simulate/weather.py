@@ -88,8 +88,11 @@ class Weather:
     def __init__(self, options: SimulationOptions, network: Network, poses: dict[bool, CameraPose]) -> None:
         self._options, self._network, self._troubles = options, network, options.troubles
         self._lens: KannalaBrandtLens = options.lens
-        self._ground = ({bumped: GroundBuffer.of(options, network, pose) for bumped, pose in poses.items()}
-                        if self._troubles & {'shadows', 'water', 'wet'} else {})
+        self._ground = (
+            {bumped: GroundBuffer.of(options, network, pose) for bumped, pose in poses.items()}
+            if self._troubles & {'shadows', 'water', 'wet'}
+            else {}
+        )
         rng = np.random.default_rng([options.seed, 11])
         self._sun_rad = float(rng.uniform(0, 2 * np.pi))
         wind = rng.uniform(0, 2 * np.pi)
@@ -129,7 +132,7 @@ class Weather:
     def _darken_shadows(self, view: FrameContext, bumped: bool) -> None:
         """Darken the ground under clouds that move with the wind, and in the shadows of vehicles."""
         ground = self._ground[bumped]
-        coarse = (ground.xy[::8, ::8] - self._wind.astype(np.float32) * np.float32(_CLOUD_SPEED_MPS * view.time_s))
+        coarse = ground.xy[::8, ::8] - self._wind.astype(np.float32) * np.float32(_CLOUD_SPEED_MPS * view.time_s)
         texels = np.mod(coarse * (_CLOUD_TEXELS / (8 * _CLOUD_SIZE_M)), _CLOUD_TEXELS).astype(np.float32)
         cloud = cv2.remap(self._clouds, texels, NO_MAP, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
         height, width = ground.distance_m.shape
@@ -159,14 +162,19 @@ class Weather:
     def _pond_mask(self, rng: np.random.Generator) -> dict[bool, tuple[np.ndarray, np.ndarray]]:
         """Lay a pond beside the road; return its pixels (n,) rows and columns by pose."""
         ground = self._ground[False]
-        fit = np.argwhere((ground.off_road_m > _POND_SEMI_AXES_M[1] + 2.5) & (ground.off_road_m < _POND_SEMI_AXES_M[1] + 9.0)
-                          & (ground.distance_m < 40.0))
+        fit = np.argwhere(
+            (ground.off_road_m > _POND_SEMI_AXES_M[1] + 2.5)
+            & (ground.off_road_m < _POND_SEMI_AXES_M[1] + 9.0)
+            & (ground.distance_m < 40.0)
+        )
         if not len(fit):
             return {}
         row, column = fit[int(rng.integers(len(fit)))]
         centre = ground.xy[row, column]
-        return {bumped: np.nonzero((((view.xy - centre) / _POND_SEMI_AXES_M) ** 2).sum(-1) < 1) for bumped, view
-                in self._ground.items()}
+        return {
+            bumped: np.nonzero((((view.xy - centre) / _POND_SEMI_AXES_M) ** 2).sum(-1) < 1)
+            for bumped, view in self._ground.items()
+        }
 
     def _draw_waves(self, view: FrameContext, bumped: bool) -> None:
         """Draw waves that travel with the wind, with the glitter of the sun on their slopes."""
@@ -177,7 +185,9 @@ class Weather:
         visible = ground.visible(view.depth_m)[rows, columns]
         rows, columns = rows[visible], columns[visible]
         numbers, rates, phases = self._waves
-        slope = np.sin(ground.xy[rows, columns] @ numbers.T - rates * view.time_s + phases).sum(-1) / math.sqrt(_WAVE_COUNT)
+        slope = np.sin(ground.xy[rows, columns] @ numbers.T - rates * view.time_s + phases).sum(-1) / math.sqrt(
+            _WAVE_COUNT
+        )
         level = 70 + 28 * slope + 130 * (slope > 1.3)
         view.picture[rows, columns] = np.clip(level[:, None] * (1.0, 0.95, 0.8), 0, 255).astype(np.uint8)
 
@@ -217,12 +227,21 @@ class Weather:
                 column, row = (round(float(c)) for c in pixel)
                 inside = 0 <= row < self._options.height_px and 0 <= column < self._options.width_px
                 distance = float(np.linalg.norm(view.pose.position_m - lamp))
-                if not valid or not inside or distance < _MIN_SIGNAL_DISTANCE_M or view.depth_m[row, column] < distance - 1.0:
+                if (
+                    not valid
+                    or not inside
+                    or distance < _MIN_SIGNAL_DISTANCE_M
+                    or view.depth_m[row, column] < distance - 1.0
+                ):
                     continue
                 beat = np.clip(0.5 + 0.9 * math.sin(2 * np.pi * (3.1 + 0.7 * number) * view.time_s + side), 0.05, 1.0)
                 colour = (60, 60, 255) if red else (190, 255, 60)
-                add_glow(view.picture, pixel, max(1.5, _SIGNAL_LAMP_SIZE_M * self._lens.focal_px / distance * 1.5),
-                         _scaled(colour, float(beat)))
+                add_glow(
+                    view.picture,
+                    pixel,
+                    max(1.5, _SIGNAL_LAMP_SIZE_M * self._lens.focal_px / distance * 1.5),
+                    _scaled(colour, float(beat)),
+                )
 
     def _rain(self, picture: np.ndarray, index: int) -> np.ndarray:
         """Draw the streaks that drops near the camera leave in one exposure, under a veil of those farther off."""
@@ -261,8 +280,11 @@ def _deep_water_waves(wind: float, rng: np.random.Generator) -> tuple[np.ndarray
     length = np.exp(rng.uniform(math.log(0.4), math.log(2.5), _WAVE_COUNT))
     heading = wind + rng.normal(0, 0.5, _WAVE_COUNT)
     number = 2 * np.pi / length
-    return (number[:, None] * np.stack([np.cos(heading), np.sin(heading)], 1), np.sqrt(_GRAVITY_MPS2 * number),
-            rng.uniform(0, 2 * np.pi, _WAVE_COUNT))
+    return (
+        number[:, None] * np.stack([np.cos(heading), np.sin(heading)], 1),
+        np.sqrt(_GRAVITY_MPS2 * number),
+        rng.uniform(0, 2 * np.pi, _WAVE_COUNT),
+    )
 
 
 @dataclass(frozen=True)
@@ -291,9 +313,18 @@ class WaterDrop:
 
 def _drops_of(options: SimulationOptions, rng: np.random.Generator) -> list[WaterDrop]:
     width, height = options.width_px, options.height_px
-    return [WaterDrop(float(rng.uniform(0, width)), float(rng.uniform(0, 0.8 * height)),
-                 float(rng.uniform(0.012, 0.035) * width), float(rng.uniform(0, 30)), float(rng.uniform(3, 20)),
-                 float(rng.uniform(0.1, 0.5) * height), float(rng.uniform(25, 40))) for _ in range(_DROP_COUNT)]
+    return [
+        WaterDrop(
+            float(rng.uniform(0, width)),
+            float(rng.uniform(0, 0.8 * height)),
+            float(rng.uniform(0.012, 0.035) * width),
+            float(rng.uniform(0, 30)),
+            float(rng.uniform(3, 20)),
+            float(rng.uniform(0.1, 0.5) * height),
+            float(rng.uniform(25, 40)),
+        )
+        for _ in range(_DROP_COUNT)
+    ]
 
 
 def _apply_drops(picture: np.ndarray, drops: list[WaterDrop], time_s: float) -> np.ndarray:

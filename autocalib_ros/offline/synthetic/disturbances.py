@@ -24,7 +24,7 @@ def corrupt_track(points: np.ndarray, size: tuple[int, int], generator: np.rando
     """Make a gross outlier of a track (n, 2): a jump to something else, or a curve that has nothing to do with it."""
     if generator.uniform() < 0.5:
         jumped = points.copy()
-        jumped[generator.integers(2, len(points) - 2):] += generator.uniform(40, 200) * _any_direction(generator)
+        jumped[generator.integers(2, len(points) - 2) :] += generator.uniform(40, 200) * _any_direction(generator)
         return reflect_into_image(jumped, size)
     return random_curve(len(points), size, generator)
 
@@ -67,7 +67,9 @@ def random_sway(generator: np.random.Generator) -> Sway:
     axis, phase = generator.normal(size=3), generator.uniform(0, 2 * np.pi)
     axis /= np.linalg.norm(axis)
     keep = np.exp(-SWAY_STEP_S / memory)
-    pushes = generator.normal(scale=0.5 * amplitude * np.sqrt(1 - keep**2), size=(int(SWAY_DURATION_S / SWAY_STEP_S), 3))
+    pushes = generator.normal(
+        scale=0.5 * amplitude * np.sqrt(1 - keep**2), size=(int(SWAY_DURATION_S / SWAY_STEP_S), 3)
+    )
     walk = lfilter([1.0], [1.0, -keep], pushes, axis=0)
     ticks = SWAY_STEP_S * np.arange(len(walk))
 
@@ -81,8 +83,9 @@ def random_sway(generator: np.random.Generator) -> Sway:
 
 def background_drift_px(camera: Camera, sway: Sway, seconds: float) -> float:
     """Return what a monitor of the still background reports for a camera that sways for `seconds`."""
-    corners = np.stack(np.meshgrid(np.linspace(0.1, 0.9, 8) * camera.width,
-                                   np.linspace(0.1, 0.9, 5) * camera.height), axis=-1).reshape(-1, 2)
+    corners = np.stack(
+        np.meshgrid(np.linspace(0.1, 0.9, 8) * camera.width, np.linspace(0.1, 0.9, 5) * camera.height), axis=-1
+    ).reshape(-1, 2)
     bearings, _ = camera.unproject(corners)
     moved, _ = camera.project(bearings @ sway(np.arange(0.0, seconds, 0.5)).transpose(0, 2, 1))
     offsets = np.median(moved - moved[0], axis=1)

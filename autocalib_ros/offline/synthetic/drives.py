@@ -64,7 +64,9 @@ def drive_across(junction: Junction, generator: np.random.Generator) -> Trajecto
     return centre + lateral[:, None] * _left_of(forward), heading
 
 
-def drive_bend(junction: Junction, generator: np.random.Generator, *, radius_m: float, towards_rad: float) -> Trajectory:
+def drive_bend(
+    junction: Junction, generator: np.random.Generator, *, radius_m: float, towards_rad: float
+) -> Trajectory:
     """Follow a bend of one radius through the junction's middle; its centre lies `towards_rad` of there."""
     middle = np.array(junction.centre_m) + radius_m * _unit(np.array(towards_rad))
     way = generator.choice([-1.0, 1.0])
@@ -83,8 +85,14 @@ def drive_ring(junction: Junction, generator: np.random.Generator, *, radius_m: 
     return _on_circle(junction, generator, along, np.array(junction.centre_m), radius_m + lane, bearing, 1.0)
 
 
-def drive_route(junction: Junction, generator: np.random.Generator, *, network: Network, rotation_rad: float = 0.0,
-                scale: float = 1.0) -> Trajectory:
+def drive_route(
+    junction: Junction,
+    generator: np.random.Generator,
+    *,
+    network: Network,
+    rotation_rad: float = 0.0,
+    scale: float = 1.0,
+) -> Trajectory:
     """Drive a route of a network whose middle lies at the junction's, turned there and scaled."""
     weights = np.array([route.share for route in network.routes])
     route = network.routes[generator.choice(len(weights), p=weights / weights.sum())]
@@ -121,19 +129,23 @@ def walk_along_road(junction: Junction, generator: np.random.Generator) -> Traje
 
 def drive_arc(junction: Junction, generator: np.random.Generator, *, radii_m: tuple[float, float]) -> Trajectory:
     """Turn on an arc of the vehicle's own through the junction's middle."""
-    return drive_bend(junction, generator, radius_m=generator.uniform(*radii_m),
-                      towards_rad=generator.uniform(0, 2 * np.pi))
+    return drive_bend(
+        junction, generator, radius_m=generator.uniform(*radii_m), towards_rad=generator.uniform(0, 2 * np.pi)
+    )
 
 
-def beside(path: np.ndarray, heading: np.ndarray, generator: np.random.Generator,
-           speeds: tuple[float, float] = (0.8, 1.2)) -> Trajectory:
+def beside(
+    path: np.ndarray, heading: np.ndarray, generator: np.random.Generator, speeds: tuple[float, float] = (0.8, 1.2)
+) -> Trajectory:
     """Drive in the next lane of a path (n, 2) with headings (n,), faster or slower than who drives there."""
     steps = np.arange(len(path), dtype=float)
     middle = 0.5 * (len(path) - 1)
     at = np.clip(middle + (steps - middle) * generator.uniform(*speeds), 0, len(path) - 1)
     shifted = path + generator.choice([-1.0, 1.0]) * LANE_M * _left_of(_unit(heading))
-    return (np.column_stack([np.interp(at, steps, shifted[:, axis]) for axis in (0, 1)]),
-            np.interp(at, steps, np.unwrap(heading)))
+    return (
+        np.column_stack([np.interp(at, steps, shifted[:, axis]) for axis in (0, 1)]),
+        np.interp(at, steps, np.unwrap(heading)),
+    )
 
 
 def trailer(path: np.ndarray, heading: np.ndarray, _: np.random.Generator) -> Trajectory:
@@ -153,8 +165,15 @@ def shadow(path: np.ndarray, heading: np.ndarray, generator: np.random.Generator
     return path + generator.uniform(*SHADOW_M) * _unit(generator.uniform(0, 2 * np.pi)), heading
 
 
-def _on_circle(junction: Junction, generator: np.random.Generator, along: np.ndarray, centre: np.ndarray,
-               radius_m: float, bearing: np.ndarray, way: float) -> Trajectory:
+def _on_circle(
+    junction: Junction,
+    generator: np.random.Generator,
+    along: np.ndarray,
+    centre: np.ndarray,
+    radius_m: float,
+    bearing: np.ndarray,
+    way: float,
+) -> Trajectory:
     outward = _unit(bearing)
     radius = radius_m + _wander(junction, generator, along)
     return centre + radius[:, None] * outward, bearing + way * np.pi / 2
@@ -176,8 +195,9 @@ def _times(way: np.ndarray, speeds: np.ndarray) -> np.ndarray:
 
 def _wander(junction: Junction, generator: np.random.Generator, along: np.ndarray) -> np.ndarray:
     """Lateral offset (n,) within the lane, `wander_m` root mean square, in waves of 25 to 80 m."""
-    sway = sum(np.sin(along * 2 * np.pi / generator.uniform(25, 80) + generator.uniform(0, 2 * np.pi))
-               for _ in range(2))
+    sway = sum(
+        np.sin(along * 2 * np.pi / generator.uniform(25, 80) + generator.uniform(0, 2 * np.pi)) for _ in range(2)
+    )
     return junction.wander_m * np.asarray(sway)
 
 

@@ -109,7 +109,9 @@ def synthetic_evidence(junction: Junction, generator: np.random.Generator) -> Ev
     return evidence_from_tracks(tracks, junction.image_size, newest, drift)
 
 
-def evidence_from_tracks(tracks: list[Track], image_size: tuple[int, int], newest_s: float, drift_px: float = 0.0) -> Evidence:
+def evidence_from_tracks(
+    tracks: list[Track], image_size: tuple[int, int], newest_s: float, drift_px: float = 0.0
+) -> Evidence:
     """Return the evidence of tracks, with the segments that matches between masked frames would give."""
     buffer = EvidenceBuffer(BufferOptions())
     for track in tracks:
@@ -117,8 +119,13 @@ def evidence_from_tracks(tracks: list[Track], image_size: tuple[int, int], newes
     for segments in sorted((part for track in tracks for part in _segments(track)), key=lambda part: part.time_s):
         buffer.add_segments(segments)
     return buffer.snapshot(
-        image_size=image_size, first_stamp_ns=0, newest_stamp_ns=int(newest_s * 1e9),
-        frames=int(newest_s / INTERVAL_S), drift_px=drift_px, unfinished=[])
+        image_size=image_size,
+        first_stamp_ns=0,
+        newest_stamp_ns=int(newest_s * 1e9),
+        frames=int(newest_s / INTERVAL_S),
+        drift_px=drift_px,
+        unfinished=[],
+    )
 
 
 def _vehicles(junction: Junction, tracks: list[Track]) -> Iterator[int]:
@@ -130,12 +137,20 @@ def _vehicles(junction: Junction, tracks: list[Track]) -> Iterator[int]:
         if len(tracks) == junction.tracks:
             return
         yield vehicle
-    raise UsageError(f'{MAX_VEHICLES_PER_TRACK * junction.tracks} vehicles left {len(tracks)} tracks of the '
-                     f'{junction.tracks} wanted: the road is out of view')
+    raise UsageError(
+        f'{MAX_VEHICLES_PER_TRACK * junction.tracks} vehicles left {len(tracks)} tracks of the '
+        f'{junction.tracks} wanted: the road is out of view'
+    )
 
 
-def _observe(junction: Junction, generator: np.random.Generator, path: np.ndarray, heading: np.ndarray,
-             times: np.ndarray, vehicle: int) -> Track | None:
+def _observe(
+    junction: Junction,
+    generator: np.random.Generator,
+    path: np.ndarray,
+    heading: np.ndarray,
+    times: np.ndarray,
+    vehicle: int,
+) -> Track | None:
     """Project one point of the body; keep the longest run inside the image."""
     ahead, left, up = generator.uniform([-2.0, -0.8, 0.2], [2.0, 0.8, 1.6])
     forward = np.column_stack([np.cos(heading), np.sin(heading)])
@@ -149,7 +164,11 @@ def _observe(junction: Junction, generator: np.random.Generator, path: np.ndarra
         seen &= (pixels[:, 0] >= junction.visible_columns_px[0]) & (pixels[:, 0] < junction.visible_columns_px[1])
     first, last = _longest_run(seen)
     points = pixels[first:last] + generator.normal(scale=junction.noise_px, size=(last - first, 2))
-    if len(points) >= MIN_TRACK_POINTS and junction.outlier_fraction and generator.uniform() < junction.outlier_fraction:
+    if (
+        len(points) >= MIN_TRACK_POINTS
+        and junction.outlier_fraction
+        and generator.uniform() < junction.outlier_fraction
+    ):
         points = corrupt_track(points, junction.image_size, generator)
     if len(points) < MIN_TRACK_POINTS or np.hypot(*(points[-1] - points[0])) < MIN_TRACK_LENGTH_PX:
         return None

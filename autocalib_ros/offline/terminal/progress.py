@@ -26,8 +26,9 @@ class ProgressReporter(Protocol):
 
 
 @contextmanager
-def progress_bar(total: float | None, unit: str, label: str, *, quiet: bool = False,
-                 stream: TextIO | None = None) -> Iterator[ProgressReporter]:
+def progress_bar(
+    total: float | None, unit: str, label: str, *, quiet: bool = False, stream: TextIO | None = None
+) -> Iterator[ProgressReporter]:
     """Show progress on stderr until the block ends: tqdm's bar on a terminal, plain lines elsewhere.
 
     `total` is counted in `unit`s, None where it is not known beforehand; `quiet` shows nothing.
@@ -57,8 +58,16 @@ class _ProgressBar:
 
         self._stream = stream
         # a terminal of unknown size has no line for tqdm, which then shows nothing
-        self._bar = tqdm(total=total, unit=' ' + unit, desc=label, file=stream, leave=True, nrows=2,
-                         ncols=terminal_width(stream) - 1, bar_format=BAR if total else OPEN_BAR)
+        self._bar = tqdm(
+            total=total,
+            unit=' ' + unit,
+            desc=label,
+            file=stream,
+            leave=True,
+            nrows=2,
+            ncols=terminal_width(stream) - 1,
+            bar_format=BAR if total else OPEN_BAR,
+        )
         self._note = ''
 
     def __enter__(self) -> _ProgressBar:

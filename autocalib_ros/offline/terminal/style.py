@@ -29,7 +29,7 @@ def is_terminal(stream: TextIO) -> bool:
 
 
 def terminal_width(stream: TextIO) -> int:
-    """Return how many columns the terminal has; `DEFAULT_COLUMNS` where it does not tell, as in a container without a size."""
+    """Return the columns of the terminal; `DEFAULT_COLUMNS` where it has no size, as in a container."""
     try:
         size = os.get_terminal_size(stream.fileno())
     except (OSError, ValueError):
@@ -54,7 +54,7 @@ def truncate(text: str, columns: int) -> str:
     text = ' '.join(text.split())
     if len(text) <= columns:
         return text
-    return text[:max(columns - 1, 0)].rstrip(' ,;:') + ELLIPSIS if columns > 0 else ''
+    return text[: max(columns - 1, 0)].rstrip(' ,;:') + ELLIPSIS if columns > 0 else ''
 
 
 def align_columns(rows: list[tuple[str, ...]], gap: str = '  ') -> list[str]:

@@ -12,8 +12,9 @@ from autocalib_ros.results.calibration import Calibration, Refusal
 INDENT = '  '
 
 
-def summary_lines(result: Calibration | Refusal, accepted_at_s: float | None = None,
-                  columns: int | None = None) -> list[str]:
+def summary_lines(
+    result: Calibration | Refusal, accepted_at_s: float | None = None, columns: int | None = None
+) -> list[str]:
     """Return what is known with one sigma, then assumptions, checks and what helps; wrapped to so many columns."""
     if isinstance(result, Refusal):
         rows = [(row.name, row.value) for row in number_rows(result)]
@@ -24,8 +25,11 @@ def summary_lines(result: Calibration | Refusal, accepted_at_s: float | None = N
     name_width, value_width = (max(len(cell[column]) for cell in cells) for column in (0, 1))
     table = [cells[0], *((row.name, row.value, f'± {row.sigma}' if row.sigma else '') for row in numbers)]
     lines = [f'{name:<{name_width}}  {value:<{value_width}}  {sigma}'.rstrip() for name, value, sigma in table]
-    remarks = [*(('assumed', text) for text in result.assumptions), *(('checked', text) for text in result.checks),
-            ('what helps', remedy(result))]
+    remarks = [
+        *(('assumed', text) for text in result.assumptions),
+        *(('checked', text) for text in result.checks),
+        ('what helps', remedy(result)),
+    ]
     return [INDENT + line for line in lines] + _wrap_pairs(remarks, columns)
 
 
@@ -33,6 +37,13 @@ def _wrap_pairs(pairs: list[tuple[str, str]], columns: int | None) -> list[str]:
     lines = []
     for name, text in pairs:
         start = f'{INDENT}{name + ":":<12}'
-        lines += (textwrap.wrap(start + text, columns, subsequent_indent=' ' * len(start), break_long_words=False)
-                  if columns else [start + text]) if text else []
+        lines += (
+            (
+                textwrap.wrap(start + text, columns, subsequent_indent=' ' * len(start), break_long_words=False)
+                if columns
+                else [start + text]
+            )
+            if text
+            else []
+        )
     return lines

@@ -8,11 +8,27 @@ from dataclasses import dataclass
 from autocalib_ros.config import DetectorOptions
 from autocalib_ros.errors import UsageError
 
-VEHICLE_NAMES = frozenset((
-    'bus', 'car', 'coach', 'lorry', 'minibus', 'motor', 'motorbike', 'motorcycle', 'pickup', 'suv', 'taxi', 'truck',
-    'van', 'vehicle'))
-PEOPLE_NAMES = frozenset((
-    'bicycle', 'bicyclist', 'bike', 'cyclist', 'pedestrian', 'people', 'person', 'rider', 'scooter'))
+VEHICLE_NAMES = frozenset(
+    (
+        'bus',
+        'car',
+        'coach',
+        'lorry',
+        'minibus',
+        'motor',
+        'motorbike',
+        'motorcycle',
+        'pickup',
+        'suv',
+        'taxi',
+        'truck',
+        'van',
+        'vehicle',
+    )
+)
+PEOPLE_NAMES = frozenset(
+    ('bicycle', 'bicyclist', 'bike', 'cyclist', 'pedestrian', 'people', 'person', 'rider', 'scooter')
+)
 
 
 @dataclass(frozen=True)
@@ -37,8 +53,10 @@ def chosen_classes(options: DetectorOptions, names: Mapping[int, str], layout: s
     if vehicles:
         highest = max(vehicles + people)
         if count is not None and highest >= count:
-            raise UsageError(f"class {highest} of 'detector.class_ids' is not in the model, whose classes are numbered "
-                             f'0 to {count - 1}')
+            raise UsageError(
+                f"class {highest} of 'detector.class_ids' is not in the model, whose classes are numbered "
+                f'0 to {count - 1}'
+            )
         return ClassIds(vehicles, people)
     if names:
         return _classes_by_name(names)
@@ -46,14 +64,18 @@ def chosen_classes(options: DetectorOptions, names: Mapping[int, str], layout: s
         return COCO_91
     if layout != 'detection_output' and count in (80, None):
         return COCO_80
-    raise UsageError(f'the model does not name its classes{f", {count} of them" if count else ""}: set '
-                     "'detector.class_ids' to the numbers of those that are vehicles")
+    raise UsageError(
+        f'the model does not name its classes{f", {count} of them" if count else ""}: set '
+        "'detector.class_ids' to the numbers of those that are vehicles"
+    )
 
 
 def _classes_by_name(names: Mapping[int, str]) -> ClassIds:
     words = {number: name.strip().lower() for number, name in names.items()}
     vehicles = tuple(number for number, word in sorted(words.items()) if word in VEHICLE_NAMES)
     if not vehicles:
-        raise UsageError(f"none of the model's classes is known as a vehicle ({', '.join(words.values())[:300]}): set "
-                         "'detector.class_ids' to the numbers of those that are")
+        raise UsageError(
+            f"none of the model's classes is known as a vehicle ({', '.join(words.values())[:300]}): set "
+            "'detector.class_ids' to the numbers of those that are"
+        )
     return ClassIds(vehicles, tuple(number for number, word in sorted(words.items()) if word in PEOPLE_NAMES))

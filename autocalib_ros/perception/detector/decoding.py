@@ -79,7 +79,9 @@ def yolov5(outputs: Outputs, size: Size, count: int | None, min_score: float) ->
 def yolov8(outputs: Outputs, size: Size, count: int | None, min_score: float) -> Boxes:
     """Columns of centre, size, classes: [1, 4 + C, A]; masks may follow the classes."""
     rows = _output_of_rank(outputs, 3)[0].T
-    return _best_class(_edges_from_centres(rows[:, :2], rows[:, 2:4]), rows[:, 4:None if count is None else 4 + count], min_score)
+    return _best_class(
+        _edges_from_centres(rows[:, :2], rows[:, 2:4]), rows[:, 4 : None if count is None else 4 + count], min_score
+    )
 
 
 def end_to_end(outputs: Outputs, size: Size, count: int | None, min_score: float) -> Boxes:
@@ -99,7 +101,9 @@ def yolov3(outputs: Outputs, size: Size, count: int | None, min_score: float) ->
     picked = next(array for array in outputs.values() if array.dtype.kind in 'iu').reshape(-1, 3)
     edges, scores = boxes_and_classes({name: array for name, array in outputs.items() if array.dtype.kind == 'f'})
     picked = picked[(picked >= 0).all(axis=1)]
-    return _above_score(Boxes(edges[picked[:, 2]][:, [1, 0, 3, 2]], scores[picked[:, 1], picked[:, 2]], picked[:, 1]), min_score)
+    return _above_score(
+        Boxes(edges[picked[:, 2]][:, [1, 0, 3, 2]], scores[picked[:, 1], picked[:, 2]], picked[:, 1]), min_score
+    )
 
 
 def yolo_nas(outputs: Outputs, size: Size, count: int | None, min_score: float) -> Boxes:
@@ -134,13 +138,15 @@ def detr(outputs: Outputs, size: Size, count: int | None, min_score: float) -> B
 def tf_od(outputs: Outputs, size: Size, count: int | None, min_score: float) -> Boxes:
     """TensorFlow's object detection: edges, y first, as shares of the input."""
     edges = outputs['detection_boxes'][0][:, [1, 0, 3, 2]]
-    return _above_score(Boxes(edges * (size + size), outputs['detection_scores'][0], outputs['detection_classes'][0]), min_score)
+    return _above_score(
+        Boxes(edges * (size + size), outputs['detection_scores'][0], outputs['detection_classes'][0]), min_score
+    )
 
 
 def detection_output(outputs: Outputs, size: Size, count: int | None, min_score: float) -> Boxes:
     """Rows of image, class, score, edges as shares of the input, up to an image below zero: [1, 1, N, 7]."""
     rows = _output_of_rank(outputs, 4)[0, 0]
-    rows = rows[:int(np.argmax(rows[:, 0] < 0))] if (rows[:, 0] < 0).any() else rows
+    rows = rows[: int(np.argmax(rows[:, 0] < 0))] if (rows[:, 0] < 0).any() else rows
     return _above_score(Boxes(rows[:, 3:] * (size + size), rows[:, 2], rows[:, 1]), min_score)
 
 
@@ -162,7 +168,7 @@ def _edges_from_centres(centres: np.ndarray, sizes: np.ndarray) -> np.ndarray:
 
 def _with_objectness(edges: np.ndarray, rows: np.ndarray, count: int | None, min_score: float) -> Boxes:
     """Boxes whose score is that of an object times that of the best class."""
-    return _best_class(edges, rows[:, 4:5] * rows[:, 5:None if count is None else 5 + count], min_score)
+    return _best_class(edges, rows[:, 4:5] * rows[:, 5 : None if count is None else 5 + count], min_score)
 
 
 def _best_class(edges: np.ndarray, scores: np.ndarray, min_score: float) -> Boxes:

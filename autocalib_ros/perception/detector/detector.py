@@ -52,8 +52,10 @@ class VehicleDetector:
         height, width = shape[1:3] if self._channels_last else shape[2:]
         self._model_size = tuple(side if isinstance(side, int) and side > 0 else None for side in (width, height))
         if options.input_size and None not in self._model_size:
-            raise UsageError(f"'detector.input_size' is for a model that takes any size; this one takes "
-                             f'{self._model_size[0]}x{self._model_size[1]}: leave it out')
+            raise UsageError(
+                f"'detector.input_size' is for a model that takes any size; this one takes "
+                f'{self._model_size[0]}x{self._model_size[1]}: leave it out'
+            )
         seen = self._probe()
         self.layout = detect_layout(seen) if options.layout == 'auto' else options.layout
         defaults = LAYOUTS[self.layout]
@@ -62,7 +64,8 @@ class VehicleDetector:
         self._colours = ColourFormat(
             order=defaults.channel_order if options.channel_order == 'auto' else options.channel_order,
             white=options.input_scale or defaults.input_scale,
-            imagenet=defaults.imagenet if options.mean_std == 'auto' else options.mean_std == 'imagenet')
+            imagenet=defaults.imagenet if options.mean_std == 'auto' else options.mean_std == 'imagenet',
+        )
         self._require_readable(seen)
         self._count = count_classes(self.layout, seen)
         self._classes = chosen_classes(options, seen.names, self.layout, self._count)
@@ -70,9 +73,11 @@ class VehicleDetector:
     def __str__(self) -> str:
         size = 'x'.join(str(side or 'any') for side in self._model_size)
         normalised = ' normalised by ImageNet' if self._colours.imagenet else ''
-        return (f'detector of layout {self.layout}, input {size} {self._mode}, {self._colours.order} up to '
-                f'{self._colours.white:g}{normalised}, vehicles are classes {_listed(self._classes.vehicles)}, people '
-                f'{_listed(self._classes.people)}')
+        return (
+            f'detector of layout {self.layout}, input {size} {self._mode}, {self._colours.order} up to '
+            f'{self._colours.white:g}{normalised}, vehicles are classes {_listed(self._classes.vehicles)}, people '
+            f'{_listed(self._classes.people)}'
+        )
 
     def detect(self, image: np.ndarray) -> Detections:
         """Find vehicles and people in a grey (H, W) or BGR (H, W, 3) image, uint8, best first."""
@@ -81,11 +86,14 @@ class VehicleDetector:
         try:
             outputs = self._run(image, placement)
         except Exception as error:  # onnxruntime has a class of its own for each reason, none with a common root
-            raise InputError(f'the detector failed on an image of {size[0]}x{size[1]}: '
-                             f'{" ".join(str(error).split())[:300]}') from error
+            raise InputError(
+                f'the detector failed on an image of {size[0]}x{size[1]}: {" ".join(str(error).split())[:300]}'
+            ) from error
         boxes = self._decode(outputs, placement.input_size, self._count, self._options.confidence)
-        boxes = boxes.subset(np.isin(boxes.classes, self._classes.vehicles + self._classes.people)
-                             & np.isfinite(boxes.edges_px).all(axis=1))
+        boxes = boxes.subset(
+            np.isin(boxes.classes, self._classes.vehicles + self._classes.people)
+            & np.isfinite(boxes.edges_px).all(axis=1)
+        )
         boxes = boxes.subset(np.argsort(-boxes.scores, kind='stable'))
         if self._nms:
             boxes = non_maximum_suppression(boxes, self._options.nms_iou)
@@ -95,13 +103,16 @@ class VehicleDetector:
 
     def _run(self, image: np.ndarray, placement: Placement) -> dict[str, np.ndarray]:
         """Outputs by name for an image; a model that asks for the image's size is given that of its input."""
-        feed = {self._image_input.name: tensor(image, placement, self._colours, INPUT_DTYPES[self._image_input.type],
-                                           channels_last=self._channels_last)}
+        feed = {
+            self._image_input.name: tensor(
+                image, placement, self._colours, INPUT_DTYPES[self._image_input.type], channels_last=self._channels_last
+            )
+        }
         if self._size_input is not None:
             # D-FINE and RT-DETR take whole numbers, width first; YOLOv3 fractions, height first
             whole = 'int' in self._size_input.type
             kind = np.int32 if 'int32' in self._size_input.type else np.int64 if whole else np.float32
-            feed[self._size_input.name] = np.array([placement.input_size[::1 if whole else -1]], kind)
+            feed[self._size_input.name] = np.array([placement.input_size[:: 1 if whole else -1]], kind)
         names = [output.name.partition(':')[0] for output in self._session.get_outputs()]
         return dict(zip(names, map(np.asarray, self._session.run(None, feed)), strict=True))
 
@@ -112,25 +123,36 @@ class VehicleDetector:
         self._colours = ColourFormat('rgb', 1.0, imagenet=False)
         grey = np.full((placement.image_size[1], placement.image_size[0]), PAD_LEVEL, np.uint8)
         meta = dict(self._session.get_modelmeta().custom_metadata_map)
-        said = '; '.join(f'{what} {", ".join(f"{port.name} {port.shape}" for port in ports)}' for what, ports in (
-            ('inputs', self._session.get_inputs()), ('outputs', self._session.get_outputs())))
+        said = '; '.join(
+            f'{what} {", ".join(f"{port.name} {port.shape}" for port in ports)}'
+            for what, ports in (('inputs', self._session.get_inputs()), ('outputs', self._session.get_outputs()))
+        )
         try:
             outputs = self._run(grey, placement)
         except Exception as error:  # as in detect
-            raise UsageError(f'the detector failed on a grey image of {placement.input_size[0]}x'
-                             f'{placement.input_size[1]} ({said}): {" ".join(str(error).split())[:300]}') from error
+            raise UsageError(
+                f'the detector failed on a grey image of {placement.input_size[0]}x'
+                f'{placement.input_size[1]} ({said}): {" ".join(str(error).split())[:300]}'
+            ) from error
         given = ', '.join(f'{name} {list(array.shape)}' for name, array in outputs.items())
-        return ModelProbe(inputs=len(self._session.get_inputs()), outputs=outputs, size=placement.input_size,
-                    names=_names(meta), end_to_end=str(meta.get('end2end', '')).lower() == 'true',
-                    shapes=f'{said}; for {placement.input_size[0]}x{placement.input_size[1]} it gave {given}')
+        return ModelProbe(
+            inputs=len(self._session.get_inputs()),
+            outputs=outputs,
+            size=placement.input_size,
+            names=_names(meta),
+            end_to_end=str(meta.get('end2end', '')).lower() == 'true',
+            shapes=f'{said}; for {placement.input_size[0]}x{placement.input_size[1]} it gave {given}',
+        )
 
     def _require_readable(self, seen: ModelProbe) -> None:
         """Raise UsageError unless the layout, which may have been asked for, reads what the grey image gave."""
         try:
             self._decode(seen.outputs, seen.size, None, 0.0)
         except (LookupError, ValueError, StopIteration) as error:
-            raise UsageError(f"the model's outputs are not of the layout {self.layout} ({seen.shapes}): set "
-                             "'detector.layout' to auto, or to what it is") from error
+            raise UsageError(
+                f"the model's outputs are not of the layout {self.layout} ({seen.shapes}): set "
+                "'detector.layout' to auto, or to what it is"
+            ) from error
 
 
 def _inputs(session: Any) -> tuple[Any, Any]:
@@ -138,8 +160,11 @@ def _inputs(session: Any) -> tuple[Any, Any]:
     ports = session.get_inputs()
     pictures = [port for port in ports if len(port.shape) == 4 and port.type in INPUT_DTYPES]
     sizes = [port for port in ports if len(port.shape) == 2 and port.shape[-1] == 2]
-    if len(pictures) != 1 or len(pictures) + len(sizes) != len(ports) or 3 not in (
-            pictures[0].shape[1], pictures[0].shape[3]):
+    if (
+        len(pictures) != 1
+        or len(pictures) + len(sizes) != len(ports)
+        or 3 not in (pictures[0].shape[1], pictures[0].shape[3])
+    ):
         given = ', '.join(f'{port.name} {port.shape} {port.type}' for port in ports)
         raise UsageError(f'the model does not take one picture [1, 3, h, w] or [1, h, w, 3]; its inputs are {given}')
     return pictures[0], sizes[0] if sizes else None
@@ -149,8 +174,9 @@ def _names(meta: Mapping[str, str]) -> dict[int, str]:
     """Read the classes by number from a model's metadata: a dictionary or a list, as text."""
     try:
         names = ast.literal_eval(meta['names'])
-        return {int(number): str(name) for number, name in (
-            names.items() if isinstance(names, dict) else enumerate(names))}
+        return {
+            int(number): str(name) for number, name in (names.items() if isinstance(names, dict) else enumerate(names))
+        }
     except (LookupError, ValueError, SyntaxError, TypeError):
         return {}
 

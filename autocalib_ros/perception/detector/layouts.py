@@ -44,8 +44,9 @@ LAYOUTS = {
     'ultralytics_rtdetr': Layout(decoding.ultralytics_rtdetr, 'stretch', needs_no_nms=True),
     'detr': Layout(decoding.detr, 'stretch', needs_no_nms=True, imagenet=True),
     'tf_od': Layout(decoding.tf_od, 'stretch', needs_no_nms=True, input_scale=255.0),
-    'detection_output': Layout(decoding.detection_output, 'stretch', needs_no_nms=True, channel_order='bgr',
-                               input_scale=255.0),
+    'detection_output': Layout(
+        decoding.detection_output, 'stretch', needs_no_nms=True, channel_order='bgr', input_scale=255.0
+    ),
 }
 
 
@@ -71,10 +72,14 @@ def detect_layout(probe: ModelProbe) -> str:
     if found:
         return found
     if all(array.ndim in (4, 5) for array in probe.outputs.values()):
-        raise UsageError(f'the model puts out raw heads, which say no boxes without their anchors ({probe.shapes}): '
-                         'export it with its detection layer')
-    raise UsageError(f"the model's layout is unknown ({probe.shapes}): set 'detector.layout', or export it as one of "
-                     f'{", ".join(LAYOUTS)}')
+        raise UsageError(
+            f'the model puts out raw heads, which say no boxes without their anchors ({probe.shapes}): '
+            'export it with its detection layer'
+        )
+    raise UsageError(
+        f"the model's layout is unknown ({probe.shapes}): set 'detector.layout', or export it as one of "
+        f'{", ".join(LAYOUTS)}'
+    )
 
 
 def _layout_by_name(probe: ModelProbe) -> str | None:
@@ -130,8 +135,11 @@ def count_classes(layout: str, probe: ModelProbe) -> int | None:
     if probe.names:
         return max(probe.names) + 1
     rows = [array for array in probe.outputs.values() if array.ndim == 3]
-    masks = MASK_COLUMNS if any(array.ndim == 4 and array.shape[1] == MASK_COLUMNS
-                                for array in probe.outputs.values()) else 0
+    masks = (
+        MASK_COLUMNS
+        if any(array.ndim == 4 and array.shape[1] == MASK_COLUMNS for array in probe.outputs.values())
+        else 0
+    )
     if layout in ('yolox', 'yolox_decoded', 'yolov5'):
         return rows[0].shape[2] - 5 - masks
     if layout == 'yolov8':

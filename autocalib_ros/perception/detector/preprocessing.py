@@ -31,18 +31,23 @@ class Placement:
         return (edges_px - self.offset * 2) / (self.factor * 2)
 
 
-def place_in_input(image_size: tuple[int, int], model_size: tuple[int | None, int | None], mode: str,
-           longest: int) -> Placement:
+def place_in_input(
+    image_size: tuple[int, int], model_size: tuple[int | None, int | None], mode: str, longest: int
+) -> Placement:
     """Place an image of (width, height); a model that takes any size gets the image's, up to `longest`.
 
     Nothing is ever enlarged: what is not there in the image does not help, and blurred vehicles are missed.
     """
     width, height = image_size
     free = min(1.0, longest / max(image_size))
-    room = [fixed or int(np.ceil(round(side * free) / SIZE_MULTIPLE_PX)) * SIZE_MULTIPLE_PX
-            for side, fixed in zip(image_size, model_size, strict=True)]
-    factors = [min(1.0, space / side, 1.0 if fixed else free)
-               for space, side, fixed in zip(room, image_size, model_size, strict=True)]
+    room = [
+        fixed or int(np.ceil(round(side * free) / SIZE_MULTIPLE_PX)) * SIZE_MULTIPLE_PX
+        for side, fixed in zip(image_size, model_size, strict=True)
+    ]
+    factors = [
+        min(1.0, space / side, 1.0 if fixed else free)
+        for space, side, fixed in zip(room, image_size, model_size, strict=True)
+    ]
     if mode != 'stretch':
         factors = [min(factors)] * 2
     size = (max(1, round(width * factors[0])), max(1, round(height * factors[1])))
@@ -62,8 +67,9 @@ class ColourFormat:
     """Normalised by ImageNet's mean and standard deviation."""
 
 
-def tensor(image: np.ndarray, placement: Placement, colours: ColourFormat, kind: np.dtype, *,
-           channels_last: bool) -> np.ndarray:
+def tensor(
+    image: np.ndarray, placement: Placement, colours: ColourFormat, kind: np.dtype, *, channels_last: bool
+) -> np.ndarray:
     """Turn a grey (H, W) or BGR (H, W, 3) image, uint8, into the input [1, 3, h, w], or [1, h, w, 3]."""
     if placement.image_size != (image.shape[1], image.shape[0]):
         image = cv2.resize(image, placement.image_size, interpolation=cv2.INTER_LINEAR)

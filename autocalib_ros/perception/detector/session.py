@@ -21,8 +21,10 @@ def open_session(options: DetectorOptions) -> Any:
     try:
         runtime = importlib.import_module('onnxruntime')
     except ImportError as error:
-        raise UsageError(f"'detector.model' needs onnxruntime, which cannot be imported ({error}): pip install "
-                         'onnxruntime, or leave the model out') from error
+        raise UsageError(
+            f"'detector.model' needs onnxruntime, which cannot be imported ({error}): pip install "
+            'onnxruntime, or leave the model out'
+        ) from error
     wanted = _providers(options.providers, runtime.get_available_providers())
     how = runtime.SessionOptions()
     how.intra_op_num_threads = options.threads
@@ -36,8 +38,10 @@ def open_session(options: DetectorOptions) -> Any:
         raise UsageError(f"'detector.model' {path} cannot be loaded: {' '.join(str(error).split())}") from error
     running = session.get_providers()
     if wanted[0] not in running:
-        raise UsageError(f"'detector.providers' asks for {wanted[0]}, which onnxruntime has but could not start: it "
-                         f'would run on {", ".join(running)}')
+        raise UsageError(
+            f"'detector.providers' asks for {wanted[0]}, which onnxruntime has but could not start: it "
+            f'would run on {", ".join(running)}'
+        )
     return session
 
 
@@ -46,6 +50,8 @@ def _providers(text: str, available: list[str]) -> list[str]:
     wanted = text.replace(',', ' ').split()
     missing = [name for name in wanted if name not in available]
     if missing or not wanted:
-        raise UsageError(f"'detector.providers' asks for {missing[0] if missing else 'none'}; this onnxruntime has "
-                         f'{", ".join(available)}')
+        raise UsageError(
+            f"'detector.providers' asks for {missing[0] if missing else 'none'}; this onnxruntime has "
+            f'{", ".join(available)}'
+        )
     return wanted

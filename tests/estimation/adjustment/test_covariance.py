@@ -17,8 +17,14 @@ from autocalib_ros.estimation.adjustment.covariance import (
 def plain(slopes: np.ndarray, residuals: np.ndarray, vehicles: np.ndarray, prior: np.ndarray) -> np.ndarray:
     """Covariance of ordinary least squares, one sample a track."""
     tracks = len(residuals)
-    return jackknife_covariance(slopes * residuals[:, None], slopes[:, :, None] * slopes[:, None], np.ones(tracks),
-                              np.zeros(tracks), vehicles, prior)
+    return jackknife_covariance(
+        slopes * residuals[:, None],
+        slopes[:, :, None] * slopes[:, None],
+        np.ones(tracks),
+        np.zeros(tracks),
+        vehicles,
+        prior,
+    )
 
 
 def test_covariance_covers_errors_shared_within_a_vehicle() -> None:
@@ -36,20 +42,23 @@ def test_leaving_out_vehicles_gives_the_jackknife_of_a_mean() -> None:
     sigma2 = plain(np.ones((5, 1)), values - values.mean(), np.arange(5), np.zeros(1))[0, 0]
     left_out = np.array([np.delete(values, index).mean() for index in range(5)])
     moves = (left_out - values.mean())[:, None]
-    assert sigma2 == pytest.approx((moves**2).sum() * small_sample_factor(moves)[0]**2)
+    assert sigma2 == pytest.approx((moves**2).sum() * small_sample_factor(moves)[0] ** 2)
 
 
 def test_few_vehicles_widen_deviations_as_student_does() -> None:
     many, one = np.ones((1000, 1)), np.array([[10.0], *[[0.1]] * 40])
     assert small_sample_factor(many)[0] == pytest.approx(1.0, abs=0.01)
-    assert small_sample_factor(np.ones((10, 1)))[0] == pytest.approx(2.042 / 1.960, abs=1e-3)  # all alike: 30 degrees of freedom
+    assert small_sample_factor(np.ones((10, 1)))[0] == pytest.approx(
+        2.042 / 1.960, abs=1e-3
+    )  # all alike: 30 degrees of freedom
     assert small_sample_factor(one)[0] > 1.5
 
 
 def test_few_vehicles_that_agree_by_chance_are_not_believed_beyond_their_noise() -> None:
     slopes = np.ones((12, 1))
-    quiet, loud = (plain(slopes, noise * np.resize([1.0, -1.0], 12), np.arange(12), np.zeros(1))[0, 0]
-                   for noise in (0.1, 3.0))
+    quiet, loud = (
+        plain(slopes, noise * np.resize([1.0, -1.0], 12), np.arange(12), np.zeros(1))[0, 0] for noise in (0.1, 3.0)
+    )
     of_noise = 1.0 / 12  # residuals of one, of twelve vehicles, for a mean
     assert 0.2 * of_noise < quiet < 0.5 * of_noise
     assert loud > 9.0 * of_noise

@@ -15,7 +15,10 @@ SIZE = (1280, 720)
 
 def test_auto_offers_the_usual_family_first() -> None:
     assert [prior.family for prior in lens_priors(SIZE, JointOptions())] == [
-        'equidistant', 'distortion_free', 'kannala_brandt']
+        'equidistant',
+        'distortion_free',
+        'kannala_brandt',
+    ]
 
 
 def test_a_distortion_free_lens_images_by_the_tangent() -> None:

@@ -34,8 +34,12 @@ def test_noise_and_wander_come_out_white() -> None:
 
 def test_drift_takes_the_weight_of_a_long_tracks_ends() -> None:
     pixels, mask, road = place()
-    steady, drifting = (whitening_matrices(pixels[:1], mask[:1], RoadPositions(road.px_per_m[:1], road.along_m[:1]), OPTIONS,
-                                  drifting=drifting)[0] for drifting in (False, True))
+    steady, drifting = (
+        whitening_matrices(
+            pixels[:1], mask[:1], RoadPositions(road.px_per_m[:1], road.along_m[:1]), OPTIONS, drifting=drifting
+        )[0]
+        for drifting in (False, True)
+    )
     slope = np.linspace(-1.0, 1.0, SAMPLES)
     assert np.sum((drifting @ slope) ** 2) < 0.7 * np.sum((steady @ slope) ** 2)
 

@@ -14,8 +14,8 @@ from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment
 from autocalib_ros.estimation.adjustment.lens_prior import known_lens, lens_priors
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig
 from autocalib_ros.estimation.estimate import Solution, find_solution, verify_with_traffic
+from autocalib_ros.estimation.markings import grid_search as markings
 from autocalib_ros.estimation.markings.grid_search import find_grids
-from autocalib_ros.estimation.markings.grid_search import grid_search as markings
 from autocalib_ros.estimation.markings.markings_solution import condition_on_lens, fit_to_markings
 from autocalib_ros.estimation.markings.road_segments import segments_on_road
 from autocalib_ros.estimation.observations.track_set import TrackSet, select_tracks
@@ -58,16 +58,20 @@ def seen(junction: Junction, lines: np.ndarray) -> Evidence:
 def painted(junction: Junction, paint: Paint = PAINT, seed: int = 1) -> Evidence:
     """The evidence of a junction with painted roads and a few posts."""
     generator = np.random.default_rng(seed)
-    return seen(junction, np.concatenate([painted_lines(junction, generator, paint),
-                                          post_lines(junction, generator, 6, paint)]))
+    return seen(
+        junction, np.concatenate([painted_lines(junction, generator, paint), post_lines(junction, generator, 6, paint)])
+    )
 
 
 def told(evidence: Evidence, lens: Camera | None = None) -> tuple[Adjustment, TrackSet, str] | Reason:
     """What the lines alone tell."""
     options = OPTIONS.joint
     tracks = select_tracks(evidence, options.max_tracks)
-    priors = [known_lens(lens)] if lens else [prior.with_loose_principal_point()
-                                              for prior in lens_priors(evidence.image_size, options)]
+    priors = (
+        [known_lens(lens)]
+        if lens
+        else [prior.with_loose_principal_point() for prior in lens_priors(evidence.image_size, options)]
+    )
     found = fit_to_markings(evidence, tracks, priors, AdjustmentConfig(priors[0], options), GateOptions())
     return found if isinstance(found, Reason) else (found[0], tracks, found[1])
 
@@ -95,12 +99,14 @@ def angle_deg(one: np.ndarray, other: np.ndarray) -> float:
 def tilt_and_roll_sigmas(fit: Adjustment, tracks: TrackSet, junction: Junction) -> np.ndarray:
     """How many of their own standard deviations tilt and roll are off, shape (2,)."""
     sigmas = PlaneEstimate.of(fit, tracks).sigma(lambda _, normal: tilt_and_roll_deg(normal))
-    return np.abs(np.subtract(tilt_and_roll_deg(fit.state.rotation[:, 2]),
-                              tilt_and_roll_deg(junction.normal_in_camera)) / sigmas)
+    return np.abs(
+        np.subtract(tilt_and_roll_deg(fit.state.rotation[:, 2]), tilt_and_roll_deg(junction.normal_in_camera)) / sigmas
+    )
 
 
-def require_true(fit: Adjustment, tracks: TrackSet, junction: Junction, *, focal: float = 0.02,
-                 normal_deg: float = 1.0) -> None:
+def require_true(
+    fit: Adjustment, tracks: TrackSet, junction: Junction, *, focal: float = 0.02, normal_deg: float = 1.0
+) -> None:
     """Require a lens and a plane near the truth, and as near as they say."""
     assert abs(focal_error(fit, junction)) < min(focal, 3.0 * fit.focal_sigma)
     assert fit.focal_sigma < 0.03  # it may not say that it knows nothing
@@ -121,7 +127,8 @@ LENSES = {
     'bulging': Camera(WIDTH, HEIGHT, 560.0, CENTRE, (0.03, 0.0, 0.0, 0.0)),
     'shrinking': Camera(WIDTH, HEIGHT, 560.0, CENTRE, (-0.03, 0.0, 0.0, 0.0)),
     'cut_out_to_the_left': Camera(WIDTH, HEIGHT, 560.0, (CENTRE[0] - 0.08 * WIDTH, CENTRE[1])),
-    'cut_out_to_the_right': Camera(WIDTH, HEIGHT, 560.0, (CENTRE[0] + 0.08 * WIDTH, CENTRE[1]))}
+    'cut_out_to_the_right': Camera(WIDTH, HEIGHT, 560.0, (CENTRE[0] + 0.08 * WIDTH, CENTRE[1])),
+}
 
 
 @pytest.mark.parametrize('lens', LENSES)
@@ -221,8 +228,14 @@ def test_lines_tell_the_pose_of_a_lens_that_is_known() -> None:
 
 def by_traffic(evidence: Evidence, tracks: TrackSet, lens: Camera) -> Solution | Reason:
     """What the traffic alone shows to who knows the lens."""
-    return find_solution(evidence, tracks, replace(OPTIONS.joint, road_markings=False), GateOptions(),
-                         np.random.default_rng(0), lens=lens)
+    return find_solution(
+        evidence,
+        tracks,
+        replace(OPTIONS.joint, road_markings=False),
+        GateOptions(),
+        np.random.default_rng(0),
+        lens=lens,
+    )
 
 
 def test_traffic_that_shows_another_plane_contradicts_lines() -> None:
@@ -298,8 +311,11 @@ def test_lines_complete_a_lens_to_a_ground_plane(assumed: Calibration, alone: Ca
     assert distance_error(assumed.camera, assumed.ground, LONE_ROAD) < 0.03
     variances = np.diag(assumed.covariance)
     assert assumed.covariance.shape == (10, 10) and (variances >= 0).all()
-    np.testing.assert_allclose(np.sqrt(variances[[0, 7, 8]]), [
-        assumed.stddev.focal_px, assumed.stddev.tilt_deg, assumed.stddev.roll_deg], rtol=1e-6)
+    np.testing.assert_allclose(
+        np.sqrt(variances[[0, 7, 8]]),
+        [assumed.stddev.focal_px, assumed.stddev.tilt_deg, assumed.stddev.roll_deg],
+        rtol=1e-6,
+    )
 
 
 def test_the_same_lines_give_the_same_numbers(assumed: Calibration) -> None:
@@ -346,8 +362,8 @@ def test_lines_that_disagree_with_full_traffic_are_not_used(by_busy_traffic: Cal
     result = solve(seen(BUSY, painted_lines(elsewhere, np.random.default_rng(1))), HELD)
     assert isinstance(result, Calibration) and result.grade == 'full'
     assert result.camera == by_busy_traffic.camera and result.assumptions == by_busy_traffic.assumptions
-    assert result.checks[:len(by_busy_traffic.checks)] == by_busy_traffic.checks
-    assert all(words.endswith('not used') for words in result.checks[len(by_busy_traffic.checks):])
+    assert result.checks[: len(by_busy_traffic.checks)] == by_busy_traffic.checks
+    assert all(words.endswith('not used') for words in result.checks[len(by_busy_traffic.checks) :])
 
 
 def test_lines_give_all_where_traffic_circles_about_one_point() -> None:
@@ -360,8 +376,9 @@ def test_lines_give_all_where_traffic_circles_about_one_point() -> None:
 
 
 def test_lines_complete_a_lens_that_is_known() -> None:
-    alone, result = (solve(evidence, OPTIONS, lens=LONE_ROAD.camera)
-                     for evidence in (driven(LONE_ROAD), painted(LONE_ROAD)))
+    alone, result = (
+        solve(evidence, OPTIONS, lens=LONE_ROAD.camera) for evidence in (driven(LONE_ROAD), painted(LONE_ROAD))
+    )
     assert not isinstance(alone, Calibration) or alone.ground is None
     assert isinstance(result, Calibration) and result.grade == 'assumed'
     assert result.camera == LONE_ROAD.camera
@@ -375,8 +392,12 @@ def drawn(seed: int) -> tuple[Junction, Evidence]:
     junction = replace(standard_junction(generator), tracks=None, vehicles=16, points_per_vehicle=3)
     evidence = synthetic_evidence(junction, generator)
     lines = painted_lines(junction, generator, Paint(askew_deg=0.3))
-    return junction, replace(evidence, still_lines_px=np.concatenate([
-        lines, post_lines(junction, generator, 6), random_lines(junction, generator, len(lines) // 3)]))
+    return junction, replace(
+        evidence,
+        still_lines_px=np.concatenate(
+            [lines, post_lines(junction, generator, 6), random_lines(junction, generator, len(lines) // 3)]
+        ),
+    )
 
 
 def test_another_focal_length_that_suits_the_lines_as_well_is_a_doubt() -> None:

@@ -41,9 +41,16 @@ def window(positions: np.ndarray, headings: np.ndarray, bodies: list[np.ndarray]
 def windows_of(pixels: np.ndarray) -> TwoFrameWindows:
     """Windows of pixels (windows, 3, POINTS, 2), each a body of its own."""
     count = len(pixels)
-    return TwoFrameWindows(first_px=pixels[:, 0], second_px=pixels[:, 2], middle_px=pixels[:, 1],
-                   mask=np.ones((count, pixels.shape[2]), bool), bodies=np.arange(count),
-                   times_s=np.zeros(count), duration_s=np.full(count, 1.6), tracks=np.zeros((count, pixels.shape[2]), int))
+    return TwoFrameWindows(
+        first_px=pixels[:, 0],
+        second_px=pixels[:, 2],
+        middle_px=pixels[:, 1],
+        mask=np.ones((count, pixels.shape[2]), bool),
+        bodies=np.arange(count),
+        times_s=np.zeros(count),
+        duration_s=np.full(count, 1.6),
+        tracks=np.zeros((count, pixels.shape[2]), int),
+    )
 
 
 def car(generator: np.random.Generator, points: int = POINTS) -> np.ndarray:
@@ -53,8 +60,11 @@ def car(generator: np.random.Generator, points: int = POINTS) -> np.ndarray:
 def turning(generator: np.random.Generator, turn_deg: float, speed_m: float = 8.0) -> np.ndarray:
     """One car that turns steadily by `turn_deg` on its way."""
     heading = generator.uniform(0, 2 * np.pi) + np.radians(turn_deg) * np.array([0.0, 0.5, 1.0])
-    chords = 0.5 * speed_m * np.column_stack([np.cos(0.5 * (heading[:-1] + heading[1:])),
-                                              np.sin(0.5 * (heading[:-1] + heading[1:]))])
+    chords = (
+        0.5
+        * speed_m
+        * np.column_stack([np.cos(0.5 * (heading[:-1] + heading[1:])), np.sin(0.5 * (heading[:-1] + heading[1:]))])
+    )
     where = generator.uniform([12.0, -6.0], [22.0, 6.0]) + np.concatenate([[[0.0, 0.0]], np.cumsum(chords, axis=0)])
     return window(where[None], heading[None], [car(generator)])
 
@@ -89,8 +99,21 @@ def test_the_distance_is_in_observed_pixels_over_their_standard_deviation() -> N
     for step in np.array([[1.0, 0.0], [0.0, 1.0]]):
         nearer = windows.second_px.copy()
         nearer[0, 0] += 0.01 * step
-        shifted = WindowRays.of(TwoFrameWindows(windows.first_px, nearer, windows.middle_px, windows.mask, windows.bodies,
-                                  windows.times_s, windows.duration_s, windows.tracks), CAMERA, POSE, JointOptions())
+        shifted = WindowRays.of(
+            TwoFrameWindows(
+                windows.first_px,
+                nearer,
+                windows.middle_px,
+                windows.mask,
+                windows.bodies,
+                windows.times_s,
+                windows.duration_s,
+                windows.tracks,
+            ),
+            CAMERA,
+            POSE,
+            JointOptions(),
+        )
         off_px = shifted.distances(motion)[0, 0] * view.sigma_px[0, 0]
         assert abs(off_px) <= 0.01 / np.sqrt(2) * 1.5  # both ends share a displacement
     assert (view.sigma_px > JointOptions().noise_px).all()
@@ -109,9 +132,11 @@ def test_settling_comes_back_from_a_motion_nearby_and_ignores_a_stranger() -> No
 
 def test_only_what_is_steered_counts_as_turning() -> None:
     generator = np.random.default_rng(6)
-    kinds = {'turning': [turning(generator, sign * turn) for turn in (12.0, 20.0, 35.0, 60.0) for sign in (-1, 1)],
-             'straight': [turning(generator, 0.0) for _ in range(40)],
-             'crossing': [crossing(generator) for _ in range(20)]}
+    kinds = {
+        'turning': [turning(generator, sign * turn) for turn in (12.0, 20.0, 35.0, 60.0) for sign in (-1, 1)],
+        'straight': [turning(generator, 0.0) for _ in range(40)],
+        'crossing': [crossing(generator) for _ in range(20)],
+    }
     shares = {}
     for kind, pixels in kinds.items():
         windows = windows_of(np.stack(pixels) + generator.normal(scale=0.3, size=np.shape(pixels)))
@@ -130,7 +155,9 @@ def test_residuals_change_as_their_derivatives_say() -> None:
     pixels = np.stack([turning(generator, turn) for turn in (15.0, -30.0, 40.0)])
     windows = windows_of(pixels + generator.normal(scale=0.05, size=pixels.shape))
     prior = lens_priors((1280, 720), JointOptions())[0]
-    parameters = Parameterisation(AdjustmentState(CAMERA, POSE, np.zeros(0)), AdjustmentConfig(prior, JointOptions(), windows=windows))
+    parameters = Parameterisation(
+        AdjustmentState(CAMERA, POSE, np.zeros(0)), AdjustmentConfig(prior, JointOptions(), windows=windows)
+    )
     rows = PlanarMotionBlock(parameters, None)
     here = rows.linearise()
     assert here.curvature.shape == (3, parameters.size, parameters.size)

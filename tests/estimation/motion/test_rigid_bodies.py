@@ -48,7 +48,9 @@ def noisy(generator: np.random.Generator, count: int = 12) -> Tracklets:
 
 def test_perfect_motion_leaves_no_residual() -> None:
     generator = np.random.default_rng(1)
-    bundle = TrackletBundle(lives_of(np.stack([life(generator, turn) for turn in (-60.0, -10.0, 0.0, 25.0, 80.0)])), 0.3, 0.05)
+    bundle = TrackletBundle(
+        lives_of(np.stack([life(generator, turn) for turn in (-60.0, -10.0, 0.0, 25.0, 80.0)])), 0.3, 0.05
+    )
     shapes = bundle.refined(CAMERA, POSE, bundle.initialised(CAMERA, POSE), 60)
     assert np.abs(bundle.residuals(CAMERA, POSE, shapes)).max() < 0.05
     reference = bundle.reference[0]
@@ -59,7 +61,7 @@ def test_perfect_motion_leaves_no_residual() -> None:
 def test_noise_is_as_large_as_it_is_said_to_be() -> None:
     bundle = TrackletBundle(noisy(np.random.default_rng(2)), NOISE_PX, 0.0)
     shapes = bundle.initialised(CAMERA, POSE)
-    squared = (bundle.residuals(CAMERA, POSE, shapes)**2).sum(axis=(1, 2, 3)) / bundle.dof
+    squared = (bundle.residuals(CAMERA, POSE, shapes) ** 2).sum(axis=(1, 2, 3)) / bundle.dof
     assert squared.mean() == pytest.approx(1.0, abs=0.25)
 
 
@@ -76,7 +78,9 @@ def test_a_stranger_on_the_body_is_not_believed() -> None:
 def test_residuals_change_as_their_derivatives_say() -> None:
     prior = lens_priors((1280, 720), JointOptions())[0]
     bundle = TrackletBundle(noisy(np.random.default_rng(4), 5), NOISE_PX, 0.0)
-    steps = Parameterisation(AdjustmentState(CAMERA, POSE, np.zeros(0)), AdjustmentConfig(prior, JointOptions(), bundle=bundle))
+    steps = Parameterisation(
+        AdjustmentState(CAMERA, POSE, np.zeros(0)), AdjustmentConfig(prior, JointOptions(), bundle=bundle)
+    )
     shapes = bundle.initialised(CAMERA, POSE)
     rows = RigidBodyBlock(steps, bundle, shapes)
     here = rows.linearise()
@@ -97,7 +101,9 @@ def test_the_residuals_tell_whether_points_drift() -> None:
     for lives, drifts in ((without_drift, False), (drifting, True)):
         bundle = TrackletBundle(lives, NOISE_PX, 0.05)
         shapes = bundle.initialised(CAMERA, POSE)
-        more_probable = bundle.noise_cost(CAMERA, POSE, shapes) < bundle.without_drift().noise_cost(CAMERA, POSE, shapes)
+        more_probable = bundle.noise_cost(CAMERA, POSE, shapes) < bundle.without_drift().noise_cost(
+            CAMERA, POSE, shapes
+        )
         assert more_probable == drifts
 
 
@@ -108,7 +114,7 @@ def test_lives_follow_the_tracks_of_a_body_and_take_bodies_in_turn() -> None:
     lives = find_tracklets(windows, instants, 1000)
     assert len(np.unique(lives.bodies)) > 15
     assert (lives.mask.sum(axis=(1, 2)) >= 15).all()
-    times = evidence.times_s[evidence.track_starts[0]:evidence.track_starts[1]]
+    times = evidence.times_s[evidence.track_starts[0] : evidence.track_starts[1]]
     assert times.min() - 1 < lives.times_s.min()
     few = find_tracklets(windows, instants, 10)
     assert len(np.unique(few.bodies)) == 10

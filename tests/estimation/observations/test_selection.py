@@ -21,12 +21,15 @@ def with_people(evidence: Evidence, count: int, generator: np.random.Generator) 
     along = np.linspace(0, 1, samples)[:, None]
     paths = (ends[:, :1] + along * (ends[:, 1:] - ends[:, :1])).reshape(-1, 2)
     return replace(
-        evidence, points_px=np.concatenate([paths, evidence.points_px]),
+        evidence,
+        points_px=np.concatenate([paths, evidence.points_px]),
         times_s=np.concatenate([np.tile(0.4 * np.arange(samples), count), evidence.times_s]),
         track_starts=np.concatenate([samples * np.arange(count), evidence.track_starts + samples * count]),
         track_vehicles=np.concatenate([100000 + np.arange(count), evidence.track_vehicles]),
-        track_kinds=np.concatenate([np.full(count, TrackKind.PERSON), np.full(evidence.track_count, TrackKind.VEHICLE)]
-                                   ).astype(np.uint8))
+        track_kinds=np.concatenate(
+            [np.full(count, TrackKind.PERSON), np.full(evidence.track_count, TrackKind.VEHICLE)]
+        ).astype(np.uint8),
+    )
 
 
 def test_people_change_nothing_of_the_lens_and_the_plane_nor_of_what_became_of_each_vehicle() -> None:

@@ -22,12 +22,19 @@ def evidence_of(tracks: list[Track], segments: list[Segments] | None = None) -> 
         buffer.add_track(track)
     for part in segments or []:
         buffer.add_segments(part)
-    return buffer.snapshot(image_size=SIZE, first_stamp_ns=0, newest_stamp_ns=20_000_000_000, frames=200,
-                           drift_px=0.0, unfinished=[])
+    return buffer.snapshot(
+        image_size=SIZE, first_stamp_ns=0, newest_stamp_ns=20_000_000_000, frames=200, drift_px=0.0, unfinished=[]
+    )
 
 
-def driving(start: tuple[float, float], speed: tuple[float, float], vehicle: int, begin_s: float = 0.0,
-            points: np.ndarray = CORNERS, seconds: float = 2.0) -> list[Track]:
+def driving(
+    start: tuple[float, float],
+    speed: tuple[float, float],
+    vehicle: int,
+    begin_s: float = 0.0,
+    points: np.ndarray = CORNERS,
+    seconds: float = 2.0,
+) -> list[Track]:
     times = begin_s + np.arange(0.0, seconds + 1e-9, 0.1)
     way = np.array(start) + (times - begin_s)[:, None] * np.array(speed)
     return [Track(vehicle, times, way + point) for point in points]
@@ -49,20 +56,25 @@ def test_vehicles_apart_or_of_another_way_are_other_bodies() -> None:
     assert len(np.unique(find_windows(evidence_of(tracks)).bodies)) == 2
     tracks = driving((100, 300), (120, 0), 1) + driving((110, 305), (-120, 0), 1)
     windows = find_windows(evidence_of(tracks))
-    assert all(len(np.unique(np.sign((windows.second_px - windows.first_px)[row, windows.mask[row], 0]))) == 1
-               for row in range(len(windows)))
+    assert all(
+        len(np.unique(np.sign((windows.second_px - windows.first_px)[row, windows.mask[row], 0]))) == 1
+        for row in range(len(windows))
+    )
 
 
 def test_too_few_points_and_standing_ones_make_no_window() -> None:
-    assert not len(find_windows(evidence_of(driving((100, 300), (120, 0), 1, points=CORNERS[:MIN_POINTS - 1]))))
+    assert not len(find_windows(evidence_of(driving((100, 300), (120, 0), 1, points=CORNERS[: MIN_POINTS - 1]))))
     assert not len(find_windows(evidence_of(driving((100, 300), (3, 0), 1))))
     assert not len(find_windows(evidence_of([])))
     assert not len(no_windows())
 
 
 def test_points_seen_one_after_the_other_do_not_meet() -> None:
-    tracks = [track for number, point in enumerate(CORNERS)
-              for track in driving((100, 300), (120, 0), 1, begin_s=3.0 * number, points=point[None])]
+    tracks = [
+        track
+        for number, point in enumerate(CORNERS)
+        for track in driving((100, 300), (120, 0), 1, begin_s=3.0 * number, points=point[None])
+    ]
     assert not len(find_windows(evidence_of(tracks)))
 
 
@@ -103,8 +115,9 @@ def test_a_track_of_one_point_is_no_body() -> None:
 def test_hours_without_traffic_change_no_window() -> None:
     apart_s = 36_000.0  # a whole number of windows, so that both vehicles meet the same instants
     lone = find_windows(evidence_of(driving((100, 300), (120, 0), 1)))
-    both = find_windows(evidence_of(driving((100, 300), (120, 0), 1)
-                                    + driving((100, 300), (120, 0), 2, begin_s=apart_s)))
+    both = find_windows(
+        evidence_of(driving((100, 300), (120, 0), 1) + driving((100, 300), (120, 0), 2, begin_s=apart_s))
+    )
     assert len(both) == 2 * len(lone)
     later = both.subset(both.times_s > apart_s)
     assert np.allclose(np.sort(later.times_s) - apart_s, np.sort(lone.times_s))

@@ -14,14 +14,20 @@ from autocalib_ros.estimation.observations.vehicle_grouping import (
 )
 
 
-def moving(starts: list[tuple[float, float]], speeds: list[tuple[float, float]],
-           begin_s: list[float]) -> tuple[TrackSet, np.ndarray]:
+def moving(
+    starts: list[tuple[float, float]], speeds: list[tuple[float, float]], begin_s: list[float]
+) -> tuple[TrackSet, np.ndarray]:
     """Tracks of 3 s with their positions on the ground in metres."""
     times = np.array(begin_s)[:, None] + np.linspace(0.0, 3.0, SAMPLES_PER_TRACK)
-    ground = (np.array(starts)[:, None] + np.array(speeds)[:, None] * (times - times[:, :1])[..., None])
+    ground = np.array(starts)[:, None] + np.array(speeds)[:, None] * (times - times[:, :1])[..., None]
     count = len(starts)
-    tracks = TrackSet(np.zeros((count, SAMPLES_PER_TRACK, 2)), np.full((count, SAMPLES_PER_TRACK), 1 / SAMPLES_PER_TRACK),
-                      np.zeros(count, int), times, np.arange(count))
+    tracks = TrackSet(
+        np.zeros((count, SAMPLES_PER_TRACK, 2)),
+        np.full((count, SAMPLES_PER_TRACK), 1 / SAMPLES_PER_TRACK),
+        np.zeros(count, int),
+        times,
+        np.arange(count),
+    )
     return tracks, ground
 
 
@@ -31,10 +37,14 @@ def test_points_that_stay_together_are_one_body() -> None:
     assert first == second
 
 
-@pytest.mark.parametrize(('start', 'speed', 'begin'), [
-    ((0, 30), (8, 0), 0.0),  # far away
-    ((1, 1), (-8, 0), 0.0),  # the other way
-    ((0, 0), (8, 0), 2.8)])  # seen together for 0.2 s only
+@pytest.mark.parametrize(
+    ('start', 'speed', 'begin'),
+    [
+        ((0, 30), (8, 0), 0.0),  # far away
+        ((1, 1), (-8, 0), 0.0),  # the other way
+        ((0, 0), (8, 0), 2.8),
+    ],
+)  # seen together for 0.2 s only
 def test_points_that_part_are_two_bodies(start: tuple[float, float], speed: tuple[float, float], begin: float) -> None:
     tracks, ground = moving([(0, 0), start], [(8, 0), speed], [0.0, begin])
     first, second = group_into_bodies(tracks, ground)
@@ -49,7 +59,9 @@ def test_a_body_is_followed_from_track_to_track() -> None:
 def test_a_track_that_leaves_its_road_by_a_degree_has_a_heading_of_one_degree() -> None:
     along = np.linspace(0.0, 20.0, SAMPLES_PER_TRACK)[None]
     px_per_m = np.full((1, SAMPLES_PER_TRACK), 30.0)
-    off, _ = heading_error_deg(np.tan(np.radians(1.0)) * along * px_per_m, px_per_m, along, np.ones((1, SAMPLES_PER_TRACK), bool))
+    off, _ = heading_error_deg(
+        np.tan(np.radians(1.0)) * along * px_per_m, px_per_m, along, np.ones((1, SAMPLES_PER_TRACK), bool)
+    )
     assert off[0] == pytest.approx(1.0, rel=1e-3)
 
 

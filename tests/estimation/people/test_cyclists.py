@@ -19,8 +19,9 @@ JUNCTION = Junction(vehicles=30)
 FIRST_RIDER, FIRST_CAR = 1000, 2000
 
 
-def ridden(number: int, size_m: tuple[float, float, float], speed_m_s: float | None,
-           generator: np.random.Generator) -> tuple[list[Track], list[Outlines]]:
+def ridden(
+    number: int, size_m: tuple[float, float, float], speed_m_s: float | None, generator: np.random.Generator
+) -> tuple[list[Track], list[Outlines]]:
     """A body that crosses the junction along one of its roads, either way."""
     heading = np.pi / 2 * generator.integers(4)
     speed = speed_m_s or generator.uniform(4.0, 7.0)
@@ -29,8 +30,9 @@ def ridden(number: int, size_m: tuple[float, float, float], speed_m_s: float | N
     return driven(JUNCTION, number, 3.0 * (number % 1000), size_m, start, heading, speed, generator)
 
 
-def several(first: int, count: int, size_m: tuple[float, float, float], speed_m_s: float | None = None,
-            seed: int = 1) -> tuple[list[Track], list[Outlines]]:
+def several(
+    first: int, count: int, size_m: tuple[float, float, float], speed_m_s: float | None = None, seed: int = 1
+) -> tuple[list[Track], list[Outlines]]:
     generator = np.random.default_rng(seed)
     pairs = [ridden(first + number, size_m, speed_m_s, generator) for number in range(count)]
     return [track for tracks, _ in pairs for track in tracks], [each for _, outlines in pairs for each in outlines]
@@ -81,9 +83,12 @@ def test_what_touches_something_else_is_not_told(gap_px: float) -> None:
 
 def test_what_is_torn_in_two_is_not_told() -> None:
     tracks, outlines = several(FIRST_RIDER, 20, RIDER_M)
-    torn = [Outlines(each.time_s, np.tile(each.vehicles, 2),
-                     np.concatenate([each.ends_px, each.ends_px + [*[300, 0] * 8, 0]]))
-            for each in outlines]
+    torn = [
+        Outlines(
+            each.time_s, np.tile(each.vehicles, 2), np.concatenate([each.ends_px, each.ends_px + [*[300, 0] * 8, 0]])
+        )
+        for each in outlines
+    ]
     assert not len(told(tracks, torn))
 
 

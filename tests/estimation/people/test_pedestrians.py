@@ -19,8 +19,14 @@ FIRST_WALKER = 1000
 TIMES_S = np.arange(0.0, 24.0, 0.4)
 
 
-def _body(junction: Junction, number: int, start_s: float, path_m: np.ndarray, half_m: np.ndarray,
-          generator: np.random.Generator) -> list[Track]:
+def _body(
+    junction: Junction,
+    number: int,
+    start_s: float,
+    path_m: np.ndarray,
+    half_m: np.ndarray,
+    generator: np.random.Generator,
+) -> list[Track]:
     """Tracks of six points of a body, `half_m` (3,) large, that goes along a path (n, 2) on the road."""
     tracks = []
     for _ in range(6):
@@ -30,7 +36,7 @@ def _body(junction: Junction, number: int, start_s: float, path_m: np.ndarray, h
         seen = valid & (pixels >= 0).all(axis=1) & (pixels < junction.image_size).all(axis=1)
         if seen.sum() > 5:
             noisy = pixels[seen] + generator.normal(scale=0.4, size=(seen.sum(), 2))
-            tracks.append(Track(number, start_s + TIMES_S[:len(path_m)][seen], noisy))
+            tracks.append(Track(number, start_s + TIMES_S[: len(path_m)][seen], noisy))
     return tracks
 
 

@@ -35,8 +35,10 @@ def test_consensus_scores_the_right_focal_length_highest() -> None:
     junction = Junction()
     tracks = select_tracks(synthetic_evidence(junction, np.random.default_rng(5)), 500)
     trials = [450.0, 500.0, 560.0, 630.0, 700.0]
-    scores = [consensus_directions(Camera.equidistant(1280, 720, trial), tracks, np.random.default_rng(0)).score
-              for trial in trials]
+    scores = [
+        consensus_directions(Camera.equidistant(1280, 720, trial), tracks, np.random.default_rng(0)).score
+        for trial in trials
+    ]
     assert trials[int(np.argmax(scores))] == 560.0
 
 
@@ -62,7 +64,7 @@ def test_votes_hold_a_vanishing_point_however_far_outside(point: tuple[float, fl
     step = ends[:, 1] - ends[:, 0]
     orientation = np.degrees(np.arctan2(step[:, 1], step[:, 0])) % 180
     found = SegmentOrientations(ends, orientation, np.zeros((180, 2)), (float(np.median(orientation)),))
-    voted, = vote_vanishing_points(found, 700.0, PaperOptions(vote_sigmas=0.0, cluster_deg=30.0))
+    (voted,) = vote_vanishing_points(found, 700.0, PaperOptions(vote_sigmas=0.0, cluster_deg=30.0))
     truth, bearing = np.append(point, 700.0), np.append(voted, 700.0)
     error = angle_deg(truth / np.linalg.norm(truth), bearing / np.linalg.norm(bearing))
     assert error < 2.0  # degrees on the sphere of directions: four voting cells

@@ -22,12 +22,18 @@ from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_e
 from autocalib_ros.results.calibration import Calibration, Refusal
 
 OPTIONS = Options(camera_height=8.0)
-ONE_ROAD = Junction(road_angles_deg=(0.0,), turning_fraction=0.0, vehicles=120,
-                    camera_from_ground=pose(35.0, 1.0, 60.0), centre_m=(6.0, -10.0))
+ONE_ROAD = Junction(
+    road_angles_deg=(0.0,),
+    turning_fraction=0.0,
+    vehicles=120,
+    camera_from_ground=pose(35.0, 1.0, 60.0),
+    centre_m=(6.0, -10.0),
+)
 
 
-def solved(junction: Junction, seed: int = 0, options: Options = OPTIONS,
-           lens: Camera | None = None) -> Calibration | Refusal:
+def solved(
+    junction: Junction, seed: int = 0, options: Options = OPTIONS, lens: Camera | None = None
+) -> Calibration | Refusal:
     return solve(synthetic_evidence(junction, np.random.default_rng(seed)), options, lens=lens)
 
 
@@ -249,8 +255,11 @@ def test_the_same_evidence_gives_the_same_answer_to_the_last_bit() -> None:
 
 def test_standard_deviations_have_the_size_of_the_errors() -> None:
     results = [solved(Junction(), seed) for seed in range(8)]
-    errors = [(result.camera.focal_px - 560.0) / result.stddev.focal_px for result in results
-              if isinstance(result, Calibration) and result.stddev.focal_px]
+    errors = [
+        (result.camera.focal_px - 560.0) / result.stddev.focal_px
+        for result in results
+        if isinstance(result, Calibration) and result.stddev.focal_px
+    ]
     assert len(errors) == 8
     assert 0.2 < np.sqrt(np.mean(np.square(errors))) < 2.0  # eight runs tell a factor of two, no more
 

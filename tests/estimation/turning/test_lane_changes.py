@@ -47,7 +47,7 @@ def test_many_lane_changes_tell_the_plane(many):
 
 
 def test_they_are_named_with_their_deviation(many):
-    words, = (words for words in many[1].assumptions if 'change lanes' in words)
+    (words,) = (words for words in many[1].assumptions if 'change lanes' in words)
     assert words.startswith('ground plane by one road and ') and words.endswith(' degrees about the road')
 
 

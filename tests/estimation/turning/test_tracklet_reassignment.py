@@ -18,7 +18,7 @@ from autocalib_ros.estimation.motion.rigid_bodies import TrackletBundle
 from autocalib_ros.estimation.observations.track_set import TrackSet, select_tracks
 from autocalib_ros.estimation.observations.tracklets import Tracklets, find_tracklets
 from autocalib_ros.estimation.observations.two_frame_windows import ResampledTracks, TwoFrameWindows, find_windows
-from autocalib_ros.estimation.turning.turning_traffic import turning_traffic as turning
+from autocalib_ros.estimation.turning import turning_traffic as turning
 from autocalib_ros.estimation.verification.consistency import compare_solutions, expected_half_differences
 from autocalib_ros.estimation.verification.gates import check_halves
 from autocalib_ros.evidence.snapshot import Evidence
@@ -94,7 +94,9 @@ def by_windows(evidence: Evidence) -> tuple[TwoFrameWindows, Adjustment, TrackSe
     """Solve with windows alone, from the truth."""
     windows = find_windows(evidence, ResampledTracks(evidence))
     nothing = select_tracks(evidence, 500).subset(np.zeros(0, int))
-    fit = adjust(TRUTH, nothing, AdjustmentConfig(known_lens(TURNING.camera), JointOptions(), windows=windows), refine=True)
+    fit = adjust(
+        TRUTH, nothing, AdjustmentConfig(known_lens(TURNING.camera), JointOptions(), windows=windows), refine=True
+    )
     return windows, turning.refine_with_turning(fit, nothing, windows) or fit, nothing
 
 
@@ -136,7 +138,9 @@ def test_halves_that_tell_alike_differ_by_twice_the_deviation_of_the_whole() -> 
 
 def test_the_step_to_a_state_leads_there() -> None:
     prior = lens_priors((1280, 720), JointOptions())[0]
-    base = AdjustmentState(Camera(1280, 720, 560.0, (640.0, 360.0), (0.01, 0, 0, 0)), TRUTH.rotation, np.array([0.0, 1.5]))
+    base = AdjustmentState(
+        Camera(1280, 720, 560.0, (640.0, 360.0), (0.01, 0, 0, 0)), TRUTH.rotation, np.array([0.0, 1.5])
+    )
     steps = Parameterisation(base, AdjustmentConfig(prior, JointOptions()))
     step = np.random.default_rng(0).normal(scale=0.05, size=steps.size)
     assert steps.step_to(steps.state(step)) == pytest.approx(step, abs=1e-9)

@@ -43,8 +43,10 @@ def test_perfect_turning_traffic_gives_the_truth() -> None:
     assert any('rigid bodies' in check for check in result.checks)
 
 
-@pytest.mark.parametrize(('joined', 'companion'), [
-    (0.0, beside), (0.3, beside), (0.5, partial(beside, speeds=(1.0, 1.0))), (0.5, trailer), (0.5, shadow)])
+@pytest.mark.parametrize(
+    ('joined', 'companion'),
+    [(0.0, beside), (0.3, beside), (0.5, partial(beside, speeds=(1.0, 1.0))), (0.5, trailer), (0.5, shadow)],
+)
 def test_turning_traffic_alone_calibrates_even_when_groups_are_wrong(joined: float, companion: Companion) -> None:
     junction = replace(TURNING, merged_fraction=joined, companion=companion)
     result = solved(junction, seed=1)
@@ -57,8 +59,14 @@ def test_turning_traffic_alone_calibrates_even_when_groups_are_wrong(joined: flo
 
 
 def test_cars_side_by_side_on_one_road_tell_no_plane() -> None:
-    junction = Junction(road_angles_deg=(0.0,), camera_from_ground=pose(30.0, 1.0, 60.0), vehicles=60,
-                        points_per_vehicle=8, turning_fraction=0.0, merged_fraction=0.7)
+    junction = Junction(
+        road_angles_deg=(0.0,),
+        camera_from_ground=pose(30.0, 1.0, 60.0),
+        vehicles=60,
+        points_per_vehicle=8,
+        turning_fraction=0.0,
+        merged_fraction=0.7,
+    )
     result = solved(junction)
     if isinstance(result, Calibration):
         assert result.ground is None and result.ground_refusal is not None
@@ -66,8 +74,13 @@ def test_cars_side_by_side_on_one_road_tell_no_plane() -> None:
 
 
 def test_turning_traffic_completes_a_single_road() -> None:
-    junction = Junction(road_angles_deg=(0.0,), camera_from_ground=pose(30.0, 1.0, 50.0), vehicles=80,
-                        points_per_vehicle=8, turning_fraction=0.5)
+    junction = Junction(
+        road_angles_deg=(0.0,),
+        camera_from_ground=pose(30.0, 1.0, 50.0),
+        vehicles=80,
+        points_per_vehicle=8,
+        turning_fraction=0.5,
+    )
     result = solved(junction)
     assert isinstance(result, Calibration)
     assert normal_error_deg(result, junction) < 1.5

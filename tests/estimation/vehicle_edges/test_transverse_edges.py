@@ -28,15 +28,28 @@ from autocalib_ros.results.calibration import Calibration
 
 CAMERA = Camera(1280, 720, 560.0, (639.5, 359.5))
 HEIGHT_M = 8.0
-ONE_ROAD = Junction(road_angles_deg=(0.0,), turning_fraction=0.0, vehicles=120,
-                    camera_from_ground=pose(35.0, 1.0, 60.0), centre_m=(6.0, -10.0))
+ONE_ROAD = Junction(
+    road_angles_deg=(0.0,),
+    turning_fraction=0.0,
+    vehicles=120,
+    camera_from_ground=pose(35.0, 1.0, 60.0),
+    centre_m=(6.0, -10.0),
+)
 BOX_M = np.array([[length, width, up] for length in (-2.2, 2.2) for width in (-0.9, 0.9) for up in (0.0, 1.5)])
 """Corners of a vehicle about its middle on the road, x ahead."""
 SIDES = [(a, b) for a in range(8) for b in range(a + 1, 8) if bin(a ^ b).count('1') == 1]
 
 
-def box_edges(camera: Camera, camera_from_ground: np.ndarray, middle_m: np.ndarray, generator: np.random.Generator, *,
-              yaw_deg: float = 0.0, clutter: float = 0.5, noise_px: float = 0.4) -> np.ndarray:
+def box_edges(
+    camera: Camera,
+    camera_from_ground: np.ndarray,
+    middle_m: np.ndarray,
+    generator: np.random.Generator,
+    *,
+    yaw_deg: float = 0.0,
+    clutter: float = 0.5,
+    noise_px: float = 0.4,
+) -> np.ndarray:
     """Edges (n, 4) of a box on the road, the nearer half of them seen, and a share of clutter about it."""
     cosine, sine = np.cos(np.radians(yaw_deg)), np.sin(np.radians(yaw_deg))
     turned = BOX_M @ np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]])
@@ -55,8 +68,14 @@ def box_edges(camera: Camera, camera_from_ground: np.ndarray, middle_m: np.ndarr
     return ends[np.hypot(*(ends[:, 2:] - ends[:, :2]).T) > 12]
 
 
-def traffic(camera_from_ground: np.ndarray, generator: np.random.Generator, vehicles: int = 40, *,
-            yaw_deg: float = 0.0, clutter: float = 0.5) -> VehicleEdges:
+def traffic(
+    camera_from_ground: np.ndarray,
+    generator: np.random.Generator,
+    vehicles: int = 40,
+    *,
+    yaw_deg: float = 0.0,
+    clutter: float = 0.5,
+) -> VehicleEdges:
     """Edges of boxes that drive along ground x on three lanes, each seen a few times."""
     ends, owners = [], []
     heading = np.linalg.inv(camera_from_ground) @ [0.0, 0.0, 1.0]
@@ -80,11 +99,14 @@ def state_of(camera_from_ground: np.ndarray, camera: Camera = CAMERA) -> Adjustm
 
 def error_deg(found: TransverseDirection, camera_from_ground: np.ndarray) -> float:
     across = found.across(state_of(camera_from_ground))
-    return float(np.degrees(wrap_undirected(np.arctan2(across @ camera_from_ground[:, 2], across @ camera_from_ground[:, 1]))))
+    return float(
+        np.degrees(wrap_undirected(np.arctan2(across @ camera_from_ground[:, 2], across @ camera_from_ground[:, 1])))
+    )
 
 
-@pytest.mark.parametrize(('tilt', 'roll', 'heading'), [(30.0, 0.0, 10.0), (20.0, 4.0, 40.0), (35.0, -6.0, 75.0),
-                                                       (25.0, 10.0, -30.0)])
+@pytest.mark.parametrize(
+    ('tilt', 'roll', 'heading'), [(30.0, 0.0, 10.0), (20.0, 4.0, 40.0), (35.0, -6.0, 75.0), (25.0, 10.0, -30.0)]
+)
 def test_boxes_give_the_direction_across_their_road(tilt: float, roll: float, heading: float) -> None:
     camera_from_ground = pose(tilt, roll, heading)
     generator = np.random.default_rng(1)
@@ -123,8 +145,9 @@ def test_one_vehicle_seen_very_often_does_not_outweigh_the_others() -> None:
     many = traffic(camera_from_ground, generator)
     # a load that leans by 8 degrees about the road, in a jam
     leaning = camera_from_ground @ np.array([[1, 0, 0], [0, 0.990, -0.139], [0, 0.139, 0.990]])
-    jam = np.concatenate([box_edges(CAMERA, leaning, np.array([14.0, 0.0]), generator, clutter=0.0)
-                          for _ in range(300)])
+    jam = np.concatenate(
+        [box_edges(CAMERA, leaning, np.array([14.0, 0.0]), generator, clutter=0.0) for _ in range(300)]
+    )
     edges = VehicleEdges(np.vstack([many.ends_px, jam]), np.append(many.vehicles, np.full(len(jam), 999)))
     found = transverse_direction_at(edges, state_of(camera_from_ground), generator)
     assert found is not None
@@ -136,7 +159,9 @@ def test_the_standard_deviation_covers_what_is_missed() -> None:
     for seed in range(12):
         generator = np.random.default_rng(seed)
         camera_from_ground = pose(generator.uniform(15, 40), generator.normal(scale=4), generator.uniform(-70, 70))
-        found = transverse_direction_at(traffic(camera_from_ground, generator, 30), state_of(camera_from_ground), generator)
+        found = transverse_direction_at(
+            traffic(camera_from_ground, generator, 30), state_of(camera_from_ground), generator
+        )
         assert found is not None
         misses.append(error_deg(found, camera_from_ground) / np.degrees(found.step_sigma_rad))
     assert np.sqrt(np.mean(np.square(misses))) < 1.2
@@ -146,7 +171,9 @@ def test_the_standard_deviation_covers_what_is_missed() -> None:
 def test_the_same_edges_and_seed_give_the_same_bits() -> None:
     camera_from_ground = pose(30.0, 2.0, 25.0)
     edges = traffic(camera_from_ground, np.random.default_rng(5))
-    first, second = (transverse_direction_at(edges, state_of(camera_from_ground), np.random.default_rng(0)) for _ in range(2))
+    first, second = (
+        transverse_direction_at(edges, state_of(camera_from_ground), np.random.default_rng(0)) for _ in range(2)
+    )
     assert first is not None and second is not None
     assert first.origin.tobytes() == second.origin.tobytes() and first.step_sigma_rad == second.step_sigma_rad
 
@@ -183,7 +210,9 @@ def test_a_level_camera_and_edges_are_joined_by_their_variances() -> None:
 def test_a_level_camera_that_edges_contradict_is_noticed() -> None:
     camera_from_ground = pose(30.0, 8.0, 5.0)
     state = state_of(camera_from_ground)
-    square = transverse_direction_at(traffic(camera_from_ground, np.random.default_rng(5)), state, np.random.default_rng(0))
+    square = transverse_direction_at(
+        traffic(camera_from_ground, np.random.default_rng(5)), state, np.random.default_rng(0)
+    )
     assert square is not None
     joined, apart_deg = combine_assumptions(LevelCamera(1.0), square, state)
     assert joined is None and apart_deg > 5.0
@@ -197,13 +226,18 @@ def with_boxes(junction: Junction, clutter: float = 0.5) -> Evidence:
         sample = len(track.times_s) // 2
         bearing, _ = junction.camera.unproject(track.points_px[sample])
         ground = bearing @ junction.camera_from_ground
-        found = box_edges(junction.camera, junction.camera_from_ground, HEIGHT_M * ground[:2] / -ground[2], generator,
-                          clutter=clutter)
+        found = box_edges(
+            junction.camera, junction.camera_from_ground, HEIGHT_M * ground[:2] / -ground[2], generator, clutter=clutter
+        )
         ends.append(found)
         owners.append(np.full(len(found), track.vehicle))
         times.append(np.full(len(found), track.times_s[sample]))
-    return replace(evidence, edges_px=np.concatenate(ends), edge_vehicles=np.concatenate(owners),
-                   edge_times_s=np.concatenate(times))
+    return replace(
+        evidence,
+        edges_px=np.concatenate(ends),
+        edge_vehicles=np.concatenate(owners),
+        edge_times_s=np.concatenate(times),
+    )
 
 
 ROLLED = replace(ONE_ROAD, camera_from_ground=pose(35.0, 5.0, 60.0))
@@ -237,8 +271,14 @@ def test_edges_that_contradict_a_level_camera_leave_no_plane_and_say_so() -> Non
 @pytest.fixture(scope='module')
 def assumed() -> Solution:
     evidence, options = with_boxes(ROLLED), Options(camera_height=HEIGHT_M)
-    solution = find_solution(evidence, select_tracks(evidence, options.joint.max_tracks), options.joint, options.gate,
-                             np.random.default_rng(0), height_m=HEIGHT_M)
+    solution = find_solution(
+        evidence,
+        select_tracks(evidence, options.joint.max_tracks),
+        options.joint,
+        options.gate,
+        np.random.default_rng(0),
+        height_m=HEIGHT_M,
+    )
     assert isinstance(solution, Solution) and isinstance(solution.plane.assumed, TransverseDirection)
     return solution
 

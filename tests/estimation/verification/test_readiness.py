@@ -18,8 +18,9 @@ GATE = GateOptions()
 def evidence_after(seconds: float, newest_track_s: float, tracks: int = 17) -> Evidence:
     """So many tracks, the last of which ended then."""
     evidence = synthetic_evidence(Junction(tracks=tracks), np.random.default_rng(0))
-    return replace(evidence, newest_stamp_ns=int(seconds * 1e9),
-                   times_s=evidence.times_s - evidence.times_s.max() + newest_track_s)
+    return replace(
+        evidence, newest_stamp_ns=int(seconds * 1e9), times_s=evidence.times_s - evidence.times_s.max() + newest_track_s
+    )
 
 
 def told(evidence: Evidence) -> str:
@@ -49,8 +50,10 @@ def test_nothing_is_foretold_when_nothing_is_missing() -> None:
     assert told(evidence_after(600.0, 590.0, tracks=60)) == ''
 
 
-@pytest.mark.parametrize(('seconds', 'description'), [(290.0, ''), (720.0, 'no traffic in the last 12 min'),
-                                                (4 * 3600.0, 'no traffic in the last 4 h')])
+@pytest.mark.parametrize(
+    ('seconds', 'description'),
+    [(290.0, ''), (720.0, 'no traffic in the last 12 min'), (4 * 3600.0, 'no traffic in the last 4 h')],
+)
 def test_without_any_traffic_that_is_said(seconds: float, description: str) -> None:
     nothing = replace(evidence_after(seconds, 0.0).select_tracks(np.zeros(0, int)))
     assert told(nothing) == description
@@ -60,8 +63,18 @@ def test_a_rate_that_stopped_is_no_rate() -> None:
     assert told(evidence_after(1200.0, 300.0)) == 'no traffic in the last 15 min'
 
 
-@pytest.mark.parametrize(('seconds', 'description'), [
-    (1.0, '10 s'), (44.0, '40 s'), (89.0, '90 s'), (95.0, '2 min'), (3000.0, '50 min'), (5400.0, '2 h'),
-    (86_400.0, '24 h'), (3 * 86_400.0, '3 days')])
+@pytest.mark.parametrize(
+    ('seconds', 'description'),
+    [
+        (1.0, '10 s'),
+        (44.0, '40 s'),
+        (89.0, '90 s'),
+        (95.0, '2 min'),
+        (3000.0, '50 min'),
+        (5400.0, '2 h'),
+        (86_400.0, '24 h'),
+        (3 * 86_400.0, '3 days'),
+    ],
+)
 def test_times_are_told_coarsely(seconds: float, description: str) -> None:
     assert coarse_duration(seconds) == description

@@ -72,8 +72,12 @@ def test_a_true_distance_in_the_true_plane_gives_the_true_height() -> None:
 def test_the_deviation_by_distance_is_that_of_clicks_and_tape() -> None:
     generator, pixels = np.random.default_rng(0), pixels_of(FAR_M)
     metres = float(np.hypot(*np.subtract(*FAR_M)))
-    heights = [height_at_truth(by_distance(pixels + generator.normal(scale=2.0, size=(2, 2)),
-                                           metres + generator.normal(scale=0.2))) for _ in range(2000)]
+    heights = [
+        height_at_truth(
+            by_distance(pixels + generator.normal(scale=2.0, size=(2, 2)), metres + generator.normal(scale=0.2))
+        )
+        for _ in range(2000)
+    ]
     scale = at_truth(by_distance(pixels, metres, distance_sigma_m=0.2, pixel_sigma_px=2.0))
     # a spread of 2000 draws is known to 1.6 %, one sigma; the slope changes over two pixels so far away
     assert isinstance(scale, Scale) and scale.sigma == pytest.approx(np.std(heights), rel=0.06)
@@ -91,9 +95,14 @@ def test_walkers_and_a_racer_do_not_change_the_height() -> None:
     assert height == pytest.approx(8.0, rel=0.02)  # one of 22 vehicles moves the middle of the others by half a rank
 
 
-@pytest.mark.parametrize(('more', 'share'), [
-    ({'speed_sigma_km_h': 3.6}, 0.1), ({'point_height_sigma_m': 0.8}, 0.1),
-    ({'speed_sigma_km_h': 3.6, 'point_height_sigma_m': 0.8}, np.sqrt(0.02))])
+@pytest.mark.parametrize(
+    ('more', 'share'),
+    [
+        ({'speed_sigma_km_h': 3.6}, 0.1),
+        ({'point_height_sigma_m': 0.8}, 0.1),
+        ({'speed_sigma_km_h': 3.6, 'point_height_sigma_m': 0.8}, np.sqrt(0.02)),
+    ],
+)
 def test_the_deviation_by_speed_holds_each_of_its_parts(more: dict[str, float], share: float) -> None:
     exact = {'speed_sigma_km_h': 0.0, 'point_height_sigma_m': 0.0, 'point_height_m': 0.0}
     scale = at_truth(by_speed(36.0, **{**exact, **more}), flow_of(np.full(20, 10.0)))
@@ -153,8 +162,12 @@ def test_road_points_are_as_unsure_as_the_scale(evidence: Evidence, result: Cali
     assert exact.stddev.height_m is None and given.stddev.height_m == 0.4
     assert '+- 0.4 m (given)' in given.assumptions[-1] and '+-' not in exact.assumptions[-1]
     for distance, without, with_sigma, by_tape in zip(
-            (10.0, 20.0, 40.0), exact.stddev.ground_point_m, given.stddev.ground_point_m,
-            result.stddev.ground_point_m, strict=True):
+        (10.0, 20.0, 40.0),
+        exact.stddev.ground_point_m,
+        given.stddev.ground_point_m,
+        result.stddev.ground_point_m,
+        strict=True,
+    ):
         assert with_sigma == pytest.approx(np.hypot(without, distance * 0.4 / result.ground.height_m), rel=1e-6)
         assert by_tape > distance * 0.04  # the tape's share; the rest of it correlates with lens and plane
 
@@ -172,12 +185,16 @@ def test_an_unusual_height_is_solved_with_once_more() -> None:
     points = ((18.0, -8.0), (26.0, -2.0))
     evidence = synthetic_evidence(junction, np.random.default_rng(1))
     options = by_distance(pixels_of(points, junction), 10.0)
-    first = find_solution(evidence, select_tracks(evidence, 1500), options.joint, options.gate,
-                          np.random.default_rng(0))
+    first = find_solution(
+        evidence, select_tracks(evidence, 1500), options.joint, options.gate, np.random.default_rng(0)
+    )
     assert isinstance(first, Solution)
     scale = known_scale(options, *first.plane.lens_and_normal)
     assert isinstance(scale, Scale)
-    found, given = solve(evidence, options), solve(evidence, Options(camera_height=scale.height(*first.plane.lens_and_normal)))
+    found, given = (
+        solve(evidence, options),
+        solve(evidence, Options(camera_height=scale.height(*first.plane.lens_and_normal))),
+    )
     assert found.camera == given.camera != first.fit.state.camera
     assert found.ground.height_m == pytest.approx(14.0, abs=3 * found.stddev.height_m)
 
@@ -191,8 +208,9 @@ def test_the_published_method_takes_a_distance(evidence: Evidence) -> None:
     options = replace(by_distance(pixels_of(NEAR_M), 10.0), method='paper')
     found = solve(evidence, options)
     assert found.ground is not None
-    places = [bearing / -(bearing @ found.ground.normal_in_camera) for bearing in
-              found.camera.unproject(pixels_of(NEAR_M))[0]]
+    places = [
+        bearing / -(bearing @ found.ground.normal_in_camera) for bearing in found.camera.unproject(pixels_of(NEAR_M))[0]
+    ]
     assert found.ground.height_m * np.linalg.norm(np.subtract(*places)) == pytest.approx(10.0)
     assert found.assumptions[-1].startswith('scale by 10 +- 0.05 m on the road')
 
@@ -207,8 +225,13 @@ def draws() -> Iterator[tuple[np.random.Generator, Solution]]:
         generator = np.random.default_rng([seed, 7])
         evidence = synthetic_evidence(JUNCTION, generator)
         options = Options()
-        solution = find_solution(evidence, select_tracks(evidence, options.joint.max_tracks), options.joint,
-                                 options.gate, np.random.default_rng(0))
+        solution = find_solution(
+            evidence,
+            select_tracks(evidence, options.joint.max_tracks),
+            options.joint,
+            options.gate,
+            np.random.default_rng(0),
+        )
         assert isinstance(solution, Solution)
         yield generator, solution
 
@@ -229,10 +252,28 @@ def test_heights_lie_within_their_deviations_over_twenty_draws() -> None:
     metres = float(np.hypot(*np.subtract(*FAR_M)))
     for generator, solution in draws():
         exact.append(score(by_distance(far, metres, pixel_sigma_px=0.0, distance_sigma_m=0.0), solution))
-        clicked.append(score(by_distance(near + generator.normal(scale=2.0, size=(2, 2)), generator.normal(10.0, 0.2),
-                                         pixel_sigma_px=2.0, distance_sigma_m=0.2), solution))
-        driven.append(score(by_speed(MEAN_KM_H + generator.normal(scale=3.0), speed_sigma_km_h=3.0,
-                                     point_height_m=MEAN_POINT_M, point_height_sigma_m=0.1), solution))
+        clicked.append(
+            score(
+                by_distance(
+                    near + generator.normal(scale=2.0, size=(2, 2)),
+                    generator.normal(10.0, 0.2),
+                    pixel_sigma_px=2.0,
+                    distance_sigma_m=0.2,
+                ),
+                solution,
+            )
+        )
+        driven.append(
+            score(
+                by_speed(
+                    MEAN_KM_H + generator.normal(scale=3.0),
+                    speed_sigma_km_h=3.0,
+                    point_height_m=MEAN_POINT_M,
+                    point_height_sigma_m=0.1,
+                ),
+                solution,
+            )
+        )
     for scores in (exact, clicked, driven):
         # twenty tell a root mean square to 16 % and a mean to 0.22, one sigma
         assert 0.5 < np.sqrt(np.mean(np.square(scores))) < 1.5
@@ -241,6 +282,7 @@ def test_heights_lie_within_their_deviations_over_twenty_draws() -> None:
 
 
 # What gives no scale.
+
 
 def test_a_pixel_above_the_horizon_leaves_the_lens(evidence: Evidence) -> None:
     found = solve(evidence, by_distance(np.array([[600.0, 20.0], [600.0, 500.0]]), 10.0))
@@ -259,10 +301,15 @@ def test_a_pixel_outside_the_image_is_wrong_usage_from_the_first_image_on(eviden
         AutoCalibrator(options).add_image(0, np.zeros((180, 320), np.uint8))
 
 
-@pytest.mark.parametrize('options', [
-    by_distance(pixels_of(NEAR_M), 10.0, distance_sigma_m=3.0),
-    by_speed(MEAN_KM_H, speed_sigma_km_h=10.0),
-    Options(camera_height=8.0, camera_height_sigma=2.0)], ids=['distance', 'speed', 'height'])
+@pytest.mark.parametrize(
+    'options',
+    [
+        by_distance(pixels_of(NEAR_M), 10.0, distance_sigma_m=3.0),
+        by_speed(MEAN_KM_H, speed_sigma_km_h=10.0),
+        Options(camera_height=8.0, camera_height_sigma=2.0),
+    ],
+    ids=['distance', 'speed', 'height'],
+)
 def test_a_scale_less_sure_than_the_gate_is_refused_with_numbers(evidence: Evidence, options: Options) -> None:
     found = solve(evidence, options)
     assert isinstance(found, Calibration) and found.ground is None and found.grade == 'lens'
@@ -279,7 +326,12 @@ def test_too_few_vehicles_tell_no_speed(count: int) -> None:
 
 
 def test_without_a_plane_there_is_no_scale() -> None:
-    one_road = Junction(road_angles_deg=(0.0,), turning_fraction=0.0, vehicles=120,
-                        camera_from_ground=pose(35.0, 1.0, 60.0), centre_m=(6.0, -10.0))
+    one_road = Junction(
+        road_angles_deg=(0.0,),
+        turning_fraction=0.0,
+        vehicles=120,
+        camera_from_ground=pose(35.0, 1.0, 60.0),
+        centre_m=(6.0, -10.0),
+    )
     found = solved(one_road, by_speed(MEAN_KM_H))
     assert found.ground is None and found.ground_refusal.code == 'one_direction'

@@ -12,8 +12,15 @@ from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.offline.recordings.open import open_source
 
 SECOND = 1_000_000_000
-KINDS = [(False, 'NONE'), (False, 'MESSAGE'), (False, 'FILE'), (True, 'NONE'), (True, 'MESSAGE'), (True, 'FILE'),
-         (True, 'STORAGE')]
+KINDS = [
+    (False, 'NONE'),
+    (False, 'MESSAGE'),
+    (False, 'FILE'),
+    (True, 'NONE'),
+    (True, 'MESSAGE'),
+    (True, 'FILE'),
+    (True, 'STORAGE'),
+]
 
 
 def brightness(source):
@@ -92,10 +99,13 @@ def test_an_image_topic_without_messages_is_no_choice(tmp_path, write_bag, image
     assert open_source(path).topic == '/a'
 
 
-@pytest.mark.parametrize(('topic', 'message'), [
-    ('/nowhere', 'has no topic /nowhere; its image topics: /cam1/image_raw'),
-    ('/heads', 'holds no images but /heads .std_msgs/msg/Header'),
-])
+@pytest.mark.parametrize(
+    ('topic', 'message'),
+    [
+        ('/nowhere', 'has no topic /nowhere; its image topics: /cam1/image_raw'),
+        ('/heads', 'holds no images but /heads .std_msgs/msg/Header'),
+    ],
+)
 def test_a_wrong_topic_is_answered_with_the_right_ones(tmp_path, write_bag, images, a_header, topic, message):
     path = write_bag(tmp_path / 'bag', [*images(2), ('/heads', 100 * SECOND, a_header)])
     with pytest.raises(UsageError, match=message):
@@ -117,7 +127,8 @@ def test_an_empty_bag_is_said_to_be_empty(tmp_path, write_bag, mcap):
 
 @pytest.mark.parametrize(('stamps', 'what'), [(lambda _: 0, 'zero'), (lambda _: 7 * SECOND, 'always the same')])
 def test_useless_header_stamps_give_way_to_the_time_of_recording(
-        tmp_path, write_bag, images, a_header_at, caplog, stamps, what):
+    tmp_path, write_bag, images, a_header_at, caplog, stamps, what
+):
     messages = images(4)
     for _, recorded_ns, message in messages:
         message.header = a_header_at(stamps(recorded_ns))
@@ -142,7 +153,8 @@ def test_an_image_that_cannot_be_decoded_is_skipped_and_counted(tmp_path, write_
     messages[3][2].data = messages[3][2].data[:10]
     assert brightness(open_source(write_bag(tmp_path / 'bag', messages))) == [5, 15, 45]
     assert [record.message for record in caplog.records] == [
-        "2 of 5 images could not be decoded and were skipped; the first: image encoding 'unheard_of' is not supported"]
+        "2 of 5 images could not be decoded and were skipped; the first: image encoding 'unheard_of' is not supported"
+    ]
 
 
 def test_only_images_that_cannot_be_decoded_are_an_error(tmp_path, write_bag, images):
@@ -222,7 +234,7 @@ def test_a_torn_sqlite_file_gives_images_or_one_line(tmp_path, write_bag, images
     bag = write_bag(tmp_path / 'bag', noisy(images, 60))
     whole = (bag / 'bag.db3').read_bytes()
     torn = tmp_path / 'torn.db3'
-    torn.write_bytes(whole[:int(share * len(whole))])
+    torn.write_bytes(whole[: int(share * len(whole))])
     try:
         assert brightness(open_source(torn))
     except InputError as error:
@@ -238,8 +250,10 @@ def test_a_text_file_named_as_a_recording_is_one_clear_line(tmp_path, name):
     assert '\n' not in str(raised.value)
 
 
-@pytest.mark.parametrize(('yaml', 'message'), [
-    ('{', 'cannot read'), ('rosbag2_bagfile_information: {version: 9}', 'cannot read'), ('[]', 'cannot read')])
+@pytest.mark.parametrize(
+    ('yaml', 'message'),
+    [('{', 'cannot read'), ('rosbag2_bagfile_information: {version: 9}', 'cannot read'), ('[]', 'cannot read')],
+)
 def test_broken_metadata_is_one_clear_line(tmp_path, yaml, message):
     (tmp_path / 'metadata.yaml').write_text(yaml)
     with pytest.raises(InputError, match=message) as raised:

@@ -33,8 +33,9 @@ def test_a_window_behind_the_end_of_a_video_is_an_error(tmp_path, write_video):
         list(source.frames())
 
 
-@pytest.mark.parametrize('window', [{'start_s': -1.0}, {'start_s': float('nan')}, {'duration_s': 0.0},
-                                    {'duration_s': float('inf')}])
+@pytest.mark.parametrize(
+    'window', [{'start_s': -1.0}, {'start_s': float('nan')}, {'duration_s': 0.0}, {'duration_s': float('inf')}]
+)
 def test_a_senseless_window_is_wrong_usage(tmp_path, write_video, window):
     with pytest.raises(UsageError):
         open_source(write_video(tmp_path / 'clip.mp4'), **window)
@@ -42,7 +43,7 @@ def test_a_senseless_window_is_wrong_usage(tmp_path, write_video, window):
 
 def test_a_truncated_video_gives_what_it_has_and_says_so(tmp_path, write_video, caplog):
     path = write_video(tmp_path / 'clip.avi', count=60)
-    path.write_bytes(path.read_bytes()[:path.stat().st_size // 2])
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     frames = list(open_source(path).frames())
     assert 5 < len(frames) < 50
     assert 'ended early' in caplog.text
@@ -50,7 +51,7 @@ def test_a_truncated_video_gives_what_it_has_and_says_so(tmp_path, write_video, 
 
 def test_a_video_that_lost_its_index_is_one_clear_line(tmp_path, write_video):
     path = write_video(tmp_path / 'clip.mp4')
-    path.write_bytes(path.read_bytes()[:path.stat().st_size // 2])
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     with pytest.raises(InputError, match=r'clip.mp4 is not a video that can be read'):
         open_source(path)
 
