@@ -27,9 +27,9 @@ setup(
         'tqdm>=4.64',
         'jinja2>=3',
         'matplotlib>=3.7',
-        'onnxruntime>=1.17',
     ],
     extras_require={
+        'detector': ['onnxruntime>=1.17'],
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
         'test': ['pytest>=7', 'pytest-xdist>=3', 'hypothesis>=6', 'ruff>=0.4'],
     },

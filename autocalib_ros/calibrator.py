@@ -53,7 +53,7 @@ TRAIL_FRAMES = 16
 """Images through which the way of a point is shown: a second at 15 Hz."""
 
 
-class FrameStatus(Enum):
+class ImageIntake(Enum):
     """What became of an image; all but `USED` and `LATE` begin the evidence anew."""
 
     FIRST = 'the first image'
@@ -88,7 +88,7 @@ class AutoCalibrator:
         self._detector = detector or open_detector(options.detector)
         self._observer: Observer | None = None
 
-    def add_image(self, stamp_ns: int, image: np.ndarray) -> FrameStatus:
+    def add_image(self, stamp_ns: int, image: np.ndarray) -> ImageIntake:
         """Take one image: grey (H, W) or BGR (H, W, 3), uint8; it is not kept nor changed.
 
         An image whose stamp repeats or steps back by less than `MAX_REORDERING_NS` is late and left out; a stamp that
@@ -99,9 +99,9 @@ class AutoCalibrator:
             raise InputError(f'an image is grey (H, W) or BGR (H, W, 3) in 8 bits, got {image.dtype} {image.shape}')
         size = (image.shape[1], image.shape[0])
         frame_status = self._frame_status(stamp_ns, size)
-        if frame_status is FrameStatus.LATE:
+        if frame_status is ImageIntake.LATE:
             return frame_status
-        if frame_status is not FrameStatus.USED:
+        if frame_status is not ImageIntake.USED:
             self._restart(stamp_ns, size)
         time_s = (stamp_ns - self._first_stamp_ns) * 1e-9
         observed = self._observer.observe(image, time_s)
@@ -120,15 +120,15 @@ class AutoCalibrator:
         self._frames += 1
         return frame_status
 
-    def _frame_status(self, stamp_ns: int, size: tuple[int, int]) -> FrameStatus:
+    def _frame_status(self, stamp_ns: int, size: tuple[int, int]) -> ImageIntake:
         if self._observer is None:
-            return FrameStatus.FIRST
+            return ImageIntake.FIRST
         if size != self._size:
-            return FrameStatus.RESIZED
+            return ImageIntake.RESIZED
         step_ns = stamp_ns - self._newest_stamp_ns
         if not -MAX_REORDERING_NS < step_ns < CLOCK_JUMP_NS:
-            return FrameStatus.TIME_JUMPED
-        return FrameStatus.USED if step_ns > 0 else FrameStatus.LATE
+            return ImageIntake.TIME_JUMPED
+        return ImageIntake.USED if step_ns > 0 else ImageIntake.LATE
 
     def change(self, options: Options) -> None:
         """Take other options, which may differ in what `config.is_reconfigurable` says; a solution is due at once."""

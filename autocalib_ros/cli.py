@@ -15,6 +15,7 @@ from autocalib_ros.commands import INTERRUPTED, WRONG_USE
 from autocalib_ros.commands import benchmark_command as benchmark
 from autocalib_ros.commands import compare_command as compare
 from autocalib_ros.commands import demo_command as demo
+from autocalib_ros.commands import docs_command as docs
 from autocalib_ros.commands import evidence_command as evidence
 from autocalib_ros.commands import picture_command as picture
 from autocalib_ros.commands import rectify_command as rectify
@@ -34,6 +35,7 @@ COMMANDS = {
     'simulate': simulate,
     'demo': demo,
     'benchmark': benchmark,
+    'docs': docs,
 }
 
 

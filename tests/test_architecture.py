@@ -4,33 +4,37 @@ import ast
 import os
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
-
-import pytest
 
 import autocalib_ros
 
 PACKAGE = Path(autocalib_ros.__file__).parent
 # From the ground up. A room imports from rooms in lower lines only; rooms of one line do not know each other.
-STOREYS = (
-    ('errors', 'threads', 'redundancy'),
-    ('config', 'files'),
-    ('camera',),
-    ('opencv_lens',),
-    ('camera_info',),
-    ('calibration', 'info_lens'),
-    ('calibration_reader',),
-    ('evidence', 'ground', 'store', 'known_camera', 'comparison'),
-    ('perception', 'estimation', 'pictures'),
-    ('compare',),
-    ('calibrator', 'standing'),
-    ('report',),
-    ('ros', 'offline'),
+LAYERS = (
+    ('errors', 'node_interface'),
+    ('config', 'util'),
+    ('lens', 'perception.detector'),
+    ('geometry',),
+    ('results',),
+    ('ground', 'evidence'),
+    ('comparison', 'perception', 'pictures', 'estimation.observations'),
+    ('estimation.motion',),
+    ('estimation.adjustment', 'estimation.people'),
+    ('estimation.straight', 'estimation.vehicle_edges'),
+    ('estimation.verification',),
+    ('estimation.markings', 'estimation.turning', 'estimation.paper'),
+    ('estimation',),
+    ('report', 'calibrator', 'revalidation'),
+    ('offline.terminal',),
+    ('offline.recordings', 'offline.simulate', 'ros'),
+    ('offline', 'offline.synthetic'),
+    ('offline.benchmark',),
     ('commands',),
     ('cli',),
-    ('__main__', 'benchmark'),
+    ('__main__',),
 )
-STOREY = {room: height for height, rooms in enumerate(STOREYS) for room in rooms}
+LAYER = {room: height for height, rooms in enumerate(LAYERS) for room in rooms}
 ROS_PACKAGES = (
     'rclpy',
     'ament_index_python',
@@ -48,6 +52,8 @@ ROS_PACKAGES = (
     'rosidl_parser',
     'rpyutils',
 )
+PER_COMMAND = ('HELP', 'DESCRIPTION')
+"""Each command module says its own."""
 WITHOUT_ROS = """
 import importlib, sys
 
@@ -72,7 +78,10 @@ MODULES = {module_name(path): path for path in sorted(PACKAGE.rglob('*.py'))}
 
 
 def room_of(module: str) -> str:
-    return module.split('.')[1] if '.' in module else ''
+    """Return the room of a module: the longest name in `LAYERS` that leads to it, '' for the package itself."""
+    parts = module.split('.')[1:]
+    inner = '.'.join(parts[:2])
+    return inner if inner in LAYER else '.'.join(parts[:1])
 
 
 def imported_modules(module: str, path: Path) -> list[str]:
@@ -85,7 +94,7 @@ def imported_modules(module: str, path: Path) -> list[str]:
         elif isinstance(node, ast.ImportFrom):
             above = package.split('.')[: len(package.split('.')) - node.level + 1] if node.level else []
             source = '.'.join([*above, *([node.module] if node.module else [])])
-            names += [f'{source}.{alias.name}' for alias in node.names] if source == 'autocalib_ros' else [source]
+            names += [inner if (inner := f'{source}.{alias.name}') in MODULES else source for alias in node.names]
     return names
 
 
@@ -97,29 +106,75 @@ def run_without_ros(modules: list[str], then: str = '') -> subprocess.CompletedP
     )
 
 
-@pytest.mark.parametrize('module', [name for name in MODULES if room_of(name)])
-def test_every_module_lives_in_a_known_room(module):
-    assert room_of(module) in STOREY
+IMPORTS = {module: imported_modules(module, path) for module, path in MODULES.items()}
 
 
-@pytest.mark.parametrize('module', MODULES)
-def test_imports_run_downward_only(module):
-    room = room_of(module)
-    for name in imported_modules(module, MODULES[module]):
-        other = room_of(name) if name.partition('.')[0] == 'autocalib_ros' else ''
-        if other in STOREY and other != room:
-            assert STOREY[other] < STOREY.get(room, 0), f'{module} imports {name}, which does not lie below it'
+def test_every_module_lives_in_a_known_room() -> None:
+    assert not [module for module in MODULES if room_of(module) and room_of(module) not in LAYER]
 
 
-@pytest.mark.parametrize('module', [name for name in MODULES if room_of(name) != 'ros'])
-def test_only_the_live_shell_imports_ros(module):
-    roots = {name.partition('.')[0] for name in imported_modules(module, MODULES[module])}
-    assert not {root for root in roots if root in ROS_PACKAGES or root.endswith('_msgs')}
+def test_imports_run_downward_only() -> None:
+    upward = [
+        f'{module} imports {name}, which does not lie below it'
+        for module, names in IMPORTS.items()
+        for name in names
+        if name.startswith('autocalib_ros.')
+        and room_of(name) not in ('', room_of(module))
+        and LAYER.get(room_of(name), -1) >= LAYER.get(room_of(module), len(LAYERS))
+    ]
+    assert not upward, '\n'.join(upward)
 
 
-@pytest.mark.parametrize('module', [name for name in MODULES if room_of(name) != 'offline'])
-def test_only_the_replay_shell_imports_rosbags(module):
-    assert 'rosbags' not in {name.partition('.')[0] for name in imported_modules(module, MODULES[module])}
+def test_no_circle_of_files() -> None:
+    """Whole-file circles hide which file knows which; imports inside functions count too."""
+    graph = {module: {name for name in names if name in MODULES} - {module} for module, names in IMPORTS.items()}
+    while leaves := [module for module, below in graph.items() if not below & set(graph)]:
+        for module in leaves:
+            del graph[module]
+    assert not graph, f'circles among {sorted(graph)}'
+
+
+def test_only_the_live_shell_imports_ros() -> None:
+    assert not [
+        f'{module} imports {name}'
+        for module, names in IMPORTS.items()
+        for name in names
+        if room_of(module) != 'ros' and (root_of(name) in ROS_PACKAGES or root_of(name).endswith('_msgs'))
+    ]
+
+
+def test_only_the_offline_shell_imports_rosbags() -> None:
+    assert not [
+        f'{module} imports {name}'
+        for module, names in IMPORTS.items()
+        for name in names
+        if not room_of(module).startswith('offline') and root_of(name) == 'rosbags'
+    ]
+
+
+def root_of(name: str) -> str:
+    return name.partition('.')[0]
+
+
+def test_file_and_class_names_are_unique() -> None:
+    """One name means one thing: neither a file nor a class may bear the name of another."""
+    files = Counter(path.name for path in MODULES.values() if not path.name.startswith('__'))
+    classes = Counter(
+        node.name
+        for path in MODULES.values()
+        for node in ast.walk(ast.parse(path.read_text(encoding='utf-8')))
+        if isinstance(node, ast.ClassDef)
+    )
+    assert not [name for name, count in (files + classes).items() if count > 1]
+
+
+def test_constants_of_one_name_have_one_value() -> None:
+    values: dict[str, set[str]] = {}
+    for path in MODULES.values():
+        for node in ast.parse(path.read_text(encoding='utf-8')).body:
+            if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name) and node.targets[0].id.isupper():
+                values.setdefault(node.targets[0].id, set()).add(ast.unparse(node.value))
+    assert not {name: found for name, found in values.items() if len(found) > 1 and name not in PER_COMMAND}
 
 
 def test_all_but_the_live_shell_imports_without_ros():

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from autocalib_ros.calibrator import CLOCK_JUMP_NS, AutoCalibrator, CalibrationProgress, FrameStatus
+from autocalib_ros.calibrator import CLOCK_JUMP_NS, AutoCalibrator, CalibrationProgress, ImageIntake
 from autocalib_ros.config import BufferOptions, GateOptions, Options
 from autocalib_ros.errors import InputError
 
@@ -92,21 +92,21 @@ def test_a_repeated_or_late_stamp_is_left_out(stamp_ns: int) -> None:
 @pytest.mark.parametrize(
     ('stamp_ns', 'size', 'expected'),
     [
-        (1_000_000_000, (180, 320), FrameStatus.USED),
-        (900_000_000, (180, 320), FrameStatus.LATE),  # the stamp of the image before
-        (1, (180, 320), FrameStatus.LATE),
-        (-100_000_000, (180, 320), FrameStatus.TIME_JUMPED),
-        (800_000_000 + CLOCK_JUMP_NS, (180, 320), FrameStatus.USED),
-        (900_000_000 + CLOCK_JUMP_NS, (180, 320), FrameStatus.TIME_JUMPED),
-        (1_000_000_000, (240, 320), FrameStatus.RESIZED),
+        (1_000_000_000, (180, 320), ImageIntake.USED),
+        (900_000_000, (180, 320), ImageIntake.LATE),  # the stamp of the image before
+        (1, (180, 320), ImageIntake.LATE),
+        (-100_000_000, (180, 320), ImageIntake.TIME_JUMPED),
+        (800_000_000 + CLOCK_JUMP_NS, (180, 320), ImageIntake.USED),
+        (900_000_000 + CLOCK_JUMP_NS, (180, 320), ImageIntake.TIME_JUMPED),
+        (1_000_000_000, (240, 320), ImageIntake.RESIZED),
     ],
 )
-def test_what_became_of_an_image_is_told(stamp_ns: int, size: tuple[int, int], expected: FrameStatus) -> None:
+def test_what_became_of_an_image_is_told(stamp_ns: int, size: tuple[int, int], expected: ImageIntake) -> None:
     assert fed(10).add_image(stamp_ns, image(30, size)) is expected
 
 
 def test_first_image_is_told() -> None:
-    assert AutoCalibrator(OPTIONS).add_image(0, image(0)) is FrameStatus.FIRST
+    assert AutoCalibrator(OPTIONS).add_image(0, image(0)) is ImageIntake.FIRST
 
 
 def test_clock_that_was_set_does_not_count_as_time_watched() -> None:

@@ -23,6 +23,7 @@ from autocalib_ros.lens.camera import Camera
 from autocalib_ros.lens.camera_info import camera_info
 from autocalib_ros.offline.simulate.options import SimulationOptions
 from autocalib_ros.offline.simulate.simulation import Simulation
+from autocalib_ros.offline.simulate.truth import truth_of
 from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_evidence
 from autocalib_ros.results.calibration import (
     GROUND_DISTANCES_M,
@@ -408,7 +409,7 @@ def worst_px(truth: dict[str, Any]) -> float:
 
 def test_the_truth_of_the_simulator_is_met():
     options = SimulationOptions(duration_s=1.0, width_px=640, height_px=360, k=(0.02, -0.004, 0.0, 0.0))
-    assert worst_px(Simulation(options).truth()) < 1e-4  # its pixels are rounded to 4 digits, half of it
+    assert worst_px(truth_of(Simulation(options))) < 1e-4  # its pixels are rounded to 4 digits, half of it
 
 
 @pytest.mark.skipif(

@@ -1,30 +1,29 @@
-"""The README's two commands: what a user runs first, and what .ci/run tests."""
+"""The README's two commands, which a user runs first and .ci/run tests, and its picture.
+
+What its text says is tested with the other pages in test_docs.py.
+"""
 
 import os
 import re
 import shlex
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
+from junction import full_result, junction_evidence
 
-from autocalib_ros.calibrator import solve
 from autocalib_ros.cli import main
 from autocalib_ros.commands.replay_command import DEFAULT_OUT
-from autocalib_ros.config import NodeOptions, Options, OptionSpec, walk_options
-from autocalib_ros.offline.synthetic.junction import Junction, synthetic_evidence
+from autocalib_ros.lens.camera import Camera
 from autocalib_ros.results.calibration_json import write_calibration_json
-from autocalib_ros.ros.status import Counts, Situation, status
 
 ROOT = Path(__file__).parent.parent
 README = ROOT / 'README.md'
 START = 'python3 -m venv'
-MADE = re.compile(r"(?:create_\w+\([^')]*|\w+_publisher\([^')]*|resolve_topic_name\()'([~/\w]+)'")
-"""A publisher, subscription, service or client that is made, and its name."""
 LARGEST_PICTURE = 300_000
 """Bytes that a page at its top may take to load."""
 
@@ -42,38 +41,6 @@ def test_readme_holds_two_commands(commands):
     assert commands[1].endswith('-m pytest -n 2')
 
 
-def table_row(name: str) -> str:
-    """Return the row of the table that begins with a name."""
-    rows = re.findall(rf'^\| `{re.escape(name)}`.*$', README.read_text(encoding='utf-8'), re.MULTILINE)
-    assert len(rows) == 1, f'{name}: {rows}'
-    return rows[0]
-
-
-@pytest.mark.parametrize('item', list(walk_options(NodeOptions())), ids=lambda item: item.name)
-def test_every_option_of_the_node_stands_in_the_table_with_its_default_and_choices(item: OptionSpec):
-    default = str(item.default).lower() if isinstance(item.default, bool) else str(item.default) or "`''`"
-    choices = f'; one of {", ".join(item.choices)}' if item.choices else ''
-    assert table_row(item.name) == f'| `{item.name}` | {default} | {item.doc}{choices} |'
-
-
-def test_every_value_of_diagnostics_is_listed():
-    keys = [key for key, _ in status(Situation(topic='', counts=Counts())).values]
-    prose = ' '.join(README.read_text(encoding='utf-8').split())
-    assert ', '.join(f'`{key}`' for key in keys) + '.' in prose
-
-
-@pytest.mark.parametrize('source', sorted((ROOT / 'autocalib_ros' / 'ros').glob('*.py')), ids=lambda path: path.name)
-def test_every_topic_and_service_of_the_live_shell_stands_in_a_table(source: Path):
-    for name in MADE.findall(source.read_text(encoding='utf-8')):
-        assert table_row(name)
-
-
-def test_topics_and_services_are_found_in_the_code():
-    text = ''.join(path.read_text(encoding='utf-8') for path in (ROOT / 'autocalib_ros' / 'ros').glob('*.py'))
-    known = {'image', 'camera_info_in', '/diagnostics', '~/camera_info', '~/calibrate', '~/top_view'}
-    assert known <= set(MADE.findall(text))
-
-
 def test_ci_runs_the_second_command(commands):
     script = (ROOT / '.ci' / 'run').read_text(encoding='utf-8')
     extraction = re.search(r'test_command=\$\((.*)\)$', script, re.MULTILINE)
@@ -88,19 +55,6 @@ def test_ci_runs_the_second_command(commands):
     assert done.stdout.strip() == commands[1]
 
 
-def test_the_example_of_a_tracker_runs(tmp_path, monkeypatch):
-    (block,) = re.findall(r'^```python\n(.*?)^```$', README.read_text(encoding='utf-8'), re.MULTILINE | re.DOTALL)
-    evidence = synthetic_evidence(Junction(), np.random.default_rng(0))
-    (tmp_path / 'results').mkdir()
-    write_calibration_json(tmp_path / 'results' / 'calibration.json', solve(evidence, Options(camera_height=8.0)))
-    monkeypatch.chdir(tmp_path)
-    measured = []
-    names = {'tracker': SimpleNamespace(measure=lambda place, noise: measured.append((place.shape, noise.shape)))}
-    exec(compile(block, str(README), 'exec'), names)
-    assert measured == [((2,), (2, 2))] * 2
-    assert names['seen'].shape == (2,) and (names['found'].sigma_m > 0).all()
-
-
 def test_the_picture_at_the_top_is_what_its_command_makes(tmp_path, monkeypatch):
     ((link, title),) = re.findall(r'!\[[^\]]+\]\((\S+) "([^"]+)"\)', README.read_text(encoding='utf-8'))
     demo, picture = (shlex.split(command) for command in title.split(' && '))
@@ -109,9 +63,12 @@ def test_the_picture_at_the_top_is_what_its_command_makes(tmp_path, monkeypatch)
     assert Path(picture[2]).parent == Path(picture[3]).parent == DEFAULT_OUT
     assert (ROOT / link).stat().st_size < LARGEST_PICTURE
     # the same command on images of a moment, in place of the recording that takes minutes to simulate
-    evidence = synthetic_evidence(Junction(), np.random.default_rng(0))
     monkeypatch.chdir(tmp_path)
-    write_calibration_json(Path(picture[2]), solve(evidence, Options(camera_height=8.0)))
+    result = full_result(junction_evidence())
+    evidence = replace(result.evidence, image_size=(1280, 720))
+    write_calibration_json(
+        Path(picture[2]), replace(result, camera=Camera.equidistant(1280, 720, 560.0), evidence=evidence)
+    )
     still = picture[3] + '.avi'
     writer = cv2.VideoWriter(still, cv2.VideoWriter_fourcc(*'MJPG'), 0.1, (1280, 720))
     for _ in range(6):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from autocalib_ros.config import Options
 from autocalib_ros.errors import InputError
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.lens.camera import Camera
+from autocalib_ros.offline.recordings.open import open_source
 from autocalib_ros.offline.recordings.sources import Source
 from autocalib_ros.perception.detector.detector import VehicleDetector
 from autocalib_ros.report.scene import SolutionSnapshot, append_snapshot
@@ -41,18 +43,21 @@ class ReplayResult:
 
 
 def replay(
-    source: Source,
+    recording: Source | Path | str,
     options: Options,
     on_progress: Callable[[int, str], None] | None = None,
     lens: Camera | None = None,
     detector: VehicleDetector | None = None,
 ) -> ReplayResult:
-    """Go through a recording and solve at its end; `on_progress` is told the frames done and a short note.
+    """Go through a recording, a path or an open one, and solve at its end.
+
+    `on_progress` gets the number of frames done and a short note.
 
     The first word of the note is the state: collecting, solving, calibrated or refused. With a known `lens` only the
     pose is solved; UsageError at the first image that is not of its shape. A `detector` that is open already is used,
     else that of the options is opened.
     """
+    source = open_source(recording) if isinstance(recording, (str, Path)) else recording
     report_progress = on_progress or (lambda done, note: None)
     calibrator, accepted_at_s, count, note, scaled_lens = AutoCalibrator(options, detector), None, 0, '', None
     latest: Calibration | Refusal | None = None

@@ -9,7 +9,7 @@ import numpy as np
 
 WIDTH_PX = 640
 MAX_CORNERS = 80
-INTERVAL_S = 0.5
+CHECK_INTERVAL_S = 0.5
 MIN_BACKGROUND_CORNERS = 8
 """Fewer background points say nothing: rain, darkness, a covered lens."""
 MAX_ROUND_TRIP_PX = 0.5
@@ -50,10 +50,10 @@ class DriftMonitor:
         self._factor = 1.0
 
     def update(self, grey: np.ndarray, time_s: float) -> None:
-        """Look at a grey image (H, W), at most every `INTERVAL_S`."""
+        """Look at a grey image (H, W), at most every `CHECK_INTERVAL_S`."""
         if time_s < self._next_s:
             return
-        self._next_s = time_s + INTERVAL_S
+        self._next_s = time_s + CHECK_INTERVAL_S
         self._factor = max(1.0, grey.shape[1] / WIDTH_PX)
         size = (round(grey.shape[1] / self._factor), round(grey.shape[0] / self._factor))
         reduced = cv2.resize(grey, size, interpolation=cv2.INTER_AREA) if self._factor > 1 else grey

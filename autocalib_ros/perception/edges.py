@@ -12,7 +12,7 @@ from autocalib_ros.perception.motion_mask import Region
 MIN_EDGE_LENGTH = 0.012
 """Shortest edge, share of the image width; below, its direction is hardly known."""
 MIN_EDGE_LENGTH_PX = 10.0
-FULL_RESOLUTION_SIDE_PX = 96
+EDGE_FULL_RESOLUTION_SIDE_PX = 96
 """Regions beyond this side are searched at half size, beyond twice this at a quarter: large edges lose nothing."""
 MAX_REGIONS = 8
 """Regions looked at in one image, largest first; smaller ones have hardly an edge."""
@@ -62,9 +62,9 @@ class EdgeFinder:
         height, width = crop.shape
         halvings = (
             0
-            if max(height, width) <= FULL_RESOLUTION_SIDE_PX
+            if max(height, width) <= EDGE_FULL_RESOLUTION_SIDE_PX
             else 1
-            if max(height, width) <= 2 * FULL_RESOLUTION_SIDE_PX
+            if max(height, width) <= 2 * EDGE_FULL_RESOLUTION_SIDE_PX
             else 2
         )
         size = (max(1, width >> halvings), max(1, height >> halvings))

@@ -17,7 +17,7 @@ MAX_ABSOLUTE_VALUE = 1e9
 """Beyond any temperature or count, and small enough to be squared."""
 CLIPPED_FRACTION, CLIPPED_S = 0.25, 2.0
 """Where so much of the image has been outside the limits for so long, new ones are taken at once."""
-SAMPLES_PER_SIDE = 128
+HISTOGRAM_SAMPLES = 128
 DEFAULT_INTERVAL_S = 0.1
 """Taken for the time between two images whose stamps do not tell."""
 
@@ -57,7 +57,7 @@ class IntensityNormaliser:
         return np.clip((image - np.float32(low)) * np.float32(scale) + np.float32(0.5), 0, 255).astype(np.uint8)
 
     def _update_limits(self, image: np.ndarray, encoding: str, stamp_s: float | None) -> None:
-        every_y, every_x = (max(1, side // SAMPLES_PER_SIDE) for side in image.shape[:2])
+        every_y, every_x = (max(1, side // HISTOGRAM_SAMPLES) for side in image.shape[:2])
         samples = image[::every_y, ::every_x].reshape(-(-image.shape[0] // every_y), -1).astype(np.float32)
         if np.isnan(samples).any():
             known = samples[~np.isnan(samples)]

@@ -23,7 +23,7 @@ from autocalib_ros.perception.images import (
 
 BLACK_LUMA, NO_CHROMA = 16, 128
 """Black in limited-range YUV."""
-JPEG_QUALITY = 95
+MASKED_JPEG_QUALITY = 95
 
 
 def require_maskable(message: Any) -> None:
@@ -136,5 +136,5 @@ def _mask_compressed(message: Any, polygons: Polygons) -> np.ndarray:
     mask = ignored_mask(polygons, image.shape[1::-1])
     dark = _with_dark_mask(image.reshape(*mask.shape, -1), mask).reshape(image.shape)
     if data[0] == 0xFF:
-        return cv2.imencode('.jpg', dark, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].ravel()
+        return cv2.imencode('.jpg', dark, [cv2.IMWRITE_JPEG_QUALITY, MASKED_JPEG_QUALITY])[1].ravel()
     return cv2.imencode('.png', dark, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].ravel()

@@ -45,7 +45,7 @@ TRACKED_COLOUR, HORIZON_COLOUR, AXIS_COLOURS = '#ffe14d', '#ff7bd5', ('#ff5544',
 """Colours: points followed now, the horizon, x and y of the ground frame."""
 MAX_PATHS = 80
 """Tracks of a road, or rejected, that are drawn: more would hide the road."""
-TOP_VIEW_PX = 640
+LIVE_TOP_VIEW_PX = 640
 SCALE_BAR_FRACTION = 0.2
 """Length of the scale bar, share of the picture's width at the most."""
 FOOT_MARGIN_HEIGHTS = 0.6
@@ -171,7 +171,7 @@ class TopPicture:
             return None
         foot = FOOT_MARGIN_HEIGHTS * ground.height_m * np.array([[-1.0, -1.0], [1.0, 1.0]])
         around = np.concatenate([seen, foot])
-        return cls(TopView.between(around.min(axis=0), around.max(axis=0), TOP_VIEW_PX), camera, ground)
+        return cls(TopView.between(around.min(axis=0), around.max(axis=0), LIVE_TOP_VIEW_PX), camera, ground)
 
     def draw(self, image: np.ndarray) -> np.ndarray:
         """Return the picture of an image, grey or BGR."""

@@ -37,7 +37,7 @@ NEAR_HEIGHTS = 6.0
 """The view from above is about the middle of the road that is nearer than this, so many camera heights."""
 SPAN_HEIGHTS = 5.5
 """Camera heights that it shows from top to bottom: beyond, a pixel of the image covers too much."""
-SAMPLES_PER_SIDE = 48
+HORIZON_SAMPLES = 48
 
 
 def showcase(known: SavedCamera, image: np.ndarray) -> np.ndarray:
@@ -82,7 +82,7 @@ def _upright(ground: GroundPlane) -> GroundPlane:
 
 
 def _view(camera: Camera, ground: GroundPlane, rows: int) -> TopView:
-    near = nearby_road_points(camera, ground, pixel_grid(camera, SAMPLES_PER_SIDE, SAMPLES_PER_SIDE), NEAR_HEIGHTS)
+    near = nearby_road_points(camera, ground, pixel_grid(camera, HORIZON_SAMPLES, HORIZON_SAMPLES), NEAR_HEIGHTS)
     if len(near) < 2:
         raise InputError(f'its image shows no road nearer than {NEAR_HEIGHTS:g} times the height of the camera')
     middle = (near.min(axis=0) + near.max(axis=0)) / 2

@@ -224,7 +224,7 @@ def next_step(result: Calibration | Refusal) -> str:
 
 
 @dataclass(frozen=True)
-class Requirement:
+class ReportRequirement:
     """One thing that a calibration needs, what was found of it, and whether that was enough."""
 
     name: str
@@ -250,7 +250,7 @@ MISSING_BY_CODE = {
 """What was missing, by the code of the refusal."""
 
 
-def needs(result: Calibration | Refusal, evidence: Evidence, gate: GateOptions) -> list[Requirement]:
+def needs(result: Calibration | Refusal, evidence: Evidence, gate: GateOptions) -> list[ReportRequirement]:
     """List what a calibration needs of the traffic and what stopped this one; nothing where nothing is missing."""
     refusal = result if isinstance(result, Refusal) else result.ground_refusal
     if refusal is None:
@@ -259,7 +259,7 @@ def needs(result: Calibration | Refusal, evidence: Evidence, gate: GateOptions) 
     counted = (
         (
             ('camera_moving',),
-            Requirement(
+            ReportRequirement(
                 'the camera stands still',
                 f'the background moved by {evidence.drift_px:.1f} px',
                 f'{limit:.1f} px at the most',
@@ -268,7 +268,7 @@ def needs(result: Calibration | Refusal, evidence: Evidence, gate: GateOptions) 
         ),
         (
             ('no_motion', 'too_few_tracks'),
-            Requirement(
+            ReportRequirement(
                 'tracks of moving traffic',
                 f'{evidence.track_count}',
                 f'{gate.min_tracks} or more',
@@ -277,7 +277,7 @@ def needs(result: Calibration | Refusal, evidence: Evidence, gate: GateOptions) 
         ),
         (
             ('poor_coverage',),
-            Requirement(
+            ReportRequirement(
                 'image crossed by traffic',
                 f'{100 * evidence.coverage:.0f} %',
                 f'{100 * gate.min_coverage:.0f} % or more',
@@ -290,7 +290,7 @@ def needs(result: Calibration | Refusal, evidence: Evidence, gate: GateOptions) 
         return rows
     return [
         *rows,
-        Requirement(
+        ReportRequirement(
             MISSING_BY_CODE.get(refusal.code, refusal.code.replace('_', ' ')),
             _sentence(_capital(refusal.message)),
             '',

@@ -18,16 +18,15 @@ import rclpy
 from geometry_msgs.msg import PolygonStamped, TransformStamped
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
+from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import CameraInfo, PointCloud2, PointField
 from std_msgs.msg import Header
 
 from autocalib_ros.errors import InputError
 from autocalib_ros.ground import Ground
 from autocalib_ros.ros.messages import header, validated
+from autocalib_ros.ros.qos import LATCHED
 
-LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-"""The calibration, however long ago it was published; without transient local it would never come."""
 WARN_PERIOD_S = 10.0
 
 

@@ -20,7 +20,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from autocalib_ros.calibrator import AutoCalibrator, CalibrationProgress, FrameStatus
+from autocalib_ros.calibrator import AutoCalibrator, CalibrationProgress, ImageIntake
 from autocalib_ros.config import Options
 from autocalib_ros.errors import AutocalibError
 from autocalib_ros.evidence.snapshot import Evidence
@@ -280,10 +280,10 @@ class CalibrationWorker:
         except Exception as error:  # an unattended camera must survive one bad frame
             self._listener.failed(error)
             return
-        if frame_status is FrameStatus.LATE:
+        if frame_status is ImageIntake.LATE:
             self.counters.late += 1
             return
-        if frame_status in (FrameStatus.TIME_JUMPED, FrameStatus.RESIZED):
+        if frame_status in (ImageIntake.TIME_JUMPED, ImageIntake.RESIZED):
             self._refused = ''
             self._listener.on_evidence_reset(frame_status.value)
         self.counters.used += 1

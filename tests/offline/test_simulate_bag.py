@@ -12,9 +12,11 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from autocalib_ros.errors import UsageError
-from autocalib_ros.offline.simulate import add_arguments, options_from, run, write_bag
+from autocalib_ros.offline.simulate import add_arguments, run, write_bag
+from autocalib_ros.offline.simulate.command import options_from
 from autocalib_ros.offline.simulate.options import SCENES, SimulationOptions
 from autocalib_ros.offline.simulate.simulation import Simulation
+from autocalib_ros.offline.simulate.truth import truth_of
 
 # One road is quickest to draw.
 TINY = {'width_px': 160, 'height_px': 90, 'focal_px': 70.0, 'rate_hz': 5.0, 'duration_s': 0.6, 'one_way': True}
@@ -85,7 +87,7 @@ def test_truth_is_written_beside_the_images(tmp_path):
     options = SimulationOptions(**TINY)
     path = write_bag(tmp_path / 'bag', options, workers=1)
     written = json.loads((path / 'truth.json').read_text())
-    assert written == json.loads(json.dumps(Simulation(options).truth()))
+    assert written == json.loads(json.dumps(truth_of(Simulation(options))))
 
 
 def test_progress_counts_every_frame(tmp_path):

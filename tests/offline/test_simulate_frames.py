@@ -8,6 +8,7 @@ import pytest
 
 from autocalib_ros.offline.simulate.options import SimulationOptions
 from autocalib_ros.offline.simulate.simulation import Simulation
+from autocalib_ros.offline.simulate.truth import truth_of
 
 SMALL = {'width_px': 320, 'height_px': 180, 'focal_px': 140.0, 'rate_hz': 5.0, 'duration_s': 4.0}
 
@@ -137,7 +138,7 @@ def test_another_seed_gives_another_picture(day):
 def test_other_networks_can_be_drawn(given):
     simulation = _simulation(**given)
     assert simulation.frame(2).std() > 20
-    assert len(simulation.truth()['road_directions']) == len(simulation.network.roads)
+    assert len(truth_of(simulation)['road_directions']) == len(simulation.network.roads)
 
 
 def test_stamps_advance_by_the_frame_time(day):

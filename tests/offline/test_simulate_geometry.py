@@ -13,6 +13,7 @@ from autocalib_ros.offline.simulate.faces import Canvas, Faces, PixelRect, Textu
 from autocalib_ros.offline.simulate.lens import CameraPose, KannalaBrandtLens, look_rotation
 from autocalib_ros.offline.simulate.options import SimulationOptions
 from autocalib_ros.offline.simulate.simulation import Simulation
+from autocalib_ros.offline.simulate.truth import truth_of
 
 SMALL = {'width_px': 320, 'height_px': 180, 'focal_px': 140.0, 'rate_hz': 5.0, 'duration_s': 2.0}
 
@@ -89,7 +90,7 @@ def test_nearer_face_hides_the_farther_one_in_any_order():
 
 @pytest.fixture(scope='module')
 def truth() -> dict:
-    return Simulation(SimulationOptions(**SMALL, bump_at_s=1.0)).truth()
+    return truth_of(Simulation(SimulationOptions(**SMALL, bump_at_s=1.0)))
 
 
 def test_truth_has_the_keys_of_the_scenes(truth):

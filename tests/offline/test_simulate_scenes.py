@@ -18,6 +18,7 @@ from autocalib_ros.offline.simulate.roundabout import RING_RADIUS_M
 from autocalib_ros.offline.simulate.scenes import BEND_RADIUS_M, build_network
 from autocalib_ros.offline.simulate.simulation import Simulation
 from autocalib_ros.offline.simulate.traffic_flow import simulate_traffic
+from autocalib_ros.offline.simulate.truth import truth_of
 from autocalib_ros.offline.simulate.vehicle_models import STEP_S, SimulatedTraffic, Vehicle, VehicleState
 
 TINY = {'width_px': 192, 'height_px': 108, 'focal_px': 84.0, 'rate_hz': 2.0, 'duration_s': 2.0}
@@ -134,7 +135,7 @@ def test_vehicles_of_no_scene_overlap(scene: str, seed: int) -> None:
 @each_scene
 def test_every_scene_renders_and_has_its_truth(scene: str) -> None:
     simulation = Simulation(SimulationOptions(**TINY, scene=scene))
-    truth = json.loads(json.dumps(simulation.truth()))
+    truth = json.loads(json.dumps(truth_of(simulation)))
     assert truth['scene'] == scene and truth['road_directions']
     assert len(truth['ground_points']['rows']) == 48
     assert scene == 'sparse' or truth['vehicles']['tracks']

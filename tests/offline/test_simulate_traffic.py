@@ -13,6 +13,7 @@ from autocalib_ros.offline.simulate.options import SimulationOptions
 from autocalib_ros.offline.simulate.scenes import build_network
 from autocalib_ros.offline.simulate.simulation import Simulation
 from autocalib_ros.offline.simulate.traffic_flow import simulate_traffic
+from autocalib_ros.offline.simulate.truth import truth_of
 from autocalib_ros.offline.simulate.vehicle_models import STEP_S, SimulatedTraffic, Vehicle, Wander
 
 MINUTE = SimulationOptions()
@@ -136,7 +137,7 @@ def test_another_seed_gives_other_traffic(network, traffic):
 
 def test_cyclists_ride_along_their_road_and_are_in_the_truth():
     options = SimulationOptions(cyclists=8, pedestrians=4, duration_s=20.0)
-    truth = Simulation(options).truth()
+    truth = truth_of(Simulation(options))
     everybody = [track for track in truth['people']['tracks'] if track['type'] == 'cyclist']
     assert len(everybody) >= 6
     assert {track['type'] for track in truth['people']['tracks']} == {'cyclist', 'pedestrian'}

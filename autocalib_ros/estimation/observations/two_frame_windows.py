@@ -25,7 +25,7 @@ MIN_POINTS = 5
 """A window's own motion takes two unknowns; fewer points say too little beyond."""
 MAX_NEIGHBOUR_DISTANCE = 0.06
 """Points of one body lie within this of a neighbour, share of the image width."""
-MIN_DISPLACEMENT = 0.01
+MIN_WINDOW_DISPLACEMENT = 0.01
 """Shortest displacement in a window, share of the image width; below it is more noise than motion."""
 MAX_MOTION_DIFFERENCE, MAX_MOTION_DIFFERENCE_PX = 0.25, 2.0
 """Displacements of neighbours on one body differ by less than this share and so many pixels: it turns, and what is
@@ -236,7 +236,7 @@ def _split_into_bodies(groups: list[_PointGroup], width: int) -> list[_PointGrou
     for group in groups:
         moves = group.second - group.first
         far = np.hypot(moves[:, 0], moves[:, 1])
-        moving = far > MIN_DISPLACEMENT * width
+        moving = far > MIN_WINDOW_DISPLACEMENT * width
         together = (
             (_pairwise_distances(group.first) < MAX_NEIGHBOUR_DISTANCE * width)
             & (_pairwise_distances(group.second) < MAX_NEIGHBOUR_DISTANCE * width)

@@ -41,7 +41,7 @@ MIN_CLEARANCE_CELLS = 2.0
 """Outlines nearer to each other than so many such pixels, or to the border, may be of one body."""
 MAX_MOTION_CELL_M = 0.5
 """What is so far away that such a pixel is as wide as a rider has no width."""
-MAX_DISTANCE_HEIGHTS = 8.0
+MAX_RIDER_DISTANCE_HEIGHTS = 8.0
 """Heights of the camera from its foot beyond which a pixel is worth too many metres."""
 HEADING_WINDOW_S = 0.5
 """An outline goes where its points went within so long."""
@@ -61,7 +61,7 @@ def cyclists(evidence: Evidence, camera: Camera, normal: np.ndarray, height_m: f
     sizes = measure_silhouettes(outlines, camera, normal, height_m)
     side = MOTION_CELL * evidence.image_size[0]
     grain_m = side * sizes.width / np.maximum(np.ptp(outlines[:, :-1:2], axis=1), side)
-    near = (sizes.distance < MAX_DISTANCE_HEIGHTS * height_m) & (grain_m < MAX_MOTION_CELL_M)
+    near = (sizes.distance < MAX_RIDER_DISTANCE_HEIGHTS * height_m) & (grain_m < MAX_MOTION_CELL_M)
     whole = near & (outlines[:, -1] >= MIN_CLEARANCE_CELLS * side) & ~_fragmented(owners, times)
     steps, at_s, of_step = _displacements(evidence, camera, normal, height_m)
     found = []
@@ -107,7 +107,7 @@ def _displacements(
     instants = ResampledTracks(evidence)
     pixels, starts = instants.all()
     places = ground_points(camera, normal, height_m, pixels)
-    near = np.hypot(*places.T) < MAX_DISTANCE_HEIGHTS * height_m
+    near = np.hypot(*places.T) < MAX_RIDER_DISTANCE_HEIGHTS * height_m
     tracks = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
     begin = np.flatnonzero((tracks[1:] == tracks[:-1]) & near[1:] & near[:-1])
     ordinal = instants.begin[tracks[begin]] + begin - starts[tracks[begin]]

@@ -15,7 +15,7 @@ from autocalib_ros.estimation.observations.two_frame_windows import (
     ResampledTracks,
     group_indices,
 )
-from autocalib_ros.estimation.people.cyclists import MAX_DISTANCE_HEIGHTS, cyclists
+from autocalib_ros.estimation.people.cyclists import MAX_RIDER_DISTANCE_HEIGHTS, cyclists
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.ground_plane import ground_points
 from autocalib_ros.lens.camera import Camera
@@ -65,7 +65,7 @@ def find_pedestrians(evidence: Evidence, camera: Camera, normal: np.ndarray, hei
     instants = ResampledTracks(evidence)
     pixels, starts = instants.all()
     places = ground_points(camera, normal, height_m, pixels)
-    near = np.hypot(*places.T) < MAX_DISTANCE_HEIGHTS * height_m
+    near = np.hypot(*places.T) < MAX_RIDER_DISTANCE_HEIGHTS * height_m
     times = np.arange(len(places)) + np.repeat(instants.begin - starts[:-1], np.diff(starts))
     paths = [np.arange(*ends)[near[slice(*ends)]] for ends in zip(starts[:-1], starts[1:], strict=True)]
     groups = group_indices(evidence.track_vehicles)

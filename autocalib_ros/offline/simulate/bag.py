@@ -22,6 +22,7 @@ from rosbags.typesys.store import Typestore
 from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.offline.simulate.options import SimulationOptions
 from autocalib_ros.offline.simulate.simulation import Simulation
+from autocalib_ros.offline.simulate.truth import truth_of
 
 TRUTH_FILE_NAME = 'truth.json'
 _BAG_VERSION: Literal[9] = 9
@@ -51,7 +52,7 @@ def write_bag(
     try:
         with _writer(path, options) as writer:
             _write_messages(writer, simulation, workers or _core_count(), progress)
-        text = json.dumps(simulation.truth(), indent=1)
+        text = json.dumps(truth_of(simulation), indent=1)
         (path / TRUTH_FILE_NAME).write_text(text, encoding='utf-8')
     except BaseException as error:
         shutil.rmtree(path, ignore_errors=True)  # half a bag is worse than none

@@ -12,7 +12,7 @@ from autocalib_ros.offline.simulate.ground_surface import PAVEMENT_WIDTH_M, edge
 from autocalib_ros.offline.simulate.network import Network, Road
 from autocalib_ros.offline.simulate.palette import Palette
 
-_TEXELS_PER_M = 24
+_SCENERY_TEXELS_PER_M = 24
 _PANEL_M = 6.0
 _LAMP_POSITIONS_M = np.arange(-105.0, 106.0, 30.0)
 _BARRIER_HEIGHT_M = 0.8
@@ -98,15 +98,15 @@ def _building(
 
 def _wall_texture(height: float, wall: tuple[int, int, int], palette: Palette, rng: np.random.Generator) -> Texture:
     """Paint one panel with two windows to the storey."""
-    rows, columns = round(height * _TEXELS_PER_M), round(_PANEL_M * _TEXELS_PER_M)
+    rows, columns = round(height * _SCENERY_TEXELS_PER_M), round(_PANEL_M * _SCENERY_TEXELS_PER_M)
     picture = paint.filled_image(rows, columns, wall)
     octaves = [(s, 5.0 * palette.texture) for s in (1.5, 5.0, 20.0)]
     paint.add_noise(picture, paint.octave_noise(rows, columns, octaves, rng))
-    storey = 3.2 * _TEXELS_PER_M
-    for top in np.arange(0.8 * _TEXELS_PER_M, rows - storey / 2, storey):
+    storey = 3.2 * _SCENERY_TEXELS_PER_M
+    for top in np.arange(0.8 * _SCENERY_TEXELS_PER_M, rows - storey / 2, storey):
         for left in (0.12, 0.60):
             x0, x1 = left * columns, (left + 0.27) * columns
-            y0, y1 = top, top + 1.5 * _TEXELS_PER_M
+            y0, y1 = top, top + 1.5 * _SCENERY_TEXELS_PER_M
             glass = paint.mix_colours(palette.window, palette.sky_low, float(rng.uniform(0, 0.5)))
             box = np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)])
             frame = box + [(-2, -2), (2, -2), (2, 2), (-2, 2)]

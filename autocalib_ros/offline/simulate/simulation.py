@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
@@ -15,7 +14,6 @@ from autocalib_ros.offline.simulate.options import SimulationOptions
 from autocalib_ros.offline.simulate.render import Renderer, SceneState
 from autocalib_ros.offline.simulate.scenes import build_network
 from autocalib_ros.offline.simulate.traffic_flow import simulate_traffic
-from autocalib_ros.offline.simulate.truth import truth_of
 from autocalib_ros.offline.simulate.vehicle_models import Vehicle, VehicleState
 
 _START_NS = 1_700_000_000_000_000_000
@@ -103,10 +101,6 @@ class Simulation:
         """Return all vehicles under way at a time."""
         found = ((vehicle, vehicle.state(time_s)) for vehicle in self.traffic.vehicles)
         return [(vehicle, state) for vehicle, state in found if state is not None]
-
-    def truth(self) -> dict[str, Any]:
-        """Return the truth in the format of truth.json."""
-        return truth_of(self)
 
 
 def _shake(options: SimulationOptions) -> np.ndarray:

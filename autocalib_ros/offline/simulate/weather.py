@@ -19,7 +19,7 @@ from autocalib_ros.offline.simulate.paint import octave_noise
 from autocalib_ros.offline.simulate.sensor import add_glow
 from autocalib_ros.offline.simulate.vehicle_models import Vehicle, VehicleState
 
-_OCCLUSION_MARGIN_M = 0.4
+_RAIN_OCCLUSION_MARGIN_M = 0.4
 """What is nearer than the ground behind it by more stands before it."""
 _SUN_RAD = math.radians(28.0)
 _SHADOW_ATTENUATION = 0.5
@@ -66,7 +66,7 @@ class GroundBuffer:
 
     def visible(self, depth_m: np.ndarray) -> np.ndarray:
         """Where (h, w) the ground is seen, given the distance (h, w) of what is nearest."""
-        return np.isfinite(self.distance_m) & (depth_m > self.distance_m - _OCCLUSION_MARGIN_M)
+        return np.isfinite(self.distance_m) & (depth_m > self.distance_m - _RAIN_OCCLUSION_MARGIN_M)
 
 
 @dataclass(frozen=True)
@@ -205,7 +205,7 @@ class Weather:
                 column, row = (round(float(c)) for c in pixel)
                 if turned < 0.05 or not valid or not (0 <= row < height and 0 <= column < width):
                     continue
-                if view.depth_m[row, column] < ground.distance_m[row, column] - _OCCLUSION_MARGIN_M:
+                if view.depth_m[row, column] < ground.distance_m[row, column] - _RAIN_OCCLUSION_MARGIN_M:
                     continue
                 texel = (ground.xy[row, column] / _PUDDLE_SIZE_M * 6.0).astype(int) % _CLOUD_TEXELS
                 # A film of water mirrors the more, the flatter one looks at it.

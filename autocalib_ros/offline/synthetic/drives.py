@@ -6,14 +6,11 @@ Each function returns positions (n, 2) in metres and headings (n,) in radians, e
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 
 from autocalib_ros.offline.simulate.network import Network
-
-if TYPE_CHECKING:
-    from autocalib_ros.offline.synthetic.junction import Junction
 
 INTERVAL_S = 0.1
 DRIVE_REACH_M = 45.0
@@ -39,10 +36,46 @@ SHADOW_M = (0.5, 2.0)
 Trajectory = tuple[np.ndarray, np.ndarray]
 Companion = Callable[[np.ndarray, np.ndarray, np.random.Generator], Trajectory]
 """What moves with a vehicle and is taken for part of it: from its positions and headings, those of the other."""
-Drive = Callable[['Junction', np.random.Generator], Trajectory]
 
 
-def drive_across(junction: Junction, generator: np.random.Generator) -> Trajectory:
+class DriveSite(Protocol):
+    """What a drive has to know of its junction; `synthetic.junction.Junction` describes each value."""
+
+    @property
+    def centre_m(self) -> tuple[float, float]:
+        """Where the roads cross, ground frame, metres."""
+        ...
+
+    @property
+    def lane_change_fraction(self) -> float:
+        """Fraction of the vehicles that change lanes."""
+        ...
+
+    @property
+    def lanes_m(self) -> tuple[float, ...]:
+        """Offsets of the lanes to the right of the middle of the road, metres."""
+        ...
+
+    @property
+    def road_angles_deg(self) -> tuple[float, ...]:
+        """Direction of each road in the ground frame, degrees."""
+        ...
+
+    @property
+    def turning_fraction(self) -> float:
+        """Fraction of the vehicles that turn off."""
+        ...
+
+    @property
+    def wander_m(self) -> float:
+        """Lateral wander of a driver, one sigma, metres."""
+        ...
+
+
+Drive = Callable[[DriveSite, np.random.Generator], Trajectory]
+
+
+def drive_across(junction: DriveSite, generator: np.random.Generator) -> Trajectory:
     """Follow one of the roads through the junction, or turn off it."""
     road = np.radians(generator.choice(junction.road_angles_deg))
     way = generator.choice([0.0, np.pi])
@@ -65,7 +98,7 @@ def drive_across(junction: Junction, generator: np.random.Generator) -> Trajecto
 
 
 def drive_bend(
-    junction: Junction, generator: np.random.Generator, *, radius_m: float, towards_rad: float
+    junction: DriveSite, generator: np.random.Generator, *, radius_m: float, towards_rad: float
 ) -> Trajectory:
     """Follow a bend of one radius through the junction's middle; its centre lies `towards_rad` of there."""
     middle = np.array(junction.centre_m) + radius_m * _unit(np.array(towards_rad))
@@ -76,7 +109,7 @@ def drive_bend(
     return _on_circle(junction, generator, along, middle, radius_m + way * LANE_M / 2, bearing, way)
 
 
-def drive_ring(junction: Junction, generator: np.random.Generator, *, radius_m: float) -> Trajectory:
+def drive_ring(junction: DriveSite, generator: np.random.Generator, *, radius_m: float) -> Trajectory:
     """Go round a roundabout, anticlockwise, from one arm to another."""
     speed = generator.uniform(4.0, 9.0)
     along = np.arange(0.0, generator.uniform(0.5, 1.5) * np.pi * radius_m, speed * INTERVAL_S)
@@ -86,7 +119,7 @@ def drive_ring(junction: Junction, generator: np.random.Generator, *, radius_m: 
 
 
 def drive_route(
-    junction: Junction,
+    junction: DriveSite,
     generator: np.random.Generator,
     *,
     network: Network,
@@ -114,7 +147,7 @@ def drive_route(
     return (np.column_stack([np.interp(at, times, path[:, axis]) for axis in (0, 1)]), np.interp(at, times, heading))
 
 
-def walk_along_road(junction: Junction, generator: np.random.Generator) -> Trajectory:
+def walk_along_road(junction: DriveSite, generator: np.random.Generator) -> Trajectory:
     """Walk on a pavement along a road, slowly, with sudden changes of heading."""
     road = np.radians(generator.choice(junction.road_angles_deg))
     along_road = _unit(np.array(road))
@@ -127,7 +160,7 @@ def walk_along_road(junction: Junction, generator: np.random.Generator) -> Traje
     return start + np.cumsum(speed[:, None] * INTERVAL_S * _unit(heading), axis=0), heading
 
 
-def drive_arc(junction: Junction, generator: np.random.Generator, *, radii_m: tuple[float, float]) -> Trajectory:
+def drive_arc(junction: DriveSite, generator: np.random.Generator, *, radii_m: tuple[float, float]) -> Trajectory:
     """Turn on an arc of the vehicle's own through the junction's middle."""
     return drive_bend(
         junction, generator, radius_m=generator.uniform(*radii_m), towards_rad=generator.uniform(0, 2 * np.pi)
@@ -166,7 +199,7 @@ def shadow(path: np.ndarray, heading: np.ndarray, generator: np.random.Generator
 
 
 def _on_circle(
-    junction: Junction,
+    junction: DriveSite,
     generator: np.random.Generator,
     along: np.ndarray,
     centre: np.ndarray,
@@ -193,7 +226,7 @@ def _times(way: np.ndarray, speeds: np.ndarray) -> np.ndarray:
     return np.concatenate([[0.0], np.cumsum(2 * np.diff(way) / (speeds[1:] + speeds[:-1]))])
 
 
-def _wander(junction: Junction, generator: np.random.Generator, along: np.ndarray) -> np.ndarray:
+def _wander(junction: DriveSite, generator: np.random.Generator, along: np.ndarray) -> np.ndarray:
     """Lateral offset (n,) within the lane, `wander_m` root mean square, in waves of 25 to 80 m."""
     sway = sum(
         np.sin(along * 2 * np.pi / generator.uniform(25, 80) + generator.uniform(0, 2 * np.pi)) for _ in range(2)
