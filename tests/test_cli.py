@@ -228,7 +228,7 @@ def test_an_interrupt_ends_quietly(still_video, tmp_path, monkeypatch, capsys):
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr('autocalib_ros.offline.recordings.sources.open_source', interrupted)
+    monkeypatch.setattr('autocalib_ros.offline.recordings.open.open_source', interrupted)
     assert main(['replay', str(still_video), '--out', str(tmp_path / 'out')]) == 130
     assert 'Traceback' not in capsys.readouterr().err
 

@@ -19,7 +19,6 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from junction import full_result, junction_evidence, refusal
 
 import autocalib_ros
 from autocalib_ros.cli import _parse_arguments, main
@@ -47,6 +46,7 @@ from autocalib_ros.perception.images import PACKED_ENCODINGS, PLANAR_ENCODINGS, 
 from autocalib_ros.results.calibration_json import to_json, write_calibration_json
 from autocalib_ros.results.refusals import REFUSALS
 from autocalib_ros.ros.status import Counts, Situation, status
+from synthetic_results import full_result, junction_evidence, refusal
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / 'docs'

@@ -11,11 +11,11 @@ from types import ModuleType, SimpleNamespace
 import cv2
 import numpy as np
 import pytest
-from junction import full_result, grey_road, junction_evidence, lens_result
 
 from autocalib_ros.ground import Ground
 from autocalib_ros.offline.replay_recording import ReplayResult
 from autocalib_ros.results.calibration_json import write_calibration_json
+from synthetic_results import full_result, grey_road, junction_evidence, lens_result
 
 EXAMPLES = Path(__file__).parent.parent / 'examples'
 

@@ -14,12 +14,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from junction import full_result, junction_evidence
 
 from autocalib_ros.cli import main
 from autocalib_ros.commands.replay_command import DEFAULT_OUT
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.results.calibration_json import write_calibration_json
+from synthetic_results import full_result, junction_evidence
 
 ROOT = Path(__file__).parent.parent
 README = ROOT / 'README.md'

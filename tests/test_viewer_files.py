@@ -48,11 +48,11 @@ def test_every_panel_of_foxglove_is_placed_once_and_has_its_settings(foxglove):
     assert kinds == {'Image', '3D', 'DiagnosticSummary', 'DiagnosticStatusPanel', 'RawMessages'}
 
 
-def test_both_show_topics_that_the_readme_lists(rviz, foxglove):
-    readme = (ROOT / 'README.md').read_text(encoding='utf-8')
-    listed = {name.replace('~/', NODE) for name in re.findall(r'^\| `([~/\w]+)`', readme, re.MULTILINE)}
-    listed |= {NODE + 'ground_points'}  # of the node that stands beside it, in its namespace
-    assert '`ground_points`' in readme
+def test_both_show_topics_that_the_reference_lists(rviz, foxglove):
+    page = (ROOT / 'docs' / 'reference' / 'topics-services-diagnostics.md').read_text(encoding='utf-8')
+    names = re.findall(r'^\| `([~/\w]+)`', page, re.MULTILINE)
+    # ground_points is of the node that stands beside it, in its namespace
+    listed = {NODE + name if name == 'ground_points' else name.replace('~/', NODE) for name in names}
     shown = {display['Topic']['Value'] for display in rviz['Displays'] if 'Topic' in display}
     shown |= set(re.findall(r'"(/[\w/]+)"', json.dumps(foxglove)))
     assert shown >= {NODE + name for name in ('debug_image', 'top_view', 'markers', 'ground_points')}

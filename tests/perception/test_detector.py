@@ -8,8 +8,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import seeing_models
 
+import onnx_models
 from autocalib_ros.config import DetectorOptions
 from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.perception.detector.detector import VehicleDetector, open_detector
@@ -39,7 +39,7 @@ BOXES = {CAR: [(300, 200, 420, 260), (60, 300, 160, 350)], PERSON: [(500, 100, 5
 
 
 def model(name: str, **how: object) -> SeeingModel:
-    return SeeingModel(getattr(seeing_models, name), **{**MODELS[name][1], **how})
+    return SeeingModel(getattr(onnx_models, name), **{**MODELS[name][1], **how})
 
 
 def options_for(name: str, **how: object) -> DetectorOptions:
@@ -92,9 +92,9 @@ def test_the_longest_side_may_be_less() -> None:
 def test_nothing_is_enlarged(name: str) -> None:
     seen: list[np.ndarray] = []
 
-    def encode(found: seeing_models.Found, size: tuple[int, int]) -> dict[str, np.ndarray]:
+    def encode(found: onnx_models.Found, size: tuple[int, int]) -> dict[str, np.ndarray]:
         seen.extend(edges for edges, _ in found)
-        return getattr(seeing_models, name)(found, size)
+        return getattr(onnx_models, name)(found, size)
 
     seeing = SeeingModel(encode, **MODELS[name][1])
     VehicleDetector(seeing, DetectorOptions()).detect(picture((200, 160), {CAR: [(40, 40, 100, 80)]}))
@@ -140,7 +140,7 @@ def test_colours_in_another_order_are_other_classes() -> None:
 def test_names_in_the_model_say_what_is_a_vehicle() -> None:
     names = {0: 'Van', 1: 'tree', 2: 'pedestrian'}
     seeing = SeeingModel(
-        lambda found, size: seeing_models.yolov8(
+        lambda found, size: onnx_models.yolov8(
             [(edges, 2 if kind == PERSON else 0) for edges, kind in found], size, 3
         ),
         meta={'names': repr(names)},
@@ -185,7 +185,7 @@ def test_what_is_not_understood_is_wrong_usage_at_the_start(outputs: dict, optio
 
 
 def test_names_without_a_vehicle_are_listed() -> None:
-    seeing = SeeingModel(lambda found, size: seeing_models.yolov8(found, size, 2), meta={'names': "['cat', 'dog']"})
+    seeing = SeeingModel(lambda found, size: onnx_models.yolov8(found, size, 2), meta={'names': "['cat', 'dog']"})
     with pytest.raises(UsageError, match=r'known as a vehicle \(cat, dog\)'):
         VehicleDetector(seeing, DetectorOptions())
 
