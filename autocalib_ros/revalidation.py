@@ -17,6 +17,7 @@ from autocalib_ros.estimation.verification.scale import Scale, known_scale
 from autocalib_ros.geometry.ground_plane import GroundPlane, tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.results.calibration import Calibration, StandardDeviations
+from autocalib_ros.results.statements import SCALE_KINDS
 
 GRADES = ('lens', 'unit_scale', 'assumed', 'full')
 """From the least that a calibration gives to the most."""
@@ -208,12 +209,12 @@ def _scaled(kept: Calibration, ground: GroundPlane, scale: Scale) -> Calibration
     height = scale.height(kept.camera, ground.normal_in_camera)
     if ground.metric and abs(height - ground.height_m) <= EQUAL_RTOL * height:
         return kept
-    words = tuple(text for text in kept.assumptions if not text.startswith('scale by '))
+    others = tuple(statement for statement in kept.assumptions if statement.kind not in SCALE_KINDS)
     return replace(
         kept,
         grade=kept.grade if ground.metric else 'assumed',
         ground=replace(ground, height_m=height, metric=True),
-        assumptions=(*words, *scale.assumption(height)),
+        assumptions=(*others, *scale.assumption(height)),
         covariance=None,
         # road points so many metres away are others now, and nothing is left that tells how sure they are
         stddev=replace(kept.stddev, height_m=scale.sigma or None, ground_point_m=()),

@@ -14,9 +14,9 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
-from autocalib_ros.calibrator import solve
 from autocalib_ros.config import JointOptions, Options, ScaleOptions
 from autocalib_ros.errors import InputError
+from autocalib_ros.estimation.estimate import solve
 from autocalib_ros.geometry.ground_plane import GroundPlane, pixels_ahead
 from autocalib_ros.ground import Ground
 from autocalib_ros.lens.camera import Camera
@@ -25,14 +25,9 @@ from autocalib_ros.offline.simulate.options import SimulationOptions
 from autocalib_ros.offline.simulate.simulation import Simulation
 from autocalib_ros.offline.simulate.truth import truth_of
 from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_evidence
-from autocalib_ros.results.calibration import (
-    GROUND_DISTANCES_M,
-    Calibration,
-    EvidenceSummary,
-    Reason,
-    StandardDeviations,
-)
+from autocalib_ros.results.calibration import GROUND_DISTANCES_M, Calibration, EvidenceSummary, StandardDeviations
 from autocalib_ros.results.calibration_json import to_json
+from autocalib_ros.results.refusals import Reason
 
 TYPES = get_typestore(Stores.ROS2_JAZZY).types
 DATA = Path(os.environ.get('AUTOCALIB_TEST_DATA', '')) / 'data'

@@ -7,12 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from autocalib_ros.calibrator import solve
 from autocalib_ros.config import JointOptions, Options
 from autocalib_ros.errors import UsageError
+from autocalib_ros.estimation.estimate import solve
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_evidence
-from autocalib_ros.results.calibration import Reason, StandardDeviations
+from autocalib_ros.results.calibration import StandardDeviations
+from autocalib_ros.results.refusals import Reason
+from autocalib_ros.results.statements import assumption
 from autocalib_ros.revalidation import CalibrationState, reconcile, with_current_options
 from stored_results import SIZE, calibration, lens_only
 
@@ -116,7 +118,10 @@ def test_height_that_is_given_now_scales_the_kept_plane():
     scaled = with_current_options(KEPT, Options(camera_height=16.2, camera_height_sigma=0.4), None)
     assert (scaled.ground.height_m, scaled.stddev.height_m, scaled.stddev.ground_point_m) == (16.2, 0.4, ())
     np.testing.assert_array_equal(scaled.ground.rotation, KEPT.ground.rotation)
-    assert scaled.assumptions == ('square pixels', 'scale by the camera height of 16.2 +- 0.4 m (given)')
+    assert scaled.assumptions == (
+        assumption('paper_roads'),
+        assumption('scale_height', given_m=16.2, given_sigma_m=0.4),
+    )
     assert (scaled.camera, scaled.grade) == (KEPT.camera, 'full')
 
 

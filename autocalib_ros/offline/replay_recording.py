@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from autocalib_ros.calibrator import AutoCalibrator, solve
+from autocalib_ros.calibrator import AutoCalibrator
 from autocalib_ros.config import Options
 from autocalib_ros.errors import InputError
+from autocalib_ros.estimation.estimate import solve
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.recordings.open import open_source

@@ -266,8 +266,8 @@ def _page(scene: ReportScene, drawn: list[_Drawn]) -> str:
         code=_code(result),
         needs=needs(result, scene.evidence, scene.options.gate),
         rows=[*number_rows(result, scene.accepted_at_s), *file_rows(result, scene.evidence)],
-        assumptions=result.assumptions if isinstance(result, Calibration) else (),
-        checks=result.checks if isinstance(result, Calibration) else (),
+        assumptions=tuple(map(str, result.assumptions)) if isinstance(result, Calibration) else (),
+        checks=tuple(map(str, result.checks)) if isinstance(result, Calibration) else (),
         chapters=[(chapter, figures) for chapter, figures in chapters if figures],
     )
 

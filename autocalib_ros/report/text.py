@@ -13,6 +13,8 @@ from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
 from autocalib_ros.lens.camera import field_of_view_deg
 from autocalib_ros.results.calibration import GROUND_DISTANCES_M, Calibration, Refusal
+from autocalib_ros.results.refusals import BY_CODE
+from autocalib_ros.results.statements import SCALE_KINDS
 
 
 @dataclass(frozen=True)
@@ -88,7 +90,7 @@ def _ground_rows(result: Calibration) -> list[TableRow]:
         return []
     down, roll = tilt_and_roll_deg(result.ground.normal_in_camera)
     height = f'{result.ground.height_m:.2f} m' if result.ground.metric else '1 (unit)'
-    note = next((text for text in result.assumptions if text.startswith('scale by ')), '')
+    note = next((statement.text for statement in result.assumptions if statement.kind in SCALE_KINDS), '')
     return [
         TableRow('camera height', height, _number(result.stddev.height_m, 2), note),
         TableRow('looks down by', f'{down:.2f} degrees', _number(result.stddev.tilt_deg, 2)),
@@ -233,23 +235,6 @@ class ReportRequirement:
     met: bool
 
 
-MISSING_BY_CODE = {
-    'camera_moving': 'a camera that stands still',
-    'no_motion': 'traffic',
-    'too_few_tracks': 'tracks that are long',
-    'poor_coverage': 'traffic in enough of the image',
-    'one_direction': 'traffic in two directions, or that turns',
-    'no_direction': 'tracks along a common direction',
-    'no_agreement': 'agreement of the traffic',
-    'no_height': 'what tells the scale',
-    'one_centre': 'traffic that turns in more than one place',
-    'halves_disagree': 'agreement of both halves of the traffic',
-    'plane_uncertain': 'a ground plane that is sure',
-    'distortion_model': 'the distortion model that is asked for',
-}
-"""What was missing, by the code of the refusal."""
-
-
 def needs(result: Calibration | Refusal, evidence: Evidence, gate: GateOptions) -> list[ReportRequirement]:
     """List what a calibration needs of the traffic and what stopped this one; nothing where nothing is missing."""
     refusal = result if isinstance(result, Refusal) else result.ground_refusal
@@ -291,7 +276,7 @@ def needs(result: Calibration | Refusal, evidence: Evidence, gate: GateOptions) 
     return [
         *rows,
         ReportRequirement(
-            MISSING_BY_CODE.get(refusal.code, refusal.code.replace('_', ' ')),
+            BY_CODE[refusal.code].missing if refusal.code in BY_CODE else refusal.code.replace('_', ' '),
             _sentence(_capital(refusal.message)),
             '',
             False,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -10,6 +11,8 @@ import numpy as np
 from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.lens.camera_info import CameraInfo, camera_info
+from autocalib_ros.results.refusals import Reason
+from autocalib_ros.results.statements import Statement, Value
 
 GROUND_DISTANCES_M = (10.0, 20.0, 40.0)
 """Distances from the camera's foot at which the accuracy on the road is told."""
@@ -101,24 +104,18 @@ class Figures:
     """Of the robust method; none for the published one."""
 
 
-@dataclass(frozen=True)
-class Reason:
-    """Why something is not given: a code for programs, numbers in words, and what to do."""
-
-    code: str
-    message: str
-    remedy: str
-
-
 @dataclass(frozen=True, kw_only=True)
 class Refusal:
     """No calibration, and why. It is false, so that `if result:` asks whether there is a calibration."""
 
     code: str
+    """One of `refusals.REFUSALS`."""
     message: str
     remedy: str
     method: str
     evidence: EvidenceSummary
+    values: Mapping[str, Value] = field(default_factory=dict, compare=False)
+    """The numbers of the message and the limit that they missed."""
     figures: Figures = field(default_factory=Figures, compare=False, repr=False)
 
     def __bool__(self) -> bool:
@@ -126,11 +123,12 @@ class Refusal:
 
     @classmethod
     def from_reason(cls, reason: Reason, method: str, evidence: EvidenceSummary, figures: Figures) -> Refusal:
-        """Make a refusal of a reason."""
+        """Return the refusal for a reason."""
         return cls(
             code=reason.code,
             message=reason.message,
             remedy=reason.remedy,
+            values=reason.values,
             method=method,
             evidence=evidence,
             figures=figures,
@@ -145,10 +143,10 @@ class Calibration:
     grade: str
     """'full': lens and metric ground plane; 'assumed': the same, where the plane rests on an assumption that was
     allowed; 'unit_scale': the plane in units of the height; 'lens': no plane."""
-    assumptions: tuple[str, ...]
-    """What was taken for granted, in words."""
-    checks: tuple[str, ...] = ()
-    """What was measured or cross-checked, in words."""
+    assumptions: tuple[Statement, ...]
+    """What was assumed, of `statements.ASSUMPTIONS`."""
+    checks: tuple[Statement, ...] = ()
+    """What was measured or cross-checked, of `statements.CHECKS`."""
     camera: Camera
     ground: GroundPlane | None
     ground_refusal: Reason | None

@@ -1,4 +1,4 @@
-"""Reads calibration.json back, to the last bit: what is written again is the same text."""
+"""The document calibration.json, written and read to the last bit: what is read and written again is the same text."""
 
 from __future__ import annotations
 
@@ -19,10 +19,11 @@ from autocalib_ros.results.calibration import (
     Calibration,
     EvidenceSummary,
     PaperReport,
-    Reason,
     Refusal,
     StandardDeviations,
 )
+from autocalib_ros.results.refusals import Reason
+from autocalib_ros.results.statements import UNKNOWN_KIND, Statement, Value
 from autocalib_ros.util.files import write_atomically
 
 MAX_JSON_BYTES = 1_000_000
@@ -51,8 +52,9 @@ def read_json(path: Path) -> Mapping[str, Any]:
 
 def calibration_from_json(document: Mapping[str, Any]) -> Calibration:
     """Return the calibration of a document of calibration.json; InputError says what is wrong with it."""
-    if document.get('version') != JSON_VERSION:
-        raise InputError(f'its version is {reprlib.repr(document.get("version"))}, and only {JSON_VERSION} is read')
+    if document.get('version') not in READ_VERSIONS:
+        versions = ' and '.join(map(str, READ_VERSIONS))
+        raise InputError(f'its version is {reprlib.repr(document.get("version"))}; versions {versions} can be read')
     if document.get('state') != 'calibrated':
         raise InputError(
             f'its state is {reprlib.repr(document.get("state"))}: it holds no calibration{_refusal_text(document)}'
@@ -89,11 +91,11 @@ def _parse_calibration(document: Mapping[str, Any]) -> Calibration:
     return Calibration(
         method=str(document['method']),
         grade=grade,
-        assumptions=tuple(map(str, document['assumptions'])),
-        checks=tuple(map(str, document['checks'])),
+        assumptions=tuple(map(_parse_statement, document['assumptions'])),
+        checks=tuple(map(_parse_statement, document['checks'])),
         camera=camera,
         ground=None if pose is None else _parse_ground(pose, metric=grade != 'unit_scale'),
-        ground_refusal=None if reason is None else Reason(*(str(reason[name]) for name in Reason.__dataclass_fields__)),
+        ground_refusal=None if reason is None else _parse_reason(reason),
         road_directions=np.array(document['road_directions_in_camera'], float).reshape(-1, 3),
         stddev=_parse_stddev(document['stddev']),
         paper=None if paper is None else _parse_paper(paper),
@@ -110,6 +112,25 @@ def _parse_calibration(document: Mapping[str, Any]) -> Calibration:
         newest_stamp_ns=int(document['newest_stamp_ns']),
         covariance=_parse_covariance(document.get('covariance')),
     )
+
+
+def _parse_statement(entry: Any) -> Statement:
+    """Return an assumption or a check; version 1 holds texts alone, some of which tell the source of the scale."""
+    if isinstance(entry, str):
+        return Statement(SCALE_OF_VERSION_1 if entry.startswith('scale by ') else UNKNOWN_KIND, entry)
+    return Statement(str(entry['kind']), str(entry['text']), _parse_values(entry['values']))
+
+
+def _parse_reason(entry: Mapping[str, Any]) -> Reason:
+    values = _parse_values(entry.get('values', {}))
+    return Reason(str(entry['code']), str(entry['message']), str(entry['remedy']), values)
+
+
+def _parse_values(values: Any) -> dict[str, Value]:
+    """Return the numbers of a statement or a refusal; InputError if there is anything else among them."""
+    if not isinstance(values, Mapping) or not all(isinstance(value, Value) for value in values.values()):
+        raise InputError(f'numbers, texts or null were expected, got {reprlib.repr(values)}')
+    return dict(values)
 
 
 def _parse_ground(pose: Mapping[str, Any], *, metric: bool) -> GroundPlane:
@@ -162,11 +183,15 @@ def _reject_constant(name: str) -> NoReturn:
     raise ValueError(f'{name} is no number')
 
 
-JSON_VERSION = 1
+JSON_VERSION = 2
+READ_VERSIONS = (1, 2)
+"""Version 1 holds assumptions and checks as texts."""
+SCALE_OF_VERSION_1 = 'scale_height'
+"""Kind of the scale in a file of version 1: the text alone names its source."""
 
 
 def to_json(result: Calibration | Refusal, *, accepted_at_s: float | None = None) -> dict[str, Any]:
-    """Return the document of calibration.json, version 1."""
+    """Return the document of calibration.json."""
     evidence = result.evidence
     document: dict[str, Any] = {
         'version': JSON_VERSION,
@@ -203,16 +228,25 @@ def to_json(result: Calibration | Refusal, *, accepted_at_s: float | None = None
     return document
 
 
-def _refusal_json(refusal: Refusal | Reason) -> dict[str, str]:
-    return {'code': refusal.code, 'message': refusal.message, 'remedy': refusal.remedy}
+def _statement_json(statement: Statement) -> dict[str, Any]:
+    return {'kind': statement.kind, 'text': statement.text, 'values': dict(statement.values)}
+
+
+def _refusal_json(refusal: Refusal | Reason) -> dict[str, Any]:
+    return {
+        'code': refusal.code,
+        'message': refusal.message,
+        'remedy': refusal.remedy,
+        'values': dict(refusal.values),
+    }
 
 
 def _calibration_json(result: Calibration) -> dict[str, Any]:
     camera, info, sigma = result.camera, result.camera_info, result.stddev
     return {
         'grade': result.grade,
-        'assumptions': list(result.assumptions),
-        'checks': list(result.checks),
+        'assumptions': [_statement_json(statement) for statement in result.assumptions],
+        'checks': [_statement_json(statement) for statement in result.checks],
         'refusal': _refusal_json(result.ground_refusal) if result.ground_refusal else None,
         'camera': {
             'model': 'kannala_brandt',

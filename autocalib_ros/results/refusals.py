@@ -1,174 +1,365 @@
-"""Stub of the table of refusal codes, until the lead's own replaces it."""
+"""The refusal codes: what each means, the limit that decides, the remedy, and the words of its messages.
+
+`reason` makes the refusal of a code from its numbers. The log, the report, the documentation and the tests read the
+same table.
+"""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from autocalib_ros.results.statements import Value, plain_values
 
 
-class RefusalCode(NamedTuple):
-    """A refusal code: what causes it, the limit that decides, and the remedy."""
+@dataclass(frozen=True)
+class Reason:
+    """Why something is not given: a code for programs, numbers in words, and a remedy."""
+
+    code: str
+    message: str
+    remedy: str
+    values: Mapping[str, Value] = field(default_factory=dict, compare=False)
+    """The numbers of the message and the limit that they missed, by the names in the table."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RefusalCode:
+    """One refusal code; texts are templates for str.format."""
 
     code: str
     cause: str
     limit: str
+    """The option or constant that decides, with its value."""
     remedy: str
+    missing: str
+    """The name of the requirement that was not met, for tables."""
+    message: str
+    variants: Mapping[str, tuple[str, str]] = field(default_factory=dict)
+    """Message and remedy ('' for the usual one) of further causes with the same code, by the name of the cause."""
 
+
+def reason(code: str, cause: str = '', **values: object) -> Reason:
+    """Return the refusal of a code with its numbers; `cause` names one of its variants."""
+    entry, plain = BY_CODE[code], plain_values(values)
+    message, remedy = entry.variants[cause] if cause else (entry.message, '')
+    return Reason(code, message.format(**plain), (remedy or entry.remedy).format(**plain), plain)
+
+
+WAIT = 'wait for more traffic, or record for longer'
 
 REFUSALS = (
     RefusalCode(
-        'camera_moving',
-        'The camera moves: the background has drifted in the image.',
-        'gate.max_drift_px, 3 px at an image width of 1280 px (scaled with the width)',
-        'Fix the camera to a rigid mount and record again.',
+        code='camera_moving',
+        cause='The camera moves: the background has drifted in the image.',
+        limit='gate.max_drift_px, 3 px at an image width of 1280 px (scaled with the width)',
+        remedy='fix the camera to a rigid mount and record again',
+        missing='a camera that stands still',
+        message='the camera moves: the background drifted by {drift_px:.1f} px (limit {limit_px:.1f} px)',
     ),
     RefusalCode(
-        'no_motion',
-        'No moving object was tracked.',
-        'at least one track',
-        'Check that the camera sees traffic and that the images are neither frozen nor dark.',
+        code='no_motion',
+        cause='No moving object was tracked.',
+        limit='at least one track',
+        remedy='check that the camera sees traffic and that the images are neither frozen nor dark',
+        missing='traffic',
+        message='no moving object in {frames} images over {seconds:.0f} s',
     ),
     RefusalCode(
-        'too_few_tracks',
-        'Too few tracks, or too few that are long enough. With method paper: no track fills the observation interval.',
-        'gate.min_tracks, 40; with method paper paper.min_lifetime (80 %) of paper.window_s (6 s)',
-        'Wait for more traffic or record for longer. With method paper: record slower traffic, shorten '
-        'paper.window_s, or use method joint.',
+        code='too_few_tracks',
+        cause='Too few tracks, or too few that are long enough. Method paper: no track fills the observation interval.',
+        limit='gate.min_tracks, 40; method paper: paper.min_lifetime (80 %) of paper.window_s (6 s)',
+        remedy=WAIT,
+        missing='tracks that are long enough',
+        message='{tracks} tracks after {seconds:.0f} s (at least {limit} needed)',
+        variants={
+            'short': ('{tracks} tracks are long enough (at least {limit} needed)', ''),
+            'paper': (
+                'no track lasted for {lifetime:.0%} of an interval of {window_s:g} s with a path of at most '
+                '{path_ratio:g} times its displacement',
+                'record slower traffic, shorten paper.window_s, or use method joint',
+            ),
+        },
     ),
     RefusalCode(
-        'poor_coverage',
-        'Traffic crosses too small a part of the image.',
-        'gate.min_coverage, 15 % of the image cells',
-        'Turn the camera so that the road fills more of the image, or use a longer lens.',
+        code='poor_coverage',
+        cause='Traffic crosses too small a part of the image.',
+        limit='gate.min_coverage, 15 % of the image cells',
+        remedy='turn the camera so that the road fills more of the image, or use a longer lens',
+        missing='traffic in enough of the image',
+        message='traffic crossed {coverage:.0%} of the image (at least {limit:.0%} needed)',
     ),
     RefusalCode(
-        'no_direction',
-        'No road direction found: the straight tracks have no common vanishing point.',
-        'no fixed limit: a consensus search must return a direction',
-        'Wait for straight traffic, or turn the camera towards a straight road.',
+        code='no_direction',
+        cause='No road direction found: the straight tracks have no common vanishing point.',
+        limit='no fixed limit: the consensus search must return a direction',
+        remedy='wait for straight traffic, or turn the camera towards a straight road',
+        missing='tracks along a common direction',
+        message='{tracks} tracks have no common vanishing point',
     ),
     RefusalCode(
-        'no_agreement',
-        'The focal length is not identifiable: the best candidate explains hardly more straight traffic than '
+        code='no_agreement',
+        cause='The focal length is not identifiable: the best candidate explains hardly more straight traffic than '
         'the median candidate.',
-        'support at the best focal length at least 1.3 times the median',
-        'Wait for straight traffic, above all near the borders of the image. The traffic may be turning, or '
-        'the lens may have no distortion: then set joint.road_angle or joint.focal_prior_px.',
+        limit='support at the best focal length at least 1.3 times the median (MIN_FOCAL_CONTRAST)',
+        remedy='wait for straight traffic, above all near the borders of the image; the traffic may be turning, or the '
+        'lens may have no distortion: then set joint.road_angle or joint.focal_prior_px',
+        missing='an identifiable focal length',
+        message='focal length not identifiable: support of straight traffic at the best candidate is {contrast:.2f} '
+        'times the median (at least {limit:g} needed)',
     ),
     RefusalCode(
-        'turning_traffic',
-        'Too few vehicles follow the straight roads that were found: the traffic turns, or the road bends.',
-        'at least 25 % of the vehicles on two or more roads, 75 % on a single road (50 % if at least 80 % of '
+        code='turning_traffic',
+        cause='Too few vehicles follow the straight roads that were found: the traffic turns, or the road bends.',
+        limit='at least 25 % of the vehicles on two or more roads, 75 % on a single road (50 % if at least 80 % of '
         'those keep to it)',
-        'Wait for straight traffic, or turn the camera towards a straight road.',
+        remedy='wait for straight traffic, or turn the camera towards a straight road',
+        missing='straight traffic',
+        message='{fraction:.0%} of the vehicles follow the {roads} straight roads that fit best (at least {limit:.0%} '
+        'needed): the traffic turns, or the road bends',
+        variants={
+            'one_road': (
+                '{fraction:.0%} of the vehicles follow the one straight road that was found (at least {limit:.0%} '
+                'needed): the traffic turns, or the road bends',
+                '',
+            )
+        },
     ),
     RefusalCode(
-        'horizon',
-        'Tracked points lie above the horizon of the estimated plane, so the tracks do not belong to one plane.',
-        'at least 95 % of the tracked points below the horizon',
-        'Wait for more traffic.',
+        code='horizon',
+        cause='Tracked points lie above the horizon of the estimated plane, so the tracks do not belong to one plane.',
+        limit='at least 95 % of the tracked points below the horizon',
+        remedy=WAIT,
+        missing='traffic below the horizon',
+        message='{fraction:.0%} of the tracked points lie above the horizon of the estimated plane (limit {limit:.0%})',
     ),
     RefusalCode(
-        'too_little_curvature',
-        'The focal length is uncertain: straight traffic shows too little lens curvature.',
-        'gate.max_sigma_focal_rel, 5 % (one sigma); or a focal length above 1.5 image diagonals; or a '
-        'distortion-free lens without a known road angle',
-        'Wait for traffic nearer the borders of the image. For a lens without distortion give the angle '
-        'between two roads (joint.road_angle) or the focal length (joint.focal_prior_px).',
+        code='too_little_curvature',
+        cause='The focal length is uncertain: straight traffic shows too little lens curvature.',
+        limit='gate.max_sigma_focal_rel, 5 % (one sigma); or a focal length above 1.5 image diagonals; or a '
+        'distortion-free lens without a known road angle or focal length',
+        remedy='wait for traffic nearer the borders of the image; a lens without distortion needs the angle between '
+        'two roads (joint.road_angle) or its focal length (joint.focal_prior_px)',
+        missing='lens curvature',
+        message='straight traffic shows too little lens curvature: focal length {focal_px:.0f} px +- {sigma:.1%} '
+        '(at most {limit:.0%} allowed)',
     ),
     RefusalCode(
-        'too_little_turning',
-        'The focal length is uncertain: too few vehicles turn, or they turn too little.',
-        '3 % of the focal length (one sigma), or gate.max_sigma_focal_rel if that is smaller',
-        'Wait for more turning vehicles, or for straight traffic.',
+        code='too_little_turning',
+        cause='The focal length is uncertain: too few vehicles turn, or they turn too little.',
+        limit='3 % of the focal length (one sigma), or gate.max_sigma_focal_rel if that is smaller',
+        remedy='wait for more turning vehicles, or for straight traffic',
+        missing='turning traffic',
+        message='turning traffic does not determine the lens: focal length {focal_px:.0f} px +- {sigma:.1%} '
+        '(at most {limit:.0%} allowed)',
     ),
     RefusalCode(
-        'one_centre',
-        'All vehicles turn about one point, as on one ring or bend, which constrains the focal length too weakly.',
-        '2 % of the focal length (one sigma), if half of the turning centres lie within 50 % of the turning radius',
-        'Wait for vehicles that turn elsewhere, enter, leave or drive straight.',
+        code='one_centre',
+        cause='All vehicles turn about one point, as on one ring or bend, which constrains the focal length too '
+        'weakly.',
+        limit='2 % of the focal length (one sigma), if half of the turning centres lie within 50 % of the turning '
+        'radius',
+        remedy='wait for vehicles that turn elsewhere, enter or leave, or drive straight',
+        missing='traffic that turns in more than one place',
+        message='all vehicles turn about one point, as on one ring or bend (half of their turning centres lie within '
+        '{spread:.0%} of the radius): focal length +- {sigma:.1%} (at most {limit:.0%} allowed there)',
     ),
     RefusalCode(
-        'lens_model',
-        'The estimated distortion k1 is too far from the assumed lens family.',
-        '3.5 times joint.k1_sigma (0.03)',
-        'Increase joint.k1_sigma if the lens is known to differ.',
+        code='lens_model',
+        cause='The estimated distortion k1 is too far from the assumed lens family.',
+        limit='3.5 times joint.k1_sigma (0.03)',
+        remedy='increase joint.k1_sigma if the lens is known to differ',
+        missing='a lens near its family',
+        message='the lens is not close to {family}: k1 = {k1:.3f}, {sigmas:.1f} sigma off (limit {limit:g})',
     ),
     RefusalCode(
-        'halves_disagree',
-        'Cross-validation in time failed: the earlier and the later half of the traffic give different results.',
-        '3 % in focal length and 1.5 degrees in the ground normal, or 3.5 sigma if that is larger',
-        'Record for longer, and check that the camera is firmly fixed.',
+        code='halves_disagree',
+        cause='Cross-validation in time failed: the earlier and the later half of the traffic give different results.',
+        limit='3 % in focal length and 1.5 degrees in the ground normal, or 3.5 sigma if that is larger',
+        remedy='record for longer, and check that the camera is firmly fixed',
+        missing='agreement of both halves of the traffic',
+        message='the earlier and the later half of the traffic disagree: focal length by {focal:.1%} (limit '
+        '{focal_limit:.1%}), ground normal by {normal_deg:.1f} degrees (limit {normal_limit_deg:.1f})',
     ),
     RefusalCode(
-        'one_direction',
-        'No ground plane: a single road direction leaves the rotation about that road free. With method '
-        'paper: the orientation histogram has fewer than two peaks.',
-        'gate.min_tracks_per_road, 10 tracks on each of two roads',
-        'Wait for traffic across the main road or for turning traffic, or set joint.roll_prior_deg.',
+        code='one_direction',
+        cause='No ground plane: a single road direction leaves the rotation about that road free. Method paper: the '
+        'orientation histogram has fewer than two peaks.',
+        limit='gate.min_tracks_per_road, 10 tracks on each of two roads',
+        remedy='wait for traffic across the main road, or for turning vehicles; or set joint.roll_prior_deg',
+        missing='traffic in two directions, or that turns',
+        message='too little traffic across the main road: {across} of {limit} tracks; {along} tracks follow one road, '
+        'and the rotation about it is free',
+        variants={
+            'edges_tried': (
+                'too little traffic across the main road: {across} of {limit} tracks; {along} tracks follow one road, '
+                'and the rotation about it is free: edges of vehicles do not determine it either',
+                '',
+            ),
+            'turning': (
+                '{along} tracks follow one road, and the rotation about it is free: no second road, and edges of '
+                'vehicles do not determine it either',
+                '',
+            ),
+            'paper': (
+                'the orientation histogram of {segments} segments has {peaks} peaks, not two',
+                'wait for traffic on a second road',
+            ),
+        },
     ),
     RefusalCode(
-        'plane_uncertain',
-        'The ground normal is too uncertain, or two estimates of it disagree.',
-        'gate.max_sigma_tilt_deg, 1.5 degrees (one sigma); three times that for a plane that rests on an assumption',
-        'Wait for more traffic on the quieter road. If vehicle edges and a level camera disagree, set '
-        'joint.roll_prior_deg to 0 or to the roll that is possible.',
+        code='plane_uncertain',
+        cause='The ground normal is too uncertain, or two estimates of it disagree.',
+        limit='gate.max_sigma_tilt_deg, 1.5 degrees (one sigma); three times that for a plane that rests on an '
+        'assumption',
+        remedy='wait for more traffic on the quieter road',
+        missing='a certain ground plane',
+        message='ground normal +- {sigma_deg:.1f} degrees (at most {limit_deg:g} allowed)',
+        variants={
+            'level_road': (
+                'the road runs level across the image, where the roll of the camera does not determine the plane',
+                'wait for traffic across the road, or for turning vehicles',
+            ),
+            'edges_and_level': (
+                'edges of vehicles and a level camera disagree by {difference_deg:.1f} degrees about the road',
+                'set joint.roll_prior_deg to 0 to trust the edges, or to the largest roll that the camera may have',
+            ),
+            'lane_changes': (
+                'two estimates of the plane differ by {difference_deg:.1f} degrees (limit {limit_deg:.1f}): '
+                '{assumed}; {changing}',
+                'wait for more traffic, above all across the road or turning',
+            ),
+        },
     ),
     RefusalCode(
-        'no_markings',
-        'Lane markings do not give a lens and a plane: there are too few, or they fit two planes, two focal '
+        code='no_markings',
+        cause='Lane markings do not give a lens and a plane: there are too few, or they fit two planes, two focal '
         'lengths or no right angle. Reported inside the message of another code.',
-        'at least 10 % of the lines along each of two directions, in at least 5 places; a right angle within '
-        '2.5 degrees',
-        'Wait for more traffic.',
+        limit='at least 10 % of the lines along each of two directions, in 5 places; focal length within '
+        'gate.max_sigma_focal_rel',
+        remedy='wait for more traffic',
+        missing='lane markings',
+        message='lane markings do not determine lens and plane: {lines} lines',
+        variants={
+            'off_road': ('lane markings do not determine lens and plane: too few lines lie beside the traffic', ''),
+            'two_planes': (
+                'lane markings do not determine lens and plane: they fit two planes {difference_deg:.0f} degrees apart',
+                '',
+            ),
+            'two_lenses': (
+                'lane markings do not determine lens and plane: they fit two focal lengths, {focal_px:.0f} and '
+                '{other_focal_px:.0f} px',
+                '',
+            ),
+            'one_axis': (
+                'lane markings do not determine lens and plane: {fraction:.0%} of the lines, in {places} places, lie '
+                'along the second of two directions (at least {limit:.0%} in {limit_places} places needed)',
+                '',
+            ),
+            'not_square': (
+                'lane markings do not determine lens and plane: they cross at {angle_deg:.1f} degrees, not at a right '
+                'angle',
+                '',
+            ),
+            'focal_length': (
+                'lane markings do not determine lens and plane: focal length +- {sigma:.1%} (at most {limit:.0%} '
+                'allowed)',
+                '',
+            ),
+        },
     ),
     RefusalCode(
-        'markings_contradicted',
-        'The plane from the lane markings contradicts the traffic.',
-        '3 sigma or 1.5 degrees, whichever is larger',
-        'Wait for more traffic. If the markings are not square to each other, set joint.road_markings to false.',
+        code='markings_contradicted',
+        cause='The plane from the lane markings contradicts the traffic.',
+        limit='3 sigma or 1.5 degrees, whichever is larger',
+        remedy='wait for more traffic; if the markings are not perpendicular, set joint.road_markings to false',
+        missing='agreement of lane markings and traffic',
+        message='ground normals from traffic and lane markings differ by {difference_deg:.1f} degrees '
+        '({sigma_deg:.1f} expected)',
+        variants={
+            'road': (
+                'the road of the traffic and the markings along it differ by {difference_deg:.1f} degrees '
+                '({sigma_deg:.1f} expected)',
+                '',
+            )
+        },
     ),
     RefusalCode(
-        'markings_unconfirmed',
-        'Lane markings give a lens and a plane, but the traffic is too sparse to confirm them.',
-        '4.5 degrees (one sigma) for the plane or the road from traffic',
-        'Wait for more traffic, straight or turning.',
+        code='markings_unconfirmed',
+        cause='Lane markings give a lens and a plane, but the traffic is too sparse to confirm them.',
+        limit='4.5 degrees (one sigma) for the plane or the road from traffic',
+        remedy='wait for more traffic, straight or turning',
+        missing='traffic that confirms the lane markings',
+        message='lane markings give a lens and a plane, but the traffic cannot confirm them: ground normal from '
+        'traffic +- {sigma_deg:.0f} degrees (at most {limit_deg:g} allowed)',
+        variants={
+            'no_traffic': (
+                'lane markings give a lens and a plane, but no traffic confirms them',
+                '',
+            )
+        },
     ),
     RefusalCode(
-        'no_height',
-        'No ground plane: the scale is unknown, because no camera height was given.',
-        'camera_height above 0',
-        'Give camera_height in metres, or a distance on the road or the mean traffic speed (scale_from), or '
-        'set allow_unit_scale for a plane in units of the camera height.',
+        code='no_height',
+        cause='No ground plane: the scale is unknown, because no camera height was given.',
+        limit='camera_height above 0',
+        remedy='give camera_height in metres, or a distance on the road or the mean traffic speed (scale_from), or set '
+        'allow_unit_scale for a plane in units of the height',
+        missing='a scale',
+        message='the ground plane needs the height of the camera above the road, which was not given',
     ),
     RefusalCode(
-        'scale_off_road',
-        'A pixel of scale.distance_px is not on the road, or the lens images nothing there.',
-        'at least 1.7 degrees below the horizon (33 camera heights away)',
-        'Choose two pixels on the road surface, near the camera.',
+        code='scale_off_road',
+        cause='A pixel of scale.distance_px is not on the road, or the lens images nothing there.',
+        limit='at least 1.7 degrees below the horizon (33 camera heights away)',
+        remedy='choose two pixels on the road surface, near to the camera',
+        missing='two pixels on the road',
+        message='pixel ({u:g}, {v:g}) of scale.distance_px is not on the road: it lies {angle_deg:.1f} degrees {side} '
+        'the horizon (at least {limit_deg:.1f} degrees below needed)',
+        variants={
+            'outside_lens': (
+                'pixel ({u:g}, {v:g}) of scale.distance_px is not on the road: the lens images nothing there',
+                '',
+            )
+        },
     ),
     RefusalCode(
-        'too_few_vehicles',
-        'Too few vehicles drive straight along the busiest road to measure its mean speed.',
-        '10 vehicles',
-        'Wait for more traffic or record for longer.',
+        code='too_few_vehicles',
+        cause='Too few vehicles drive straight along the busiest road to measure its mean speed.',
+        limit='10 vehicles',
+        remedy=WAIT,
+        missing='vehicles along the busiest road',
+        message='{vehicles} vehicles drive straight along the busiest road (at least {limit} needed to compare their '
+        'speed with the given mean)',
     ),
     RefusalCode(
-        'scale_uncertain',
-        'The camera height that follows from the given scale is too uncertain.',
-        'gate.max_sigma_height_rel, 20 % (one sigma)',
-        'Give a longer distance on the road nearer to the camera, wait for more traffic, or give the camera height.',
+        code='scale_uncertain',
+        cause='The camera height that follows from the given scale is too uncertain.',
+        limit='gate.max_sigma_height_rel, 20 % (one sigma)',
+        remedy='give a longer distance on the road nearer to the camera, wait for more traffic, or give the camera '
+        'height',
+        missing='a certain scale',
+        message='camera height {height_m:.2f} m +- {sigma:.0%} (at most {limit:.0%} allowed)',
     ),
     RefusalCode(
-        'vanishing_points_disagree',
-        'Method paper only: no focal length makes the two vanishing points perpendicular.',
-        'the focal length squared must be positive',
-        'The roads are not perpendicular, or the lens is wrong: use method joint.',
+        code='vanishing_points_disagree',
+        cause='Method paper only: no focal length makes the two vanishing points perpendicular.',
+        limit='the focal length squared must be positive',
+        remedy='the roads are not perpendicular, or the lens is wrong: use method joint',
+        missing='perpendicular vanishing points',
+        message='no focal length makes the two vanishing points perpendicular (orientations {first_deg:.0f} and '
+        '{second_deg:.0f} degrees)',
     ),
     RefusalCode(
-        'distortion_model',
-        'The distortion model that was asked for cannot represent the lens.',
-        '0.5 px anywhere in the image',
-        'Set distortion_model to one of the models that the message names; equidistant always fits.',
+        code='distortion_model',
+        cause='The distortion model that was asked for cannot represent the lens.',
+        limit='0.5 px anywhere in the image',
+        remedy='set distortion_model to one of the models that the message names; equidistant always fits',
+        missing='the requested distortion model',
+        message='{misfit}',
+        variants={'misfit': ('{misfit}', '{instead}')},
     ),
 )
-"""Every code."""
+"""Every refusal code."""
+
+BY_CODE = {entry.code: entry for entry in REFUSALS}

@@ -21,7 +21,7 @@ def describe_refusal(refusal: Refusal) -> str:
 
 def describe_calibration(result: Calibration) -> str:
     """Return focal length, tilt and height with their sigma, the grade and what was assumed."""
-    assumptions = '; '.join(result.assumptions) or 'none'
+    assumptions = '; '.join(map(str, result.assumptions)) or 'none'
     numbers = ', '.join(describe_numbers(result))
     return _one_line(f'calibrated, grade {result.grade}: {numbers}; assumptions: {assumptions}')
 

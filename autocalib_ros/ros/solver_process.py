@@ -13,9 +13,9 @@ import traceback
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 
-from autocalib_ros.calibrator import solve
 from autocalib_ros.config import Options
 from autocalib_ros.errors import AutocalibError
+from autocalib_ros.estimation.estimate import solve
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.results.calibration import Calibration, Refusal

@@ -176,7 +176,7 @@ def _result_values(result: Calibration | None) -> Iterator[tuple[str, str]]:
     yield 'roll_sigma_deg', _number(sigma and sigma.roll_deg, '.3g')
     yield 'height_m', _number(ground.height_m if ground is not None and ground.metric else None, '.3f')
     yield 'height_sigma_m', _number(sigma and sigma.height_m, '.3g')
-    yield 'assumptions', '' if result is None else '; '.join(result.assumptions)
+    yield 'assumptions', '' if result is None else '; '.join(map(str, result.assumptions))
     refusal = None if result is None else result.ground_refusal
     yield 'no_ground_plane', '' if refusal is None else refusal.message
     yield 'newest_stamp_s', _number(None if result is None else result.newest_stamp_ns * 1e-9, '.3f')

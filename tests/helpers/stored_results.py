@@ -22,6 +22,7 @@ from autocalib_ros.results.calibration import (
     PaperReport,
     StandardDeviations,
 )
+from autocalib_ros.results.statements import assumption, check
 from autocalib_ros.results.store import StoredCalibration
 
 SIZE = (640, 360)
@@ -44,8 +45,11 @@ def calibration(
     return Calibration(
         method='joint',
         grade='full',
-        assumptions=('square pixels', 'scale by the camera height of 8.1 m (given)'),
-        checks=('held-out tracks: 0.31 px',),
+        assumptions=(
+            assumption('paper_roads'),
+            assumption('scale_height', given_m=8.1, given_sigma_m=0.0),
+        ),
+        checks=(check('halves', focal=0.004, normal_deg=0.2),),
         camera=camera,
         ground=GroundPlane(pitched, height_m),
         ground_refusal=None,

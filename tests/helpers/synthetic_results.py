@@ -15,11 +15,12 @@ from autocalib_ros.results.calibration import (
     Calibration,
     Figures,
     PaperReport,
-    Reason,
     Refusal,
     Residuals,
     StandardDeviations,
 )
+from autocalib_ros.results.refusals import Reason
+from autocalib_ros.results.statements import assumption
 
 SPEED_M_S = 10.0
 """Of every vehicle."""
@@ -88,7 +89,7 @@ def full_result(evidence: Evidence) -> Calibration:
     return Calibration(
         method='joint',
         grade='full',
-        assumptions=('the two roads are perpendicular',),
+        assumptions=(assumption('paper_roads'),),
         camera=Camera.equidistant(320, 180, 140.0),
         ground=ground,
         ground_refusal=None,

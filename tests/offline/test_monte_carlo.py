@@ -31,14 +31,8 @@ from autocalib_ros.offline.benchmark.monte_carlo import (
 )
 from autocalib_ros.offline.benchmark.table import falsely_accepted, format_tables, is_overconfident
 from autocalib_ros.offline.synthetic.junction import Junction, pose
-from autocalib_ros.results.calibration import (
-    Calibration,
-    EvidenceSummary,
-    Figures,
-    Reason,
-    Refusal,
-    StandardDeviations,
-)
+from autocalib_ros.results.calibration import Calibration, EvidenceSummary, Figures, Refusal, StandardDeviations
+from autocalib_ros.results.refusals import Reason
 
 JUNCTION = Junction()
 TASK = Task('standard', 0, 7, ('joint',))

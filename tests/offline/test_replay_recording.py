@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from autocalib_ros.calibrator import solve
 from autocalib_ros.config import GateOptions, Options
 from autocalib_ros.errors import InputError, UsageError
+from autocalib_ros.estimation.estimate import solve
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.recordings.open import open_source
 from autocalib_ros.offline.recordings.sources import Frame

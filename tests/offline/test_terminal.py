@@ -10,6 +10,7 @@ import pytest
 
 from autocalib_ros.offline.terminal.style import align_columns, coloured, state_colour, truncate, wants_colour
 from autocalib_ros.offline.terminal.summary import summary_lines
+from autocalib_ros.results.statements import Statement
 
 
 class Terminal(io.StringIO):
@@ -74,7 +75,7 @@ def test_the_summary_has_the_numbers_with_their_sigmas(full):
 
 
 def test_long_words_of_the_summary_are_indented_on_the_next_line(full):
-    result = replace(full.result, checks=('words ' * 30,))
+    result = replace(full.result, checks=(Statement('unknown', 'words ' * 30),))
     lines = summary_lines(result, columns=80)
     begin = next(index for index, line in enumerate(lines) if line.startswith('  checked:'))
     assert max(map(len, lines)) <= 80

@@ -140,9 +140,7 @@ def test_colours_in_another_order_are_other_classes() -> None:
 def test_names_in_the_model_say_what_is_a_vehicle() -> None:
     names = {0: 'Van', 1: 'tree', 2: 'pedestrian'}
     seeing = SeeingModel(
-        lambda found, size: onnx_models.yolov8(
-            [(edges, 2 if kind == PERSON else 0) for edges, kind in found], size, 3
-        ),
+        lambda found, size: onnx_models.yolov8([(edges, 2 if kind == PERSON else 0) for edges, kind in found], size, 3),
         meta={'names': repr(names)},
     )
     detector = VehicleDetector(seeing, DetectorOptions())

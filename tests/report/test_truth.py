@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from autocalib_ros.calibrator import solve
 from autocalib_ros.config import Options
+from autocalib_ros.estimation.estimate import solve
 from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.offline.synthetic.junction import Junction, synthetic_evidence
 from autocalib_ros.pictures.views import TopView, grid_lines, grid_step, ground_to_image, image_to_ground

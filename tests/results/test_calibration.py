@@ -11,8 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from autocalib_ros.geometry.ground_plane import GroundPlane, quaternion_xyzw
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.results.calibration import Calibration, EvidenceSummary, Reason, Refusal, StandardDeviations
+from autocalib_ros.results.calibration import Calibration, EvidenceSummary, Refusal, StandardDeviations
 from autocalib_ros.results.calibration_json import to_json, write_calibration_json
+from autocalib_ros.results.refusals import Reason
+from autocalib_ros.results.statements import assumption
 
 CAMERA = Camera(1280, 720, 560.0, (639.5, 359.5))
 EVIDENCE = EvidenceSummary(
@@ -24,7 +26,7 @@ def calibration(ground: GroundPlane | None) -> Calibration:
     return Calibration(
         method='joint',
         grade='full',
-        assumptions=('square pixels',),
+        assumptions=(assumption('paper_roads'),),
         camera=CAMERA,
         ground=ground,
         ground_refusal=None,

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from autocalib_ros.errors import InputError
-from autocalib_ros.results.calibration import Reason, Refusal
+from autocalib_ros.results.calibration import Refusal
 from autocalib_ros.results.calibration_json import calibration_from_json, calibration_json, read_json
+from autocalib_ros.results.refusals import Reason
 from stored_results import calibration, lens_only
 
 WHOLE = calibration()

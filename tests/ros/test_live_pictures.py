@@ -14,7 +14,8 @@ from autocalib_ros.calibrator import AutoCalibrator, CalibrationProgress
 from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.offline.synthetic.junction import pose
 from autocalib_ros.pictures import live_overlay as live
-from autocalib_ros.results.calibration import EvidenceSummary, Reason
+from autocalib_ros.results.calibration import EvidenceSummary
+from autocalib_ros.results.refusals import Reason
 from autocalib_ros.revalidation import CalibrationState
 from autocalib_ros.ros.live_pictures import VERIFIED_COLOUR, WAITING_COLOUR, LivePictures, caption_of, image_message
 from autocalib_ros.ros.messages import header, stamp_ns, time_message, validated

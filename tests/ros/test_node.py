@@ -12,8 +12,8 @@ from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage
 
-from autocalib_ros.calibrator import with_requested_model
 from autocalib_ros.errors import UsageError
+from autocalib_ros.estimation.publish import with_requested_model
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.lens.camera_info import camera_info
 from autocalib_ros.lens.camera_info_yaml import write_camera_info_yaml

@@ -8,9 +8,10 @@ from dataclasses import replace
 
 import pytest
 
-from autocalib_ros.calibrator import AutoCalibrator, solve
+from autocalib_ros.calibrator import AutoCalibrator
 from autocalib_ros.config import Options, ScaleOptions
 from autocalib_ros.errors import UsageError
+from autocalib_ros.estimation.estimate import solve
 from autocalib_ros.results.calibration import Refusal
 from autocalib_ros.ros.solver_process import SolverDied, SolverProcess
 from bench import PATIENCE_S, PIXELS

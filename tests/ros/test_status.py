@@ -8,7 +8,9 @@ import pytest
 from autocalib_ros.calibrator import CalibrationProgress
 from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.results.calibration import Calibration, EvidenceSummary, Reason, StandardDeviations
+from autocalib_ros.results.calibration import Calibration, EvidenceSummary, StandardDeviations
+from autocalib_ros.results.refusals import Reason
+from autocalib_ros.results.statements import assumption
 from autocalib_ros.ros.status import (
     ERROR,
     OK,
@@ -30,7 +32,7 @@ TILTED = np.array([[0.0, -SIN, COS], [-1.0, 0.0, 0.0], [0.0, -COS, -SIN]])
 RESULT = Calibration(
     method='joint',
     grade='full',
-    assumptions=('right angle',),
+    assumptions=(assumption('paper_roads'),),
     camera=Camera.equidistant(1280, 720, 512.346),
     ground=GroundPlane(TILTED, 8.0),
     ground_refusal=None,
@@ -141,7 +143,7 @@ def test_numbers_of_the_calibration_are_told():
         'roll_sigma_deg': '0.25',
         'height_m': '8.000',
         'height_sigma_m': '0.1',
-        'assumptions': 'right angle',
+        'assumptions': 'the two roads are perpendicular',
         'no_ground_plane': '',
         'newest_stamp_s': '1700000000.250',
     }

@@ -20,7 +20,8 @@ from autocalib_ros.estimation.observations.two_frame_windows import no_windows
 from autocalib_ros.estimation.verification.gates import check_markings_view
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.ground_plane import unsigned_angle_deg
-from autocalib_ros.results.calibration import Reason
+from autocalib_ros.results.refusals import Reason, reason
+from autocalib_ros.results.statements import Statement, assumption
 
 MIN_ALIGNED_FRACTION = 0.1
 """Of the lines along either direction: by chance a few in a hundred are, and one road's own are along the other."""
@@ -30,7 +31,6 @@ of a lamp post, may be askew."""
 AMBIGUITY_NATS, MAX_AMBIGUITY_DEG = 5.0, 3.0
 """Another plane, so far from the best, speaks against it when its probability is no less than e to the minus this of
 the best one's; and so does another focal length that is farther away than its deviation may be."""
-NO_MARKINGS = 'no_markings'
 MIN_VARIANCE = 1e-12
 """Lines without noise, as tests make them, leave parameters without any spread."""
 MAX_SKEW_SIGMAS = 2.5
@@ -39,7 +39,7 @@ MAX_SKEW_SIGMAS = 2.5
 
 def fit_to_markings(
     evidence: Evidence, tracks: TrackSet, priors: list[LensPrior], config: AdjustmentConfig, gate: GateOptions
-) -> tuple[Adjustment, str] | Reason:
+) -> tuple[Adjustment, Statement] | Reason:
     """Estimate lens and plane from the lines on the road; with what was assumed in words, or a reason why not."""
     every = segments_on_road(evidence)
     grids = find_grids(every, priors)
@@ -50,15 +50,13 @@ def fit_to_markings(
     state = AdjustmentState(best.camera, best.rotation, np.array([0.0, np.pi / 2 + best.skew_rad]))
     fit = evaluate_at(state, tracks, replace(config, prior=best.prior, crossing_rad=None), best.covariance)
     if not fit.focal_sigma <= gate.max_sigma_focal_rel:
-        return _no_markings(
-            f'the focal length to {min(fit.focal_sigma, 9.99):.1%}, {gate.max_sigma_focal_rel:.0%} is needed'
-        )
+        return reason('no_markings', 'focal_length', sigma=min(fit.focal_sigma, 9.99), limit=gate.max_sigma_focal_rel)
     return check_markings_view(fit, tracks) or (fit, _describe(lines, best))
 
 
 def refine_with_markings(
     fit: Adjustment, evidence: Evidence, tracks: TrackSet, prior: LensPrior, gate: GateOptions
-) -> tuple[Adjustment, str] | Reason:
+) -> tuple[Adjustment, Statement] | Reason:
     """Return the lens and plane near those of a solution to which the lines on the road lead, with its roads.
 
     With what was assumed in words, or a reason why not.
@@ -93,12 +91,15 @@ def _upward_normal(fit: Adjustment) -> np.ndarray:
     return -normal if normal[1] > 0 else normal
 
 
-def _describe(lines: RoadSegments, grid: MarkingGrid) -> str:
-    told = grid.responsibilities[:2].max(axis=0) > 0.5
-    places, tested_deg = len(np.unique(lines.groups[told])), 90.0 + np.degrees(grid.skew_rad)
-    return (
-        f'{told.sum()} lines in {places} places on the road taken as parallel or square to each other: '
-        f'90 +- {np.degrees(RIGHT_ANGLE_SIGMA_RAD):g} degrees (tested: {tested_deg:.1f})'
+def _describe(lines: RoadSegments, grid: MarkingGrid) -> Statement:
+    """Return the assumption that lines along either axis of the grid are parallel or perpendicular."""
+    aligned = grid.responsibilities[:2].max(axis=0) > 0.5
+    return assumption(
+        'lane_markings',
+        lines=aligned.sum(),
+        places=len(np.unique(lines.groups[aligned])),
+        sigma_deg=np.degrees(RIGHT_ANGLE_SIGMA_RAD),
+        angle_deg=90.0 + np.degrees(grid.skew_rad),
     )
 
 
@@ -115,10 +116,10 @@ def _accepted_grid(
 ) -> tuple[RoadSegments, MarkingGrid] | Reason:
     """Return the lines beside traffic and the best grid by them, or what speaks against it."""
     if not grids:
-        return _no_markings(f'there are {len(every)}')
+        return reason('no_markings', lines=len(every))
     nearer = keep_lines_near_traffic(every, grids[0], evidence)
     if nearer is None:
-        return _no_markings('too few are beside the traffic')
+        return reason('no_markings', 'off_road')
     return _check_ambiguity(every, grids, gate) or _check_axes(*nearer, min_places) or nearer
 
 
@@ -130,10 +131,10 @@ def _check_ambiguity(lines: RoadSegments, grids: list[MarkingGrid], gate: GateOp
             continue
         difference_deg = _normal_difference_deg(lines, best, other)
         if difference_deg > MAX_AMBIGUITY_DEG:
-            return _no_markings(f'they suit two planes {difference_deg:.0f} degrees apart')
+            return reason('no_markings', 'two_planes', difference_deg=difference_deg)
         focals = sorted(grid.camera.focal_px for grid in (best, other))
         if other.prior is best.prior and np.log(focals[1] / focals[0]) > gate.max_sigma_focal_rel:
-            return _no_markings(f'they suit two focal lengths, {focals[0]:.0f} and {focals[1]:.0f} px')
+            return reason('no_markings', 'two_lenses', focal_px=focals[0], other_focal_px=focals[1])
     return None
 
 
@@ -153,14 +154,14 @@ def _check_axes(lines: RoadSegments, grid: MarkingGrid, min_places: int) -> Reas
     places = min(len(np.unique(lines.groups[mask])) for mask in grid.responsibilities[:2] > 0.5)
     share = grid.fractions[:2].min()
     if share < MIN_ALIGNED_FRACTION or places < min_places:
-        return _no_markings(
-            f'{share:.0%} of them, in {places} places, are along the second of two directions; '
-            f'{MIN_ALIGNED_FRACTION:.0%} in {min_places} places are needed'
+        return reason(
+            'no_markings',
+            'one_axis',
+            fraction=share,
+            places=places,
+            limit=MIN_ALIGNED_FRACTION,
+            limit_places=min_places,
         )
     if abs(grid.skew_rad) > MAX_SKEW_SIGMAS * RIGHT_ANGLE_SIGMA_RAD:
-        return _no_markings(f'they cross at {90 + np.degrees(grid.skew_rad):.1f} degrees, not at a right angle')
+        return reason('no_markings', 'not_square', angle_deg=90 + np.degrees(grid.skew_rad))
     return None
-
-
-def _no_markings(why: str) -> Reason:
-    return Reason(NO_MARKINGS, f'lines on the road do not tell lens and plane: {why}', 'wait for more traffic')

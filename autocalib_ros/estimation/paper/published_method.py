@@ -23,13 +23,11 @@ from autocalib_ros.geometry.ground_plane import (
     rotation_from_vanishing_points,
 )
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.results.calibration import Calibration, Figures, Reason, StandardDeviations
+from autocalib_ros.results.calibration import Calibration, Figures, StandardDeviations
+from autocalib_ros.results.refusals import Reason, reason
+from autocalib_ros.results.statements import assumption
 
-PAPER_ASSUMPTIONS = (
-    'equidistant lens with the principal point at the image centre',
-    'the two roads are perpendicular',
-    'the published method gives no uncertainty',
-)
+PAPER_ASSUMPTIONS = tuple(assumption(kind) for kind in ('paper_lens', 'paper_roads', 'paper_uncertainty'))
 
 
 def solve_paper(
@@ -38,11 +36,12 @@ def solve_paper(
     """Run both stages; the reason instead when a stage has nothing to work on."""
     if intrinsics is None:
         paper = options.paper
-        return Reason(
+        return reason(
             'too_few_tracks',
-            f'no track lived for {paper.min_lifetime:.0%} of an interval of {paper.window_s:g} s '
-            f'with a path of at most {paper.max_path_ratio:g} x its displacement',
-            'record slower traffic, shorten paper.window_s, or use method joint',
+            'paper',
+            lifetime=paper.min_lifetime,
+            window_s=paper.window_s,
+            path_ratio=paper.max_path_ratio,
         )
     camera = Camera.equidistant(*evidence.image_size, intrinsics.report.focal_px)
     found = segment_orientations(camera, evidence.segments_px, options.paper)
@@ -70,21 +69,14 @@ def _with_ground(result: Calibration, found: SegmentOrientations, evidence: Evid
     if len(points) < 2:
         return replace(
             result,
-            ground_refusal=Reason(
-                'one_direction',
-                f'the orientation histogram of {len(evidence.segments_px)} segments has {len(points)} peaks, not two',
-                'wait for traffic on a second road',
-            ),
+            ground_refusal=reason('one_direction', 'paper', segments=len(evidence.segments_px), peaks=len(points)),
         )
     focal = focal_from_vanishing_points(*points)
     if focal is None or result.paper is None:
         return replace(
             result,
-            ground_refusal=Reason(
-                'vanishing_points_disagree',
-                'no focal length makes the two vanishing points perpendicular '
-                f'(orientations {found.peaks_deg[0]:.0f} and {found.peaks_deg[1]:.0f} degrees)',
-                'the roads are not perpendicular or the lens is wrong: use method joint',
+            ground_refusal=reason(
+                'vanishing_points_disagree', first_deg=found.peaks_deg[0], second_deg=found.peaks_deg[1]
             ),
         )
     rotation = rotation_from_vanishing_points(*points, focal)

@@ -13,6 +13,7 @@ from autocalib_ros.estimation.adjustment.parameters import AdjustmentState, Road
 from autocalib_ros.estimation.observations.track_set import TrackSet, evenly_spaced
 from autocalib_ros.estimation.straight.initialisation import MIN_ROAD_SEPARATION_DEG, roads_separated
 from autocalib_ros.geometry.great_circles import fit_circles, unproject_rays
+from autocalib_ros.results.statements import Statement, assumption, check
 
 MAX_ROADS = 4
 MAX_PROPOSAL_TRACKS = 40
@@ -133,19 +134,18 @@ def _angles_in_plane(state: AdjustmentState, normals: np.ndarray) -> np.ndarray:
     return np.arctan2(along[:, 1], along[:, 0])
 
 
-def fix_right_angle(fit: Adjustment, tracks: TrackSet, options: JointOptions) -> tuple[Adjustment, str | None]:
-    """Hold two roads at 90 degrees where the evidence does not speak against it, or at what is asserted."""
+def fix_right_angle(fit: Adjustment, tracks: TrackSet, options: JointOptions) -> tuple[Adjustment, Statement | None]:
+    """Fix two roads at 90 degrees unless the evidence contradicts it, or at the given angle; and the angle."""
     if len(fit.state.angles_rad) < 2:
         return fit, None
     angle, config = crossing_deg(fit.state), fit.problem.config
     if config.crossing_rad is not None:
-        return fit, f'roads cross at {options.crossing_deg:g} degrees (asserted)'
+        return fit, assumption('crossing_angle', angle_deg=options.crossing_deg, sigma_deg=None, source='given')
     sigma = float(fit.sigma(lambda state: np.array([crossing_deg(state)]))[0])
-    measured = f'roads cross at {angle:.1f} +- {min(sigma, 90.0):.1f} degrees (measured)'
     if options.road_angle == 'free' or abs(90.0 - angle) > max(RIGHT_ANGLE_SIGMAS * sigma, RIGHT_ANGLE_FLOOR_DEG):
-        return fit, measured
+        return fit, check('crossing_angle', angle_deg=angle, sigma_deg=min(sigma, 90.0), source='measured')
     squared = adjust(fit.state, tracks, replace(config, crossing_rad=np.pi / 2))
-    return squared, f'roads cross at 90 degrees (tested: {angle:.1f} +- {sigma:.1f})'
+    return squared, assumption('crossing_angle', angle_deg=angle, sigma_deg=sigma, source='fixed')
 
 
 def main_road(fit: Adjustment, tracks: TrackSet) -> tuple[np.ndarray, TrackSet]:

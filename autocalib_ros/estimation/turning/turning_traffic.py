@@ -22,7 +22,7 @@ from autocalib_ros.estimation.observations.track_set import TrackSet
 from autocalib_ros.estimation.observations.tracklets import find_tracklets, no_tracklets
 from autocalib_ros.estimation.observations.two_frame_windows import ResampledTracks, TwoFrameWindows
 from autocalib_ros.estimation.verification.consistency import compare_solutions
-from autocalib_ros.results.calibration import Reason
+from autocalib_ros.results.refusals import Reason, reason
 
 START_FOCAL_DIAGONALS = (0.35, 0.55, 0.85)
 """Focal lengths to start from, in image diagonals: lenses of about 100, 75 and 50 degrees across the diagonal."""
@@ -179,12 +179,11 @@ def check_turning_centres(fit: Adjustment, windows: TwoFrameWindows) -> Reason |
     distances = np.hypot(*(centres - np.median(centres, axis=0)).T)
     if not len(radii) or np.median(distances) > MAX_CENTRE_SPREAD * np.median(radii):
         return None
-    return Reason(
+    return reason(
         'one_centre',
-        f'all vehicles turn about one point, as on one ring or bend (half of their centres lie within '
-        f'{np.median(distances) / np.median(radii):.0%} of the radius), and tell the focal length to {sigma:.1%}; '
-        f'{MAX_SIGMA_FOCAL_ONE_CENTRE:.0%} is needed there',
-        'wait for more traffic, above all such that turns elsewhere, enters or leaves, or drives straight',
+        spread=np.median(distances) / np.median(radii),
+        sigma=sigma,
+        limit=MAX_SIGMA_FOCAL_ONE_CENTRE,
     )
 
 

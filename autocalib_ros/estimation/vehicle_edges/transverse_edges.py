@@ -25,6 +25,7 @@ from autocalib_ros.geometry.great_circles import bearing_change, unproject_rays
 from autocalib_ros.geometry.robust_kernels import wrap_undirected
 from autocalib_ros.geometry.small_matrices import cross, dot
 from autocalib_ros.lens.camera import Camera
+from autocalib_ros.results.statements import Statement, assumption
 
 MAX_EDGES = 1000
 """Edges in one estimate, the longest of each vehicle in turn."""
@@ -115,8 +116,8 @@ class TransverseDirection:
     vehicles: int
     turn_rad: float = 0.0
     """A rotation about the road that another assumption adds."""
-    besides: str = ''
-    """That assumption in words."""
+    level_sigma_deg: float | None = None
+    """Sigma of the roll, degrees, if the direction combines the edges with a level camera."""
 
     def across(self, state: AdjustmentState, step_rad: float = 0.0) -> np.ndarray:
         """Direction (3,) across the first road at a state near the solution, rotated about the road by a step."""
@@ -130,11 +131,13 @@ class TransverseDirection:
         return np.cos(turn) * across + np.sin(turn) * np.cross(along, across)
 
     @property
-    def description(self) -> str:
-        """What is assumed."""
-        return (
-            f'edges of {self.vehicles} vehicles taken as square to it{self.besides}: '
-            f'+- {np.degrees(self.step_sigma_rad):.1f} degrees about the road'
+    def assumption(self) -> Statement:
+        """The assumption as a statement."""
+        return assumption(
+            'transverse_edges',
+            vehicles=self.vehicles,
+            sigma_deg=np.degrees(self.step_sigma_rad),
+            level_sigma_deg=self.level_sigma_deg,
         )
 
 

@@ -1,4 +1,4 @@
-"""What speaks against a solution: each doubt gives a reason with numbers and a remedy, or nothing."""
+"""Acceptance gates: each check returns the reason why a solution is not accepted, or None."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ from autocalib_ros.estimation.verification.consistency import compare_solutions,
 from autocalib_ros.estimation.verification.ground_normal import LevelCamera, PlaneEstimate, orient_above_traffic
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.ground_plane import MIN_FRACTION_BELOW_HORIZON
-from autocalib_ros.results.calibration import Reason
+from autocalib_ros.results.refusals import Reason, reason
+from autocalib_ros.results.statements import Statement, check
 
 MIN_STRAIGHT_FRACTION = 0.25
 """Share of vehicles that follow the roads; below it the traffic turns, and what it agrees on is a turn."""
@@ -55,8 +56,6 @@ HALVES_FOCAL_TOLERANCE = 0.03
 HALVES_NORMAL_TOLERANCE_DEG = 1.5
 """Two halves of the evidence may always differ by so much: it is within what the program promises."""
 
-NOT_CROSS_CHECKED = 'not cross-checked in time: the earlier or the later half has too little traffic on a road'
-
 
 def check_straight_traffic(fit: Adjustment, contrast: float, tracks: TrackSet) -> Reason | None:
     """Say why the straight traffic that a solution started from tells nothing, if so.
@@ -68,13 +67,7 @@ def check_straight_traffic(fit: Adjustment, contrast: float, tracks: TrackSet) -
     if share < MIN_STRAIGHT_FRACTION:
         return _turning_traffic_reason(fit, share, MIN_STRAIGHT_FRACTION)
     if contrast < MIN_FOCAL_CONTRAST and not (prior.family == 'distortion_free' and len(fit.state.angles_rad) > 1):
-        return Reason(
-            'no_agreement',
-            f'no focal length stands out: with the best one {contrast:.2f} times as much traffic '
-            f'follows straight roads as with a middling one, {MIN_FOCAL_CONTRAST:g} times is needed',
-            'wait for straight traffic, above all near the borders of the image; the traffic may be turning, or the '
-            'lens may have no distortion: then give joint.road_angle or joint.focal_prior_px',
-        )
+        return reason('no_agreement', contrast=contrast, limit=MIN_FOCAL_CONTRAST)
     return _check_horizon(fit, tracks)
 
 
@@ -120,11 +113,7 @@ def _check_horizon(fit: Adjustment, tracks: TrackSet) -> Reason | None:
 
 
 def _above_horizon_reason(fraction_below_horizon: float) -> Reason:
-    return Reason(
-        'horizon',
-        f'{1 - fraction_below_horizon:.0%} of the tracked points lie above the horizon of the plane found',
-        'the traffic found does not belong to one plane: wait for more of it',
-    )
+    return reason('horizon', fraction=1 - fraction_below_horizon, limit=1 - MIN_FRACTION_BELOW_HORIZON)
 
 
 def motion_constrains_focal(fit: Adjustment) -> bool:
@@ -152,14 +141,9 @@ def lane_keeping_fraction(fit: Adjustment, evidence: Evidence) -> float:
     return float(kept.sum() / following.sum()) if following.sum() >= MIN_VEHICLES_PER_ROAD else 0.0
 
 
-def _turning_traffic_reason(fit: Adjustment, share: float, needed: float) -> Reason:
-    where = 'best straight roads' if len(fit.state.angles_rad) > 1 else 'one straight road that was found'
-    return Reason(
-        'turning_traffic',
-        f'only {share:.0%} of the vehicles follow the {where}, {needed:.0%} '
-        'are needed: the traffic turns, or the road bends',
-        'wait for straight traffic, or turn the camera towards a straight road',
-    )
+def _turning_traffic_reason(fit: Adjustment, fraction: float, limit: float) -> Reason:
+    roads = len(fit.state.angles_rad)
+    return reason('turning_traffic', '' if roads > 1 else 'one_road', fraction=fraction, limit=limit, roads=roads)
 
 
 def _check_focal_length(fit: Adjustment, gate: GateOptions, *, turned: bool) -> Reason | None:
@@ -175,19 +159,8 @@ def _check_focal_length(fit: Adjustment, gate: GateOptions, *, turned: bool) -> 
     needed = min(gate.max_sigma_focal_rel, MAX_TURNING_FOCAL_SIGMA) if turned else gate.max_sigma_focal_rel
     if not (too_long or circular or not sigma <= needed):
         return None
-    found = f'focal length {camera.focal_px:.0f} px +- {min(sigma, 9.99):.1%}, {needed:.0%} is needed'
-    if turned:
-        return Reason(
-            'too_little_turning',
-            f'traffic that turns tells too little of the lens: {found}',
-            'wait for more vehicles that turn, or for straight traffic',
-        )
-    return Reason(
-        'too_little_curvature',
-        f'straight traffic shows too little lens curvature: {found}',
-        'wait for traffic nearer the borders of the image; a lens without distortion needs the angle between two '
-        'roads (joint.road_angle) or its focal length (joint.focal_prior_px)',
-    )
+    code = 'too_little_turning' if turned else 'too_little_curvature'
+    return reason(code, focal_px=camera.focal_px, sigma=min(sigma, 9.99), limit=needed)
 
 
 def _check_lens_model(fit: Adjustment) -> Reason | None:
@@ -196,11 +169,7 @@ def _check_lens_model(fit: Adjustment) -> Reason | None:
         return None
     off = abs(camera.k[0] - prior.centre.k[0]) / prior.sigma[3]
     if off > MAX_K1_SIGMAS:
-        return Reason(
-            'lens_model',
-            f'the lens is not close to {prior.family}: k1 = {camera.k[0]:.3f}, {off:.1f} sigmas off',
-            'widen joint.k1_sigma if the lens is known to differ',
-        )
+        return reason('lens_model', family=prior.family, k1=camera.k[0], sigmas=off, limit=MAX_K1_SIGMAS)
     return None
 
 
@@ -208,24 +177,16 @@ def check_plane(plane: PlaneEstimate, gate: GateOptions, *, assumed: bool = Fals
     """Say why the ground plane cannot be trusted, if so; one that is `assumed` may be less sure."""
     sigma = plane.worst_sigma_deg
     if isinstance(plane.assumed, LevelCamera) and not plane.assumed.constrains_plane(plane.fit.state):
-        return Reason(
-            'plane_uncertain',
-            'the road leads level across the image, where the roll of the camera tells nothing of the plane',
-            'wait for traffic across the road, or that turns',
-        )
+        return reason('plane_uncertain', 'level_road')
     if plane.assumed is not None and plane.fraction_below_horizon < MIN_FRACTION_BELOW_HORIZON:
         return _above_horizon_reason(plane.fraction_below_horizon)
     needed = gate.max_sigma_tilt_deg * (ASSUMED_PLANE_SIGMA_FACTOR if assumed or plane.assumed is not None else 1.0)
     if not sigma <= needed:
-        return Reason(
-            'plane_uncertain',
-            f'the ground normal is known to {min(sigma, 90.0):.1f} degrees, {needed:g} are needed',
-            'wait for more traffic on the quieter road',
-        )
+        return reason('plane_uncertain', sigma_deg=min(sigma, 90.0), limit_deg=needed)
     return None
 
 
-def check_halves(fit: Adjustment, tracks: TrackSet, gate: GateOptions) -> Reason | str:
+def check_halves(fit: Adjustment, tracks: TrackSet, gate: GateOptions) -> Reason | Statement:
     """Solve the earlier and the later half of the vehicles; they have to agree within what they know."""
     config = replace(fit.problem.config, vehicle_correlation=fit.vehicle_correlation)
     lives = no_tracklets() if config.bundle is None else config.bundle.lives
@@ -239,12 +200,12 @@ def check_halves(fit: Adjustment, tracks: TrackSet, gate: GateOptions) -> Reason
         part, bundle = tracks.subset(half), config.bundle and config.bundle.subset(living)
         part_setting = replace(config, windows=config.windows.subset(seen), bundle=bundle)
         if half.sum() + seen.sum() + living.sum() < MIN_RESIDUAL_ROWS or config.turning and not part_setting.turning:
-            return NOT_CROSS_CHECKED
+            return check('halves_not_compared')
         _, motion, shapes = fit.problem.warm_start
         warm_start = None, motion.subset(seen) if motion else None, shapes.subset(living) if bundle and shapes else None
         fits.append(adjust(fit.state, part, part_setting, refine=True, warm_start=warm_start))
         if any(mask.sum() < gate.min_tracks_per_road // 2 for mask in road_support(fits[-1], part)):
-            return NOT_CROSS_CHECKED
+            return check('halves_not_compared')
     apart = compare_solutions(*fits)
     focal, turn = apart.focal, apart.normal_deg if fit.plane_known else 0.0  # one road leaves the normal free
     # what either half says of itself is no excuse where the whole claims to know better
@@ -253,14 +214,10 @@ def check_halves(fit: Adjustment, tracks: TrackSet, gate: GateOptions) -> Reason
         np.minimum(MAX_HALVES_SIGMAS * apart.sigmas, MAX_WHOLE_SIGMAS * expected_half_differences(fit, *fits)),
     )
     if focal > focal_limit or turn > turn_limit:
-        return Reason(
-            'halves_disagree',
-            f'the earlier and the later half of the traffic disagree: focal length by {focal:.1%}, '
-            f'ground normal by {turn:.1f} degrees',
-            'record for longer; check that the camera is firmly fixed',
+        return reason(
+            'halves_disagree', focal=focal, focal_limit=focal_limit, normal_deg=turn, normal_limit_deg=turn_limit
         )
-    normal = f' and {turn:.1f} degrees in the ground normal' if fit.plane_known else ''
-    return f'the earlier and the later half of the traffic differ by {focal:.1%} in focal length{normal}'
+    return check('halves', focal=focal, normal_deg=turn if fit.plane_known else None)
 
 
 def _earlier_half(*seen: tuple[np.ndarray, np.ndarray]) -> list[np.ndarray]:

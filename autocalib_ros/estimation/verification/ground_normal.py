@@ -15,6 +15,7 @@ from autocalib_ros.geometry.great_circles import unproject_rays
 from autocalib_ros.geometry.ground_plane import orient_upward, tilt_and_roll_deg
 from autocalib_ros.geometry.robust_kernels import wrap_undirected
 from autocalib_ros.lens.camera import Camera
+from autocalib_ros.results.statements import Statement, assumption
 
 STEP_RAD = 1e-5
 AGREEMENT_SIGMAS = 3.0
@@ -47,9 +48,9 @@ class LevelCamera:
         return float(np.hypot(along[1], along[2])) > MIN_SINE_TO_X_AXIS
 
     @property
-    def description(self) -> str:
-        """What is assumed."""
-        return f'a camera that is not rolled: roll = 0 +- {self.sigma_deg:g} degrees'
+    def assumption(self) -> Statement:
+        """The assumption as a statement."""
+        return assumption('level_camera', sigma_deg=self.sigma_deg)
 
 
 def combine_assumptions(
@@ -75,7 +76,7 @@ def combine_assumptions(
         square,
         turn_rad=turn(0.0) * (square.step_sigma_rad / both) ** 2,
         step_sigma_rad=square.step_sigma_rad * sigma / both,
-        besides=f', and {level.description}',
+        level_sigma_deg=level.sigma_deg,
     )
     return joined if abs(turn(0.0)) <= AGREEMENT_SIGMAS * both else None, float(np.degrees(abs(turn(0.0))))
 

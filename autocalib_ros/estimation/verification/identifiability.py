@@ -1,4 +1,4 @@
-"""What the evidence cannot tell is held at what was known before, and said."""
+"""Fix parameters that the evidence does not determine at their prior mean, and report them."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from autocalib_ros.estimation.adjustment.lens_prior import LENS_PARAMETERS
 from autocalib_ros.estimation.adjustment.model_selection import MODEL_SELECTION_MARGIN, select_model
 from autocalib_ros.estimation.observations.track_set import TrackSet
 from autocalib_ros.lens.camera import Camera
+from autocalib_ros.results.statements import Statement, assumption
 
 
 def release_k2(fit: Adjustment, tracks: TrackSet) -> Adjustment:
@@ -68,21 +69,16 @@ def _restored(camera: Camera, prior: Camera, name: str) -> Camera:
     return replace(camera, **values[name])
 
 
-def lens_assumptions(fit: Adjustment, fixed: tuple[str, ...]) -> tuple[str, ...]:
-    """Say in words what was taken for granted of the lens."""
+def lens_assumptions(fit: Adjustment, fixed: tuple[str, ...]) -> tuple[Statement, ...]:
+    """Return what was assumed of the lens, with the parameters that were fixed at their prior."""
     prior = fit.problem.config.prior
     if prior.family == 'known':
-        return ('the lens is as given: only the pose was solved',)
-    words = {
-        'equidistant': 'lens near equidistant: k1 = 0',
-        'distortion_free': 'lens free of distortion: k1 = 1/3',
-        'kannala_brandt': 'lens between equidistant and free of distortion: k1 = 1/6',
-    }
-    told = [f'{words[prior.family]} +- {prior.sigma[3]:.3g}']
-    point = prior.sigma[1]
-    told.append('principal point at the image centre' + (f' +- {point:.0f} px' if point > 0 else ''))
+        return (assumption('lens_given'),)
+    statements = [
+        assumption('lens_family', family=prior.family, k1_sigma=prior.sigma[3]),
+        assumption('principal_point', sigma_px=prior.sigma[1]),
+    ]
     if prior.focal_known:
-        sigma = prior.sigma[0] * prior.centre.focal_px
-        spread = f' +- {sigma:g} px' if sigma > 0 else ''
-        told.append(f'focal length {prior.centre.focal_px:g} px{spread} (given)')
-    return (*told, *(f'{name} held there: the traffic cannot determine it' for name in fixed))
+        focal_px = prior.centre.focal_px
+        statements.append(assumption('focal_given', focal_px=focal_px, sigma_px=prior.sigma[0] * focal_px))
+    return (*statements, *(assumption('parameter_fixed', parameter=name) for name in fixed))

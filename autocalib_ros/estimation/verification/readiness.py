@@ -1,4 +1,4 @@
-"""Is there enough evidence to try: reasons not to, with numbers, in words an installer understands."""
+"""Readiness: is there enough evidence to try a solution, and if not, what is missing and for how long."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from autocalib_ros.config import GateOptions
 from autocalib_ros.evidence.snapshot import Evidence
-from autocalib_ros.results.calibration import Reason
+from autocalib_ros.results.refusals import Reason, reason
 
 REFERENCE_WIDTH_PX = 1280
 """Image width for which `max_drift_px` is given; it scales with the width."""
@@ -38,16 +38,9 @@ def drift_limit_px(image_width: int, gate: GateOptions) -> float:
 def check_steady(evidence: Evidence, gate: GateOptions) -> Reason | None:
     """Say how far the camera moved, where that is too far."""
     limit = drift_limit_px(evidence.image_size[0], gate)
-    return (
-        None
-        if evidence.drift_px <= limit
-        else Reason(
-            'camera_moving',
-            f'the camera moves: the background drifted by {evidence.drift_px:.1f} px, and up to '
-            f'{limit:.1f} px pass for standing still',
-            'fix the camera to something rigid and record again',
-        )
-    )
+    if evidence.drift_px <= limit:
+        return None
+    return reason('camera_moving', drift_px=evidence.drift_px, limit_px=limit)
 
 
 def check_readiness(evidence: Evidence, gate: GateOptions) -> Reason | None:
@@ -56,23 +49,11 @@ def check_readiness(evidence: Evidence, gate: GateOptions) -> Reason | None:
     if moving:
         return moving
     if not evidence.track_count:
-        return Reason(
-            'no_motion',
-            f'nothing moved in {evidence.frames} images over {evidence.seconds:.0f} s',
-            'check that the camera sees traffic and that the images are not frozen or dark',
-        )
+        return reason('no_motion', frames=evidence.frames, seconds=evidence.seconds)
     if evidence.track_count < gate.min_tracks:
-        return Reason(
-            'too_few_tracks',
-            f'{evidence.track_count} tracks of the {gate.min_tracks} needed after {evidence.seconds:.0f} s',
-            'wait for more traffic, or record for longer',
-        )
+        return reason('too_few_tracks', tracks=evidence.track_count, seconds=evidence.seconds, limit=gate.min_tracks)
     if evidence.coverage < gate.min_coverage:
-        return Reason(
-            'poor_coverage',
-            f'traffic crossed {evidence.coverage:.0%} of the image, {gate.min_coverage:.0%} is needed',
-            'turn the camera so that the road fills more of the image, or choose a longer lens',
-        )
+        return reason('poor_coverage', coverage=evidence.coverage, limit=gate.min_coverage)
     return None
 
 

@@ -6,8 +6,8 @@ heights in the solved lens and plane, and so tells the height; it is then as sur
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -16,7 +16,8 @@ from autocalib_ros.estimation.adjustment.noise_model import DEFAULT_CAMERA_HEIGH
 from autocalib_ros.estimation.observations.track_set import TrackSet
 from autocalib_ros.geometry.ground_plane import ground_points
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.results.calibration import Reason
+from autocalib_ros.results.refusals import Reason, reason
+from autocalib_ros.results.statements import Statement, Value, assumption
 
 SIMILAR_HEIGHT_FACTOR = 1.25
 """A height within this factor of the usual one weighs near against far as that one did: nothing is solved again."""
@@ -46,16 +47,19 @@ class Scale:
     """Standard deviation of the height, without that of lens and plane."""
     metric: bool
     """Whether the height is in metres."""
-    description: str
+    kind: str = ''
+    """Kind of the assumption that names the source; '' without a scale."""
+    values: Mapping[str, Value] = field(default_factory=dict)
+    """Numbers of that assumption."""
     derived: bool = False
     """Whether the height follows from lens and plane; otherwise it was given."""
 
-    def assumption(self, height: float, sigma: float | None = None) -> tuple[str, ...]:
-        """Say in words what the scale rests on, and the height with its whole standard deviation that follows."""
+    def assumption(self, height: float, sigma: float | None = None) -> tuple[Statement, ...]:
+        """Return the source of the scale, with the height and its total standard deviation if they follow from it."""
         if not self.metric:
             return ()
-        spread = '' if sigma is None else f' +- {sigma:.2g}'
-        return (f'scale by {self.description}' + (f': camera height {height:.3f}{spread} m' if self.derived else ''),)
+        derived = {'height_m': height, 'height_sigma_m': sigma} if self.derived else {}
+        return (assumption(self.kind, **self.values, **derived),)
 
 
 def known_scale(options: Options, camera: Camera, normal: np.ndarray, flow: TrackSet | None = None) -> Scale | Reason:
@@ -69,29 +73,18 @@ def known_scale(options: Options, camera: Camera, normal: np.ndarray, flow: Trac
         return _scale_from_speed(options.scale, camera, normal, flow)
     height, sigma = options.camera_height, options.camera_height_sigma
     if height > 0:
-        spread = f' +- {sigma:g}' if sigma > 0 else ''
-        return Scale(lambda *_: height, sigma, True, f'the camera height of {height:g}{spread} m (given)')
+        values = {'given_m': height, 'given_sigma_m': sigma}
+        return Scale(lambda *_: height, sigma, True, 'scale_height', values)
     if options.allow_unit_scale:
-        return Scale(lambda *_: 1.0, 0.0, False, '')
-    return Reason(
-        'no_height',
-        'the ground plane needs the height of the camera above the road, which was not given',
-        'give camera_height in metres; or a distance on the road or the mean speed of the traffic (scale_from); or '
-        'allow_unit_scale for a plane in units of the height',
-    )
+        return Scale(lambda *_: 1.0, 0.0, False)
+    return reason('no_height')
 
 
 def check_scale(height: float, sigma: float, gate: GateOptions) -> Reason | None:
     """Say why a height with its whole standard deviation cannot be trusted, if so."""
     if sigma <= gate.max_sigma_height_rel * height:
         return None
-    return Reason(
-        'scale_uncertain',
-        f'the scale is too uncertain: camera height {height:.2f} m +- '
-        f'{min(sigma / height, 9.99):.0%}, {gate.max_sigma_height_rel:.0%} is needed',
-        'give it more surely: a longer distance on the road nearer to the camera, the mean speed of more traffic, or '
-        'the camera height',
-    )
+    return reason('scale_uncertain', height_m=height, sigma=min(sigma / height, 9.99), limit=gate.max_sigma_height_rel)
 
 
 def is_unusual(height_m: float) -> bool:
@@ -105,20 +98,12 @@ def _scale_from_distance(given: ScaleOptions, camera: Camera, normal: np.ndarray
     bearings, valid = camera.unproject(pixels)
     below = -(bearings @ normal)
     for (u, v), sine, there in zip(given.pixels, below, valid, strict=True):
-        if not there or sine < MIN_DEPRESSION_SCALE_SINE:
+        if not there:
+            return reason('scale_off_road', 'outside_lens', u=u, v=v)
+        if sine < MIN_DEPRESSION_SCALE_SINE:
             degrees, needed = np.degrees(np.arcsin([sine, MIN_DEPRESSION_SCALE_SINE]))
             side = 'below' if degrees > 0 else 'above'
-            where = (
-                f'lies {abs(degrees):.1f} degrees {side} the horizon of the plane found'
-                if there
-                else ('lies where the lens found shows nothing')
-            )
-            return Reason(
-                'scale_off_road',
-                f'pixel ({u:g}, {v:g}) of scale.distance_px is not on the road: it {where}, at least '
-                f'{needed:.1f} degrees below is needed',
-                'give two pixels on the surface of the road, near to the camera',
-            )
+            return reason('scale_off_road', u=u, v=v, angle_deg=abs(degrees), side=side, limit_deg=needed)
 
     def length(lens: Camera, up: np.ndarray, at: np.ndarray = pixels) -> float:
         return float(np.hypot(*np.subtract(*ground_points(lens, up, 1.0, at))))
@@ -131,13 +116,17 @@ def _scale_from_distance(given: ScaleOptions, camera: Camera, normal: np.ndarray
     relative = np.hypot(
         given.distance_sigma_m / given.distance_m, given.pixel_sigma_px * np.linalg.norm(slopes) / heights
     )
-    between = ' and '.join(f'({u:g}, {v:g})' for u, v in given.pixels)
     return Scale(
         lambda lens, up: given.distance_m / length(lens, up),
         float(given.distance_m / heights * relative),
         True,
-        f'{given.distance_m:g} +- {given.distance_sigma_m:g} m on the road between the pixels {between}, each '
-        f'+- {given.pixel_sigma_px:g} px (given)',
+        'scale_distance',
+        {
+            'distance_m': given.distance_m,
+            'distance_sigma_m': given.distance_sigma_m,
+            'pixel_sigma_px': given.pixel_sigma_px,
+            'pixels': ' and '.join(f'({u:g}, {v:g})' for u, v in given.pixels),
+        },
         derived=True,
     )
 
@@ -153,12 +142,7 @@ def _scale_from_speed(given: ScaleOptions, camera: Camera, normal: np.ndarray, f
     tracks = _flowing(camera, normal, flow)
     vehicles = len(np.unique(tracks.vehicles))
     if vehicles < MIN_SPEED_VEHICLES:
-        return Reason(
-            'too_few_vehicles',
-            f'{vehicles} vehicles drive straight along the busiest road, {MIN_SPEED_VEHICLES} are '
-            'needed to compare their speed with the mean that was given',
-            'wait for more traffic, or record for longer',
-        )
+        return reason('too_few_vehicles', vehicles=vehicles, limit=MIN_SPEED_VEHICLES)
     speeds = _vehicle_speeds(camera, normal, tracks)
     mean, error = trimmed_mean(speeds)
     varying = MAD_TO_SIGMA * float(np.median(np.abs(speeds - np.median(speeds)))) / mean
@@ -170,9 +154,15 @@ def _scale_from_speed(given: ScaleOptions, camera: Camera, normal: np.ndarray, f
         ),
         float(np.hypot(above * relative, given.point_height_sigma_m)),
         True,
-        f'a mean speed of {given.speed_km_h:g} +- {given.speed_sigma_km_h:g} km/h (given) of {vehicles} vehicles on '
-        f'the busiest road, which vary by {varying:.0%}, seen {given.point_height_m:g} +- '
-        f'{given.point_height_sigma_m:g} m above it',
+        'scale_speed',
+        {
+            'speed_km_h': given.speed_km_h,
+            'speed_sigma_km_h': given.speed_sigma_km_h,
+            'vehicles': vehicles,
+            'variation': varying,
+            'point_height_m': given.point_height_m,
+            'point_height_sigma_m': given.point_height_sigma_m,
+        },
         derived=True,
     )
 

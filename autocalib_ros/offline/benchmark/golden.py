@@ -14,9 +14,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from autocalib_ros.calibrator import solve
 from autocalib_ros.config import Options
 from autocalib_ros.errors import AutocalibError, InputError, UsageError
+from autocalib_ros.estimation.estimate import solve
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera

@@ -17,10 +17,10 @@ from pathlib import Path
 
 import numpy as np
 
-from autocalib_ros.calibrator import solve
 from autocalib_ros.comparison import best_rotation
 from autocalib_ros.config import Options
 from autocalib_ros.errors import InputError, UsageError
+from autocalib_ros.estimation.estimate import solve
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.ground_plane import GroundPlane, angles_deg, tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera, pixel_grid

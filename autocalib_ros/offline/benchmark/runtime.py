@@ -12,8 +12,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from autocalib_ros.calibrator import AutoCalibrator, solve
+from autocalib_ros.calibrator import AutoCalibrator
 from autocalib_ros.config import Options
+from autocalib_ros.estimation.estimate import solve
 from autocalib_ros.offline.recordings.open import open_source
 
 FLOW_POINTS = 300

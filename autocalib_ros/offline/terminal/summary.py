@@ -26,8 +26,8 @@ def summary_lines(
     table = [cells[0], *((row.name, row.value, f'± {row.sigma}' if row.sigma else '') for row in numbers)]
     lines = [f'{name:<{name_width}}  {value:<{value_width}}  {sigma}'.rstrip() for name, value, sigma in table]
     remarks = [
-        *(('assumed', text) for text in result.assumptions),
-        *(('checked', text) for text in result.checks),
+        *(('assumed', statement.text) for statement in result.assumptions),
+        *(('checked', statement.text) for statement in result.checks),
         ('what helps', remedy(result)),
     ]
     return [INDENT + line for line in lines] + _wrap_pairs(remarks, columns)

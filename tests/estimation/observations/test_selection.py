@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from autocalib_ros.calibrator import solve
 from autocalib_ros.config import Options
+from autocalib_ros.estimation.estimate import solve
 from autocalib_ros.estimation.observations.selection import drop_pedestrians
 from autocalib_ros.evidence.snapshot import Evidence, TrackKind
 from autocalib_ros.offline.synthetic.junction import Junction, synthetic_evidence

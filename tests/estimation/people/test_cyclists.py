@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from autocalib_ros.calibrator import solve
 from autocalib_ros.config import Options
+from autocalib_ros.estimation.estimate import solve
 from autocalib_ros.estimation.people.cyclists import cyclists
 from autocalib_ros.evidence.snapshot import Evidence, Outlines, Track
 from autocalib_ros.offline.synthetic.junction import Junction, evidence_from_tracks, synthetic_evidence
@@ -134,6 +134,6 @@ def test_where_too_few_vehicles_are_left_the_plane_is_of_all_and_says_so(street:
     demanding = replace(options, gate=replace(options.gate, min_tracks=least))
     result = solve(among, demanding)
     assert isinstance(result, Calibration), result
-    [check] = [words for words in result.checks if 'people' in words]
-    assert f'of the {least} needed' in check
+    [check] = [check for check in result.checks if check.kind == 'pedestrians_kept']
+    assert f'at least {least} needed' in check.text
     assert result.evidence.people >= 17

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from autocalib_ros.calibrator import solve
 from autocalib_ros.config import Options
+from autocalib_ros.estimation.estimate import solve
 from autocalib_ros.estimation.people.pedestrians import find_pedestrians
 from autocalib_ros.evidence.snapshot import Evidence, Track
 from autocalib_ros.offline.synthetic.junction import Junction, evidence_from_tracks, synthetic_evidence

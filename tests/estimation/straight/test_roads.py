@@ -7,19 +7,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from autocalib_ros.calibrator import solve
 from autocalib_ros.config import GateOptions, JointOptions, Options
 from autocalib_ros.estimation.adjustment.bundle_adjustment import adjust
 from autocalib_ros.estimation.adjustment.lens_prior import lens_priors
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig, AdjustmentState
+from autocalib_ros.estimation.estimate import solve
 from autocalib_ros.estimation.observations.track_set import select_tracks
-from autocalib_ros.estimation.verification.gates import NOT_CROSS_CHECKED, check_halves
+from autocalib_ros.estimation.verification.gates import check_halves
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.benchmark.families import families
 from autocalib_ros.offline.benchmark.monte_carlo import draw_evidence
 from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration, Refusal
+from autocalib_ros.results.statements import check
 
 OPTIONS = Options(camera_height=8.0)
 ONE_ROAD = Junction(
@@ -81,14 +82,14 @@ def test_skewed_roads_are_measured_not_squared() -> None:
     junction = Junction(road_angles_deg=(0.0, 70.0), vehicles=120)
     result = solved(junction)
     assert isinstance(result, Calibration)
-    assert any('measured' in text for text in result.checks)
+    assert [check.values['source'] for check in result.checks if check.kind == 'crossing_angle'] == ['measured']
     assert normal_error_deg(result, junction) < 1.0
 
 
 def test_perpendicularity_is_tested_before_it_is_used() -> None:
     result = solved(Junction())
     assert isinstance(result, Calibration)
-    assert any('90 degrees (tested' in text for text in result.assumptions)
+    assert [item.values['source'] for item in result.assumptions if item.kind == 'crossing_angle'] == ['fixed']
 
 
 def test_perpendicularity_can_be_asserted() -> None:
@@ -102,7 +103,7 @@ def test_an_asserted_angle_that_is_not_90_degrees_is_held() -> None:
     junction = Junction(road_angles_deg=(0.0, 70.0), vehicles=120)
     result = solved(junction, options=replace(OPTIONS, joint=JointOptions(road_angle='70')))
     assert isinstance(result, Calibration)
-    assert 'roads cross at 70 degrees (asserted)' in result.assumptions
+    assert 'roads cross at 70 degrees (given)' in map(str, result.assumptions)
     first, second = result.road_directions
     assert abs(first @ second) == pytest.approx(np.cos(np.radians(70.0)), abs=1e-9)
     assert normal_error_deg(result, junction) < 0.5
@@ -123,7 +124,7 @@ def test_a_known_lens_is_kept_and_the_pose_solved() -> None:
     assert isinstance(result, Calibration)
     assert result.camera == camera
     assert result.stddev.focal_px == 0.0
-    assert result.assumptions[0] == 'the lens is as given: only the pose was solved'
+    assert result.assumptions[0].kind == 'lens_given'
     assert normal_error_deg(result, junction) < 0.5
 
 
@@ -154,7 +155,7 @@ def test_a_distortion_free_lens_is_found_when_the_angle_of_the_roads_is_given() 
 def test_what_one_road_cannot_tell_is_held_and_said() -> None:
     result = solved(ONE_ROAD)
     assert isinstance(result, Calibration)
-    assert any('held there: the traffic cannot determine it' in text for text in result.assumptions)
+    assert 'parameter_fixed' in [statement.kind for statement in result.assumptions]
 
 
 def test_ground_points_are_less_sure_farther_away() -> None:
@@ -179,7 +180,7 @@ def test_one_road_and_a_level_camera_give_an_assumed_plane_where_allowed(roll_de
     result = solved(junction, options=options)
     assert isinstance(result, Calibration)
     assert result.grade == 'assumed' and result.ground is not None
-    assert any('roll = 0 +- 2 degrees' in text for text in result.assumptions)
+    assert any(item.kind == 'level_camera' and item.values['sigma_deg'] == 2.0 for item in result.assumptions)
     assert result.stddev.roll_deg == pytest.approx(2.0, rel=0.2)
     sigma = np.hypot(result.stddev.roll_deg, result.stddev.tilt_deg or 0.0)
     assert normal_error_deg(result, junction) < 2.0 * sigma
@@ -270,7 +271,7 @@ def test_a_half_without_tracks_is_said_not_to_be_cross_checked() -> None:
     state = AdjustmentState(Junction().camera, Junction().camera_from_ground, np.array([0.0, np.pi / 2]))
     prior = lens_priors((1280, 720), JointOptions())[0]
     fit = adjust(state, one_vehicle, AdjustmentConfig(prior, JointOptions()))
-    assert check_halves(fit, one_vehicle, GateOptions()) == NOT_CROSS_CHECKED
+    assert check_halves(fit, one_vehicle, GateOptions()) == check('halves_not_compared')
 
 
 def test_a_moving_camera_is_refused() -> None:

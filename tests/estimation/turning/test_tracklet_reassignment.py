@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from autocalib_ros.calibrator import solve
 from autocalib_ros.config import GateOptions, JointOptions, Options
 from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment, adjust
 from autocalib_ros.estimation.adjustment.lens_prior import known_lens, lens_priors
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig, AdjustmentState, Parameterisation
+from autocalib_ros.estimation.estimate import solve
 from autocalib_ros.estimation.motion.rigid_bodies import TrackletBundle
 from autocalib_ros.estimation.observations.track_set import TrackSet, select_tracks
 from autocalib_ros.estimation.observations.tracklets import Tracklets, find_tracklets
@@ -26,7 +26,8 @@ from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.synthetic.drives import drive_arc
 from autocalib_ros.offline.synthetic.junction import Junction, synthetic_evidence
-from autocalib_ros.results.calibration import Calibration, Reason
+from autocalib_ros.results.calibration import Calibration
+from autocalib_ros.results.refusals import Reason
 
 TURNING = Junction(drive=partial(drive_arc, radii_m=(12.0, 60.0)), vehicles=14, points_per_vehicle=8, noise_px=0.3)
 TRUTH = AdjustmentState(TURNING.camera, TURNING.camera_from_ground, np.zeros(0))

@@ -8,15 +8,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from autocalib_ros.calibrator import AutoCalibrator, solve
+from autocalib_ros.calibrator import AutoCalibrator
 from autocalib_ros.config import Options, ScaleOptions
 from autocalib_ros.errors import UsageError
-from autocalib_ros.estimation.estimate import Solution, find_solution
+from autocalib_ros.estimation.estimate import find_solution, solve
 from autocalib_ros.estimation.observations.track_set import SAMPLES_PER_TRACK, TrackSet, select_tracks
+from autocalib_ros.estimation.solution import Solution
 from autocalib_ros.estimation.verification.scale import MIN_SPEED_VEHICLES, Scale, known_scale, trimmed_mean
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_evidence
-from autocalib_ros.results.calibration import Calibration, Reason
+from autocalib_ros.results.calibration import Calibration
+from autocalib_ros.results.refusals import Reason
 
 JUNCTION = Junction()
 NEAR_M, FAR_M = ((10.0, -8.0), (18.0, -2.0)), ((25.0, -15.0), (38.0, -16.0))
@@ -152,15 +154,19 @@ def test_a_distance_gives_a_metric_ground_plane(result: Calibration) -> None:
 
 
 def test_the_source_of_the_scale_stands_among_the_assumptions(result: Calibration) -> None:
-    assert result.assumptions[-1].startswith('scale by 10 +- 0.4 m on the road between the pixels (')
-    assert f'camera height {result.ground.height_m:.3f} +- {result.stddev.height_m:.2g} m' in result.assumptions[-1]
+    source = result.assumptions[-1]
+    assert source.kind == 'scale_distance'
+    assert (source.values['distance_m'], source.values['distance_sigma_m']) == (10.0, 0.4)
+    assert source.values['height_m'] == result.ground.height_m
+    assert source.values['height_sigma_m'] == result.stddev.height_m
+    assert f'camera height {result.ground.height_m:.3f} +- {result.stddev.height_m:.2g} m' in source.text
 
 
 def test_road_points_are_as_unsure_as_the_scale(evidence: Evidence, result: Calibration) -> None:
     exact = solve(evidence, Options(camera_height=result.ground.height_m))
     given = solve(evidence, Options(camera_height=result.ground.height_m, camera_height_sigma=0.4))
     assert exact.stddev.height_m is None and given.stddev.height_m == 0.4
-    assert '+- 0.4 m (given)' in given.assumptions[-1] and '+-' not in exact.assumptions[-1]
+    assert '+- 0.4 m (given)' in given.assumptions[-1].text and '+-' not in exact.assumptions[-1].text
     for distance, without, with_sigma, by_tape in zip(
         (10.0, 20.0, 40.0),
         exact.stddev.ground_point_m,
@@ -177,7 +183,9 @@ def test_a_speed_gives_the_height_of_the_evidence() -> None:
     assert found.ground is not None and found.stddev.height_m is not None
     assert found.ground.height_m == pytest.approx(8.0, abs=2.5 * found.stddev.height_m)
     assert found.stddev.height_m < 0.1 * 8.0
-    assert 'vehicles on the busiest road' in found.assumptions[-1]
+    assert (
+        found.assumptions[-1].kind == 'scale_speed' and found.assumptions[-1].values['vehicles'] >= MIN_SPEED_VEHICLES
+    )
 
 
 def test_an_unusual_height_is_solved_with_once_more() -> None:
@@ -185,9 +193,7 @@ def test_an_unusual_height_is_solved_with_once_more() -> None:
     points = ((18.0, -8.0), (26.0, -2.0))
     evidence = synthetic_evidence(junction, np.random.default_rng(1))
     options = by_distance(pixels_of(points, junction), 10.0)
-    first = find_solution(
-        evidence, select_tracks(evidence, 1500), options.joint, options.gate, np.random.default_rng(0)
-    )
+    first = find_solution(evidence, select_tracks(evidence, 1500), options)
     assert isinstance(first, Solution)
     scale = known_scale(options, *first.plane.lens_and_normal)
     assert isinstance(scale, Scale)
@@ -212,7 +218,7 @@ def test_the_published_method_takes_a_distance(evidence: Evidence) -> None:
         bearing / -(bearing @ found.ground.normal_in_camera) for bearing in found.camera.unproject(pixels_of(NEAR_M))[0]
     ]
     assert found.ground.height_m * np.linalg.norm(np.subtract(*places)) == pytest.approx(10.0)
-    assert found.assumptions[-1].startswith('scale by 10 +- 0.05 m on the road')
+    assert found.assumptions[-1].kind == 'scale_distance'
 
 
 # Seeds of their own: Monte Carlo of what is clicked, taped and driven.
@@ -228,9 +234,7 @@ def draws() -> Iterator[tuple[np.random.Generator, Solution]]:
         solution = find_solution(
             evidence,
             select_tracks(evidence, options.joint.max_tracks),
-            options.joint,
-            options.gate,
-            np.random.default_rng(0),
+            options,
         )
         assert isinstance(solution, Solution)
         yield generator, solution
@@ -315,14 +319,14 @@ def test_a_scale_less_sure_than_the_gate_is_refused_with_numbers(evidence: Evide
     assert isinstance(found, Calibration) and found.ground is None and found.grade == 'lens'
     reason = found.ground_refusal
     assert reason is not None and reason.code == 'scale_uncertain'
-    assert '20% is needed' in reason.message and 'm +- ' in reason.message
+    assert reason.values['limit'] == 0.2 and reason.values['sigma'] > 0.2 and 'm +- ' in reason.message
 
 
 @pytest.mark.parametrize('count', [0, MIN_SPEED_VEHICLES - 1])
 def test_too_few_vehicles_tell_no_speed(count: int) -> None:
     reason = at_truth(by_speed(36.0), flow_of(np.full(count, 10.0)))
     assert isinstance(reason, Reason) and reason.code == 'too_few_vehicles'
-    assert f'{count} vehicles' in reason.message and f'{MIN_SPEED_VEHICLES} are' in reason.message
+    assert reason.values == {'vehicles': count, 'limit': MIN_SPEED_VEHICLES} and f'{count} vehicles' in reason.message
 
 
 def test_without_a_plane_there_is_no_scale() -> None:

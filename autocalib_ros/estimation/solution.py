@@ -1,0 +1,92 @@
+"""Values that the steps of the estimator share: what they observe, and what they found."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from autocalib_ros.config import GateOptions
+from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment
+from autocalib_ros.estimation.adjustment.lens_prior import LensPrior
+from autocalib_ros.estimation.observations.track_set import TrackSet, evenly_spaced
+from autocalib_ros.estimation.observations.two_frame_windows import ResampledTracks, TwoFrameWindows
+from autocalib_ros.estimation.verification.ground_normal import PlaneEstimate
+from autocalib_ros.evidence.snapshot import Evidence
+from autocalib_ros.results.refusals import Reason
+from autocalib_ros.results.statements import Statement
+
+MAX_SUBSAMPLE_TRACKS = 200
+"""Tracks, evenly spaced in the list of all, by which initial solutions are made and compared. The adjustment itself
+uses every track."""
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Evidence as the estimator reads it, with the priors and gates that apply."""
+
+    tracks: TrackSet
+    windows: TwoFrameWindows
+    instants: ResampledTracks
+    priors: list[LensPrior]
+    """Lens families, the preferred one first."""
+    gate: GateOptions
+    evidence: Evidence
+    generator: np.random.Generator
+
+    @property
+    def subsample(self) -> TrackSet:
+        """At most `MAX_SUBSAMPLE_TRACKS` of the tracks."""
+        return self.tracks.subset(evenly_spaced(len(self.tracks), MAX_SUBSAMPLE_TRACKS))
+
+
+@dataclass(frozen=True)
+class Solution:
+    """A lens, the ground plane and its roads; with a reason if there is no ground plane."""
+
+    fit: Adjustment
+    plane: PlaneEstimate
+    along: np.ndarray
+    """Unit vector (3,), camera frame, along the road with the most vehicles."""
+    flow: TrackSet
+    """Tracks that follow that road straight; empty if no road is straight."""
+    assumptions: tuple[Statement, ...]
+    checks: tuple[Statement, ...]
+    plane_refusal: Reason | None
+    reduced: bool = False
+    """Whether the plane rests on less than crossing roads or turning vehicles, without an assumption in `plane`."""
+    from_markings: bool = False
+    """Whether lens and plane come from the lane markings."""
+
+    @property
+    def assumed(self) -> bool:
+        """Whether the plane rests on one of the assumptions."""
+        return self.plane.assumed is not None or self.reduced
+
+    @property
+    def full(self) -> bool:
+        """Whether crossing roads or turning vehicles determine all of it."""
+        return self.plane_refusal is None and not self.assumed
+
+
+def is_better(other: Solution | Reason, found: Solution | Reason) -> bool:
+    """Whether `other` gives more than `found`: any solution, then a plane, then the smaller sigma of the plane."""
+    if isinstance(other, Reason) or isinstance(found, Reason):
+        return isinstance(other, Solution)
+    if other.plane_refusal or found.plane_refusal:
+        return other.plane_refusal is None
+    return other.plane.worst_sigma_deg < found.plane.worst_sigma_deg
+
+
+def append_reason(found: Solution | Reason, further: Reason) -> Solution | Reason:
+    """Add to the reason why something is missing, if anything is, why a further strategy failed too."""
+    if isinstance(found, Solution):
+        refusal = found.plane_refusal
+        return found if refusal is None else replace(found, plane_refusal=_joined(refusal, further))
+    return _joined(found, further)
+
+
+def _joined(first: Reason, further: Reason) -> Reason:
+    return replace(
+        first, message=f'{first.message}; {further.message}', values={**first.values, 'further': further.code}
+    )

@@ -1,0 +1,174 @@
+"""The strategies of the estimator: straight traffic, turning traffic, and lane markings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+
+from autocalib_ros.config import JointOptions
+from autocalib_ros.estimation.adjustment.bundle_adjustment import UNMODELLED_FOCAL, Adjustment, adjust, road_support
+from autocalib_ros.estimation.adjustment.lens_prior import LensPrior, known_lens
+from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig
+from autocalib_ros.estimation.markings.markings_solution import (
+    condition_on_lens,
+    fit_to_markings,
+    refine_with_markings,
+)
+from autocalib_ros.estimation.one_road import PLANE_TOLERANCE_DEG, CrossTraffic
+from autocalib_ros.estimation.refinement import refine_and_verify, select_noise_model
+from autocalib_ros.estimation.solution import Observations, Solution
+from autocalib_ros.estimation.straight.initialisation import solve_from_consensus
+from autocalib_ros.estimation.straight.roads import (
+    add_further_roads,
+    add_second_road,
+    drop_unsupported_roads,
+    main_road,
+)
+from autocalib_ros.estimation.turning.turning_traffic import fit_turning_traffic
+from autocalib_ros.estimation.verification.consistency import compare_solutions
+from autocalib_ros.estimation.verification.gates import check_plane, check_straight_traffic
+from autocalib_ros.estimation.verification.ground_normal import AGREEMENT_SIGMAS, PlaneEstimate
+from autocalib_ros.estimation.verification.identifiability import lens_assumptions
+from autocalib_ros.geometry.ground_plane import unsigned_angle_deg
+from autocalib_ros.results.refusals import Reason, reason
+from autocalib_ros.results.statements import Statement, check
+
+MAX_CONFIRMING_SIGMA_DEG = 4.5
+"""Traffic whose plane, or whose road, is less certain than this (one sigma) does not confirm lane markings."""
+
+
+def estimate_from_straight_traffic(observations: Observations, config: AdjustmentConfig) -> Solution | Reason:
+    """Estimate from the vanishing points of straight tracks: multi-start, adjustment, refinement, verification."""
+    tracks, gate = observations.tracks, observations.gate
+    initial = solve_from_consensus(observations.subsample, config, observations.generator)
+    if initial is None:
+        return reason('no_direction', tracks=len(tracks))
+    best, contrast = initial
+    fit = adjust(best.state, tracks, best.problem.config)
+    support = road_support(fit, tracks)
+    second = sorted(int(mask.sum()) for mask in support)[:-1]
+    crossing = CrossTraffic(min([gate.min_tracks_per_road, *(second or [0])]), gate.min_tracks_per_road)
+    fit, tracks = select_noise_model(drop_unsupported_roads(fit, support, tracks, gate), observations)
+    fit = add_further_roads(add_second_road(fit, tracks, gate), tracks, gate)
+    return check_straight_traffic(fit, contrast, tracks) or refine_and_verify(
+        fit, tracks, observations, crossing=crossing
+    )
+
+
+def estimate_from_turning_traffic(observations: Observations, config: AdjustmentConfig) -> Solution | Reason | None:
+    """Estimate from vehicles that turn; None if too few do."""
+    turned = fit_turning_traffic(observations.tracks, observations.windows, config)
+    if turned is None:
+        return None
+    fit, tracks = select_noise_model(add_further_roads(turned, observations.tracks, observations.gate), observations)
+    return refine_and_verify(fit, tracks, observations, turned=True)
+
+
+def estimate_from_lane_markings(observations: Observations, config: AdjustmentConfig) -> Solution | Reason:
+    """Estimate from lane markings; the traffic, seen through the lens that they give, has to confirm the plane."""
+    priors = [_prior_for_markings(prior, config.options) for prior in observations.priors]
+    found = fit_to_markings(observations.evidence, observations.tracks, priors, config, observations.gate)
+    if isinstance(found, Reason):
+        return found
+    fit, statement = found
+    checks = verify_with_traffic(fit, _planes_of_traffic(fit, observations, config))
+    if isinstance(checks, Reason):
+        return checks
+    along, flow = main_road(fit, observations.tracks)
+    plane = PlaneEstimate.of(fit, observations.tracks)
+    return Solution(
+        fit,
+        plane,
+        along,
+        flow,
+        (*lens_assumptions(fit, ()), statement),
+        checks,
+        check_plane(plane, observations.gate, assumed=True),
+        reduced=True,
+        from_markings=True,
+    )
+
+
+def _planes_of_traffic(fit: Adjustment, observations: Observations, config: AdjustmentConfig) -> list[PlaneEstimate]:
+    """Planes that straight and turning traffic give through a lens that is taken as known."""
+    known = known_lens(fit.state.camera)
+    straight = estimate_from_straight_traffic(replace(observations, priors=[known]), replace(config, prior=known))
+    turned = fit_turning_traffic(observations.tracks, observations.windows, replace(config, prior=known))
+    planes = [] if isinstance(straight, Reason) else [straight.plane]
+    return planes if turned is None else [*planes, PlaneEstimate.of(turned, observations.tracks)]
+
+
+def sharpen_with_lane_markings(found: Solution, observations: Observations) -> Solution:
+    """Return the solution with lens and plane of the lane markings, if both agree and the markings are more certain."""
+    config = found.fit.problem.config
+    prior = _prior_for_markings(config.prior, config.options)
+    sharper = refine_with_markings(found.fit, observations.evidence, observations.tracks, prior, observations.gate)
+    if isinstance(sharper, Reason):
+        return found
+    fit, statement = sharper
+    plane = PlaneEstimate.of(fit, observations.tracks)
+    difference = compare_solutions(found.fit, fit)
+    agree = not difference.exceeds(AGREEMENT_SIGMAS) and check_plane(plane, observations.gate) is None
+    compared = check('lane_markings', focal=difference.focal, normal_deg=difference.normal_deg, used=agree)
+    checks = (*found.checks, compared)
+    if not agree or _uncertainty(fit, plane) > _uncertainty(found.fit, found.plane):
+        return replace(found, checks=checks)
+    along, flow = main_road(fit, observations.tracks)
+    return replace(
+        found,
+        fit=fit,
+        plane=plane,
+        along=along,
+        flow=flow,
+        checks=checks,
+        assumptions=(*lens_assumptions(fit, ()), statement),
+        from_markings=True,
+    )
+
+
+def _uncertainty(fit: Adjustment, plane: PlaneEstimate) -> float:
+    """Product of the sigmas of focal length and plane."""
+    return max(fit.focal_sigma, UNMODELLED_FOCAL) * plane.worst_sigma_deg
+
+
+def _prior_for_markings(prior: LensPrior, options: JointOptions) -> LensPrior:
+    """Return the prior for lane markings, which determine the principal point, unless that is given."""
+    return prior if options.principal_point_sigma_px >= 0 else prior.with_loose_principal_point()
+
+
+def verify_with_traffic(by_markings: Adjustment, planes: Iterable[PlaneEstimate]) -> tuple[Statement, ...] | Reason:
+    """Check lane markings against planes from the traffic, seen through the lens of the markings.
+
+    Each plane that is certain enough has to agree, and at least one has to be.
+    """
+    by_markings, checks, best_deg = condition_on_lens(by_markings), [], np.inf
+    for plane in planes:
+        difference_deg, own_deg, other_deg, what = _difference_from(by_markings, plane)
+        best_deg, sigma_deg = min(best_deg, own_deg), float(np.hypot(own_deg, other_deg))
+        if own_deg > MAX_CONFIRMING_SIGMA_DEG:
+            continue
+        if difference_deg > max(AGREEMENT_SIGMAS * sigma_deg, PLANE_TOLERANCE_DEG):
+            cause = 'road' if what == 'road' else ''
+            return reason('markings_contradicted', cause, difference_deg=difference_deg, sigma_deg=sigma_deg)
+        checks.append(check(f'markings_and_traffic_{what}', difference_deg=difference_deg, sigma_deg=sigma_deg))
+    if checks:
+        return tuple(checks)
+    if best_deg >= 90.0:
+        return reason('markings_unconfirmed', 'no_traffic')
+    return reason('markings_unconfirmed', sigma_deg=best_deg, limit_deg=MAX_CONFIRMING_SIGMA_DEG)
+
+
+def _difference_from(by_markings: Adjustment, plane: PlaneEstimate) -> tuple[float, float, float, str]:
+    """Angle between traffic and markings, sigma of the traffic, sigma of the markings (degrees), and what differs."""
+    if plane.fit.plane_known:
+        angle = unsigned_angle_deg(by_markings.state.rotation[:, 2], plane.normal(plane.fit.state))
+        return angle, plane.worst_sigma_deg, PlaneEstimate(by_markings, 1.0).worst_sigma_deg, 'normal'
+    road = plane.fit.state.directions[0]
+    angle = min(unsigned_angle_deg(axis, road) for axis in by_markings.state.directions)
+    own, other = (
+        float(np.degrees(np.linalg.norm(fit.sigma(lambda state: state.directions[0]))))
+        for fit in (plane.fit, by_markings)
+    )
+    return angle, own, other, 'road'

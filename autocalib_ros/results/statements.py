@@ -1,0 +1,191 @@
+"""Assumptions and checks of a calibration as values: a kind and its numbers. All of them are worded here.
+
+A statement is made by `assumption` or `check`, which take the kind and the numbers that its text needs. Programs read
+the kind and the numbers; logs, the report and the terminal print the text.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+Value = float | int | str | bool | None
+"""What a statement may hold: everything that JSON can say in one item."""
+
+
+@dataclass(frozen=True)
+class Statement:
+    """One assumption or one check."""
+
+    kind: str
+    """Key of `ASSUMPTIONS` or `CHECKS`; `UNKNOWN_KIND` for a text from a file of an older version."""
+    text: str
+    """The statement in words, with its numbers."""
+    values: Mapping[str, Value] = field(default_factory=dict)
+    """The numbers and names in the text, by their names in the table."""
+
+    def __str__(self) -> str:
+        return self.text
+
+
+UNKNOWN_KIND = 'unknown'
+
+
+def assumption(kind: str, **values: object) -> Statement:
+    """Return an assumption of `ASSUMPTIONS` with its numbers."""
+    return _worded(ASSUMPTIONS, kind, values)
+
+
+def check(kind: str, **values: object) -> Statement:
+    """Return a check of `CHECKS` with its numbers."""
+    return _worded(CHECKS, kind, values)
+
+
+def plain_values(values: Mapping[str, object]) -> dict[str, Value]:
+    """Return numbers as Python's own, so that they can be compared and written as JSON."""
+    return {name: value.item() if isinstance(value, np.generic) else value for name, value in values.items()}  # type: ignore[misc]
+
+
+def _worded(table: Mapping[str, Wording], kind: str, values: Mapping[str, object]) -> Statement:
+    plain = plain_values(values)
+    wording = table[kind]
+    text = wording.format(**plain) if isinstance(wording, str) else wording(**plain)
+    return Statement(kind, text, plain)
+
+
+Wording = str | Callable[..., str]
+"""A template for str.format, or a function, of the values."""
+
+FAMILY_NAMES = {
+    'equidistant': ('lens near equidistant', '0'),
+    'distortion_free': ('lens without distortion', '1/3'),
+    'kannala_brandt': ('lens between equidistant and distortion-free', '1/6'),
+}
+"""Name of each lens family in a sentence, and its k1 (Kannala & Brandt 2006)."""
+
+
+def plus_minus(sigma: float | None, form: str = 'g') -> str:
+    """Return ' +- sigma', '' for an exact value."""
+    return f' +- {sigma:{form}}' if sigma else ''
+
+
+def _lens_family(family: str, k1_sigma: float) -> str:
+    name, k1 = FAMILY_NAMES[family]
+    return f'{name}: k1 = {k1} +- {k1_sigma:.3g}'
+
+
+def _principal_point(sigma_px: float) -> str:
+    return 'principal point at the image centre' + (f' +- {sigma_px:.0f} px' if sigma_px > 0 else '')
+
+
+def _focal_given(focal_px: float, sigma_px: float) -> str:
+    return f'focal length {focal_px:g}{plus_minus(sigma_px)} px (given)'
+
+
+def _halves(focal: float, normal_deg: float | None) -> str:
+    normal = '' if normal_deg is None else f' and {normal_deg:.1f} degrees in ground normal'
+    return f'earlier and later half of the traffic differ by {focal:.1%} in focal length{normal}'
+
+
+def _lane_markings_difference(focal: float, normal_deg: float, used: bool) -> str:
+    difference = f'{focal:.1%} in focal length and {normal_deg:.1f} degrees in ground normal'
+    return f'lane markings differ from the traffic by {difference}' + ('' if used else ': not used')
+
+
+def _crossing_angle(angle_deg: float, sigma_deg: float | None, source: str) -> str:
+    if source == 'given':
+        return f'roads cross at {angle_deg:g} degrees (given)'
+    measured = f'{angle_deg:.1f} +- {sigma_deg:.1f} degrees'
+    return f'roads cross at 90 degrees (measured: {measured})' if source == 'fixed' else f'roads cross at {measured}'
+
+
+def _transverse_edges(vehicles: int, sigma_deg: float, level_sigma_deg: float | None) -> str:
+    level = '' if level_sigma_deg is None else f' and of a level camera (roll 0 +- {level_sigma_deg:g} degrees)'
+    return f'plane across one road from edges of {vehicles} vehicles{level}: +- {sigma_deg:.1f} degrees about the road'
+
+
+def _height_note(height_m: float | None, height_sigma_m: float | None) -> str:
+    if height_m is None:
+        return ''
+    return f': camera height {height_m:.3f}{plus_minus(height_sigma_m, ".2g")} m'
+
+
+def _scale_height(given_m: float, given_sigma_m: float, **_: object) -> str:
+    return f'scale from the camera height of {given_m:g}{plus_minus(given_sigma_m)} m (given)'
+
+
+def _scale_distance(
+    distance_m: float,
+    distance_sigma_m: float,
+    pixel_sigma_px: float,
+    pixels: str,
+    height_m: float | None = None,
+    height_sigma_m: float | None = None,
+) -> str:
+    return (
+        f'scale from {distance_m:g} +- {distance_sigma_m:g} m on the road between the pixels {pixels}, each '
+        f'+- {pixel_sigma_px:g} px (given){_height_note(height_m, height_sigma_m)}'
+    )
+
+
+def _scale_speed(
+    speed_km_h: float,
+    speed_sigma_km_h: float,
+    vehicles: int,
+    variation: float,
+    point_height_m: float,
+    point_height_sigma_m: float,
+    height_m: float | None = None,
+    height_sigma_m: float | None = None,
+) -> str:
+    return (
+        f'scale from a mean speed of {speed_km_h:g} +- {speed_sigma_km_h:g} km/h (given) of {vehicles} vehicles on the '
+        f'busiest road (their speeds vary by {variation:.0%}), tracked {point_height_m:g} +- '
+        f'{point_height_sigma_m:g} m above it{_height_note(height_m, height_sigma_m)}'
+    )
+
+
+ASSUMPTIONS: dict[str, Wording] = {
+    'lens_given': 'the lens is given: only the pose was estimated',
+    'lens_family': _lens_family,
+    'principal_point': _principal_point,
+    'focal_given': _focal_given,
+    'parameter_fixed': '{parameter} fixed at its prior: the traffic does not determine it',
+    'crossing_angle': _crossing_angle,
+    'level_camera': 'plane across one road from a level camera: roll = 0 +- {sigma_deg:g} degrees',
+    'transverse_edges': _transverse_edges,
+    'lane_changes': 'plane across one road from {vehicles} vehicles that change lanes: +- {sigma_deg:.1f} degrees '
+    'about the road',
+    'lane_markings': '{lines} lane markings in {places} places taken as parallel or perpendicular: 90 +- {sigma_deg:g} '
+    'degrees (measured: {angle_deg:.1f})',
+    'scale_height': _scale_height,
+    'scale_distance': _scale_distance,
+    'scale_speed': _scale_speed,
+    'paper_lens': 'equidistant lens with the principal point at the image centre',
+    'paper_roads': 'the two roads are perpendicular',
+    'paper_uncertainty': 'the published method gives no uncertainty',
+}
+"""Wording of every assumption, by its kind."""
+
+SCALE_KINDS = ('scale_height', 'scale_distance', 'scale_speed')
+"""Kinds that say where the scale comes from; at most one stands in a calibration."""
+
+CHECKS: dict[str, Wording] = {
+    'crossing_angle': _crossing_angle,
+    'turning_vehicles': '{vehicles} turning vehicles move as rigid bodies in the plane',
+    'halves': _halves,
+    'halves_not_compared': 'not cross-validated in time: the earlier or the later half has too little traffic',
+    'edges_and_level': 'edges of vehicles and a level camera differ by {difference_deg:.1f} degrees about the road',
+    'lane_changes': '{vehicles} vehicles that change lanes (+- {sigma_deg:.1f} degrees about the road) differ by '
+    '{difference_deg:.1f} degrees from the assumed plane',
+    'lane_markings': _lane_markings_difference,
+    'markings_and_traffic_normal': 'ground normals from traffic and lane markings differ by {difference_deg:.1f} '
+    'degrees ({sigma_deg:.1f} expected)',
+    'markings_and_traffic_road': 'road of the traffic and the markings along it differ by {difference_deg:.1f} degrees '
+    '({sigma_deg:.1f} expected)',
+    'pedestrians_kept': 'pedestrian tracks kept in the plane estimate; without them: {without}',
+    'distortion_model': 'camera_info uses {model}: at most {error_px:.2g} px off anywhere in the image',
+}
+"""Wording of every check, by its kind."""
