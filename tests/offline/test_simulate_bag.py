@@ -1,4 +1,4 @@
-"""Simulated bags can be read, and do not depend on who drew them."""
+"""Simulated bags are readable and do not depend on the number of workers."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def test_progress_counts_every_frame(tmp_path):
 
 def test_existing_folder_is_not_overwritten(tmp_path):
     (tmp_path / 'note.txt').write_text('mine')
-    with pytest.raises(UsageError, match='exists already'):
+    with pytest.raises(UsageError, match='already exists'):
         write_bag(tmp_path, SimulationOptions(**TINY))
 
 
@@ -110,7 +110,7 @@ def test_folder_that_is_no_bag_is_never_overwritten(tmp_path):
     assert (tmp_path / 'note.txt').read_text() == 'mine'
 
 
-def test_bag_is_overwritten_when_told(tmp_path):
+def test_bag_is_overwritten_on_request(tmp_path):
     write_bag(tmp_path / 'bag', SimulationOptions(**TINY), workers=1)
     options = SimulationOptions(**{**TINY, 'duration_s': 0.2})
     path = write_bag(tmp_path / 'bag', options, workers=1, overwrite=True)

@@ -1,4 +1,4 @@
-"""Simulated frames show what the options ask for."""
+"""Simulated frames agree with the options."""
 
 from __future__ import annotations
 
@@ -23,8 +23,9 @@ def day() -> Simulation:
 
 
 def _motion_error_px(simulation: Simulation, first: int, second: int, turn: np.ndarray) -> float:
-    """Follow corners from one frame to another; return the median distance from where a turn of
-    the camera (3, 3, in its own frame) would take them.
+    """Track corners from one frame to another; return their median distance from the prediction.
+
+    turn: rotation (3, 3) of the camera in its own frame.
     """
     grey = [cv2.cvtColor(simulation.frame(i), cv2.COLOR_BGR2GRAY) for i in (first, second)]
     corners = cv2.goodFeaturesToTrack(grey[0], 80, 0.05, 8)
@@ -86,7 +87,7 @@ def test_thermal_contrast_is_some_hundred_counts():
     assert np.abs(np.diff(frame[-20:, :60].astype(int), axis=1)).mean() < 12  # noise of three counts, and texture
 
 
-def test_the_shutter_freezes_the_picture_and_leaves_another_offset_and_pattern():
+def test_the_shutter_freezes_the_image_and_changes_offset_and_pattern():
     simulation = _simulation(thermal=True, empty=True, shutter_every_s=2.0, rate_hz=10.0)
     before, *shut = (simulation.frame(index) for index in range(19, 25))
     assert all(np.array_equal(frame, before) for frame in shut)
@@ -96,7 +97,7 @@ def test_the_shutter_freezes_the_picture_and_leaves_another_offset_and_pattern()
     assert change.std() > 1.1 * calm.std()
 
 
-def test_a_shutter_that_is_shown_is_flat():
+def test_shutter_image_is_flat():
     options = {'thermal': True, 'shutter_every_s': 2.0, 'rate_hz': 10.0}
     simulation = _simulation(**options, shutter_shows='flat')
     assert simulation.frame(22).std() < 0.2 * simulation.frame(19).std()
@@ -109,14 +110,14 @@ def test_night_is_darker_and_has_bright_lamps(day):
     assert night.max() > 220
 
 
-def test_bump_moves_the_picture_as_the_lens_says():
+def test_bump_moves_the_image_as_the_lens_predicts():
     simulation = _simulation(empty=True, bump_at_s=2.0, bump_deg=1.0, noise_sigma=0.0)
     turn = simulation.pose.world_from_camera.T @ simulation.bumped_pose().world_from_camera
-    # What the corner tracker itself errs by.
+    # Error of the corner tracker itself.
     assert _motion_error_px(simulation, 9, 10, turn) < 0.1
 
 
-def test_shake_moves_the_picture_as_the_lens_says():
+def test_shake_moves_the_image_as_the_lens_predicts():
     simulation = _simulation(empty=True, shake_px=2.0, noise_sigma=0.0)
     second = int(np.argmax([np.trace(-simulation.shake(i)) for i in range(20)]))
     assert _motion_error_px(simulation, 0, second, simulation.shake(second)) < 0.1
@@ -130,7 +131,7 @@ def test_shake_has_the_stated_size():
     assert np.std(moved, axis=0) == pytest.approx((2.0, 2.0), rel=0.2)
 
 
-def test_another_seed_gives_another_picture(day):
+def test_another_seed_gives_another_image(day):
     assert not np.array_equal(day.frame(0), _simulation(seed=5).frame(0))
 
 

@@ -1,4 +1,4 @@
-"""The simulator's lens, its drawing and its truth agree with each other."""
+"""The lens, the renderer and the ground truth of the simulator agree with each other."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_camera_looks_down_along_its_heading():
 
 
 def _painted_corner_error_px(texels: int, distance_m: float) -> float:
-    """Draw a corner where four chequered fields meet; return how far it is off, in pixels."""
+    """Draw a checkerboard corner; return its localisation error in pixels."""
     picture = np.full((texels, texels, 4), 255, np.uint8)
     half = texels // 2
     picture[:half, half:, :3] = picture[half:, :half, :3] = 20
@@ -69,8 +69,8 @@ def _painted_corner_error_px(texels: int, distance_m: float) -> float:
 
 @pytest.mark.parametrize('distance_m', [5.0, 12.0])
 @pytest.mark.parametrize('texels', [40, 160, 640])
-def test_painted_corner_appears_where_the_lens_puts_it(texels, distance_m):
-    # The corner finder itself is good to a few hundredths of a pixel.
+def test_painted_corner_appears_at_its_projection(texels, distance_m):
+    # The corner detector itself is accurate to a few hundredths of a pixel.
     assert _painted_corner_error_px(texels, distance_m) < 0.1
 
 
@@ -158,12 +158,12 @@ def test_bump_turns_the_camera_by_its_angle():
         ({'storage': 'tape'}, 'unknown storage'),
         ({'focal_px': -1.0}, 'focal_px'),
         ({'road_angle_deg': 10.0}, 'road_angle_deg'),
-        ({'night': True, 'thermal': True}, 'exclude each other'),
+        ({'night': True, 'thermal': True}, 'mutually exclusive'),
         ({'shutter_every_s': 60.0}, 'only thermal cameras'),
         ({'thermal': True, 'shutter_shows': 'open'}, 'unknown shutter_shows'),
         ({'bump_at_s': 500.0}, 'bump_at_s'),
         ({'k': (0.01,)}, 'not four'),
-        ({'k': (-0.3, 0.0, 0.0, 0.0)}, 'forms no image beyond'),
+        ({'k': (-0.3, 0.0, 0.0, 0.0)}, 'invalid beyond'),
         ({'topic': 'image'}, 'not absolute'),
         ({'duration_s': float('nan')}, 'duration_s'),
     ],

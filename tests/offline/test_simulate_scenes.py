@@ -1,7 +1,8 @@
-"""Every scene of the simulator: roads without gaps, vehicles that roll along them, pictures and their truth."""
+"""Every scene of the simulator: continuous roads, rolling vehicles, frames and ground truth."""
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 from functools import lru_cache
@@ -68,11 +69,11 @@ def angle_between(a: float, b: float) -> float:
 
 
 @each_scene
-def test_paths_go_on_where_they_were_and_bend_smoothly(scene: str) -> None:
+def test_paths_are_continuous_in_pose_and_curvature(scene: str) -> None:
     for route in driven(scene)[0].routes:
         segments = route.path.segments
         assert min(segment.length for segment in segments) > 0
-        for before, after in zip(segments[:-1], segments[1:], strict=True):
+        for before, after in itertools.pairwise(segments):
             assert before.end() == pytest.approx((after.x, after.y, after.heading), abs=1e-9)
             curvature = before.curvature + before.sharpness * before.length
             assert curvature == pytest.approx(after.curvature, abs=1e-9)
@@ -100,12 +101,12 @@ def test_rear_axles_do_not_slip_sideways(scene: str) -> None:
 
 
 @each_scene
-def test_vehicles_go_as_fast_as_they_say_and_are_not_thrown_off_the_road(scene: str) -> None:
+def test_vehicles_move_at_their_speed_with_bounded_lateral_acceleration(scene: str) -> None:
     for vehicle, t in states(driven(scene)[1]):
         first, last = vehicle.state(t), vehicle.state(t + 0.02)
         moved = np.hypot(*(rear_axle(vehicle, t + 0.02) - rear_axle(vehicle, t))) / 0.02
         assert moved == pytest.approx(first.speed_mps, rel=0.03, abs=0.15)
-        # Acceleration to the side, m/s^2: drivers bear three, tyres nine.
+        # Lateral acceleration in m/s^2: drivers accept three, tyres nine.
         assert angle_between(last.heading, first.heading) / 0.02 * first.speed_mps < 3.5
 
 
@@ -133,10 +134,11 @@ def test_vehicles_of_no_scene_overlap(scene: str, seed: int) -> None:
 
 
 @each_scene
-def test_every_scene_renders_and_has_its_truth(scene: str) -> None:
+def test_every_scene_renders_and_has_ground_truth(scene: str) -> None:
     simulation = Simulation(SimulationOptions(**TINY, scene=scene))
     truth = json.loads(json.dumps(truth_of(simulation)))
-    assert truth['scene'] == scene and truth['road_directions']
+    assert truth['scene'] == scene
+    assert truth['road_directions']
     assert len(truth['ground_points']['rows']) == 48
     assert scene == 'sparse' or truth['vehicles']['tracks']
     frames = [simulation.frame(index).astype(int) for index in (0, 3)]
@@ -172,42 +174,43 @@ def test_truth_names_the_directions_of_straight_roads(scene: str, headings_deg: 
     assert {round(math.degrees(math.atan2(y, x))) for x, y in directions} == headings_deg
 
 
-def test_a_bend_keeps_its_lanes_apart_and_has_its_radius() -> None:
+def test_a_bend_has_constant_lane_offsets_and_its_radius() -> None:
     network, _ = driven('bend')
     road = network.roads[0]
     for route in network.routes:
         way = np.linspace(20.0, route.path.length - 20.0, 60)
-        aside = road.edge_distance(route.path.at(way)[:, :2]) + road.half_width_m
-        assert np.ptp(aside) < 0.05  # metres
+        lateral = road.edge_distance(route.path.at(way)[:, :2]) + road.half_width_m
+        assert np.ptp(lateral) < 0.05  # metres
         assert min(radius for *_, radius in route.path.curves()) == pytest.approx(BEND_RADIUS_M, abs=9.0)
 
 
-def test_a_ring_is_driven_anticlockwise_on_its_radius_by_who_entered_and_leaves() -> None:
+def test_a_ring_is_driven_anticlockwise_on_its_radius() -> None:
     for route in driven('roundabout')[0].routes:
         ring = route.ring
         x, y, heading = route.path.at(np.linspace(ring.entry_s, ring.exit_s, 20)).T
         assert np.hypot(x, y) == pytest.approx(RING_RADIUS_M, abs=1e-6)
         assert (x * np.sin(heading) - y * np.cos(heading) > 0).all()
         start, end = route.path.at(np.array([0.0, route.path.length]))
-        assert np.hypot(start[0], start[1]) > 100 and np.hypot(end[0], end[1]) > 100
+        assert np.hypot(start[0], start[1]) > 100
+        assert np.hypot(end[0], end[1]) > 100
         expected = {'right': -90, 'straight': 0, 'left': 90}[route.movement]
         assert math.degrees(math.remainder(end[2] - start[2], 2 * math.pi)) == pytest.approx(expected, abs=1e-6)
 
 
-def test_vehicles_slow_down_for_the_ring_and_wait_for_it() -> None:
+def test_vehicles_slow_down_and_yield_at_a_roundabout() -> None:
     _, traffic = driven('roundabout')
     on_ring = [
         float(v.speeds_mps[(v.s > v.route.ring.entry_s) & (v.s < v.route.ring.exit_s)].max(initial=0.0))
         for v in traffic.vehicles
     ]
-    assert 4.0 < max(on_ring) < 7.0  # metres per second; two m/s^2 to the side on 19 m are 6.2
+    assert 4.0 < max(on_ring) < 7.0  # metres per second; 2 m/s^2 of lateral acceleration at 19 m are 6.2 m/s
     assert any((v.speeds_mps[(v.s > 70) & (v.s < v.route.stop_s)] < 0.5).any() for v in traffic.vehicles)
 
 
-def test_a_share_of_the_motorway_traffic_changes_lanes_at_motorway_speed() -> None:
+def test_a_fraction_of_the_motorway_traffic_changes_lanes_at_motorway_speed() -> None:
     _, traffic = driven('highway')
     changing = [v for v in traffic.vehicles if v.route.movement == 'lane change']
-    assert 0.08 < len(changing) / len(traffic.vehicles) < 0.35  # of 0.18 asked for
+    assert 0.08 < len(changing) / len(traffic.vehicles) < 0.35  # 0.18 requested
     for vehicle in changing:
         start, end = vehicle.route.path.at(np.array([0.0, vehicle.route.path.length]))
         assert abs(end[1] - start[1]) == pytest.approx(3.6, abs=1e-3)
@@ -216,16 +219,18 @@ def test_a_share_of_the_motorway_traffic_changes_lanes_at_motorway_speed() -> No
     assert max(float(v.speeds_mps.max()) for v in traffic.vehicles if v.kind == 'truck') < 25.0
 
 
-def test_a_motorway_of_one_way_has_one_heading() -> None:
+def test_a_one_way_motorway_has_one_heading() -> None:
     network = build_network(SimulationOptions(scene='highway', one_way=True))
     ends = [route.path.at(np.array([0.0, route.path.length]))[:, 2] for route in network.routes]
-    assert np.abs(ends).max() < 1e-9 and len({route.approach for route in network.routes}) == 3
+    assert np.abs(ends).max() < 1e-9
+    assert len({route.entry_lane for route in network.routes}) == 3
 
 
-def test_nobody_drives_on_the_arm_that_a_tee_lacks() -> None:
+def test_no_vehicle_drives_on_the_missing_arm_of_a_tee() -> None:
     network, traffic = driven('tee')
-    places = np.array([(v.state(t).x, v.state(t).y) for v, t in states(traffic)])
-    assert places[:, 1].min() > -9.0 and places[:, 1].max() > 40.0
+    positions = np.array([(v.state(t).x, v.state(t).y) for v, t in states(traffic)])
+    assert positions[:, 1].min() > -9.0
+    assert positions[:, 1].max() > 40.0
     assert {r.movement for r in network.routes} == {'straight', 'left', 'right'}
     assert edge_distance(network, np.array([[0.0, 60.0], [0.0, -60.0]])).tolist() == pytest.approx([-8.0, 52.0])
 
@@ -239,7 +244,7 @@ def test_a_sparse_junction_has_a_vehicle_every_ten_seconds_or_rarer() -> None:
     assert 10 < np.mean(counts) < 20  # of at most twenty in 200 s
 
 
-def test_a_skew_crossing_takes_another_angle_when_told() -> None:
+def test_a_skew_crossing_takes_the_road_angle_option() -> None:
     assert SimulationOptions(scene='skew').road_crossing_deg == 65.0
     assert SimulationOptions().road_crossing_deg == 90.0
     assert SimulationOptions(scene='skew', road_angle_deg=70.0).road_crossing_deg == 70.0

@@ -1,4 +1,4 @@
-"""The simulated traffic moves as traffic does."""
+"""The simulated traffic is plausible."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def traffic(network) -> SimulatedTraffic:
 
 
 def _crossing_time(vehicle: Vehicle) -> float | None:
-    """When a vehicle passes the middle of the junction, or None."""
+    """Return the time at which a vehicle passes the centre of the junction, or None."""
     passed = vehicle.s > vehicle.route.stop_s + 10.0
     return vehicle.start_s + STEP_S * int(passed.argmax()) if passed.any() else None
 
@@ -66,9 +66,9 @@ def test_every_path_is_smooth(network):
 @pytest.mark.parametrize('angle_deg', [60.0, 90.0, 120.0])
 def test_routes_leave_on_the_lanes_of_straight_traffic(angle_deg):
     routes = junction(math.radians(angle_deg), 0.2).routes
-    ends = {r.leave: r.path.at(r.path.length)[:2] for r in routes if r.movement == 'straight'}
+    ends = {r.exit_lane: r.path.at(r.path.length)[:2] for r in routes if r.movement == 'straight'}
     for route in routes:
-        assert route.path.at(route.path.length)[:2] == pytest.approx(ends[route.leave], abs=1e-6)
+        assert route.path.at(route.path.length)[:2] == pytest.approx(ends[route.exit_lane], abs=1e-6)
 
 
 def test_wander_has_the_stated_standard_deviation():
@@ -77,7 +77,7 @@ def test_wander_has_the_stated_standard_deviation():
     assert values.std() == pytest.approx(0.1, rel=0.05)
 
 
-def test_straight_vehicles_keep_their_lane_but_for_the_wander(traffic):
+def test_straight_vehicles_keep_their_lane_up_to_the_wander(traffic):
     offsets = []
     for vehicle in (v for v in traffic.vehicles if v.route.movement == 'straight'):
         for s in np.arange(20.0, 200.0, 10.0):
@@ -138,34 +138,34 @@ def test_another_seed_gives_other_traffic(network, traffic):
 def test_cyclists_ride_along_their_road_and_are_in_the_truth():
     options = SimulationOptions(cyclists=8, pedestrians=4, duration_s=20.0)
     truth = truth_of(Simulation(options))
-    everybody = [track for track in truth['people']['tracks'] if track['type'] == 'cyclist']
-    assert len(everybody) >= 6
+    cyclists = [track for track in truth['people']['tracks'] if track['type'] == 'cyclist']
+    assert len(cyclists) >= 6
     assert {track['type'] for track in truth['people']['tracks']} == {'cyclist', 'pedestrian'}
-    for track in everybody:
+    for track in cyclists:
         t, x, y, heading, speed = np.array(track['rows'])[:, :5].T
         on = np.diff(t) < 0.3
         way = np.hypot(np.diff(x), np.diff(y))
-        begins_anew = way > 5.0
+        restarts = way > 5.0
         assert 4.0 <= speed[0] <= 7.0
-        np.testing.assert_allclose((way / np.diff(t))[on & ~begins_anew], speed[0], atol=0.1)
+        np.testing.assert_allclose((way / np.diff(t))[on & ~restarts], speed[0], atol=0.1)
         turn = np.arctan2(np.diff(y), np.diff(x)) - heading[:-1]
-        assert np.abs(np.angle(np.exp(1j * turn)))[on & ~begins_anew].max() < 0.1
+        assert np.abs(np.angle(np.exp(1j * turn)))[on & ~restarts].max() < 0.1
 
 
-def test_cyclists_change_the_picture_only_where_they_are():
+def test_cyclists_change_only_the_pixels_around_them():
     small = {'width_px': 320, 'height_px': 180, 'focal_px': 140.0, 'noise_sigma': 0.0, 'duration_s': 5.0}
     alone, ridden = (Simulation(SimulationOptions(cyclists=number, **small)) for number in (0, 6))
     assert len(alone.traffic.vehicles) == len(ridden.traffic.vehicles)
     changed = (alone.frame(10) != ridden.frame(10)).any(axis=2)
     assert 10 < changed.sum() < 0.05 * changed.size
     time_s = ridden.time_s(10)
-    places = np.array([cyclist.place(time_s)[:2] for cyclist in ridden.cyclists])
-    pixels, seen = ridden.lens.project(ridden.pose.to_camera(np.pad(places, ((0, 0), (0, 1)), constant_values=0.9)))
+    positions = np.array([cyclist.state(time_s)[:2] for cyclist in ridden.cyclists])
+    pixels, seen = ridden.lens.project(ridden.pose.to_camera(np.pad(positions, ((0, 0), (0, 1)), constant_values=0.9)))
     rows, columns = np.nonzero(changed)
-    apart = np.hypot(columns[:, None] - pixels[seen, 0], rows[:, None] - pixels[seen, 1]).min(axis=1)
-    assert apart.max() < 25.0  # a rider is 15 px tall at 15 m
+    distance = np.hypot(columns[:, None] - pixels[seen, 0], rows[:, None] - pixels[seen, 1]).min(axis=1)
+    assert distance.max() < 25.0  # a rider is 15 px tall at 15 m
 
 
 @pytest.mark.parametrize('scene', ['highway', 'roundabout'])
-def test_where_nobody_may_cycle_nobody_does(scene):
+def test_some_scenes_have_no_cyclists(scene):
     assert not Simulation(SimulationOptions(scene=scene, cyclists=8)).cyclists

@@ -1,4 +1,4 @@
-"""Troubles are drawn where their physics puts them, and nowhere else."""
+"""Disturbances appear only where their physics predicts them."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def _simulation(**given) -> Simulation:
 
 
 def _changed(trouble: str, first: int, second: int, **given) -> np.ndarray:
-    """Where (h, w) two frames differ by more than rounding does."""
+    """Mask (h, w) where two frames differ by more than rounding."""
     simulation = _simulation(trouble=trouble, **given)
     return np.abs(simulation.frame(first).astype(int) - simulation.frame(second)).max(-1) > 12
 
@@ -43,14 +43,14 @@ def _off_road() -> np.ndarray:
 
 
 @pytest.mark.parametrize('trouble', ['trees', 'flags', 'leds', 'water', 'shadows', 'rain', 'drops', 'clock'])
-def test_an_empty_road_moves_with_each_trouble(trouble):
+def test_each_trouble_changes_an_empty_road(trouble):
     changed = _changed(trouble, 100, 104, empty=True) | _changed(trouble, 100, 260, empty=True)
     assert 5e-5 < changed.mean() < 0.5
 
 
 @pytest.mark.parametrize('trouble', ['trees', 'flags', 'water'])
-def test_what_sways_stays_where_it_is(trouble):
-    # Where it moves later is beside where it moved before: nothing travels.
+def test_swaying_objects_stay_in_place(trouble):
+    # Later changes lie next to earlier ones: nothing travels.
     early, late = (_changed(trouble, begin, begin + 13, empty=True) for begin in (100, 140))
     reach = cv2.dilate(early.astype(np.uint8), np.ones((21, 21), np.uint8)) > 0
     assert (late & reach).sum() > 0.9 * late.sum() > 0
@@ -67,27 +67,27 @@ def test_a_frame_does_not_depend_on_the_frames_before():
     assert np.array_equal(simulation.frame(30), first)
 
 
-def test_a_vehicle_shades_the_ground_beside_it_and_not_itself():
+def test_a_vehicle_casts_a_shadow_on_the_ground_beside_it():
     simulation, plain = _simulation(trouble='shadows'), _simulation()
     index = 150
     darker = plain.frame(index).astype(int).max(-1) - simulation.frame(index).max(-1)
     ground = GroundBuffer.of(plain.options, plain.network, plain.pose)
     clouds = _simulation(trouble='shadows', empty=True).frame(index).astype(int).max(-1)
-    # Without its vehicles the same place is as bright as the clouds leave it.
+    # Reference without vehicles: brightness under the clouds alone.
     cast = (clouds - simulation.frame(index).max(-1) > 25) & (darker > 25) & np.isfinite(ground.distance_m)
     inside = [_inside(plain, *pair) for pair in plain.states(plain.time_s(index))]
     assert (cast & ~np.logical_or.reduce(inside)).sum() > 80
 
 
 def _inside(simulation: Simulation, vehicle, state) -> np.ndarray:
-    """Where (h, w) the box of a vehicle is seen."""
+    """Mask (h, w) of the projected bounding box of a vehicle."""
     pixels, _ = simulation.lens.project(simulation.pose.to_camera(box_corners(vehicle, state)))
     mask = np.zeros((simulation.options.height_px, simulation.options.width_px), np.uint8)
     cv2.fillConvexPoly(mask, cv2.convexHull(np.round(pixels).astype(np.int32)), 1)
     return mask > 0
 
 
-def test_a_wet_road_mirrors_lamps_as_far_below_it_as_they_are_above():
+def test_a_wet_road_reflects_lamps_at_their_mirror_images():
     wet, dry = _simulation(trouble='wet', night=True), _simulation(night=True)
     index = 150
     added = wet.frame(index).astype(int).max(-1) - dry.frame(index).max(-1)
@@ -97,15 +97,15 @@ def test_a_wet_road_mirrors_lamps_as_far_below_it_as_they_are_above():
         for lamp in vehicle_lamps(vehicle, state)
         if (pixel := _mirrored(dry, lamp)) is not None
     ]
-    bright = [added[int(round(y)), int(round(x))] for x, y in near]
+    bright = [added[round(y), round(x)] for x, y in near]
     assert np.quantile(bright, 0.9) > 40
-    # And not above the road: nothing is added over the horizon.
+    # Nothing is added above the horizon.
     ground = GroundBuffer.of(dry.options, dry.network, dry.pose)
     assert (added[np.isinf(ground.distance_m)] < 20).all()
 
 
 def _mirrored(simulation: Simulation, lamp) -> np.ndarray | None:
-    """Pixel (2,) of a lamp's mirror image where it is in the picture and shines this way."""
+    """Return the pixel (2,) of a lamp's mirror image, or None if outside the image or facing away."""
     below = lamp.position_m * (1, 1, -1)
     to_camera = simulation.pose.position_m - below
     pixel, valid = simulation.lens.project(simulation.pose.to_camera(below))
@@ -122,6 +122,6 @@ def _mirrored(simulation: Simulation, lamp) -> np.ndarray | None:
         ({'trouble': 'trees', 'thermal': True}, 'leave out trouble or thermal'),
     ],
 )
-def test_what_cannot_be_drawn_is_said(given, words):
+def test_impossible_troubles_are_refused(given, words):
     with pytest.raises(UsageError, match=words):
         replace(SimulationOptions(), **given)

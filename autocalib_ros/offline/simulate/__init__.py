@@ -1,4 +1,4 @@
-"""Synthetic traffic seen through a known lens, as a recording with its truth beside it."""
+"""Traffic simulator: recordings of synthetic traffic seen through a known lens, with ground truth."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def write_bag(
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
-    """Simulate a recording into a new bag folder; see `bag.write_bag`."""
-    from autocalib_ros.offline.simulate.bag import write_bag as write  # rosbags is needed for nothing else
+    """Simulate a recording and write it to a new bag folder; see `bag.write_bag`."""
+    from autocalib_ros.offline.simulate.bag import write_bag as write  # imported here: nothing else needs rosbags
 
     return write(path, options, workers=workers, overwrite=overwrite, progress=progress)

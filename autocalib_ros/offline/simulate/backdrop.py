@@ -1,4 +1,4 @@
-"""The picture without traffic, drawn once for a pose of the camera."""
+"""The static scene without traffic, rendered once per camera pose."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from autocalib_ros.offline.simulate.ground_surface import GroundMap
 from autocalib_ros.offline.simulate.lens import CameraPose
 from autocalib_ros.offline.simulate.palette import Palette
 
-_HAZE_LENGTH_M = 260.0
+_HAZE_LENGTH_M = 260.0  # attenuation length
 
 
 def draw_backdrop(
@@ -27,10 +27,10 @@ def draw_backdrop(
     down = rays[..., 2] < -1e-3
     distance = np.where(down, -height / np.minimum(rays[..., 2], -1e-3), np.inf)
     canvas.distance[:] = distance
-    places = rays[..., :2] * np.where(down, distance, 0)[..., None]
-    places += pose.position_m[:2].astype(np.float32)
+    positions = rays[..., :2] * np.where(down, distance, 0)[..., None]
+    positions += pose.position_m[:2].astype(np.float32)
     for ground in grounds:
-        _draw_ground(canvas, places, distance, height, ground)
+        _draw_ground(canvas, positions, distance, height, ground)
     _add_haze(canvas, palette)
     canvas.draw(canvas.project_faces([scenery], pose)[0])
 
@@ -42,10 +42,10 @@ def _draw_sky(canvas: Canvas, rays: np.ndarray, palette: Palette) -> None:
     canvas.colour[..., 3] = 255
 
 
-def _draw_ground(canvas: Canvas, places: np.ndarray, distance: np.ndarray, height: float, ground: GroundMap) -> None:
-    """Colour the samples that look at the ground map, each from the level that suits it."""
-    inside = np.isfinite(distance) & (np.abs(places) < ground.half_m).all(-1)
-    # Footprint of a sample: the mean of its width and of its length along the line of sight.
+def _draw_ground(canvas: Canvas, positions: np.ndarray, distance: np.ndarray, height: float, ground: GroundMap) -> None:
+    """Colour the samples on a ground map, each from its mipmap level."""
+    inside = np.isfinite(distance) & (np.abs(positions) < ground.half_m).all(-1)
+    # Footprint of a sample: geometric mean of its width and its length along the line of sight.
     angle = 1.0 / (canvas.lens.focal_px * SAMPLES_PER_PIXEL)
     footprint = angle * distance * np.sqrt(np.maximum(distance / height, 1.0))
     wanted = np.log2(np.maximum(footprint / ground.texel_m, 1e-6))
@@ -53,20 +53,20 @@ def _draw_ground(canvas: Canvas, places: np.ndarray, distance: np.ndarray, heigh
     level = np.clip(np.round(wanted), 0, len(ground.levels) - 1).astype(np.int8)
     for i in np.unique(level[inside]):
         here = inside & (level == i)
-        picture = ground.levels[i]
-        scale = picture.shape[0] / (2 * ground.half_m)
+        image = ground.levels[i]
+        scale = image.shape[0] / (2 * ground.half_m)
         rows, columns = np.nonzero(here)
         part = np.s_[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
-        x = (places[part][..., 0] + ground.half_m) * scale - 0.5
-        y = (ground.half_m - places[part][..., 1]) * scale - 0.5
-        picked = cv2.remap(
-            picture,
+        x = (positions[part][..., 0] + ground.half_m) * scale - 0.5
+        y = (ground.half_m - positions[part][..., 1]) * scale - 0.5
+        sampled = cv2.remap(
+            image,
             x.astype(np.float32),
             y.astype(np.float32),
             cv2.INTER_LINEAR,
             borderMode=cv2.BORDER_REPLICATE,
         )
-        canvas.colour[part][..., :3][here[part]] = picked[here[part]]
+        canvas.colour[part][..., :3][here[part]] = sampled[here[part]]
 
 
 def _add_haze(canvas: Canvas, palette: Palette) -> None:

@@ -1,4 +1,4 @@
-"""A simulated recording as a rosbag2 folder with truth.json in it."""
+"""Write a simulated recording as a rosbag2 folder with truth.json in it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from autocalib_ros.offline.simulate.truth import truth_of
 
 TRUTH_FILE_NAME = 'truth.json'
 _BAG_VERSION: Literal[9] = 9
-_LATENCY_NS = 5_000_000  # recorders see an image a little after its stamp
+_LATENCY_NS = 5_000_000  # a recorder receives an image shortly after its stamp
 _BATCH_FRAMES = 64
 _JPEG_QUALITY = 92
 
@@ -39,15 +39,15 @@ def write_bag(
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
-    """Simulate a recording into a new bag folder, with truth.json in it; return the folder.
+    """Simulate a recording into a new bag folder with truth.json in it; return the folder.
 
-    workers: processes that draw (default: one for each core); the result does not depend on it.
-    overwrite: replace a bag of that name.  progress: called with (frames done, frames in all).
+    workers: number of rendering processes (default: one per core); the result does not depend on it.
+    overwrite: replace an existing bag.  progress: called with (frames done, total frames).
     """
     path = Path(path)
     if workers is not None and workers < 1:
         raise UsageError(f'workers is {workers}: choose 1 or more')
-    _clear_target(path, overwrite)
+    _prepare_target(path, overwrite)
     simulation = Simulation(options)
     try:
         with _writer(path, options) as writer:
@@ -55,32 +55,32 @@ def write_bag(
         text = json.dumps(truth_of(simulation), indent=1)
         (path / TRUTH_FILE_NAME).write_text(text, encoding='utf-8')
     except BaseException as error:
-        shutil.rmtree(path, ignore_errors=True)  # half a bag is worse than none
+        shutil.rmtree(path, ignore_errors=True)  # leave no incomplete bag behind
         if isinstance(error, (OSError, WriterError)):
             raise InputError(f'cannot write {path}: {error}') from error
         raise
     return path
 
 
-def _clear_target(path: Path, overwrite: bool) -> None:
-    """Make sure that nothing stands at the path; remove only what is a bag, and only if told to."""
+def _prepare_target(path: Path, overwrite: bool) -> None:
+    """Make the path available: remove an empty folder, or an existing bag if overwrite is set."""
     if not path.exists():
         return
     if path.is_dir() and not any(path.iterdir()):
         path.rmdir()
         return
     if not overwrite:
-        raise UsageError(f'{path} exists already: choose another name, or --overwrite to replace the bag')
+        raise UsageError(f'{path} already exists: choose another name, or use --overwrite to replace the bag')
     if not (path / 'metadata.yaml').is_file():
         raise UsageError(
-            f'{path} is not a bag (no metadata.yaml in it), so it is not overwritten: '
-            'remove it yourself or choose another name'
+            f'{path} is not a bag (it has no metadata.yaml), so it is not overwritten: '
+            'remove it manually or choose another name'
         )
     shutil.rmtree(path)
 
 
 def _writer(path: Path, options: SimulationOptions) -> Writer:
-    """Return a writer for the storage that the options name."""
+    """Return a bag writer for the storage format of the options."""
     plugin = StoragePlugin.MCAP if options.storage == 'mcap' else StoragePlugin.SQLITE3
     path.parent.mkdir(parents=True, exist_ok=True)
     writer = Writer(path, version=_BAG_VERSION, storage_plugin=plugin)
@@ -117,12 +117,12 @@ def _write_messages(
 
 @contextmanager
 def _rendered_images(simulation: Simulation, workers: int) -> Iterator[Iterator[bytes]]:
-    """Hand out the serialised images in order, drawn here or by other processes."""
+    """Yield the serialised images in order, rendered here or by worker processes."""
     count = simulation.options.frame_count
     if workers == 1:
         yield (_image(simulation, index) for index in range(count))
         return
-    # Spawned, not forked: OpenCV and BLAS have threads of their own. The backdrop goes along.
+    # Spawn, not fork: OpenCV and BLAS have threads. The backdrop is rendered once and sent to the workers.
     simulation.renderer().prepare()
     context = multiprocessing.get_context('spawn')
     with context.Pool(workers, _start_worker, (simulation,)) as pool:
@@ -130,7 +130,7 @@ def _rendered_images(simulation: Simulation, workers: int) -> Iterator[Iterator[
 
 
 def _in_batches(pool: Any, count: int) -> Iterator[bytes]:
-    """Hand out images in order; only a batch at a time, or a slow disk would fill the memory."""
+    """Yield images in order, one batch at a time: with a slow disk, more would fill the memory."""
     for start in range(0, count, _BATCH_FRAMES):
         yield from pool.imap(_render_in_worker, range(start, min(start + _BATCH_FRAMES, count)))
 
@@ -163,7 +163,7 @@ def _header(simulation: Simulation, index: int) -> Any:
 
 
 def _image(simulation: Simulation, index: int) -> bytes:
-    """Draw a frame and return it as a serialised message."""
+    """Render a frame and return it as a serialised message."""
     frame, options = simulation.frame(index), simulation.options
     encoding = 'mono16' if options.thermal else 'bgr8'
     store, header = _typestore(), _header(simulation, index)
@@ -184,7 +184,7 @@ def _image(simulation: Simulation, index: int) -> bytes:
 
 
 def _compressed(frame: np.ndarray, encoding: str) -> dict[str, Any]:
-    """Compress as image_transport does: JPEG, or PNG for 16 bits."""
+    """Compress an image as image_transport does: JPEG, or PNG for 16 bits."""
     if encoding == 'mono16':
         _, data = cv2.imencode('.png', frame, [cv2.IMWRITE_PNG_COMPRESSION, 1])
         return {'format': 'mono16; png compressed ', 'data': data.reshape(-1)}
@@ -193,12 +193,12 @@ def _compressed(frame: np.ndarray, encoding: str) -> dict[str, Any]:
 
 
 def _camera_info(simulation: Simulation, index: int) -> bytes | memoryview:
-    """Return the true CameraInfo of a frame, serialised."""
+    """Return the true CameraInfo of a frame as a serialised message."""
     store, options, lens = _typestore(), simulation.options, simulation.lens
     (cx, cy), f = lens.centre_px, lens.focal_px
     name = 'sensor_msgs/msg/CameraInfo'
     roi = store.types['sensor_msgs/msg/RegionOfInterest'](x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
-    # Readers take all-zero coefficients of this model for "no distortion at all".
+    # Consumers interpret all-zero coefficients of this model as "no distortion".
     d = [k or 1e-9 if i == 0 else k for i, k in enumerate(lens.k)]
     message = store.types[name](
         header=_header(simulation, index),

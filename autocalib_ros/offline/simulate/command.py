@@ -1,4 +1,4 @@
-"""`autocalib simulate`: the options of the simulator on the command line."""
+"""`autocalib simulate`: command line of the simulator."""
 
 from __future__ import annotations
 
@@ -17,18 +17,20 @@ _CHOICES = {'scene': SCENES, 'storage': STORAGES, 'shutter_shows': SHUTTER_SHOWS
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the bag and one option for each field of SimulationOptions."""
+    """Add the bag argument and one option per field of SimulationOptions."""
     parser.add_argument('bag', metavar='BAG', help='rosbag2 folder to write')
     _add_lens_and_size(parser)
     for field in fields(SimulationOptions):
         if field.name not in _CUSTOM_OPTIONS:
             _add_option(parser, field.name, field.type, field.default, field.metadata['help'])
-    parser.add_argument('--workers', type=int, metavar='N', help='processes; default: one a core')
-    parser.add_argument('--overwrite', action='store_true', help='replace a bag of that name')
+    parser.add_argument(
+        '--workers', type=int, metavar='N', help='number of rendering processes (default: one per core)'
+    )
+    parser.add_argument('--overwrite', action='store_true', help='replace an existing bag')
 
 
 def options_from(args: argparse.Namespace) -> SimulationOptions:
-    """Return the options that the arguments ask for; what was not given keeps its default."""
+    """Return the options of the arguments; options not given keep their defaults."""
     given = {field.name: getattr(args, field.name) for field in fields(SimulationOptions) if hasattr(args, field.name)}
     if hasattr(args, 'size'):
         given['width_px'], given['height_px'] = args.size
@@ -79,7 +81,7 @@ def _add_lens_and_size(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_option(parser: argparse.ArgumentParser, name: str, kind: Any, default: Any, text: str) -> None:
-    """Add one option; its flag is the field's name without the unit."""
+    """Add one option; its flag is the field name without the unit."""
     flag = '--' + _UNIT.sub('', name).replace('_', '-')
     if default is MISSING:
         raise TypeError(f'option {name} has no default')
@@ -100,12 +102,12 @@ def _add_option(parser: argparse.ArgumentParser, name: str, kind: Any, default: 
 
 
 def _type_of(kind: Any) -> type:
-    """Return the type behind an annotation such as 'float | None'."""
+    """Return the type of an annotation such as 'float | None'."""
     return {'int': int, 'float': float, 'str': str}[str(kind).split(' | ')[0]]
 
 
 def _size(text: str) -> tuple[int, int]:
     match = re.fullmatch(r'(\d+)x(\d+)', text)
     if match is None:
-        raise UsageError(f'size {text!r} is not WxH: write it as in 1280x720')
+        raise UsageError(f'size {text!r} is not WxH: write it like 1280x720')
     return int(match[1]), int(match[2])

@@ -1,32 +1,44 @@
-"""Cyclists: as narrow as who walks, as fast as a car that turns, along the kerb or on the pavement."""
+"""Cyclists along the kerb or on the pavement: as narrow as pedestrians, as fast as turning cars."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
 from autocalib_ros.offline.simulate import paint
+from autocalib_ros.offline.simulate.clothing import FigureSizes, figure_images
 from autocalib_ros.offline.simulate.faces import Faces, Texture
 from autocalib_ros.offline.simulate.network import Network, Road
 from autocalib_ros.offline.simulate.options import SimulationOptions
 from autocalib_ros.offline.simulate.palette import palette_for
 
-_ROUTE_HALF_LENGTH_M = 45.0  # from the middle of the network, either way
+_ROUTE_HALF_LENGTH_M = 45.0  # routes end at this distance from the centre of the network
 _FROM_KERB_M = 0.6
-_BICYCLE_LENGTH_M, _BICYCLE_HEIGHT_M = 1.75, 1.0  # of the bicycle
+_BICYCLE_LENGTH_M, _BICYCLE_HEIGHT_M = 1.75, 1.0
 _WHEEL_RADIUS_M = 0.34
-_TEXELS_PER_M = 60  # texels to the metre
+_TEXELS_PER_M = 60
+_SIZES = FigureSizes(leg=(44, 10), trunk=(36, 26), arm=(32, 7), head=(17, 13))
+
+
+class CyclistState(NamedTuple):
+    """Position in metres, heading and pedal phase in radians."""
+
+    x: float
+    y: float
+    heading: float
+    pedal_phase: float
 
 
 @dataclass(frozen=True)
 class Cyclist:
-    """Somebody who rides along a road, again and again."""
+    """A cyclist who rides along a road periodically."""
 
     road: Road
-    aside_m: float
+    lateral_m: float
     """To the left of the road's axis."""
     forward: bool
     """Along the axis or against it."""
@@ -34,16 +46,17 @@ class Cyclist:
     first_s: float
     clothes: int
 
-    def place(self, time_s: float) -> tuple[float, float, float, float]:
-        """Return (x, y, heading, phase of the pedals in radians)."""
-        way = (time_s - self.first_s) * self.speed_mps % (2 * _ROUTE_HALF_LENGTH_M)
-        along = way - _ROUTE_HALF_LENGTH_M if self.forward else _ROUTE_HALF_LENGTH_M - way
-        x, y = self.road.at(along, self.aside_m + 0.06 * math.sin(way / 1.3)).tolist()
-        return x, y, self.road.heading(along) + (0.0 if self.forward else math.pi), way * 2 * math.pi / 4.5
+    def state(self, time_s: float) -> CyclistState:
+        """Return the state at a time."""
+        distance = (time_s - self.first_s) * self.speed_mps % (2 * _ROUTE_HALF_LENGTH_M)
+        along = distance - _ROUTE_HALF_LENGTH_M if self.forward else _ROUTE_HALF_LENGTH_M - distance
+        x, y = self.road.at(along, self.lateral_m + 0.06 * math.sin(distance / 1.3)).tolist()
+        heading = self.road.heading(along) + (0.0 if self.forward else math.pi)
+        return CyclistState(x, y, heading, distance * 2 * math.pi / 4.5)
 
 
 def spawn_cyclists(network: Network, options: SimulationOptions) -> tuple[Cyclist, ...]:
-    """Return the cyclists of a recording; none where there is no pavement, and none round a roundabout."""
+    """Return the cyclists of a recording; none on rural roads and at roundabouts."""
     if options.empty or network.rural or network.roundabout is not None:
         return ()
     rng = np.random.default_rng([options.seed, 12])
@@ -64,23 +77,21 @@ def _cyclist(network: Network, rng: np.random.Generator) -> Cyclist:
     )
 
 
-def figure_faces(
-    cyclist: Cyclist, place: tuple[float, float, float, float], viewer_xy: np.ndarray, thermal: bool
-) -> Faces:
-    """Return a flat bicycle, seen from both sides, and upright rectangles of its rider that face the viewer (2,)."""
-    x, y, heading, phase = place
+def cyclist_faces(cyclist: Cyclist, state: CyclistState, viewer_xy: np.ndarray, thermal: bool) -> Faces:
+    """Return a flat bicycle, visible from both sides, and billboards of its rider facing the viewer (2,)."""
+    x, y, heading, phase = state
     ride = np.array([math.cos(heading), math.sin(heading)])
     left = np.array([-ride[1], ride[0]])
     to_viewer = math.atan2(viewer_xy[1] - y, viewer_xy[0] - x)
     across = np.array([-math.sin(to_viewer), math.cos(to_viewer)])
-    here = np.array([x, y])
-    front, rear = here + ride * _BICYCLE_LENGTH_M / 2, here - ride * _BICYCLE_LENGTH_M / 2
+    centre = np.array([x, y])
+    front, rear = centre + ride * _BICYCLE_LENGTH_M / 2, centre - ride * _BICYCLE_LENGTH_M / 2
     corners = [
         [(*start, _BICYCLE_HEIGHT_M), (*(end - start), 0.0), (0.0, 0.0, -_BICYCLE_HEIGHT_M)]
         for start, end in ((front, rear), (rear, front))
     ]
     swing = 0.17 * math.sin(phase)
-    for ahead_low, aside_low, low, ahead_high, aside_high, high, width in (
+    for ahead_low, lateral_low, low, ahead_high, lateral_high, high, width in (
         (0.05 + swing, 0.1, 0.2 + 0.1 * math.cos(phase), -0.15, 0.1, 0.98, 0.17),
         (0.05 - swing, -0.1, 0.2 - 0.1 * math.cos(phase), -0.15, -0.1, 0.98, 0.17),
         (-0.15, 0.0, 0.9, 0.12, 0.0, 1.48, 0.44),
@@ -88,8 +99,8 @@ def figure_faces(
         (0.48, -0.25, 0.95, 0.12, -0.2, 1.42, 0.11),
         (0.17, 0.0, 1.46, 0.2, 0.0, 1.74, 0.21),
     ):
-        top = here + ride * ahead_high + left * aside_high - across * width / 2
-        foot = here + ride * ahead_low + left * aside_low - across * width / 2
+        top = centre + ride * ahead_high + left * lateral_high - across * width / 2
+        foot = centre + ride * ahead_low + left * lateral_low - across * width / 2
         corners.append([(*top, high), (*(across * width), 0.0), (*(foot - top), low - high)])
     return Faces(np.array(corners), _textures(cyclist.clothes, thermal))
 
@@ -97,31 +108,15 @@ def figure_faces(
 @lru_cache(maxsize=32)
 def _textures(clothes: int, thermal: bool) -> tuple[Texture, ...]:
     palette = palette_for(thermal)
-    rng = np.random.default_rng([clothes, 6])
-    coat = palette.clothes[clothes % len(palette.clothes)]
-    legs = palette.clothes[(clothes * 3 + 1) % len(palette.clothes)]
+    images = figure_images(clothes, _SIZES, palette, np.random.default_rng([clothes, 6]))
     bicycle = Texture(_bicycle(palette.tyre, palette.bodies[clothes % len(palette.bodies)]))
-    pictures = []
-    for colour, size in (
-        (legs, (44, 10)),
-        (paint.mix_colours(legs, palette.trim, 0.3), (44, 10)),
-        (coat, (36, 26)),
-        (coat, (32, 7)),
-        (coat, (32, 7)),
-        (palette.skin, (17, 13)),
-    ):
-        picture = paint.filled_image(*size, colour)
-        paint.add_noise(
-            picture, paint.octave_noise(*size, ((2.0, 6.0 * palette.texture), (8.0, 8.0 * palette.texture)), rng)
-        )
-        pictures.append(picture)
-    return bicycle, bicycle, *(Texture(picture) for picture in pictures)
+    return bicycle, bicycle, *(Texture(image) for image in images)
 
 
 def _bicycle(tyre: tuple[int, int, int], frame: tuple[int, int, int]) -> np.ndarray:
-    """Paint two wheels and the bars of the frame; alpha cuts the rest out."""
+    """Paint two wheels and the frame; alpha is the silhouette."""
     height, width = round(_BICYCLE_HEIGHT_M * _TEXELS_PER_M), round(_BICYCLE_LENGTH_M * _TEXELS_PER_M)
-    picture = paint.filled_image(height, width, tyre)
+    image = paint.filled_image(height, width, tyre)
     alpha = np.zeros((height, width), np.uint8)
     hub = height - _WHEEL_RADIUS_M * _TEXELS_PER_M
     wheels = [(_WHEEL_RADIUS_M * _TEXELS_PER_M, hub), (width - _WHEEL_RADIUS_M * _TEXELS_PER_M, hub)]
@@ -138,6 +133,6 @@ def _bicycle(tyre: tuple[int, int, int], frame: tuple[int, int, int]) -> np.ndar
         (pedals, wheels[1]),
     ):
         paint.line(alpha, start, end, (255,), 4)
-        paint.line(picture, start, end, (*frame, 255), 4)
-    picture[..., 3] = alpha
-    return picture
+        paint.line(image, start, end, (*frame, 255), 4)
+    image[..., 3] = alpha
+    return image

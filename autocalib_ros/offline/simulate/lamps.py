@@ -1,4 +1,4 @@
-"""Light at night: beams on the road, pools under street lamps, blobs of head and tail lamps."""
+"""Lights at night: beams on the road, pools of light under street lamps, glow of head and tail lamps."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from autocalib_ros.offline.simulate.vehicle_models import Vehicle, VehicleState
 
 _HEAD_LAMP_COLOUR = (215, 240, 255)
 _TAIL_LAMP_COLOUR = (40, 30, 230)
-_BEAM_SIZE_M = (16.0, 6.0)
+_BEAM_SIZE_M = (16.0, 6.0)  # length and width on the road
 LAMP_HEIGHT_M = 0.7
 
 
 @lru_cache(maxsize=16)
 def beam_faces(kind: str) -> Faces:
-    """Return the light that a vehicle throws on the road before it, to be drawn as a gain."""
+    """Return the head-lamp beam on the road ahead of a vehicle, to be drawn as a gain."""
     length, width = _BEAM_SIZE_M
     start = SHAPES[kind].length_m / 2
     # Texture x runs along the beam, y across it.
@@ -42,14 +42,14 @@ def light_pool() -> Faces:
 
 
 def _gain_faces(light: np.ndarray, corners: list[tuple[float, float, float]]) -> Faces:
-    picture = np.full((*light.shape, 4), 255, np.uint8)
-    picture[..., :3] = (100 + 155 * np.clip(light, 0, 1))[..., None]
-    return Faces(np.array([corners], float), (Texture(picture),))
+    image = np.full((*light.shape, 4), 255, np.uint8)
+    image[..., :3] = (100 + 155 * np.clip(light, 0, 1))[..., None]
+    return Faces(np.array([corners], float), (Texture(image),))
 
 
 @dataclass(frozen=True)
 class Lamp:
-    """A lamp of a vehicle: its place (3,), the heading (2,) in which it shines, its colour and size."""
+    """A vehicle lamp: position (3,), horizontal direction (2,) of its light, colour and size."""
 
     position_m: np.ndarray
     direction: np.ndarray
@@ -69,30 +69,30 @@ def vehicle_lamps(vehicle: Vehicle, state: VehicleState) -> Iterator[Lamp]:
 
 
 def add_lamps(
-    picture: np.ndarray,
+    image: np.ndarray,
     canvas: Canvas,
     pose: CameraPose,
     vehicles: list[tuple[Vehicle, VehicleState]],
 ) -> None:
-    """Add the blobs of all lamps that are turned to the camera and not hidden, in place."""
+    """Add the glow of all visible lamps that face the camera, in place."""
     for vehicle, state in vehicles:
         for lamp in vehicle_lamps(vehicle, state):
-            _add_lamp(picture, canvas, pose, lamp)
+            _add_lamp(image, canvas, pose, lamp)
 
 
-def _add_lamp(picture: np.ndarray, canvas: Canvas, pose: CameraPose, lamp: Lamp) -> None:
+def _add_lamp(image: np.ndarray, canvas: Canvas, pose: CameraPose, lamp: Lamp) -> None:
     to_camera = pose.position_m - lamp.position_m
     distance = float(np.linalg.norm(to_camera))
     turned = float(lamp.direction @ to_camera[:2]) / distance
     pixel, valid = canvas.lens.project(pose.to_camera(lamp.position_m))
-    column, row = (int(round(c)) for c in pixel)
+    column, row = (round(c) for c in pixel)
     if turned < 0.05 or not valid:
         return
-    if not (0 <= row < picture.shape[0] and 0 <= column < picture.shape[1]):
+    if not (0 <= row < image.shape[0] and 0 <= column < image.shape[1]):
         return
     if canvas.distance[row * SAMPLES_PER_PIXEL, column * SAMPLES_PER_PIXEL] < distance - 0.5:
         return
-    # A lamp is dazzling along its axis and fades to the side; far ones stay visible.
+    # A lamp is brightest along its axis and fades to the side; distant ones stay visible.
     radius = max(1.2, lamp.size_m * canvas.lens.focal_px / distance * (0.6 + 1.4 * turned**2))
     strength = min(1.0, 0.35 + turned)
-    add_glow(picture, pixel, radius, mix_colours((0, 0, 0), lamp.colour, strength))
+    add_glow(image, pixel, radius, mix_colours((0, 0, 0), lamp.colour, strength))

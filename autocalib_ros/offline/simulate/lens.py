@@ -1,6 +1,6 @@
-"""The simulator's own lens and camera pose, independent of the estimator's.
+"""Lens and camera pose of the simulator, independent of the estimator's.
 
-Kannala-Brandt: r = f (theta + k1 theta^3 + k2 theta^5 + k3 theta^7 + k4 theta^9), theta the angle
+Kannala and Brandt (2006): r = f (theta + k1 theta^3 + k2 theta^5 + k3 theta^7 + k4 theta^9), theta the angle
 from the optical axis.  Camera optical frame: x right, y down, z forward.  Pixel (0, 0) is the
 centre of the top-left pixel.
 """
@@ -16,7 +16,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class KannalaBrandtLens:
-    """A radially symmetric lens in front of square pixels.
+    """Kannala-Brandt lens with square pixels.
 
     focal_px: f in pixels; k: k1..k4; centre_px: the principal point (x, y) in pixels.
     """
@@ -27,7 +27,7 @@ class KannalaBrandtLens:
 
     @cached_property
     def theta_limit(self) -> float:
-        """Angle in radians up to which the radius grows, at most pi."""
+        """Angle in radians up to which the radius increases, at most pi."""
         slope = np.zeros(2 * len(self.k) + 1)  # dr/dtheta / f = 1 + 3 k1 theta^2 + 5 k2 theta^4 ..
         slope[0] = 1.0
         slope[2::2] = [(2 * i + 3) * k for i, k in enumerate(self.k)]
@@ -37,14 +37,14 @@ class KannalaBrandtLens:
 
     @property
     def radius_limit_px(self) -> float:
-        """Largest image radius that the lens can form, in pixels."""
+        """Largest valid image radius in pixels."""
         return float(self._radius(np.float64(self.theta_limit)))
 
     def project(self, points_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Project points (..., 3) in the optical frame.
 
-        Returns pixels (..., 2) and a validity mask (...).  A point outside the range of the lens
-        is placed on the rim in its own direction and marked invalid.
+        Returns pixels (..., 2) and a validity mask (...).  A point outside the valid range of the
+        lens is projected to the rim in its direction and marked invalid.
         """
         x, y, z = np.moveaxis(np.asarray(points_camera, float), -1, 0)
         across = np.hypot(x, y)
@@ -55,7 +55,7 @@ class KannalaBrandtLens:
         return np.stack([x * scale + self.centre_px[0], y * scale + self.centre_px[1]], -1), valid
 
     def bearings(self, pixels: np.ndarray) -> np.ndarray:
-        """Return the unit rays (..., 3) in the optical frame of pixels (..., 2)."""
+        """Return the unit bearings (..., 3) in the optical frame of pixels (..., 2)."""
         offset = np.asarray(pixels, float) - np.array(self.centre_px)
         radius = np.hypot(offset[..., 0], offset[..., 1])
         theta = np.interp(radius, *self._table)
@@ -73,29 +73,29 @@ class KannalaBrandtLens:
 
     @cached_property
     def _table(self) -> tuple[np.ndarray, np.ndarray]:
-        """Radii and angles so close together that linear interpolation errs by < 1e-9 rad."""
+        """Radii and angles of a lookup table; linear interpolation errs by < 1e-9 rad."""
         theta = np.linspace(0.0, self.theta_limit, 1 << 16)
         return self._radius(theta), theta
 
 
 @dataclass(frozen=True)
 class CameraPose:
-    """Where the camera is: rotation (3, 3) and position (3,) in metres, world frame z up."""
+    """Camera pose: rotation (3, 3) and position (3,) in metres; world frame z up."""
 
     world_from_camera: np.ndarray
     position_m: np.ndarray
 
     def to_camera(self, points_world: np.ndarray) -> np.ndarray:
-        """Take points (..., 3) from the world to the optical frame."""
+        """Transform points (..., 3) from the world to the optical frame."""
         return (np.asarray(points_world, float) - self.position_m) @ self.world_from_camera
 
     def rotated(self, camera_rotation: np.ndarray) -> CameraPose:
-        """Return the pose after the camera turned by a rotation (3, 3) in its own frame."""
+        """Return the pose after a rotation (3, 3) in the camera frame."""
         return CameraPose(self.world_from_camera @ camera_rotation, self.position_m)
 
 
 def look_rotation(yaw_deg: float, pitch_deg: float, roll_deg: float) -> np.ndarray:
-    """Return world_from_camera (3, 3) of a camera looking along a heading and down.
+    """Return world_from_camera (3, 3) from yaw, downward pitch and roll.
 
     Positive roll turns the camera clockwise as seen from behind it.
     """
@@ -108,7 +108,7 @@ def look_rotation(yaw_deg: float, pitch_deg: float, roll_deg: float) -> np.ndarr
 
 
 def rotation_from_vector(vector_rad: np.ndarray) -> np.ndarray:
-    """Return the rotation (3, 3) about a vector (3,) by its length in radians (Rodrigues)."""
+    """Return the rotation matrix (3, 3) of a rotation vector (3,) in radians (Rodrigues)."""
     angle = float(np.linalg.norm(vector_rad))
     if angle < 1e-15:
         return np.eye(3)

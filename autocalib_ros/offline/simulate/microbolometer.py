@@ -1,4 +1,4 @@
-"""A thermal core: 14-bit counts of heat, a pattern and an offset that drift, and the shutter that sets them anew."""
+"""Thermal sensor: 14-bit counts with fixed-pattern noise, offset drift and flat-field corrections by a shutter."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ import numpy as np
 from autocalib_ros.offline.simulate.options import SimulationOptions
 
 COUNTS_PER_LEVEL = 8.0
-"""Counts to one grey level of the palette: at 25 counts a kelvin, which is usual, engines are 19 K above the road."""
+"""Counts per grey level of the palette: at the usual 25 counts/K, engines are 19 K warmer than the road."""
 NOISE_COUNTS_PER_LEVEL = 1.5
-"""Counts of noise to one grey level of `noise_sigma`: by default 3, or 120 mK."""
+"""Counts per grey level of `noise_sigma`: by default 3 counts of noise, or 120 mK."""
 BASE_COUNTS = 6400.0
 OFFSET_DRIFT_PER_S = 0.8
-"""Counts that the offset gains each second while the housing warms, until the shutter takes them away."""
+"""Offset drift in counts per second while the housing warms, reset by the shutter."""
 PIXEL_FPN_COUNTS, COLUMN_FPN_COUNTS = 2.0, 1.5
-"""Standard deviation of what the correction leaves of each pixel's and each column's own offset."""
+"""Standard deviations of the pixel and column fixed-pattern noise that the correction leaves."""
 SHADING_COUNTS, SHADING_PER_S = 12.0, 0.4
-"""Counts that the corners glow more than the centre: standard deviation after the shutter, and growth."""
+"""Excess counts of the corners over the centre (shading): standard deviation after a correction, and growth."""
 FFC_OFFSET_COUNTS = 60.0
-"""Standard deviation of the offset that one closing of the shutter leaves."""
+"""Standard deviation of the offset after a flat-field correction."""
 SHUTTER_CLOSED_S = 0.5
-"""How long the shutter hides the scene."""
+"""Duration of a shutter closure."""
 
 
 class Microbolometer:
-    """Turns drawn heat pictures into counts; a function of the options and the time alone."""
+    """Converts rendered thermal images to counts; depends only on the options and the time."""
 
     def __init__(self, options: SimulationOptions) -> None:
         self._options = options
@@ -40,12 +40,12 @@ class Microbolometer:
         self._shading = (square / 2).astype(np.float32)
 
     def counts(
-        self, picture: np.ndarray, time_s: float, noise: np.ndarray, *, shutter_closed: bool = False
+        self, image: np.ndarray, time_s: float, noise: np.ndarray, *, shutter_closed: bool = False
     ) -> np.ndarray:
         """Return mono16 counts (h, w) of a heat picture (h, w, 3), or of the closed shutter, and noise (h, w, 1)."""
         event, since_s = self._shutter_state(time_s)
         self._redraw_pattern(event)
-        heat = cv2.GaussianBlur(np.ascontiguousarray(picture[..., 0]).astype(np.float32), (0, 0), 0.6)
+        heat = cv2.GaussianBlur(np.ascontiguousarray(image[..., 0]).astype(np.float32), (0, 0), 0.6)
         if shutter_closed:
             heat[:] = heat.mean()
         gain = COUNTS_PER_LEVEL * (1 + 0.03 * math.sin(2 * math.pi * time_s / 47.0))
@@ -55,7 +55,7 @@ class Microbolometer:
         return np.clip(np.round(counts), 0, 16383).astype(np.uint16)
 
     def _shutter_state(self, time_s: float) -> tuple[int, float]:
-        """Return how often the shutter has opened by then, and the seconds since."""
+        """Return the number of completed corrections and the time since the last one."""
         every_s = self._options.shutter_every_s
         if every_s is None or time_s < every_s + SHUTTER_CLOSED_S:
             return 0, time_s
@@ -63,7 +63,7 @@ class Microbolometer:
         return event, time_s - SHUTTER_CLOSED_S - event * every_s
 
     def _redraw_pattern(self, event: int) -> None:
-        """Draw the offset and the pattern that hold since the shutter opened for the `event`-th time."""
+        """Draw offset, shading and fixed-pattern noise of the `event`-th correction."""
         if event == self._event:
             return
         rng = np.random.default_rng([self._options.seed, 9, event])
@@ -76,7 +76,7 @@ class Microbolometer:
 
 
 def shutter_closed_since(options: SimulationOptions, time_s: float) -> float | None:
-    """Return when the shutter closed that hides the scene at a time; None where it is open."""
+    """Return the time at which the shutter closed if it is closed at a time, else None."""
     every_s = options.shutter_every_s
     if every_s is None or time_s < every_s:
         return None

@@ -1,4 +1,4 @@
-"""A straight motorway with three lanes each way, on which some vehicles change lanes."""
+"""Straight motorway with three lanes each way and lane changes."""
 
 from __future__ import annotations
 
@@ -10,27 +10,27 @@ from autocalib_ros.offline.simulate.paths import Path, lane_change, straight_lan
 MOTORWAY_LANE_WIDTH_M = 3.6
 MOTORWAY_HALF_LENGTH_M = 150.0
 MOTORWAY_TRAFFIC_FACTOR = 1.2
-"""Traffic of a lane relative to one in a town."""
+"""Traffic of a lane relative to an urban one."""
 MOTORWAY_SPEEDS_MPS = (24.0, 28.0, 32.0)
-"""Of the lanes, the outer one first."""
+"""Cruise speeds of the lanes, the outer one first."""
 MEDIAN_WIDTH_M = 1.4
-"""From the barrier in the middle of a motorway to its inner edge line."""
+"""From the central barrier to the inner edge line."""
 SHOULDER_WIDTH_M = 2.6
 LANE_CHANGE_LENGTH_M = 110.0
-"""Four seconds at the speed of the middle lane."""
+"""Length of a lane change: four seconds at the speed of the middle lane."""
 LANE_CHANGE_STARTS_M = (60.0, 95.0, 130.0)
-"""Where lane changes begin, from the start of a lane."""
+"""Arc lengths at which lane changes begin."""
 
 
 def highway(one_way: bool, changing_fraction: float) -> Network:
-    """Return a motorway along the x axis, three lanes each way; a part of the vehicles change lanes."""
+    """Return a motorway along the x axis, three lanes each way; a fraction of the vehicles changes lanes."""
     w = MOTORWAY_LANE_WIDTH_M
     inner = -1.5 * w if one_way else MEDIAN_WIDTH_M
-    painted = [(inner, 'solid'), (inner + w, 'dash'), (inner + 2 * w, 'dash'), (inner + 3 * w, 'solid')]
+    markings = [(inner, 'solid'), (inner + w, 'dash'), (inner + 2 * w, 'dash'), (inner + 3 * w, 'solid')]
     half = inner + 3 * w + SHOULDER_WIDTH_M
     sides = (1,) if one_way else (1, -1)
-    edges = tuple((side * offset, kind) for side in sides for offset, kind in painted)
-    # From the outer lane, which is the rightmost, inwards.
+    edges = tuple((side * offset, kind) for side in sides for offset, kind in markings)
+    # From the outer (rightmost) lane inwards.
     offsets = [-(inner + (2.5 - i) * w) for i in range(3)]
     routes = [
         route
@@ -52,7 +52,7 @@ def highway(one_way: bool, changing_fraction: float) -> Network:
 
 
 def _motorway_routes(heading: float, offsets: list[float], index: int, changing_fraction: float) -> list[Route]:
-    """Return the routes that begin in a lane: on in it, and into the lanes beside it."""
+    """Return the routes that begin in a lane: straight on, and into the adjacent lanes."""
     lane = straight_lane(heading, offsets[index], MOTORWAY_HALF_LENGTH_M)
     names = [f'lane {math.degrees(heading):.0f} {offset:+.1f}' for offset in offsets]
     speed = MOTORWAY_SPEEDS_MPS[index]
@@ -71,8 +71,8 @@ def _motorway_routes(heading: float, offsets: list[float], index: int, changing_
     ]
     for target in targets:
         for begin_s in LANE_CHANGE_STARTS_M:
-            aside = offsets[target] - offsets[index]
-            path = lane_change(lane, begin_s, LANE_CHANGE_LENGTH_M, aside)
+            lateral = offsets[target] - offsets[index]
+            path = lane_change(lane, begin_s, LANE_CHANGE_LENGTH_M, lateral)
             routes.append(
                 Route(
                     path,

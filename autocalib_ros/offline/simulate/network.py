@@ -1,6 +1,6 @@
-"""Road networks: roads, the routes over them and the signals that guard them.
+"""Road networks: roads, routes and signals.
 
-A network knows geometry only, and traffic knows routes only: `scenes.py` holds the networks.
+A network is geometry only, and the traffic simulation uses its routes only; `scenes.py` builds the networks.
 """
 
 from __future__ import annotations
@@ -17,19 +17,21 @@ from autocalib_ros.offline.simulate.paths import Path, PathSegment
 LANE_WIDTH_M = 3.2
 RURAL_LANE_WIDTH_M = 3.5
 ARM_LENGTH_M = 110.0
+"""Length of a lane on an arm, from the origin."""
 CROSSING_WIDTH_M = 3.5
 CITY_SPEED_MPS = 12.5
+"""Mean cruise speed in town."""
 _AXIS_SAMPLES_M = np.arange(-400.0, 400.0, 0.5)
-"""Where a curved road is looked up; roads are painted no farther."""
+"""Arc lengths at which the axis of a curved road is sampled; roads are painted no farther."""
 _MAX_AXIS_DISTANCE_M = 60.0
-"""Farther from a curved road nobody asks how far exactly."""
+"""Distances from the axis of a curved road are clipped here."""
 
 
 @dataclass(frozen=True)
 class Circulation:
-    """The part of a route that lies on the ring of a roundabout.
+    """Part of a route on the ring of a roundabout.
 
-    joins_s, leaves_s: arc lengths of the route; joins_m: place on the ring where it joins.
+    joins_s, leaves_s: arc lengths along the route; joins_m: position on the ring where the route enters.
     """
 
     entry_s: float
@@ -38,28 +40,29 @@ class Circulation:
     circumference_m: float
 
     def position_m(self, s: float) -> float:
-        """Return the place on the ring at an arc length of the route; before the ring, ahead of it."""
+        """Return the position on the ring at an arc length of the route, extrapolated before the entry."""
         return self.entry_m + s - self.entry_s
 
     def distance_ahead_m(self, position_m: float, s: float) -> float:
-        """Return the way round the ring from where a route is at s to a place, 0..circumference."""
+        """Return the distance round the ring from arc length s of the route to a ring position, 0..circumference."""
         return (position_m - self.position_m(s)) % self.circumference_m
 
 
 @dataclass(frozen=True)
 class Route:
-    """A way through the network.
+    """A route through the network.
 
-    approach and leave name the lanes it shares with other routes; stop_s is the arc length of its
-    stop line, split_s the one at which it parts from the other routes of its approach lane.
-    share is its traffic relative to that of one lane.  Where stop_s is 0 there is no stop line, and
-    the route belongs to both its lanes from the start.  ring: who enters it gives way.  narrow: its
-    turns are too tight for long vehicles.
+    entry_lane, exit_lane: names of the lanes that it shares with other routes.
+    share: traffic relative to that of one lane.
+    stop_s: arc length of the stop line; 0 without one, and then the route occupies both lanes from its start.
+    diverge_s: arc length at which it diverges from the other routes of its entry lane.
+    ring: the part on a roundabout, where entering vehicles yield.
+    narrow: its turns are too tight for long vehicles.
     """
 
     path: Path
-    approach: str
-    leave: str
+    entry_lane: str
+    exit_lane: str
     movement: str
     share: float
     stop_s: float = math.inf
@@ -71,16 +74,16 @@ class Route:
 
     @property
     def entry_lanes(self) -> frozenset[str]:
-        """The lanes that it uses from its start."""
-        return frozenset({self.approach, self.leave} if self.stop_s <= 0 else {self.approach})
+        """Lanes that a vehicle occupies from the start of the route."""
+        return frozenset({self.entry_lane, self.exit_lane} if self.stop_s <= 0 else {self.entry_lane})
 
 
 @dataclass(frozen=True)
 class Road:
-    """A strip of asphalt for painting, about the path of its axis.
+    """A strip of asphalt along an axis.
 
     lane_edges_m: (offset to the left of the axis, kind) with kind 'edge', 'dash' or 'solid'.
-    begin_m: where along the axis it begins; only a straight road may.
+    begin_m: arc length at which a straight road begins.
     """
 
     path: Path
@@ -90,33 +93,33 @@ class Road:
 
     @property
     def straight(self) -> bool:
-        """Whether it has one heading."""
+        """Whether the road has one heading."""
         return self.path.straight
 
     @property
     def headings(self) -> tuple[float, ...]:
-        """The headings of its straight parts."""
+        """Headings of the straight segments."""
         return tuple(segment.heading for segment in self.path.segments if segment.straight)
 
     def reaches(self, along: float) -> bool:
-        """Tell whether it is there at a distance along its axis."""
+        """Whether the road exists at a distance along its axis."""
         return along >= self.begin_m
 
-    def at(self, along: np.ndarray | float, aside: np.ndarray | float) -> np.ndarray:
-        """Return ground points (..., 2) at distances along the road and to the left of its axis."""
-        rows = self.path.at(along)
-        left = np.stack([-np.sin(rows[..., 2]), np.cos(rows[..., 2])], -1)
-        return rows[..., :2] + np.asarray(aside, float)[..., None] * left
+    def at(self, along: np.ndarray | float, lateral: np.ndarray | float) -> np.ndarray:
+        """Return ground points (..., 2) at distances along the axis and to its left."""
+        poses = self.path.at(along)
+        left = np.stack([-np.sin(poses[..., 2]), np.cos(poses[..., 2])], -1)
+        return poses[..., :2] + np.asarray(lateral, float)[..., None] * left
 
     def heading(self, along: float) -> float:
         """Return the heading of the axis at a distance along it."""
         return float(self.path.at(along)[2])
 
     def edge_distance(self, xy: np.ndarray) -> np.ndarray:
-        """Return how far points (..., 2) lie outside the strip, in metres; negative on it."""
+        """Return the signed distance of points (..., 2) to the edge of the road in metres, negative on it."""
         if not self.straight:
-            found, _ = self._axis_tree.query(xy, distance_upper_bound=_MAX_AXIS_DISTANCE_M)
-            return np.minimum(found, _MAX_AXIS_DISTANCE_M) - self.half_width_m
+            distance, _ = self._axis_tree.query(xy, distance_upper_bound=_MAX_AXIS_DISTANCE_M)
+            return np.minimum(distance, _MAX_AXIS_DISTANCE_M) - self.half_width_m
         x, y, heading = self.path.at(0.0).tolist()
         dx, dy = xy[..., 0] - x, xy[..., 1] - y
         c, s = math.cos(heading), math.sin(heading)
@@ -143,39 +146,49 @@ def straight_road(
 
 @dataclass(frozen=True)
 class Roundabout:
-    """A ring about the origin: radii of the asphalt's outer edge and of the island."""
+    """A ring about the origin: radii of the outer edge of the asphalt and of the island."""
 
     outer_m: float
     island_m: float
 
 
 @dataclass(frozen=True)
+class StopLines:
+    """Markings across the arms of a junction, as distances from the origin.
+
+    stop_m: stop or give-way line.  crossing_m: nearer edge of the zebra crossing.
+    """
+
+    stop_m: float
+    crossing_m: float
+
+    @property
+    def clear_m(self) -> float:
+        """Distance beyond which an arm has neither stop line nor crossing."""
+        return max(self.stop_m, self.crossing_m + CROSSING_WIDTH_M)
+
+
+@dataclass(frozen=True)
 class Network:
     """Roads, routes and signals.
 
-    stop_m is the distance of the stop or give-way lines from the origin, crossing_m that of the
-    nearer edge of the zebra crossings.  Where it is rural there are no pavements, houses or people;
-    barriers_m are offsets from the axis of the first road at which crash barriers stand.
+    phases: signal names and their green times in seconds, in order.
+    stop_lines: None without a junction.
+    viewpoint_m, view_yaw_deg: default ground point and yaw of the camera.
+    rural: no pavements, houses or pedestrians.
+    barriers_m: offsets of crash barriers from the axis of the first road.
     """
 
     roads: tuple[Road, ...]
     routes: tuple[Route, ...]
     phases: tuple[tuple[str, float], ...]
-    stop_m: float | None
+    stop_lines: StopLines | None
     viewpoint_m: tuple[float, float]
     view_yaw_deg: float
-    crossing_m: float | None = None
     corner_radius_m: float = 6.5
     roundabout: Roundabout | None = None
     rural: bool = False
     barriers_m: tuple[float, ...] = ()
-
-    @property
-    def clear_m(self) -> float:
-        """Distance from the origin beyond which an arm is a plain road: past its stop line and crossing."""
-        if self.stop_m is None:
-            return 0.0
-        return max(self.stop_m, self.crossing_m + CROSSING_WIDTH_M)
 
     def directions(self) -> np.ndarray:
         """Return unit vectors (n, 2) along the straight roads."""

@@ -1,4 +1,4 @@
-"""Everything that can be chosen about a simulated recording, and nothing else."""
+"""Options of a simulated recording."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ from autocalib_ros.offline.simulate.lens import KannalaBrandtLens
 
 SCENES = ('junction', 'road', 'highway', 'bend', 'roundabout', 'skew', 'tee', 'sparse')
 SQUARE_DEG = 90.0
+"""Default angle between the roads of a junction."""
 SKEW_DEG = 65.0
+"""Default angle between the roads of scene skew."""
 ONE_WAY_SCENES = ('junction', 'road', 'highway', 'bend')
 STORAGES = ('sqlite3', 'mcap')
 SHUTTER_SHOWS = ('frozen', 'flat')
@@ -24,13 +26,13 @@ def _option(default: Any, help_text: str) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class SimulationOptions:
-    """What is simulated; every default of the simulator lives here.
+    """All options of the simulator with their defaults.
 
-    Valid by construction: an impossible combination raises `UsageError`.
+    Valid by construction: an invalid value or combination raises `UsageError`.
     """
 
     scene: str = _option('junction', 'road network: ' + ' or '.join(SCENES))
-    seed: int = _option(0, 'seed of everything random')
+    seed: int = _option(0, 'seed of the random generators')
 
     width_px: int = _option(1280, 'image width')
     height_px: int = _option(720, 'image height')
@@ -39,43 +41,43 @@ class SimulationOptions:
 
     focal_px: float = _option(560.0, 'focal length of the lens')
     k: tuple[float, float, float, float] = _option((0.01, 0.0, 0.0, 0.0), 'Kannala-Brandt coefficients k1..k4')
-    principal_point_offset_px: tuple[float, float] = _option((6.0, -4.0), 'principal point minus image centre')
+    principal_point_offset_px: tuple[float, float] = _option((6.0, -4.0), 'principal point minus image centre, x and y')
 
     camera_height_m: float = _option(8.0, 'height of the camera above the road')
-    pitch_deg: float = _option(32.0, 'how far the camera looks down')
+    pitch_deg: float = _option(32.0, 'pitch of the optical axis below the horizontal')
     yaw_deg: float | None = _option(
-        None, 'heading of the optical axis from the first road; default: towards the traffic'
+        None, 'heading of the optical axis, counter-clockwise from the first road; default: towards the traffic'
     )
-    roll_deg: float = _option(0.8, 'roll about the optical axis')
-    position_m: tuple[float, float] | None = _option(None, 'foot point of the camera; default: beside the road')
+    roll_deg: float = _option(0.8, 'roll about the optical axis, clockwise as seen from behind the camera')
+    position_m: tuple[float, float] | None = _option(None, 'ground point below the camera; default: beside the road')
 
-    density: float = _option(9.0, 'vehicles a minute and lane; of scene sparse a fifteenth of them')
-    turning_fraction: float = _option(0.18, 'part of the vehicles that turn, or change lanes')
+    density: float = _option(9.0, 'vehicles per minute and lane; one fifteenth of it in scene sparse')
+    turning_fraction: float = _option(0.18, 'fraction of the vehicles that turn or change lanes')
     road_angle_deg: float | None = _option(
         None,
-        f'angle between the two roads of a junction; default {SQUARE_DEG:g}, of scene skew {SKEW_DEG:g}',
+        f'angle between the two roads of a junction; default {SQUARE_DEG:g}, in scene skew {SKEW_DEG:g}',
     )
-    one_way: bool = _option(False, 'one road only, driven in one direction')
-    wander_m: float = _option(0.1, 'standard deviation of the wander within the lane')
-    pedestrians: int = _option(10, 'people on the pavements')
-    cyclists: int = _option(0, 'cyclists along the kerbs and on the pavements; none round a roundabout')
-    empty: bool = _option(False, 'no vehicles and no people')
+    one_way: bool = _option(False, 'a single road with one-way traffic')
+    wander_m: float = _option(0.1, 'standard deviation of the lateral wander within the lane')
+    pedestrians: int = _option(10, 'pedestrians on the pavements')
+    cyclists: int = _option(0, 'cyclists along the kerbs and on the pavements; none at a roundabout')
+    empty: bool = _option(False, 'no vehicles, pedestrians or cyclists')
 
-    noise_sigma: float = _option(2.0, 'sensor noise in grey levels')
-    night: bool = _option(False, 'darkness, head lamps, more noise')
+    noise_sigma: float = _option(2.0, 'standard deviation of the sensor noise in grey levels')
+    night: bool = _option(False, 'night: darkness, head lamps, more noise')
     thermal: bool = _option(False, 'thermal camera: mono16 instead of bgr8')
     shutter_every_s: float | None = _option(
         None,
-        'seconds between two closings of the shutter of a thermal camera, half a second each, after which its '
-        'offset and pattern are others; default: never',
+        'seconds between flat-field corrections of a thermal camera; each closes the shutter for 0.5 s and '
+        'changes offset and fixed-pattern noise; default: never',
     )
     shutter_shows: str = _option(
-        'frozen', 'what a thermal camera sends while its shutter is closed: the last picture, or the shutter'
+        'frozen', 'what a thermal camera sends while its shutter is closed: the last image, or the flat shutter'
     )
-    shake_px: float = _option(0.0, 'standard deviation of the camera shake')
-    trouble: str = _option('', 'what moves and is no traffic, comma between: ' + ', '.join(TROUBLES))
-    bump_at_s: float | None = _option(None, 'time at which the camera is knocked askew')
-    bump_deg: float = _option(2.0, 'angle by which it is knocked askew')
+    shake_px: float = _option(0.0, 'standard deviation of the camera shake in the image')
+    trouble: str = _option('', 'disturbances that are not traffic, comma-separated: ' + ', '.join(TROUBLES))
+    bump_at_s: float | None = _option(None, 'time at which the camera is bumped')
+    bump_deg: float = _option(2.0, 'rotation angle of the bump')
 
     topic: str = _option('/camera/image_raw', 'image topic')
     truth_topic: str = _option('/camera/truth/camera_info', 'topic of the true CameraInfo')
@@ -98,7 +100,7 @@ class SimulationOptions:
 
     @property
     def troubles(self) -> frozenset[str]:
-        """What moves and is no traffic."""
+        """The disturbances that are not traffic."""
         return frozenset(filter(None, self.trouble.split(',')))
 
     @property
@@ -120,22 +122,22 @@ class SimulationOptions:
             if getattr(self, name) not in allowed:
                 raise UsageError(f'unknown {name} {getattr(self, name)!r}: choose {" or ".join(allowed)}')
         for name in sorted(self.troubles - frozenset(TROUBLES)):
-            raise UsageError(f'unknown trouble {name!r}: choose of {", ".join(TROUBLES)}, with commas between')
+            raise UsageError(f'unknown trouble {name!r}: choose from {", ".join(TROUBLES)}, separated by commas')
         for name in ('topic', 'truth_topic'):
             if not getattr(self, name).startswith('/'):
-                raise UsageError(f'{name} {getattr(self, name)!r} is not absolute: begin it with a "/"')
+                raise UsageError(f'{name} {getattr(self, name)!r} is not absolute: start it with "/"')
         if self.topic == self.truth_topic:
             raise UsageError(f'topic and truth_topic are both {self.topic!r}: name two topics')
 
     def _check_combinations(self) -> None:
         if self.night and self.thermal:
-            raise UsageError('night and thermal exclude each other: choose one')
+            raise UsageError('night and thermal are mutually exclusive: choose one')
         if self.shutter_every_s is not None and not self.thermal:
-            raise UsageError('shutter_every_s is given without thermal: only thermal cameras have such a shutter')
+            raise UsageError('shutter_every_s requires thermal: only thermal cameras have such a shutter')
         if self.troubles and self.thermal:
-            raise UsageError('the troubles are those of daylight and lamps: leave out trouble or thermal')
+            raise UsageError('trouble is not available for thermal cameras: leave out trouble or thermal')
         if 'wet' in self.troubles and not self.night:
-            raise UsageError('a wet road mirrors lamps: trouble wet needs night')
+            raise UsageError('trouble wet needs night: it shows lamps reflected by the road')
         if self.one_way and self.scene not in ONE_WAY_SCENES:
             raise UsageError(f'scene {self.scene!r} has no one_way: choose {" or ".join(ONE_WAY_SCENES)}')
         if self.bump_at_s is not None and not 0.0 < self.bump_at_s < self.duration_s:
@@ -153,8 +155,8 @@ class SimulationOptions:
         )
         if corner_px > lens.radius_limit_px:
             raise UsageError(
-                f'the lens forms no image beyond {lens.radius_limit_px:.0f} px from its centre, '
-                f'but the image corner is {corner_px:.0f} px away: '
+                f'the lens model is invalid beyond {lens.radius_limit_px:.0f} px from the principal point, '
+                f'but an image corner is {corner_px:.0f} px away: '
                 'use a longer focal length, a smaller image or smaller coefficients'
             )
 

@@ -1,4 +1,4 @@
-"""Painting of textures: grain, panels, windows, lettering."""
+"""Drawing primitives for textures: noise, polygons, lines, discs, text."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ import numpy as np
 
 from autocalib_ros.offline.simulate.palette import Colour
 
-_FIXED_POINT_BITS = 4  # fractional bits of the drawing functions of OpenCV
+_FIXED_POINT_BITS = 4  # fractional bits of OpenCV drawing coordinates
 
 
 def filled_image(height: int, width: int, colour: Colour) -> np.ndarray:
-    """Return an opaque BGRA picture (h, w, 4) of one colour."""
-    picture = np.empty((max(height, 2), max(width, 2), 4), np.uint8)
-    picture[:] = (*colour, 255)
-    return picture
+    """Return an opaque BGRA image (h, w, 4) of one colour."""
+    image = np.empty((max(height, 2), max(width, 2), 4), np.uint8)
+    image[:] = (*colour, 255)
+    return image
 
 
 def octave_noise(
     height: int, width: int, octaves: Iterable[tuple[float, float]], rng: np.random.Generator
 ) -> np.ndarray:
-    """Return smooth noise (h, w) float32: a sum over (size in texels, standard deviation)."""
+    """Return smooth noise (h, w) float32, the sum of octaves (size in texels, standard deviation)."""
     total = np.zeros((height, width), np.float32)
     for size, stddev in octaves:
         rows, columns = max(2, int(height / size) + 2), max(2, int(width / size) + 2)
@@ -35,50 +35,50 @@ def octave_noise(
     return total
 
 
-def add_noise(picture: np.ndarray, noise: np.ndarray) -> None:
-    """Add noise (h, w) in grey levels to the colours of a picture (h, w, 3 or 4), in place."""
-    rough = picture[..., :3].astype(np.float32) + noise[..., None]
-    picture[..., :3] = np.clip(rough, 0, 255).astype(np.uint8)
+def add_noise(image: np.ndarray, noise: np.ndarray) -> None:
+    """Add noise (h, w) in grey levels to the colours of an image (h, w, 3 or 4), in place."""
+    rough = image[..., :3].astype(np.float32) + noise[..., None]
+    image[..., :3] = np.clip(rough, 0, 255).astype(np.uint8)
 
 
-def polygon(picture: np.ndarray, points: np.ndarray, colour: tuple[int, ...]) -> None:
-    """Fill a polygon (n, 2) given in texels, (0, 0) being the corner of the picture."""
+def polygon(image: np.ndarray, points: np.ndarray, colour: tuple[int, ...]) -> None:
+    """Fill a polygon (n, 2) in texels; (0, 0) is the corner of the image."""
     fixed = np.round((np.asarray(points, float) - 0.5) * (1 << _FIXED_POINT_BITS)).astype(np.int32)
-    cv2.fillPoly(picture, [fixed], colour, cv2.LINE_AA, _FIXED_POINT_BITS)
+    cv2.fillPoly(image, [fixed], colour, cv2.LINE_AA, _FIXED_POINT_BITS)
 
 
 def line(
-    picture: np.ndarray,
+    image: np.ndarray,
     start: tuple[float, float],
     end: tuple[float, float],
     colour: tuple[int, ...],
     width: int = 1,
 ) -> None:
-    """Draw a line between two points given in texels."""
-    ends = [tuple(int(round((c - 0.5) * (1 << _FIXED_POINT_BITS))) for c in p) for p in (start, end)]
-    cv2.line(picture, ends[0], ends[1], colour, width, cv2.LINE_AA, _FIXED_POINT_BITS)
+    """Draw a line between two points in texels."""
+    ends = [tuple(round((c - 0.5) * (1 << _FIXED_POINT_BITS)) for c in p) for p in (start, end)]
+    cv2.line(image, ends[0], ends[1], colour, width, cv2.LINE_AA, _FIXED_POINT_BITS)
 
 
-def disc(picture: np.ndarray, centre: tuple[float, float], radius: float, colour: tuple[int, ...]) -> None:
-    """Fill a circle given in texels."""
-    x, y = (int(round((c - 0.5) * (1 << _FIXED_POINT_BITS))) for c in centre)
-    radius_fixed = int(round(radius * (1 << _FIXED_POINT_BITS)))
-    cv2.circle(picture, (x, y), radius_fixed, colour, -1, cv2.LINE_AA, _FIXED_POINT_BITS)
+def disc(image: np.ndarray, centre: tuple[float, float], radius: float, colour: tuple[int, ...]) -> None:
+    """Fill a circle in texels."""
+    x, y = (round((c - 0.5) * (1 << _FIXED_POINT_BITS)) for c in centre)
+    radius_fixed = round(radius * (1 << _FIXED_POINT_BITS))
+    cv2.circle(image, (x, y), radius_fixed, colour, -1, cv2.LINE_AA, _FIXED_POINT_BITS)
 
 
-def draw_text(picture: np.ndarray, text: str, box: tuple[float, float, float, float], colour: Colour) -> None:
-    """Write a text as large as it fits into the box (x0, y0, x1, y1) of texels."""
+def draw_text(image: np.ndarray, text: str, box: tuple[float, float, float, float], colour: Colour) -> None:
+    """Draw text as large as fits into a box (x0, y0, x1, y1) in texels."""
     x0, y0, x1, y1 = box
     (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_DUPLEX, 1.0, 2)
     scale = min((x1 - x0) / width, (y1 - y0) / height)
     if scale * height < 5:
         return
-    place = (round((x0 + x1 - scale * width) / 2), round((y0 + y1 + scale * height) / 2))
+    position = (round((x0 + x1 - scale * width) / 2), round((y0 + y1 + scale * height) / 2))
     thickness = max(1, round(3 * scale))
-    cv2.putText(picture, text, place, cv2.FONT_HERSHEY_DUPLEX, scale, (*colour, 255), thickness, cv2.LINE_AA)
+    cv2.putText(image, text, position, cv2.FONT_HERSHEY_DUPLEX, scale, (*colour, 255), thickness, cv2.LINE_AA)
 
 
 def mix_colours(a: Colour, b: Colour, part: float) -> Colour:
-    """Return the colour this part of the way from a to b."""
+    """Interpolate linearly between two colours: a at part 0, b at part 1."""
     blue, green, red = (round(x + part * (y - x)) for x, y in zip(a, b, strict=True))
     return (blue, green, red)

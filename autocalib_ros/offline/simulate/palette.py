@@ -1,4 +1,4 @@
-"""Colours (BGR, 0..255) of everything, by daylight and in the eyes of a thermal camera."""
+"""Colours (BGR, 0..255) of all materials, by daylight and for a thermal camera."""
 
 from __future__ import annotations
 
@@ -9,7 +9,10 @@ Colour = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class Palette:
-    """One look of the world; texture scales the contrast of all grain, engine warms the bonnet."""
+    """Colours of all materials.
+
+    texture: factor on the contrast of all texture noise.  engine: colour of the warm bonnet, thermal only.
+    """
 
     asphalt: Colour
     marking: Colour
@@ -106,5 +109,5 @@ THERMAL = Palette(
 
 
 def palette_for(thermal: bool) -> Palette:
-    """Return the palette of a kind of camera."""
+    """Return the palette of a daylight or thermal camera."""
     return THERMAL if thermal else DAY

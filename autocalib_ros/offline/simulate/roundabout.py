@@ -1,4 +1,4 @@
-"""A roundabout of one lane with four arms."""
+"""Single-lane roundabout with four arms."""
 
 from __future__ import annotations
 
@@ -13,21 +13,22 @@ from autocalib_ros.offline.simulate.network import (
     Network,
     Roundabout,
     Route,
+    StopLines,
     straight_road,
 )
 from autocalib_ros.offline.simulate.paths import Path, PathSegment, chain_segments, straight_lane
 
 RING_RADIUS_M = 19.0
-"""Of the path on the ring of a roundabout."""
+"""Radius of the path on the ring."""
 RING_WIDTH_M = 7.6
 ENTRY_RADIUS_M = 16.0
 ENTRY_SPIRAL_M = 5.0
 RING_SPIRAL_M = 7.0
-"""From the bend of the entry to that of the ring, and back."""
+"""Length of the clothoid from the entry curve to the ring, and back."""
 
 
 def roundabout(turning_fraction: float) -> Network:
-    """Return a ring with four arms of a lane each way; who enters gives way."""
+    """Return a ring with four arms of one lane each way; entering vehicles yield."""
     half = RURAL_LANE_WIDTH_M
     edges = ((-half, 'edge'), (half, 'edge'), (0.0, 'solid'))
     ring = Roundabout(RING_RADIUS_M + RING_WIDTH_M / 2, RING_RADIUS_M - RING_WIDTH_M / 2)
@@ -44,10 +45,9 @@ def roundabout(turning_fraction: float) -> Network:
         tuple(straight_road(h, half, edges) for h in (0.0, math.pi / 2)),
         tuple(routes),
         (),
-        stop_m,
+        StopLines(stop_m, stop_m + 6.0),
         foot,
         yaw,
-        crossing_m=stop_m + 6.0,
         corner_radius_m=10.0,
         roundabout=ring,
     )
@@ -59,7 +59,7 @@ def _ring_route(heading: float, exits: int, share: float, stop_m: float) -> Rout
     entry, before_m, joined_rad = _entry(offset)
     lane = straight_lane(heading, offset, ARM_LENGTH_M)
     lead = PathSegment(lane.x, lane.y, heading, ARM_LENGTH_M - before_m)
-    # Exit k lies k quarters round from the arm of entry; the way out is the way in, mirrored.
+    # Exit k is k quarter turns from the entry arm; the exit curve mirrors the entry curve.
     around = exits * math.pi / 2 - 2 * joined_rad
     curvature = 1 / RING_RADIUS_M
     spans = [*entry, (around * RING_RADIUS_M, curvature, curvature)]
@@ -68,11 +68,11 @@ def _ring_route(heading: float, exits: int, share: float, stop_m: float) -> Rout
     path = Path((lead, *curve, PathSegment(*curve[-1].end(), ARM_LENGTH_M - before_m)))
     entry_s = float(path.starts[1 + len(entry)])
     exit_s = entry_s + around * RING_RADIUS_M
-    leave = heading + math.pi + exits * math.pi / 2
+    exit_heading = heading + math.pi + exits * math.pi / 2
     return Route(
         path=path,
-        approach=f'in {math.degrees(heading):.0f}',
-        leave=f'out {math.degrees(leave) % 360:.0f}',
+        entry_lane=f'in {math.degrees(heading):.0f}',
+        exit_lane=f'out {math.degrees(exit_heading) % 360:.0f}',
         movement={1: 'right', 2: 'straight', 3: 'left'}[exits],
         share=share,
         stop_s=ARM_LENGTH_M - stop_m,
@@ -85,9 +85,9 @@ def _ring_route(heading: float, exits: int, share: float, stop_m: float) -> Rout
 
 
 def _entry(offset: float) -> tuple[list[tuple[float, float, float]], float, float]:
-    """Return the spans from a lane onto the ring, and where they begin and end.
+    """Return the spans from a lane onto the ring, their start and their end.
 
-    They begin so far before the middle of the ring, and end at such an angle round it from the arm.
+    Start: distance before the centre of the ring.  End: angle round the ring from the entry arm.
     """
     entering, circling = -1 / ENTRY_RADIUS_M, 1 / RING_RADIUS_M
 
@@ -95,7 +95,7 @@ def _entry(offset: float) -> tuple[list[tuple[float, float, float]], float, floa
         return [(ENTRY_SPIRAL_M, 0.0, entering), (arc_m, entering, entering), (RING_SPIRAL_M, entering, circling)]
 
     def centre(arc_m: float) -> tuple[float, float, float]:
-        """Return the middle of the ring as seen from where the spans begin, and their turn."""
+        """Return the centre of the ring relative to the start of the spans, and their deflection."""
         x, y, heading = chain_segments((0.0, 0.0, 0.0), spans(arc_m))[-1].end()
         return x - RING_RADIUS_M * math.sin(heading), y + RING_RADIUS_M * math.cos(heading), heading
 

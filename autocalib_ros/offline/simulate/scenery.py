@@ -1,4 +1,4 @@
-"""What stands still beside the road: buildings, trees, poles."""
+"""Static objects beside the road: buildings, trees, poles, barriers."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from autocalib_ros.offline.simulate.network import Network, Road
 from autocalib_ros.offline.simulate.palette import Palette
 
 _SCENERY_TEXELS_PER_M = 24
-_PANEL_M = 6.0
-_LAMP_POSITIONS_M = np.arange(-105.0, 106.0, 30.0)
+_PANEL_M = 6.0  # width of a wall panel
+_LAMP_POSITIONS_M = np.arange(-105.0, 106.0, 30.0)  # along a road
 _BARRIER_HEIGHT_M = 0.8
 _BARRIER_REACH_M = 300.0
 _BARRIER_PANEL_M = 6.0
 
 
 def build_scenery(network: Network, viewpoint: np.ndarray, palette: Palette, seed: int) -> Faces:
-    """Return all standing things; viewpoint (2,) is the foot of the camera, kept in the clear."""
+    """Return all static objects; viewpoint (2,) is the ground point below the camera, which is kept clear."""
     rng = np.random.default_rng([seed, 4])
     parts: list[Faces] = []
     crowns = [foliage_texture(palette, rng) for _ in range(6)]
@@ -38,15 +38,15 @@ def build_scenery(network: Network, viewpoint: np.ndarray, palette: Palette, see
 def _is_unobstructed(
     network: Network, viewpoint: np.ndarray, points: np.ndarray, kerb_m: float, camera_m: float
 ) -> bool:
-    """Tell whether points (n, 2) keep off the roads, the camera and its view of the centre."""
+    """Whether points (n, 2) are clear of the roads, the camera and its view of the centre."""
     if edge_distance(network, points).min() < kerb_m:
         return False
     offset = points - viewpoint
     if np.hypot(*offset.T).min() < camera_m:
         return False
     towards = -viewpoint / max(float(np.hypot(*viewpoint)), 1e-6)
-    along, aside = offset @ towards, np.abs(offset @ np.array([-towards[1], towards[0]]))
-    return not bool(((along > 0) & (along < np.hypot(*viewpoint)) & (aside < 12.0)).any())
+    along, lateral = offset @ towards, np.abs(offset @ np.array([-towards[1], towards[0]]))
+    return not bool(((along > 0) & (along < np.hypot(*viewpoint)) & (lateral < 12.0)).any())
 
 
 def _buildings(
@@ -57,8 +57,8 @@ def _buildings(
         length, depth = rng.uniform(14, 22), rng.uniform(10, 14)
         height = float(rng.choice([6.4, 9.6, 12.8]))
         wall = palette.walls[int(rng.integers(len(palette.walls)))]
-        aside = side * (road.half_width_m + PAVEMENT_WIDTH_M + rng.uniform(3.0, 6.0) + depth / 2)
-        centre = road.at(along, aside)
+        lateral = side * (road.half_width_m + PAVEMENT_WIDTH_M + rng.uniform(3.0, 6.0) + depth / 2)
+        centre = road.at(along, lateral)
         box = _rectangle(centre, road.heading(along), length, depth)
         if _is_unobstructed(network, viewpoint, _perimeter_points(box), PAVEMENT_WIDTH_M + 1.0, 20.0):
             parts.append(_building(box, height, wall, palette, rng))
@@ -73,7 +73,7 @@ def _rectangle(centre: np.ndarray, heading: float, length: float, depth: float) 
 
 
 def _perimeter_points(ring: np.ndarray) -> np.ndarray:
-    """Return points along the sides of a ring (4, 2)."""
+    """Return points along the sides of a rectangle (4, 2)."""
     following = np.roll(ring, -1, axis=0)
     return np.concatenate([ring + f * (following - ring) for f in (0, 0.25, 0.5, 0.75)])
 
@@ -81,7 +81,7 @@ def _perimeter_points(ring: np.ndarray) -> np.ndarray:
 def _building(
     ring: np.ndarray, height: float, wall: tuple[int, int, int], palette: Palette, rng: np.random.Generator
 ) -> Faces:
-    """Return a building: walls in panels a few metres wide, and a flat roof."""
+    """Return a building with panelled walls and a flat roof."""
     corners, textures = [], []
     panel = _wall_texture(height, wall, palette, rng)
     for start, end in zip(ring, np.roll(ring, -1, axis=0), strict=True):
@@ -97,11 +97,11 @@ def _building(
 
 
 def _wall_texture(height: float, wall: tuple[int, int, int], palette: Palette, rng: np.random.Generator) -> Texture:
-    """Paint one panel with two windows to the storey."""
+    """Paint a wall panel with two windows per storey."""
     rows, columns = round(height * _SCENERY_TEXELS_PER_M), round(_PANEL_M * _SCENERY_TEXELS_PER_M)
-    picture = paint.filled_image(rows, columns, wall)
+    image = paint.filled_image(rows, columns, wall)
     octaves = [(s, 5.0 * palette.texture) for s in (1.5, 5.0, 20.0)]
-    paint.add_noise(picture, paint.octave_noise(rows, columns, octaves, rng))
+    paint.add_noise(image, paint.octave_noise(rows, columns, octaves, rng))
     storey = 3.2 * _SCENERY_TEXELS_PER_M
     for top in np.arange(0.8 * _SCENERY_TEXELS_PER_M, rows - storey / 2, storey):
         for left in (0.12, 0.60):
@@ -110,19 +110,19 @@ def _wall_texture(height: float, wall: tuple[int, int, int], palette: Palette, r
             glass = paint.mix_colours(palette.window, palette.sky_low, float(rng.uniform(0, 0.5)))
             box = np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)])
             frame = box + [(-2, -2), (2, -2), (2, 2), (-2, 2)]
-            paint.polygon(picture, frame, (*palette.kerb, 255))
-            paint.polygon(picture, box, (*glass, 255))
-            paint.line(picture, ((x0 + x1) / 2, y0), ((x0 + x1) / 2, y1), (*palette.kerb, 255), 2)
-    return Texture(picture)
+            paint.polygon(image, frame, (*palette.kerb, 255))
+            paint.polygon(image, box, (*glass, 255))
+            paint.line(image, ((x0 + x1) / 2, y0), ((x0 + x1) / 2, y1), (*palette.kerb, 255), 2)
+    return Texture(image)
 
 
 def billboard(
-    place: np.ndarray, viewpoint: np.ndarray, width: float, low: float, high: float
+    position: np.ndarray, viewpoint: np.ndarray, width: float, low: float, high: float
 ) -> list[tuple[float, ...]]:
-    """Return an upright rectangle that faces the camera."""
-    away = place - viewpoint
+    """Return a billboard: an upright rectangle that faces the camera."""
+    away = position - viewpoint
     across = np.array([away[1], -away[0]]) / max(float(np.hypot(*away)), 1e-6) * width
-    return [(*(place - across / 2), high), (*across, 0.0), (0.0, 0.0, low - high)]
+    return [(*(position - across / 2), high), (*across, 0.0), (0.0, 0.0, low - high)]
 
 
 def _trees(
@@ -136,17 +136,17 @@ def _trees(
 ) -> list[Faces]:
     parts = []
     for along in np.arange(-100.0, 101.0, 11.0):
-        aside = side * (road.half_width_m + PAVEMENT_WIDTH_M + rng.uniform(0.5, 2.0))
-        place = road.at(along + rng.uniform(-3, 3), aside)
+        lateral = side * (road.half_width_m + PAVEMENT_WIDTH_M + rng.uniform(0.5, 2.0))
+        position = road.at(along + rng.uniform(-3, 3), lateral)
         height = rng.uniform(4.5, 8.0)
         if not road.reaches(along) or not _is_unobstructed(
-            network, viewpoint, place[None], PAVEMENT_WIDTH_M - 0.2, 14.0
+            network, viewpoint, position[None], PAVEMENT_WIDTH_M - 0.2, 14.0
         ):
             continue
         width = 0.7 * height
         corners = [
-            billboard(place, viewpoint, 0.25, 0.0, 0.5 * height),
-            billboard(place, viewpoint, width, 0.3 * height, height),
+            billboard(position, viewpoint, 0.25, 0.0, 0.5 * height),
+            billboard(position, viewpoint, width, 0.3 * height, height),
         ]
         trunk = Texture(paint.filled_image(32, 4, palette.trunk))
         parts.append(Faces(np.array(corners), (trunk, crowns[int(rng.integers(len(crowns)))])))
@@ -154,9 +154,9 @@ def _trees(
 
 
 def foliage_texture(palette: Palette, rng: np.random.Generator) -> Texture:
-    """Paint leaves: overlapping discs, lit from above."""
+    """Paint foliage: overlapping discs, lit from above."""
     size = 128
-    picture = paint.filled_image(size, size, palette.foliage)
+    image = paint.filled_image(size, size, palette.foliage)
     alpha = np.zeros((size, size), np.uint8)
     for _ in range(160):
         angle, radius = rng.uniform(0, 2 * np.pi), 0.40 * np.sqrt(rng.uniform())
@@ -165,31 +165,31 @@ def foliage_texture(palette: Palette, rng: np.random.Generator) -> Texture:
         other = palette.sky_low if light > 0 else palette.trim
         colour = paint.mix_colours(palette.foliage, other, min(0.5, abs(light) * 0.5))
         centre, spread = (x * size, y * size), rng.uniform(0.04, 0.10) * size
-        paint.disc(picture, centre, spread, (*colour, 255))
+        paint.disc(image, centre, spread, (*colour, 255))
         paint.disc(alpha, centre, spread, (255,))
-    picture[..., 3] = alpha
-    return Texture(picture)
+    image[..., 3] = alpha
+    return Texture(image)
 
 
 def _poles(road: Road, side: int, network: Network, viewpoint: np.ndarray, palette: Palette) -> list[Faces]:
-    """Street lamps along the road and signal posts at the stop lines."""
+    """Return street lamps along the road and signal posts at the stop lines."""
     metal = Texture(paint.filled_image(32, 4, palette.pole))
     head = paint.filled_image(48, 16, palette.trim)
     for i, colour in enumerate(((40, 40, 200), (40, 160, 200), (80, 180, 60))):
         paint.disc(head, (8.0, 8.0 + 16 * i), 5.0, (*paint.mix_colours(palette.trim, colour, 0.4), 255))
     plans = [(along, 0.6, 0.14, 8.0) for along in _LAMP_POSITIONS_M]
-    if network.phases:
-        plans += [(side * network.stop_m, 0.5, 0.16, 4.2)]
+    if network.phases and network.stop_lines is not None:
+        plans += [(side * network.stop_lines.stop_m, 0.5, 0.16, 4.2)]
     parts = []
     for along, kerb, width, height in plans:
-        place = road.at(along, side * (road.half_width_m + kerb))
+        position = road.at(along, side * (road.half_width_m + kerb))
         if not road.reaches(along):
             continue
-        if edge_distance(network, place) < 0.2 or np.hypot(*(place - viewpoint)) < 9.0:
+        if edge_distance(network, position) < 0.2 or np.hypot(*(position - viewpoint)) < 9.0:
             continue
-        corners, textures = [billboard(place, viewpoint, width, 0.0, height)], [metal]
+        corners, textures = [billboard(position, viewpoint, width, 0.0, height)], [metal]
         if height < 5.0:
-            corners.append(billboard(place, viewpoint, 0.36, height - 1.0, height + 0.1))
+            corners.append(billboard(position, viewpoint, 0.36, height - 1.0, height + 0.1))
             textures.append(Texture(head))
         parts.append(Faces(np.array(corners), tuple(textures)))
     return parts
@@ -199,9 +199,9 @@ def _barriers(network: Network, palette: Palette) -> list[Faces]:
     """Return concrete crash barriers along the first road."""
     concrete = Texture(paint.filled_image(16, 16, palette.kerb))
     parts = []
-    for aside in network.barriers_m:
+    for lateral in network.barriers_m:
         for along in np.arange(-_BARRIER_REACH_M, _BARRIER_REACH_M, _BARRIER_PANEL_M):
-            a, b = network.roads[0].at(np.array([along, along + _BARRIER_PANEL_M]), aside)
+            a, b = network.roads[0].at(np.array([along, along + _BARRIER_PANEL_M]), lateral)
             left = (b - a)[::-1] * (-1, 1) / _BARRIER_PANEL_M * 0.15
             step = (*(b - a), 0.0)
             faces = [
@@ -214,10 +214,10 @@ def _barriers(network: Network, palette: Palette) -> list[Faces]:
 
 def street_lamp_positions(network: Network) -> list[tuple[float, float]]:
     """Return the ground points (x, y) under the street lamps."""
-    places = []
+    positions = []
     for road in network.roads:
         for side in (1, -1):
             for along in filter(road.reaches, _LAMP_POSITIONS_M):
                 x, y = road.at(along, side * (road.half_width_m - 1.5)).tolist()
-                places.append((x, y))
-    return places
+                positions.append((x, y))
+    return positions

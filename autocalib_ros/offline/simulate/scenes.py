@@ -1,4 +1,4 @@
-"""Which road network a scene has, and the networks of one road."""
+"""The road network of each scene, and the networks with a single road."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from autocalib_ros.offline.simulate.paths import Path, apex_per_radius, join_lin
 from autocalib_ros.offline.simulate.roundabout import roundabout
 
 SPARSE_TRAFFIC_FACTOR = 1 / 15
-"""Of the traffic of a junction: a vehicle every ten to fifteen seconds on all its arms together."""
+"""Traffic relative to that of a junction: one vehicle every 10 to 15 s on all arms together."""
 
 BEND_RADIUS_M = 80.0
 BEND_DEG = 80.0
 
 
 def build_network(options: SimulationOptions) -> Network:
-    """Return the road network that the options ask for."""
+    """Build the road network of the options."""
     angle = math.radians(options.road_crossing_deg)
     turning = options.turning_fraction
     if options.scene == 'highway':
@@ -53,12 +53,12 @@ def single_road(one_way: bool) -> Network:
         lane = straight_lane(heading, math.copysign(i, -1 if heading else i) * LANE_WIDTH_M, ARM_LENGTH_M)
         name = f'lane{i:+g}'
         routes.append(Route(Path((lane,)), name, name, 'straight', 1.0))
-    # Near enough to fill the picture, and looking across the road, not along it.
+    # Close enough to fill the image, and looking across the road rather than along it.
     return Network((straight_road(0.0, half, edges),), tuple(routes), (), None, (-8.0, -half - 5.0), 52.0)
 
 
 def _lanes(one_way: bool, width_m: float) -> tuple[list[float], float, tuple[tuple[float, str], ...]]:
-    """Return the lanes' offsets in lanes, half the road's width and its painted lines."""
+    """Return the lane offsets in lane widths, the half-width of the road and its markings."""
     half = (1.5 if one_way else 2.0) * width_m
     offsets, inner = [-1.5, -0.5, 0.5, 1.5], {-1.0: 'dash', 0.0: 'solid', 1.0: 'dash'}
     if one_way:
@@ -68,13 +68,13 @@ def _lanes(one_way: bool, width_m: float) -> tuple[list[float], float, tuple[tup
     return offsets, half, tuple(edges)
 
 
-def scale_traffic(network: Network, share: float) -> Network:
-    """Return a network with a multiple of its traffic."""
-    return replace(network, routes=tuple(replace(r, share=share * r.share) for r in network.routes))
+def scale_traffic(network: Network, factor: float) -> Network:
+    """Return a network with its traffic scaled by a factor."""
+    return replace(network, routes=tuple(replace(r, share=factor * r.share) for r in network.routes))
 
 
 def bend(one_way: bool) -> Network:
-    """Return a country road that bends to the left, its middle at the origin and along x there."""
+    """Return a rural road that bends to the left; its middle is at the origin, heading along x."""
     offsets, half, edges = _lanes(one_way, RURAL_LANE_WIDTH_M)
     turned = math.radians(BEND_DEG)
     along = BEND_RADIUS_M * apex_per_radius(turned)
@@ -89,12 +89,12 @@ def bend(one_way: bool) -> Network:
     return Network((Road(axis, half + 0.6, edges),), tuple(routes), (), None, (-6.0, -half - 7.0), 66.0, rural=True)
 
 
-def _bend_lane(aside_m: float, apex_m: float, forward: bool) -> Path:
-    """Return a lane at an offset to the left of the bend's axis, driven forward or back."""
+def _bend_lane(lateral_m: float, apex_m: float, forward: bool) -> Path:
+    """Return a lane at an offset to the left of the bend's axis, in either direction."""
     half_turn = math.radians(BEND_DEG) / 2
-    # The turn that is as far from the axis in the middle of the bend as on its straights.
-    radius = BEND_RADIUS_M - aside_m * (1 / math.cos(half_turn) - 1) / apex_per_radius(2 * half_turn)
-    ends = [straight_lane(h, aside_m, ARM_LENGTH_M + 20.0, (0.0, -apex_m)) for h in (-half_turn, half_turn)]
+    # Radius for which the lane keeps its distance from the axis at the apex of the bend as on the straights.
+    radius = BEND_RADIUS_M - lateral_m * (1 / math.cos(half_turn) - 1) / apex_per_radius(2 * half_turn)
+    ends = [straight_lane(h, lateral_m, ARM_LENGTH_M + 20.0, (0.0, -apex_m)) for h in (-half_turn, half_turn)]
     if forward:
         return join_lines(ends[0], ends[1], radius)
     back = [replace(p, x=x, y=y, heading=p.heading + math.pi) for p in ends for x, y, _ in [p.end()]]

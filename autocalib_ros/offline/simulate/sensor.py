@@ -1,4 +1,4 @@
-"""From the drawn picture to the sensor's: darkness and lamps, noise."""
+"""Image sensor: noise, darkness, glow of lamps."""
 
 from __future__ import annotations
 
@@ -10,17 +10,18 @@ import numpy as np
 from autocalib_ros.offline.simulate.microbolometer import NOISE_COUNTS_PER_LEVEL
 from autocalib_ros.offline.simulate.options import SimulationOptions
 
-_NOISE_MARGIN_PX = 64
-NIGHT_GAIN = 0.28
+_NOISE_MARGIN_PX = 64  # range of the random offset of a crop
+NIGHT_GAIN = 0.28  # brightness at night relative to day
+_NIGHT_NOISE = 1.8  # noise at night relative to day: higher sensor gain
 
 
 class SensorNoise:
-    """Sensor noise: a crop, at a random place and flipped at random, of one large noise picture."""
+    """Sensor noise: random crops, randomly flipped, of one large noise image."""
 
     def __init__(self, options: SimulationOptions) -> None:
         self._seed = options.seed
         self._size = (options.height_px, options.width_px)
-        sigma = options.noise_sigma * (1.8 if options.night else 1.0)
+        sigma = options.noise_sigma * (_NIGHT_NOISE if options.night else 1.0)
         channels = 1 if options.thermal else 3
         if options.thermal:
             sigma *= NOISE_COUNTS_PER_LEVEL
@@ -36,24 +37,24 @@ class SensorNoise:
         return cv2.flip(crop, int(rng.integers(-1, 2))).reshape(*self._size, -1)
 
 
-def darken(picture: np.ndarray) -> np.ndarray:
-    """Return a BGR picture (h, w, 3) as it looks at night without lamps."""
+def darken(image: np.ndarray) -> np.ndarray:
+    """Return a BGR image (h, w, 3) darkened to a night without lamps."""
     levels = np.arange(256) * NIGHT_GAIN
     table = np.stack([levels * 1.15, levels, levels * 0.9], -1).round().astype(np.uint8)
-    return cv2.LUT(picture, table[None])
+    return cv2.LUT(image, table[None])
 
 
-def add_glow(picture: np.ndarray, pixel: np.ndarray, radius_px: float, colour: tuple[int, int, int]) -> None:
-    """Add a soft bright blob around a pixel (2,) to a BGR picture, in place."""
-    reach = max(2.0, 3.0 * radius_px)
-    x0, y0 = (max(0, math.floor(c - reach)) for c in pixel)
-    x1 = min(picture.shape[1], math.ceil(pixel[0] + reach) + 1)
-    y1 = min(picture.shape[0], math.ceil(pixel[1] + reach) + 1)
+def add_glow(image: np.ndarray, pixel: np.ndarray, radius_px: float, colour: tuple[int, int, int]) -> None:
+    """Add a glow around a pixel (2,) to a BGR image, in place."""
+    radius = max(2.0, 3.0 * radius_px)
+    x0, y0 = (max(0, math.floor(c - radius)) for c in pixel)
+    x1 = min(image.shape[1], math.ceil(pixel[0] + radius) + 1)
+    y1 = min(image.shape[0], math.ceil(pixel[1] + radius) + 1)
     if x1 <= x0 or y1 <= y0:
         return
     dx, dy = np.arange(x0, x1) - pixel[0], np.arange(y0, y1) - pixel[1]
     square = (dx[None] ** 2 + dy[:, None] ** 2) / radius_px**2
     core = np.exp(-square / 0.35) + 0.30 * np.exp(-square / 2.2)
     light = np.clip(core, 0, 1)[..., None] * np.array(colour, float)
-    patch = picture[y0:y1, x0:x1]
+    patch = image[y0:y1, x0:x1]
     patch[:] = np.clip(patch + light, 0, 255).astype(np.uint8)

@@ -1,6 +1,6 @@
-"""Kinds of vehicles as side profiles extruded over their width; dimensions in metres.
+"""Vehicle types as side profiles extruded over their width; dimensions in metres.
 
-Body frame: origin on the ground under the middle of the vehicle, x forward, y left, z up.
+Body frame: origin on the ground below the centre of the vehicle, x forward, y left, z up.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ Profile = tuple[tuple[float, float], ...]
 
 @dataclass(frozen=True)
 class BodyPart:
-    """A profile (x, z) from the lower front over the top to the lower rear, and its extrusion.
+    """An extruded profile (x, z) from the lower front over the top to the lower rear.
 
-    labels: what each of the len(profile) - 1 strips between neighbouring points shows.
+    labels: appearance of each of the len(profile) - 1 strips between neighbouring points.
     windows: outlines (x, z) of the side windows.
     """
 
@@ -23,7 +23,6 @@ class BodyPart:
     width_m: float
     windows: tuple[Profile, ...] = ()
     lettering: str = ''
-    painted: bool = True
 
     @property
     def top_m(self) -> float:
@@ -33,7 +32,7 @@ class BodyPart:
 
 @dataclass(frozen=True)
 class VehicleShape:
-    """One kind of vehicle; share is its part of the traffic."""
+    """One vehicle type; fraction: its fraction of the traffic."""
 
     kind: str
     length_m: float
@@ -41,14 +40,14 @@ class VehicleShape:
     wheelbase_m: float
     wheel_radius_m: float
     parts: tuple[BodyPart, ...]
-    share: float
+    fraction: float
     acceleration_mps2: float
     fits_narrow_turns: bool = True
     top_speed_mps: float = 40.0
 
     @property
     def wheels_x_m(self) -> tuple[float, float]:
-        """Where the axles are."""
+        """Positions of the front and rear axle."""
         return self.wheelbase_m / 2, -self.wheelbase_m / 2
 
 

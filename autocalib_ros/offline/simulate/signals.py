@@ -1,15 +1,17 @@
-"""Traffic signals that run through their phases and skip left turns that nobody waits for."""
+"""Traffic signals with fixed phases; left-turn phases are skipped without demand."""
 
 from __future__ import annotations
 
 from collections.abc import Collection
 
 AMBER_S = 3.0
+"""Duration of amber after each green phase."""
 ALL_RED_S = 1.0
+"""Clearance time with all signals red before the next green phase."""
 
 
 class SignalController:
-    """The lights of one junction; without phases everything is always green."""
+    """Signal controller of one junction; without phases all signals stay green."""
 
     def __init__(self, phases: tuple[tuple[str, float], ...], start_s: float) -> None:
         self._phases = phases
@@ -20,7 +22,7 @@ class SignalController:
         self._log()
 
     def update(self, now: float, waiting: Collection[str | None]) -> None:
-        """Go on to a time; waiting names the signals somebody waits at."""
+        """Advance to a time; waiting: names of the signals with waiting vehicles."""
         self._now = now
         if not self._phases:
             return
@@ -33,7 +35,7 @@ class SignalController:
             self._log()
 
     def light(self, name: str) -> str:
-        """Return 'green', 'amber' or 'red'."""
+        """Return the state of a signal: 'green', 'amber' or 'red'."""
         phase, green_s = self._phases[self._index]
         if phase != name:
             return 'red'

@@ -1,7 +1,7 @@
-"""Traffic over the routes of a network, simulated once and before the first frame is drawn.
+"""Microscopic traffic simulation on the routes of a network, run once before the first frame.
 
-Drivers follow the intelligent driver model (Treiber et al. 2000), stop at signals, slow down for
-curves, give way to who circles on a ring and wander within their lanes.
+Drivers follow the intelligent driver model (Treiber et al. 2000), stop at signals, slow down for curves, yield to
+vehicles on a roundabout and wander laterally within their lanes.
 """
 
 from __future__ import annotations
@@ -12,23 +12,27 @@ from itertools import permutations
 
 import numpy as np
 
-from autocalib_ros.offline.simulate.network import CITY_SPEED_MPS, Network, Route
+from autocalib_ros.offline.simulate.network import CITY_SPEED_MPS, Circulation, Network, Route
 from autocalib_ros.offline.simulate.options import SimulationOptions
 from autocalib_ros.offline.simulate.shapes import SHAPES, VehicleShape
 from autocalib_ros.offline.simulate.signals import SignalController
 from autocalib_ros.offline.simulate.vehicle_models import STEP_S, SimulatedTraffic, Vehicle, Wander
 
-WARM_UP_S = 52.0
-STANDSTILL_GAP_M = 2.0
-COLOUR_COUNT = 10  # how many body colours a palette has
-_BRAKING_MPS2 = 1.5  # for a curve or a ring ahead
-_CRITICAL_GAP_S = 4.0  # drivers enter a ring when nobody will be at their place for so long
-_EXIT_CLEARANCE_M = 8.0  # beyond an exit, until a vehicle's tail is clear of the ring
+WARM_UP_S = 52.0  # simulated before the first frame, so that the roads are filled
+STANDSTILL_GAP_M = 2.0  # s0 of the intelligent driver model
+COLOUR_COUNT = 10  # number of body colours of a palette
+_CURVE_BRAKING_MPS2 = 1.5  # deceleration before a curve or a roundabout
+_LATERAL_ACCELERATION_MPS2 = 2.0  # comfortable lateral acceleration in a curve
+_COMFORTABLE_BRAKING_MPS2 = 2.2  # b of the intelligent driver model
+_MAX_BRAKING_MPS2 = 7.0
+_ENTRY_ROOM_M = 20.0  # free distance that a vehicle needs to enter its lane
+_CRITICAL_GAP_S = 4.0  # gap acceptance at a roundabout: shortest time gap that a driver enters
+_EXIT_CLEARANCE_M = 8.0  # distance past the exit after which a vehicle no longer occupies the ring
 
 
 @dataclass
 class _Driver:
-    """A vehicle under way."""
+    """State of a driver and the vehicle during the simulation."""
 
     number: int
     shape: VehicleShape
@@ -57,7 +61,7 @@ class _Driver:
 
 
 def simulate_traffic(network: Network, options: SimulationOptions) -> SimulatedTraffic:
-    """Simulate the traffic of a whole recording, with a warm-up before its first frame."""
+    """Simulate the traffic of a whole recording, including a warm-up before the first frame."""
     if options.empty or options.density == 0:
         return SimulatedTraffic((), ())
     rng = np.random.default_rng([options.seed, 1])
@@ -75,12 +79,12 @@ def simulate_traffic(network: Network, options: SimulationOptions) -> SimulatedT
         done += [d.vehicle() for d in gone]
         drivers = [d for d in drivers if d.s <= d.route.path.length]
     done += [d.vehicle() for d in drivers if len(d.trace) > 1]
-    seen = [v for v in done if v.start_s + len(v.s) * STEP_S > 0.0]
-    return SimulatedTraffic(tuple(sorted(seen, key=lambda v: v.number)), tuple(signals.green_phases))
+    recorded = [v for v in done if v.start_s + len(v.s) * STEP_S > 0.0]
+    return SimulatedTraffic(tuple(sorted(recorded, key=lambda v: v.number)), tuple(signals.green_phases))
 
 
 class _Arrivals:
-    """Vehicles that arrive at random and enter as soon as their lane has room."""
+    """Poisson arrivals; a vehicle enters as soon as its lane has room."""
 
     def __init__(self, routes: tuple[Route, ...], options: SimulationOptions, rng: np.random.Generator) -> None:
         self._rng = rng
@@ -91,23 +95,23 @@ class _Arrivals:
         self._waiting: dict[str, list[Route]] = {}
 
     def admit(self, now: float, drivers: list[_Driver]) -> None:
-        """Add the vehicles that arrive now to the drivers."""
+        """Add the vehicles that arrive by now to the drivers."""
         for i, (route, rate) in enumerate(self._flows):
             while self._next[i] <= now:
-                self._waiting.setdefault(route.approach, []).append(route)
+                self._waiting.setdefault(route.entry_lane, []).append(route)
                 self._next[i] += self._rng.exponential(1 / rate)
         for queue in self._waiting.values():
-            if queue and (room := _entry_gap(queue[0], drivers))[0] > 20.0:
+            if queue and (room := _entry_gap(queue[0], drivers))[0] > _ENTRY_ROOM_M:
                 drivers.append(self._driver(now, queue.pop(0), *room))
 
     def _driver(self, now: float, route: Route, room_m: float, leader_mps: float) -> _Driver:
         rng = self._rng
         shapes = [s for s in SHAPES.values() if s.fits_narrow_turns or not route.narrow]
-        shares = np.array([s.share for s in shapes])
-        shape = shapes[int(rng.choice(len(shapes), p=shares / shares.sum()))]
+        fractions = np.array([s.fraction for s in shapes])
+        shape = shapes[int(rng.choice(len(shapes), p=fractions / fractions.sum()))]
         cruise = float(np.clip(rng.normal(12.5, 1.3), 9.5, 16.0)) * route.speed_mps / CITY_SPEED_MPS
         cruise = min(cruise, shape.top_speed_mps)
-        safe = max(0.0, min(cruise, leader_mps + 0.1 * (room_m - 20.0)))
+        safe = max(0.0, min(cruise, leader_mps + 0.1 * (room_m - _ENTRY_ROOM_M)))
         self._count += 1
         return _Driver(
             self._count,
@@ -124,7 +128,7 @@ class _Arrivals:
 
 
 def _entry_gap(route: Route, drivers: list[_Driver]) -> tuple[float, float]:
-    """Return the free way at the start of a route and the speed of the last vehicle there."""
+    """Return the free distance at the start of a route and the speed of the last vehicle there."""
     inside = [d for d in drivers if d.route.entry_lanes & route.entry_lanes]
     if not inside:
         return math.inf, math.inf
@@ -133,13 +137,13 @@ def _entry_gap(route: Route, drivers: list[_Driver]) -> tuple[float, float]:
 
 
 def _requests_green(driver: _Driver) -> bool:
-    """Tell whether a vehicle is before its stop line and close enough to call for a green."""
+    """Whether a vehicle is within 40 m before its stop line, where it requests a green phase."""
     ahead = driver.route.stop_s - driver.s
     return math.isfinite(ahead) and 0.0 < ahead < 40.0
 
 
 def _step_drivers(drivers: list[_Driver], signals: SignalController) -> None:
-    """Move all drivers by one step."""
+    """Advance all drivers by one time step."""
     if not drivers:
         return
     v = np.array([d.v for d in drivers])
@@ -147,13 +151,16 @@ def _step_drivers(drivers: list[_Driver], signals: SignalController) -> None:
     stop = np.array([_stop_line_gap(d, signals, drivers) for d in drivers])
     leader_v = np.where(stop < gap, 0.0, leader_v)
     gap = np.minimum(gap, stop)
-    wish = np.array([min(d.cruise_mps, _curve_speed_limit(d)) for d in drivers])
-    strength = np.array([d.shape.acceleration_mps2 for d in drivers])
+    desired_v = np.array([min(d.cruise_mps, _curve_speed_limit(d)) for d in drivers])
+    max_acceleration = np.array([d.shape.acceleration_mps2 for d in drivers])
     headway = np.array([d.headway_s for d in drivers])
-    free = 1 - (v / wish) ** 4
-    desired = STANDSTILL_GAP_M + np.maximum(0.0, v * headway + v * (v - leader_v) / (2 * np.sqrt(strength * 2.2)))
-    acceleration = strength * (free - (desired / np.maximum(gap, 0.1)) ** 2)
-    new_v = np.maximum(0.0, v + np.clip(acceleration, -7.0, None) * STEP_S)
+    # Intelligent driver model: free-road term, desired gap s*, acceleration.
+    free = 1 - (v / desired_v) ** 4
+    desired_gap = STANDSTILL_GAP_M + np.maximum(
+        0.0, v * headway + v * (v - leader_v) / (2 * np.sqrt(max_acceleration * _COMFORTABLE_BRAKING_MPS2))
+    )
+    acceleration = max_acceleration * (free - (desired_gap / np.maximum(gap, 0.1)) ** 2)
+    new_v = np.maximum(0.0, v + np.clip(acceleration, -_MAX_BRAKING_MPS2, None) * STEP_S)
     new_v[(new_v < 0.02) & (gap < STANDSTILL_GAP_M + 0.5)] = 0.0
     for d, speed in zip(drivers, new_v.tolist(), strict=True):
         d.trace.append((d.s, d.v))
@@ -162,59 +169,61 @@ def _step_drivers(drivers: list[_Driver], signals: SignalController) -> None:
 
 
 def _leaders(drivers: list[_Driver]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the gap to the vehicle ahead and its speed, (n,) each; no leader: (inf, 0)."""
+    """Return the gap to the leading vehicle and its speed, (n,) each; (inf, 0) without a leader."""
     s = np.array([d.s for d in drivers])
     half = np.array([d.shape.length_m / 2 for d in drivers])
-    names = [d.route.approach for d in drivers] + [d.route.leave for d in drivers]
-    approach, leave = np.split(_integer_codes(names), 2)
+    names = [d.route.entry_lane for d in drivers] + [d.route.exit_lane for d in drivers]
+    entry_lane, exit_lane = np.split(_integer_codes(names), 2)
     stop = np.array([d.route.stop_s for d in drivers])
     past_line = s > np.minimum(stop, [d.route.path.length for d in drivers])
-    left = np.array([d.route.path.length for d in drivers]) - s
-    # On the approach lane until the leader's tail has turned off; then towards a shared exit lane.
-    split = np.array([d.route.diverge_s for d in drivers]) + 2 * half + 1.0
-    same_route = (approach[:, None] == approach) & (leave[:, None] == leave)
-    ahead = (approach[:, None] == approach) & (same_route | (s < split)[None, :])
+    remaining = np.array([d.route.path.length for d in drivers]) - s
+    # A leader counts on the entry lane until its tail has diverged, then on a shared exit lane.
+    diverge = np.array([d.route.diverge_s for d in drivers]) + 2 * half + 1.0
+    same_route = (entry_lane[:, None] == entry_lane) & (exit_lane[:, None] == exit_lane)
+    ahead = (entry_lane[:, None] == entry_lane) & (same_route | (s < diverge)[None, :])
     along = np.where(ahead, s[None, :] - s[:, None], np.inf)
-    merging = (leave[:, None] == leave) & past_line[:, None] & past_line[None, :]
-    # Who changes lanes belongs to the new one from the start, and to the old one until it has left.
-    free, stays = stop <= 0, s < split
-    crossing = (approach[:, None] == leave) & stays[:, None]
-    crossing |= crossing.T | ((approach[:, None] == approach) & stays[:, None] & stays)
-    merging |= crossing & free[:, None] & free
-    merged = np.where(merging & ~same_route, left[:, None] - left[None, :], np.inf)
+    merging = (exit_lane[:, None] == exit_lane) & past_line[:, None] & past_line[None, :]
+    # A vehicle that changes lanes occupies the target lane from the start and its old lane until it has left it.
+    no_stop_line, on_entry_lane = stop <= 0, s < diverge
+    crossing = (entry_lane[:, None] == exit_lane) & on_entry_lane[:, None]
+    crossing |= crossing.T | ((entry_lane[:, None] == entry_lane) & on_entry_lane[:, None] & on_entry_lane)
+    merging |= crossing & no_stop_line[:, None] & no_stop_line
+    merged = np.where(merging & ~same_route, remaining[:, None] - remaining[None, :], np.inf)
     along[along <= 0] = np.inf
     merged[merged <= 0] = np.inf
     distance_ahead_m = np.minimum(np.minimum(along, merged), _ring_distances(drivers))
     gaps = distance_ahead_m - half[:, None] - half[None, :]
     np.fill_diagonal(gaps, np.inf)
-    first = gaps.argmin(1)
-    rows = np.arange(len(drivers))
-    speeds = np.array([d.v for d in drivers])[first]
-    return gaps[rows, first], np.where(np.isfinite(gaps[rows, first]), speeds, 0.0)
+    leader = gaps.argmin(1)
+    gap = gaps[np.arange(len(drivers)), leader]
+    speeds = np.array([d.v for d in drivers])[leader]
+    return gap, np.where(np.isfinite(gap), speeds, 0.0)
 
 
 def _ring_distances(drivers: list[_Driver]) -> np.ndarray:
-    """Return the way round a ring (n, n) from each vehicle on it to each one ahead; else inf.
+    """Return the distance round a ring (n, n) from each vehicle on it to each one ahead, inf elsewhere.
 
-    On the ring is who has passed its give-way line and has not left with its tail.
+    A vehicle is on the ring from its give-way line until its tail has left.
     """
-    ways = np.full((len(drivers), len(drivers)), np.inf)
+    distances = np.full((len(drivers), len(drivers)), np.inf)
     on_ring = [i for i, d in enumerate(drivers) if _is_on_ring(d)]
     for i, j in permutations(on_ring, 2):
-        ways[i, j] = _ring_distance(drivers[i], drivers[j])
-    return ways
+        distances[i, j] = _ring_distance(drivers[i], drivers[j])
+    return distances
 
 
 def _ring_distance(driver: _Driver, other: _Driver) -> float:
-    """Return the way round the ring to another vehicle on it if that is ahead, else inf."""
-    ring, there = driver.route.ring, other.route.ring
-    ahead = ring.distance_ahead_m(there.position_m(other.s), driver.s)
-    stays = ring.exit_s - driver.s
-    if other.s < there.entry_s:
-        concerned = stays > ring.distance_ahead_m(there.entry_m, driver.s)
+    """Return the distance round the ring to another vehicle on it if that one is relevant and ahead, else inf."""
+    ring, other_ring = driver.route.ring, other.route.ring
+    if ring is None or other_ring is None:
+        return math.inf
+    ahead = ring.distance_ahead_m(other_ring.position_m(other.s), driver.s)
+    to_exit = ring.exit_s - driver.s
+    if other.s < other_ring.entry_s:
+        relevant = to_exit > ring.distance_ahead_m(other_ring.entry_m, driver.s)
     else:
-        concerned = ahead < stays + (driver.shape.length_m + other.shape.length_m) / 2 + _EXIT_CLEARANCE_M
-    return ahead if concerned and ahead < ring.circumference_m / 2 else math.inf
+        relevant = ahead < to_exit + (driver.shape.length_m + other.shape.length_m) / 2 + _EXIT_CLEARANCE_M
+    return ahead if relevant and ahead < ring.circumference_m / 2 else math.inf
 
 
 def _is_on_ring(driver: _Driver) -> bool:
@@ -226,32 +235,32 @@ def _is_on_ring(driver: _Driver) -> bool:
     )
 
 
-def _must_yield(driver: _Driver, drivers: list[_Driver]) -> bool:
-    """Tell whether somebody on the ring will soon pass where a vehicle wants to join it."""
-    ring = driver.route.ring
+def _must_yield(driver: _Driver, ring: Circulation, drivers: list[_Driver]) -> bool:
+    """Whether a vehicle on the ring passes the entry of this driver within the critical gap."""
     for other in drivers:
-        if other is driver or not _is_on_ring(other) or other.route.approach == driver.route.approach:
+        other_ring = other.route.ring
+        if other_ring is None or other is driver or other.route.entry_lane == driver.route.entry_lane:
             continue
-        round_m = other.route.ring.distance_ahead_m(ring.entry_m, other.s)
-        passes = other.route.ring.exit_s - other.s > round_m
-        if passes and round_m < _CRITICAL_GAP_S * max(other.v, 3.0) + other.shape.length_m:
+        distance_m = other_ring.distance_ahead_m(ring.entry_m, other.s)
+        passes = _is_on_ring(other) and other_ring.exit_s - other.s > distance_m
+        if passes and distance_m < _CRITICAL_GAP_S * max(other.v, 3.0) + other.shape.length_m:
             return True
     return False
 
 
 def _integer_codes(names: list[str]) -> np.ndarray:
-    """Number the names, equal names alike: numbers compare faster."""
+    """Return integer codes of names: integers compare faster."""
     numbers: dict[str, int] = {}
     return np.array([numbers.setdefault(name, len(numbers)) for name in names])
 
 
 def _stop_line_gap(driver: _Driver, signals: SignalController, drivers: list[_Driver]) -> float:
-    """Return the way to the stop line if the driver has to stop there, else inf."""
+    """Return the gap to the stop line if the driver has to stop there, else inf."""
     ahead = driver.route.stop_s - driver.s - driver.shape.length_m / 2
     if ahead < -0.3 or math.isinf(ahead):
         return math.inf
     if driver.route.ring is not None:
-        light = 'amber' if _must_yield(driver, drivers) else 'green'
+        light = 'amber' if _must_yield(driver, driver.route.ring, drivers) else 'green'
     elif driver.route.signal is not None:
         light = signals.light(driver.route.signal)
     else:
@@ -259,16 +268,15 @@ def _stop_line_gap(driver: _Driver, signals: SignalController, drivers: list[_Dr
     braking = {'green': 0.0, 'amber': 2.0, 'red': 5.0}[light]
     if light == 'green' or driver.v**2 > 2 * braking * max(ahead, 0.0) + 0.5:
         return math.inf
-    # The gap of the model is one to a bumper; drivers stop closer to a line.
+    # The model keeps its standstill gap to a bumper; drivers stop closer to a line.
     return max(ahead, 0.0) + STANDSTILL_GAP_M - 0.6
 
 
 def _curve_speed_limit(driver: _Driver) -> float:
-    """Return the speed that the curve of the route allows here, braking early for it."""
+    """Return the speed limit of the curves ahead, with comfortable braking before them."""
     limit = math.inf
     for start, end, radius in driver.route.path.curves():
-        comfortable = 2.0 * radius
         if driver.s < end:
             ahead = max(0.0, start - driver.s)
-            limit = min(limit, math.sqrt(comfortable + 2 * _BRAKING_MPS2 * ahead))
+            limit = min(limit, math.sqrt(_LATERAL_ACCELERATION_MPS2 * radius + 2 * _CURVE_BRAKING_MPS2 * ahead))
     return limit

@@ -1,33 +1,32 @@
-"""The truth beside a recording, in the format of truth.json."""
+"""Ground truth of a simulated recording, in the format of truth.json."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from autocalib_ros.offline.simulate.cyclist_actors import Cyclist
 from autocalib_ros.offline.simulate.ground_surface import PAVEMENT_WIDTH_M, edge_distance
 from autocalib_ros.offline.simulate.lens import CameraPose
+from autocalib_ros.offline.simulate.pedestrian_actors import Pedestrian
+from autocalib_ros.offline.simulate.simulation import Simulation
+from autocalib_ros.offline.simulate.vehicle_models import Vehicle
 
-if TYPE_CHECKING:
-    from autocalib_ros.offline.simulate.cyclist_actors import Cyclist
-    from autocalib_ros.offline.simulate.pedestrian_actors import Pedestrian
-    from autocalib_ros.offline.simulate.simulation import Simulation
-    from autocalib_ros.offline.simulate.vehicle_models import VehicleState
-
-    _State = tuple[float, float, float, float]  # x, y, heading, speed
+_StateAt = Callable[[float], tuple[float, float, float, float] | None]
+"""The state (x, y, heading, speed) of a road user at a time in seconds; None while absent."""
 
 TRACK_RATE_HZ = 5
 _TRACK_RANGE_M = 60.0
 _GROUND_POINTS = 48
 _GROUND_RANGE_M = 45.0
-_OCCLUSION_MARGIN_M = 0.5  # a static thing hides a point when it is nearer to the camera by more than this
+_OCCLUSION_MARGIN_M = 0.5  # a point is occluded by static geometry nearer to the camera by more than this
 
 
 def truth_of(simulation: Simulation) -> dict[str, Any]:
-    """Return lens, camera, road directions, ground points and vehicle tracks."""
+    """Return lens, camera, road directions, ground points and tracks of all road users."""
     options = simulation.options
     truth = {
         'case': 'simulated',
@@ -44,7 +43,7 @@ def truth_of(simulation: Simulation) -> dict[str, Any]:
         'road_directions': [[*direction, 0.0] for direction in simulation.network.directions().round(9).tolist()],
         'ground_points': _ground_points(simulation, bumped=False),
         'vehicles': _vehicles(simulation),
-        'people': _people(simulation),
+        'people': _pedestrians_and_cyclists(simulation),
         'options': asdict(options),
     }
     if options.bump_at_s is not None:
@@ -74,7 +73,7 @@ def _lens(simulation: Simulation) -> dict[str, Any]:
 
 
 def _camera(pose: CameraPose) -> dict[str, Any]:
-    """Describe a pose; angles as in the options."""
+    """Return a pose as JSON; angles as in the options."""
     rotation = pose.world_from_camera
     return {
         'R_world_from_camera': rotation.round(9).tolist(),
@@ -93,27 +92,27 @@ def _rounded_degrees(angle: float) -> float:
 def _project_visible(
     simulation: Simulation, pose: CameraPose, bumped: bool, points: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pixels (n, 2) of world points (n, 3) and whether each is seen."""
+    """Project world points (n, 3): return pixels (n, 2) and a visibility mask (n,)."""
     camera = pose.to_camera(points)
-    pixels, seen = simulation.lens.project(camera)
+    pixels, visible = simulation.lens.project(camera)
     limit = np.array([simulation.options.width_px - 1, simulation.options.height_px - 1])
-    seen &= ((pixels >= 0) & (pixels <= limit)).all(1)
-    index = np.flatnonzero(seen)
+    visible &= ((pixels >= 0) & (pixels <= limit)).all(1)
+    index = np.flatnonzero(visible)
     behind = simulation.renderer().background_distance_m(bumped, pixels[index])
-    seen[index] = behind > np.linalg.norm(camera[index], axis=1) - _OCCLUSION_MARGIN_M
-    return pixels, seen
+    visible[index] = behind > np.linalg.norm(camera[index], axis=1) - _OCCLUSION_MARGIN_M
+    return pixels, visible
 
 
 def _ground_points(simulation: Simulation, bumped: bool) -> dict[str, Any]:
-    """Return visible points of the road and the pavements around the camera."""
+    """Return visible ground points on the road and the pavements around the camera."""
     pose = simulation.bumped_pose() if bumped else simulation.pose
     rng = np.random.default_rng([simulation.options.seed, 9])
-    reach = _GROUND_RANGE_M * np.sqrt(rng.uniform(0.01, 1.0, 4000))
+    radius = _GROUND_RANGE_M * np.sqrt(rng.uniform(0.01, 1.0, 4000))
     angle = rng.uniform(0, 2 * np.pi, 4000)
-    xy = pose.position_m[:2] + reach[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1)
+    xy = pose.position_m[:2] + radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1)
     xy = xy[edge_distance(simulation.network, xy) < PAVEMENT_WIDTH_M].round(2)
-    pixels, seen = _project_visible(simulation, pose, bumped, np.pad(xy, ((0, 0), (0, 1))))
-    rows = np.concatenate([xy, pixels.round(4)], 1)[seen][:_GROUND_POINTS]
+    pixels, visible = _project_visible(simulation, pose, bumped, np.pad(xy, ((0, 0), (0, 1))))
+    rows = np.concatenate([xy, pixels.round(4)], 1)[visible][:_GROUND_POINTS]
     return {'columns': ['X', 'Y', 'u', 'v'], 'rows': rows.tolist()}
 
 
@@ -123,7 +122,7 @@ _TRACK_COLUMNS = ['t', 'X', 'Y', 'heading_rad', 'speed_mps', 'u', 'v']
 def _vehicles(simulation: Simulation) -> dict[str, Any]:
     tracks = []
     for vehicle in simulation.traffic.vehicles:
-        rows = _track_rows(simulation, lambda t, vehicle=vehicle: _vehicle_state(vehicle.state(t)))
+        rows = _track_rows(simulation, _vehicle_state(vehicle))
         if rows:
             tracks.append({'id': f'v{vehicle.number}', 'type': vehicle.kind, 'rows': rows})
     return {
@@ -135,48 +134,57 @@ def _vehicles(simulation: Simulation) -> dict[str, Any]:
     }
 
 
-def _people(simulation: Simulation) -> dict[str, Any]:
-    """Return the tracks of who walks and who cycles, each with a gap where it begins anew."""
+def _pedestrians_and_cyclists(simulation: Simulation) -> dict[str, Any]:
+    """Return the tracks of pedestrians and cyclists; a track has a gap where its path restarts."""
+    pedestrians = [_pedestrian_state(pedestrian) for pedestrian in simulation.pedestrians]
+    cyclists = [_cyclist_state(cyclist) for cyclist in simulation.cyclists]
     tracks = []
-    for kind, everybody, state in (
-        ('pedestrian', simulation.people, _pedestrian_state),
-        ('cyclist', simulation.cyclists, _cyclist_state),
-    ):
-        for number, person in enumerate(everybody, 1):
-            rows = _track_rows(simulation, lambda t, person=person, state=state: state(person, t))
-            if rows:
+    for kind, states in (('pedestrian', pedestrians), ('cyclist', cyclists)):
+        for number, state in enumerate(states, 1):
+            if rows := _track_rows(simulation, state):
                 tracks.append({'id': f'{kind[0]}{number}', 'type': kind, 'rows': rows})
     return {'columns': _TRACK_COLUMNS, 'tracks': tracks}
 
 
-def _vehicle_state(state: VehicleState | None) -> _State | None:
-    return None if state is None else (state.x, state.y, state.heading, state.speed_mps)
+def _vehicle_state(vehicle: Vehicle) -> _StateAt:
+    def state_at(time_s: float) -> tuple[float, float, float, float] | None:
+        state = vehicle.state(time_s)
+        return None if state is None else (state.x, state.y, state.heading, state.speed_mps)
+
+    return state_at
 
 
-def _pedestrian_state(person: Pedestrian, time_s: float) -> _State | None:
-    place = person.place(time_s)
-    return None if place is None else (*place[:2], person.heading, person.speed_mps)
+def _pedestrian_state(pedestrian: Pedestrian) -> _StateAt:
+    def state_at(time_s: float) -> tuple[float, float, float, float] | None:
+        state = pedestrian.state(time_s)
+        return None if state is None else (state.x, state.y, pedestrian.heading, pedestrian.speed_mps)
+
+    return state_at
 
 
-def _cyclist_state(cyclist: Cyclist, time_s: float) -> _State:
-    return (*cyclist.place(time_s)[:3], cyclist.speed_mps)
+def _cyclist_state(cyclist: Cyclist) -> _StateAt:
+    def state_at(time_s: float) -> tuple[float, float, float, float]:
+        state = cyclist.state(time_s)
+        return state.x, state.y, state.heading, cyclist.speed_mps
+
+    return state_at
 
 
-def _track_rows(simulation: Simulation, state: Callable[[float], _State | None]) -> list[list[float]]:
-    """Return the rows of what is in a `state` at a time, while it can be seen."""
+def _track_rows(simulation: Simulation, state_at: _StateAt) -> list[list[float]]:
+    """Sample a road user at TRACK_RATE_HZ; return its rows while it is visible."""
     duration = simulation.options.frame_count / simulation.options.rate_hz
     times = np.arange(int(np.ceil(duration * TRACK_RATE_HZ - 1e-9))) / TRACK_RATE_HZ
-    found = [(t, here) for t in times.tolist() if (here := state(t)) is not None]
+    found = [(t, state) for t in times.tolist() if (state := state_at(t)) is not None]
     rows: list[list[float]] = []
     for bumped in (False, True):
-        part = [(t, *here) for t, here in found if simulation.is_bumped(t) == bumped]
+        part = [(t, *state) for t, state in found if simulation.is_bumped(t) == bumped]
         if not part:
             continue
         values = np.array(part)
         pose = simulation.bumped_pose() if bumped else simulation.pose
         centres = np.pad(values[:, 1:3], ((0, 0), (0, 1)))
-        pixels, seen = _project_visible(simulation, pose, bumped, centres)
-        seen &= np.hypot(*(centres - pose.position_m)[:, :2].T) <= _TRACK_RANGE_M
-        kept = np.concatenate([values.round(4), pixels.round(3)], 1)[seen]
+        pixels, visible = _project_visible(simulation, pose, bumped, centres)
+        visible &= np.hypot(*(centres - pose.position_m)[:, :2].T) <= _TRACK_RANGE_M
+        kept = np.concatenate([values.round(4), pixels.round(3)], 1)[visible]
         rows += kept.tolist()
     return rows

@@ -1,4 +1,4 @@
-"""Vehicles as they were driven: where each one is at any time of its life."""
+"""Vehicle trajectories: the state of each vehicle at any time."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from autocalib_ros.offline.simulate.network import CITY_SPEED_MPS, Route
 from autocalib_ros.offline.simulate.shapes import SHAPES, VehicleShape
 
 STEP_S = 0.1
-_TANGENT_STEP_M = 0.1  # short enough for the tangent of a path
+_TANGENT_STEP_M = 0.1  # step of the finite difference for the tangent of a path
 
 
 @dataclass(frozen=True)
 class Wander:
-    """Lateral offset within the lane as a smooth function of the way gone.
+    """Lateral offset within the lane as a smooth function of arc length.
 
-    A function of the way, not of time: a waiting vehicle does not slide sideways.
+    It depends on arc length, not time, so that a waiting vehicle does not slip sideways.
     """
 
     amplitudes_m: np.ndarray
@@ -27,7 +27,7 @@ class Wander:
 
     @classmethod
     def draw(cls, stddev_m: float, rng: np.random.Generator, speed_mps: float = CITY_SPEED_MPS) -> Wander:
-        """Draw a wander of a standard deviation; at its speed it is correlated over seconds."""
+        """Draw a wander of a standard deviation; its wavelengths scale with the speed."""
         count = 4
         return cls(
             np.full(count, stddev_m * math.sqrt(2.0 / count)),
@@ -43,7 +43,7 @@ class Wander:
 
 @dataclass(frozen=True)
 class VehicleState:
-    """Where a vehicle is: centre of its footprint in metres, heading in radians, speed."""
+    """State of a vehicle: centre of its footprint in metres, heading in radians, speed."""
 
     x: float
     y: float
@@ -53,7 +53,7 @@ class VehicleState:
 
 @dataclass(frozen=True)
 class Vehicle:
-    """One vehicle and its whole life: arc length and speed every STEP_S from start_s on."""
+    """One vehicle and its trajectory: arc length and speed every STEP_S from start_s on."""
 
     number: int
     kind: str
@@ -66,11 +66,11 @@ class Vehicle:
 
     @property
     def shape(self) -> VehicleShape:
-        """Its dimensions."""
+        """The shape of its type."""
         return SHAPES[self.kind]
 
     def state(self, time_s: float) -> VehicleState | None:
-        """Return where it is at a time, or None before and after its life."""
+        """Return the state at a time, or None before and after the trajectory."""
         position = (time_s - self.start_s) / STEP_S
         index = math.floor(position + 1e-9)
         if index < 0 or index > len(self.s) - 2:
@@ -82,12 +82,12 @@ class Vehicle:
         return VehicleState(x, y, heading, float(v0 + (v1 - v0) * tau / STEP_S))
 
     def pose(self, s: float) -> tuple[float, float, float]:
-        """Return (x, y, heading): the rear axle follows the wandering path and rolls along it."""
+        """Return (x, y, heading) of the centre; the rear axle follows the path without side slip."""
         half_m = self.shape.wheelbase_m / 2
         near = s - half_m + np.array([-0.5, 0.5]) * _TANGENT_STEP_M
-        rows = self.route.path.at(near)
-        aside = self.wander.at(near)
-        xy = rows[:, :2] + aside[:, None] * np.stack([-np.sin(rows[:, 2]), np.cos(rows[:, 2])], -1)
+        poses = self.route.path.at(near)
+        lateral = self.wander.at(near)
+        xy = poses[:, :2] + lateral[:, None] * np.stack([-np.sin(poses[:, 2]), np.cos(poses[:, 2])], -1)
         (x0, y0), (x1, y1) = xy.tolist()
         heading = math.atan2(y1 - y0, x1 - x0)
         x, y = (x0 + x1) / 2, (y0 + y1) / 2
@@ -96,7 +96,7 @@ class Vehicle:
 
 @dataclass(frozen=True)
 class SimulatedTraffic:
-    """All vehicles, and the green times (signal, start, end) that they obeyed."""
+    """All vehicles of a recording, and the green phases (signal, start, end) of its signals."""
 
     vehicles: tuple[Vehicle, ...]
     green_phases: tuple[tuple[str, float, float], ...]

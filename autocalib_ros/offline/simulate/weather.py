@@ -1,10 +1,9 @@
-"""What light, water and the lens put into the picture that is no traffic, each with its own physics."""
+"""Image effects that are not traffic: shadows, water, wet road, rain and drops on the lens, recorder clock."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
@@ -16,11 +15,12 @@ from autocalib_ros.offline.simulate.lens import CameraPose, KannalaBrandtLens
 from autocalib_ros.offline.simulate.network import Network
 from autocalib_ros.offline.simulate.options import SimulationOptions
 from autocalib_ros.offline.simulate.paint import octave_noise
+from autocalib_ros.offline.simulate.palette import Colour
 from autocalib_ros.offline.simulate.sensor import add_glow
 from autocalib_ros.offline.simulate.vehicle_models import Vehicle, VehicleState
 
-_RAIN_OCCLUSION_MARGIN_M = 0.4
-"""What is nearer than the ground behind it by more stands before it."""
+_GROUND_DEPTH_MARGIN_M = 0.4
+"""A pixel nearer than the ground by more than this shows an object. Judgement."""
 _SUN_RAD = math.radians(28.0)
 _SHADOW_ATTENUATION = 0.5
 _CLOUD_SPEED_MPS, _CLOUD_SIZE_M, _CLOUD_ATTENUATION = 7.0, 45.0, 0.4
@@ -31,31 +31,31 @@ _GRAVITY_MPS2 = 9.81
 _PUDDLE_SIZE_M = 1.5
 """Size of the puddles and dry patches of a wet road."""
 _REFLECTION_DEPTHS_M = (0.25, 0.45, 0.7, 1.0, 1.5)
-"""Depths below the road at which the rough mirror of a wet road shows a lamp of 0.7 m."""
+"""Depths below the road at which a rough wet surface reflects a lamp 0.7 m above it."""
 _DROP_COUNT = 9
 _RAIN_STREAK_COUNT = 350
 _RAIN_FALL_MPS, _EXPOSURE_S = 7.0, 1 / 60
 _SIGNAL_LAMP_SIZE_M = 0.12
 _SIGNAL_HEAD_HEIGHT_M = 3.6
 _MIN_SIGNAL_DISTANCE_M = 9.0
-"""So near the camera stands no signal."""
+"""Minimum distance of a signal from the camera."""
 _CLOCK_FONT = cv2.FONT_HERSHEY_DUPLEX
 
 
 @dataclass(frozen=True)
 class GroundBuffer:
-    """The ground behind each pixel."""
+    """Ground intersection of each pixel's ray."""
 
     xy: np.ndarray
-    """Metres, shape (h, w, 2); far away where there is sky."""
+    """Position in metres (h, w, 2); far away in the sky."""
     distance_m: np.ndarray
-    """From the camera, shape (h, w); infinite where there is sky."""
+    """Distance from the camera (h, w); infinite in the sky."""
     off_road_m: np.ndarray
-    """How far off the asphalt, shape (h, w)."""
+    """Signed distance to the edge of the asphalt (h, w), negative on it."""
 
     @classmethod
     def of(cls, options: SimulationOptions, network: Network, pose: CameraPose) -> GroundBuffer:
-        """Meet every pixel's ray with the ground."""
+        """Intersect every pixel's ray with the ground plane."""
         grid = np.stack(np.meshgrid(np.arange(options.width_px), np.arange(options.height_px)), -1)
         rays = options.lens.bearings(grid) @ pose.world_from_camera.T
         down = rays[..., 2] < -0.01
@@ -65,17 +65,17 @@ class GroundBuffer:
         return cls(xy.astype(np.float32), distance.astype(np.float32), edge_distance(network, xy).astype(np.float32))
 
     def visible(self, depth_m: np.ndarray) -> np.ndarray:
-        """Where (h, w) the ground is seen, given the distance (h, w) of what is nearest."""
-        return np.isfinite(self.distance_m) & (depth_m > self.distance_m - _RAIN_OCCLUSION_MARGIN_M)
+        """Return the mask (h, w) of visible ground, given the depth map (h, w)."""
+        return np.isfinite(self.distance_m) & (depth_m > self.distance_m - _GROUND_DEPTH_MARGIN_M)
 
 
 @dataclass(frozen=True)
 class FrameContext:
-    """What the effects of one frame are given."""
+    """Input of the image effects of one frame."""
 
-    picture: np.ndarray
+    image: np.ndarray
     depth_m: np.ndarray
-    """Distance (h, w) of what each pixel shows."""
+    """Depth map (h, w)."""
     pose: CameraPose
     vehicles: list[tuple[Vehicle, VehicleState]]
     index: int
@@ -83,7 +83,7 @@ class FrameContext:
 
 
 class Weather:
-    """The troubles of one recording that are drawn into finished pictures; each frame depends on its index alone."""
+    """Effects of one recording, drawn into rendered images; each frame depends only on its index."""
 
     def __init__(self, options: SimulationOptions, network: Network, poses: dict[bool, CameraPose]) -> None:
         self._options, self._network, self._troubles = options, network, options.troubles
@@ -104,51 +104,51 @@ class Weather:
         self._pond = self._pond_mask(rng) if 'water' in self._troubles else None
         self._drops = _drops_of(options, rng)
 
-    def apply_ground_effects(self, view: FrameContext, bumped: bool) -> None:
-        """Change how the ground looks by daylight: shadows, water."""
+    def apply_ground_effects(self, context: FrameContext, bumped: bool) -> None:
+        """Apply the effects of daylight on the ground: shadows, water."""
         if 'water' in self._troubles:
-            self._draw_waves(view, bumped)
+            self._draw_waves(context, bumped)
         if 'shadows' in self._troubles:
-            self._darken_shadows(view, bumped)
+            self._darken_shadows(context, bumped)
 
-    def add_light_sources(self, view: FrameContext, bumped: bool) -> None:
-        """Add what shines: mirrored lamps, signals."""
+    def add_light_sources(self, context: FrameContext, bumped: bool) -> None:
+        """Add light sources: reflected lamps, signals."""
         if 'wet' in self._troubles:
-            self._add_lamp_reflections(view, bumped)
+            self._add_lamp_reflections(context, bumped)
         if 'leds' in self._troubles:
-            self._signals(view)
+            self._add_signal_lamps(context)
 
-    def apply_lens_effects(self, view: FrameContext) -> np.ndarray:
-        """Return the picture through rain and drops, with the clock that the recorder burns in."""
-        picture = view.picture
+    def apply_lens_effects(self, context: FrameContext) -> np.ndarray:
+        """Return the image with rain, drops on the lens and the clock of the recorder."""
+        image = context.image
         if 'rain' in self._troubles:
-            picture = self._rain(picture, view.index)
+            image = self._rain(image, context.index)
         if 'drops' in self._troubles:
-            picture = _apply_drops(picture, self._drops, view.time_s)
+            image = _apply_drops(image, self._drops, context.time_s)
         if 'clock' in self._troubles:
-            _burn_in_clock(picture, view.time_s)
-        return picture
+            _burn_in_clock(image, context.time_s)
+        return image
 
-    def _darken_shadows(self, view: FrameContext, bumped: bool) -> None:
-        """Darken the ground under clouds that move with the wind, and in the shadows of vehicles."""
+    def _darken_shadows(self, context: FrameContext, bumped: bool) -> None:
+        """Darken the ground in the shadows of moving clouds and of vehicles."""
         ground = self._ground[bumped]
-        coarse = ground.xy[::8, ::8] - self._wind.astype(np.float32) * np.float32(_CLOUD_SPEED_MPS * view.time_s)
+        coarse = ground.xy[::8, ::8] - self._wind.astype(np.float32) * np.float32(_CLOUD_SPEED_MPS * context.time_s)
         texels = np.mod(coarse * (_CLOUD_TEXELS / (8 * _CLOUD_SIZE_M)), _CLOUD_TEXELS).astype(np.float32)
         cloud = cv2.remap(self._clouds, texels, NO_MAP, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
         height, width = ground.distance_m.shape
         light = 1 - _CLOUD_ATTENUATION * cv2.resize(cloud, (width, height), interpolation=cv2.INTER_LINEAR)
         mask = np.zeros((height, width), np.uint8)
-        for vehicle, state in view.vehicles:
-            outline = self._shadow_outline(vehicle, state, view.pose)
+        for vehicle, state in context.vehicles:
+            outline = self._shadow_outline(vehicle, state, context.pose)
             if outline is not None:
                 cv2.fillConvexPoly(mask, outline, 255, cv2.LINE_AA, 4)
         shadow = cv2.GaussianBlur(mask, (0, 0), 1.0).astype(np.float32) / 255
         light *= 1 - _SHADOW_ATTENUATION * shadow
-        light[~ground.visible(view.depth_m)] = 1.0
-        view.picture[:] = (view.picture * light[..., None]).astype(np.uint8)
+        light[~ground.visible(context.depth_m)] = 1.0
+        context.image[:] = (context.image * light[..., None]).astype(np.uint8)
 
     def _shadow_outline(self, vehicle: Vehicle, state: VehicleState, pose: CameraPose) -> np.ndarray | None:
-        """Return the outline (n, 2), in sixteenths of a pixel, of the shadow that the low sun casts, if all is seen."""
+        """Return the outline (n, 2) of a cast shadow in 1/16 px, or None if it is not entirely in view."""
         shape = vehicle.shape
         base = box_corners(vehicle, state)[:4, :2]
         top = max(part.top_m for part in shape.parts)
@@ -160,7 +160,7 @@ class Weather:
         return np.round(pixels * 16).astype(np.int32) if valid.all() else None
 
     def _pond_mask(self, rng: np.random.Generator) -> dict[bool, tuple[np.ndarray, np.ndarray]]:
-        """Lay a pond beside the road; return its pixels (n,) rows and columns by pose."""
+        """Place a pond beside the road; return its pixel rows and columns (n,) per camera pose."""
         ground = self._ground[False]
         fit = np.argwhere(
             (ground.off_road_m > _POND_SEMI_AXES_M[1] + 2.5)
@@ -171,97 +171,102 @@ class Weather:
             return {}
         row, column = fit[int(rng.integers(len(fit)))]
         centre = ground.xy[row, column]
-        return {
-            bumped: np.nonzero((((view.xy - centre) / _POND_SEMI_AXES_M) ** 2).sum(-1) < 1)
-            for bumped, view in self._ground.items()
-        }
+        masks: dict[bool, tuple[np.ndarray, np.ndarray]] = {}
+        for bumped, buffer in self._ground.items():
+            rows, columns = np.nonzero((((buffer.xy - centre) / _POND_SEMI_AXES_M) ** 2).sum(-1) < 1)
+            masks[bumped] = rows, columns
+        return masks
 
-    def _draw_waves(self, view: FrameContext, bumped: bool) -> None:
-        """Draw waves that travel with the wind, with the glitter of the sun on their slopes."""
+    def _draw_waves(self, context: FrameContext, bumped: bool) -> None:
+        """Draw waves that travel with the wind, with sun glitter on their slopes."""
         if not self._pond:
             return
         rows, columns = self._pond[bumped]
         ground = self._ground[bumped]
-        visible = ground.visible(view.depth_m)[rows, columns]
+        visible = ground.visible(context.depth_m)[rows, columns]
         rows, columns = rows[visible], columns[visible]
         numbers, rates, phases = self._waves
-        slope = np.sin(ground.xy[rows, columns] @ numbers.T - rates * view.time_s + phases).sum(-1) / math.sqrt(
+        slope = np.sin(ground.xy[rows, columns] @ numbers.T - rates * context.time_s + phases).sum(-1) / math.sqrt(
             _WAVE_COUNT
         )
         level = 70 + 28 * slope + 130 * (slope > 1.3)
-        view.picture[rows, columns] = np.clip(level[:, None] * (1.0, 0.95, 0.8), 0, 255).astype(np.uint8)
+        context.image[rows, columns] = np.clip(level[:, None] * (1.0, 0.95, 0.8), 0, 255).astype(np.uint8)
 
-    def _add_lamp_reflections(self, view: FrameContext, bumped: bool) -> None:
-        """Add the lamps that the wet road mirrors: they shine from below it, smeared by its roughness."""
-        ground, camera = self._ground[bumped], view.pose.position_m
+    def _add_lamp_reflections(self, context: FrameContext, bumped: bool) -> None:
+        """Add the reflections of lamps in the wet road: mirror images below it, smeared by its roughness."""
+        ground, camera = self._ground[bumped], context.pose.position_m
         height, width = ground.distance_m.shape
-        for lamp in (lamp for vehicle, state in view.vehicles for lamp in vehicle_lamps(vehicle, state)):
+        for lamp in (lamp for vehicle, state in context.vehicles for lamp in vehicle_lamps(vehicle, state)):
             for depth in _REFLECTION_DEPTHS_M:
                 below = np.array([*lamp.position_m[:2], -depth])
                 to_camera = camera - below
                 distance = float(np.linalg.norm(to_camera))
                 turned = float(lamp.direction @ to_camera[:2]) / distance
-                pixel, valid = self._lens.project(view.pose.to_camera(below))
+                pixel, valid = self._lens.project(context.pose.to_camera(below))
                 column, row = (round(float(c)) for c in pixel)
                 if turned < 0.05 or not valid or not (0 <= row < height and 0 <= column < width):
                     continue
-                if view.depth_m[row, column] < ground.distance_m[row, column] - _RAIN_OCCLUSION_MARGIN_M:
+                if context.depth_m[row, column] < ground.distance_m[row, column] - _GROUND_DEPTH_MARGIN_M:
                     continue
                 texel = (ground.xy[row, column] / _PUDDLE_SIZE_M * 6.0).astype(int) % _CLOUD_TEXELS
-                # A film of water mirrors the more, the flatter one looks at it.
+                # Schlick approximation: a film of water reflects more at grazing angles.
                 reflectance = 0.05 + 0.95 * (1 - float(to_camera[2]) / distance) ** 5
-                share = 1.6 * reflectance * float(self._puddles[texel[1], texel[0]]) * min(1.0, 0.35 + turned)
+                gain = 1.6 * reflectance * float(self._puddles[texel[1], texel[0]]) * min(1.0, 0.35 + turned)
                 radius = max(1.2, 1.3 * lamp.size_m * self._lens.focal_px / distance)
-                add_glow(view.picture, pixel, radius, _scaled(lamp.colour, min(share, 0.7)))
+                add_glow(context.image, pixel, radius, _scaled(lamp.colour, min(gain, 0.7)))
 
-    def _signals(self, view: FrameContext) -> None:
-        """Add the lit lamps of signals, whose pulses beat with the exposures."""
-        if not self._network.phases or self._network.stop_m is None:
+    def _add_signal_lamps(self, context: FrameContext) -> None:
+        """Add lit signal lamps, whose LED pulses beat with the exposures."""
+        stop_lines = self._network.stop_lines
+        if not self._network.phases or stop_lines is None:
             return
         for number, road in enumerate(self._network.roads):
             for side in (1, -1):
-                foot = road.at(side * self._network.stop_m, side * (road.half_width_m + 0.5))
-                red = int(view.time_s / 12 + number) % 2
+                foot = road.at(side * stop_lines.stop_m, side * (road.half_width_m + 0.5))
+                red = int(context.time_s / 12 + number) % 2
                 lamp = np.array([*foot, _SIGNAL_HEAD_HEIGHT_M + 0.35 * red])
-                pixel, valid = self._lens.project(view.pose.to_camera(lamp))
+                pixel, valid = self._lens.project(context.pose.to_camera(lamp))
                 column, row = (round(float(c)) for c in pixel)
                 inside = 0 <= row < self._options.height_px and 0 <= column < self._options.width_px
-                distance = float(np.linalg.norm(view.pose.position_m - lamp))
+                distance = float(np.linalg.norm(context.pose.position_m - lamp))
                 if (
                     not valid
                     or not inside
                     or distance < _MIN_SIGNAL_DISTANCE_M
-                    or view.depth_m[row, column] < distance - 1.0
+                    or context.depth_m[row, column] < distance - 1.0
                 ):
                     continue
-                beat = np.clip(0.5 + 0.9 * math.sin(2 * np.pi * (3.1 + 0.7 * number) * view.time_s + side), 0.05, 1.0)
+                beat = np.clip(
+                    0.5 + 0.9 * math.sin(2 * np.pi * (3.1 + 0.7 * number) * context.time_s + side), 0.05, 1.0
+                )
                 colour = (60, 60, 255) if red else (190, 255, 60)
                 add_glow(
-                    view.picture,
+                    context.image,
                     pixel,
                     max(1.5, _SIGNAL_LAMP_SIZE_M * self._lens.focal_px / distance * 1.5),
                     _scaled(colour, float(beat)),
                 )
 
-    def _rain(self, picture: np.ndarray, index: int) -> np.ndarray:
-        """Draw the streaks that drops near the camera leave in one exposure, under a veil of those farther off."""
+    def _rain(self, image: np.ndarray, index: int) -> np.ndarray:
+        """Draw motion-blurred streaks of near drops under a haze of distant ones."""
         rng = np.random.default_rng([self._options.seed, 12, index])
-        height, width = picture.shape[:2]
+        height, width = image.shape[:2]
         distance = 1.0 + 12.0 * rng.uniform(size=_RAIN_STREAK_COUNT) ** 0.5
         length = _RAIN_FALL_MPS * _EXPOSURE_S * self._lens.focal_px / distance
         start = rng.uniform((0, 0), (width, height), (_RAIN_STREAK_COUNT, 2))
         lean = 0.12 + rng.normal(0, 0.03, _RAIN_STREAK_COUNT)
-        veil = np.zeros((height, width), np.uint8)
+        streaks = np.zeros((height, width), np.uint8)
         for (x, y), reach, slant, metres in zip(start, length, lean, distance, strict=True):
-            ends = [(round(16 * x), round(16 * y)), (round(16 * (x + slant * reach)), round(16 * (y + reach)))]
-            cv2.line(veil, *ends, int(np.clip(110 / metres + 12, 0, 90)), 1, cv2.LINE_AA, 4)
-        veil = cv2.GaussianBlur(veil, (0, 0), 0.8)
-        hazy = cv2.addWeighted(picture, 0.85, np.full_like(picture, 150), 0.08, 0)
-        return cv2.add(hazy, cv2.cvtColor(veil, cv2.COLOR_GRAY2BGR))
+            first = round(16 * x), round(16 * y)
+            last = round(16 * (x + slant * reach)), round(16 * (y + reach))
+            cv2.line(streaks, first, last, int(np.clip(110 / metres + 12, 0, 90)), 1, cv2.LINE_AA, 4)
+        blurred = cv2.GaussianBlur(streaks, (0, 0), 0.8)
+        hazy = cv2.addWeighted(image, 0.85, np.full_like(image, 150), 0.08, 0)
+        return cv2.add(hazy, cv2.cvtColor(blurred, cv2.COLOR_GRAY2BGR))
 
 
 def box_corners(vehicle: Vehicle, state: VehicleState) -> np.ndarray:
-    """Return the corners (8, 3) of a vehicle's box, the four on the ground first."""
+    """Return the corners (8, 3) of a vehicle's bounding box, the four on the ground first."""
     shape = vehicle.shape
     c, s = math.cos(state.heading), math.sin(state.heading)
     length, width = shape.length_m / 2, shape.width_m / 2
@@ -271,12 +276,13 @@ def box_corners(vehicle: Vehicle, state: VehicleState) -> np.ndarray:
     return np.concatenate([np.pad(base, ((0, 0), (0, 1)), constant_values=z) for z in (0.0, top)])
 
 
-def _scaled(colour: tuple[int, int, int], share: float) -> Any:
-    return tuple(round(c * share) for c in colour)
+def _scaled(colour: Colour, gain: float) -> Colour:
+    blue, green, red = (round(c * gain) for c in colour)
+    return blue, green, red
 
 
 def _deep_water_waves(wind: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Wave vectors (n, 2) in 1/m, rates (n,) in 1/s of waves on deep water, and phases (n,)."""
+    """Return wave vectors (n, 2) in rad/m, angular frequencies (n,) of deep-water waves, and phases (n,)."""
     length = np.exp(rng.uniform(math.log(0.4), math.log(2.5), _WAVE_COUNT))
     heading = wind + rng.normal(0, 0.5, _WAVE_COUNT)
     number = 2 * np.pi / length
@@ -289,7 +295,7 @@ def _deep_water_waves(wind: float, rng: np.random.Generator) -> tuple[np.ndarray
 
 @dataclass(frozen=True)
 class WaterDrop:
-    """Water on the front glass, far out of focus: it comes, rests, runs down, and comes again."""
+    """A defocused drop on the front glass: it appears, rests, runs down, and reappears."""
 
     x_px: float
     y_px: float
@@ -299,16 +305,16 @@ class WaterDrop:
     run_px_per_s: float
     period_s: float
 
-    def place(self, time_s: float, height_px: int) -> tuple[float, float] | None:
-        """Return where it is at a time, None while it is not there."""
+    def position(self, time_s: float, height_px: int) -> tuple[float, float] | None:
+        """Return the position at a time, or None while absent."""
         age = (time_s - self.appears_s) % self.period_s
         running = max(0.0, age - self.rest_s)
-        # It creeps, then goes faster, held up by the glass now and then.
-        way = self.run_px_per_s * (running + 0.25 * math.sin(4 * running)) * min(1.0, running)
-        y = self.y_px + way
+        # It creeps, then runs faster, sticking to the glass intermittently.
+        travelled = self.run_px_per_s * (running + 0.25 * math.sin(4 * running)) * min(1.0, running)
+        y = self.y_px + travelled
         if y > height_px + self.radius_px:
             return None
-        return self.x_px + 6 * math.sin(0.02 * way), y
+        return self.x_px + 6 * math.sin(0.02 * travelled), y
 
 
 def _drops_of(options: SimulationOptions, rng: np.random.Generator) -> list[WaterDrop]:
@@ -327,16 +333,16 @@ def _drops_of(options: SimulationOptions, rng: np.random.Generator) -> list[Wate
     ]
 
 
-def _apply_drops(picture: np.ndarray, drops: list[WaterDrop], time_s: float) -> np.ndarray:
-    """Blend in, under each drop, what it shows: the surroundings upside down and blurred."""
-    height, width = picture.shape[:2]
-    small = cv2.resize(picture, (width // 8, height // 8), interpolation=cv2.INTER_AREA)
+def _apply_drops(image: np.ndarray, drops: list[WaterDrop], time_s: float) -> np.ndarray:
+    """Blend in each drop: an inverted, blurred image of its surroundings."""
+    height, width = image.shape[:2]
+    small = cv2.resize(image, (width // 8, height // 8), interpolation=cv2.INTER_AREA)
     blurred = cv2.GaussianBlur(small, (0, 0), 3.0)
     for drop in drops:
-        place = drop.place(time_s, height)
-        if place is None:
+        position = drop.position(time_s, height)
+        if position is None:
             continue
-        x, y = place
+        x, y = position
         reach = 1.6 * drop.radius_px
         x0, x1 = (int(np.clip(c, 0, width)) for c in (x - reach, x + reach))
         y0, y1 = (int(np.clip(c, 0, height)) for c in (y - reach, y + reach))
@@ -347,16 +353,16 @@ def _apply_drops(picture: np.ndarray, drops: list[WaterDrop], time_s: float) -> 
         alpha = 0.85 / (1 + np.exp((radius - 1) * 9))
         source = np.stack([(x - 4 * dx) / 8, (y - 4 * dy) / 8], -1).astype(np.float32)
         shown = cv2.remap(blurred, source, NO_MAP, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
-        patch = picture[y0:y1, x0:x1]
+        patch = image[y0:y1, x0:x1]
         patch[:] = (patch + alpha[..., None] * (shown.astype(float) - patch)).astype(np.uint8)
-    return picture
+    return image
 
 
-def _burn_in_clock(picture: np.ndarray, time_s: float) -> None:
-    """Burn date and time into the picture, in place."""
+def _burn_in_clock(image: np.ndarray, time_s: float) -> None:
+    """Burn date and time into the image, in place."""
     text = f'2024-05-17 08:{int(time_s) // 60:02d}:{int(time_s) % 60:02d}:{int(time_s * 100) % 100:02d}'
-    scale = picture.shape[1] / 1280
+    scale = image.shape[1] / 1280
     (width, height), base = cv2.getTextSize(text, _CLOCK_FONT, scale, 2)
     x, y = round(20 * scale), round(20 * scale) + height
-    cv2.rectangle(picture, (x - 4, y - height - 6), (x + width + 4, y + base), (0, 0, 0), -1)
-    cv2.putText(picture, text, (x, y), _CLOCK_FONT, scale, (255, 255, 255), max(1, round(2 * scale)), cv2.LINE_AA)
+    cv2.rectangle(image, (x - 4, y - height - 6), (x + width + 4, y + base), (0, 0, 0), -1)
+    cv2.putText(image, text, (x, y), _CLOCK_FONT, scale, (255, 255, 255), max(1, round(2 * scale)), cv2.LINE_AA)

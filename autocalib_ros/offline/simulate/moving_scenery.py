@@ -1,4 +1,4 @@
-"""What moves beside the road and is no traffic: trees and flags in the wind, LED signs that are scanned."""
+"""Moving objects beside the road that are not traffic: trees and flags in the wind, scanned LED signs."""
 
 from __future__ import annotations
 
@@ -12,27 +12,31 @@ from autocalib_ros.offline.simulate.faces import Faces, Texture
 from autocalib_ros.offline.simulate.ground_surface import PAVEMENT_WIDTH_M, edge_distance
 from autocalib_ros.offline.simulate.lens import CameraPose, KannalaBrandtLens
 from autocalib_ros.offline.simulate.network import Network
-from autocalib_ros.offline.simulate.palette import Palette
+from autocalib_ros.offline.simulate.palette import Colour, Palette
 from autocalib_ros.offline.simulate.scenery import billboard, foliage_texture
 
 TREE_COUNT, FLAG_COUNT, SIGN_COUNT = 5, 3, 2
+"""Objects of each kind, at most: fewer where the view has no room. Judgement."""
 _GUST_PERIOD_S = 9.0
-"""Wind comes and goes with this period."""
+"""Period of the wind strength in seconds. Judgement."""
 _BRANCH_COUNT = 7
 _STRIP_COUNT = 10
 _NEAR_BRANCH_M, _NEAR_FOLIAGE_SIZE_M = 4.0, 1.1
-"""How far before the camera a bough hangs into the picture, and how large its leaves are together."""
+"""Distance of a branch that hangs into the image, and size of its foliage."""
 _FLAG_SIZE_M = (3.0, 2.0)
+"""Width and height of a flag."""
 _FLAG_WAVELENGTH_M, _FLAG_WAVE_MPS = 1.3, 2.5
-"""Length and speed of the wave that runs out along a flag."""
+"""Wavelength and speed of the wave along a flag."""
 _SIGN_SIZE_M = (1.6, 1.2)
+"""Width and height of a sign."""
 _SIGN_STEPS = 12
+"""Textures of one beat period."""
 _SIGN_BEAT_HZ = 1.3
-"""What is left of the frequency of the rows of a sign when it is looked at with the camera's."""
+"""Beat frequency of the row scan of a sign with the frame rate."""
 
 
 def wind_strength(time_s: float) -> float:
-    """Return the strength of the wind at a time, 0.4 to 1."""
+    """Return the wind strength at a time, 0.4 to 1."""
     return 0.7 + 0.3 * math.sin(2 * math.pi * time_s / _GUST_PERIOD_S) * math.cos(
         2 * math.pi * time_s / (2.3 * _GUST_PERIOD_S)
     )
@@ -47,36 +51,40 @@ def roadside_positions(
     rng: np.random.Generator,
     count: int,
 ) -> list[np.ndarray]:
-    """Draw places (2,) beside the road that the camera sees, at `beyond_m` from the asphalt and up to 3 m more."""
-    places: list[np.ndarray] = []
+    """Draw random visible positions (2,) beside the road, `beyond_m` to `beyond_m` + 3 m from the asphalt."""
+    positions: list[np.ndarray] = []
     for _ in range(4000):
         reach, angle = rng.uniform(9.0, 40.0), rng.uniform(0, 2 * np.pi)
-        place = pose.position_m[:2] + reach * np.array([math.cos(angle), math.sin(angle)])
-        if len(places) == count:
+        position = pose.position_m[:2] + reach * np.array([math.cos(angle), math.sin(angle)])
+        if len(positions) == count:
             break
-        off = float(edge_distance(network, place))
-        pixel, valid = lens.project(pose.to_camera(np.array([*place, 1.5])))
-        seen = bool(valid) and bool(((pixel > 20) & (pixel < np.array(size) - 20)).all())
-        if seen and beyond_m < off < beyond_m + 3.0 and all(math.dist(place, other) > 4.0 for other in places):
-            places.append(place)
-    return places
+        distance_m = float(edge_distance(network, position))
+        pixel, valid = lens.project(pose.to_camera(np.array([*position, 1.5])))
+        visible = bool(valid) and bool(((pixel > 20) & (pixel < np.array(size) - 20)).all())
+        if (
+            visible
+            and beyond_m < distance_m < beyond_m + 3.0
+            and all(math.dist(position, other) > 4.0 for other in positions)
+        ):
+            positions.append(position)
+    return positions
 
 
 @dataclass(frozen=True)
 class Tree:
-    """A trunk and branches with leaves; each branch swings about the foot in its own time."""
+    """A trunk and branches with foliage; each branch swings about its pivot at its own frequency."""
 
     branches: np.ndarray
     """Corners (n, 3, 3) at rest."""
     pivots_m: np.ndarray
-    """(n, 3): about which each swings."""
+    """Centres of rotation (n, 3)."""
     swings_rad: np.ndarray
     rates_hz: np.ndarray
     phases: np.ndarray
     textures: tuple[Texture, ...]
 
     def at(self, time_s: float) -> Faces:
-        """Return its faces at a time."""
+        """Return the faces at a time."""
         wave = np.sin(2 * np.pi * self.rates_hz * time_s + self.phases)
         angles = self.swings_rad * wind_strength(time_s) * (0.4 + 0.6 * wave)
         return Faces(
@@ -86,7 +94,7 @@ class Tree:
 
 
 def _rotated_in_plane(corners: np.ndarray, pivot: np.ndarray, angle: float) -> np.ndarray:
-    """Turn a face (3, 3) within its own plane about a point (3,) of that plane."""
+    """Rotate a face (3, 3) in its own plane about a pivot (3,)."""
     axis = np.cross(corners[1], corners[2])
     axis /= np.linalg.norm(axis)
     c, s = math.cos(angle), math.sin(angle)
@@ -97,18 +105,18 @@ def _rotated_in_plane(corners: np.ndarray, pivot: np.ndarray, angle: float) -> n
     return np.stack([pivot + turned(corners[0] - pivot), turned(corners[1]), turned(corners[2])])
 
 
-def tree(place: np.ndarray, viewer: np.ndarray, palette: Palette, rng: np.random.Generator) -> Tree:
-    """Return a tree at a place (2,) that faces the viewer (2,)."""
+def make_tree(position: np.ndarray, viewer: np.ndarray, palette: Palette, rng: np.random.Generator) -> Tree:
+    """Return a tree at a position (2,) that faces the viewer (2,)."""
     height = rng.uniform(4.5, 7.5)
-    towards = (viewer - place) / max(float(np.hypot(*(viewer - place))), 1e-6)
-    corners = [billboard(place, viewer, 0.25, 0.0, 0.5 * height)]
-    pivots, swings, rates = [(*place, 0.0)], [0.004], [0.4]
+    towards = (viewer - position) / max(float(np.hypot(*(viewer - position))), 1e-6)
+    corners = [billboard(position, viewer, 0.25, 0.0, 0.5 * height)]
+    pivots, swings, rates = [(*position, 0.0)], [0.004], [0.4]
     for i in range(_BRANCH_COUNT):
-        aside = rng.uniform(-0.25, 0.25) * height * np.array([-towards[1], towards[0]])
-        centre = place + aside + 0.05 * (i + 1) * towards
+        lateral = rng.uniform(-0.25, 0.25) * height * np.array([-towards[1], towards[0]])
+        centre = position + lateral + 0.05 * (i + 1) * towards
         low = rng.uniform(0.3, 0.65) * height
         corners.append(billboard(centre, viewer, 0.36 * height, low, low + 0.36 * height))
-        pivots.append((*place, 0.3 * height))
+        pivots.append((*position, 0.3 * height))
         swings.append(rng.uniform(0.02, 0.07))
         rates.append(rng.uniform(0.35, 1.4))
     textures = (
@@ -128,7 +136,7 @@ def tree(place: np.ndarray, viewer: np.ndarray, palette: Palette, rng: np.random
 def near_branch(
     pose: CameraPose, lens: KannalaBrandtLens, size: tuple[int, int], palette: Palette, rng: np.random.Generator
 ) -> Tree:
-    """Return leaves on the end of a bough, close before the camera, that hang into an upper corner of the picture."""
+    """Return the foliage of a branch close to the camera that hangs into an upper corner of the image."""
     viewer = pose.position_m[:2]
     column = rng.choice([0.12, 0.88]) * size[0]
     corners, pivots = [], []
@@ -151,9 +159,9 @@ def near_branch(
 
 @dataclass(frozen=True)
 class Flag:
-    """A cloth on a pole: strips that waves run along, away from the pole."""
+    """A flag on a pole: vertical strips with waves that travel away from the pole."""
 
-    place: np.ndarray
+    position: np.ndarray
     heading: float
     top_m: float
     phase: float
@@ -161,42 +169,45 @@ class Flag:
     pole: Texture
 
     def at(self, time_s: float, viewer: np.ndarray) -> Faces:
-        """Return its faces at a time, strips turned so that the viewer (2,) sees their front."""
+        """Return the faces at a time, with the strips turned to show the viewer (2,) their front."""
         width, height = _FLAG_SIZE_M
         step = width / _STRIP_COUNT
-        foot = self.place.copy()
-        corners = [billboard(self.place, viewer, 0.09, 0.0, self.top_m + 0.1)]
+        foot = self.position.copy()
+        corners = [billboard(self.position, viewer, 0.09, 0.0, self.top_m + 0.1)]
         for i in range(_STRIP_COUNT):
             along = (i + 0.5) * step
             wave = (
                 2 * np.pi * (along - _FLAG_WAVE_MPS * wind_strength(time_s) * time_s) / _FLAG_WAVELENGTH_M + self.phase
             )
             heading = self.heading + 0.7 * min(1.0, along) * math.cos(wave)
-            way = step * np.array([math.cos(heading), math.sin(heading)])
-            facing = way[0] * (foot - viewer)[1] - way[1] * (foot - viewer)[0] > 0
-            origin, edge = (foot, way) if facing else (foot + way, -way)
+            direction = step * np.array([math.cos(heading), math.sin(heading)])
+            facing = direction[0] * (foot - viewer)[1] - direction[1] * (foot - viewer)[0] > 0
+            origin, edge = (foot, direction) if facing else (foot + direction, -direction)
             corners.append([(*origin, self.top_m), (*edge, 0.0), (0.0, 0.0, -height)])
-            foot = foot + way
+            foot = foot + direction
         return Faces(np.array(corners, float), (self.pole, *self.strips))
 
 
-def flag(place: np.ndarray, viewer: np.ndarray, palette: Palette, rng: np.random.Generator) -> Flag:
-    """Return a flag at a place (2,) that blows across the line of sight."""
-    away = place - viewer
+def make_flag(position: np.ndarray, viewer: np.ndarray, palette: Palette, rng: np.random.Generator) -> Flag:
+    """Return a flag at a position (2,) that blows across the line of sight."""
+    away = position - viewer
     heading = math.atan2(away[1], away[0]) + rng.choice([-1, 1]) * rng.uniform(0.9, 1.6)
     rows, columns = 64, 10
     strips = []
-    stripes = [tuple(int(c) for c in rng.integers(20, 235, 3)) for _ in range(3)]
+    stripes: list[Colour] = []
+    for _ in range(3):
+        blue, green, red = rng.integers(20, 235, 3).tolist()
+        stripes.append((blue, green, red))
     emblem = rng.integers(0, _STRIP_COUNT)
     for i in range(_STRIP_COUNT):
-        picture = paint.filled_image(rows, columns, stripes[0])
+        image = paint.filled_image(rows, columns, stripes[0])
         for band, colour in enumerate(stripes):
-            picture[band * rows // 3 : (band + 1) * rows // 3, :, :3] = colour
+            image[band * rows // 3 : (band + 1) * rows // 3, :, :3] = colour
         if abs(i - emblem) < 2:
-            picture[20:44, :, :3] = (230, 230, 230) if i % 2 else (30, 30, 30)
-        strips.append(Texture(picture))
+            image[20:44, :, :3] = (230, 230, 230) if i % 2 else (30, 30, 30)
+        strips.append(Texture(image))
     return Flag(
-        place,
+        position,
         heading,
         rng.uniform(4.0, 6.0),
         rng.uniform(0, 2 * np.pi),
@@ -207,20 +218,21 @@ def flag(place: np.ndarray, viewer: np.ndarray, palette: Palette, rng: np.random
 
 @dataclass(frozen=True)
 class LedSign:
-    """A message sign whose rows of LEDs light in turn: seen at the camera's rate, dark bands creep over it."""
+    """A row-scanned LED sign: sampled at the frame rate, dark bands drift over it."""
 
     corners: np.ndarray
     textures: tuple[Texture, ...]
+    """One for each step of the beat period."""
     phase: float
 
     def at(self, time_s: float) -> Faces:
-        """Return its faces at a time."""
+        """Return the faces at a time."""
         step = int((time_s * _SIGN_BEAT_HZ + self.phase) % 1.0 * _SIGN_STEPS)
         return Faces(self.corners, (self.textures[step],))
 
 
-def sign(place: np.ndarray, viewer: np.ndarray, rng: np.random.Generator) -> LedSign:
-    """Return a sign at a place (2,), turned to the viewer (2,)."""
+def make_sign(position: np.ndarray, viewer: np.ndarray, rng: np.random.Generator) -> LedSign:
+    """Return a sign at a position (2,) that faces the viewer (2,)."""
     rows, columns = 48, 64
     text = np.zeros((rows, columns, 4), np.uint8)
     paint.draw_text(text, f'{rng.integers(3, 9)}0', (6.0, 6.0, columns - 6.0, rows - 6.0), (60, 190, 255))
@@ -228,17 +240,17 @@ def sign(place: np.ndarray, viewer: np.ndarray, rng: np.random.Generator) -> Led
     lit, textures = text[..., :3].max(-1) > 60, []
     for step in range(_SIGN_STEPS):
         band = 0.5 + 0.5 * np.cos(2 * np.pi * (np.arange(rows)[:, None] / rows * 1.5 - step / _SIGN_STEPS))
-        picture = board.copy()
+        image = board.copy()
         light = (0.15 + 0.85 * band)[..., None] * np.array((60, 190, 255))
-        picture[..., :3] = np.where(lit[..., None], light, picture[..., :3]).astype(np.uint8)
-        textures.append(Texture(picture))
+        image[..., :3] = np.where(lit[..., None], light, image[..., :3]).astype(np.uint8)
+        textures.append(Texture(image))
     low = rng.uniform(2.5, 4.0)
-    corners = np.array([billboard(place, viewer, _SIGN_SIZE_M[0], low, low + _SIGN_SIZE_M[1])], float)
+    corners = np.array([billboard(position, viewer, _SIGN_SIZE_M[0], low, low + _SIGN_SIZE_M[1])], float)
     return LedSign(corners, tuple(textures), float(rng.uniform()))
 
 
 class MovingScenery:
-    """All that sways and blinks beside the road of one recording."""
+    """All moving objects beside the road of one recording."""
 
     def __init__(
         self,
@@ -253,18 +265,20 @@ class MovingScenery:
         rng = np.random.default_rng([seed, 10])
         self._viewer = viewer = pose.position_m[:2]
 
-        def places(name: str, beyond_m: float, count: int) -> list[np.ndarray]:
+        def positions(name: str, beyond_m: float, count: int) -> list[np.ndarray]:
             drawn = roadside_positions(network, pose, lens, size, beyond_m, rng, count)
             return drawn if name in troubles else []
 
-        self._trees = [tree(place, viewer, palette, rng) for place in places('trees', PAVEMENT_WIDTH_M, TREE_COUNT)]
+        self._trees = [
+            make_tree(position, viewer, palette, rng) for position in positions('trees', PAVEMENT_WIDTH_M, TREE_COUNT)
+        ]
         if 'trees' in troubles:
             self._trees.append(near_branch(pose, lens, size, palette, rng))
-        self._flags = [flag(place, viewer, palette, rng) for place in places('flags', 1.0, FLAG_COUNT)]
-        self._signs = [sign(place, viewer, rng) for place in places('leds', 0.5, SIGN_COUNT)]
+        self._flags = [make_flag(position, viewer, palette, rng) for position in positions('flags', 1.0, FLAG_COUNT)]
+        self._signs = [make_sign(position, viewer, rng) for position in positions('leds', 0.5, SIGN_COUNT)]
 
     def at(self, time_s: float) -> list[Faces]:
-        """Return the faces of each of them at a time."""
+        """Return the faces of each object at a time."""
         return [
             *(tree.at(time_s) for tree in self._trees),
             *(flag.at(time_s, self._viewer) for flag in self._flags),
