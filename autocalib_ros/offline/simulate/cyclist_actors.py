@@ -21,7 +21,7 @@ _FROM_KERB_M = 0.6
 _BICYCLE_LENGTH_M, _BICYCLE_HEIGHT_M = 1.75, 1.0
 _WHEEL_RADIUS_M = 0.34
 _TEXELS_PER_M = 60
-_SIZES = FigureSizes(leg=(44, 10), trunk=(36, 26), arm=(32, 7), head=(17, 13))
+_RIDER_SIZES = FigureSizes(leg=(44, 10), trunk=(36, 26), arm=(32, 7), head=(17, 13))
 
 
 class CyclistState(NamedTuple):
@@ -108,7 +108,7 @@ def cyclist_faces(cyclist: Cyclist, state: CyclistState, viewer_xy: np.ndarray, 
 @lru_cache(maxsize=32)
 def _textures(clothes: int, thermal: bool) -> tuple[Texture, ...]:
     palette = palette_for(thermal)
-    images = figure_images(clothes, _SIZES, palette, np.random.default_rng([clothes, 6]))
+    images = figure_images(clothes, _RIDER_SIZES, palette, np.random.default_rng([clothes, 6]))
     bicycle = Texture(_bicycle(palette.tyre, palette.bodies[clothes % len(palette.bodies)]))
     return bicycle, bicycle, *(Texture(image) for image in images)
 

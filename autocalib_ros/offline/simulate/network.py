@@ -31,7 +31,7 @@ _MAX_AXIS_DISTANCE_M = 60.0
 class Circulation:
     """Part of a route on the ring of a roundabout.
 
-    joins_s, leaves_s: arc lengths along the route; joins_m: position on the ring where the route enters.
+    entry_s, exit_s: arc lengths along the route; entry_m: position on the ring where the route enters.
     """
 
     entry_s: float

@@ -163,7 +163,7 @@ def join_lines(first: PathSegment, last: PathSegment, radius: float) -> Path:
 
 
 def lane_change(lane: PathSegment, begin_s: float, length: float, lateral_m: float) -> Path:
-    """Return a lane change that starts at begin_s and moves aside_m to the left over a length."""
+    """Return a lane change that starts at begin_s and moves lateral_m to the left over a length."""
     lead = PathSegment(lane.x, lane.y, lane.heading, begin_s)
     curvature = 8 * lateral_m / length**2
     for _ in range(OFFSET_ITERATIONS):

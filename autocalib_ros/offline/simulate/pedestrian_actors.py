@@ -18,7 +18,7 @@ from autocalib_ros.offline.simulate.palette import palette_for
 
 _WALK_RANGE_M = 45.0
 _STRIDE_M = 1.4
-_SIZES = FigureSizes(leg=(40, 10), trunk=(36, 24), arm=(32, 8), head=(14, 12))
+_PEDESTRIAN_SIZES = FigureSizes(leg=(40, 10), trunk=(36, 24), arm=(32, 8), head=(14, 12))
 
 
 class PedestrianState(NamedTuple):
@@ -108,8 +108,8 @@ def pedestrian_faces(pedestrian: Pedestrian, state: PedestrianState, viewer_xy: 
 
 @lru_cache(maxsize=64)
 def _textures(clothes: int, thermal: bool) -> tuple[Texture, ...]:
-    images = figure_images(clothes, _SIZES, palette_for(thermal), np.random.default_rng([clothes, 5]))
-    alpha = np.zeros(_SIZES.head, np.uint8)
+    images = figure_images(clothes, _PEDESTRIAN_SIZES, palette_for(thermal), np.random.default_rng([clothes, 5]))
+    alpha = np.zeros(_PEDESTRIAN_SIZES.head, np.uint8)
     paint.disc(alpha, (6.0, 7.0), 6.0, (255,))
     images[-1][..., 3] = alpha
     return tuple(Texture(image) for image in images)

@@ -1,4 +1,4 @@
-"""Image effects that are not traffic: shadows, water, wet road, rain and drops on the lens, recorder clock."""
+"""Image effects that are not traffic: shadows, water, wet road, lit signals; rain, drops and clock by lens_effects."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from autocalib_ros.offline.simulate.faces import NO_MAP
 from autocalib_ros.offline.simulate.ground_surface import edge_distance
 from autocalib_ros.offline.simulate.lamps import vehicle_lamps
 from autocalib_ros.offline.simulate.lens import CameraPose, KannalaBrandtLens
+from autocalib_ros.offline.simulate.lens_effects import apply_drops, apply_rain, burn_in_clock, spawn_drops
 from autocalib_ros.offline.simulate.network import Network
 from autocalib_ros.offline.simulate.options import SimulationOptions
 from autocalib_ros.offline.simulate.paint import octave_noise
@@ -32,14 +33,10 @@ _PUDDLE_SIZE_M = 1.5
 """Size of the puddles and dry patches of a wet road."""
 _REFLECTION_DEPTHS_M = (0.25, 0.45, 0.7, 1.0, 1.5)
 """Depths below the road at which a rough wet surface reflects a lamp 0.7 m above it."""
-_DROP_COUNT = 9
-_RAIN_STREAK_COUNT = 350
-_RAIN_FALL_MPS, _EXPOSURE_S = 7.0, 1 / 60
 _SIGNAL_LAMP_SIZE_M = 0.12
 _SIGNAL_HEAD_HEIGHT_M = 3.6
 _MIN_SIGNAL_DISTANCE_M = 9.0
 """Minimum distance of a signal from the camera."""
-_CLOCK_FONT = cv2.FONT_HERSHEY_DUPLEX
 
 
 @dataclass(frozen=True)
@@ -102,7 +99,7 @@ class Weather:
         self._puddles = np.clip(0.55 + octave_noise(size, size, ((2.0, 0.25), (6.0, 0.3)), rng), 0, 1)
         self._waves = _deep_water_waves(wind, rng)
         self._pond = self._pond_mask(rng) if 'water' in self._troubles else None
-        self._drops = _drops_of(options, rng)
+        self._drops = spawn_drops(options.width_px, options.height_px, rng)
 
     def apply_ground_effects(self, context: FrameContext, bumped: bool) -> None:
         """Apply the effects of daylight on the ground: shadows, water."""
@@ -122,11 +119,12 @@ class Weather:
         """Return the image with rain, drops on the lens and the clock of the recorder."""
         image = context.image
         if 'rain' in self._troubles:
-            image = self._rain(image, context.index)
+            rng = np.random.default_rng([self._options.seed, 12, context.index])
+            image = apply_rain(image, self._lens.focal_px, rng)
         if 'drops' in self._troubles:
-            image = _apply_drops(image, self._drops, context.time_s)
+            image = apply_drops(image, self._drops, context.time_s)
         if 'clock' in self._troubles:
-            _burn_in_clock(image, context.time_s)
+            burn_in_clock(image, context.time_s)
         return image
 
     def _darken_shadows(self, context: FrameContext, bumped: bool) -> None:
@@ -247,23 +245,6 @@ class Weather:
                     _scaled(colour, float(beat)),
                 )
 
-    def _rain(self, image: np.ndarray, index: int) -> np.ndarray:
-        """Draw motion-blurred streaks of near drops under a haze of distant ones."""
-        rng = np.random.default_rng([self._options.seed, 12, index])
-        height, width = image.shape[:2]
-        distance = 1.0 + 12.0 * rng.uniform(size=_RAIN_STREAK_COUNT) ** 0.5
-        length = _RAIN_FALL_MPS * _EXPOSURE_S * self._lens.focal_px / distance
-        start = rng.uniform((0, 0), (width, height), (_RAIN_STREAK_COUNT, 2))
-        lean = 0.12 + rng.normal(0, 0.03, _RAIN_STREAK_COUNT)
-        streaks = np.zeros((height, width), np.uint8)
-        for (x, y), reach, slant, metres in zip(start, length, lean, distance, strict=True):
-            first = round(16 * x), round(16 * y)
-            last = round(16 * (x + slant * reach)), round(16 * (y + reach))
-            cv2.line(streaks, first, last, int(np.clip(110 / metres + 12, 0, 90)), 1, cv2.LINE_AA, 4)
-        blurred = cv2.GaussianBlur(streaks, (0, 0), 0.8)
-        hazy = cv2.addWeighted(image, 0.85, np.full_like(image, 150), 0.08, 0)
-        return cv2.add(hazy, cv2.cvtColor(blurred, cv2.COLOR_GRAY2BGR))
-
 
 def box_corners(vehicle: Vehicle, state: VehicleState) -> np.ndarray:
     """Return the corners (8, 3) of a vehicle's bounding box, the four on the ground first."""
@@ -291,78 +272,3 @@ def _deep_water_waves(wind: float, rng: np.random.Generator) -> tuple[np.ndarray
         np.sqrt(_GRAVITY_MPS2 * number),
         rng.uniform(0, 2 * np.pi, _WAVE_COUNT),
     )
-
-
-@dataclass(frozen=True)
-class WaterDrop:
-    """A defocused drop on the front glass: it appears, rests, runs down, and reappears."""
-
-    x_px: float
-    y_px: float
-    radius_px: float
-    appears_s: float
-    rest_s: float
-    run_px_per_s: float
-    period_s: float
-
-    def position(self, time_s: float, height_px: int) -> tuple[float, float] | None:
-        """Return the position at a time, or None while absent."""
-        age = (time_s - self.appears_s) % self.period_s
-        running = max(0.0, age - self.rest_s)
-        # It creeps, then runs faster, sticking to the glass intermittently.
-        travelled = self.run_px_per_s * (running + 0.25 * math.sin(4 * running)) * min(1.0, running)
-        y = self.y_px + travelled
-        if y > height_px + self.radius_px:
-            return None
-        return self.x_px + 6 * math.sin(0.02 * travelled), y
-
-
-def _drops_of(options: SimulationOptions, rng: np.random.Generator) -> list[WaterDrop]:
-    width, height = options.width_px, options.height_px
-    return [
-        WaterDrop(
-            float(rng.uniform(0, width)),
-            float(rng.uniform(0, 0.8 * height)),
-            float(rng.uniform(0.012, 0.035) * width),
-            float(rng.uniform(0, 30)),
-            float(rng.uniform(3, 20)),
-            float(rng.uniform(0.1, 0.5) * height),
-            float(rng.uniform(25, 40)),
-        )
-        for _ in range(_DROP_COUNT)
-    ]
-
-
-def _apply_drops(image: np.ndarray, drops: list[WaterDrop], time_s: float) -> np.ndarray:
-    """Blend in each drop: an inverted, blurred image of its surroundings."""
-    height, width = image.shape[:2]
-    small = cv2.resize(image, (width // 8, height // 8), interpolation=cv2.INTER_AREA)
-    blurred = cv2.GaussianBlur(small, (0, 0), 3.0)
-    for drop in drops:
-        position = drop.position(time_s, height)
-        if position is None:
-            continue
-        x, y = position
-        reach = 1.6 * drop.radius_px
-        x0, x1 = (int(np.clip(c, 0, width)) for c in (x - reach, x + reach))
-        y0, y1 = (int(np.clip(c, 0, height)) for c in (y - reach, y + reach))
-        if x1 <= x0 or y1 <= y0:
-            continue
-        dx, dy = np.meshgrid(np.arange(x0, x1) - x, np.arange(y0, y1) - y)
-        radius = np.hypot(dx, dy) / drop.radius_px
-        alpha = 0.85 / (1 + np.exp((radius - 1) * 9))
-        source = np.stack([(x - 4 * dx) / 8, (y - 4 * dy) / 8], -1).astype(np.float32)
-        shown = cv2.remap(blurred, source, NO_MAP, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
-        patch = image[y0:y1, x0:x1]
-        patch[:] = (patch + alpha[..., None] * (shown.astype(float) - patch)).astype(np.uint8)
-    return image
-
-
-def _burn_in_clock(image: np.ndarray, time_s: float) -> None:
-    """Burn date and time into the image, in place."""
-    text = f'2024-05-17 08:{int(time_s) // 60:02d}:{int(time_s) % 60:02d}:{int(time_s * 100) % 100:02d}'
-    scale = image.shape[1] / 1280
-    (width, height), base = cv2.getTextSize(text, _CLOCK_FONT, scale, 2)
-    x, y = round(20 * scale), round(20 * scale) + height
-    cv2.rectangle(image, (x - 4, y - height - 6), (x + width + 4, y + base), (0, 0, 0), -1)
-    cv2.putText(image, text, (x, y), _CLOCK_FONT, scale, (255, 255, 255), max(1, round(2 * scale)), cv2.LINE_AA)
