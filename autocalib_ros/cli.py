@@ -1,4 +1,4 @@
-"""The `autocalib` command: which sub-commands there are, and the one place where errors are caught."""
+"""The `autocalib` command line: sub-commands, logging and error handling."""
 
 from __future__ import annotations
 
@@ -40,7 +40,10 @@ COMMANDS = {
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command; return 0 calibrated or done, 3 refused, 2 wrong usage or unreadable input, 130 interrupted."""
+    """Run a sub-command and return the exit status.
+
+    0 calibrated or done, 3 refused, 2 wrong usage or unreadable input, 130 interrupted.
+    """
     limit_blas_threads()
     _silence_libraries()
     _replace_unencodable_characters()
@@ -59,14 +62,14 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _silence_libraries() -> None:
-    """Keep FFmpeg and OpenCV from writing to stderr on their own: what matters is said in one line."""
+    """Suppress the log output of FFmpeg, OpenCV and matplotlib: errors are reported once, in one line."""
     os.environ.setdefault('OPENCV_FFMPEG_LOGLEVEL', '-8')
     os.environ.setdefault('OPENCV_LOG_LEVEL', 'OFF')
     logging.getLogger('matplotlib').setLevel(logging.ERROR)
 
 
 def _replace_unencodable_characters() -> None:
-    """Print a replacement for what a terminal cannot show, such as the plus-minus sign, instead of failing."""
+    """Make stdout and stderr replace characters that their encoding lacks, such as the plus-minus sign."""
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, 'reconfigure'):
             stream.reconfigure(errors='replace')
@@ -86,7 +89,7 @@ def _warnings_on_stderr() -> Iterator[None]:
 
 
 class _Parser(argparse.ArgumentParser):
-    """argparse that answers wrong usage in one line, through the one place where errors are caught."""
+    """Argument parser that raises `UsageError`, so that `main` reports wrong usage in one line."""
 
     def error(self, message: str) -> NoReturn:
         """Raise UsageError."""
@@ -94,13 +97,13 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _parse_arguments(argv: list[str]) -> argparse.Namespace:
-    parser = _Parser(prog='autocalib', description='Calibrate a fixed roadside camera from the traffic that it sees.')
+    parser = _Parser(prog='autocalib', description='Calibrate a fixed roadside camera from traffic.')
     parser.add_argument('--version', action='version', version=f'autocalib {__version__}')
     commands = parser.add_subparsers(title='commands', metavar='COMMAND', required=True, parser_class=_Parser)
     for name, command in COMMANDS.items():
         own = commands.add_parser(name, help=command.HELP, description=command.DESCRIPTION)
         own.set_defaults(run=command.run)
-        if name in argv:  # the options of others are not asked for, and the simulator's take a while to import
+        if name in argv:  # only the command in use: the options of `simulate` are slow to import
             command.add_arguments(own)
     return parser.parse_args(argv)
 

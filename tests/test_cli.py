@@ -1,4 +1,4 @@
-"""The command as a person meets it: messages and exit statuses."""
+"""The `autocalib` command: messages and exit statuses."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def test_help_imports_nothing_heavy(tmp_path):
         (['evidence', 'x', '-p', 'scale_from=distance'], "needs 'scale.distance_px'"),
         (['demo', '--scale-from', 'guess'], "invalid choice: 'guess'"),
         (['replay', 'x', '-p', 'camera_hight=3'], "did you mean 'camera_height'?"),
-        (['replay', 'x', '-p', 'camera_height'], 'is not of the form name=value'),
+        (['replay', 'x', '-p', 'camera_height'], 'does not have the form name=value'),
         (['replay', 'x', '-p', 'tracking.max_points=many'], "'max_points' takes a int, got 'many'"),
         (['replay', 'x', '--params-file', 'nowhere.yaml'], 'cannot read nowhere.yaml'),
         (['replay', 'nowhere.mp4'], 'nowhere.mp4 does not exist'),
@@ -141,7 +141,7 @@ def test_a_truncated_video_is_one_line_from_the_libraries_too(tmp_path):
 
 
 def test_nothing_that_moves_is_refused_with_the_reason(still_video, tmp_path):
-    # a terminal that knows no more than ASCII is no reason to fail
+    # output that the terminal cannot encode must not raise
     done = autocalib(
         'replay', still_video, '--camera-height', 8, '--out', 'out', folder=tmp_path, PYTHONIOENCODING='ascii'
     )
@@ -176,12 +176,12 @@ def test_pixels_outside_the_image_are_noticed_at_the_first_image(still_video, tm
 
 
 @pytest.mark.parametrize('scale', [['--scale-distance', '10', '80', '150', '80', '12.5'], ['--scale-speed', '50']])
-def test_no_height_is_missed_where_something_else_tells_the_scale(scale, still_video, tmp_path, capsys):
+def test_no_height_warning_with_another_metric_scale(scale, still_video, tmp_path, capsys):
     assert main(['replay', str(still_video), '--out', str(tmp_path / 'out'), *scale]) == 3
     assert 'height' not in capsys.readouterr().err
 
 
-def test_no_height_is_said_in_one_line(still_video, tmp_path, capsys):
+def test_a_missing_height_is_reported_in_one_line(still_video, tmp_path, capsys):
     assert main(['replay', str(still_video), '--out', str(tmp_path / 'out')]) == 3
     lines = capsys.readouterr().err.splitlines()
     assert sum('No camera height given' in line for line in lines) == 1
@@ -247,8 +247,8 @@ def test_json_is_calibration_json_and_the_rest_goes_to_stderr(still_video, tmp_p
 
 def test_colours_are_for_terminals(still_video, tmp_path, capsys, monkeypatch):
     command = ['replay', str(still_video), '--quiet', '--out', str(tmp_path / 'out')]
-    for force, told in (('', 'Not calibrated: '), ('1', '\033[31mNot calibrated: ')):
+    for force, start in (('', 'Not calibrated: '), ('1', '\033[31mNot calibrated: ')):
         monkeypatch.setenv('FORCE_COLOR', force)
         monkeypatch.setenv('NO_COLOR', '')
         assert main(command) == 3
-        assert capsys.readouterr().err.startswith(told)
+        assert capsys.readouterr().err.startswith(start)

@@ -1,9 +1,9 @@
-"""The sub-commands of `autocalib`, a module each: HELP, DESCRIPTION, add_arguments(parser), run(arguments) -> status.
+"""Sub-commands of `autocalib`: each module has HELP, DESCRIPTION, add_arguments(parser) and run(arguments) -> status.
 
-Everything heavy (OpenCV, SciPy, rosbags, matplotlib) is imported where it is used, so that --help is quick.
+Heavy modules (OpenCV, SciPy, rosbags, matplotlib) are imported inside the functions that use them: --help is fast.
 """
 
 DONE, WRONG_USE, REFUSED, INTERRUPTED = 0, 2, 3, 130
-"""Exit statuses: calibrated, or else what was asked for; wrong usage or unreadable input; refused; stopped by hand."""
+"""Exit statuses: success; wrong usage or unreadable input; refused; interrupted by the user (128 + SIGINT)."""
 MOVED = 3
-"""Exit status where golden evidence gives other values than are expected of it."""
+"""Exit status of `benchmark golden` if a result differs from the expected one."""

@@ -7,34 +7,34 @@ from pathlib import Path
 
 from autocalib_ros.commands import DONE, MOVED
 
-HELP = 'measure what the program costs on this machine'
+HELP = 'measure accuracy and cost, or check results on stored evidence'
 DESCRIPTION = None
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add a parser for each benchmark."""
     what = parser.add_subparsers(title='benchmarks', metavar='WHAT', dest='what', required=True)
-    cost = what.add_parser('cost', help='processor time of a frame and of a solution, and memory')
-    cost.add_argument('source', metavar='SOURCE', type=Path, help='recording to measure on')
-    cost.add_argument('--duration', type=float, metavar='S', help='seconds of it to use')
-    accuracy = what.add_parser('accuracy', help='errors against the truth of made-up traffic, by Monte Carlo')
+    runtime = what.add_parser('cost', help='processor time per frame and per solution, and memory')
+    runtime.add_argument('source', metavar='SOURCE', type=Path, help='recording to replay')
+    runtime.add_argument('--duration', type=float, metavar='S', help='seconds of the recording to use')
+    accuracy = what.add_parser('accuracy', help='errors against ground truth on synthetic traffic, by Monte Carlo')
     accuracy.add_argument('--runs', type=int, default=20, metavar='N', help='draws per family (default: %(default)s)')
-    accuracy.add_argument('--family', nargs='+', default=[], metavar='NAME', help='kinds of evidence (default: all)')
+    accuracy.add_argument('--family', nargs='+', default=[], metavar='NAME', help='evidence families (default: all)')
     accuracy.add_argument(
         '--method',
         nargs='+',
         choices=('joint', 'paper'),
         default=['joint', 'paper'],
-        help='robust method, the published one, or both (default)',
+        help='robust method, published method, or both (default)',
     )
-    accuracy.add_argument('--jobs', type=int, default=1, metavar='J', help='processes (default: %(default)s)')
+    accuracy.add_argument('--jobs', type=int, default=1, metavar='J', help='number of processes (default: %(default)s)')
     accuracy.add_argument('--seed', type=int, default=0, metavar='S', help='seed of the draws (default: %(default)s)')
-    accuracy.add_argument('--out', type=Path, metavar='FILE', help='CSV to write, one row a run')
+    accuracy.add_argument('--out', type=Path, metavar='FILE', help='CSV file to write, one row per run')
     golden = what.add_parser(
         'golden',
-        help='whether saved evidence still gives the verdicts and numbers that are expected of it',
-        description='Solve saved evidence and print what moved. Exit status 0 when nothing did, 3 when something did, '
-        'also where --update took it for expected.',
+        help='compare results on stored evidence with the expected ones',
+        description='Solve stored evidence and list every value that moved. Exit status: 0 if nothing moved, 3 '
+        'otherwise, also with --update.',
     )
     golden.add_argument(
         'folder',
@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs='?',
         type=Path,
         default=Path('tests/golden'),
-        help='evidence and expected.json (default: %(default)s)',
+        help='folder with the evidence and expected.json (default: %(default)s)',
     )
     golden.add_argument('--only', nargs='+', default=[], metavar='NAME', help='cases to solve (default: all)')
     golden.add_argument(
@@ -50,33 +50,33 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=float,
         default=0.1,
         metavar='T',
-        help='a number has moved when it differs by more than this part of its stated standard '
-        'deviation (default: %(default)s)',
+        help='largest change of a number that counts as equal, in units of its stated standard deviation '
+        '(default: %(default)s)',
     )
-    golden.add_argument('--exact', action='store_true', help='instead: when it differs in its last digit')
+    golden.add_argument('--exact', action='store_true', help='compare numbers to the last digit instead')
     golden.add_argument(
-        '--update', action='store_true', help='of cases in which something moved, expect what was found from now on'
+        '--update', action='store_true', help='store the new values of the cases that moved as the expected ones'
     )
-    golden.add_argument('--jobs', type=int, default=1, metavar='J', help='processes (default: %(default)s)')
+    golden.add_argument('--jobs', type=int, default=1, metavar='J', help='number of processes (default: %(default)s)')
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Measure and print."""
+    """Run a benchmark and print its report; return the exit status."""
     if arguments.what == 'cost':
-        from autocalib_ros.offline.benchmark.runtime import cost
+        from autocalib_ros.offline.benchmark.runtime import measure_cost
 
-        print(cost(arguments.source, arguments.duration))
+        print(measure_cost(arguments.source, arguments.duration))
         return DONE
     if arguments.what == 'golden':
         from autocalib_ros.offline.benchmark import golden
 
-        measured = golden.measure(
+        golden_run = golden.run_cases(
             arguments.folder, arguments.only, tolerance=arguments.tolerance, exact=arguments.exact, jobs=arguments.jobs
         )
-        print('\n'.join(golden.lines(measured)))
+        print('\n'.join(golden.format_report(golden_run)))
         if arguments.update:
-            golden.update(arguments.folder, measured)
-        return MOVED if measured.moved else DONE
+            golden.update(arguments.folder, golden_run)
+        return MOVED if golden_run.moved else DONE
     from autocalib_ros.offline.benchmark.monte_carlo import run_monte_carlo
     from autocalib_ros.offline.benchmark.table import format_tables
 

@@ -7,26 +7,28 @@ from pathlib import Path
 
 from autocalib_ros.commands import DONE, REFUSED
 
-HELP = 'say how two calibrations of one camera differ'
+HELP = 'compare two calibrations of one camera'
 DESCRIPTION = (
-    'Say how two calibrations of one camera differ: is that of last month still right? Exit status: 0 they '
-    'agree within 3 combined standard deviations, 3 they differ, or nothing tells, 2 wrong input.'
+    'Compare two calibrations of one camera, for example to check whether an old one is still valid. Exit status: '
+    '0 if they agree within 3 combined standard deviations, 3 if they differ or their uncertainty is unknown, 2 on '
+    'wrong input.'
 )
 CALIBRATION_FILES = (
-    'calibration.json, NAME.autocalib.json of the node, or a camera_info.yaml, of a checkerboard for example'
+    'calibration.json, NAME.autocalib.json of the node, or a camera_info.yaml, for example of a checkerboard '
+    'calibration'
 )
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the two files and the truth."""
+    """Add the two calibration files, the ground truth and the output format."""
     parser.add_argument('first', metavar='A', type=Path, help=CALIBRATION_FILES)
     parser.add_argument('second', metavar='B', type=Path, help='the same')
-    parser.add_argument('--truth', metavar='T', type=Path, help='truth.json of a simulation, to compare both with')
-    parser.add_argument('--json', action='store_true', help='print a document instead of the table')
+    parser.add_argument('--truth', metavar='T', type=Path, help='truth.json of a simulation; compares both with it too')
+    parser.add_argument('--json', action='store_true', help='print a JSON document instead of the table')
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Compare; return the exit status."""
+    """Compare two calibrations and print the result; return the exit status."""
     import json
     import sys
 

@@ -1,4 +1,4 @@
-"""A comparison as lines for a terminal and as a document for programs."""
+"""Format a comparison of calibrations as a terminal table and as a JSON document."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from autocalib_ros.offline.terminal.style import align_columns
 
 DIGITS = {'px': 2, 'deg': 2, 'm': 3, '': 5}
 SIGNED = ('focal length', 'tilt', 'roll', 'height')
-"""Errors against the truth that have a sign."""
+"""Errors against the ground truth that are signed."""
 
 
 def comparison_lines(result: Comparison) -> list[str]:
-    """Return the differences as a table, in the order lens, pose, road, and what was not compared."""
-    rows = [('', 'A', 'B', 'B - A', 'sigmas')]
+    """Return the differences as table lines: lens, pose, road, and notes on quantities that were not compared."""
+    rows: list[tuple[str, ...]] = [('', 'A', 'B', 'B - A', 'sigmas')]
     rows += [_row(item) for item in (*result.lens, *result.pose)]
     if result.normal_deg is not None:
         rows.append(('ground normal', '', '', f'{result.normal_deg:.2f} deg apart', ''))
-    for name, rays in (('rays, lens alone', result.rays), ('rays, best turned', result.rays_aligned)):
+    for name, rays in (('rays, lens alone', result.rays), ('rays, aligned', result.rays_aligned)):
         rows.append(
             (name, '', '', f'up to {rays.largest_deg:.2f} deg, mean {rays.mean_deg:.2f}', _format_sigmas(rays.sigmas))
         )
@@ -28,12 +28,12 @@ def comparison_lines(result: Comparison) -> list[str]:
         (f'road {item.distance_m:g} m ahead', '', '', f'{item.separation_m:.2f} m apart', _format_sigmas(item.sigmas))
         for item in result.road
     ]
-    turned = (
-        f'rays, best turned: after a rotation of B by {result.alignment_deg:.2f} degrees, which lenses trade against'
-        ' the principal point'
+    alignment = (
+        f'rays, aligned: B is rotated by {result.alignment_deg:.2f} degrees for the best fit, because rotation and'
+        ' principal point compensate each other'
     )
-    road = ['road: where one pixel meets it; the foot of the camera is one point, and headings are turned to fit']
-    return [*align_columns(rows), turned, *(road if result.road else []), *result.notes]
+    road = ['road: where one pixel meets the road plane; both planes share the point below the camera and the heading']
+    return [*align_columns(rows), alignment, *(road if result.road else []), *result.notes]
 
 
 def _row(item: Difference) -> tuple[str, ...]:
@@ -55,7 +55,7 @@ def _format_sigmas(sigmas: float | None) -> str:
 
 
 def comparison_document(result: Comparison) -> dict[str, Any]:
-    """Return everything, with the verdict, as a document for JSON; what is infinite or not known is null."""
+    """Return the comparison and its verdict as a JSON document; infinite and unknown values are null."""
 
     def with_sigmas(item: Any) -> dict[str, Any]:
         more = {'difference': item.difference} if isinstance(item, Difference) else {}
@@ -87,8 +87,8 @@ def _finite(value: Any) -> Any:
 
 
 def truth_lines(errors: list[dict[str, float | None]]) -> list[str]:
-    """Return the errors of A and B side by side."""
-    rows = [('against the truth', 'A', 'B')]
+    """Return the errors of A and B against the ground truth as table lines."""
+    rows: list[tuple[str, ...]] = [('against the truth', 'A', 'B')]
     rows += [
         (
             name,

@@ -10,12 +10,12 @@ from autocalib_ros.commands import DONE, REFUSED
 from autocalib_ros.commands.output import print_stderr, replay_and_report
 from autocalib_ros.commands.replay_command import DEFAULT_OUT
 
-HELP = 'simulate traffic, calibrate from it, compare with the truth'
+HELP = 'simulate traffic, calibrate from it and compare with the ground truth'
 DESCRIPTION = None
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add what can be chosen."""
+    """Add the output folder, the seed and the source of the metric scale."""
     parser.add_argument(
         '--out', type=Path, default=DEFAULT_OUT, metavar='DIR', help='folder for the results (default: %(default)s)'
     )
@@ -24,13 +24,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--scale-from',
         choices=('height', 'distance', 'speed'),
         default='height',
-        help='what is given of the truth to tell the scale (default: %(default)s)',
+        help='quantity of the ground truth that fixes the metric scale (default: %(default)s)',
     )
-    parser.add_argument('--keep-bag', action='store_true', help='leave the simulated recording in DIR/recording')
+    parser.add_argument('--keep-bag', action='store_true', help='keep the simulated recording in DIR/recording')
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Simulate, replay and compare; return the exit status."""
+    """Simulate, replay and compare with the ground truth; return the exit status."""
     from autocalib_ros.offline import outputs
     from autocalib_ros.offline.demonstration import compare_with_truth, options_from_truth, simulate_bag
     from autocalib_ros.offline.recordings.open import open_source
@@ -48,5 +48,5 @@ def run(arguments: argparse.Namespace) -> int:
         return REFUSED
     print(comparison.table())
     if not comparison.within_tolerance:
-        print_stderr('The demonstration failed: the result is farther from the truth than promised.')
+        print_stderr('Demo failed: errors exceed the expected tolerance.')
     return DONE if comparison.within_tolerance else REFUSED

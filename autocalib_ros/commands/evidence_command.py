@@ -11,20 +11,20 @@ from autocalib_ros.commands.solve_options import add_solve_options, options_from
 
 HELP = 'solve saved evidence again with other options'
 DESCRIPTION = (
-    'Solve the evidence.npz of a replay again, without its pictures. Options of tracking, motion and buffer '
-    'shape the gathering and change nothing here. Exit status as of replay.'
+    'Solve the evidence.npz of a replay again, without images. tracking.*, motion.* and buffer.* affect evidence '
+    'collection only and are ignored here. Exit status as for replay.'
 )
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the file and what is told to the solution."""
-    parser.add_argument('file', metavar='FILE.npz', type=Path, help='evidence that a replay has saved')
+    """Add the evidence file, the solver options and the output folder."""
+    parser.add_argument('file', metavar='FILE.npz', type=Path, help='evidence saved by replay')
     add_solve_options(parser)
-    parser.add_argument('--out', type=Path, metavar='DIR', help='folder for the results (default: nothing is written)')
+    parser.add_argument('--out', type=Path, metavar='DIR', help='folder for the results (default: write no files)')
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Solve; return the exit status."""
+    """Solve saved evidence; return the exit status."""
     options = options_from_arguments(arguments)
     lens = read_known_lens(arguments, options)
     from autocalib_ros.evidence.snapshot import Evidence

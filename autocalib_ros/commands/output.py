@@ -1,4 +1,4 @@
-"""What a solution says on the terminal: results on stdout, all else on stderr."""
+"""Terminal output of a solution: results on stdout, everything else on stderr."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def replay_and_report(
     quiet: bool = False,
     json: bool = False,
 ) -> ReplayResult:
-    """Replay, write the results and say what came out."""
+    """Replay a recording, write the output files and print the result."""
     from autocalib_ros.offline.outputs import write_outputs
     from autocalib_ros.offline.replay_recording import replay
     from autocalib_ros.offline.terminal.progress import progress_bar
@@ -44,7 +44,7 @@ def replay_and_report(
 
 
 def warn_missing_scale(options: Options, lens: Camera | None) -> None:
-    """Say on stderr what a solution without any scale leaves out."""
+    """Warn on stderr if no metric scale is given: the result has no metric ground plane."""
     if options.scale_from == 'height' and options.camera_height == 0:
         scale = 'is given in units of that height' if options.allow_unit_scale else 'is left out'
         calibrated = 'the lens is calibrated' if lens is None else 'the lens is known'
@@ -55,7 +55,7 @@ def warn_missing_scale(options: Options, lens: Camera | None) -> None:
 
 
 def print_result(replayed: ReplayResult, out: Path | None, names: list[str], *, quiet: bool, json: bool) -> None:
-    """Print a refusal's reason on stderr; the summary on stdout, or instead calibration.json."""
+    """Print a refusal on stderr, and the summary or calibration.json on stdout."""
     from autocalib_ros.offline.terminal.style import coloured, is_terminal, state_colour, terminal_width
     from autocalib_ros.offline.terminal.summary import summary_lines
     from autocalib_ros.report.text import remedy, verdict

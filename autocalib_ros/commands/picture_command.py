@@ -6,20 +6,20 @@ import argparse
 
 from autocalib_ros.commands import view_options as views
 
-HELP = 'show in one picture what a calibration makes of an image: grid on the road, horizon, road from above'
+HELP = 'overlay the ground grid and horizon on an image, next to a top-down view'
 DESCRIPTION = (
-    'One picture that tells what a calibration is: at the left the image with a grid on the road and the '
-    'horizon, at the right the road from above with the same grid.'
+    'Show a calibration in one picture: left, the image with the ground grid and the horizon; right, the top-down '
+    'view with the same grid.'
 )
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the files."""
+    """Add the input and output files."""
     views.add_files(parser, 'calibration.json, or NAME.autocalib.json of the node')
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Write; return the exit status."""
+    """Write the picture; return the exit status."""
     from autocalib_ros.pictures.showcase import showcase
 
     return views.render_to_file(arguments, 'picture', lambda known: lambda image: showcase(known, image))

@@ -13,6 +13,7 @@ import pkgutil
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import fields, is_dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -306,7 +307,7 @@ def constant_page(package: Path) -> str:
 def documented_constants(source: str) -> Iterator[tuple[tuple[str, ...], str, str]]:
     """Yield names, value and description of the module constants with a string literal below them."""
     body = ast.parse(source).body
-    for statement, following in zip(body, body[1:], strict=False):
+    for statement, following in pairwise(body):
         if not isinstance(following, ast.Expr) or not isinstance(following.value, ast.Constant):
             continue
         if not isinstance(following.value.value, str) or not isinstance(statement, (ast.Assign, ast.AnnAssign)):

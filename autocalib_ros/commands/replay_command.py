@@ -13,7 +13,7 @@ from autocalib_ros.config import Options
 
 if TYPE_CHECKING:
     from autocalib_ros.offline.recordings.sources import Source
-    from autocalib_ros.offline.replay_recording import ReplayResult
+    from autocalib_ros.results.calibration import Calibration, Refusal
 
 HELP = 'calibrate from a recording'
 DESCRIPTION = 'Calibrate from a recording. Exit status: 0 calibrated, 3 refused, 2 wrong usage or unreadable input.'
@@ -21,12 +21,12 @@ DEFAULT_OUT = Path('autocalib_out')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the recording and what becomes of it."""
+    """Add the recording, the solver options and the output files."""
     parser.add_argument(
         'source', metavar='SOURCE', type=Path, help='rosbag2 folder, .mcap, .db3, ROS 1 .bag or video file'
     )
     add_solve_options(parser)
-    parser.add_argument('--topic', metavar='T', help='image topic; needed when there are several')
+    parser.add_argument('--topic', metavar='T', help='image topic; required if the recording has several')
     parser.add_argument(
         '--out', type=Path, default=DEFAULT_OUT, metavar='DIR', help='folder for the results (default: %(default)s)'
     )
@@ -36,12 +36,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='BAG',
         help='write a new rosbag2 with the images, CameraInfo and the ground transform',
     )
-    parser.add_argument('--start', type=float, default=0.0, metavar='S', help='seconds to skip at the beginning')
+    parser.add_argument('--start', type=float, default=0.0, metavar='S', help='seconds to skip at the start')
     parser.add_argument('--duration', type=float, metavar='S', help='seconds to use')
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Replay; return the exit status."""
+    """Calibrate from a recording; return the exit status."""
     options = options_from_arguments(arguments)
     lens = read_known_lens(arguments, options)
     from autocalib_ros.offline.recordings.open import open_source
@@ -49,7 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     detector = open_detector(options.detector)
     if detector is not None and not arguments.quiet:
-        print_stderr(f'Vehicles by a {detector}')
+        print_stderr(f'Vehicle tracks from a {detector}')
     source = open_source(arguments.source, arguments.topic, arguments.start, arguments.duration)
     from autocalib_ros.offline import outputs
 
@@ -58,14 +58,16 @@ def run(arguments: argparse.Namespace) -> int:
         source, options, arguments.out, lens=lens, detector=detector, quiet=arguments.quiet, json=arguments.json
     )
     if arguments.write_bag is not None:
-        _write_bag(arguments.write_bag, replayed, source, options)
+        _write_bag(arguments.write_bag, replayed.result, source, options)
     return DONE if replayed.result else REFUSED
 
 
-def _write_bag(path: Path, replayed: ReplayResult, source: Source, options: Options) -> None:
-    if not replayed.result:
-        print_stderr(f'{path} is not written: there is no calibration')
+def _write_bag(path: Path, result: Calibration | Refusal, source: Source, options: Options) -> None:
+    from autocalib_ros.results.calibration import Refusal
+
+    if isinstance(result, Refusal):
+        print_stderr(f'{path} is not written: no calibration')
         return
     from autocalib_ros.offline.recordings.write_bag import write_bag
 
-    write_bag(path, replayed.result, source, options.tf_parent, options.ignored_polygons)
+    write_bag(path, result, source, options.tf_parent, options.ignored_polygons)

@@ -1,4 +1,4 @@
-"""What `replay` and `evidence` share: the options that a solution is told, and the known lens."""
+"""Arguments shared by `replay` and `evidence`: solver options, metric scale and known lens."""
 
 from __future__ import annotations
 
@@ -13,39 +13,39 @@ if TYPE_CHECKING:
 
 
 def add_solve_options(parser: argparse.ArgumentParser) -> None:
-    """Add what is told to the solution, whatever it is fed from, and how its result is printed."""
+    """Add the arguments for the solver, the metric scale and the printed output."""
     scale = parser.add_mutually_exclusive_group()
     scale.add_argument(
         '--camera-height',
         type=float,
         metavar='H',
-        help='height of the camera above the road in metres; without any scale only the lens is calibrated',
+        help='height of the camera above the road in metres; without a metric scale only the lens is calibrated',
     )
     scale.add_argument(
         '--scale-distance',
         type=float,
         nargs=5,
         metavar=('U1', 'V1', 'U2', 'V2', 'METRES'),
-        help='instead: two pixels on the road, and the metres between them',
+        help='alternative: two pixels on the road and the distance between them in metres',
     )
     scale.add_argument(
         '--scale-speed',
         type=float,
         metavar='KM_H',
-        help='instead: the mean speed of the traffic that flows on the busiest road',
+        help='alternative: mean speed of the moving traffic on the busiest road in km/h',
     )
     parser.add_argument(
         '--camera-info',
         type=Path,
         metavar='FILE',
-        help='file of camera_info_manager with the known lens: only the pose is solved',
+        help='camera_info_manager file with the known lens; only the pose is estimated',
     )
     parser.add_argument('--params-file', type=Path, metavar='F', help='ROS 2 parameter file with options')
-    parser.add_argument('--method', choices=('joint', 'paper'), help='robust method (default) or the published one')
+    parser.add_argument('--method', choices=('joint', 'paper'), help='robust method (default) or the published method')
     parser.add_argument(
         '--allow-unit-scale',
         action='store_true',
-        help="without a height, give the ground plane in units of the camera's height",
+        help='without a metric scale, give the ground plane in units of the camera height',
     )
     parser.add_argument(
         '-p',
@@ -53,14 +53,16 @@ def add_solve_options(parser: argparse.ArgumentParser) -> None:
         action='append',
         default=[],
         metavar='NAME=VALUE',
-        help='any option by its full name, for example joint.noise_px=0.7; may be repeated',
+        help='any option by its full name, for example joint.noise_px=0.7; repeatable',
     )
-    parser.add_argument('--quiet', action='store_true', help='no progress and no summary; refusals stay on stderr')
+    parser.add_argument(
+        '--quiet', action='store_true', help='print no progress and no summary; refusals still go to stderr'
+    )
     parser.add_argument('--json', action='store_true', help='print calibration.json on stdout instead of the summary')
 
 
 def options_from_arguments(arguments: argparse.Namespace) -> Options:
-    """Put the options together: defaults, then the parameter file, then the command line."""
+    """Return the options: defaults, overridden by the parameter file, overridden by the command line."""
     from autocalib_ros.offline.parameter_file import override_options, parse_assignments, read_params_file
 
     values: dict[str, Any] = read_params_file(arguments.params_file) if arguments.params_file else {}
@@ -74,7 +76,7 @@ def options_from_arguments(arguments: argparse.Namespace) -> Options:
 
 
 def _scale_values(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return the options of the one source of the scale that the command line names, if any."""
+    """Return the options of the scale source given on the command line, if any."""
     if arguments.camera_height is not None:
         return {'camera_height': arguments.camera_height}
     if arguments.scale_distance is not None:
@@ -90,9 +92,9 @@ def _scale_values(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def read_known_lens(arguments: argparse.Namespace, options: Options) -> Camera | None:
-    """Read the known lens: that of the command line, else the one that the parameter file gives to a live node.
+    """Read the known lens from --camera-info, else from `camera_info_file` of the parameter file; None without either.
 
-    UsageError where the results could not say it in the distortion model that is asked for.
+    Raise UsageError if the requested distortion model cannot represent the lens.
     """
     from autocalib_ros.offline.parameter_file import camera_info_file
 
@@ -105,5 +107,5 @@ def read_known_lens(arguments: argparse.Namespace, options: Options) -> Camera |
     from autocalib_ros.lens.camera_info_yaml import read_camera_info
 
     lens = read_camera_info(file)
-    camera_info(lens, options.distortion_model)
+    camera_info(lens, options.distortion_model)  # fails early if the model cannot represent the lens
     return lens

@@ -11,18 +11,18 @@ if TYPE_CHECKING:
     from autocalib_ros.offline.view_files import Renderer
     from autocalib_ros.results.saved_camera import SavedCamera
 
-HELP = 'show the road from above, from an image or video'
+HELP = 'render a top-down view of the road from an image or video'
 DESCRIPTION = (
-    'Show the road from above, from an image or video, with a saved calibration of the camera; x of the '
-    'ground frame to the right, y up.'
+    'Render a top-down view of the road from an image or video with a saved calibration of the camera. The x axis '
+    'of the ground frame points right, the y axis up.'
 )
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the files and what is shown."""
+    """Add the input and output files, resolution, extent and drawings."""
     views.add_files(parser, 'calibration.json, or NAME.autocalib.json of the node')
     parser.add_argument(
-        '--px-per-m', type=float, metavar='P', help='pixels a metre (default: 1000 along the longer side)'
+        '--px-per-m', type=float, metavar='P', help='pixels per metre (default: 1000 pixels along the longer side)'
     )
     for axis in 'xy':
         parser.add_argument(
@@ -30,14 +30,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             type=float,
             nargs=2,
             metavar=('LOW', 'HIGH'),
-            help=f'range of {axis} in metres (default: the road that the image shows)',
+            help=f'range of {axis} in metres (default: the road in view)',
         )
-    parser.add_argument('--grid', action='store_true', help='draw lines at round metres')
+    parser.add_argument('--grid', action='store_true', help='draw grid lines at round metres')
     parser.add_argument('--scale-bar', action=argparse.BooleanOptionalAction, default=True, help='draw a scale bar')
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Write; return the exit status."""
+    """Write the top-down view; return the exit status."""
     from autocalib_ros.pictures.known_views import choose_top_view, top_view_renderer
 
     def make_renderer(known: SavedCamera) -> Renderer:

@@ -1,4 +1,4 @@
-"""What `rectify`, `topview` and `picture` share."""
+"""Arguments and file handling shared by `rectify`, `topview` and `picture`."""
 
 from __future__ import annotations
 
@@ -17,30 +17,33 @@ if TYPE_CHECKING:
 
 
 def add_files(parser: argparse.ArgumentParser, calibration: str = CALIBRATION_FILES) -> None:
-    """Add the calibration, the images and the result."""
+    """Add the calibration, the source of images and the output file."""
     parser.add_argument('calibration', metavar='CALIBRATION', type=Path, help=calibration)
     parser.add_argument('source', metavar='SOURCE', type=Path, help='image, video or recording of that camera')
-    parser.add_argument('out', metavar='OUT', type=Path, help='.png or .jpg: one picture; .mp4 or .avi: a video')
+    parser.add_argument('out', metavar='OUT', type=Path, help='.png or .jpg for one picture, .mp4 or .avi for a video')
     parser.add_argument(
         '--at',
         type=float,
         default=0.0,
         metavar='S',
-        help='seconds after the first image: which one a picture shows, or where a video begins',
+        help='seconds after the first image: the image of a picture, or the start of a video',
     )
     parser.add_argument('--duration', type=float, metavar='S', help='seconds of a video')
-    parser.add_argument('--topic', metavar='T', help='image topic of a recording; needed when there are several')
+    parser.add_argument('--topic', metavar='T', help='image topic; required if the recording has several')
     parser.add_argument(
         '--params-file',
         type=Path,
         metavar='F',
-        help='ROS 2 parameter file of the camera, whose ignore_regions are black in the result',
+        help='ROS 2 parameter file of the camera; its ignore_regions are blacked out',
     )
-    parser.add_argument('--quiet', action='store_true', help='no progress, and not what was written')
+    parser.add_argument('--quiet', action='store_true', help='print neither progress nor the name of the written file')
 
 
 def render_to_file(arguments: argparse.Namespace, label: str, make_renderer: Callable[[SavedCamera], Renderer]) -> int:
-    """Write what `make_renderer` makes of the camera in images of the source's size; return the exit status."""
+    """Render the images of the source with a saved calibration into a file; return the exit status.
+
+    `make_renderer` gets the camera scaled to the size of the images.
+    """
     import numpy as np
 
     from autocalib_ros.errors import AutocalibError
@@ -70,7 +73,7 @@ def render_to_file(arguments: argparse.Namespace, label: str, make_renderer: Cal
 
 
 def _ignored(params_file: Path | None) -> Polygons:
-    """Return the polygons of `ignore_regions` in a parameter file, in pixels of the calibrated images."""
+    """Return the `ignore_regions` polygons of a parameter file, in pixels of the calibrated images."""
     if params_file is None:
         return ()
     from autocalib_ros.config import Options

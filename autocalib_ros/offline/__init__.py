@@ -1,1 +1,1 @@
-"""The replay shell: recordings in, files and reports out, and a simulator with known truth."""
+"""Offline shell: recordings in, files and reports out; benchmarks, and a simulator with ground truth."""

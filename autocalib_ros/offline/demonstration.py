@@ -1,4 +1,4 @@
-"""The whole program on simulated traffic, against the truth."""
+"""Demonstration: simulate traffic, calibrate from it and compare with the ground truth."""
 
 from __future__ import annotations
 
@@ -22,29 +22,29 @@ from autocalib_ros.results.calibration import Calibration, Refusal
 MAX_FOCAL_ERROR_PERCENT = 3.0
 MAX_NORMAL_ERROR_DEG = 1.0
 MAX_ROAD_ANGLE_DEG, MAX_DETOUR_RATIO = 6.0, 1.05
-"""A simulated vehicle follows a road when its way leads along it to this angle and is longer by no more than this."""
+"""A vehicle follows a road if its displacement is within this angle of it, and its path at most this ratio longer."""
 MIN_DISPLACEMENT_M = 10.0
 
 
 @dataclass(frozen=True)
 class TruthErrors:
-    """How far a calibration is from the truth; nan where it gives no ground plane."""
+    """Errors of a calibration against the ground truth; nan without a ground plane."""
 
     focal_error_percent: float
     normal_deg: float
     height_m: float
     distance_error_percent: float
-    """Median over pairs of points on the road."""
+    """Median error over pairs of road points."""
     height_note: str = 'given'
-    """How sure the height claims to be."""
+    """Source of the height: 'given', or its stated standard deviation."""
 
     @property
     def within_tolerance(self) -> bool:
-        """Whether lens and ground are as close as the demonstration promises."""
+        """Whether the errors of lens and ground normal are within the limits of the demonstration."""
         return abs(self.focal_error_percent) <= MAX_FOCAL_ERROR_PERCENT and self.normal_deg <= MAX_NORMAL_ERROR_DEG
 
     def table(self) -> str:
-        """Return the errors as lines for a terminal."""
+        """Return the errors as text lines for the terminal."""
         rows = (
             ('focal length', f'{self.focal_error_percent:+.2f} %', f'within {MAX_FOCAL_ERROR_PERCENT:g} %'),
             ('ground normal', f'{self.normal_deg:.2f} degrees', f'within {MAX_NORMAL_ERROR_DEG:g} degree'),
@@ -56,9 +56,9 @@ class TruthErrors:
 
 
 def simulate_bag(bag: Path, seed: int) -> dict[str, Any]:
-    """Simulate the default scene into a new bag; return its truth.
+    """Simulate the default scene into a new bag and return its ground truth.
 
-    The images are JPEG: raw ones would take gigabytes.
+    Images are stored as JPEG: raw images would take gigabytes.
     """
     from autocalib_ros.offline import simulate
 
@@ -69,7 +69,7 @@ def simulate_bag(bag: Path, seed: int) -> dict[str, Any]:
 
 
 def options_from_truth(truth: dict[str, Any], scale_from: str) -> Options:
-    """Return the options of somebody who knows the height, a distance on the road, or the mean speed of a road."""
+    """Return options whose metric scale (height, distance on the road, or mean speed) comes from the ground truth."""
     if scale_from == 'distance':
         (x1, y1, *first), (x2, y2, *second) = _most_distant_pair(nearby_road_points(truth))
         return Options(
@@ -85,32 +85,32 @@ def options_from_truth(truth: dict[str, Any], scale_from: str) -> Options:
 
 
 def _most_distant_pair(points: np.ndarray) -> np.ndarray:
-    """The two of points (n, 4) whose pixels lie farthest from each other, shape (2, 4)."""
+    """Return the two of the points (n, 4) with the largest distance in pixels, shape (2, 4)."""
     ones, others = np.triu_indices(len(points), 1)
     best = np.argmax(np.hypot(*(points[ones, 2:] - points[others, 2:]).T))
     return points[[ones[best], others[best]]]
 
 
 def _mean_speed(truth: dict[str, Any]) -> float:
-    """Mean speed in metres a second, as loops would count it, of the road that most vehicles follow straight."""
+    """Return the mean speed in m/s, as induction loops measure it, on the road that most vehicles follow straight."""
     speeds: list[list[float]] = [[] for _ in truth['road_directions']]
     for track in truth['vehicles']['tracks']:
         rows = np.array(track['rows'])
-        way = rows[-1, 1:3] - rows[0, 1:3]
-        length, path = np.hypot(*way), np.hypot(*np.diff(rows[:, 1:3], axis=0).T).sum()
-        cosines = np.abs(np.array(truth['road_directions'])[:, :2] @ way) / max(length, 1e-9)
+        displacement = rows[-1, 1:3] - rows[0, 1:3]
+        length, path = np.hypot(*displacement), np.hypot(*np.diff(rows[:, 1:3], axis=0).T).sum()
+        cosines = np.abs(np.array(truth['road_directions'])[:, :2] @ displacement) / max(length, 1e-9)
         if (
             length > MIN_DISPLACEMENT_M
             and path < MAX_DETOUR_RATIO * length
             and cosines.max() > np.cos(np.radians(MAX_ROAD_ANGLE_DEG))
         ):
-            # a loop somewhere on the way: each metre counts alike
+            # averaged over distance, not time: an induction loop at a random place on the path
             speeds[int(cosines.argmax())].append(float((rows[:, 4] ** 2).sum() / rows[:, 4].sum()))
     return float(np.mean(max(speeds, key=len)))
 
 
 def compare_with_truth(result: Calibration | Refusal, truth: dict[str, Any]) -> TruthErrors | None:
-    """Compare with the truth; None for a refusal."""
+    """Return the errors of a result against the ground truth; None for a refusal."""
     if isinstance(result, Refusal):
         return None
     focal_error_percent = 100 * (result.camera.focal_px / truth['lens']['f'] - 1)

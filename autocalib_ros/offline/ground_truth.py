@@ -1,11 +1,11 @@
-"""A truth.json, and how far distances on the road are from it."""
+"""Read a truth.json and compute the errors of a calibration against it."""
 
 from __future__ import annotations
 
 import json
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -17,26 +17,26 @@ from autocalib_ros.pictures.views import image_to_ground
 from autocalib_ros.results.saved_camera import SavedCamera
 
 MAX_COMPARED_RANGE_M = 40.0
-"""Distances are compared between points of the road this near to the camera."""
+"""Largest distance from the camera of the road points between which distances are compared."""
 MIN_COMPARED_DISTANCE_M = 2.0
-"""Shorter distances on the road are not compared: their relative error says little."""
+"""Shorter distances are not compared: their relative error is dominated by pixel noise."""
 
 
 def median_distance_error(true_m: np.ndarray, found_m: np.ndarray) -> float:
-    """Median relative error of the distances between points (n, 2) on the road; nan where all are too short."""
+    """Return the median relative error of the distances between road points (n, 2); nan if all are too short."""
     first, second = np.triu_indices(len(true_m), 1)
     true_lengths = np.hypot(*(true_m[first] - true_m[second]).T)
     lengths = np.hypot(*(found_m[first] - found_m[second]).T)
     far_apart = true_lengths > MIN_COMPARED_DISTANCE_M
     if not far_apart.any():
         return float('nan')
-    # a point that ends up above the horizon is as wrong as can be, and must not drop out of the median
+    # a point above the estimated horizon counts as an infinite error, so that it stays in the median
     errors = np.where(np.isfinite(lengths), np.abs(lengths / np.maximum(true_lengths, 1e-9) - 1), np.inf)
     return float(np.median(errors[far_apart]))
 
 
 def read_truth(path: Path) -> dict[str, Any]:
-    """Read a truth.json."""
+    """Read a truth.json, or raise InputError."""
     try:
         return json.loads(path.read_text(encoding='utf-8'))
     except OSError as error:
@@ -46,52 +46,54 @@ def read_truth(path: Path) -> dict[str, Any]:
 
 
 def nearby_road_points(truth: dict[str, Any]) -> np.ndarray:
-    """Return rows X, Y, u, v of points of the road that are not too far away, shape (n, 4)."""
+    """Return rows X, Y (metres), u, v (pixels) of road points up to `MAX_COMPARED_RANGE_M` away, shape (n, 4)."""
     points = np.array(truth['ground_points']['rows']).reshape(-1, 4)
     return points[np.hypot(*(points[:, :2] - truth['camera']['position'][:2]).T) <= MAX_COMPARED_RANGE_M]
 
 
 def distance_error_percent(camera: Camera, ground: GroundPlane, truth: dict[str, Any]) -> float:
-    """Return the median error of distances between points of the road that are not too far away."""
+    """Return the median error in percent of distances between road points up to `MAX_COMPARED_RANGE_M` away."""
     points = nearby_road_points(truth)
     true_m, pixels = points[:, :2], points[:, 2:]
     return 100 * median_distance_error(true_m, image_to_ground(camera, ground, pixels))
 
 
 SUPPORTED_LENS_MODELS = ('equidistant', 'kannala_brandt')
-"""Models of a truth.json that are read; both are the one of camera.py."""
+"""Lens models of a truth.json that can be read; both are the Kannala-Brandt model of `Camera`."""
 
 
 def true_camera(truth: dict[str, Any]) -> SavedCamera:
-    """Return the lens and pose of a truth.json; InputError where it holds none."""
+    """Return the lens and pose of a truth.json, or raise InputError if it has none."""
     try:
         lens, pose = truth['lens'], truth['camera']
         if lens['model'] not in SUPPORTED_LENS_MODELS:
             raise InputError(
-                f'the lens of the truth is {lens["model"]!r}, expected {" or ".join(SUPPORTED_LENS_MODELS)}'
+                f'unsupported lens model {lens["model"]!r} in the truth; expected {" or ".join(SUPPORTED_LENS_MODELS)}'
             )
+        k1, k2, k3, k4 = map(float, lens['k'])
         camera = Camera(
             int(truth['width']),
             int(truth['height']),
             float(lens['f']),
             (float(lens['cx']), float(lens['cy'])),
-            tuple(float(value) for value in lens['k']),
+            (k1, k2, k3, k4),
         )
         ground = GroundPlane(np.array(pose['R_world_from_camera'], float).reshape(3, 3), float(pose['height']))
     except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f'the truth is none of a simulation ({type(error).__name__}: {error})') from error
+        raise InputError(f'not the truth of a simulation ({type(error).__name__}: {error})') from error
     return SavedCamera(
         width=camera.width, height=camera.height, lens=camera, matrix=camera.matrix, k=camera.k, ground=ground
     )
 
 
 def errors_against_truth(known: SavedCamera, truth: dict[str, Any]) -> dict[str, float | None]:
-    """Return how far a camera is from the truth, by name with the unit; None for what it does not hold."""
+    """Return the errors of a camera by name and unit; None for quantities that the camera lacks."""
     true = true_camera(truth)
     result = compare_calibrations(true, known)
     scaled = known.scaled_to(true.width, true.height)
     pose = {item.name: item.difference for item in result.pose}
-    metric = known.ground is not None and known.ground.metric
+    ground = scaled.ground
+    camera = cast(Camera, scaled.lens)  # `image_to_ground` needs `unproject` only, which every lens has
     return {
         'focal length, %': 100 * result.lens[0].difference / result.lens[0].first,
         'principal point, px': math.hypot(result.lens[1].difference, result.lens[2].difference),
@@ -101,9 +103,7 @@ def errors_against_truth(known: SavedCamera, truth: dict[str, Any]) -> dict[str,
         'tilt, deg': pose.get('tilt'),
         'roll, deg': pose.get('roll'),
         'height, m': pose.get('height'),
-        f'distances within {MAX_COMPARED_RANGE_M:g} m, median, %': distance_error_percent(
-            scaled.lens, scaled.ground, truth
-        )
-        if metric
+        f'distances within {MAX_COMPARED_RANGE_M:g} m, median, %': distance_error_percent(camera, ground, truth)
+        if ground is not None and ground.metric
         else None,
     }

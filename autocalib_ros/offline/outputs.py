@@ -1,4 +1,4 @@
-"""The files of a result: checked for before the work, written after it."""
+"""Prepare the output folder before a run and write the output files after it."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ CAMERA_INFO, CALIBRATION, EVIDENCE, REPORT = 'camera_info.yaml', 'calibration.js
 
 
 def prepare_output_dir(out_dir: Path, bag: Path | None = None) -> None:
-    """Make the folder for the results, and make sure that nothing stands in the way; UsageError otherwise."""
+    """Create the output folder; raise UsageError if it is not writable or `bag` exists already."""
     if out_dir.exists() and not out_dir.is_dir():
-        raise UsageError(f'{out_dir} is a file, not a folder for the results')
+        raise UsageError(f'{out_dir} is a file, not a folder')
     try:
         out_dir.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise UsageError(f'cannot make the folder {out_dir}: {error.strerror or error}') from error
+        raise UsageError(f'cannot create the folder {out_dir}: {error.strerror or error}') from error
     if not os.access(out_dir, os.W_OK):
         raise UsageError(f'cannot write into the folder {out_dir}')
     if bag is not None and bag.exists():
@@ -31,14 +31,14 @@ def prepare_output_dir(out_dir: Path, bag: Path | None = None) -> None:
 
 
 def write_outputs(out_dir: Path, replayed: ReplayResult, source: Source) -> list[str]:
-    """Write the results of a replay with its evidence; return the names written."""
+    """Write the result files and the evidence of a replay; return the names of the files."""
     names = write_result(out_dir, replayed, source.name, camera_name(source))
     replayed.evidence.save(out_dir / EVIDENCE)
     return [*names, EVIDENCE]
 
 
 def write_result(out_dir: Path, replayed: ReplayResult, source_name: str, name_of_camera: str = 'camera') -> list[str]:
-    """Write the results, and remove those of an earlier run that no longer hold; return the names written."""
+    """Write the result files and remove stale ones of an earlier run; return the names of the files."""
     from autocalib_ros.report.page import write_report  # imported late: it needs matplotlib
 
     result = replayed.result

@@ -1,4 +1,4 @@
-"""Options from a ROS 2 parameter file and from `name=value` on the command line."""
+"""Read options from a ROS 2 parameter file and from `name=value` arguments."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ QOS_OVERRIDES_PREFIX = 'qos_overrides.'
 
 
 def read_params_file(path: Path) -> dict[str, Any]:
-    """Return the core's options in a ROS 2 parameter file by full name; what only a live node needs is left out."""
+    """Return the options in a ROS 2 parameter file by full name, without those that only a live node uses."""
     return {name: value for name, value in _read_values(path).items() if not _is_node_only(name)}
 
 
 def camera_info_file(path: Path) -> str:
-    """Return the file with the lens that a ROS 2 parameter file names, '' where it names none.
+    """Return the option `camera_info_file` of a ROS 2 parameter file, '' if it is not set.
 
-    A replay uses the lens that the live node uses, so that both give the same.
+    Replay uses the same lens as the live node, so that both give the same result.
     """
     return NodeOptions(camera_info_file=_read_values(path).get('camera_info_file', '')).camera_info_file
 
@@ -43,7 +43,7 @@ def _read_values(path: Path) -> dict[str, Any]:
 
 
 def _sections(tree: Any, name: str = '') -> dict[str, Mapping[str, Any]]:
-    """Find every `ros__parameters` with the full name of its node; namespaces may be nested."""
+    """Return every `ros__parameters` section by the full name of its node; namespaces may be nested."""
     found: dict[str, Mapping[str, Any]] = {}
     for key, value in tree.items() if isinstance(tree, Mapping) else ():
         if key == 'ros__parameters':
@@ -54,7 +54,7 @@ def _sections(tree: Any, name: str = '') -> dict[str, Mapping[str, Any]]:
 
 
 def _applicable_sections(path: Path, sections: dict[str, Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """Return the sections that hold for a replay, those for all nodes first: a file may serve several nodes."""
+    """Return the sections that apply to a replay, wildcard sections first; the file may configure several nodes."""
     if not sections:
         raise InputError(f"{path} is not a ROS 2 parameter file: it has no 'ros__parameters'")
     general = [name for name in sections if name.split('/')[-1] in WILDCARDS]
@@ -62,7 +62,7 @@ def _applicable_sections(path: Path, sections: dict[str, Mapping[str, Any]]) -> 
     if len(named) > 1:
         named = [name for name in named if 'autocalib' in name.split('/')[-1]]
     if len(named) > 1:
-        raise UsageError(f'{path} holds parameters for several nodes: {", ".join(named)}; a replay needs one of them')
+        raise UsageError(f'{path} configures several nodes: {", ".join(named)}; a replay needs exactly one')
     return [sections[name] for name in general + named]
 
 
@@ -72,21 +72,21 @@ def _is_node_only(name: str) -> bool:
 
 
 def parse_assignments(assignments: list[str]) -> dict[str, Any]:
-    """Return the values of `name=value` or `name:=value`, read as YAML."""
+    """Parse `name=value` or `name:=value` arguments; values are YAML. Raise UsageError for other text."""
     values: dict[str, Any] = {}
     for text in assignments:
         name, equals, value = text.replace(':=', '=', 1).partition('=')
         if not name.strip() or not equals:
-            raise UsageError(f"'-p {text}' is not of the form name=value")
+            raise UsageError(f"'-p {text}' does not have the form name=value")
         try:
             values[name.strip()] = yaml.safe_load(value)
         except yaml.YAMLError as error:
-            raise UsageError(f"'-p {text}' has a value that is not YAML") from error
+            raise UsageError(f"'-p {text}' has an invalid YAML value") from error
     return values
 
 
 def override_options(options: Options, values: Mapping[str, Any]) -> Options:
-    """Return `options` with values by full name; YAML takes `1e-05`, without a point, for text."""
+    """Return `options` with values replaced by full name; numbers such as `1e-05`, text in YAML, are converted."""
     floats = {item.name for item in walk_options(options) if isinstance(item.default, float)}
     return with_overrides(
         options, {name: _as_float(value) if name in floats else value for name, value in values.items()}
@@ -99,4 +99,4 @@ def _as_float(value: Any) -> Any:
     try:
         return float(value)
     except ValueError:
-        return value  # the option itself says best what it takes
+        return value  # the check of the option gives the better error message

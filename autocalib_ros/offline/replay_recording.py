@@ -1,4 +1,4 @@
-"""A recording through the same AutoCalibrator that the live node holds."""
+"""Calibrate from a recording with the same `AutoCalibrator` as the live node."""
 
 from __future__ import annotations
 
@@ -21,26 +21,27 @@ from autocalib_ros.report.scene import SolutionSnapshot, append_snapshot
 from autocalib_ros.results.calibration import Calibration, Refusal
 
 SOLVE_AGAIN_GROWTH = 2.0
-"""Once accepted, a solution on the way is tried again when the recording has grown by this factor: by then a standard
-deviation has fallen by a third. Only the report has use for it."""
+"""Growth of the recording after which an accepted calibration is solved again, for the convergence plot of the report.
+
+With twice the evidence a standard deviation falls by a third."""
 PROGRESS_EVERY_FRAMES = 15
-"""Frames between two questions for the progress: it is for people, who read slowly."""
+"""Frames between progress updates."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayResult:
-    """What a recording gave."""
+    """Result and evidence of a recording."""
 
     result: Calibration | Refusal
     evidence: Evidence
     accepted_at_s: float | None
-    """Seconds of recording until the first accepted calibration."""
+    """Seconds of recording before the first accepted calibration; None without one."""
     background: np.ndarray | None
-    """The road without its traffic, BGR uint8."""
+    """Background image without traffic, BGR uint8; None if unknown."""
     frames: int
     options: Options = field(default_factory=Options)
     moments: tuple[SolutionSnapshot, ...] = ()
-    """What the solutions on the way said, and the last."""
+    """Intermediate solutions and the last one, for the convergence plot of the report."""
 
 
 def replay(
@@ -50,13 +51,11 @@ def replay(
     lens: Camera | None = None,
     detector: VehicleDetector | None = None,
 ) -> ReplayResult:
-    """Go through a recording, a path or an open one, and solve at its end.
+    """Collect evidence from a recording, given as a path or an open source, and solve at its end.
 
-    `on_progress` gets the number of frames done and a short note.
-
-    The first word of the note is the state: collecting, solving, calibrated or refused. With a known `lens` only the
-    pose is solved; UsageError at the first image that is not of its shape. A `detector` that is open already is used,
-    else that of the options is opened.
+    `on_progress` receives the number of frames and a short note, whose first word is the state: collecting, solving,
+    calibrated or refused. With a known `lens` only the pose is estimated; UsageError if its aspect ratio differs from
+    that of the images. `detector` is an open detector; None opens the one of the options. InputError without an image.
     """
     source = open_source(recording) if isinstance(recording, (str, Path)) else recording
     report_progress = on_progress or (lambda done, note: None)
@@ -72,7 +71,7 @@ def replay(
             report_progress(count, 'solving')
             tried = solve(due, options, lens=scaled_lens)
             moments = append_snapshot(moments, tried)
-            if tried and accepted_at_s is None:  # a live run would have been accepted then
+            if tried and accepted_at_s is None:  # a live node would have accepted it at this time
                 accepted_at_s = due.seconds
             latest = tried if tried or accepted_at_s is None else latest
             next_solve_s = 0.0 if accepted_at_s is None else SOLVE_AGAIN_GROWTH * due.seconds
@@ -81,7 +80,7 @@ def replay(
         report_progress(count, note)
     evidence = calibrator.snapshot()
     if evidence is None:
-        raise InputError(f'{source.name} gives no image')
+        raise InputError(f'{source.name} has no images')
     report_progress(count, 'solving')
     result = solve(evidence, options, lens=scaled_lens)
     report_progress(count, 'calibrated' if result else 'refused')
@@ -101,17 +100,16 @@ def replay(
 def _progress_note(
     calibrator: AutoCalibrator, latest: Calibration | Refusal | None, accepted_at_s: float | None
 ) -> str:
-    """Say the state, how far the evidence has come, and what is missing."""
+    """Return state, progress of the evidence, and the missing evidence or the last refusal."""
     if isinstance(latest, Calibration):
         return f'calibrated since {accepted_at_s:.0f} s: focal length {latest.camera.focal_px:.0f} px'
     progress = calibrator.progress()
-    # all that a first solution needs is there, and yet it was refused: then that is what is missing
-    refused = latest is not None and not progress.missing
-    return f'collecting {progress}' + (f': {latest.message}' if refused else '')
+    # the evidence is complete but the solution was refused: the refusal says what is missing
+    return f'collecting {progress}' + (f': {latest.message}' if latest is not None and not progress.missing else '')
 
 
 def solve_evidence(evidence: Evidence, options: Options, lens: Camera | None = None) -> ReplayResult:
-    """Solve saved evidence; it does not tell when it would first have been accepted, and has no picture."""
+    """Solve saved evidence; the result has no background image and no time of first acceptance."""
     return ReplayResult(
         result=solve(evidence, options, lens=_scaled_lens(lens, evidence.image_size)),
         evidence=evidence,

@@ -1,4 +1,4 @@
-"""One picture of an image, video or bag through a view, or a video of all of them."""
+"""Render an image, video or bag into one picture or a video."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ IMAGE_SUFFIXES = (*PICTURE_SUFFIXES, '.bmp', '.tif', '.tiff', '.webp', '.pgm', '
 JPEG_QUALITY = 88
 
 Renderer = Callable[[np.ndarray], np.ndarray]
-"""Takes an image, grey (H, W) or BGR (H, W, 3) uint8, to the picture of it, BGR uint8."""
+"""Renders an image, grey (H, W) or BGR (H, W, 3) uint8, as a BGR uint8 picture."""
 
 
 @dataclass(frozen=True)
 class SourceSelection:
-    """Which images of a recording: a picture takes the first of them."""
+    """Selected images of a recording; a picture shows the first of them."""
 
     topic: str | None = None
     start_s: float = 0.0
@@ -44,10 +44,10 @@ def write_view(
     label: str,
     quiet: bool = False,
 ) -> tuple[int, int]:
-    """Write what `renderer_for(width, height)` makes of the images; return the size of the picture or video.
+    """Render the images of a source with `renderer_for(width, height)`; return width and height of the output.
 
-    A file of that name is replaced once the new one is whole. UsageError where the names do not fit each other,
-    InputError where something cannot be read or written.
+    An existing file is replaced only once the new one is complete. Raise UsageError for incompatible file names,
+    InputError if a file cannot be read or written.
     """
     _check(source, out, selection)
     if source.suffix.lower() in IMAGE_SUFFIXES:
@@ -61,11 +61,9 @@ def write_view(
 def _check(source: Path, out: Path, selection: SourceSelection) -> None:
     kind = out.suffix.lower()
     if kind not in (*PICTURE_SUFFIXES, *VIDEO_CODECS):
-        raise UsageError(
-            f'{out} is neither a picture nor a video: name it {", ".join((*PICTURE_SUFFIXES, *VIDEO_CODECS))}'
-        )
+        raise UsageError(f'{out} is neither a picture nor a video: use {", ".join((*PICTURE_SUFFIXES, *VIDEO_CODECS))}')
     if out.is_dir():
-        raise UsageError(f'{out} is a folder, not a file to write')
+        raise UsageError(f'{out} is a folder, not a file')
     if out.exists() and source.exists() and out.samefile(source):
         raise UsageError(f'{out} is the source itself: choose another name for the result')
     if source.suffix.lower() in IMAGE_SUFFIXES and (kind in VIDEO_CODECS or selection != SourceSelection()):
@@ -78,14 +76,14 @@ def _check(source: Path, out: Path, selection: SourceSelection) -> None:
 
 
 def read_image(path: Path) -> np.ndarray:
-    """Read an image file as BGR uint8; InputError where that cannot be."""
+    """Read an image file as BGR uint8, or raise InputError."""
     try:
         data = np.fromfile(path, np.uint8)
     except OSError as error:
         raise InputError(f'cannot read {path}: {error.strerror or error}') from error
     image = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
     if image is None:
-        raise InputError(f'{path} is not an image that can be read: it is damaged, cut off or of another kind')
+        raise InputError(f'{path} is not a readable image: damaged, truncated or unsupported')
     return image
 
 
@@ -105,14 +103,19 @@ def _write_picture(out: Path, picture: np.ndarray) -> tuple[int, int]:
 def _write_video(
     recording: Source, out: Path, renderer_for: Callable[[int, int], Renderer], label: str, quiet: bool
 ) -> tuple[int, int]:
-    view = writer = size = None
+    view: Renderer | None = None
+    writer: cv2.VideoWriter | None = None
+    size = (0, 0)  # set by the first frame; `frames` raises InputError without one
     with _atomic_output(out) as unfinished, progress_bar(recording.total, 'images', label, quiet=quiet) as progress:
         try:
             for count, frame in enumerate(recording.frames(), start=1):
                 view = view or renderer_for(frame.image.shape[1], frame.image.shape[0])
                 picture = view(frame.image)
                 if writer is None:
-                    size = (picture.shape[1] // 2 * 2, picture.shape[0] // 2 * 2)  # codecs halve the colours
+                    size = (
+                        picture.shape[1] // 2 * 2,
+                        picture.shape[0] // 2 * 2,
+                    )  # even sizes: codecs subsample the colours by two
                     writer = _open_writer(out, unfinished, _frame_rate(recording), size)
                 writer.write(np.ascontiguousarray(picture[: size[1], : size[0]]))
                 progress.update_to(count)
@@ -124,7 +127,7 @@ def _write_video(
 
 def _open_writer(out: Path, unfinished: Path, rate: float, size: tuple[int, int]) -> cv2.VideoWriter:
     codec = VIDEO_CODECS[out.suffix.lower()]
-    writer = cv2.VideoWriter(str(unfinished), cv2.VideoWriter_fourcc(*codec), rate, size)
+    writer = cv2.VideoWriter(str(unfinished), _fourcc(codec), rate, size)
     if not writer.isOpened():
         raise InputError(
             f'cannot write {out}: this OpenCV cannot encode {codec} of {size[0]}x{size[1]} there; choose'
@@ -133,13 +136,17 @@ def _open_writer(out: Path, unfinished: Path, rate: float, size: tuple[int, int]
     return writer
 
 
+def _fourcc(codec: str) -> int:
+    return cv2.VideoWriter_fourcc(*codec)  # type: ignore[attr-defined]  # missing in OpenCV's type stubs
+
+
 def _frame_rate(recording: Source) -> float:
     return recording.total / recording.duration_s if recording.total and recording.duration_s else FALLBACK_FPS
 
 
 @contextmanager
 def _atomic_output(out: Path) -> Iterator[Path]:
-    """Yield a name to write to, which takes the place of `out` at the end; nothing of it is left after an error."""
+    """Yield a temporary path that replaces `out` at the end; it is removed after an error."""
     unfinished = out.with_name(f'.{out.stem}~{os.getpid()}{out.suffix}')
     try:
         out.parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Tiny recordings, written with rosbags and OpenCV, and results built by hand."""
+"""Fixtures: tiny recordings written with rosbags and OpenCV, and hand-built results."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ TYPES1 = get_typestore(Stores.ROS1_NOETIC)
 
 
 def picture(index: int) -> np.ndarray:
-    """Return a grey image that tells its number by its brightness."""
+    """Return a grey image whose brightness encodes its index."""
     return np.full((HEIGHT, WIDTH), (10 * index + 5) % 256, np.uint8)
 
 

@@ -1,4 +1,4 @@
-"""The comparison with the truth that the demonstration ends with."""
+"""The comparison of the demonstration with the ground truth."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from autocalib_ros.pictures.views import ground_to_image
 
 @pytest.fixture
 def truth(full):
-    """Return the truth of the calibration built by hand."""
+    """Return the ground truth of the hand-built calibration."""
     camera, ground = full.result.camera, full.result.ground
     x, y = np.meshgrid(np.linspace(2, 20, 6), np.linspace(2, 20, 6))
     points = np.stack([x.ravel(), y.ravel(), np.zeros(36)], axis=1)
@@ -87,5 +87,5 @@ def test_a_truth_that_cannot_be_read_is_one_line(tmp_path, text):
     path = tmp_path / 'truth.json'
     if text is not None:
         path.write_text(text)
-    with pytest.raises(InputError, match='truth.json'):
+    with pytest.raises(InputError, match=r'truth\.json'):
         read_truth(path)

@@ -1,4 +1,4 @@
-"""`autocalib evidence`: saved evidence solved again, and a lens that is known."""
+"""`autocalib evidence`: solving saved evidence again, and known lenses."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def without_height(saved, capsys):
 
 @pytest.fixture
 def evidence(without_height):
-    """Return the same with the height of the camera."""
+    """Return the same function with the camera height given."""
     return lambda *arguments: without_height('--camera-height', '8', *arguments)
 
 
@@ -113,9 +113,9 @@ def test_quiet_leaves_only_the_reason(evidence):
 
 
 def test_no_height_is_said(saved, lens_file, capsys):
-    for more, told in (([], 'the lens is calibrated'), (['--camera-info', str(lens_file)], 'the lens is known')):
+    for more, message in (([], 'the lens is calibrated'), (['--camera-info', str(lens_file)], 'the lens is known')):
         assert main(['evidence', str(saved), *REFUSE, *more]) == 3
-        assert f'No camera height given: {told}, the ground plane is left out' in capsys.readouterr().err
+        assert f'No camera height given: {message}, the ground plane is left out' in capsys.readouterr().err
 
 
 def test_a_known_lens_is_kept_and_the_pose_is_found(evidence, lens_file):
@@ -195,24 +195,24 @@ def test_a_lens_of_another_shape_is_wrong_usage(evidence, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ('name', 'told'), [('nowhere.yaml', 'cannot read'), ('evidence.npz', 'it is not YAML'), ('.', 'Is a directory')]
+    ('name', 'message'), [('nowhere.yaml', 'cannot read'), ('evidence.npz', 'it is not YAML'), ('.', 'Is a directory')]
 )
-def test_an_unreadable_lens_is_one_line_and_status_2(evidence, saved, name, told):
+def test_an_unreadable_lens_is_one_line_and_status_2(evidence, saved, name, message):
     status, stdout, stderr = evidence('--camera-info', saved.parent / name)
     assert (status, stdout, stderr.count('\n')) == (2, '', 1)
-    assert told in stderr and str(saved.parent) in stderr
+    assert message in stderr and str(saved.parent) in stderr
 
 
 @pytest.mark.parametrize(
-    ('content', 'told'),
+    ('content', 'message'),
     [(None, 'No such file'), (b'', 'is not a file of saved evidence'), (b'words', 'is not a file of saved evidence')],
 )
-def test_unreadable_evidence_is_one_line_and_status_2(content, told, tmp_path, capsys):
+def test_unreadable_evidence_is_one_line_and_status_2(content, message, tmp_path, capsys):
     if content is not None:
         (tmp_path / 'e.npz').write_bytes(content)
     assert main(['evidence', str(tmp_path / 'e.npz'), '--out', str(tmp_path / 'out')]) == 2
     error = capsys.readouterr().err
-    assert error.startswith('autocalib: error: ') and told in error and error.count('\n') == 1
+    assert error.startswith('autocalib: error: ') and message in error and error.count('\n') == 1
     assert not (tmp_path / 'out').exists()
 
 

@@ -1,4 +1,4 @@
-"""The golden evidence: what counts as moved, the command, and the stored cases themselves."""
+"""Golden evidence: comparison rules, the command, and the stored cases."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.offline.benchmark import golden
 from autocalib_ros.offline.benchmark.golden import (
     Case,
-    Measured,
+    GoldenRun,
     Moved,
     Outcome,
-    chosen,
     differences,
-    lines,
-    measure,
-    outcome_of,
+    format_report,
+    outcome_from_result,
     read_cases,
-    told,
+    run_cases,
+    select_cases,
+    solve_case,
     write_cases,
 )
 from synthetic_results import full_result, junction_evidence, lens_result, refusal
@@ -55,7 +55,7 @@ def names(moved: list[Moved]) -> list[str]:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Return a folder with the quick cases alone."""
+    """Return a folder with the quick cases only."""
     cases = [case for case in read_cases(STORED) if case.name in QUICK]
     for case in cases:
         shutil.copy(STORED / case.evidence, tmp_path)
@@ -63,8 +63,8 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def corrupt_track(folder: Path, case: str, **changes: Any) -> None:
-    """Expect something else of a case."""
+def expect(folder: Path, case: str, **changes: Any) -> None:
+    """Change the expected result of a case."""
     path = folder / golden.EXPECTED
     document = json.loads(path.read_text())
     document['cases'][case]['expected'].update(changes)
@@ -79,7 +79,7 @@ def corrupt_track(folder: Path, case: str, **changes: Any) -> None:
         (with_numbers(focal_px=559.59), ['focal_px']),
         (with_numbers(k1=0.01019), []),
         (with_numbers(k1=0.01021), ['k1']),
-        (with_numbers(k2=1e-10), []),  # held at zero, and still zero
+        (with_numbers(k2=1e-10), []),  # fixed at zero
         (with_numbers(k2=1e-6), ['k2']),
         (with_numbers(height_m=8.000007), []),  # without a sigma: a millionth of itself
         (with_numbers(height_m=8.00001), ['height_m']),
@@ -92,7 +92,7 @@ def test_a_number_moves_when_it_leaves_a_tenth_of_its_sigma(found: Outcome, move
     assert names(differences('case', EXPECTED, found)) == moved
 
 
-def test_the_change_is_told_in_expected_sigmas() -> None:
+def test_a_change_is_reported_in_expected_sigmas() -> None:
     (item,) = differences('case', EXPECTED, with_numbers(focal_px=558.0))
     assert item == Moved('case', 'focal_px', 560.0, 558.0, pytest.approx(-0.5))
     (item,) = differences('case', EXPECTED, with_numbers(height_m=8.1))
@@ -111,14 +111,14 @@ def test_exact_compares_to_the_last_digit() -> None:
     assert differences('case', EXPECTED, nearly) == []
 
 
-def test_another_verdict_is_told_alone() -> None:
+def test_a_changed_verdict_is_reported_alone() -> None:
     assert names(differences('case', EXPECTED, Outcome(REFUSED))) == ['state', 'grade', 'refusal', 'roads', 'people']
     other = Outcome({**REFUSED, 'refusal': 'horizon'})
     assert differences('case', Outcome(REFUSED), other) == [Moved('case', 'refusal', 'no_motion', 'horizon')]
 
 
-def test_a_count_that_is_another_stands_beside_the_numbers() -> None:
-    found = replace(with_numbers(focal_px=562.0), words={**CALIBRATED, 'people': 3})
+def test_a_changed_count_is_reported_with_the_numbers() -> None:
+    found = replace(with_numbers(focal_px=562.0), verdict={**CALIBRATED, 'people': 3})
     assert names(differences('case', EXPECTED, found)) == ['people', 'focal_px']
 
 
@@ -132,30 +132,34 @@ def test_a_new_case_has_moved() -> None:
     assert differences('case', None, EXPECTED) == [Moved('case', 'state', 'new', 'calibrated')]
 
 
-def test_a_full_result_is_told_with_lens_pose_and_sigmas() -> None:
-    outcome = told(FULL)
-    assert (outcome.words['state'], outcome.words['grade'], outcome.words['refusal']) == ('calibrated', 'full', None)
+def test_the_outcome_of_a_full_result_has_lens_pose_and_sigmas() -> None:
+    outcome = outcome_from_result(FULL)
+    assert (outcome.verdict['state'], outcome.verdict['grade'], outcome.verdict['refusal']) == (
+        'calibrated',
+        'full',
+        None,
+    )
     assert list(outcome.numbers) == list(golden.COVARIANCE_PARAMETERS)
     assert outcome.numbers['focal_px'] == FULL.camera.focal_px
     assert outcome.stddev['focal_px'] == FULL.stddev.focal_px
 
 
-def test_a_lens_alone_and_a_refusal_are_told_with_their_codes() -> None:
-    lens, none = told(lens_result(FULL)), told(NONE)
-    assert lens.words['grade'] == 'lens' and 'tilt_deg' not in lens.numbers
-    assert none.words == {**REFUSED, 'refusal': NONE.code} and not none.numbers
+def test_the_outcome_of_a_lens_alone_and_of_a_refusal_has_their_codes() -> None:
+    lens, none = outcome_from_result(lens_result(FULL)), outcome_from_result(NONE)
+    assert lens.verdict['grade'] == 'lens' and 'tilt_deg' not in lens.numbers
+    assert none.verdict == {**REFUSED, 'refusal': NONE.code} and not none.numbers
 
 
-def test_lines_sum_up_what_moved() -> None:
+def test_the_report_lists_and_counts_changes() -> None:
     case = Case(name='a', description='', made='', evidence='a.npz', options={})
-    assert lines(Measured((case,), {}, ())) == ['1 case: nothing moved']
-    assert lines(Measured((case,) * 26, {}, ())) == ['26 cases: nothing moved']
+    assert format_report(GoldenRun((case,), {}, ())) == ['1 case: nothing moved']
+    assert format_report(GoldenRun((case,) * 26, {}, ())) == ['26 cases: nothing moved']
     moved = (
         Moved('a', 'focal_px', 560.0, 558.0, -0.5),
         Moved('a', 'grade', 'full', None),
         Moved('a', 'k1', 0.01, 0.010000000001),
     )
-    head, *rows, last = lines(Measured((case,) * 2, {}, moved))
+    head, *rows, last = format_report(GoldenRun((case,) * 2, {}, moved))
     assert head.split() == ['case', 'quantity', 'expected', 'found', 'sigmas']
     assert [row.split() for row in rows] == [
         ['a', 'focal_px', '560', '558', '-0.5'],
@@ -167,8 +171,8 @@ def test_lines_sum_up_what_moved() -> None:
 
 def test_cases_are_chosen_by_name_in_their_own_order() -> None:
     cases = read_cases(STORED)
-    assert [case.name for case in chosen(cases, ['two_roads', 'bend'])] == ['bend', 'two_roads']
-    assert chosen(cases, []) == cases
+    assert [case.name for case in select_cases(cases, ['two_roads', 'bend'])] == ['bend', 'two_roads']
+    assert select_cases(cases, []) == cases
 
 
 def test_a_solver_that_fails_is_an_outcome(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -176,11 +180,11 @@ def test_a_solver_that_fails_is_an_outcome(monkeypatch: pytest.MonkeyPatch) -> N
         raise np.linalg.LinAlgError('singular')
 
     monkeypatch.setattr(golden, 'solve', fail)
-    (case,) = chosen(read_cases(STORED), ['bend'])
-    assert outcome_of(STORED, case).words['state'] == 'crash:LinAlgError'
+    (case,) = select_cases(read_cases(STORED), ['bend'])
+    assert solve_case(STORED, case).verdict['state'] == 'crash:LinAlgError'
 
 
-def test_what_is_written_reads_the_same(tmp_path: Path) -> None:
+def test_written_cases_are_read_back_unchanged(tmp_path: Path) -> None:
     cases = read_cases(STORED)
     write_cases(tmp_path, cases[::-1])
     assert read_cases(tmp_path) == cases
@@ -188,30 +192,30 @@ def test_what_is_written_reads_the_same(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('text', ['{', '[]', '{"format": 1, "cases": {"a": {}}}', '{"format": 2, "cases": {}}'])
-def test_a_file_that_is_none_of_expected_values_is_wrong_input(
+def test_a_file_without_expected_values_is_wrong_input(
     text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / golden.EXPECTED).write_text(text)
     assert main(['benchmark', 'golden', str(tmp_path)]) == 2
-    told = capsys.readouterr().err
-    assert golden.EXPECTED in told and told.count('\n') == 1
+    error = capsys.readouterr().err
+    assert golden.EXPECTED in error and error.count('\n') == 1
 
 
 @pytest.mark.parametrize(
     ('arguments', 'message'),
     [
         (['nowhere'], 'nowhere holds no golden evidence (no expected.json): give the folder that does, tests/golden'),
-        ([str(STORED), '--only', 'unheard_of'], "no golden case is called 'unheard_of'; there are bend"),
-        ([str(STORED), '--jobs', '0'], '--jobs is 1 or more; got 0'),
-        ([str(STORED), '--tolerance', '-1'], '--tolerance is 0 or more; got -1'),
+        ([str(STORED), '--only', 'unheard_of'], "unknown golden case 'unheard_of'; known cases: bend"),
+        ([str(STORED), '--jobs', '0'], '--jobs must be at least 1; got 0'),
+        ([str(STORED), '--tolerance', '-1'], '--tolerance must be at least 0; got -1'),
     ],
 )
 def test_wrong_usage_is_one_line_and_status_2(
     arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(['benchmark', 'golden', *arguments]) == 2
-    told = capsys.readouterr().err
-    assert message in told and told.count('\n') == 1
+    error = capsys.readouterr().err
+    assert message in error and error.count('\n') == 1
 
 
 def test_evidence_that_is_missing_is_wrong_input(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -227,12 +231,12 @@ def test_nothing_moved_is_status_0(folder: Path, capsys: pytest.CaptureFixture[s
     assert (folder / golden.EXPECTED).read_text() == before
 
 
-def test_what_moved_is_printed_and_status_3_until_it_is_expected(
+def test_changes_are_printed_with_status_3_until_they_are_expected(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     right = (folder / golden.EXPECTED).read_text()
-    corrupt_track(folder, 'bend', refusal='horizon')
-    corrupt_track(folder, 'pedestrians', refusal='horizon')
+    expect(folder, 'bend', refusal='horizon')
+    expect(folder, 'pedestrians', refusal='horizon')
     wrong = (folder / golden.EXPECTED).read_text()
     command = ['benchmark', 'golden', str(folder), '--only', 'bend']
     assert main(command) == 3
@@ -240,10 +244,12 @@ def test_what_moved_is_printed_and_status_3_until_it_is_expected(
     assert printed[1].split()[:3] == ['bend', 'refusal', 'horizon']
     assert printed[-1] == '1 case: 1 value moved in 1'
     assert (folder / golden.EXPECTED).read_text() == wrong
-    assert main([*command, '--update']) == 3  # it did move
+    assert main([*command, '--update']) == 3  # the run itself found a change
     assert main(command) == 0
-    corrupt_track(folder, 'pedestrians', refusal=json.loads(right)['cases']['pedestrians']['expected']['refusal'])
-    assert json.loads((folder / golden.EXPECTED).read_text()) == json.loads(right)  # what was not solved stayed
+    expect(folder, 'pedestrians', refusal=json.loads(right)['cases']['pedestrians']['expected']['refusal'])
+    assert json.loads((folder / golden.EXPECTED).read_text()) == json.loads(
+        right
+    )  # cases that were not solved are unchanged
 
 
 def test_stored_cases_and_stored_evidence_belong_together() -> None:
@@ -251,15 +257,15 @@ def test_stored_cases_and_stored_evidence_belong_together() -> None:
     assert {case.evidence for case in cases} == {path.name for path in STORED.glob('*.npz')}
     assert all(case.description and case.made and case.expected for case in cases)
     assert sum(path.stat().st_size for path in STORED.glob('*.npz')) < 3.2e6
-    grades = {case.expected.words['grade'] for case in cases}
+    grades = {case.expected.verdict['grade'] for case in cases}
     assert grades == {None, 'full', 'assumed', 'lens', 'unit_scale'}
 
 
-def test_stored_evidence_holds_what_later_methods_are_judged_by() -> None:
-    held = [Evidence.load(path) for path in sorted(STORED.glob('*.npz'))]
+def test_stored_evidence_has_edges_outlines_and_markings() -> None:
+    stored = [Evidence.load(path) for path in sorted(STORED.glob('*.npz'))]
     for name in ('edges_px', 'outlines_px', 'still_lines_px'):
-        assert any(len(getattr(evidence, name)) for evidence in held)
-    assert any(evidence.track_kinds.any() for evidence in held)
+        assert any(len(getattr(evidence, name)) for evidence in stored)
+    assert any(evidence.track_kinds.any() for evidence in stored)
 
 
 @pytest.mark.parametrize(
@@ -267,10 +273,10 @@ def test_stored_evidence_holds_what_later_methods_are_judged_by() -> None:
     [
         pytest.param(case, id=case.name)
         for case in read_cases(STORED)
-        if case.truth and case.expected.words['state'] == 'calibrated' and case.options.get('method') != 'paper'
+        if case.truth and case.expected.verdict['state'] == 'calibrated' and case.options.get('method') != 'paper'
     ],
 )
-def test_what_is_expected_of_stored_evidence_is_about_the_truth(case: Case) -> None:
+def test_expected_results_agree_with_the_ground_truth(case: Case) -> None:
     numbers, sigmas = case.expected.numbers, case.expected.stddev
     for name in ('focal_px', 'tilt_deg', 'roll_deg'):
         if name in numbers:
@@ -279,11 +285,11 @@ def test_what_is_expected_of_stored_evidence_is_about_the_truth(case: Case) -> N
 
 @pytest.mark.slow
 def test_nothing_moved() -> None:
-    measured = measure(STORED, jobs=2, quiet=True)
-    assert not measured.moved, '\n'.join(lines(measured))
+    golden_run = run_cases(STORED, jobs=2, quiet=True)
+    assert not golden_run.moved, '\n'.join(format_report(golden_run))
 
 
 @pytest.mark.slow
 def test_processes_do_not_change_a_digit(folder: Path) -> None:
-    alone, shared = (measure(folder, jobs=jobs, quiet=True) for jobs in (1, 2))
+    alone, shared = (run_cases(folder, jobs=jobs, quiet=True) for jobs in (1, 2))
     assert alone.found == shared.found

@@ -1,4 +1,4 @@
-"""The accuracy benchmark: errors of results with known faults, counts of made-up runs, and one tiny run of it all."""
+"""The accuracy benchmark: errors of results with known faults, tables of synthetic runs, and a small complete run."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def refused(code: str, **changes: object) -> Run:
 
 
 def cells(text: str, block: str, name: str) -> list[str]:
-    """Return the words of a family's line in the block with a title."""
+    """Return the words of the line of a family in the block with the given title."""
     part = next(part for part in text.split('\n\n') if block in part.splitlines()[0])
     return next(line for line in part.splitlines() if line.startswith(name)).split()
 
@@ -208,7 +208,7 @@ def test_beyond_is_what_its_own_sigmas_forbid(changes: dict[str, object], beyond
 
 @pytest.mark.parametrize(
     ('family', 'title'),
-    [('standard', 'determines the calibration: stated'), ('roundabout', 'does not, or that misleads: stated')],
+    [('standard', 'determines the calibration: stated'), ('roundabout', 'does not, or that is misleading: stated')],
 )
 def test_table_flags_what_is_beyond_its_own_sigmas_in_either_list(family: str, title: str) -> None:
     runs = [
@@ -291,7 +291,7 @@ def test_methods_stand_beneath_each_other_and_lines_fit_a_terminal() -> None:
     lines = [line.split()[:2] for line in text.splitlines()]
     place = lines.index(['lane_changes', 'joint'])
     assert lines[place + 1] == ['lane_changes', 'paper']
-    assert 'does not, or that misleads' in text
+    assert 'does not, or that is misleading' in text
     assert text.endswith('1 solutions crashed:\n  noise 4 (joint, LinAlgError)')
 
 
@@ -304,7 +304,7 @@ def test_csv_has_a_row_a_run_and_leaves_blank_what_is_not_given(tmp_path: Path) 
     assert (second['run'], second['code'], second['focal_error']) == ('2', 'horizon', '')
 
 
-def test_a_csv_that_cannot_be_written_is_told_before_the_work(tmp_path: Path) -> None:
+def test_an_unwritable_csv_is_reported_before_the_work(tmp_path: Path) -> None:
     with pytest.raises(InputError, match='cannot write'):
         run_monte_carlo(['many'], ['joint'], 1000, out=tmp_path, quiet=True)
 
@@ -329,10 +329,10 @@ def test_processes_do_not_change_the_result() -> None:
 @pytest.mark.parametrize(
     ('arguments', 'message'),
     [
-        (['--family', 'unheard_of'], "no family of evidence is called 'unheard_of'; there are standard, few"),
-        (['--runs', '0'], '--runs is 1 or more; got 0'),
-        (['--jobs', '0'], '--jobs is 1 or more; got 0'),
-        (['--seed', '-1'], '--seed is 0 or more; got -1'),
+        (['--family', 'unheard_of'], "unknown evidence family 'unheard_of'; known families: standard, few"),
+        (['--runs', '0'], '--runs must be at least 1; got 0'),
+        (['--jobs', '0'], '--jobs must be at least 1; got 0'),
+        (['--seed', '-1'], '--seed must be at least 0; got -1'),
         (['--method', 'magic'], "invalid choice: 'magic'"),
     ],
 )
@@ -340,8 +340,8 @@ def test_wrong_usage_is_one_line_and_status_2(
     arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(['benchmark', 'accuracy', *arguments]) == 2
-    told = capsys.readouterr().err
-    assert message in told and told.count('\n') == 1
+    error = capsys.readouterr().err
+    assert message in error and error.count('\n') == 1
 
 
 def test_the_cost_benchmark_is_still_there(capsys: pytest.CaptureFixture[str]) -> None:

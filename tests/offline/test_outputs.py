@@ -1,4 +1,4 @@
-"""The files of a replay, and a calibration as a recording."""
+"""Output files of a replay, and recordings with the calibration."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SECOND = 1_000_000_000
 
 
 def written(path, store):
-    """Return (topic, recorded_ns, message) of a bag, and the connections by topic."""
+    """Return tuples (topic, recorded_ns, message) of a bag, and its connections by topic."""
     with AnyReader([path], default_typestore=store) as reader:
         messages = [
             (connection.topic, at, reader.deserialize(raw, connection.msgtype))
@@ -32,7 +32,7 @@ def written(path, store):
 
 @pytest.fixture
 def write_bag_of(request):
-    """The fixture that writes recordings; `write_bag` is what is tested here."""
+    """The fixture that writes recordings, renamed: `write_bag` is the function under test."""
     return request.getfixturevalue('write_bag')
 
 
@@ -67,7 +67,7 @@ def test_what_stands_in_the_way_is_wrong_usage(tmp_path):
     (tmp_path / 'file').touch()
     with pytest.raises(UsageError, match='is a file, not a folder'):
         outputs.prepare_output_dir(tmp_path / 'file', None)
-    with pytest.raises(UsageError, match='cannot make the folder'):
+    with pytest.raises(UsageError, match='cannot create the folder'):
         outputs.prepare_output_dir(tmp_path / 'file' / 'out', None)
     with pytest.raises(UsageError, match='exists already and is not overwritten'):
         outputs.prepare_output_dir(tmp_path / 'out', tmp_path / 'file')

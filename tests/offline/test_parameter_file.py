@@ -1,4 +1,4 @@
-"""Parameter files of ROS 2 and assignments on the command line."""
+"""ROS 2 parameter files, and assignments on the command line."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def test_a_broken_file_is_one_clear_line(tmp_path, text, message):
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(InputError, match='cannot read .*nowhere.yaml: No such file'):
+    with pytest.raises(InputError, match=r'cannot read .*nowhere\.yaml: No such file'):
         read_params_file(tmp_path / 'nowhere.yaml')
 
 

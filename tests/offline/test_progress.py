@@ -1,4 +1,4 @@
-"""Progress on a terminal and elsewhere."""
+"""Progress reports on a terminal and in a log."""
 
 from __future__ import annotations
 

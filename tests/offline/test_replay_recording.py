@@ -1,4 +1,4 @@
-"""The loop of a replay on a recording of a box that drives across."""
+"""Replay of a synthetic recording with one moving box."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from autocalib_ros.results.calibration import Refusal
 
 
 class Drive:
-    """A source made of arrays: what replay needs of one and no more."""
+    """A minimal `Source` of generated images."""
 
     name, topic, image_type, camera_frame, duration_s = 'drive', '', '', '', None
 
@@ -37,12 +37,12 @@ class Drive:
 
 
 def test_a_replay_counts_its_frames_and_reports_them():
-    told = []
-    replayed = replay(Drive(40), Options(), lambda done, note: told.append((done, note)))
+    reports = []
+    replayed = replay(Drive(40), Options(), lambda done, note: reports.append((done, note)))
     assert replayed.frames == replayed.evidence.frames == 40
-    assert [done for done, _ in told] == [*range(1, 41), 40, 40]
-    assert [note for _, note in told[-2:]] == ['solving', 'refused']
-    assert told[0][1].startswith('collecting 0 %: 0 of 40 tracks')
+    assert [done for done, _ in reports] == [*range(1, 41), 40, 40]
+    assert [note for _, note in reports[-2:]] == ['solving', 'refused']
+    assert reports[0][1].startswith('collecting 0 %: 0 of 40 tracks')
     assert replayed.background.shape == (120, 160, 3)
 
 
@@ -60,29 +60,29 @@ def test_the_same_recording_gives_the_same_evidence():
 
 
 def test_a_recording_without_images_is_an_error():
-    with pytest.raises(InputError, match='drive gives no image'):
+    with pytest.raises(InputError, match='drive has no images'):
         replay(Drive(0), Options())
 
 
 def test_a_known_lens_goes_into_each_solution_in_the_size_of_the_images(monkeypatch):
-    told = []
+    reports = []
 
-    def told_solve(evidence, options, *, lens):
-        told.append(lens)
+    def recording_solve(evidence, options, *, lens):
+        reports.append(lens)
         return solve(evidence, options)
 
-    monkeypatch.setattr('autocalib_ros.offline.replay_recording.solve', told_solve)
+    monkeypatch.setattr('autocalib_ros.offline.replay_recording.solve', recording_solve)
     options = Options(first_solve_s=0.0, gate=GateOptions(min_tracks=4))
     replay(Drive(150), options, lens=Camera.equidistant(320, 240, 200.0))
-    assert len(told) > 1
-    assert set(told) == {Camera.equidistant(160, 120, 100.0)}
+    assert len(reports) > 1
+    assert set(reports) == {Camera.equidistant(160, 120, 100.0)}
 
 
 def test_a_lens_of_another_shape_is_noticed_at_the_first_image():
-    told = []
+    reports = []
     with pytest.raises(UsageError, match='images of 160x90, and these images have 160x120'):
-        replay(Drive(40), Options(), lambda done, note: told.append(done), lens=Camera.equidistant(160, 90, 100.0))
-    assert not told
+        replay(Drive(40), Options(), lambda done, note: reports.append(done), lens=Camera.equidistant(160, 90, 100.0))
+    assert not reports
 
 
 def test_evidence_solved_again_gives_the_same():
@@ -106,12 +106,12 @@ def test_a_refused_solution_is_what_is_missing_and_then_since_when_it_is_calibra
     monkeypatch.setattr(
         'autocalib_ros.offline.replay_recording.solve', lambda due, options, lens: next(results, accepted)
     )
-    told = []
+    reports = []
     # the box is all that there is to see, so that the background seems to drift by up to 100 px
     gate = GateOptions(min_tracks=4, min_coverage=0.0, max_drift_px=1000.0)
     options = Options(first_solve_s=0.0, solve_interval_s=1.0, solve_growth=1.01, gate=gate)
-    replay(Drive(300), options, lambda done, note: told.append(note))
-    assert 'collecting 100 %: the halves disagree' in told
-    assert any(note.startswith('calibrated since ') and note.endswith('focal length 100 px') for note in told)
-    assert told.index('solving') < told.index('collecting 100 %: the halves disagree')
-    assert told[-1] == 'calibrated'
+    replay(Drive(300), options, lambda done, note: reports.append(note))
+    assert 'collecting 100 %: the halves disagree' in reports
+    assert any(note.startswith('calibrated since ') and note.endswith('focal length 100 px') for note in reports)
+    assert reports.index('solving') < reports.index('collecting 100 %: the halves disagree')
+    assert reports[-1] == 'calibrated'

@@ -1,4 +1,4 @@
-"""The made-up traffic is what it says it is: in number, in place, and in the ways it goes wrong."""
+"""Synthetic evidence: counts, geometry and disturbances as specified."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def drawn(name: str) -> tuple[Junction, Evidence]:
 
 
 def circles(junction: Junction, evidence: Evidence) -> tuple[np.ndarray, np.ndarray]:
-    """Normals (tracks, 3) of the tracks' great circles in the true lens, and their worst distance in pixels."""
+    """Return great-circle normals (tracks, 3) of the tracks in the true lens, and their largest residuals in pixels."""
     normals, worst = [], []
     for track in evidence.tracks():
         bearings, _ = junction.camera.unproject(track.points_px)
@@ -307,7 +307,7 @@ def test_a_sway_moves_the_tracks_with_the_camera() -> None:
     )
 
 
-def test_a_road_out_of_view_is_told() -> None:
+def test_a_road_out_of_view_is_an_error() -> None:
     with pytest.raises(UsageError, match='out of view'):
         synthetic_evidence(replace(CLEAN, centre_m=(-200.0, 0.0), tracks=2), rng())
 

@@ -1,4 +1,4 @@
-"""What the terminal shows: colours where they are wanted, a table that is aligned, lines that fit."""
+"""Terminal layout: colours, aligned tables, truncated lines."""
 
 from __future__ import annotations
 

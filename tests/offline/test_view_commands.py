@@ -26,12 +26,12 @@ DIP = np.radians(28.0)
 DOWN = np.array([[1.0, 0, 0], [0, np.cos(DIP), np.sin(DIP)], [0, -np.sin(DIP), np.cos(DIP)]])
 LENS = Camera(640, 360, 300.0, (322.0, 178.0), (0.01, 0.0, 0.0, 0.0))
 POSE = GroundPlane(LOOKS_ALONG @ DOWN, 8.0)
-"""Looks along the ground's x, 28 degrees down."""
+"""Camera that looks along the ground x axis, 28 degrees down."""
 SQUARE_M = 2.0
 
 
 def chequered(camera: Camera) -> np.ndarray:
-    """Return what the camera sees of a road of squares, 40 and 220, under a sky of 130."""
+    """Return the image of a chequered road with grey levels 40 and 220, and a sky of 130."""
     pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1).astype(float)
     points = image_to_ground(camera, POSE, pixels)
     odd = np.nan_to_num(np.floor(points / SQUARE_M).sum(axis=-1)) % 2 == 1
@@ -41,7 +41,7 @@ def chequered(camera: Camera) -> np.ndarray:
 
 @pytest.fixture
 def saved(tmp_path) -> Path:
-    """Return the folder of a calibration.json, an image.png and an image of half the size, half.png."""
+    """Return a folder with calibration.json, image.png and half.png, the image at half size."""
     write_calibration_json(tmp_path / 'calibration.json', replace(calibration(), camera=LENS, ground=POSE))
     cv2.imwrite(str(tmp_path / 'image.png'), chequered(LENS))
     cv2.imwrite(str(tmp_path / 'half.png'), chequered(LENS.scaled_to(320, 180)))
@@ -50,7 +50,7 @@ def saved(tmp_path) -> Path:
 
 @pytest.fixture
 def video(saved) -> Path:
-    """Return a video of 20 images at 10 Hz that gets brighter."""
+    """Return a video of 20 images at 10 Hz with increasing brightness."""
     path = saved / 'clip.avi'
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*'MJPG'), 10.0, (640, 360))
     for index in range(20):
@@ -71,7 +71,7 @@ def command(saved, capsys):
 
 
 def squares_are_square(picture: np.ndarray, low_m: tuple[float, float], px_per_m: float) -> bool:
-    """Whether the middle of each square of the road lies where it should in a view from above."""
+    """Return whether the centres of the squares are at their true places in a top-down view."""
     rows, columns = picture.shape[:2]
     high_y = low_m[1] + rows / px_per_m
     for x in np.arange(low_m[0] + 1, low_m[0] + columns / px_per_m, SQUARE_M):
@@ -91,7 +91,7 @@ def test_the_road_from_above_is_to_scale_in_images_of_any_size(image, command, s
     assert squares_are_square(cv2.imread(str(saved / 'top.png')), (6.0, -4.0), 20.0)
 
 
-def test_a_view_from_above_shows_the_road_with_a_scale_bar_unless_told_otherwise(command, saved):
+def test_a_view_from_above_has_a_scale_bar_by_default(command, saved):
     for name, more in (('plain', ['--no-scale-bar']), ('bar', []), ('grid', ['--grid'])):
         assert command('topview', saved / 'image.png', saved / f'{name}.png', *more)[0] == 0
     plain, bar, grid = (cv2.imread(str(saved / f'{name}.png')).astype(int) for name in ('plain', 'bar', 'grid'))
@@ -181,7 +181,7 @@ def test_the_picture_shows_image_and_view_from_above_with_the_same_squares(comma
 
 
 @pytest.mark.parametrize(
-    ('arguments', 'told'),
+    ('arguments', 'message'),
     [
         (['image.png', 'out.gif'], 'is neither a picture nor a video'),
         (['image.png', 'image.png'], 'is the source itself'),
@@ -190,17 +190,17 @@ def test_the_picture_shows_image_and_view_from_above_with_the_same_squares(comma
         (['image.png', '.'], 'is neither a picture'),
         (['clip.avi', 'out.png', '--duration', '3'], '--duration is for videos'),
         (['clip.avi', 'out.png', '--at', '99'], 'no image 99 s after the start'),
-        (['clip.avi', 'out.png', '--at', '-1'], 'zero seconds or later'),
+        (['clip.avi', 'out.png', '--at', '-1'], 'the start must be at least 0 seconds'),
         (['nowhere.mp4', 'out.png'], 'does not exist'),
         (['nowhere.png', 'out.png'], 'cannot read'),
-        (['words.png', 'out.png'], 'is not an image that can be read'),
-        (['words.mp4', 'out.png'], 'is not a video that can be read'),
-        (['empty.png', 'out.png'], 'is not an image that can be read'),
+        (['words.png', 'out.png'], 'is not a readable image'),
+        (['words.mp4', 'out.png'], 'is not a readable video'),
+        (['empty.png', 'out.png'], 'is not a readable image'),
         (['square.png', 'out.png'], 'these images have 300x300, another shape'),
         (['image.png', 'words.png/out.png'], 'cannot write'),
     ],
 )
-def test_what_does_not_fit_is_one_line_and_status_2(arguments, told, command, saved, video, monkeypatch):
+def test_what_does_not_fit_is_one_line_and_status_2(arguments, message, command, saved, video, monkeypatch):
     monkeypatch.chdir(saved)
     Path('words.png').write_text('only words\n' * 50)
     Path('words.mp4').write_text('only words\n' * 50)
@@ -209,12 +209,12 @@ def test_what_does_not_fit_is_one_line_and_status_2(arguments, told, command, sa
     before = sorted(saved.iterdir())
     status, stdout, stderr = command('topview', *arguments)
     assert (status, stdout, stderr.count('\n')) == (2, '', 1)
-    assert stderr.startswith('autocalib: error: ') and told in stderr
+    assert stderr.startswith('autocalib: error: ') and message in stderr
     assert sorted(saved.iterdir()) == before
 
 
 @pytest.mark.parametrize(
-    ('arguments', 'told'),
+    ('arguments', 'message'),
     [
         (['topview', '--x', '5', '5'], '--x takes the lower and then the higher end'),
         (['topview', '--px-per-m', '0'], '--px-per-m is more than 0'),
@@ -222,9 +222,9 @@ def test_what_does_not_fit_is_one_line_and_status_2(arguments, told, command, sa
         (['rectify', '--balance', '2'], 'the balance lies between 0'),
     ],
 )
-def test_wrong_numbers_are_told(arguments, told, command, saved):
+def test_wrong_numbers_are_reported(arguments, message, command, saved):
     status, _, stderr = command(arguments[0], saved / 'image.png', saved / 'out.png', *arguments[1:])
-    assert status == 2 and told in stderr
+    assert status == 2 and message in stderr
 
 
 @pytest.mark.parametrize('name', ['topview', 'picture'])
@@ -237,13 +237,13 @@ def test_a_lens_without_a_plane_makes_no_view_from_above(name, command, saved):
 def test_a_plane_without_metres_is_shown_in_heights_of_the_camera(command, saved, monkeypatch):
     unit = replace(calibration(), grade='unit_scale', camera=LENS, ground=GroundPlane(POSE.rotation, 1.0, False))
     write_calibration_json(saved / 'calibration.json', unit)
-    told = []
-    monkeypatch.setattr('matplotlib.axes.Axes.text', lambda axes, x, y, words, **how: told.append(words))
+    labels = []
+    monkeypatch.setattr('matplotlib.axes.Axes.text', lambda axes, x, y, words, **how: labels.append(words))
     assert command('topview', saved / 'image.png', saved / 'out.png')[0] == 0
     assert command('picture', saved / 'image.png', saved / 'out.png')[0] == 0
-    assert told[0].endswith(' camera heights')
-    assert any(words.endswith('squares of 0.5 camera heights') for words in told)
-    assert not any(words.endswith(' m') for words in told)
+    assert labels[0].endswith(' camera heights')
+    assert any(words.endswith('squares of 0.5 camera heights') for words in labels)
+    assert not any(words.endswith(' m') for words in labels)
 
 
 def test_a_lens_that_folds_back_inside_the_image_cannot_be_undistorted(saved, capsys):
@@ -292,7 +292,7 @@ def test_ignored_regions_are_black_in_images_of_any_size(image, command, saved):
     assert black.sum() < 86 * 86
 
 
-def test_a_codec_that_is_missing_is_told_and_leaves_nothing(command, saved, video, monkeypatch):
+def test_a_missing_codec_is_an_error_and_leaves_nothing(command, saved, video, monkeypatch):
     monkeypatch.setitem(view_files.VIDEO_CODECS, '.mp4', '????')
     status, _, stderr = command('rectify', video, saved / 'out.mp4', '--quiet')
     assert status == 2 and 'cannot encode' in stderr

@@ -1,1 +1,1 @@
-"""Benchmarks: accuracy by Monte Carlo, cost, and golden evidence."""
+"""Benchmarks: accuracy by Monte Carlo, processor time and memory, and regression on golden evidence."""

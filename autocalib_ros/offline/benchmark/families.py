@@ -1,7 +1,7 @@
-"""The kinds of made-up evidence on which accuracy is measured, each drawn anew for every run.
+"""Families of synthetic evidence for the accuracy benchmark; every run draws its own junction.
 
-`DETERMINED` families hold enough to calibrate from, each but the first a variation of `standard` in one thing;
-`UNDERDETERMINED` ones do not, or hold it in a form that misleads: there a refusal is the right answer.
+`DETERMINED` families contain enough information to calibrate; each varies one property of `standard`.
+`UNDERDETERMINED` families contain too little or misleading information: a refusal is the correct result.
 """
 
 from __future__ import annotations
@@ -35,22 +35,22 @@ from autocalib_ros.offline.synthetic.junction import HEADWAY_S, Junction, eviden
 WIDTH, HEIGHT = 1280, 720
 FOCAL_PX = (500.0, 640.0)
 LONG_FOCAL_PX = (700.0, 1200.0)
-"""Of distortion-free lenses, which are not made as wide."""
+"""Focal lengths of distortion-free lenses in pixels; such lenses are not built with a wider field of view."""
 TANGENT_SERIES = (1 / 3, 2 / 15, 17 / 315, 62 / 2835)
-"""The series of the tangent."""
+"""Coefficients k1 to k4 of tan(theta) = theta (1 + k1 theta^2 + ...), in the model of Kannala & Brandt (2006)."""
 MAX_K1 = 0.05
 TURNING_K1 = 0.03
 MAX_CENTRE_OFFSET_PX = 20.0
-"""Of the principal point from the image centre, along each axis."""
+"""Largest offset of the principal point from the image centre along each axis."""
 PRINCIPAL_POINT_SIGMA = 0.01
-"""Standard deviation of the same, share of the image width: what joint.principal_point_sigma_px is by default."""
+"""Standard deviation of the principal point, fraction of the image width: default joint.principal_point_sigma_px."""
 
 Family = Callable[[np.random.Generator], tuple[Junction, Evidence]]
-"""Draws the truth, and evidence of it."""
+"""Draws the ground truth and evidence of it."""
 
 
 def standard_junction(generator: np.random.Generator, heading_deg: tuple[float, float] = (25.0, 65.0)) -> Junction:
-    """Draw the standard case: 60 tracks, one per vehicle, on two perpendicular roads that cross ahead of the camera."""
+    """Draw the standard junction: 60 tracks, one per vehicle, on two perpendicular roads that cross ahead."""
     tilt, roll, heading, height = generator.uniform([26, -2, heading_deg[0], 6], [38, 2, heading_deg[1], 10])
     reach = generator.uniform(1.1, 1.7) * height / np.tan(np.radians(tilt))
     bearing = np.radians(generator.uniform(-8, 8) - heading)
@@ -65,7 +65,7 @@ def standard_junction(generator: np.random.Generator, heading_deg: tuple[float, 
 
 
 def draw_lens(generator: np.random.Generator) -> Camera:
-    """Draw a lens near equidistant whose principal point is off the image centre."""
+    """Draw a nearly equidistant lens with its principal point off the image centre."""
     focal, k1, right, down = generator.uniform(
         [FOCAL_PX[0], -MAX_K1, -MAX_CENTRE_OFFSET_PX, -MAX_CENTRE_OFFSET_PX],
         [FOCAL_PX[1], MAX_K1, MAX_CENTRE_OFFSET_PX, MAX_CENTRE_OFFSET_PX],
@@ -75,12 +75,12 @@ def draw_lens(generator: np.random.Generator) -> Camera:
 
 
 def draw_distortion_free_lens(generator: np.random.Generator) -> Camera:
-    """Draw a lens that images straight lines as straight lines."""
+    """Draw a lens without distortion: straight lines stay straight in the image."""
     return replace(draw_lens(generator), focal_px=float(generator.uniform(*LONG_FOCAL_PX)), k=TANGENT_SERIES)
 
 
 def family_of(junction_of: Callable[[np.random.Generator], Junction]) -> Family:
-    """Make a family of junctions that are drawn and then driven through."""
+    """Return the family that draws a junction and simulates traffic through it."""
 
     def family(generator: np.random.Generator) -> tuple[Junction, Evidence]:
         junction = junction_of(generator)
@@ -90,28 +90,28 @@ def family_of(junction_of: Callable[[np.random.Generator], Junction]) -> Family:
 
 
 def standard_with(**changes: Any) -> Family:
-    """Make a family of standard junctions with other values of some fields."""
+    """Return the family of standard junctions with the given fields changed."""
     return family_of(lambda generator: replace(standard_junction(generator), **changes))
 
 
 def skew(generator: np.random.Generator) -> Junction:
-    """Two roads that cross at 60 to 85 degrees."""
+    """Draw two roads that cross at 60 to 85 degrees."""
     crossing = generator.choice([-1.0, 1.0]) * generator.uniform(60.0, 85.0)
     return replace(standard_junction(generator), road_angles_deg=(0.0, float(crossing)))
 
 
 def equidistant(generator: np.random.Generator) -> Junction:
-    """An equidistant lens, centred: the solver's prior is the truth."""
+    """Draw a centred equidistant lens: the mean of the solver's prior is the truth."""
     return replace(standard_junction(generator), camera=Camera.equidistant(WIDTH, HEIGHT, generator.uniform(*FOCAL_PX)))
 
 
 def three_roads(generator: np.random.Generator) -> Junction:
-    """A third road at about 45 degrees to the two perpendicular ones."""
+    """Draw a third road at about 45 degrees to the two perpendicular ones."""
     return replace(standard_junction(generator), road_angles_deg=(0.0, 90.0, float(generator.uniform(35.0, 55.0))))
 
 
 def one_road(generator: np.random.Generator) -> Junction:
-    """One road, straight, passing off the optical axis: the lens alone can be had."""
+    """Draw one straight road that passes beside the optical axis: only the lens is identifiable."""
     return replace(
         _random_track_count(standard_junction(generator, (40.0, 75.0)), generator),
         road_angles_deg=(0.0,),
@@ -120,12 +120,12 @@ def one_road(generator: np.random.Generator) -> Junction:
 
 
 def distortion_free(generator: np.random.Generator) -> Junction:
-    """A distortion-free lens over perpendicular roads: the right angle alone tells the focal length."""
+    """Draw a distortion-free lens over perpendicular roads: only the right angle constrains the focal length."""
     return replace(standard_junction(generator), camera=draw_distortion_free_lens(generator))
 
 
 def radial(generator: np.random.Generator) -> Junction:
-    """One road straight ahead: each track runs through the distortion centre, where no lens bends it."""
+    """Draw one road straight ahead: radial tracks pass through the distortion centre and stay straight in any lens."""
     junction = _random_track_count(standard_junction(generator, (-1.0, 1.0)), generator)
     lanes = (0.0, float(generator.uniform(0.3, 1.5)))
     return replace(
@@ -134,21 +134,21 @@ def radial(generator: np.random.Generator) -> Junction:
 
 
 def bend(generator: np.random.Generator) -> Junction:
-    """Curved traffic only: one bend of constant radius."""
+    """Draw curved traffic only: one bend of constant radius."""
     drive = partial(drive_bend, radius_m=generator.uniform(15.0, 60.0), towards_rad=generator.uniform(0, 2 * np.pi))
     return replace(_random_track_count(standard_junction(generator), generator), drive=drive)
 
 
 def roundabout(generator: np.random.Generator) -> Junction:
-    """Curved traffic only: the ring of a roundabout."""
+    """Draw curved traffic only: the ring of a roundabout."""
     drive = partial(drive_ring, radius_m=generator.uniform(15.0, 30.0))
     return replace(_random_track_count(standard_junction(generator), generator), drive=drive)
 
 
 def turning(generator: np.random.Generator) -> Junction:
-    """Vehicles that turn, each on an arc of its own, a fifth of them taken for one with a neighbour.
+    """Draw turning vehicles, each on its own arc, a fifth of them merged with a neighbour into one vehicle.
 
-    The principal point is the image centre: turns tell less of it than of all else.
+    The principal point is the image centre: turns constrain it less than the other parameters.
     """
     junction = _with_centred_lens(standard_junction(generator), generator)
     return replace(
@@ -162,19 +162,19 @@ def turning(generator: np.random.Generator) -> Junction:
 
 
 def turning_off_centre(generator: np.random.Generator) -> Junction:
-    """Vehicles that turn, before a lens whose principal point is off the image centre as the solver expects it."""
+    """Draw turning vehicles and a principal point off the image centre, distributed as in the solver's prior."""
     junction = turning(generator)
     point = np.array(junction.camera.principal_point_px) + generator.normal(0.0, PRINCIPAL_POINT_SIGMA * WIDTH, 2)
     return replace(junction, camera=replace(junction.camera, principal_point_px=(float(point[0]), float(point[1]))))
 
 
 def motorway(generator: np.random.Generator) -> Junction:
-    """A motorway of three lanes one way, a third of the vehicles changing lanes: the lens alone can be had."""
+    """Draw a motorway of three lanes one way, 30 % of the vehicles changing lanes: only the lens is identifiable."""
     return _with_traffic_on(standard_junction(generator, (40.0, 75.0)), highway(one_way=True, changing_fraction=0.3))
 
 
 def long_bend(generator: np.random.Generator) -> Junction:
-    """A road with lanes both ways that bends by 80 degrees on 64 to 112 m: in view, mostly about one point."""
+    """Draw a two-way road that bends by 80 degrees over 64 to 112 m: in view, mostly about a single centre."""
     junction = _with_centred_lens(standard_junction(generator), generator)
     return _with_traffic_on(
         junction,
@@ -185,7 +185,7 @@ def long_bend(generator: np.random.Generator) -> Junction:
 
 
 def roundabout_arms(generator: np.random.Generator) -> Junction:
-    """A roundabout with vehicles that enter, circle and leave, seen from outside."""
+    """Draw a roundabout seen from outside, with vehicles that enter, circulate and leave."""
     junction = _with_centred_lens(standard_junction(generator), generator)
     scale = generator.uniform(0.8, 1.3)
     direction = np.array(junction.centre_m) / np.hypot(*junction.centre_m)
@@ -199,19 +199,19 @@ def roundabout_arms(generator: np.random.Generator) -> Junction:
 
 
 def skew_turning(generator: np.random.Generator) -> Junction:
-    """Two roads that cross at 60 to 70 degrees, a third of the vehicles turning."""
+    """Draw two roads that cross at 60 to 70 degrees, 35 % of the vehicles turning."""
     network = crossing(np.radians(generator.uniform(60.0, 70.0)), turning_fraction=0.35)
     return _with_traffic_on(standard_junction(generator), network, rotation_rad=np.pi * generator.integers(2))
 
 
 def tee(generator: np.random.Generator) -> Junction:
-    """A road on which another one ends: all its vehicles turn, and some of the main road's."""
+    """Draw a T-junction: all vehicles of the side road turn, and some of the main road."""
     network = crossing(np.pi / 2, turning_fraction=0.35, tee=True)
     return _with_traffic_on(standard_junction(generator), network, rotation_rad=np.pi / 2 * generator.integers(4))
 
 
 def sparse(generator: np.random.Generator) -> Junction:
-    """A junction with a vehicle every twelve seconds, watched for two to four minutes."""
+    """Draw a junction with a vehicle every twelve seconds, observed for two to four minutes."""
     junction = _with_traffic_on(standard_junction(generator), crossing(np.pi / 2, turning_fraction=0.3))
     return replace(junction, vehicles=int(generator.integers(10, 21)), headway_s=12.0)
 
@@ -219,13 +219,13 @@ def sparse(generator: np.random.Generator) -> Junction:
 def _with_traffic_on(
     junction: Junction, network: Network, *, rotation_rad: float = 0.0, scale: float = 1.0
 ) -> Junction:
-    """Let 40 vehicles with eight points each drive the routes of a network."""
+    """Return the junction with 40 vehicles of eight points each on the routes of a network."""
     drive = partial(drive_route, network=network, rotation_rad=rotation_rad, scale=scale)
     return replace(junction, drive=drive, tracks=None, vehicles=40, points_per_vehicle=8)
 
 
 def _with_centred_lens(junction: Junction, generator: np.random.Generator) -> Junction:
-    """Give the camera a lens nearer equidistant, with its principal point at the image centre."""
+    """Return the junction with a lens closer to equidistant and its principal point at the image centre."""
     camera = replace(
         Camera.equidistant(WIDTH, HEIGHT, junction.camera.focal_px),
         k=(float(generator.uniform(-TURNING_K1, TURNING_K1)), 0.0, 0.0, 0.0),
@@ -234,12 +234,12 @@ def _with_centred_lens(junction: Junction, generator: np.random.Generator) -> Ju
 
 
 def pedestrians(generator: np.random.Generator) -> Junction:
-    """People on pavements, nobody on the road."""
+    """Draw pedestrians on pavements and no vehicles."""
     return replace(standard_junction(generator), drive=walk_along_road, tracks=int(generator.integers(60, 200)))
 
 
 def short_piece(generator: np.random.Generator) -> Junction:
-    """One road from the side, of which only a short piece is in view."""
+    """Draw one road from the side, of which only a short section is in view."""
     left = generator.uniform(0.2, 0.6) * WIDTH
     return replace(
         _random_track_count(standard_junction(generator, (75.0, 105.0)), generator),
@@ -250,23 +250,23 @@ def short_piece(generator: np.random.Generator) -> Junction:
 
 
 def distortion_free_skew(generator: np.random.Generator) -> Junction:
-    """A distortion-free lens over skewed roads: neither curvature nor a right angle tells the focal length."""
+    """Draw a distortion-free lens over skew roads: neither curvature nor a right angle constrains the focal length."""
     return replace(_random_track_count(skew(generator), generator), camera=draw_distortion_free_lens(generator))
 
 
 def swaying_camera(generator: np.random.Generator) -> Junction:
-    """Draw ordinary traffic before a camera that does not stand still."""
+    """Draw ordinary traffic in front of a swaying camera."""
     return replace(_random_track_count(standard_junction(generator), generator), sway=random_sway(generator))
 
 
 def undetected_sway(generator: np.random.Generator) -> tuple[Junction, Evidence]:
-    """Draw the same, where the monitor of the background sees nothing of it."""
+    """Draw a swaying camera whose drift monitor reports no drift."""
     junction, evidence = family_of(swaying_camera)(generator)
     return junction, replace(evidence, drift_px=0.0)
 
 
 def noise(generator: np.random.Generator) -> tuple[Junction, Evidence]:
-    """Points that stagger or straggle through the image and belong to no road."""
+    """Draw random walks and noisy lines in the image that belong to no road."""
     junction = standard_junction(generator)
     tracks = []
     for number in range(int(generator.integers(60, 240))):
@@ -278,7 +278,7 @@ def noise(generator: np.random.Generator) -> tuple[Junction, Evidence]:
 
 
 def _random_track_count(junction: Junction, generator: np.random.Generator) -> Junction:
-    """Give each vehicle one to four points: 60 to 240 tracks."""
+    """Return the junction with one to four points per vehicle: 60 to 240 tracks."""
     points = int(generator.integers(1, 5))
     return replace(junction, tracks=60 * points, points_per_vehicle=points)
 

@@ -1,7 +1,7 @@
-"""Saved evidence with the verdict and the numbers that it has to give: `autocalib benchmark golden`.
+"""Regression benchmark on stored evidence with expected results: `autocalib benchmark golden`.
 
-A folder holds `expected.json` and the evidence of its cases, each solved with the options of the case. Whatever moves
-is told: a verdict or a count that is another, a number that is off by more than a part of its stated sigma.
+A folder holds `expected.json` and the evidence of its cases. Each case is solved with its own options. The report lists
+every change: a different verdict or count, or a number that changed by more than a fraction of its stated sigma.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from autocalib_ros.estimation.estimate import solve
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.offline.benchmark.processes import in_order
+from autocalib_ros.offline.benchmark.processes import map_in_order
 from autocalib_ros.offline.parameter_file import override_options
 from autocalib_ros.offline.terminal.progress import progress_bar
 from autocalib_ros.offline.terminal.style import align_columns
@@ -28,70 +28,70 @@ from autocalib_ros.results.calibration import COVARIANCE_PARAMETERS, GROUND_DIST
 from autocalib_ros.util.files import write_atomically
 
 EXPECTED = 'expected.json'
-WORDS = ('state', 'grade', 'refusal', 'ground_refusal', 'roads', 'people')
-"""What is compared as it stands: the verdict, the codes of its refusals, and counts."""
-SAME = 1e-6
-"""A number without a sigma has moved when it differs by this part of itself."""
-SAME_AS_ZERO = 1e-9
-"""Numbers that differ by less than this are the same, however small they are."""
+VERDICT_FIELDS = ('state', 'grade', 'refusal', 'ground_refusal', 'roads', 'people')
+"""Fields compared for equality: verdict, refusal codes, and counts. The first three are the verdict proper."""
+RELATIVE_TOLERANCE = 1e-6
+"""Largest relative change of a number without a sigma that counts as equal; covers rounding, judgement."""
+ABSOLUTE_TOLERANCE = 1e-9
+"""Largest absolute change that counts as equal for any number; covers values near zero, judgement."""
 FORMAT = 1
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a solution gave, or has to give."""
+    """The compared part of a result, found or expected."""
 
-    words: Mapping[str, str | int | None]
-    """By the names of `WORDS`."""
+    verdict: Mapping[str, str | int | None]
+    """Verdict and counts by field name, see `VERDICT_FIELDS`."""
     numbers: Mapping[str, float] = field(default_factory=dict)
-    """Lens and pose, by the names of `COVARIANCE_PARAMETERS`."""
+    """Lens and pose by parameter name, see `COVARIANCE_PARAMETERS`."""
     stddev: Mapping[str, float] = field(default_factory=dict)
-    """One sigma of those that have one, and of road points ahead."""
+    """One standard deviation, for the parameters that have one and for road points ahead."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """Evidence, what the solution is told, and what has to come of it."""
+    """Evidence, solver inputs and expected result."""
 
     name: str
     description: str
     made: str
-    """How the evidence was made."""
+    """How the evidence was generated or recorded."""
     evidence: str
-    """File in the folder; several cases may share one."""
+    """File name in the folder; several cases may share a file."""
     options: Mapping[str, Any]
-    """By their full names."""
+    """Options by full name."""
     lens: Mapping[str, Any] | None = None
-    """The known lens, focal_px, principal_point_px and k, where the pose alone is solved."""
+    """Known lens (focal_px, principal_point_px, k) of a case in which only the pose is estimated."""
     truth: Mapping[str, Any] | None = None
-    """Lens and pose that the evidence was made with; for people, nothing is compared with it."""
+    """True lens and pose of synthetic evidence. For readers: the benchmark does not compare with it."""
     expected: Outcome | None = None
-    """None of a case that is new."""
+    """None for a new case."""
 
 
 @dataclass(frozen=True)
 class Moved:
-    """One quantity of a case that is not what it was expected to be."""
+    """A quantity of a case that differs from the expected one."""
 
     case: str
     quantity: str
     expected: str | float | None
     found: str | float | None
     sigmas: float | None = None
-    """The change in stated sigmas, where there are any."""
+    """Change in units of the expected sigma; None without a sigma."""
 
 
 @dataclass(frozen=True)
-class Measured:
-    """What cases gave, and what of it is not as expected."""
+class GoldenRun:
+    """Results of the cases, and the differences from the expected ones."""
 
     cases: tuple[Case, ...]
     found: Mapping[str, Outcome]
-    """By the names of the cases."""
+    """Results by case name."""
     moved: tuple[Moved, ...]
 
 
-def measure(
+def run_cases(
     folder: Path,
     only: Sequence[str] = (),
     *,
@@ -99,16 +99,20 @@ def measure(
     exact: bool = False,
     jobs: int = 1,
     quiet: bool = False,
-) -> Measured:
-    """Solve the cases of a folder, or `only` some of them by name, in the order of their names."""
+) -> GoldenRun:
+    """Solve the cases of a folder in alphabetical order and compare them with the expected results.
+
+    `only` selects cases by name, all if empty. `tolerance` is in units of the expected sigma; `exact` compares to the
+    last digit. Raise UsageError for wrong arguments, InputError for unreadable files.
+    """
     if jobs < 1:
-        raise UsageError(f'--jobs is 1 or more; got {jobs}')
+        raise UsageError(f'--jobs must be at least 1; got {jobs}')
     if not 0 <= tolerance < math.inf:
-        raise UsageError(f'--tolerance is 0 or more; got {tolerance}')
-    cases = chosen(read_cases(folder), only)
+        raise UsageError(f'--tolerance must be at least 0; got {tolerance}')
+    cases = select_cases(read_cases(folder), only)
     found: dict[str, Outcome] = {}
     with progress_bar(len(cases), 'cases', 'golden', quiet=quiet) as progress:
-        for case, outcome in zip(cases, in_order(partial(outcome_of, folder), cases, jobs), strict=True):
+        for case, outcome in zip(cases, map_in_order(partial(solve_case, folder), cases, jobs), strict=True):
             found[case.name] = outcome
             progress.update_to(len(found), case.name)
     moved = [
@@ -116,33 +120,33 @@ def measure(
         for case in cases
         for item in differences(case.name, case.expected, found[case.name], tolerance=tolerance, exact=exact)
     ]
-    return Measured(tuple(cases), found, tuple(moved))
+    return GoldenRun(tuple(cases), found, tuple(moved))
 
 
-def update(folder: Path, measured: Measured) -> None:
-    """Expect what was found from now on, of the cases in which something moved; all else stays as it is."""
-    changed = {item.case for item in measured.moved}
+def update(folder: Path, golden_run: GoldenRun) -> None:
+    """Store the results of the cases that moved as expected results; leave all other cases unchanged."""
+    changed = {item.case for item in golden_run.moved}
     if changed:
         write_cases(
             folder,
             [
-                replace(case, expected=measured.found[case.name]) if case.name in changed else case
+                replace(case, expected=golden_run.found[case.name]) if case.name in changed else case
                 for case in read_cases(folder)
             ],
         )
 
 
-def chosen(cases: Sequence[Case], names: Sequence[str]) -> list[Case]:
-    """Return the cases with these names in their own order, all of them for none, or raise UsageError."""
+def select_cases(cases: Sequence[Case], names: Sequence[str]) -> list[Case]:
+    """Return the cases with these names in their stored order, all cases if `names` is empty, or raise UsageError."""
     known = [case.name for case in cases]
     for name in names:
         if name not in known:
-            raise UsageError(f"no golden case is called '{name}'; there are {', '.join(known)}")
+            raise UsageError(f"unknown golden case '{name}'; known cases: {', '.join(known)}")
     return [case for case in cases if not names or case.name in names]
 
 
-def outcome_of(folder: Path, case: Case) -> Outcome:
-    """Solve a case; a solver that fails is an outcome too, and does not end the benchmark."""
+def solve_case(folder: Path, case: Case) -> Outcome:
+    """Solve a case; an exception of the solver is an outcome too and does not stop the benchmark."""
     evidence, options = Evidence.load(folder / case.evidence), override_options(Options(), case.options)
     lens = (
         None
@@ -152,23 +156,23 @@ def outcome_of(folder: Path, case: Case) -> Outcome:
         )
     )
     try:
-        return told(solve(evidence, options, lens=lens))
+        return outcome_from_result(solve(evidence, options, lens=lens))
     except AutocalibError:
         raise
     except Exception as error:
-        return Outcome(_words(state=f'crash:{type(error).__name__}'))
+        return Outcome(_verdict(state=f'crash:{type(error).__name__}'))
 
 
-def _words(**given: str | int | None) -> dict[str, str | int | None]:
-    return {name: given.get(name) for name in WORDS}
+def _verdict(**values: str | int | None) -> dict[str, str | int | None]:
+    return {name: values.get(name) for name in VERDICT_FIELDS}
 
 
-def told(result: Calibration | Refusal) -> Outcome:
-    """Return what is compared of a result."""
+def outcome_from_result(result: Calibration | Refusal) -> Outcome:
+    """Return the compared part of a result."""
     if isinstance(result, Refusal):
-        return Outcome(_words(state='refused', refusal=result.code))
+        return Outcome(_verdict(state='refused', refusal=result.code))
     camera, ground, sigma = result.camera, result.ground, result.stddev
-    words = _words(
+    verdict = _verdict(
         state='calibrated',
         grade=result.grade,
         roads=len(result.road_directions),
@@ -194,58 +198,58 @@ def told(result: Calibration | Refusal) -> Outcome:
         for distance, value in zip(GROUND_DISTANCES_M, sigma.ground_point_m, strict=False)
     }
     return Outcome(
-        words,
-        _given(dict(zip(COVARIANCE_PARAMETERS, numbers, strict=True))),
-        _given({**dict(zip(COVARIANCE_PARAMETERS, deviations, strict=True)), **ahead}),
+        verdict,
+        _without_none(dict(zip(COVARIANCE_PARAMETERS, numbers, strict=True))),
+        _without_none({**dict(zip(COVARIANCE_PARAMETERS, deviations, strict=True)), **ahead}),
     )
 
 
-def _given(values: Mapping[str, float | None]) -> dict[str, float]:
+def _without_none(values: Mapping[str, float | None]) -> dict[str, float]:
     return {name: float(value) for name, value in values.items() if value is not None}
 
 
 def differences(
     case: str, expected: Outcome | None, found: Outcome, *, tolerance: float = 0.1, exact: bool = False
 ) -> list[Moved]:
-    """Return what moved; where the verdict is another, that alone.
+    """Return the quantities that moved; if the verdict changed, only the verdict.
 
-    A number may differ by `tolerance` of its expected sigma, and a sigma by that part of itself; without a sigma, or
-    with one of 0, by `SAME` of itself. With `exact` nothing may differ.
+    Numbers may change by `tolerance` times their expected sigma, sigmas by `tolerance` times themselves, and numbers
+    without a sigma, or with sigma 0, by `RELATIVE_TOLERANCE` times themselves. With `exact`, every change counts.
     """
     if expected is None:
-        return [Moved(case, 'state', 'new', found.words['state'])]
+        return [Moved(case, 'state', 'new', found.verdict['state'])]
     moved = [
-        Moved(case, name, expected.words[name], found.words[name])
-        for name in WORDS
-        if expected.words[name] != found.words[name]
+        Moved(case, name, expected.verdict[name], found.verdict[name])
+        for name in VERDICT_FIELDS
+        if expected.verdict[name] != found.verdict[name]
     ]
-    if any(item.quantity in WORDS[:3] for item in moved):
+    if any(item.quantity in VERDICT_FIELDS[:3] for item in moved):
         return moved
     allowed = {name: tolerance * sigma for name, sigma in expected.stddev.items()}
     for kind, before, after in (('', expected.numbers, found.numbers), ('sigma of ', expected.stddev, found.stddev)):
         for name in dict.fromkeys([*before, *after]):
             old, new = before.get(name), after.get(name)
-            if _same(old, new, 0.0 if exact else allowed.get(name, 0.0), exact=exact):
+            if _is_same(old, new, 0.0 if exact else allowed.get(name, 0.0), exact=exact):
                 continue
             sigma = expected.stddev.get(name)
-            sigmas = (new - old) / sigma if sigma and None not in (old, new) else None
+            sigmas = (new - old) / sigma if sigma and old is not None and new is not None else None
             moved.append(Moved(case, kind + name, old, new, sigmas))
     return moved
 
 
-def _same(expected: float | None, found: float | None, allowed: float, *, exact: bool) -> bool:
+def _is_same(expected: float | None, found: float | None, allowed: float, *, exact: bool) -> bool:
     if exact or expected is None or found is None:
         return expected == found
-    return abs(found - expected) <= max(allowed, SAME * abs(expected), SAME_AS_ZERO)
+    return abs(found - expected) <= max(allowed, RELATIVE_TOLERANCE * abs(expected), ABSOLUTE_TOLERANCE)
 
 
-def lines(measured: Measured) -> list[str]:
-    """Return what moved as a table, and the line that sums it up."""
-    count, moved = len(measured.cases), measured.moved
+def format_report(golden_run: GoldenRun) -> list[str]:
+    """Return the table of changes and a summary line."""
+    count, moved = len(golden_run.cases), golden_run.moved
     cases = f'{count} case{"" if count == 1 else "s"}'
     if not moved:
         return [f'{cases}: nothing moved']
-    rows = [('case', 'quantity', 'expected', 'found', 'sigmas')]
+    rows: list[tuple[str, ...]] = [('case', 'quantity', 'expected', 'found', 'sigmas')]
     rows += [
         (
             item.case,
@@ -260,7 +264,7 @@ def lines(measured: Measured) -> list[str]:
 
 
 def _cells(expected: str | float | None, found: str | float | None) -> tuple[str, str]:
-    """Return two values in as many digits as tell them apart."""
+    """Return two values as text with enough digits to distinguish them."""
     for digits in (6, 10, 17):
         cells = tuple(
             f'{value:.{digits}g}' if isinstance(value, float) else '-' if value is None else str(value)
@@ -272,17 +276,17 @@ def _cells(expected: str | float | None, found: str | float | None) -> tuple[str
 
 
 def read_cases(folder: Path) -> list[Case]:
-    """Read the cases of a folder in the order of their names, or raise InputError."""
+    """Read the cases of a folder in alphabetical order, or raise InputError."""
     path = folder / EXPECTED
     if not path.is_file():
         raise InputError(
-            f'{folder} holds no golden evidence (no {EXPECTED}): give the folder that does, tests/golden '
-            'in the sources of this program'
+            f'{folder} holds no golden evidence (no {EXPECTED}): give the folder that does, tests/golden in the '
+            'source tree'
         )
     try:
         document = json.loads(path.read_text(encoding='utf-8'))
         if document['format'] != FORMAT:
-            raise InputError(f'{path} is of format {document["format"]}, not {FORMAT}')
+            raise InputError(f'{path} has format {document["format"]}; expected {FORMAT}')
         return [_case(name, entry) for name, entry in sorted(document['cases'].items())]
     except OSError as error:
         raise InputError(f'cannot read {path}: {error.strerror or error}') from error
@@ -302,12 +306,14 @@ def _case(name: str, entry: Mapping[str, Any]) -> Case:
         truth=entry.get('truth'),
         expected=None
         if expected is None
-        else Outcome(_words(**{word: expected[word] for word in WORDS}), expected['numbers'], expected['stddev']),
+        else Outcome(
+            _verdict(**{word: expected[word] for word in VERDICT_FIELDS}), expected['numbers'], expected['stddev']
+        ),
     )
 
 
 def write_cases(folder: Path, cases: Sequence[Case]) -> None:
-    """Write the cases in the order of their names, numbers in full precision."""
+    """Write the cases in alphabetical order, numbers in full precision."""
     document = {'format': FORMAT, 'cases': {case.name: _entry(case) for case in sorted(cases, key=lambda it: it.name)}}
     write_atomically(folder / EXPECTED, json.dumps(document, indent=1, allow_nan=False) + '\n')
 
@@ -323,5 +329,5 @@ def _entry(case: Case) -> dict[str, Any]:
         **optional,
         'expected': None
         if expected is None
-        else {**expected.words, 'numbers': expected.numbers, 'stddev': expected.stddev},
+        else {**expected.verdict, 'numbers': expected.numbers, 'stddev': expected.stddev},
     }

@@ -1,7 +1,7 @@
-"""How near the results come to the truth, by Monte Carlo: `autocalib benchmark accuracy`.
+"""Monte-Carlo benchmark of accuracy on synthetic evidence: `autocalib benchmark accuracy`.
 
-Every run draws a lens, a pose and traffic of one family of evidence, solves it by each method and compares with the
-truth. The evidence of a run follows from seed, family and number of the run alone: `draw_evidence` draws it again.
+Each run draws a lens, a pose and traffic of one evidence family, solves the evidence by each method and compares the
+results with the ground truth. The evidence depends only on seed, family and run number: `draw_evidence` reproduces it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.ground_plane import GroundPlane, angles_deg, tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera, pixel_grid
 from autocalib_ros.offline.benchmark.families import families
-from autocalib_ros.offline.benchmark.processes import in_order
+from autocalib_ros.offline.benchmark.processes import map_in_order
 from autocalib_ros.offline.ground_truth import MAX_COMPARED_RANGE_M, median_distance_error
 from autocalib_ros.offline.synthetic.junction import Junction
 from autocalib_ros.offline.terminal.progress import progress_bar
@@ -33,43 +33,44 @@ from autocalib_ros.pictures.views import ground_to_image, image_to_ground
 from autocalib_ros.results.calibration import Calibration, Refusal
 
 RAY_GRID = (49, 28)
+"""Columns and rows of pixels at which rays are compared."""
 GROUND_GRID = 5
-"""Distances are compared between so many ranges times so many bearings on the road."""
+"""Number of ranges, and of bearings, of the road points between which distances are compared."""
 MAX_BEARING_DEG = 40.0
-"""Those points lie so far to either side of where the camera looks."""
+"""Largest bearing of those road points from the viewing direction, to either side."""
 NAN = math.nan
 
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """One solution beside the truth; nan where the result gives nothing to compare."""
+    """Errors of one solution; nan for quantities that the result lacks."""
 
     family: str
     method: str
     run: int
     accepted: bool
     code: str
-    """Why it was refused, or '' where it was accepted."""
+    """Refusal code, or '' if accepted."""
     grade: str = ''
     focal_error: float = NAN
-    """Relative to the true focal length, as is its sigma."""
+    """Focal length error relative to the true value; `focal_sigma` likewise."""
     focal_sigma: float = NAN
     rays_deg: float = NAN
-    """Mean angle over the image between estimated and true rays after the rotation that aligns them best."""
+    """Mean angle between estimated and true rays over the image, after the rotation that aligns them best."""
     normal_deg: float = NAN
     tilt_error_deg: float = NAN
     tilt_sigma_deg: float = NAN
     roll_error_deg: float = NAN
     roll_sigma_deg: float = NAN
     distance_error: float = NAN
-    """Median relative error of distances between points of the road."""
+    """Median relative error of distances between road points."""
     cpu_s: float = NAN
-    """Processor time of the solution."""
+    """Processor time of the solution, seconds."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """One draw of evidence, to be solved by each method."""
+    """One draw of evidence and the methods that solve it."""
 
     family: str
     seed: int
@@ -87,14 +88,17 @@ def run_monte_carlo(
     out: Path | None = None,
     quiet: bool = False,
 ) -> list[Run]:
-    """Solve `runs` draws of each family by each method; write a row a run to `out` as they come."""
+    """Solve `runs` draws of each family by each method.
+
+    Write one CSV row per run to `out` as results arrive. Raise UsageError for wrong arguments.
+    """
     for name, value, least in (('runs', runs, 1), ('jobs', jobs, 1), ('seed', seed, 0)):
         if value < least:
-            raise UsageError(f'--{name} is {least} or more; got {value}')
+            raise UsageError(f'--{name} must be at least {least}; got {value}')
     tasks = [Task(family, seed, run, tuple(methods)) for family in select_families(names) for run in range(runs)]
     done: list[Run] = []
     with open_csv(out) as write, progress_bar(len(tasks), 'draws', 'accuracy', quiet=quiet) as progress:
-        for count, results in enumerate(in_order(run_task, tasks, jobs), 1):
+        for count, results in enumerate(map_in_order(run_task, tasks, jobs), 1):
             write(results)
             done += results
             progress.update_to(count, results[-1].family)
@@ -102,28 +106,28 @@ def run_monte_carlo(
 
 
 def select_families(names: Sequence[str]) -> list[str]:
-    """Return the names of families, all of them for none, or raise UsageError."""
+    """Return the names of the families, all families if `names` is empty, or raise UsageError."""
     every = list(families())
     for name in names:
         if name not in every:
-            raise UsageError(f"no family of evidence is called '{name}'; there are {', '.join(every)}")
+            raise UsageError(f"unknown evidence family '{name}'; known families: {', '.join(every)}")
     return list(names) or every
 
 
 def run_task(task: Task) -> list[Run]:
-    """Draw the evidence of a task and solve it by each of its methods."""
+    """Draw the evidence of a task and solve it by each method."""
     junction, evidence = draw_evidence(task.family, task.seed, task.run)
     return [run_method(task, method, junction, evidence) for method in task.methods]
 
 
 def draw_evidence(family: str, seed: int, run: int) -> tuple[Junction, Evidence]:
-    """Draw truth and evidence of one run of a family."""
+    """Draw the ground truth and the evidence of one run of a family."""
     sequence = np.random.SeedSequence([seed, zlib.crc32(family.encode()), run])
     return families()[family](np.random.default_rng(sequence))
 
 
 def run_method(task: Task, method: str, junction: Junction, evidence: Evidence) -> Run:
-    """Solve with the true camera height; a solver that fails is recorded and does not end the benchmark."""
+    """Solve with the true camera height; record an exception of the solver instead of stopping the benchmark."""
     began = time.process_time()
     try:
         result = solve(evidence, Options(camera_height=junction.height_m, method=method))
@@ -137,7 +141,7 @@ def run_method(task: Task, method: str, junction: Junction, evidence: Evidence) 
 def compare_calibrations(
     task: Task, method: str, result: Calibration | Refusal, junction: Junction, cpu_s: float
 ) -> Run:
-    """Return how far a result is from the truth."""
+    """Return the errors of a result against the ground truth."""
     if isinstance(result, Refusal):
         return Run(family=task.family, method=method, run=task.run, accepted=False, code=result.code, cpu_s=cpu_s)
     true, sigma = junction.camera, result.stddev
@@ -167,7 +171,7 @@ def _nan_if_none(value: float | None) -> float:
 
 
 def _pose_errors_deg(ground: GroundPlane | None, true_normal: np.ndarray) -> tuple[float, float, float]:
-    """Errors of tilt and roll, and the angle between the normals, in degrees."""
+    """Return the errors of tilt and roll, and the angle between the ground normals, in degrees."""
     if ground is None:
         return NAN, NAN, NAN
     normal = ground.normal_in_camera
@@ -176,7 +180,7 @@ def _pose_errors_deg(ground: GroundPlane | None, true_normal: np.ndarray) -> tup
 
 
 def mean_ray_error_deg(camera: Camera, true: Camera) -> float:
-    """Mean angle over the image between the rays of two lenses, the one turned onto the other as well as can be."""
+    """Return the mean angle between the rays of two lenses over the image, after the best-fitting rotation."""
     pixels = pixel_grid(true, *RAY_GRID)
     (found, valid), (wanted, there) = camera.unproject(pixels), true.unproject(pixels)
     found, wanted = found[valid & there], wanted[valid & there]
@@ -184,7 +188,7 @@ def mean_ray_error_deg(camera: Camera, true: Camera) -> float:
 
 
 def distance_error(camera: Camera, ground: GroundPlane | None, junction: Junction) -> float:
-    """Median relative error of distances between road points in view, up to `MAX_COMPARED_RANGE_M` away."""
+    """Return the median relative error of distances between road points in view up to `MAX_COMPARED_RANGE_M`."""
     if ground is None:
         return NAN
     true_m, pixels = _road_points(junction)
@@ -192,7 +196,7 @@ def distance_error(camera: Camera, ground: GroundPlane | None, junction: Junctio
 
 
 def _road_points(junction: Junction) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, 2) on the road before the camera, metres, and where the image shows them (n, 2)."""
+    """Return road points (n, 2) in front of the camera in metres, and their pixels (n, 2)."""
     ahead = junction.camera_from_ground[2]
     bearings = np.arctan2(ahead[1], ahead[0]) + np.radians(np.linspace(-MAX_BEARING_DEG, MAX_BEARING_DEG, GROUND_GRID))
     ranges, bearings = np.meshgrid(MAX_COMPARED_RANGE_M * np.arange(1, GROUND_GRID + 1) / GROUND_GRID, bearings)
@@ -205,7 +209,7 @@ def _road_points(junction: Junction) -> tuple[np.ndarray, np.ndarray]:
 
 @contextmanager
 def open_csv(path: Path | None) -> Iterator[Callable[[Sequence[Run]], None]]:
-    """Open a CSV with one row a run; without a path, write nowhere."""
+    """Open a CSV file and yield a function that appends runs to it; without a path, the function does nothing."""
     if path is None:
         yield lambda runs: None
         return
@@ -220,7 +224,7 @@ def open_csv(path: Path | None) -> Iterator[Callable[[Sequence[Run]], None]]:
 
         def write(runs: Sequence[Run]) -> None:
             writer.writerows(_row(run) for run in runs)
-            stream.flush()  # what was measured outlives an interruption
+            stream.flush()  # finished runs survive an interruption
 
         yield write
 

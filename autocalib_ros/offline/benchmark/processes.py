@@ -1,4 +1,4 @@
-"""Work that is shared by processes, with results in the order of the tasks."""
+"""Map a function over tasks in parallel processes, results in the order of the tasks."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ Task = TypeVar('Task')
 Result = TypeVar('Result')
 
 
-def in_order(work: Callable[[Task], Result], tasks: Sequence[Task], jobs: int) -> Iterator[Result]:
-    """Yield the results in the order of the tasks, whatever the number of processes."""
+def map_in_order(work: Callable[[Task], Result], tasks: Sequence[Task], jobs: int) -> Iterator[Result]:
+    """Yield `work(task)` for each task, in the order of the tasks, computed by `jobs` processes."""
     if jobs == 1:
         yield from map(work, tasks)
         return
-    # spawned, not forked: a worker has to set its threads before numpy comes in
+    # spawned, not forked: a worker must limit its BLAS threads before it imports numpy
     with ProcessPoolExecutor(jobs, get_context('spawn'), limit_blas_threads) as pool:
         try:
             yield from pool.map(work, tasks)

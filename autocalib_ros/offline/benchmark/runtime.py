@@ -1,6 +1,6 @@
-"""What the program costs: `autocalib benchmark cost SOURCE`.
+"""Processor time and memory of a replay: `autocalib benchmark cost SOURCE`.
 
-Figures of one run on one machine: compare ratios, not milliseconds of different days.
+The figures describe one run on one machine: compare ratios, not absolute times of different runs.
 """
 
 from __future__ import annotations
@@ -21,12 +21,17 @@ FLOW_POINTS = 300
 FLOW_REPEATS = 30
 
 
-def cost(path: Path, duration_s: float | None) -> str:
-    """Tell processor time per frame beside that of bare optical flow, of one solution, and the largest memory."""
+def measure_cost(path: Path, duration_s: float | None) -> str:
+    """Replay a recording on one thread and report processor times and peak memory.
+
+    Reports the time per frame, its ratio to plain optical flow, the time of one solution, and the peak resident memory
+    before and after it.
+    """
     cv2.setNumThreads(1)
     source = open_source(path, duration_s=duration_s)
     calibrator = AutoCalibrator(Options(camera_height=8.0))
-    spent, images = [], []
+    spent: list[float] = []
+    images: list[np.ndarray] = []
     for frame in source.frames():
         began = time.thread_time()
         calibrator.add_image(frame.stamp_ns, frame.image)
@@ -46,18 +51,19 @@ def cost(path: Path, duration_s: float | None) -> str:
             f'{width}x{height}, {len(spent)} frames of {source.name}, one thread',
             f'processor time per frame: mean {mean:.1f} ms, 95 % of frames '
             f'below {1e3 * np.quantile(spent, 0.95):.1f} ms',
-            f'bare optical flow of {FLOW_POINTS} points: {bare:.1f} ms; a frame costs {mean / bare:.1f} times that',
+            f'plain optical flow of {FLOW_POINTS} points: {bare:.1f} ms; a frame takes {mean / bare:.1f} times as long',
             f'one solution: {solution:.1f} s of processor time ({"calibrated" if result else "refused"})',
-            f'largest memory of the process: {memory:.0f} MB before the solution, {after:.0f} MB after',
+            f'peak resident memory: {memory:.0f} MB before the solution, {after:.0f} MB after',
         ]
     )
 
 
 def bare_optical_flow_s(images: list[np.ndarray]) -> float:
-    """Processor time of one pyramidal Lucas-Kanade step of `FLOW_POINTS` points between two images."""
+    """Return the processor time of one pyramidal Lucas-Kanade step of `FLOW_POINTS` points between two images."""
     before, after = (cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image for image in images)
     points = cv2.goodFeaturesToTrack(before, FLOW_POINTS, 0.01, 10)
     began = time.thread_time()
     for _ in range(FLOW_REPEATS):
-        cv2.calcOpticalFlowPyrLK(before, after, points, None, winSize=(15, 15), maxLevel=3)
+        # OpenCV's type stubs lack the documented None for `nextPts`
+        cv2.calcOpticalFlowPyrLK(before, after, points, None, winSize=(15, 15), maxLevel=3)  # type: ignore[call-overload]
     return (time.thread_time() - began) / FLOW_REPEATS

@@ -1,4 +1,4 @@
-"""The accuracy benchmark in tables for a terminal of 120 columns: one line for a family and method."""
+"""Tables of the accuracy benchmark, 120 columns wide: one line per family and method."""
 
 from __future__ import annotations
 
@@ -11,29 +11,36 @@ from autocalib_ros.offline.benchmark.families import UNDERDETERMINED
 from autocalib_ros.offline.benchmark.monte_carlo import Run
 
 COVERAGE_SIGMAS = 1.96
-"""A normal error lies within so many sigmas in 95 % of the cases."""
+"""Half-width of the 95 % interval of a normal distribution, in standard deviations."""
 FALSE_ACCEPT_SIGMAS = 3.0
+"""Errors beyond this many stated standard deviations count as false."""
 FALSE_ACCEPT_FOCAL = 0.05
+"""Relative focal length error that counts as false whatever the stated sigma; judgement."""
 FALSE_ACCEPT_DEG = 1.0
+"""Tilt and roll errors below this never count as false, degrees; judgement."""
 NAME_FORMAT = '{:<21}{:<6}{:>5}{:>6}'
 ERRORS_FORMAT = NAME_FORMAT + '  {:<21}{:>7}{:>7}{:>7}{:>7}{:>8}{:>7}{:>7}{:>7}'
 SIGMAS_FORMAT = NAME_FORMAT + '{:>7}{:>8}{:>7}{:>8}{:>7}{:>7}{:>8}{:>7}{:>8}'
 
 
 def format_tables(runs: Sequence[Run]) -> str:
-    """Return the errors of the families, their standard deviations held against them, and the crashes."""
+    """Return tables of errors, of stated standard deviations against errors, and the list of crashes."""
     determined = [run for run in runs if run.family not in UNDERDETERMINED]
     doubtful = [run for run in runs if run.family in UNDERDETERMINED]
     blocks = [
         *_blocks('Evidence that determines the calibration', determined),
-        *_blocks('Evidence that does not, or that misleads', doubtful),
+        *_blocks('Evidence that does not, or that is misleading', doubtful),
         *_crashes(runs),
     ]
     return '\n\n'.join(blocks)
 
 
 def falsely_accepted(run: Run) -> bool:
-    """Whether a result was published that is wrong: by its own standard deviations, or beyond 5 % in focal length."""
+    """Return whether a wrong result was accepted.
+
+    Wrong means: focal length beyond 3 stated standard deviations or 5 %, or tilt or roll beyond 3 stated standard
+    deviations and 1 degree.
+    """
     if not run.accepted:
         return False
     focal = abs(run.focal_error)
@@ -42,7 +49,7 @@ def falsely_accepted(run: Run) -> bool:
 
 
 def is_overconfident(run: Run) -> bool:
-    """Whether a published focal length, tilt or roll is wrong by more than three of its own standard deviations."""
+    """Return whether focal length, tilt or roll of an accepted result is beyond 3 of its stated standard deviations."""
     pairs = (
         (run.focal_error, run.focal_sigma),
         (run.tilt_error_deg, run.tilt_sigma_deg),
@@ -144,13 +151,13 @@ def _crashes(runs: Sequence[Run]) -> list[str]:
 
 
 def _column(runs: Sequence[Run], name: str) -> np.ndarray:
-    """Return the values (n,) of a field, without those that are not given."""
+    """Return the values (n,) of a field, without nan."""
     values = np.array([getattr(run, name) for run in runs], float)
     return values[~np.isnan(values)]
 
 
 def _z_scores(runs: Sequence[Run], error: str, sigma: str) -> np.ndarray:
-    """Return errors in units of their stated standard deviations, where there is one."""
+    """Return the errors (n,) in units of their stated standard deviations, for runs that state one."""
     pairs = np.array([(getattr(run, error), getattr(run, sigma)) for run in runs], float).reshape(-1, 2)
     errors, sigmas = pairs[(pairs[:, 1] > 0) & np.isfinite(pairs[:, 0])].T
     return errors / sigmas

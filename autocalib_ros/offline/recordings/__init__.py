@@ -1,1 +1,1 @@
-"""Recordings: rosbag2, ROS 1 bags, mcap and videos as sources of images; writing of bags."""
+"""Read rosbag2, ROS 1 bags, MCAP files and videos as sources of images; write rosbag2 recordings."""

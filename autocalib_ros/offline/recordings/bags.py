@@ -1,4 +1,4 @@
-"""Recordings of ROS through rosbags: topics, stamps, and what is left of a damaged file."""
+"""Read images from ROS 1 and ROS 2 recordings: choice of topic and stamps, tolerance of damaged files."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ LOG = logging.getLogger(__name__)
 
 IMAGE_TYPES = ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage')
 PEEK_IMAGES = 5
-"""Images looked at beforehand to learn whether their header stamps can be trusted."""
+"""Images inspected at opening to decide whether the header stamps are usable."""
 ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 
 
 @dataclass(frozen=True)
 class _BagMessage:
-    """One message: when it was recorded, its bytes as CDR or ROS 1, and the message."""
+    """A message: receive time, serialised bytes (CDR or ROS 1), and the message itself, None if damaged."""
 
     recorded_ns: int
     raw: bytes | memoryview
@@ -39,7 +39,7 @@ class _BagMessage:
 
 
 class BagSource:
-    """The images of one topic of a rosbag2 folder, a lone .mcap or .db3, or a ROS 1 .bag."""
+    """Images on one topic of a rosbag2 folder, a single .mcap or .db3 file, or a ROS 1 .bag."""
 
     def __init__(self, path: Path, topic: str | None, window: TimeWindow) -> None:
         self.name = str(path)
@@ -53,13 +53,14 @@ class BagSource:
             first = self._peek(readers)
             recording_s = (max(reader.end_time for reader in readers) - self._first_ns) * 1e-9
         self.camera_frame = first.header.frame_id.lstrip('/') if first else ''
-        self.duration_s = window.overlap_s(recording_s)
+        duration_s = window.overlap_s(recording_s)
+        self.duration_s: float | None = duration_s
         if any(is_truncated(part) for part in _recording_files(path)):
-            LOG.warning('%s ended early, its recorder did not close it; what is whole of it is used', self.name)
-        self.total = count if window.is_whole_recording else round(count * self.duration_s / max(recording_s, 1e-9))
+            LOG.warning('%s ended early, its recorder did not close it; complete records are used', self.name)
+        self.total = count if window.is_whole_recording else round(count * duration_s / max(recording_s, 1e-9))
 
     def frames(self) -> Iterator[Frame]:
-        """Decode the images of the window; InputError when there is none."""
+        """Yield the decoded images of the window in order of time; InputError without an image."""
         decoder, order = ImageDecoder(), _StampFilter()
         decoded, broken, reason = 0, 0, ''
         for stored in self._messages():
@@ -84,7 +85,7 @@ class BagSource:
             LOG.warning('%d images came late or twice and were skipped', order.late)
 
     def stored(self) -> Iterator[StoredImage]:
-        """Go through the messages of the window as CDR."""
+        """Yield the messages of the window as CDR."""
         for stored in self._messages():
             if stored.message is not None:
                 header = stored.message.header
@@ -92,7 +93,7 @@ class BagSource:
                 yield StoredImage(stored.recorded_ns, _header_ns(header), header.frame_id, cdr)
 
     def _messages(self) -> Iterator[_BagMessage]:
-        """Read the window's messages; a recording that breaks off midway gives what it has, and a warning."""
+        """Yield the messages of the window; a truncated recording yields its readable part and logs a warning."""
         start_ns, stop_ns = self._window.bounds_ns
         start_ns += self._first_ns
         stop_ns = None if stop_ns is None else stop_ns + self._first_ns
@@ -106,7 +107,7 @@ class BagSource:
                     yield stored
             except AutocalibError:
                 raise
-            except Exception as error:  # a damaged file can raise anything from the depths of its decoder
+            except Exception as error:  # decoders of damaged files raise arbitrary exceptions
                 if not yielded:
                     raise InputError(f'cannot read {self.name}: {_one_line(error)}') from error
                 LOG.warning('%s ended early, after %d images: %s', self.name, yielded, _one_line(error))
@@ -121,32 +122,32 @@ class BagSource:
                 yield _BagMessage(recorded_ns, raw, self._message(raw))
 
     def _message(self, raw: bytes | memoryview) -> Any:
-        """Return the message, or None where its bytes make no sense."""
+        """Return the deserialised message, or None if it is damaged."""
         read = self._types.deserialize_ros1 if self._ros1 else self._types.deserialize_cdr
         try:
             return read(raw, self.image_type)
-        except Exception:  # noqa: BLE001  a damaged message can raise anything; one is no reason to stop
+        except Exception:  # a damaged message raises arbitrary exceptions and is skipped
             return None
 
     def _peek(self, readers: list[Any]) -> Any:
-        """Look at the first images: where time begins, and whether the stamps in their headers can be used."""
+        """Inspect the first images: start time, and whether the header stamps are usable."""
         first = list(islice(self._read(readers, None, None), PEEK_IMAGES))
         if not first:
-            raise InputError(f'{self.name} gives no image on {self.topic}')
+            raise InputError(f'{self.name} has no images on {self.topic}')
         self._first_ns = first[0].recorded_ns
         messages = [stored.message for stored in first if stored.message is not None]
         stamps = [_header_ns(message.header) for message in messages]
         self._use_headers = bool(stamps) and stamps[0] > 0 and (len(stamps) == 1 or len(set(stamps)) > 1)
         if stamps and not self._use_headers:
             what = 'zero' if stamps[0] <= 0 else 'always the same'
-            LOG.warning('the stamps in the headers on %s are %s; the times of recording are used', self.topic, what)
+            LOG.warning('header stamps on %s are %s; receive times are used', self.topic, what)
         return messages[0] if messages else None
 
     def _stamp_ns(self, stored: _BagMessage) -> int:
         return _header_ns(stored.message.header) if self._use_headers else stored.recorded_ns
 
     def _to_ros2_cdr(self, message: Any) -> memoryview:
-        """Return a message of ROS 1 as CDR; its header loses its `seq`."""
+        """Return a ROS 1 message as CDR, without the `seq` of its header."""
         types = get_typestore(Stores.ROS2_JAZZY)
         time, header = types.types['builtin_interfaces/msg/Time'], types.types['std_msgs/msg/Header']
         stamp = message.header.stamp
@@ -158,7 +159,7 @@ class BagSource:
 
 
 class _Topics:
-    """The topics of a recording, for the choice of one and for what is said when it cannot be made."""
+    """The topics of a recording: selection of the image topic and error messages."""
 
     def __init__(self, name: str, readers: list[Any]) -> None:
         self._name = name
@@ -167,17 +168,17 @@ class _Topics:
         for connection in (c for reader in readers for c in reader.connections):
             self._add(connection)
         if not any(self.counts.values()):
-            raise InputError(f'{name} is an empty recording: it holds no message')
+            raise InputError(f'{name} is an empty recording: it has no messages')
 
     def _add(self, connection: Connection) -> None:
         self.counts[connection.topic] = self.counts.get(connection.topic, 0) + connection.msgcount
         self._types[connection.topic] = connection.msgtype
 
     def choose(self, topic: str | None) -> tuple[str, str]:
-        """Return the image topic and its type: the one asked for, or the only one there is."""
+        """Return the requested image topic, or the only one, and its type; UsageError or InputError without one."""
         images = [name for name in self.counts if self._types[name] in IMAGE_TYPES and self.counts[name]]
         if not images:
-            raise InputError(f'{self._name} holds no images; its topics: {self._describe(self.counts)}')
+            raise InputError(f'{self._name} has no images; its topics: {self._describe(self.counts)}')
         if topic is None and len(images) > 1:
             raise UsageError(
                 f'{self._name} has {len(images)} image topics, choose one with --topic: {self._describe(images)}'
@@ -187,7 +188,7 @@ class _Topics:
             raise UsageError(f'{self._name} has no topic {chosen}; its image topics: {self._describe(images)}')
         if chosen not in images:
             raise UsageError(
-                f'{chosen} holds no images but {self._describe([chosen])}; image topics: {self._describe(images)}'
+                f'{chosen} has no images but {self._describe([chosen])}; image topics: {self._describe(images)}'
             )
         return chosen, self._types[chosen]
 
@@ -196,14 +197,14 @@ class _Topics:
 
 
 class _StampFilter:
-    """Lets stamps pass that grow, or that step back so far that the clock must have been set."""
+    """Accepts stamps that increase, or that jump back so far that the clock must have been reset."""
 
     def __init__(self) -> None:
         self._newest_ns: int | None = None
         self.late = 0
 
     def accepts(self, stamp_ns: int) -> bool:
-        """Say whether an image of that stamp is to be used."""
+        """Return whether to use an image with this stamp; count the late ones."""
         newest = self._newest_ns
         if newest is not None and newest - MAX_REORDERING_NS < stamp_ns <= newest:
             self.late += 1
@@ -214,7 +215,7 @@ class _StampFilter:
 
 @contextmanager
 def _open_readers(path: Path) -> Iterator[list[Any]]:
-    """Open all files of a recording; a folder without metadata.yaml is what a recorder leaves that was killed."""
+    """Open all files of a recording; a killed recorder leaves a folder without metadata.yaml."""
     with ExitStack() as stack:
         readers = [
             stack.enter_context(Reader1(part) if _is_ros1(part) else Reader2(readable_path(part)))
@@ -224,12 +225,12 @@ def _open_readers(path: Path) -> Iterator[list[Any]]:
 
 
 def _is_ros1(path: Path) -> bool:
-    """Say whether this is a recording of ROS 1: a file, where a folder of ROS 2 may bear any name."""
+    """Return whether the path is a ROS 1 recording: a .bag file, not a rosbag2 folder of such a name."""
     return path.suffix.lower() == '.bag' and not path.is_dir()
 
 
 def _recording_files(path: Path) -> list[Path]:
-    """Return what is to be opened: the recording itself, or the files of a folder whose metadata.yaml is no use."""
+    """Return the paths to open: the recording itself, or the files of a folder without a valid metadata.yaml."""
     if not path.is_dir():
         return [path]
     parts = sorted(part for part in path.iterdir() if part.suffix in ('.mcap', '.db3'))
@@ -239,13 +240,13 @@ def _recording_files(path: Path) -> list[Path]:
     if not parts:
         raise InputError(f'{path} is not a recording: it has neither a metadata.yaml nor .mcap or .db3 files')
     if len({part.suffix for part in parts}) > 1:
-        raise InputError(f'{path} has no metadata.yaml and holds both .mcap and .db3 files: give one of them')
+        raise InputError(f'{path} has no metadata.yaml but both .mcap and .db3 files: give one file')
     return parts
 
 
 @contextmanager
 def _as_input_errors(path: Path) -> Iterator[None]:
-    """Turn whatever a damaged file makes rosbags raise into one line."""
+    """Convert exceptions that rosbags raises for damaged files into an InputError of one line."""
     try:
         yield
     except AutocalibError:
@@ -266,11 +267,11 @@ def _header_ns(header: Any) -> int:
 
 
 def _decompressed(raw: bytes | memoryview) -> bytes | memoryview:
-    """Unpack a message of a lone file whose metadata.yaml, gone by now, said that messages are compressed."""
+    """Decompress a message of a single file whose missing metadata.yaml announced compressed messages."""
     if bytes(raw[:4]) != ZSTD_MAGIC:  # a CDR message begins with 00, a ROS 1 image with its counter
         return raw
     try:
-        from compression import zstd  # Python 3.14
+        from compression import zstd  # type: ignore[import-not-found]  # Python 3.14
     except ImportError:
         from backports import zstd  # comes with rosbags
     return zstd.decompress(raw)

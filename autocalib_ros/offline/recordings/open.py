@@ -1,4 +1,4 @@
-"""DOCSTRING."""
+"""Open a recording of any supported format."""
 
 from __future__ import annotations
 
@@ -11,23 +11,24 @@ from autocalib_ros.offline.recordings.sources import BAG_SUFFIXES, Source, TimeW
 def open_source(
     path: str | Path, topic: str | None = None, start_s: float = 0.0, duration_s: float | None = None
 ) -> Source:
-    """Open a rosbag2 folder, a lone .mcap or .db3, a ROS 1 .bag or a video file.
+    """Open a rosbag2 folder, a single .mcap or .db3 file, a ROS 1 .bag or a video file.
 
-    Raises UsageError when the topic has to be chosen or is not there, InputError when the file cannot be read.
+    `start_s` and `duration_s` select a time window from the first image. Raise UsageError if the topic is ambiguous or
+    missing, InputError if the file cannot be read.
     """
     path, window = Path(path), TimeWindow(start_s, duration_s)
     _check_readable(path)
     if path.is_dir() or path.suffix.lower() in BAG_SUFFIXES:
-        from autocalib_ros.offline.recordings.bags import BagSource  # imported late: a video needs no rosbags
+        from autocalib_ros.offline.recordings.bags import BagSource  # lazy import: videos do not need rosbags
 
         return BagSource(path, topic, window)
     if path.suffix == '.zstd':
         raise InputError(
-            f'{path} is a compressed part of a recording: give the folder with its metadata.yaml,'
-            ' or unpack it first (zstd -d)'
+            f'{path} is a compressed part of a recording: give the folder with its metadata.yaml, or decompress the'
+            ' file first (zstd -d)'
         )
     if topic is not None:
-        raise UsageError(f'{path} is a video: it has no topics to choose from')
+        raise UsageError(f'{path} is a video and has no topics')
     from autocalib_ros.offline.recordings.videos import VideoSource
 
     return VideoSource(path, window)

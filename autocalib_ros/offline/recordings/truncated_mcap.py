@@ -1,8 +1,8 @@
-"""An .mcap file whose recorder was killed: it has no footer, and readers refuse it.
+"""Read an .mcap file without its footer, as a killed recorder leaves it.
 
-What is whole in it is presented with a footer that says "no index", so that a reader scans it. Nothing is
-written and nothing copied. Records are an opcode (1 byte), a length (8 bytes, little-endian) and a content;
-https://mcap.dev/spec.
+Readers refuse such a file. Here its complete records are presented together with a footer without index, so that a
+reader scans them; nothing is written or copied. A record is an opcode (1 byte), a length (8 bytes, little-endian) and
+its content; https://mcap.dev/spec.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from typing import Any, BinaryIO
 
 MAGIC = b'\x89MCAP0\r\n'
 FOOTER = b'\x02' + struct.pack('<QQQI', 20, 0, 0, 0) + MAGIC
-"""No summary section and no checksum."""
+"""Footer record without summary section and checksum, and the closing magic bytes."""
 DATA_END = 0x0F
 RECORD_HEAD = struct.Struct('<BQ')
 
 
 def is_truncated(path: Path) -> bool:
-    """Say whether a file is an .mcap without its end; what is no .mcap at all is not."""
+    """Return whether the file is a truncated .mcap; False for files that are not .mcap."""
     if path.suffix != '.mcap':
         return False
     with path.open('rb') as stream:
@@ -32,7 +32,7 @@ def is_truncated(path: Path) -> bool:
 
 
 def readable_path(path: Path) -> Any:
-    """Return the path itself, or for a torn .mcap a stand-in whose `open` gives the whole records and a footer."""
+    """Return the path, or for a truncated .mcap a substitute whose `open` gives the complete records and a footer."""
     if not is_truncated(path):
         return path
     with path.open('rb') as stream:
@@ -40,7 +40,7 @@ def readable_path(path: Path) -> Any:
 
 
 def _count_complete_bytes(stream: BinaryIO, size: int) -> int:
-    """Return where the last whole record of the data section ends."""
+    """Return the end of the last complete record of the data section in bytes."""
     position = len(MAGIC)
     while position + RECORD_HEAD.size <= size:
         stream.seek(position)
@@ -52,7 +52,7 @@ def _count_complete_bytes(stream: BinaryIO, size: int) -> int:
 
 
 class _TruncatedMcapPath:
-    """Stands in for the path of a torn file, as far as rosbags uses it."""
+    """Substitute for the path of a truncated file, with the methods that rosbags uses."""
 
     def __init__(self, path: Path, complete_bytes: int) -> None:
         self._path, self._complete_bytes = path, complete_bytes
@@ -62,15 +62,15 @@ class _TruncatedMcapPath:
         return str(self._path)
 
     def exists(self) -> bool:
-        """It does."""
+        """Return True."""
         return True
 
     def is_dir(self) -> bool:
-        """It is a file."""
+        """Return False: it is a file."""
         return False
 
     def open(self, *_: Any, **__: Any) -> BinaryIO:
-        """Open the whole part and the footer behind it, for reading."""
+        """Open the complete records, followed by the footer, for reading."""
         return io.BufferedReader(_StreamWithFooter(self._path.open('rb', buffering=0), self._complete_bytes))
 
 
@@ -82,11 +82,11 @@ class _StreamWithFooter(io.RawIOBase):
         self._stream, self._complete_bytes, self._position = stream, complete_bytes, 0
 
     def readable(self) -> bool:
-        """Yes."""
+        """Return True."""
         return True
 
     def seekable(self) -> bool:
-        """Yes."""
+        """Return True."""
         return True
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:

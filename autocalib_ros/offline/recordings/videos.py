@@ -1,4 +1,4 @@
-"""Video files through OpenCV."""
+"""Read images from video files with OpenCV."""
 
 from __future__ import annotations
 
@@ -17,11 +17,12 @@ LOG = logging.getLogger(__name__)
 PLAUSIBLE_FPS = (0.01, 1000.0)
 FALLBACK_FPS = 25.0
 MIN_DECODED_FRACTION = 0.95
-"""Share of the frames promised by the file's header; some containers only estimate their number."""
+"""Fraction of the frames declared in the header below which a video counts as truncated; some containers estimate
+their number only."""
 
 
 class VideoSource:
-    """One video file; stamps in nanoseconds since its first frame."""
+    """Images of a video file, stamped in nanoseconds since its first frame."""
 
     topic = image_type = camera_frame = ''
 
@@ -31,9 +32,9 @@ class VideoSource:
         with self._capture() as capture:
             fps, declared_frames = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
             if not capture.grab():
-                raise InputError(f'{self.name} holds no frame that can be decoded')
+                raise InputError(f'{self.name} has no frame that can be decoded')
         if not PLAUSIBLE_FPS[0] <= fps <= PLAUSIBLE_FPS[1]:
-            LOG.warning('%s does not say its frame rate; taken for %g frames/s', self.name, FALLBACK_FPS)
+            LOG.warning('%s has no valid frame rate; %g frames/s assumed', self.name, FALLBACK_FPS)
             fps = FALLBACK_FPS
         self._fps = fps
         self._declared_frames = int(declared_frames) if 0 < declared_frames < 1e9 else None
@@ -43,18 +44,18 @@ class VideoSource:
             self.total = round(self.duration_s * fps)
 
     def frames(self) -> Iterator[Frame]:
-        """Decode the frames of the window; InputError when there is none."""
+        """Yield the decoded frames of the window; InputError without a frame."""
         for stamp_ns, capture in self._stamped():
             decoded, image = capture.retrieve()
             if decoded:
                 yield Frame(stamp_ns, image)
 
     def stored(self) -> Iterator[StoredImage]:
-        """Go through the stamps of the window; a video holds no messages."""
+        """Yield the stamps of the window; a video has no messages."""
         return (StoredImage(stamp_ns, stamp_ns, '') for stamp_ns, _ in self._stamped())
 
     def _stamped(self) -> Iterator[tuple[int, cv2.VideoCapture]]:
-        """Yield the stamp of each frame of the window, and the capture that holds the frame."""
+        """Yield the stamp of each frame of the window, and the capture to retrieve the frame from."""
         start_ns, stop_ns = self._window.bounds_ns
         clock, yielded = _FrameClock(self._fps), 0
         with self._capture() as capture:
@@ -79,16 +80,14 @@ class VideoSource:
         capture = cv2.VideoCapture(str(self._path))
         try:
             if not capture.isOpened():
-                raise InputError(
-                    f'{self.name} is not a video that can be read: it is damaged, cut off or of another kind'
-                )
+                raise InputError(f'{self.name} is not a readable video: damaged, truncated or unsupported')
             yield capture
         finally:
             capture.release()
 
 
 class _FrameClock:
-    """Presentation times where the container has sane ones, counted frames elsewhere."""
+    """Stamps of frames: presentation times if they increase, else multiples of the frame interval."""
 
     def __init__(self, fps: float) -> None:
         self._step_ns = 1e9 / fps
@@ -97,7 +96,7 @@ class _FrameClock:
         self.ticks = 0
 
     def next_ns(self, position_ms: float) -> int:
-        """Return the next frame's stamp; it always grows."""
+        """Return the stamp of the next frame; stamps increase strictly."""
         if self._offset_ms is None:
             self._offset_ms, stamp_ns = position_ms, 0
         else:

@@ -1,4 +1,4 @@
-"""A calibration as a rosbag2 recording, next to the images it belongs to."""
+"""Write a rosbag2 recording with the images, their CameraInfo and the ground transform."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
@@ -23,8 +23,8 @@ from autocalib_ros.results.calibration import Calibration
 
 LOG = logging.getLogger(__name__)
 
-BAG_VERSION = 9
-"""What Jazzy writes."""
+BAG_VERSION: Final = 9
+"""Version of rosbag2 metadata, as written by ROS 2 Jazzy."""
 DEFAULT_FRAME = 'camera_optical_frame'
 GROUND_TOPIC = '/autocalib/ground_transform'
 INFINITE_DURATION = QosTime(2147483647, 4294967295)
@@ -44,11 +44,11 @@ LATCHED_QOS = Qos(
 def write_bag(
     path: Path, result: Calibration, source: Source, tf_parent: str = 'ground', ignored: Polygons = ()
 ) -> None:
-    """Write a new bag: the images, a CameraInfo with the header of each, and the ground transform where there is one.
+    """Write a new bag: the images, a CameraInfo with the header of each image, and the ground transform if known.
 
-    CameraInfo goes to the sibling of the image topic. All but the images are latched, so that a node that
-    starts late during playback gets them too. The `ignored` polygons are black in the images; UsageError, and no bag,
-    where images are of a kind in which that cannot be done.
+    CameraInfo is written to the sibling of the image topic. All topics except the images are latched: nodes that start
+    late during playback receive them. The `ignored` polygons are blacked out. Raise UsageError, without leaving a bag,
+    if `path` exists or the image encoding cannot be blacked out; InputError if the bag cannot be written.
     """
     if path.exists():
         raise UsageError(f'{path} exists already and is not overwritten')
@@ -56,20 +56,20 @@ def write_bag(
         with Writer(path, version=BAG_VERSION, storage_plugin=StoragePlugin.MCAP) as writer:
             _BagWriter(writer, result, source, tf_parent, ignored).write()
     except BaseException as error:
-        shutil.rmtree(path, ignore_errors=True)  # half a bag is worse than none
+        shutil.rmtree(path, ignore_errors=True)  # an incomplete bag is worse than none
         if isinstance(error, OSError):
             raise InputError(f'cannot write {path}: {error.strerror or error}') from error
         raise
 
 
 def camera_info_topic(source: Source) -> str:
-    """Return the sibling of the image topic, as image_transport finds it."""
+    """Return the camera_info topic next to the image topic, following image_transport."""
     parts = image_topic(source).split('/')[:-1]
     return '/'.join([*parts, 'camera_info']) if source.topic else '/camera/camera_info'
 
 
 class _BagWriter:
-    """The connections and messages of one new bag."""
+    """Connections and messages of a new bag."""
 
     def __init__(self, writer: Writer, result: Calibration, source: Source, tf_parent: str, ignored: Polygons) -> None:
         self._ignored, self._broken = ignored, 0
@@ -78,7 +78,7 @@ class _BagWriter:
         self._ground_frame = f'{camera_name(source)}_ground'
 
     def write(self) -> None:
-        """Write everything in the order of recording."""
+        """Write all messages in the order of the recording."""
         info = self._connect(camera_info_topic(self._source), 'sensor_msgs/msg/CameraInfo')
         images = self._connect(self._source.topic, self._source.image_type, ()) if self._source.topic else None
         for index, stored in enumerate(self._source.stored()):
@@ -89,16 +89,16 @@ class _BagWriter:
                 self._writer.write(images, stored.recorded_ns, cdr)
         if self._broken:
             LOG.warning(
-                '%d images cannot be decoded and so not be made black where asked: they are left out of the bag',
+                '%d images cannot be decoded to black out ignore_regions and are left out of the bag',
                 self._broken,
             )
 
-    def _image(self, cdr: bytes | memoryview) -> bytes | memoryview | None:
-        """Return an image as it is to be written; None where its regions cannot be made black."""
-        if not self._ignored:
+    def _image(self, cdr: bytes | memoryview | None) -> bytes | memoryview | None:
+        """Return an image with its ignored regions blacked out; None if it cannot be decoded, or in a video."""
+        if cdr is None or not self._ignored:
             return cdr
         kind = self._source.image_type
-        message = self._store.deserialize_cdr(cdr, kind)
+        message: Any = self._store.deserialize_cdr(cdr, kind)
         require_maskable(message)
         try:
             black = mask_message(message, self._ignored)
@@ -132,7 +132,7 @@ class _BagWriter:
         )
 
     def _transform(self, ground: GroundPlane, camera_frame: str) -> Any:
-        """Return the transform between ground and camera, as the live node publishes it."""
+        """Return the transform between ground and camera, the same as the live node publishes."""
         pose = ground.transform(self._ground_frame, camera_frame, self._tf_parent)
         vector = self._make('geometry_msgs/msg/Vector3', **dict(zip('xyz', _floats(pose.translation_m), strict=True)))
         quaternion = self._make(

@@ -1,1 +1,1 @@
-"""Synthetic evidence without images: junctions, drives, disturbances."""
+"""Synthetic evidence without images: junctions, trajectories, disturbances."""

@@ -1,4 +1,4 @@
-"""What goes wrong: gross outliers, points that follow no road, a camera that waves about."""
+"""Disturbances of synthetic evidence: gross outliers, tracks on no road, a swaying camera."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from autocalib_ros.lens.camera import Camera
 
 SWAY_STEP_S = 0.5
 SWAY_DURATION_S = 3000.0
-"""A swaying camera sways for so long; synthetic recordings are shorter."""
+"""Length of the simulated sway; synthetic recordings are shorter."""
 DRIFT_QUANTILES = (0.05, 0.95)
-"""Of the background's offsets, as the monitor of stillness takes them."""
+"""Quantiles of the background offsets, as used by `perception.drift_monitor`."""
 
 Sway = Callable[[np.ndarray], np.ndarray]
 """Rotations (n, 3, 3) of the camera about its mean pose at times (n,) in seconds."""
 
 
 def corrupt_track(points: np.ndarray, size: tuple[int, int], generator: np.random.Generator) -> np.ndarray:
-    """Make a gross outlier of a track (n, 2): a jump to something else, or a curve that has nothing to do with it."""
+    """Turn a track (n, 2) into a gross outlier: a jump to another object, or an unrelated curve."""
     if generator.uniform() < 0.5:
         jumped = points.copy()
         jumped[generator.integers(2, len(points) - 2) :] += generator.uniform(40, 200) * _any_direction(generator)
@@ -30,7 +30,7 @@ def corrupt_track(points: np.ndarray, size: tuple[int, int], generator: np.rando
 
 
 def random_curve(count: int, size: tuple[int, int], generator: np.random.Generator) -> np.ndarray:
-    """Return `count` points (n, 2) of an arc anywhere in the image, 100 to 600 px in radius."""
+    """Return `count` points (n, 2) on a random arc in the image, radius 100 to 600 px."""
     bend = generator.choice([-1.0, 1.0]) / generator.uniform(100, 600)
     along = np.linspace(0.0, generator.uniform(80, 500), count)
     heading = generator.uniform(0, 2 * np.pi) + bend * along
@@ -39,13 +39,13 @@ def random_curve(count: int, size: tuple[int, int], generator: np.random.Generat
 
 
 def random_walk(count: int, size: tuple[int, int], generator: np.random.Generator) -> np.ndarray:
-    """Return `count` points (n, 2) that stagger about: rain, leaves, a lost tracker."""
+    """Return `count` points (n, 2) of a random walk, such as rain, leaves or a lost tracker give."""
     steps = generator.normal(scale=generator.uniform(2.0, 8.0), size=(count, 2))
     return reflect_into_image(generator.uniform((0, 0), size) + np.cumsum(steps, axis=0), size)
 
 
 def noisy_line(count: int, size: tuple[int, int], generator: np.random.Generator) -> np.ndarray:
-    """Return `count` points (n, 2) along an almost straight line anywhere in the image, any way."""
+    """Return `count` points (n, 2) along a random, almost straight line in the image."""
     way = _any_direction(generator)
     along = np.linspace(0.0, generator.uniform(60, 500), count)
     sideways = np.cumsum(generator.normal(scale=generator.uniform(0.2, 1.5), size=count))
@@ -54,14 +54,17 @@ def noisy_line(count: int, size: tuple[int, int], generator: np.random.Generator
 
 
 def reflect_into_image(points: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Mirror points (n, 2) at the image's borders until they lie inside."""
+    """Reflect points (n, 2) at the image borders until they lie inside."""
     last = np.array(size) - 1.0
     turned = np.mod(points, 2 * last)
     return np.minimum(turned, 2 * last - turned)
 
 
 def random_sway(generator: np.random.Generator) -> Sway:
-    """Draw a motion of 0.5 to 3 degrees over 1 to 10 s: a swing about one axis and a random walk about all three."""
+    """Draw a sway of 0.5 to 3 degrees over 1 to 10 s.
+
+    The sum of an oscillation about one axis and an Ornstein-Uhlenbeck process about all three.
+    """
     amplitude = np.radians(0.5 * 6.0 ** generator.uniform())
     period, memory = generator.uniform(1.0, 10.0, 2)
     axis, phase = generator.normal(size=3), generator.uniform(0, 2 * np.pi)
@@ -82,7 +85,7 @@ def random_sway(generator: np.random.Generator) -> Sway:
 
 
 def background_drift_px(camera: Camera, sway: Sway, seconds: float) -> float:
-    """Return what a monitor of the still background reports for a camera that sways for `seconds`."""
+    """Return the drift in pixels that the drift monitor reports for a camera that sways for `seconds`."""
     corners = np.stack(
         np.meshgrid(np.linspace(0.1, 0.9, 8) * camera.width, np.linspace(0.1, 0.9, 5) * camera.height), axis=-1
     ).reshape(-1, 2)

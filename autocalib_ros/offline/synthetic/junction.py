@@ -1,4 +1,4 @@
-"""Evidence of a made-up junction with known truth, without images: for tests and Monte-Carlo studies."""
+"""Synthetic evidence of a junction with ground truth, without images: for tests and Monte-Carlo studies."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ MIN_TRACK_LENGTH_PX = 25.0
 MIN_TRACK_POINTS = 8
 MAX_TRACK_POINTS = 100
 MAX_TRACKED_RANGE_M = 60.0
-"""Farther points are too small to be followed."""
+"""Points farther from the camera are not tracked: they are too small in the image."""
 HEADWAY_S = 1.5
 MAX_VEHICLES_PER_TRACK = 100
-"""A junction where fewer vehicles leave a track is out of view."""
+"""Limit of vehicles per wanted track: if more are needed, the junction is out of view."""
 
 
 def pose(tilt_deg: float, roll_deg: float, heading_deg: float) -> np.ndarray:
-    """Return camera_from_ground (3, 3): ground x is `heading_deg` to the left of where the camera looks."""
+    """Return camera_from_ground (3, 3): ground x points `heading_deg` to the left of the viewing direction."""
     tilt, roll, heading = np.radians([tilt_deg, roll_deg, heading_deg])
     level = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])  # from x ahead, y left, z up
     pitch = np.array([[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]])
@@ -46,38 +46,38 @@ def pose(tilt_deg: float, roll_deg: float, heading_deg: float) -> np.ndarray:
 
 @dataclass(frozen=True, kw_only=True)
 class Junction:
-    """What is seen, and how badly."""
+    """Camera, roads, traffic, and disturbances of a synthetic scene."""
 
     camera: Camera = field(default_factory=lambda: Camera(1280, 720, 560.0, (639.5, 359.5)))
     camera_from_ground: np.ndarray = field(default_factory=lambda: pose(32.0, 1.0, 35.0))
     height_m: float = 8.0
     centre_m: tuple[float, float] = (18.0, -12.0)
-    """Where the roads cross, relative to the camera's foot point in the ground frame."""
+    """Crossing of the roads in the ground frame, whose origin is the point below the camera."""
     road_angles_deg: tuple[float, ...] = (0.0, 90.0)
     lanes_m: tuple[float, ...] = (0.5 * LANE_M, 1.5 * LANE_M)
-    """How far to the right of its road's middle a vehicle may drive."""
+    """Offsets of the lanes to the right of the middle of the road."""
     drive: Drive = drive_across
-    """How a road user moves."""
+    """Trajectory model of the road users."""
     vehicles: int = 60
     tracks: int | None = None
-    """When set, vehicles drive until exactly so many tracks are recorded, and `vehicles` does not count."""
+    """If set, simulate until exactly this number of tracks is recorded and ignore `vehicles`."""
     points_per_vehicle: int = 4
     headway_s: float = HEADWAY_S
     """Time between vehicles."""
     turning_fraction: float = 0.2
     lane_change_fraction: float = 0.0
     merged_fraction: float = 0.0
-    """Share of the vehicles that have company with which they are taken for one."""
+    """Fraction of the vehicles that are merged with a companion into one vehicle."""
     companion: Companion = beside
-    """What moves with them: another vehicle beside them, a trailer, a shadow."""
+    """Trajectory of the companion: a vehicle in the adjacent lane, a trailer, or a shadow."""
     wander_m: float = 0.1
     noise_px: float = 0.5
     outlier_fraction: float = 0.0
-    """Share of the tracks that are spoilt."""
+    """Fraction of the tracks that are gross outliers."""
     visible_columns_px: tuple[float, float] | None = None
-    """Columns between which the road is in view; all of them where it is None."""
+    """Range of columns in which the road is visible; None for all."""
     sway: Sway | None = None
-    """How the camera moves about `camera_from_ground`."""
+    """Motion of the camera about `camera_from_ground`; None if it stands still."""
 
     @property
     def normal_in_camera(self) -> np.ndarray:
@@ -91,7 +91,7 @@ class Junction:
 
 
 def synthetic_evidence(junction: Junction, generator: np.random.Generator) -> Evidence:
-    """Drive vehicles through the junction and record their points as a tracker would."""
+    """Simulate vehicles on the junction and return the tracks of their points as evidence."""
     tracks: list[Track] = []
     newest = 0.0
     for vehicle in _vehicles(junction, tracks):
@@ -112,7 +112,7 @@ def synthetic_evidence(junction: Junction, generator: np.random.Generator) -> Ev
 def evidence_from_tracks(
     tracks: list[Track], image_size: tuple[int, int], newest_s: float, drift_px: float = 0.0
 ) -> Evidence:
-    """Return the evidence of tracks, with the segments that matches between masked frames would give."""
+    """Return evidence with the given tracks and the segments that keypoint matching would give for them."""
     buffer = EvidenceBuffer(BufferOptions())
     for track in tracks:
         buffer.add_track(track)
@@ -129,7 +129,7 @@ def evidence_from_tracks(
 
 
 def _vehicles(junction: Junction, tracks: list[Track]) -> Iterator[int]:
-    """Count vehicles until all have come, or until the tracks are as many as wanted."""
+    """Yield vehicle ids: `vehicles` of them, or until the wanted number of tracks is reached."""
     if junction.tracks is None:
         yield from range(junction.vehicles)
         return
@@ -151,7 +151,7 @@ def _observe(
     times: np.ndarray,
     vehicle: int,
 ) -> Track | None:
-    """Project one point of the body; keep the longest run inside the image."""
+    """Return the track of one random point of a body: its longest visible run, or None if that is too short."""
     ahead, left, up = generator.uniform([-2.0, -0.8, 0.2], [2.0, 0.8, 1.6])
     forward = np.column_stack([np.cos(heading), np.sin(heading)])
     leftward = np.column_stack([-forward[:, 1], forward[:, 0]])
@@ -177,7 +177,7 @@ def _observe(
 
 
 def _bearings(junction: Junction, relative_m: np.ndarray, times_s: np.ndarray) -> np.ndarray:
-    """Turn points (n, 3) relative to the camera, ground axes, into the camera frame of their times (n,)."""
+    """Rotate points (n, 3) relative to the camera from ground axes into the camera frame at times (n,)."""
     steady = relative_m @ junction.camera_from_ground.T
     return steady if junction.sway is None else np.einsum('nij,nj->ni', junction.sway(times_s), steady)
 
@@ -192,7 +192,7 @@ def _longest_run(seen: np.ndarray) -> tuple[int, int]:
 
 
 def _segments(track: Track) -> Iterator[Segments]:
-    """Where a point was in consecutive masked frames, as matches between them would give."""
+    """Yield the displacement of a point between consecutive keypoint frames."""
     first, last = np.ceil(track.times_s[0] / SEGMENT_INTERVAL_S), np.floor(track.times_s[-1] / SEGMENT_INTERVAL_S)
     frames = np.arange(first, last + 1) * SEGMENT_INTERVAL_S
     places = CubicSpline(track.times_s, track.points_px)(frames)

@@ -1,1 +1,1 @@
-"""What the commands print: progress, colours, and the summary of a result."""
+"""Terminal output of the commands: progress, colours, and the summary of a result."""

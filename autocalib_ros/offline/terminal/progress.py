@@ -1,4 +1,4 @@
-"""Progress for a person who waits: a bar on a terminal, now and then a line in a log."""
+"""Progress reports: a bar on a terminal, a line now and then in a log."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from autocalib_ros.offline.terminal.style import is_terminal, terminal_width, tr
 LINE_EVERY_S = 5.0
 LINE_EVERY_FRACTION = 0.1
 MIN_INTERVAL_S = 1.0
-"""A short run that goes through its tenths or its states in a moment needs no ten lines."""
+"""Shortest time between two lines, seconds: a short run does not need a line for every tenth of it."""
 BAR = '{desc} {percentage:3.0f} %|{bar:8}| {remaining} left{postfix}'
 OPEN_BAR = '{desc} {n_fmt}{unit}, {elapsed}{postfix}'
 
 
 class ProgressReporter(Protocol):
-    """What `progress_bar` hands out."""
+    """Receives progress; see `progress_bar`."""
 
     def update_to(self, done: float, note: str = '') -> None:
-        """Show that `done` of the total is done, with a short note behind it whose first word is the state."""
+        """Show that `done` of the total is done, followed by a short note whose first word is the state."""
 
 
 @contextmanager
 def progress_bar(
     total: float | None, unit: str, label: str, *, quiet: bool = False, stream: TextIO | None = None
 ) -> Iterator[ProgressReporter]:
-    """Show progress on stderr until the block ends: tqdm's bar on a terminal, plain lines elsewhere.
+    """Show progress on stderr until the block ends: a tqdm bar on a terminal, plain lines elsewhere.
 
-    `total` is counted in `unit`s, None where it is not known beforehand; `quiet` shows nothing.
+    `total` is counted in `unit`s, None if unknown; `quiet` shows nothing.
     """
     stream = stream or sys.stderr
     if quiet:
@@ -51,13 +51,13 @@ class _NoProgress:
 
 
 class _ProgressBar:
-    """tqdm's bar, with as much of the note behind it as the terminal has columns for."""
+    """A tqdm bar followed by the note, truncated to the width of the terminal."""
 
     def __init__(self, total: float | None, unit: str, label: str, stream: TextIO) -> None:
-        from tqdm import tqdm  # imported late: `autocalib --help` has no use for it
+        from tqdm import tqdm  # lazy import: `autocalib --help` does not need it
 
         self._stream = stream
-        # a terminal of unknown size has no line for tqdm, which then shows nothing
+        # nrows=2: on a terminal of unknown size tqdm would show nothing
         self._bar = tqdm(
             total=total,
             unit=' ' + unit,
@@ -78,7 +78,7 @@ class _ProgressBar:
         self._bar.close()
 
     def update_to(self, done: float, note: str = '') -> None:
-        """Move the bar to `done`; show another state at once, because it may take a while."""
+        """Move the bar to `done`; show a new state immediately, because it may last."""
         changed, self._note = _state(note) != _state(self._note), note
         self._bar.ncols = terminal_width(self._stream) - 1  # the window may have been resized
         fixed = {**self._bar.format_dict, 'n': done, 'postfix': '', 'ncols': None}
@@ -90,7 +90,7 @@ class _ProgressBar:
 
 
 class _ProgressLines:
-    """One line every few seconds or per cent, and for another state: for logs, pipes and files."""
+    """A line every few seconds or per cent and for each new state: for logs, pipes and files."""
 
     def __init__(self, total: float | None, unit: str, label: str, stream: TextIO) -> None:
         self._total, self._unit, self._label, self._stream = total, unit, label, stream
@@ -99,7 +99,7 @@ class _ProgressLines:
         self._note = self._reported_note = ''
 
     def update_to(self, done: float, note: str = '') -> None:
-        """Remember `done` and say it when it is time."""
+        """Store `done` and print a line if one is due."""
         self._done, self._note = done, note
         step = LINE_EVERY_FRACTION * self._total if self._total else float('inf')
         now = time.monotonic()
@@ -110,7 +110,7 @@ class _ProgressLines:
             self._report(now)
 
     def finish(self) -> None:
-        """Say the last state once."""
+        """Print the last state unless it was printed already."""
         if self._done > self._reported or not self._reported:
             self._report(time.monotonic())
 
@@ -127,5 +127,5 @@ class _ProgressLines:
 
 
 def _state(note: str) -> str:
-    """Return the first word of a note."""
+    """Return the state: the first word of a note."""
     return note.partition(' ')[0]

@@ -1,4 +1,4 @@
-"""A result as a short table for the terminal; the report has all the numbers."""
+"""Summary of a result for the terminal; the report has all numbers."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ INDENT = '  '
 def summary_lines(
     result: Calibration | Refusal, accepted_at_s: float | None = None, columns: int | None = None
 ) -> list[str]:
-    """Return what is known with one sigma, then assumptions, checks and what helps; wrapped to so many columns."""
+    """Return values with one sigma, then assumptions, checks and remedy, wrapped to `columns` columns."""
     if isinstance(result, Refusal):
         rows = [(row.name, row.value) for row in number_rows(result)]
         return [INDENT + line for line in align_columns(rows)] + _wrap_pairs([('what helps', remedy(result))], columns)
     numbers = number_rows(replace(result, paper=None), accepted_at_s)
-    # rows without a deviation may be long, and would push the column of the others far out
+    # column widths from rows with a sigma only: other rows can be long
     cells = [('', 'value', '1 sigma'), *((row.name, row.value, f'± {row.sigma}') for row in numbers if row.sigma)]
     name_width, value_width = (max(len(cell[column]) for cell in cells) for column in (0, 1))
     table = [cells[0], *((row.name, row.value, f'± {row.sigma}' if row.sigma else '') for row in numbers)]

@@ -1,4 +1,4 @@
-"""Recordings of ROS: kinds, topics, stamps, damage."""
+"""ROS recordings: formats, topics, stamps, damaged files."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def test_an_image_topic_without_messages_is_no_choice(tmp_path, write_bag, image
     ('topic', 'message'),
     [
         ('/nowhere', 'has no topic /nowhere; its image topics: /cam1/image_raw'),
-        ('/heads', 'holds no images but /heads .std_msgs/msg/Header'),
+        ('/heads', 'has no images but /heads .std_msgs/msg/Header'),
     ],
 )
 def test_a_wrong_topic_is_answered_with_the_right_ones(tmp_path, write_bag, images, a_header, topic, message):
@@ -114,7 +114,7 @@ def test_a_wrong_topic_is_answered_with_the_right_ones(tmp_path, write_bag, imag
 
 def test_a_bag_without_images_says_what_it_holds(tmp_path, write_bag, a_header):
     path = write_bag(tmp_path / 'bag', [('/heads', SECOND, a_header)])
-    with pytest.raises(InputError, match='holds no images; its topics: /heads'):
+    with pytest.raises(InputError, match='has no images; its topics: /heads'):
         open_source(path)
 
 
@@ -159,7 +159,7 @@ def test_an_image_that_cannot_be_decoded_is_skipped_and_counted(tmp_path, write_
 
 def test_only_images_that_cannot_be_decoded_are_an_error(tmp_path, write_bag, images):
     path = write_bag(tmp_path / 'bag', images(3, encoding='32FC2'))
-    with pytest.raises(InputError, match="none of the 3 images on /cam1/image_raw.*encoding '32FC2' is not supported"):
+    with pytest.raises(InputError, match=r"none of the 3 images on /cam1/image_raw.*encoding '32FC2' is not supported"):
         list(open_source(path).frames())
 
 
@@ -182,7 +182,7 @@ def test_a_source_can_be_gone_through_twice(tmp_path, write_bag, images):
 
 
 def noisy(images, count):
-    """Images of noise: they do not compress away, so that a cut hits them."""
+    """Return images of noise, which do not compress, so that truncation hits them."""
     messages = images(count)
     random = np.random.default_rng(1)
     for _, _, message in messages:
@@ -229,12 +229,12 @@ def test_a_ros1_bag_that_breaks_off_is_an_error(tmp_path, write_bag1, images, ro
         open_source(path)
 
 
-@pytest.mark.parametrize('share', [0.3, 0.6, 0.9])
-def test_a_torn_sqlite_file_gives_images_or_one_line(tmp_path, write_bag, images, share):
+@pytest.mark.parametrize('fraction', [0.3, 0.6, 0.9])
+def test_a_torn_sqlite_file_gives_images_or_one_line(tmp_path, write_bag, images, fraction):
     bag = write_bag(tmp_path / 'bag', noisy(images, 60))
     whole = (bag / 'bag.db3').read_bytes()
     torn = tmp_path / 'torn.db3'
-    torn.write_bytes(whole[: int(share * len(whole))])
+    torn.write_bytes(whole[: int(fraction * len(whole))])
     try:
         assert brightness(open_source(torn))
     except InputError as error:
@@ -245,7 +245,7 @@ def test_a_torn_sqlite_file_gives_images_or_one_line(tmp_path, write_bag, images
 def test_a_text_file_named_as_a_recording_is_one_clear_line(tmp_path, name):
     path = tmp_path / name
     path.write_text('this is no recording, only a few words that somebody saved under the wrong name\n' * 3)
-    with pytest.raises(InputError, match='cannot read .*text') as raised:
+    with pytest.raises(InputError, match=r'cannot read .*text') as raised:
         open_source(path)
     assert '\n' not in str(raised.value)
 
