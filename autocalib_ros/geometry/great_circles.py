@@ -1,9 +1,9 @@
-"""Straight paths as great circles: the geometry that every estimator shares.
+"""Great circles of straight paths: unprojection, circle fits and distances in observed pixels.
 
-A straight path in space, seen by any central camera, lies on a plane through the camera: its bearings
-lie on a great circle with a unit normal n, past 90 degrees too. Residuals are measured in observed
-pixels: the distance n.b of a bearing from the circle over the length of its gradient with respect to the
-pixel. A residual that shrinks with the parameters, in the undistorted plane say, would favour wrong ones.
+A straight path in space and the projection centre of a central camera span a plane. Its bearings b therefore lie on
+a great circle with unit normal n, beyond 90 degrees from the optical axis too. The residual is the Sampson distance in
+observed pixels: n.b over the norm of its gradient with respect to the pixel. A residual in the undistorted plane
+shrinks with the focal length and would bias the estimate.
 """
 
 from __future__ import annotations
@@ -18,34 +18,37 @@ from autocalib_ros.lens.camera import Camera
 
 @dataclass(frozen=True)
 class Rays:
-    """Bearings of pixels with the directions in which a pixel moves them."""
+    """Bearings of pixels and their derivatives with respect to the pixel."""
 
     bearings: np.ndarray
     """Unit vectors, shape (..., 3)."""
     radial: np.ndarray
-    """Change of the bearing for one pixel outwards, shape (..., 3)."""
+    """Derivative of the bearing by the image radius, per pixel, shape (..., 3)."""
     tangential: np.ndarray
-    """Change of the bearing for one pixel around the principal point, shape (..., 3)."""
+    """Derivative of the bearing along the circle around the principal point, per pixel, shape (..., 3)."""
 
     def pixel_scale(self, normals: np.ndarray) -> np.ndarray:
-        """Pixels per unit of n.b for circle normals (..., 3) that broadcast against the bearings."""
+        """Return pixels per unit of n.b, shape (...), for circle normals (..., 3) that broadcast to the bearings."""
         outwards, around = dot(self.radial, normals), dot(self.tangential, normals)
         return 1.0 / np.sqrt(np.maximum(outwards * outwards + around * around, 1e-18))
 
     def distance_px(self, normals: np.ndarray) -> np.ndarray:
-        """Signed distance in observed pixels of each bearing from the great circle of its normal."""
+        """Return the signed Sampson distance in pixels, shape (...), from the great circles with normals (..., 3)."""
         return dot(self.bearings, normals) * self.pixel_scale(normals)
 
 
 def unproject_rays(camera: Camera, pixels: np.ndarray) -> Rays:
-    """Unproject pixels (..., 2); where the lens model does not reach, the last bearing that it reaches."""
+    """Unproject pixels (..., 2) to rays.
+
+    Beyond the largest image radius of the lens model, a pixel gets the outermost bearing of the model.
+    """
     x, y = pixels[..., 0] - camera.principal_point_px[0], pixels[..., 1] - camera.principal_point_px[1]
     radius = np.maximum(np.sqrt(x * x + y * y), 1e-9)
     theta, _ = camera.angle(radius)
-    # one tangent is cheaper than a sine and a cosine
+    # half-angle formulas: one tangent is cheaper than a sine and a cosine
     half = np.tan(0.5 * theta)
-    share = 1.0 / (1.0 + half * half)
-    sine, cosine = 2.0 * half * share, (1.0 - half * half) * share
+    cosine2 = 1.0 / (1.0 + half * half)
+    sine, cosine = 2.0 * half * cosine2, (1.0 - half * half) * cosine2
     x, y = x / radius, y / radius
     outward = 1.0 / np.maximum(camera.radius_derivative(theta), 1e-3 * camera.focal_px)
     around = sine / radius
@@ -58,7 +61,7 @@ def unproject_rays(camera: Camera, pixels: np.ndarray) -> Rays:
 
 
 def bearing_change(rays: Rays, camera: Camera, pixels: np.ndarray, way_px: np.ndarray) -> np.ndarray:
-    """Change (n, 3) of the bearings of pixels (n, 2) along a way (n, 2) in the image."""
+    """Return the change (n, 3) of the bearings of pixels (n, 2) for image displacements `way_px` (n, 2)."""
     outward = pixels - camera.principal_point_px
     outward = outward / np.maximum(np.hypot(*outward.T), 1e-9)[:, None]
     return (
@@ -68,7 +71,11 @@ def bearing_change(rays: Rays, camera: Camera, pixels: np.ndarray, way_px: np.nd
 
 
 def scatter(rays: Rays, weights: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """Sum w s^2 b b^T per track, shape (tracks, 3, 3): n^T S n is the mean squared distance in pixels."""
+    """Return the scatter matrix S = sum w s^2 b b^T per track, shape (tracks, 3, 3).
+
+    n^T S n is the mean squared distance in px^2 from the great circle with normal n, for weights w and pixel scales s
+    of shape (tracks, samples).
+    """
     weighted = rays.bearings * (weights * scale * scale)[..., None]
     return weighted.transpose(0, 2, 1) @ rays.bearings
 
@@ -84,7 +91,10 @@ def fit_circles(rays: Rays, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def circle_scatter(rays: Rays, weights: np.ndarray) -> np.ndarray:
-    """Return each track's scatter (tracks, 3, 3) where its great circle makes a pixel worth what it is."""
+    """Return each track's scatter (tracks, 3, 3) at the pixel scale of its own best great circle.
+
+    The scale depends on the circle: two fixed-point iterations from scale 1.
+    """
     scale = np.ones(weights.shape)
     for _ in range(2):
         normals, _ = smallest_eigenvectors(scatter(rays, weights, scale))
@@ -101,9 +111,10 @@ def orthonormal_basis(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def fit_circles_through(matrix: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Fit to each track's scatter (tracks, 3, 3) the great circle through its direction (tracks, 3).
+    """Fit the great circle through a given direction (tracks, 3) to each track's scatter (tracks, 3, 3).
 
-    Returns normals (tracks, 3) and mean squared distances in px^2 (tracks,): a 2x2 eigenproblem each.
+    Returns normals (tracks, 3) and mean squared distances in px^2 (tracks,): the smaller eigenpair of the 2x2
+    restriction of the scatter to the plane perpendicular to the direction.
     """
     first, second = orthonormal_basis(directions)
     image = np.einsum('tij,tj->ti', matrix, first)
@@ -116,22 +127,28 @@ def fit_circles_through(matrix: np.ndarray, directions: np.ndarray) -> tuple[np.
 
 
 def squared_distances_through(matrix: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Mean squared pixel distance of every track (t) from its best circle through every direction (h): (h, t)."""
-    return _squared_distances(_quadratic_forms(matrix), directions)
+    """Return the mean squared distance of every track from its best circle through every direction.
 
-
-def _quadratic_forms(matrix: np.ndarray) -> np.ndarray:
-    """Quadratic forms, shape (2, 6, tracks), of a unit direction in scatter matrices S (tracks, 3, 3).
-
-    Their values are the sum and the product of the eigenvalues that S has in the plane across the direction d:
-    trace S - d^T S d, and d^T C d with the cofactors C of S.
+    Scatter matrices (tracks, 3, 3) and unit directions (directions, 3) give px^2 of shape (directions, tracks).
     """
-    diagonal, rest, minors, mixed = cofactors(matrix)
-    return np.stack([np.concatenate([diagonal.sum(axis=0) - diagonal, -rest]), np.concatenate([minors, mixed])])
+    return squared_distances(quadratic_forms(matrix), directions)
 
 
-def _squared_distances(forms: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Lesser eigenvalue (directions, tracks) across unit directions (directions, 3), from `_quadratic_forms`."""
+def quadratic_forms(matrix: np.ndarray) -> np.ndarray:
+    """Return two quadratic forms of a unit direction d per scatter matrix S (tracks, 3, 3), shape (2, 6, tracks).
+
+    Their values are the sum and the product of the two eigenvalues of S restricted to the plane perpendicular to d:
+    trace S - d^T S d, and d^T C d with the cofactor matrix C of S.
+    """
+    diagonal, off_diagonal, minors, mixed = cofactors(matrix)
+    return np.stack([np.concatenate([diagonal.sum(axis=0) - diagonal, -off_diagonal]), np.concatenate([minors, mixed])])
+
+
+def squared_distances(forms: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Return the smaller restricted eigenvalue for unit directions (directions, 3), shape (directions, tracks).
+
+    `forms` are those of `quadratic_forms`.
+    """
     products = np.concatenate([directions**2, 2.0 * directions[:, NEXT] * directions[:, LAST]], axis=1)
     total, product = products @ forms
     root = np.sqrt(np.maximum(total * total - 4.0 * product, 0.0))

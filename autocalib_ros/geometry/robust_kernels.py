@@ -1,22 +1,44 @@
-"""DOCSTRING."""
+"""Robust kernels (M-estimators): weight, loss and density, one group of functions a kernel; undirected angles.
+
+Geman-McClure bounds the loss and rejects outliers; Student's t keeps heavy tails.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
 STUDENT_FREEDOM, STUDENT_PEAK_DENSITY = 4.0, 0.375
-"""Of Student's distribution about a peak, and its density in the middle for a scale of one: edges of wheels and lamps
-make long tails."""
+"""Degrees of freedom of Student's t distribution, and its density at 0 for unit scale: edges of wheels and lamps make
+long tails."""
+
+
+def geman_mcclure_weight(squared: np.ndarray, limit: np.ndarray | float) -> np.ndarray:
+    """Return the weight of squared residuals: 1 at 0, a quarter at `limit`; derivative of `geman_mcclure_loss`.
+
+    Redescending kernel of Geman & McClure (1985); both arguments broadcast.
+    """
+    return 1.0 / (1.0 + squared / limit) ** 2
+
+
+def geman_mcclure_loss(squared: np.ndarray, limit: np.ndarray | float) -> np.ndarray:
+    """Return the loss of finite squared residuals; it approaches `limit`."""
+    return squared / (1.0 + squared / limit)
+
+
+def geman_mcclure_bounded_loss(squared: np.ndarray, limit: np.ndarray | float) -> np.ndarray:
+    """Return `geman_mcclure_loss`, and its bound `limit` for infinite squared residuals."""
+    far = ~np.isfinite(squared)
+    return np.where(far, limit, geman_mcclure_loss(np.where(far, 0.0, squared), limit))
 
 
 def student_density(residuals: np.ndarray, sigmas: np.ndarray) -> np.ndarray:
-    """Density of each miss by Student's distribution of these scales."""
+    """Return Student's t density of residuals with scales `sigmas`; both broadcast."""
     apart = 1.0 + (residuals / sigmas) ** 2 / STUDENT_FREEDOM
     return STUDENT_PEAK_DENSITY / sigmas / (apart * apart * np.sqrt(apart))
 
 
 def student_weight(residuals: np.ndarray, sigmas: np.ndarray) -> np.ndarray:
-    """Weight of each miss by Student's distribution."""
+    """Return the M-estimator weight of residuals with scales `sigmas` for Student's t: (nu + 1) / (nu + r^2 / s^2)."""
     return (STUDENT_FREEDOM + 1.0) / (STUDENT_FREEDOM + (residuals / sigmas) ** 2)
 
 

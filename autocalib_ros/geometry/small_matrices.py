@@ -1,49 +1,51 @@
-"""Algebra of many small vectors and matrices at once, where NumPy's own works through them one by one."""
+"""Vectorised algebra of many small vectors and matrices, where NumPy's linear algebra loops over them."""
 
 from __future__ import annotations
 
 import numpy as np
 
 NEXT, LAST = [1, 2, 0], [2, 0, 1]
+"""Cyclic successor and predecessor of each of three indices."""
 LAGUERRE_STEPS = 3
-"""Each step from 0, which is below all eigenvalues, triples the digits of the least."""
+"""Iterations of Laguerre's method from 0, a lower bound of all eigenvalues: convergence is cubic, each step triples the
+number of correct digits."""
 
 
 def dot(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Scalar products of vectors (..., 3) that broadcast against each other, shape (...)."""
+    """Return the scalar products of vectors (..., 3) that broadcast against each other, shape (...)."""
     if first.ndim == second.ndim > 1 and second.shape[-2] == 1:
-        # one vector for a row of others, which is a product of matrices
+        # one vector against a row of vectors: a matrix product, which is faster
         return (first @ second.swapaxes(-1, -2))[..., 0]
     return np.einsum('...i,...i->...', first, second)
 
 
 def cross(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Vector products of vectors (..., 3) that broadcast against each other, shape (..., 3)."""
+    """Return the cross products of vectors (..., 3) that broadcast against each other, shape (..., 3)."""
     (x, y, z), (u, v, w) = ([vectors[..., axis] for axis in range(3)] for vectors in (first, second))
     return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=-1)
 
 
 def cofactors(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the parts of symmetric matrices (n, 3, 3) and of their cofactors: two diagonals and two rests (3, n).
+    """Return diagonals and off-diagonals of symmetric matrices (n, 3, 3) and of their cofactor matrices, (3, n) each.
 
-    Entry i of a rest stands in the row and the column that are not i.
+    Entry i of an off-diagonal is the element in the row and the column other than i.
     """
     flat = matrix.reshape(-1, 9).T
-    diagonal, rest = flat[[0, 4, 8]], flat[[5, 2, 1]]
-    return (diagonal, rest, diagonal[NEXT] * diagonal[LAST] - rest * rest, rest[NEXT] * rest[LAST] - diagonal * rest)
+    diagonal, off = flat[[0, 4, 8]], flat[[5, 2, 1]]
+    return (diagonal, off, diagonal[NEXT] * diagonal[LAST] - off * off, off[NEXT] * off[LAST] - diagonal * off)
 
 
 def smallest_eigenvectors(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Unit eigenvectors (n, 3) of the least eigenvalues of positive semidefinite matrices (n, 3, 3), and those (n,).
+    """Return the unit eigenvectors (n, 3) of the smallest eigenvalues of PSD matrices (n, 3, 3), and the eigenvalues.
 
-    The cofactors of S - l I, l close to the least eigenvalue, are close to a multiple of e e^T: their largest column
-    is close to e, and they turn it closer.
+    The cofactor matrix of S - l I, l close to the smallest eigenvalue, is nearly a multiple of e e^T. Its largest
+    column is nearly e; one multiplication by the cofactor matrix refines it (inverse iteration).
     """
-    diagonal, rest, minors, mixed = cofactors(matrix)
+    diagonal, off, minors, mixed = cofactors(matrix)
     trace = diagonal.sum(axis=0)
-    shift = _smallest_roots(trace, minors.sum(axis=0), diagonal[0] * minors[0] + (rest[1:] * mixed[1:]).sum(axis=0))
+    shift = _smallest_roots(trace, minors.sum(axis=0), diagonal[0] * minors[0] + (off[1:] * mixed[1:]).sum(axis=0))
     minors = minors + shift * (diagonal - trace + shift)
-    mixed = mixed + shift * rest
+    mixed = mixed + shift * off
     near = np.stack(
         [minors[0], mixed[2], mixed[1], mixed[2], minors[1], mixed[0], mixed[1], mixed[0], minors[2]], axis=-1
     ).reshape(-1, 3, 3)
@@ -54,7 +56,10 @@ def smallest_eigenvectors(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _smallest_roots(trace: np.ndarray, minors: np.ndarray, determinant: np.ndarray) -> np.ndarray:
-    """Least roots (n,) of l^3 - trace l^2 + minors l - determinant, all of whose roots are real: Laguerre's method."""
+    """Return the smallest roots (n,) of l^3 - trace l^2 + minors l - determinant by Laguerre's method.
+
+    All three roots are real, as for a symmetric matrix.
+    """
     root = np.zeros(len(trace))
     for _ in range(LAGUERRE_STEPS):
         value = ((root - trace) * root + minors) * root - determinant
@@ -66,7 +71,7 @@ def _smallest_roots(trace: np.ndarray, minors: np.ndarray, determinant: np.ndarr
 
 
 def inverse_cholesky_factors(matrix: np.ndarray) -> np.ndarray:
-    """Return the inverses of the lower Cholesky factors of positive definite matrices (size, size, n), same shape."""
+    """Return the inverses of the lower Cholesky factors of positive definite matrices, shape (size, size, n)."""
     factor, inverse = np.zeros((2, *matrix.shape))
     for row in range(len(matrix)):
         column = matrix[row:, row] - np.einsum('jkn,kn->jn', factor[row:, :row], factor[row, :row])

@@ -1,8 +1,8 @@
-"""What is known of a lens before any traffic: the families of real lenses, and what a person asserts.
+"""Gaussian prior on the lens parameters: families of real lenses, and options that assert a lens.
 
-Kannala-Brandt coefficients tell the classical projections apart: k = 0 is equidistant, the series of the tangent
-(k1 = 1/3, k2 = 2/15, ...) is free of distortion, and fixed roadside lenses lie near the one or the other. A lens
-family is a centre with standard deviations; a standard deviation of zero holds a parameter.
+Coefficients of Kannala & Brandt (2006) distinguish the classical projections: k = 0 is equidistant, the series of the
+tangent (k1 = 1/3, k2 = 2/15, ...) is distortion-free, and roadside lenses lie near one of the two. A family is a mean
+with standard deviations; a standard deviation of zero fixes a parameter.
 """
 
 from __future__ import annotations
@@ -16,46 +16,51 @@ from autocalib_ros.config import JointOptions
 from autocalib_ros.lens.camera import Camera, image_centre
 
 EQUIDISTANT = (0.0, 0.0, 0.0, 0.0)
+"""Coefficients k1 to k4 of r = f theta."""
 DISTORTION_FREE = (1 / 3, 2 / 15, 17 / 315, 62 / 2835)
+"""Coefficients k1 to k4 of r = f tan(theta): its Taylor series."""
 KANNALA_BRANDT = (1 / 6, 1 / 30, 0.0, 0.0)
 KANNALA_BRANDT_SIGMA = (1 / 6, 1 / 30)
-"""Any lens between the two families, each a sigma away."""
+"""Mean and sigma of k1, k2 of a family that covers the range between the two above, one sigma from either."""
 K2_SIGMA = 0.02
-"""Standard deviation of k2 about its family: at one radian it moves an image point by 2 %, as k1 does by 3 %."""
+"""Standard deviation of k2 about its family: it moves an image point at one radian by 2 %, as the default sigma of k1
+moves it by 3 %."""
 PRINCIPAL_POINT_SIGMA_FRACTION = 0.01
-"""Standard deviation of the principal point, share of the image width, unless given in pixels."""
+"""Standard deviation of the principal point, fraction of the image width, unless the option gives pixels. Judgement."""
 LOOSE_PRINCIPAL_POINT_SIGMA_FRACTION = 0.1
-"""The same for evidence that tells the principal point: an image may be cut out of a larger one, or magnified."""
+"""Standard deviation of the principal point, fraction of the image width, where the evidence identifies it: an image
+may be cropped or digitally zoomed. Judgement."""
 LENS_PARAMETERS = ('focal length', 'principal point x', 'principal point y', 'k1', 'k2')
+"""Names of the lens parameters, in the order of `LensPrior.sigma`."""
 
 
 @dataclass(frozen=True)
 class LensPrior:
-    """A family of lenses: centre and standard deviations of focal length, principal point, k1 and k2."""
+    """Gaussian prior of a lens family: mean and standard deviations of focal length, principal point, k1 and k2."""
 
     family: str
     centre: Camera
-    """Its focal length counts only where `focal_known`."""
+    """Mean; its focal length is used only where `focal_known`."""
     sigma: np.ndarray
-    """Of log f (inf: unknown), cx and cy in pixels, k1, k2; 0 holds, shape (5,)."""
+    """Of log f (inf: unknown), cx and cy in pixels, k1, k2; 0: fixed, shape (5,)."""
 
     @property
     def focal_known(self) -> bool:
-        """Whether anything is known of the focal length."""
+        """Whether the prior constrains the focal length."""
         return bool(np.isfinite(self.sigma[0]))
 
     @cached_property
     def free(self) -> np.ndarray:
-        """Indices of the parameters that are not held."""
+        """Indices of the free parameters."""
         return np.flatnonzero(self.sigma > 0)
 
     @cached_property
     def units(self) -> np.ndarray:
-        """What a unit step of each free parameter is: its sigma, or one in log f where that is unknown."""
+        """Unit of each free parameter: its sigma, or 1 in log f where that is unknown, shape (free,)."""
         return np.where(np.isfinite(self.sigma), self.sigma, 1.0)[self.free]
 
     def moved(self, camera: Camera, step: np.ndarray) -> Camera:
-        """Return the camera moved by a step of the free parameters in their units."""
+        """Return the camera moved by a step (free,) in units of the free parameters."""
         change = np.zeros(5)
         change[self.free] = step * self.units
         cx, cy = camera.principal_point_px
@@ -68,7 +73,7 @@ class LensPrior:
         )
 
     def step(self, camera: Camera, other: Camera) -> np.ndarray:
-        """Return the step of the free parameters, in their units, by which `moved` takes a camera to another."""
+        """Return the step (free,) by which `moved` takes a camera to another."""
         shift = np.subtract(other.principal_point_px, camera.principal_point_px)
         change = np.array(
             [np.log(other.focal_px / camera.focal_px), *shift, other.k[0] - camera.k[0], other.k[1] - camera.k[1]]
@@ -76,44 +81,44 @@ class LensPrior:
         return change[self.free] / self.units
 
     def deviations(self, camera: Camera) -> np.ndarray:
-        """Deviation from the centre of each free parameter in sigmas, 0 where nothing is known; shape (free,)."""
+        """Return the deviation of each free parameter from the mean in sigmas, 0 for an unknown one, shape (free,)."""
         return np.where(np.isfinite(self.sigma[self.free]), self.step(self.centre, camera), 0.0)
 
     @cached_property
     def information(self) -> np.ndarray:
-        """Diagonal of the prior's information about the free parameters in their units: 1 known, 0 unknown."""
+        """Diagonal of the prior information in units of the free parameters: 1 known, 0 unknown, shape (free,)."""
         return np.isfinite(self.sigma[self.free]).astype(float)
 
     def start(self, focal_px: float) -> Camera:
-        """Return the centre with a focal length to start from; the prior's own where it has one."""
+        """Return the mean with a starting focal length, or with the prior's own where it has one."""
         return self.centre if self.focal_known else replace(self.centre, focal_px=float(focal_px))
 
     def with_fixed(self, names: tuple[str, ...]) -> LensPrior:
-        """Return the prior with parameters held."""
+        """Return the prior with the parameters `names` fixed."""
         fixed = np.array([name in names for name in LENS_PARAMETERS])
         return replace(self, sigma=np.where(fixed, 0.0, self.sigma))
 
     def with_loose_principal_point(self) -> LensPrior:
-        """Return the prior with the principal point anywhere near the middle, and k2 free, unless these are held."""
+        """Return the prior with a loose principal point and free k2, unless these are fixed by an option."""
         sigma = self.sigma.copy()
         sigma[1:3] = np.where(sigma[1:3] > 0, LOOSE_PRINCIPAL_POINT_SIGMA_FRACTION * self.centre.width, 0.0)
         sigma[4] = max(sigma[4], K2_SIGMA) if sigma[3] > 0 else sigma[4]
         return replace(self, sigma=sigma)
 
     def with_free_k2(self) -> LensPrior:
-        """Return the prior with k2 set free about its centre."""
+        """Return the prior with k2 free about its mean."""
         sigma = self.sigma.copy()
         sigma[4] = K2_SIGMA
         return replace(self, sigma=sigma)
 
 
 def known_lens(lens: Camera) -> LensPrior:
-    """Return the prior of a lens that is known: all of it held."""
+    """Return the prior of a known lens: all parameters fixed."""
     return LensPrior('known', lens, np.zeros(5))
 
 
 def lens_priors(image_size: tuple[int, int], options: JointOptions) -> list[LensPrior]:
-    """Return the families to choose from, the most usual one first."""
+    """Return the priors of the lens families to choose from, the most common one first."""
     width, _ = image_size
     point = options.principal_point_sigma_px
     point = PRINCIPAL_POINT_SIGMA_FRACTION * width if point < 0 else point
@@ -124,7 +129,7 @@ def lens_priors(image_size: tuple[int, int], options: JointOptions) -> list[Lens
         'distortion_free': (DISTORTION_FREE, (options.k1_sigma, 0.0)),
         'kannala_brandt': (KANNALA_BRANDT, KANNALA_BRANDT_SIGMA),
     }
-    names = families if options.lens_prior == 'auto' else [options.lens_prior]
+    names = list(families) if options.lens_prior == 'auto' else [options.lens_prior]
     centre = Camera(*image_size, focal if focal > 0 else float(width), image_centre(*image_size))
     return [
         LensPrior(name, replace(centre, k=families[name][0]), np.array([log_focal, point, point, *families[name][1]]))

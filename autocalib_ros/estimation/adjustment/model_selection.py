@@ -1,4 +1,8 @@
-"""DOCSTRING."""
+"""Model selection between adjustments of the same evidence: lens family, k2, point drift.
+
+Models are compared by twice the negative log probability: robust residual cost, prior and the Laplace approximation
+of the evidence (MacKay 1992).
+"""
 
 from __future__ import annotations
 
@@ -9,30 +13,29 @@ import numpy as np
 from autocalib_ros.estimation.adjustment.bundle_adjustment import (
     FINAL_ROBUST_LIMIT,
     MIN_RESIDUAL_ROWS,
-    MIN_RESIDUAL_SCALE,
     Adjustment,
-    bounded_loss,
 )
 from autocalib_ros.estimation.adjustment.parameters import Parameterisation
+from autocalib_ros.estimation.adjustment.problem import MIN_RESIDUAL_SCALE
 from autocalib_ros.estimation.adjustment.residual_blocks import StraightTrackBlock
 from autocalib_ros.estimation.observations.track_set import TrackSet, UnprojectedTracks
+from autocalib_ros.geometry.robust_kernels import geman_mcclure_bounded_loss
 
 MODEL_SELECTION_MARGIN = 9.0
-"""k2 is set free, or a rarer family of lenses chosen, when that makes the traffic so much more probable: twice the
-logarithm, three sigmas."""
+"""Smallest gain in twice the log probability for which k2 is freed, or a rarer lens family chosen: three sigmas."""
 
 
 def select_model(fits: list[Adjustment], tracks: TrackSet, margin: float = 0.0) -> Adjustment:
-    """Choose the solution that makes the traffic most probable; the first unless it is beaten by a margin."""
+    """Return the most probable solution; the first one unless another beats it by `margin` (twice the log)."""
     scales = np.min([fit.scales for fit in fits], axis=0)
     costs = [laplace_cost(fit, tracks, scales) + (margin if index else 0.0) for index, fit in enumerate(fits)]
     return fits[int(np.argmin(costs))]
 
 
 def noise_cost(fit: Adjustment, tracks: TrackSet, *, drifting: bool) -> float:
-    """Twice the negative logarithm of how probable the residuals are with or without drift, their scale fitted.
+    """Return twice the negative log likelihood of the inlier tracks with or without point drift, scale fitted.
 
-    Infinite where hardly a track is explained.
+    Infinite with fewer than `MIN_RESIDUAL_ROWS` inliers.
     """
     labels = np.where(fit.inliers(), fit.labels, -2)
     if np.count_nonzero(labels >= 0) < MIN_RESIDUAL_ROWS:
@@ -47,16 +50,16 @@ def noise_cost(fit: Adjustment, tracks: TrackSet, *, drifting: bool) -> float:
         UnprojectedTracks.through(fit.state.camera, on_roads),
         np.ones(len(on_roads)),
     )
-    _, squared = rows.at(np.zeros(parameters.size))
+    squared = rows.at(np.zeros(parameters.size))
     scale = max(float(np.median(squared)), MIN_RESIDUAL_SCALE)
     return float((rows.dof * np.log(scale) - 2.0 * rows.log_density()).sum())
 
 
 def laplace_cost(fit: Adjustment, tracks: TrackSet, scales: np.ndarray) -> float:
-    """Twice the negative logarithm of a fit's probability, for comparison between fits of the same evidence.
+    """Return twice the negative log probability of a fit, to compare fits of the same evidence.
 
-    All at one scale for each kind of row (kinds,), with the prior and, by Laplace's approximation, the volume that
-    the evidence leaves of it.
+    Robust residual cost at one scale per residual block, `scales` (blocks,), plus the prior's, plus the log determinant
+    of the posterior information (Laplace approximation).
     """
     problem, turning = fit.problem, fit.problem.block_of_row > 0
     dof = np.concatenate([np.maximum((tracks.weights > 0).sum(axis=1) - 1, 1), problem.dof[turning]])
@@ -67,5 +70,5 @@ def laplace_cost(fit: Adjustment, tracks: TrackSet, scales: np.ndarray) -> float
     squared = np.concatenate([fit.whitened2, fit.turning2])
     deviations, prior = problem.parameters.prior_gradient(fit.state.camera)
     volume = np.linalg.slogdet(fit.information + np.diag(prior) + 1e-9 * np.eye(len(prior)))[1]
-    cost = (vehicle_weight / scale * dof * bounded_loss(squared, FINAL_ROBUST_LIMIT * scale)).sum()
+    cost = (vehicle_weight / scale * dof * geman_mcclure_bounded_loss(squared, FINAL_ROBUST_LIMIT * scale)).sum()
     return float(cost + deviations @ deviations + volume)

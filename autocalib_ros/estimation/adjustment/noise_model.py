@@ -1,9 +1,9 @@
-"""How far a straight drive's image may lie from its great circle: tracking, drift, wander and heading.
+"""Noise model of a straight track: covariance of its distances from the great circle, and its whitening.
 
-A tracked position has noise of its own, and a driver wanders in the lane, slowly: many pixels close to the camera
-and few far away. Where points are followed from picture to picture each step may add a little more, a random walk,
-and a track's heading is then off its road's; the residuals themselves tell whether they do. Residuals are whitened
-by that covariance, so that each track weighs by what it tells, near or far, long or short, sampled densely or not.
+Four terms: white noise of tracked positions; lateral wander of the driver in the lane, correlated along the road, many
+pixels close to the camera and few far away; and, for points tracked from frame to frame, drift as a random walk and a
+heading error of the track against its road. Model selection decides whether drift and heading error apply. Whitening
+by this covariance weights each track by its information, whatever its distance, length or sampling.
 """
 
 from __future__ import annotations
@@ -14,31 +14,33 @@ import numpy as np
 
 from autocalib_ros.config import JointOptions
 from autocalib_ros.geometry.great_circles import Rays
+from autocalib_ros.geometry.ground_plane import depression_sine
 from autocalib_ros.geometry.small_matrices import cross, dot, inverse_cholesky_factors
 
 WANDER_CORRELATION_LENGTH_M = 10.0
-"""Distance over which a driver's sideways wander is forgotten: ways of 25 to 80 m from side to side and back."""
+"""Correlation length in metres of the lateral wander in the lane: drivers weave with periods of 25 to 80 m."""
 DEFAULT_CAMERA_HEIGHT_M = 8.0
-"""Height of a camera that was not given; it sets nothing but the weight of near against far."""
+"""Assumed camera height in metres where none is given; it only sets the weight of near against far points."""
 MIN_DEPRESSION_NOISE_RAD = 0.02
-"""Least height of the road's direction below the horizon, radians: farther away all metres are alike."""
+"""Smallest depression angle in radians in the noise model: beyond 50 camera heights the wander in pixels is constant.
+"""
 
 
 @dataclass(frozen=True)
 class RoadPositions:
-    """Where tracks run on the road, as far as that weighs their distances."""
+    """Approximate positions of tracks on the road, for the noise model."""
 
     px_per_m: np.ndarray
-    """Pixels across a circle for a metre across its road, shape (tracks, samples)."""
+    """Pixels across the circle per metre across the road, shape (tracks, samples)."""
     along_m: np.ndarray
-    """Metres along the road, shape (tracks, samples)."""
+    """Position along the road in metres, shape (tracks, samples)."""
 
 
 def locate_on_road(
     rays: Rays, normals: np.ndarray, directions: np.ndarray, up: np.ndarray, height_m: float
 ) -> RoadPositions:
-    """Place tracks on the road: circle normals and road directions (tracks, 3), ground normal `up` (3,)."""
-    below = np.maximum(-(rays.bearings @ up), MIN_DEPRESSION_NOISE_RAD) / (
+    """Locate tracks on the road from circle normals and road directions (tracks, 3) and the ground normal `up` (3,)."""
+    below = depression_sine(rays.bearings, up, MIN_DEPRESSION_NOISE_RAD) / (
         height_m if height_m > 0 else DEFAULT_CAMERA_HEIGHT_M
     )
     across = np.abs(dot(normals, cross(directions, up)))[:, None]
@@ -50,9 +52,10 @@ def locate_on_road(
 def whitening_matrices(
     pixels: np.ndarray, mask: np.ndarray, road: RoadPositions, options: JointOptions, *, drifting: bool
 ) -> np.ndarray:
-    """Return W (tracks, samples, samples) with W^T W the inverse covariance of the distances from the circles.
+    """Return lower triangular W (tracks, samples, samples), W^T W = inverse covariance of the circle distances.
 
-    W is lower triangular. Samples where `mask` (tracks, samples) is false get zero rows and columns.
+    Samples with a false `mask` (tracks, samples) get zero rows and columns. With `drifting`, random-walk drift and
+    heading error are part of the covariance.
     """
     mask, along_m, px_per_m = (np.ascontiguousarray(part.T) for part in (mask, road.along_m, road.px_per_m))
     wander = options.wander_m * px_per_m
@@ -71,6 +74,6 @@ def whitening_matrices(
 
 
 def _tracked_distance_px(pixels: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Way in pixels that tracks (tracks, samples, 2) have been followed up to each sample, shape (samples, tracks)."""
+    """Return the path length in pixels of tracks (tracks, samples, 2) up to each sample, shape (samples, tracks)."""
     steps = np.hypot(*np.diff(pixels, axis=1).T) * (mask[1:] & mask[:-1])
     return np.concatenate([np.zeros((1, len(pixels))), np.cumsum(steps, axis=0)])

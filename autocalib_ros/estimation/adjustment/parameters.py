@@ -1,4 +1,4 @@
-"""What is solved for: lens, ground plane and roads; and the steps by which a solution moves."""
+"""State of the bundle adjustment and its local parameterisation: lens, ground plane and road directions."""
 
 from __future__ import annotations
 
@@ -16,79 +16,83 @@ from autocalib_ros.geometry.great_circles import Rays
 from autocalib_ros.lens.camera import Camera
 
 MIN_SINE_TO_X_AXIS = 0.2
-"""Sine of the angle to the camera's x axis below which a road does not tell the plane of a camera without roll."""
+"""Smallest sine of the angle between a road and the camera's x axis for which zero roll constrains the ground plane.
+Judgement."""
 
 
 @dataclass(frozen=True)
 class AdjustmentState:
-    """Lens and roads: road j runs along `rotation` applied to (cos, sin, 0) of `angles_rad[j]`; the first is 0."""
+    """Lens and road directions: road j is `rotation` times (cos, sin, 0) of `angles_rad[j]`; the first angle is 0."""
 
     camera: Camera
     rotation: np.ndarray
-    """camera_from_plane, shape (3, 3): its third column is the ground normal, unless one road alone is known."""
+    """camera_from_plane, shape (3, 3). The third column is the ground normal, unless one road alone is known."""
     angles_rad: np.ndarray
-    """Shape (roads,)."""
+    """Angle of each road in the plane, shape (roads,)."""
 
     @property
     def in_plane(self) -> np.ndarray:
-        """The roads' unit vectors in the frame of their plane, shape (roads, 3)."""
+        """Unit vectors of the roads in the plane frame, shape (roads, 3)."""
         return np.column_stack([np.cos(self.angles_rad), np.sin(self.angles_rad), np.zeros(len(self.angles_rad))])
 
     @property
     def directions(self) -> np.ndarray:
-        """Unit vectors in the camera frame, shape (roads, 3)."""
+        """Unit vectors of the roads in the camera frame, shape (roads, 3)."""
         return self.in_plane @ self.rotation.T
 
 
 @dataclass(frozen=True)
 class AdjustmentConfig:
-    """What a solution is given besides tracks and a start."""
+    """Configuration of an adjustment: prior, options, noise model and turning vehicles."""
 
     prior: LensPrior
     options: JointOptions
     height_m: float = 0.0
-    """Height of the camera, 0 unknown: it weighs near against far, no more."""
+    """Camera height in metres, 0: unknown. It only sets the weight of near against far points."""
     crossing_rad: float | None = None
-    """Angle of the second road to the first where that is held."""
+    """Fixed angle of the second road to the first, None: free."""
     drifting: bool = False
-    """Whether tracked points drift; then one track hardly tells a slight turn, and those of one body are judged
-    together."""
+    """Whether tracked points drift. A single track then hardly shows a slight turn, so the tracks of one body are
+    weighted together."""
     vehicle_correlation: float = 0.3
-    """How much the errors of one vehicle's tracks correlate, 0 to 1: a guess until a fit has measured it."""
+    """Correlation, 0 to 1, of the errors of one vehicle's tracks: judgement, until a fit has measured it."""
     windows: TwoFrameWindows = field(default_factory=no_windows)
-    """Vehicles that turn, each between two instants."""
+    """Turning vehicles, each between two instants."""
     bundle: TrackletBundle | None = None
-    """The same, each over its life."""
+    """Turning vehicles, each over its tracklet."""
 
     @property
     def turning(self) -> bool:
-        """Whether vehicles that turn are part of the problem."""
+        """Whether turning vehicles are part of the problem."""
         return len(self.windows) > 0 or self.bundle is not None
 
 
 @dataclass(frozen=True)
 class Parameterisation:
-    """The parameters, as steps from a base: free ones of the lens in their units, turns of the plane, road angles."""
+    """Local parameterisation: steps from a base state.
+
+    Order: free lens parameters in units of the prior, rotations of the plane (rad), free road angles (rad).
+    """
 
     base: AdjustmentState
     config: AdjustmentConfig
 
     @property
     def lens(self) -> int:
-        """Number of free parameters of the lens; they come first."""
+        """Number of free lens parameters."""
         return len(self.config.prior.free)
 
     @cached_property
     def axes(self) -> np.ndarray:
-        """Axes (turns, 3), in the frame of the plane, about which the evidence can tell a turn of it."""
+        """Axes (rotations, 3), in the plane frame, about which a rotation of the plane is observable."""
         roads, every = len(self.base.angles_rad), np.eye(3)
         if roads == 0:
-            return every[:2]  # headings in the plane mean nothing
-        return every if roads > 1 or self.config.turning else every[1:]  # one road turns freely about itself
+            return every[:2]  # without roads, the heading in the plane is arbitrary
+        return every if roads > 1 or self.config.turning else every[1:]  # rotation about a lone road is unobservable
 
     @cached_property
     def free_angles(self) -> tuple[int, ...]:
-        """Roads whose angle is free: the first is the frame, the second may be held."""
+        """Indices of roads with a free angle: the first defines the frame, the second may be fixed."""
         fixed = self.config.crossing_rad is not None and len(self.base.angles_rad) > 1
         return tuple(range(2 if fixed else 1, len(self.base.angles_rad)))
 
@@ -107,7 +111,7 @@ class Parameterisation:
         )
 
     def step_to(self, state: AdjustmentState) -> np.ndarray:
-        """Return the step (parameters,) from the base to a state near it, as far as the parameters reach."""
+        """Return the step (parameters,) from the base to a nearby state, projected on the free parameters."""
         turn = Rotation.from_matrix(self.base.rotation.T @ state.rotation).as_rotvec()
         angles = np.angle(np.exp(1j * (state.angles_rad - self.base.angles_rad)))
         return np.concatenate(
@@ -115,15 +119,15 @@ class Parameterisation:
         )
 
     def camera(self, step: np.ndarray) -> Camera:
-        """Return the lens at a step (lens,) of its own parameters."""
+        """Return the camera at a step (lens,) of the free lens parameters."""
         return self.config.prior.moved(self.base.camera, step)
 
     def turned(self, step: np.ndarray) -> np.ndarray:
-        """Return the rotation matrix of a step (turns,) about the axes."""
+        """Return the rotation matrix (3, 3) of a step (rotations,) about the axes."""
         return Rotation.from_rotvec(step @ self.axes).as_matrix()
 
     def prior_gradient(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """Gradient (parameters,) and information (parameters,) of the prior at a camera."""
+        """Return gradient and diagonal information of the prior at a camera, (parameters,) each."""
         gradient, information = np.zeros(self.size), np.zeros(self.size)
         gradient[: self.lens] = self.config.prior.deviations(camera)
         information[: self.lens] = self.config.prior.information
@@ -131,7 +135,10 @@ class Parameterisation:
 
 
 def upward_normal(state: AdjustmentState, config: AdjustmentConfig, rays: Rays) -> np.ndarray:
-    """Normal (3,) of the plane away from the traffic; where one road is all that is known, of an unrolled camera."""
+    """Return the ground normal (3,) away from the traffic.
+
+    With one road and no turning vehicles the normal is that of a camera without roll.
+    """
     normal = state.rotation[:, 2]
     if len(state.angles_rad) == 1 and not config.turning:
         normal = level_normal(state.directions[0])
@@ -140,9 +147,10 @@ def upward_normal(state: AdjustmentState, config: AdjustmentConfig, rays: Rays) 
 
 
 def level_normal(along: np.ndarray) -> np.ndarray:
-    """Normal (3,), up or down, of the plane of a road (3,) under a camera that is not rolled.
+    """Return the normal (3,), of either sign, of the plane of a road (3,) under a camera without roll.
 
-    Such a plane contains the camera's x axis and the road; a road along that axis leaves the one across the image.
+    The plane contains the camera's x axis and the road. For a road along the x axis it is perpendicular to the image's
+    y axis instead.
     """
     level = np.cross(along, [1.0, 0.0, 0.0])
     image_up = along[1] * along - [0.0, 1.0, 0.0]
@@ -151,7 +159,7 @@ def level_normal(along: np.ndarray) -> np.ndarray:
 
 
 def initial_state(camera: Camera, found: RoadDirections) -> AdjustmentState:
-    """Build the state of directions found by consensus: the first is x, the plane is that of the first two."""
+    """Build the state of consensus directions: the first is the x axis, the first two span the plane."""
     first = found.directions[0]
     second = found.directions[1] if len(found.directions) > 1 else np.roll(first, 1)
     normal = np.cross(first, second)
@@ -162,7 +170,7 @@ def initial_state(camera: Camera, found: RoadDirections) -> AdjustmentState:
 
 
 def with_crossing_angle(state: AdjustmentState, crossing_rad: float | None) -> AdjustmentState:
-    """Return the state with its second road at an angle to the first, on the side where it is."""
+    """Return the state with the second road at a fixed angle to the first, on the side nearest to its own angle."""
     if crossing_rad is None or len(state.angles_rad) < 2:
         return state
     angles = state.angles_rad.copy()
@@ -173,11 +181,11 @@ def with_crossing_angle(state: AdjustmentState, crossing_rad: float | None) -> A
 
 @dataclass(frozen=True)
 class RoadDirections:
-    """Road directions found by consensus."""
+    """Road directions from consensus of tracks."""
 
     directions: np.ndarray
     """Unit vectors in the camera frame, shape (n, 3)."""
     labels: np.ndarray
     """Direction of each track, -2 for none, shape (tracks,)."""
     score: float
-    """Summed support: how many nats of coincidence the directions explain."""
+    """Summed support in nats: negative log probability of the inliers under random directions."""

@@ -1,8 +1,8 @@
-"""The kinds of residuals of the joint problem, and their derivatives by its parameters.
+"""Residual blocks of the bundle adjustment and their derivatives by its parameters.
 
-A row is one track against its road, one window against a motion in the plane, or one life of a rigid body. Residuals
-are whitened: divided by what they are expected to be. What a row has unknown of its own is solved inside (variable
-projection, Kaufman 1975), so that the problem stays small.
+A row of a block is one track against its road, one two-frame window against a planar motion, or one tracklet against
+a rigid body. Residuals are whitened by the noise model. The unknowns of a row (circle, motion, shape) are eliminated
+by variable projection (Kaufman 1975), so that only the shared parameters remain.
 """
 
 from __future__ import annotations
@@ -27,25 +27,26 @@ from autocalib_ros.geometry.great_circles import Rays, fit_circles_through, unpr
 from autocalib_ros.geometry.small_matrices import cross, dot
 
 DIFFERENTIATION_STEP = 1e-6
-"""Step of the parameters, in their units, by which distances are differentiated where no closed form is used."""
+"""Step of forward differences, in units of the parameters, where no closed form is used: balances truncation against
+double-precision rounding."""
 
 
 @dataclass(frozen=True)
 class LinearisedRows:
-    """What each row tells at the base, its own unknowns solved: its residuals r and their derivatives J, in sums."""
+    """Gradient and Gauss-Newton matrix of each row, from residuals r and Jacobians J with eliminated unknowns."""
 
     squared: np.ndarray
-    """Mean squared residual, r^T r over the freedom, shape (rows,)."""
+    """Mean squared residual, r^T r over the degrees of freedom, shape (rows,)."""
     gradient: np.ndarray
     """J^T r, shape (rows, parameters)."""
     curvature: np.ndarray
     """J^T J, shape (rows, parameters, parameters)."""
     influence: np.ndarray
-    """Weight by what speaks for a row besides its own residuals, shape (rows,)."""
+    """Weight from evidence outside the row's residuals (corroboration by other tracks), shape (rows,)."""
 
     @classmethod
     def of(cls, residuals: np.ndarray, slopes: np.ndarray, dof: np.ndarray, influence: np.ndarray) -> LinearisedRows:
-        """Sum up residuals (rows, samples) and slopes (rows, samples, parameters)."""
+        """Sum residuals (rows, samples) and Jacobians `slopes` (rows, samples, parameters) over the samples."""
         transposed = slopes.transpose(0, 2, 1)
         return cls(
             (residuals**2).sum(axis=1) / dof,
@@ -56,7 +57,7 @@ class LinearisedRows:
 
 
 class StraightTrackBlock:
-    """Labelled tracks, each on a great circle through the direction of its road."""
+    """Labelled tracks, one a row: distances from the great circle through the direction of the track's road."""
 
     def __init__(
         self,
@@ -85,42 +86,44 @@ class StraightTrackBlock:
         self._normals = self._circles(base, self._rays)
 
     def _circles(self, state: AdjustmentState, rays: Rays) -> np.ndarray:
-        """Normals (tracks, 3) of each track's best circle through its road's direction, in whitened distances."""
+        """Return the normals (tracks, 3) of the circles through the roads that minimise whitened distances."""
         whitened = self.whiten @ (rays.bearings * self._scale[..., None])
         normals, _ = fit_circles_through(whitened.transpose(0, 2, 1) @ whitened, state.directions[self._labels])
         return normals
 
-    def at(self, step: np.ndarray) -> tuple[None, np.ndarray]:
-        """Mean squared whitened distance of each track from its circle, shape (tracks,); nothing to go on from."""
+    def at(self, step: np.ndarray) -> np.ndarray:
+        """Return the mean squared whitened distance of each track at a parameter step, shape (tracks,)."""
         state = self._parameters.state(step)
         rays = unproject_rays(state.camera, self._tracks.pixels)
         distance = rays.distance_px(self._circles(state, rays)[:, None])
-        return None, ((self.whiten @ distance[..., None])[..., 0] ** 2).sum(axis=1) / self.dof
+        return ((self.whiten @ distance[..., None])[..., 0] ** 2).sum(axis=1) / self.dof
 
     def distances_px(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Observed pixels (n, 2), their distances from the circles (n,), and their tracks (n,), at the base."""
+        """Return observed pixels (n, 2), their distances from the circles (n,) and their tracks (n,), at the base."""
         track, sample = np.nonzero(self._mask)
         distance = np.abs(self._rays.distance_px(self._normals[:, None]))
         return self._tracks.pixels[track, sample], distance[track, sample], track
 
     def log_density(self) -> np.ndarray:
-        """Logarithm of the determinant of each track's whitening, shape (tracks,)."""
+        """Return the log determinant of each track's whitening matrix, shape (tracks,)."""
         diagonal = np.diagonal(self.whiten, axis1=1, axis2=2)
         return np.where(self._mask, np.log(np.where(self._mask, diagonal, 1.0)), 0.0).sum(axis=1)
 
     def linearise(self) -> LinearisedRows:
-        """Residuals at the base and their derivatives.
+        """Return the rows at the base.
 
-        The lens by differences of the exact residual: its gradient changes with the lens too, and that small
-        term decides where the minimum lies. The roads in closed form: a direction d that moves by dd turns a
-        normal n by -(n.dd) d. The circle's own angle is projected out.
+        Lens derivatives are forward differences of the exact residual: its pixel scale changes with the lens, and
+        that small term shifts the minimum. Road derivatives are closed-form: a direction d that moves by dd turns a
+        normal n by -(n.dd) d. The circle's angle about its direction is projected out.
         """
         rays, normals, parameters = self._rays, self._normals[:, None], self._parameters
         scale = rays.pixel_scale(normals)
-        here = dot(rays.bearings, normals) * scale
-        columns = [(self._distance(unit, normals) - here) / DIFFERENTIATION_STEP for unit in np.eye(parameters.lens)]
-        across = here * scale
-        # distance over gradient: the second term is how the gradient itself turns with the normal
+        distance = dot(rays.bearings, normals) * scale
+        columns = [
+            (self._distance(unit, normals) - distance) / DIFFERENTIATION_STEP for unit in np.eye(parameters.lens)
+        ]
+        across = distance * scale
+        # derivative by the normal of n.b over its gradient norm: the second term is the change of the norm
         pull = rays.bearings - across[..., None] * (
             dot(rays.radial, normals)[..., None] * rays.radial
             + dot(rays.tangential, normals)[..., None] * rays.tangential
@@ -135,7 +138,10 @@ class StraightTrackBlock:
         free, slopes = slopes[..., :1], slopes[..., 1:]
         along = (free * slopes).sum(axis=1, keepdims=True) / np.maximum((free * free).sum(axis=1, keepdims=True), 1e-12)
         return LinearisedRows.of(
-            (self.whiten @ here[..., None])[..., 0], slopes - free * along, self.dof, self._lane_keeping_weights(here)
+            (self.whiten @ distance[..., None])[..., 0],
+            slopes - free * along,
+            self.dof,
+            self._lane_keeping_weights(distance),
         )
 
     def _distance(self, unit: np.ndarray, normals: np.ndarray) -> np.ndarray:
@@ -144,14 +150,14 @@ class StraightTrackBlock:
         )
 
     def _turns(self) -> list[np.ndarray]:
-        """Change (tracks, 3) of each track's direction with each parameter of the roads."""
+        """Return the derivative (tracks, 3) of each track's direction by each rotation and road angle."""
         base = self._parameters.base
         turns = [cross(axis, base.in_plane)[self._labels] @ base.rotation.T for axis in self._parameters.axes]
         sideways = cross(np.array([0.0, 0.0, 1.0]), base.in_plane)[self._labels] @ base.rotation.T
         return turns + [sideways * (self._labels == road)[:, None] for road in self._parameters.free_angles]
 
     def _lane_keeping_weights(self, distance_px: np.ndarray) -> np.ndarray:
-        """Influence (tracks,) of tracks by whether their vehicles keep to their roads; 1 where nothing drifts."""
+        """Return weights (tracks,) for whether the tracks' vehicles drive along their roads; 1 without point drift."""
         if not self._parameters.config.drifting:
             return np.ones(len(self._tracks))
         side = np.where(self._normals @ self._up < 0, -1.0, 1.0)[:, None]
@@ -160,48 +166,53 @@ class StraightTrackBlock:
 
 
 class PlanarMotionBlock:
-    """Windows, each with the motion in the plane that suits it best; `motion` is one near it, None unknown."""
+    """Two-frame windows, one a row: Sampson distances from the best planar motion of each window.
+
+    `motion` is the warm start, None where there is none.
+    """
 
     def __init__(self, parameters: Parameterisation, motion: PlanarMotion | None) -> None:
         self._parameters, self._windows = parameters, parameters.config.windows
         self.vehicle_ids, self.vehicle_weight = self._windows.bodies, self._windows.body_weights
         self._base = view = self._view(parameters.base)
         self.warm_start = initial_motion(view) if motion is None else refined(view, motion)
-        self._here = view.distances(self.warm_start)
-        self._slopes = view.slopes(self.warm_start, self._here)
-        self._root = np.sqrt(robust_weight(self._here))
+        self._distances = view.distances(self.warm_start)
+        self._slopes = view.slopes(self.warm_start, self._distances)
+        self._root = np.sqrt(robust_weight(self._distances))
         self.dof = np.maximum(view.mask.sum(axis=1) - 2, 1)
 
     def _view(self, state: AdjustmentState) -> WindowRays:
         return WindowRays.of(self._windows, state.camera, state.rotation, self._parameters.config.options)
 
     def at(self, step: np.ndarray) -> tuple[PlanarMotion, np.ndarray]:
-        """Motion at a step and mean squared distances, shape (windows,)."""
+        """Return the motions and the mean squared distances (windows,) at a parameter step."""
         view = self._view(self._parameters.state(step))
         motion = refined(view, self.warm_start)
         return motion, ((self._root * view.distances(motion)) ** 2).sum(axis=1) / self.dof
 
     def linearise(self) -> LinearisedRows:
-        """Residuals at the base and their derivatives, by differences; the window's own motion projected out."""
+        """Return the rows at the base, by forward differences; the motion of each window is projected out."""
         parameters = self._parameters
-        columns = [(self._distances_at(unit) - self._here) / DIFFERENTIATION_STEP for unit in np.eye(parameters.size)]
+        columns = [
+            (self._distances_at(unit) - self._distances) / DIFFERENTIATION_STEP for unit in np.eye(parameters.size)
+        ]
         slopes = self._root[..., None] * np.stack(columns, axis=-1)
         own = self._root[..., None] * self._slopes
         matrix = own.transpose(0, 2, 1) @ own + 1e-9 * np.eye(2)
         slopes = slopes - own @ np.linalg.solve(matrix, own.transpose(0, 2, 1) @ slopes)
-        return LinearisedRows.of(self._root * self._here, slopes, self.dof, np.ones(len(self.dof)))
+        return LinearisedRows.of(self._root * self._distances, slopes, self.dof, np.ones(len(self.dof)))
 
     def distances_px(self) -> tuple[np.ndarray, np.ndarray]:
-        """Observed pixels (n, 2) and how far each misses the motion of its window (n,), at the base."""
+        """Return observed pixels (n, 2) and their distances (n,) from the motions of their windows, at the base."""
         window, point = np.nonzero(self._base.mask)
-        distance = np.abs(self._here * self._base.sigma_px)
+        distance = np.abs(self._distances * self._base.sigma_px)
         return self._windows.second_px[window, point], distance[window, point]
 
     def _distances_at(self, unit: np.ndarray) -> np.ndarray:
-        """Distances a small step away, the motions as they are."""
+        """Return the distances one differentiation step along a unit parameter vector, with motions fixed."""
         lens, turns = self._parameters.lens, self._parameters.lens + len(self._parameters.axes)
         if unit[turns:].any():
-            return self._here  # the angle of a road is nothing to a window
+            return self._distances  # windows do not depend on road angles
         view = (
             self._base.turned(self._parameters.turned(DIFFERENTIATION_STEP * unit[lens:turns]))
             if unit[lens:].any()
@@ -211,7 +222,10 @@ class PlanarMotionBlock:
 
 
 class RigidBodyBlock:
-    """Lives of rigid bodies, each with the shape and the way that suit it best; `shapes` are near, None unknown."""
+    """Tracklets of rigid bodies, one a row: reprojection errors of the best shape and motion of each tracklet.
+
+    `shapes` is the warm start, None where there is none.
+    """
 
     def __init__(self, parameters: Parameterisation, bundle: TrackletBundle, shapes: StructureAndMotion | None) -> None:
         self._parameters, self._bundle, base = parameters, bundle, parameters.base
@@ -221,14 +235,13 @@ class RigidBodyBlock:
             if shapes is None
             else bundle.refined(base.camera, base.rotation, shapes)
         )
-        here = bundle.residuals(base.camera, base.rotation, self.warm_start)
-        self._root = np.sqrt(bundle.robust_weight(here))[:, :, None, None]
-        self._here = here
+        self._residuals = bundle.residuals(base.camera, base.rotation, self.warm_start)
+        self._root = np.sqrt(bundle.robust_weight(self._residuals))[:, :, None, None]
         self._follow: np.ndarray | None = None
-        """How the unknowns of each life change with a step, shape (lives, unknowns, parameters)."""
+        """Derivative of the unknowns of each tracklet by the parameters, shape (tracklets, unknowns, parameters)."""
 
     def at(self, step: np.ndarray) -> tuple[StructureAndMotion, np.ndarray]:
-        """Shapes at a step and mean squared residuals, shape (lives,)."""
+        """Return the shapes and the mean squared residuals (tracklets,) at a parameter step."""
         state = self._parameters.state(step)
         near = self.warm_start if self._follow is None else self.warm_start.stepped(-(self._follow @ step))
         shapes = self._bundle.refined(state.camera, state.rotation, near)
@@ -236,7 +249,7 @@ class RigidBodyBlock:
         return shapes, (residuals**2).sum(axis=(1, 2, 3)) / self.dof
 
     def linearise(self) -> LinearisedRows:
-        """Residuals at the base and their derivatives; what is unknown of each life projected out."""
+        """Return the rows at the base; shape and motion of each tracklet are projected out."""
         parameters, bundle, base = self._parameters, self._bundle, self._parameters.base
         slopes, by_place = bundle.slopes(base.camera, base.rotation, self.warm_start)
         lenses = [parameters.camera(DIFFERENTIATION_STEP * unit) for unit in np.eye(parameters.lens)]
@@ -245,15 +258,15 @@ class RigidBodyBlock:
             for change in bundle.residual_changes(lenses, base.camera, base.rotation, self.warm_start)
         ]
         columns += [bundle.rotation_jacobian(axis, by_place, self.warm_start) for axis in parameters.axes]
-        columns += [np.zeros(self._here.shape)] * len(parameters.free_angles)
-        own, here = bundle.weighted_system(slopes, self._here)
+        columns += [np.zeros(self._residuals.shape)] * len(parameters.free_angles)
+        own, residuals = bundle.weighted_system(slopes, self._residuals)
         shared = (self._root[..., None] * np.stack(columns, axis=-1)).reshape(len(own), -1, parameters.size)
         matrix = damped(own.transpose(0, 2, 1) @ own, np.zeros(len(own)))
         self._follow = np.linalg.solve(matrix, own.transpose(0, 2, 1) @ shared)
-        return LinearisedRows.of(here, shared - own @ self._follow, self.dof, np.ones(len(own)))
+        return LinearisedRows.of(residuals, shared - own @ self._follow, self.dof, np.ones(len(own)))
 
     def distances_px(self) -> tuple[np.ndarray, np.ndarray]:
-        """Observed pixels (n, 2) and how far each is from its place on the body (n,), at the base."""
+        """Return observed pixels (n, 2) and their reprojection errors (n,), at the base."""
         base, lives = self._parameters.base, self._bundle.lives
         away = self._bundle.reprojection_errors_px(base.camera, base.rotation, self.warm_start)
         return lives.pixels[lives.mask], np.hypot(*away[lives.mask].T)

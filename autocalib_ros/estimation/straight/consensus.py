@@ -7,10 +7,10 @@ import numpy as np
 from autocalib_ros.estimation.adjustment.parameters import RoadDirections
 from autocalib_ros.estimation.observations.track_set import TrackSet
 from autocalib_ros.geometry.great_circles import (
-    _quadratic_forms,
-    _squared_distances,
     fit_circles,
     orthonormal_basis,
+    quadratic_forms,
+    squared_distances,
     unproject_rays,
 )
 from autocalib_ros.geometry.small_matrices import cross
@@ -43,7 +43,7 @@ def consensus_directions(
     normals, own, matrix = fit_circles(rays, tracks.weights)
     probes = generator.normal(size=(RANDOM_DIRECTIONS, 3))
     probes /= np.linalg.norm(probes, axis=1, keepdims=True)
-    forms = _quadratic_forms(matrix)
+    forms = quadratic_forms(matrix)
     chance = _support(forms, probes, inlier_px).mean(axis=0)
     surprise = (
         -np.log(np.clip(chance, 1.0 / RANDOM_DIRECTIONS, 1.0)) * np.sqrt(tracks.vehicle_weight) * (own < inlier_px**2)
@@ -66,7 +66,7 @@ def consensus_directions(
 
 def _support(forms: np.ndarray, directions: np.ndarray, inlier_px: float) -> np.ndarray:
     """Support of every track for every direction (directions, 3), 0 to 1, shape (directions, tracks)."""
-    return np.maximum(0.0, 1.0 - _squared_distances(forms, directions) / inlier_px**2)
+    return np.maximum(0.0, 1.0 - squared_distances(forms, directions) / inlier_px**2)
 
 
 def _strongest(
