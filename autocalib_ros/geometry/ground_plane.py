@@ -15,7 +15,7 @@ from autocalib_ros.lens.camera import Camera
 MIN_FRACTION_BELOW_HORIZON = 0.95
 """Smallest fraction of tracked points below the horizon of a plausible ground plane: vehicles drive on the road.
 Judgement; leaves 5 % for outliers."""
-MIN_DEPRESSION_SINE = 1e-6
+CLAMP_DEPRESSION_SINE = 1e-6
 """Clamp of the sine of the depression angle for public coordinates: rays at or above the horizon meet the ground a
 million camera heights away."""
 
@@ -84,7 +84,7 @@ def ahead_direction(normal: np.ndarray) -> np.ndarray:
     return ahead / np.linalg.norm(ahead)
 
 
-def depression_sine(bearings: np.ndarray, normal: np.ndarray, min_sine: float = MIN_DEPRESSION_SINE) -> np.ndarray:
+def depression_sine(bearings: np.ndarray, normal: np.ndarray, min_sine: float = CLAMP_DEPRESSION_SINE) -> np.ndarray:
     """Return the sine of the angle below the horizon of unit bearings (..., 3), clamped to `min_sine`, shape (...).
 
     The one denominator of every ray-ground intersection; the clamp limits the distance to height / `min_sine`.
@@ -93,7 +93,7 @@ def depression_sine(bearings: np.ndarray, normal: np.ndarray, min_sine: float = 
 
 
 def intersect_ground(
-    bearings: np.ndarray, normal: np.ndarray, height: float, min_sine: float = MIN_DEPRESSION_SINE
+    bearings: np.ndarray, normal: np.ndarray, height: float, min_sine: float = CLAMP_DEPRESSION_SINE
 ) -> np.ndarray:
     """Return the range (...) along unit bearings (..., 3) to the ground plane, in the unit of `height`.
 

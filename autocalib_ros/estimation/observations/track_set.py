@@ -1,4 +1,4 @@
-"""DOCSTRING."""
+"""Tracks selected from the evidence, resampled to arrays of equal length, and their weights by vehicle."""
 
 from __future__ import annotations
 
@@ -11,26 +11,27 @@ from autocalib_ros.geometry.great_circles import Rays, circle_scatter, unproject
 from autocalib_ros.lens.camera import Camera
 
 SAMPLES_PER_TRACK = 10
-"""Points of a track that enter a fit; more of one path add correlated noise, not information."""
+"""Points of a track in a fit; more points of one path add correlated noise, not information."""
 MIN_DISPLACEMENT_DIAGONALS = 0.04
-"""Shortest displacement of a track that says something of the lens, share of the image diagonal."""
+"""Shortest displacement of a track that constrains the lens, fraction of the image diagonal. Judgement."""
 MAX_PATH_RATIO = 1.3
-"""Largest path length / displacement of a track that may be straight, lens curvature and noise included."""
+"""Largest ratio of path length to displacement of a track that may be straight, with lens curvature and noise."""
 SELECTION_CELLS = (8, 5)
+"""Columns and rows of the image grid over which selected tracks are spread."""
 
 
 @dataclass(frozen=True)
 class TrackSet:
-    """Tracks in arrays of equal length; `weights` is 0 where a track has no point and sums to 1 per track."""
+    """Tracks resampled to `SAMPLES_PER_TRACK` points each."""
 
     pixels: np.ndarray
-    """Shape (tracks, SAMPLES, 2)."""
+    """Shape (tracks, samples, 2)."""
     weights: np.ndarray
-    """Shape (tracks, SAMPLES)."""
+    """Weight of each point: equal, 0 for the repeated points of a short track, sum 1 per track, (tracks, samples)."""
     vehicles: np.ndarray
-    """Shape (tracks,)."""
+    """Vehicle id of each track, shape (tracks,)."""
     sample_times_s: np.ndarray
-    """Time of each point, shape (tracks, SAMPLES)."""
+    """Time of each point, shape (tracks, samples)."""
     indices: np.ndarray
     """Index of each track in the evidence, shape (tracks,)."""
 
@@ -38,7 +39,7 @@ class TrackSet:
         return len(self.vehicles)
 
     def subset(self, keep: np.ndarray) -> TrackSet:
-        """Return the tracks that `keep`, a mask or indices, selects."""
+        """Return the tracks of a mask or of indices `keep`."""
         return TrackSet(
             self.pixels[keep], self.weights[keep], self.vehicles[keep], self.sample_times_s[keep], self.indices[keep]
         )
@@ -50,25 +51,25 @@ class TrackSet:
 
     @property
     def vehicle_weight(self) -> np.ndarray:
-        """One over the number of tracks of the same vehicle, shape (tracks,)."""
+        """Weight of each track that gives every vehicle a sum of 1, shape (tracks,)."""
         return kish_weight(self.vehicles, 1.0)
 
     def kish_weight(self, correlation: float) -> np.ndarray:
-        """Weight (tracks,) of tracks whose errors correlate so much, 0 to 1, within a vehicle."""
+        """Return weights (tracks,) for errors with a correlation, 0 to 1, within a vehicle."""
         return kish_weight(self.vehicles, correlation)
 
 
 def kish_weight(vehicle_ids: np.ndarray, correlation: float) -> np.ndarray:
-    """Weight (n,) of what belongs to owners (n,) and whose errors correlate so much, 0 to 1, within one.
+    """Return weights (n,) of observations of vehicles (n,) whose errors have a correlation, 0 to 1, within a vehicle.
 
-    Kish's design effect; with a correlation of 1 all of an owner's together count as one.
+    One over the design effect of Kish (1965); with a correlation of 1 all observations of a vehicle count as one.
     """
     _, inverse, counts = np.unique(vehicle_ids, return_inverse=True, return_counts=True)
     return 1.0 / (1.0 + (counts[inverse] - 1.0) * correlation)
 
 
 def select_tracks(evidence: Evidence, limit: int) -> TrackSet:
-    """Choose tracks long enough to matter, at most `limit`, spread over image cells, headings and vehicles."""
+    """Select at most `limit` long, possibly straight tracks, spread over image cells, headings and vehicles."""
     starts, points = evidence.track_starts, evidence.points_px
     way, displacement = _displacements(evidence)
     straight = path_lengths(points, starts) <= MAX_PATH_RATIO * displacement
@@ -78,13 +79,13 @@ def select_tracks(evidence: Evidence, limit: int) -> TrackSet:
 
 
 def long_tracks(evidence: Evidence) -> TrackSet:
-    """All tracks that are long enough, straight or not."""
+    """Return all tracks of sufficient displacement, straight or not."""
     _, displacement = _displacements(evidence)
     return _track_set(evidence, np.flatnonzero(_long_enough(evidence, displacement)))
 
 
 def _displacements(evidence: Evidence) -> tuple[np.ndarray, np.ndarray]:
-    """How far each track went: as vectors (tracks, 2) and lengths (tracks,) in pixels."""
+    """Return the displacement of each track in pixels, as vectors (tracks, 2) and lengths (tracks,)."""
     way = evidence.points_px[evidence.track_starts[1:] - 1] - evidence.points_px[evidence.track_starts[:-1]]
     return way, np.hypot(way[:, 0], way[:, 1])
 
@@ -94,7 +95,10 @@ def _long_enough(evidence: Evidence, displacement: np.ndarray) -> np.ndarray:
 
 
 def path_lengths(points: np.ndarray, starts: np.ndarray) -> np.ndarray:
-    """Lengths (paths,) of the paths into which `starts` (paths + 1,), with the end, divide `points` (n, 2)."""
+    """Return the lengths (paths,) of consecutive paths in `points` (n, 2).
+
+    `starts` (paths + 1,) are the indices of the first points, followed by n.
+    """
     steps = np.zeros(len(points) + 1)
     steps[1:-1] = np.hypot(*np.diff(points, axis=0).T)
     steps[starts] = 0.0
@@ -102,9 +106,9 @@ def path_lengths(points: np.ndarray, starts: np.ndarray) -> np.ndarray:
 
 
 def _selection_order(evidence: Evidence, candidates: np.ndarray, way: np.ndarray) -> np.ndarray:
-    """Order of choice (n,) of candidates, longest first, that went `way` (n, 2).
+    """Return the order of selection (n,) of candidates with displacements `way` (n, 2), longest first.
 
-    By rank within a cell and heading, vehicles in turn.
+    Round robin over image cells and headings, and over vehicles within a cell.
     """
     starts, vehicles = evidence.track_starts, evidence.track_vehicles[candidates]
     middle = evidence.points_px[(starts[candidates] + starts[candidates + 1]) // 2]
@@ -115,12 +119,12 @@ def _selection_order(evidence: Evidence, candidates: np.ndarray, way: np.ndarray
 
 
 def evenly_spaced(count: int, limit: int) -> np.ndarray:
-    """Indices of at most `limit` out of `count`, evenly spread."""
+    """Return at most `limit` evenly spaced indices out of `count`."""
     return np.linspace(0, max(count - 1, 0), min(limit, count)).astype(int)
 
 
 def count_earlier(*keys: np.ndarray) -> np.ndarray:
-    """Count for each element how many before it have the same keys (n,)."""
+    """Return for each element the number of earlier elements with the same keys (n,)."""
     _, group, counts = np.unique(np.column_stack(keys), axis=0, return_inverse=True, return_counts=True)
     earlier = np.empty(len(group), int)
     earlier[np.argsort(group, kind='stable', axis=None)] = np.arange(len(group)) - np.repeat(
@@ -145,19 +149,20 @@ def _track_set(evidence: Evidence, indices: np.ndarray) -> TrackSet:
 
 @dataclass(frozen=True)
 class UnprojectedTracks:
-    """Tracks through one camera: what every question about their circles begins with."""
+    """Tracks unprojected by one camera."""
 
     rays: Rays
+    """Of shape (tracks, samples)."""
     matrix: np.ndarray
-    """Scatter of each track, shape (tracks, 3, 3)."""
+    """Scatter matrix of each track, shape (tracks, 3, 3)."""
 
     @classmethod
     def through(cls, camera: Camera, tracks: TrackSet) -> UnprojectedTracks:
-        """Unproject tracks and sum up their scatter."""
+        """Unproject tracks and compute their scatter matrices."""
         rays = unproject_rays(camera, tracks.pixels)
         return cls(rays, circle_scatter(rays, tracks.weights))
 
     def subset(self, keep: np.ndarray) -> UnprojectedTracks:
-        """Return the tracks that `keep`, a mask or indices, selects."""
+        """Return the tracks of a mask or of indices `keep`."""
         rays = Rays(self.rays.bearings[keep], self.rays.radial[keep], self.rays.tangential[keep])
         return UnprojectedTracks(rays, self.matrix[keep])

@@ -1,1 +1,1 @@
-"""The method of Jain and Saunier as published."""
+"""Method of Jain & Saunier (arXiv 2001.07243) as published."""

@@ -1,4 +1,4 @@
-"""Focal length from the straightness of tracks: the published form, and a robust one on the sphere."""
+"""Intrinsic stage of Jain & Saunier (arXiv 2001.07243): focal length from the straightness of tracks."""
 
 from __future__ import annotations
 
@@ -7,44 +7,44 @@ from dataclasses import dataclass
 import numpy as np
 
 from autocalib_ros.config import PaperOptions
-from autocalib_ros.estimation.observations.track_set import TrackSet, path_lengths
+from autocalib_ros.estimation.observations.track_set import path_lengths
 from autocalib_ros.evidence.snapshot import Evidence
-from autocalib_ros.geometry.great_circles import fit_circles, unproject_rays
 from autocalib_ros.lens.camera import Camera, image_centre
 from autocalib_ros.results.calibration import PaperReport
 
 RIM_MARGIN = 1.02
-"""The shortest trial focal length keeps tracked points this factor inside 90 degrees, where tan flips sign."""
-TRACK_SCALE_PX = 1.0
-"""Mean distance from its great circle at which a track is no longer believed to be straight."""
+"""Margin of the shortest trial focal length: it keeps tracked points within 90 degrees, where the tangent changes sign.
+"""
 
 
 @dataclass(frozen=True)
 class PaperIntrinsics:
-    """Result of the published intrinsic stage, with the interval that it comes from."""
+    """Result of the intrinsic stage, with the interval of the median focal length."""
 
     report: PaperReport
     sweep: np.ndarray
-    """Trial focal length and summed squared error, shape (n, 2)."""
+    """Trial focal length in pixels and summed squared error in px^2, shape (n, 2)."""
     tracks: np.ndarray
-    """Indices in the evidence of the tracks used."""
+    """Indices of the tracks in the evidence, shape (m,)."""
 
 
 @dataclass(frozen=True)
 class ObservedInterval:
-    """One observed interval: pixel paths (n, 2) of the tracks that the paper keeps, longest first."""
+    """Tracks that the paper keeps of one observed interval, longest first."""
 
     paths: list[np.ndarray]
+    """Pixels of each track, shape (n, 2)."""
     tracks: list[int]
+    """Indices in the evidence."""
 
 
 def paper_intervals(evidence: Evidence, options: PaperOptions) -> list[ObservedInterval]:
-    """Apply the paper's two filters in each observed interval of `window_s` and take the longest tracks.
+    """Apply the paper's two filters in each interval of `window_s` and keep the longest tracks.
 
-    A track is kept if it lived for `min_lifetime` of the interval and its path is at most `max_path_ratio` its
-    displacement. Intervals with fewer tracks than the fullest are left out: all estimates rest on as many.
+    A track passes if it lasts for `min_lifetime` of the interval and its path is at most `max_path_ratio` times its
+    displacement. Intervals with fewer tracks than the fullest are dropped, so that all estimates use the same number.
     """
-    starts, tracks, windows = _split_by_interval(evidence, options.window_s)
+    starts, tracks, intervals = _split_by_interval(evidence, options.window_s)
     points, times = evidence.points_px, evidence.times_s
     first, last = starts[:-1], starts[1:] - 1
     displacement = np.hypot(*(points[last] - points[first]).T)
@@ -55,8 +55,8 @@ def paper_intervals(evidence: Evidence, options: PaperOptions) -> list[ObservedI
         & (path_lengths(points, starts) <= options.max_path_ratio * displacement)
     )
     longest = []
-    for window in np.unique(windows[kept]):
-        inside = np.flatnonzero(kept & (windows == window))
+    for interval in np.unique(intervals[kept]):
+        inside = np.flatnonzero(kept & (intervals == interval))
         longest.append(inside[np.argsort(-displacement[inside], kind='stable')[: options.longest]])
     fullest = max(map(len, longest), default=0)
     return [
@@ -67,31 +67,34 @@ def paper_intervals(evidence: Evidence, options: PaperOptions) -> list[ObservedI
 
 
 def _split_by_interval(evidence: Evidence, window_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Divide tracks into parts within an interval: where each begins, with the end (parts + 1,); track and interval."""
-    windows = np.floor(evidence.times_s / window_s).astype(int)
-    begins = np.diff(windows, prepend=0) != 0
+    """Split tracks at the borders of the intervals.
+
+    Returns the index of the first point of each part, followed by the number of points (parts + 1,), and the track and
+    the interval of each part (parts,).
+    """
+    intervals = np.floor(evidence.times_s / window_s).astype(int)
+    begins = np.diff(intervals, prepend=0) != 0
     begins[evidence.track_starts[:-1]] = True
     starts = np.flatnonzero(begins)
     tracks = np.searchsorted(evidence.track_starts, starts, side='right') - 1
-    return np.append(starts, len(windows)), tracks, windows[starts]
+    return np.append(starts, len(intervals)), tracks, intervals[starts]
 
 
 def paper_intrinsics(evidence: Evidence, options: PaperOptions) -> PaperIntrinsics | None:
-    """Run the paper's intrinsic stage on each observed interval; the result is that of the median focal length.
+    """Run the paper's intrinsic stage on each interval and return the result of the median focal length.
 
-    One interval is the paper's clip. Of many, the median is the one that a person would believe; intervals
-    whose error still falls at an end of the sweep have no least error, and count only where all are like that.
-    None where no track fills an interval.
+    The paper uses a single clip; the median over intervals is robust. Intervals whose smallest error is at an end of
+    the sweep have no minimum and are used only where no interval has one. None where no track passes the filters.
     """
     intervals = paper_intervals(evidence, options)
     if not intervals:
         return None
     sweeps = [_sweep(interval, evidence.image_size, options) for interval in intervals]
-    least = [int(np.argmin(sweep[:, 1])) for sweep in sweeps]
-    inside = [index for index, place in enumerate(least) if 0 < place < options.focal_steps - 1]
-    candidates = sorted(inside or range(len(sweeps)), key=lambda index: sweeps[index][least[index], 0])
+    minima = [int(np.argmin(sweep[:, 1])) for sweep in sweeps]
+    inside = [index for index, minimum in enumerate(minima) if 0 < minimum < options.focal_steps - 1]
+    candidates = sorted(inside or range(len(sweeps)), key=lambda index: sweeps[index][minima[index], 0])
     median = candidates[(len(candidates) - 1) // 2]
-    focal, paths = float(sweeps[median][least[median], 0]), intervals[median].paths
+    focal, paths = float(sweeps[median][minima[median], 0]), intervals[median].paths
     camera = Camera.equidistant(*evidence.image_size, focal)
     before = np.mean([_line_fit_errors(path) / len(path) for path in paths])
     after = np.mean([_line_fit_errors(camera.undistort(path)) / len(path) for path in paths])
@@ -104,7 +107,7 @@ def paper_intrinsics(evidence: Evidence, options: PaperOptions) -> PaperIntrinsi
 
 
 def _sweep(interval: ObservedInterval, image_size: tuple[int, int], options: PaperOptions) -> np.ndarray:
-    """Trial focal lengths up to the image diagonal with their summed squared errors, shape (n, 2)."""
+    """Return trial focal lengths up to the image diagonal and their summed squared line errors, shape (n, 2)."""
     centre = np.asarray(image_centre(*image_size))
     radii = [np.hypot(*(path - centre).T) for path in interval.paths]
     lowest = RIM_MARGIN * max(radius.max() for radius in radii) / (np.pi / 2)
@@ -118,7 +121,7 @@ def _sweep(interval: ObservedInterval, image_size: tuple[int, int], options: Pap
 
 
 def _line_fit_errors(points: np.ndarray) -> np.ndarray:
-    """Summed squared distances of points (..., n, 2) from their best line, shape (...)."""
+    """Return the summed squared distances of points (..., n, 2) from their total least squares line, shape (...)."""
     x, y = np.moveaxis(points - points.mean(axis=-2, keepdims=True), -1, 0)
     xx, xy, yy = (x * x).sum(-1), (x * y).sum(-1), (y * y).sum(-1)
     return np.maximum(0.5 * (xx + yy - np.hypot(xx - yy, 2 * xy)), 0.0)
@@ -127,25 +130,10 @@ def _line_fit_errors(points: np.ndarray) -> np.ndarray:
 def distortion_polynomial(camera: Camera) -> tuple[float, float, float]:
     """Fit the paper's k1..k3 in `x_u / x_d - 1 = k1 r^2 + k2 r^4 + k3 r^6` on normalised distorted radii.
 
-    It maps distorted to undistorted, the opposite of OpenCV's plumb_bob: a reported quantity, never CameraInfo.D.
+    Maps distorted to undistorted, the inverse of OpenCV's plumb_bob: for the report only, not for CameraInfo.D.
     """
     corner = np.hypot(camera.width, camera.height) / 2
     r = np.linspace(0.02, 1.0, 200) * min(corner, camera.focal_px * np.radians(80.0)) / camera.focal_px
     powers = np.column_stack([r**2, r**4, r**6])
     k, *_ = np.linalg.lstsq(powers, np.tan(r) / r - 1, rcond=None)
     return float(k[0]), float(k[1]), float(k[2])
-
-
-def straightness_sweep(tracks: TrackSet, image_size: tuple[int, int], trials: np.ndarray) -> np.ndarray:
-    """Robust straightness on the sphere of equidistant cameras with focal lengths `trials`; shape of `trials`.
-
-    The cost of a track is the logarithm of its mean squared pixel distance: a turning vehicle costs little more
-    than a wandering one. Tracks of one vehicle share one weight.
-    """
-    share = tracks.vehicle_weight
-    costs = []
-    for trial in trials:
-        rays = unproject_rays(Camera.equidistant(*image_size, trial), tracks.pixels)
-        _, distance2, _ = fit_circles(rays, tracks.weights)
-        costs.append((share * np.log1p(distance2 / TRACK_SCALE_PX**2)).sum())
-    return np.array(costs)

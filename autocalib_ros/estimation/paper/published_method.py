@@ -1,4 +1,4 @@
-"""The method of Jain & Saunier as published, from evidence to a calibration."""
+"""Method of Jain & Saunier (arXiv 2001.07243) as published: evidence to calibration."""
 
 from __future__ import annotations
 
@@ -33,7 +33,11 @@ PAPER_ASSUMPTIONS = tuple(assumption(kind) for kind in ('paper_lens', 'paper_roa
 def solve_paper(
     evidence: Evidence, options: Options, intrinsics: PaperIntrinsics | None, figures: Figures
 ) -> Calibration | Reason:
-    """Run both stages; the reason instead when a stage has nothing to work on."""
+    """Run the intrinsic and the extrinsic stage.
+
+    A refusal instead where the intrinsic stage has no tracks; without an extrinsic result the calibration has grade
+    'lens' and carries the refusal of its ground plane.
+    """
     if intrinsics is None:
         paper = options.paper
         return reason(
@@ -64,14 +68,15 @@ def solve_paper(
 
 
 def _with_ground(result: Calibration, found: SegmentOrientations, evidence: Evidence, options: Options) -> Calibration:
-    """Add the extrinsic stage to the lens, or say why it has none."""
+    """Return the calibration with the extrinsic stage, or with the refusal of its ground plane."""
     points = vote_vanishing_points(found, result.camera.focal_px, options.paper)
     if len(points) < 2:
         return replace(
             result,
             ground_refusal=reason('one_direction', 'paper', segments=len(evidence.segments_px), peaks=len(points)),
         )
-    focal = focal_from_vanishing_points(*points)
+    first, second = points
+    focal = focal_from_vanishing_points(first, second)
     if focal is None or result.paper is None:
         return replace(
             result,
@@ -79,7 +84,7 @@ def _with_ground(result: Calibration, found: SegmentOrientations, evidence: Evid
                 'vanishing_points_disagree', first_deg=found.peaks_deg[0], second_deg=found.peaks_deg[1]
             ),
         )
-    rotation = rotation_from_vanishing_points(*points, focal)
+    rotation = rotation_from_vanishing_points(first, second, focal)
     bearings, _ = result.camera.unproject(evidence.points_px)
     normal, _ = orient_upward(rotation[:, 2], bearings)
     report, roads = replace(result.paper, focal_from_vanishing_points_px=focal), rotation[:, :2].T

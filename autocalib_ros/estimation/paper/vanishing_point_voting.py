@@ -1,4 +1,4 @@
-"""DOCSTRING."""
+"""Vanishing points by orientation histogram and voting: steps 7 to 9 of Jain & Saunier (arXiv 2001.07243)."""
 
 from __future__ import annotations
 
@@ -11,30 +11,31 @@ from autocalib_ros.geometry.great_circles import orthonormal_basis
 from autocalib_ros.lens.camera import Camera
 
 HISTOGRAM_BINS = 180
+"""Bins of the orientation histogram, one degree each."""
 VOTE_CELL_DEG = 0.5
-"""Side of a voting cell, in angle from the optical axis."""
+"""Side of a voting cell in degrees from the optical axis."""
 MAX_VANISHING_ANGLE_DEG = 89.5
-"""A vanishing point at infinity is held at this angle, so that it keeps finite coordinates."""
+"""Largest angle of a vanishing point from the optical axis: keeps points at infinity at finite coordinates."""
 MAX_VOTING_SEGMENTS = 2000
-"""Segments of one cluster that vote; more move no maximum."""
+"""Segments of one cluster that vote; more do not move the maximum."""
 
 
 @dataclass(frozen=True)
 class SegmentOrientations:
-    """Segments in the undistorted image, by orientation."""
+    """Segments in the undistorted image and their orientations."""
 
     ends_px: np.ndarray
-    """Segments relative to the principal point, shape (n, 2, 2)."""
+    """End points relative to the principal point, shape (n, 2, 2)."""
     orientation_deg: np.ndarray
-    """Shape (n,), 0 to 180."""
+    """0 to 180, shape (n,)."""
     histogram: np.ndarray
-    """Orientation in degrees and number of segments, shape (180, 2)."""
+    """Orientation in degrees and number of segments, shape (HISTOGRAM_BINS, 2)."""
     peaks_deg: tuple[float, ...]
-    """Orientations of the two roads, or fewer where the histogram has no second peak."""
+    """Orientations of the two roads; fewer where the histogram has no second peak."""
 
 
 def segment_orientations(camera: Camera, segments_px: np.ndarray, options: PaperOptions) -> SegmentOrientations:
-    """Run steps 7 and 8 of the paper on segments x0, y0, x1, y1 (n, 4): undistort, histogram of orientation."""
+    """Undistort segments x0, y0, x1, y1 (n, 4) and compute their orientation histogram: steps 7 and 8 of the paper."""
     ends = camera.undistort(segments_px.reshape(-1, 2, 2)) - np.asarray(camera.principal_point_px)
     ends = ends[np.isfinite(ends).all(axis=(1, 2))]
     step = ends[:, 1] - ends[:, 0]
@@ -47,7 +48,10 @@ def segment_orientations(camera: Camera, segments_px: np.ndarray, options: Paper
 
 
 def vote_vanishing_points(found: SegmentOrientations, focal_px: float, options: PaperOptions) -> np.ndarray:
-    """Run step 9 of the paper: vanishing points (peaks, 2) in undistorted pixels about the principal point."""
+    """Vote for the vanishing point of each peak: step 9 of the paper.
+
+    Returns undistorted pixels relative to the principal point, shape (peaks, 2).
+    """
     points = [
         _vote_vanishing_point(
             found.ends_px[_orientation_difference(found.orientation_deg, peak) <= options.cluster_deg],
@@ -60,45 +64,45 @@ def vote_vanishing_points(found: SegmentOrientations, focal_px: float, options: 
 
 
 def _orientation_difference(first_deg: np.ndarray, second_deg: float) -> np.ndarray:
-    """Angle between undirected orientations, 0 to 90 degrees."""
+    """Return the angle between undirected orientations, 0 to 90 degrees."""
     return np.abs((first_deg - second_deg + 90.0) % 180.0 - 90.0)
 
 
 def _peaks(centres: np.ndarray, counts: np.ndarray, separation_deg: float) -> tuple[float, ...]:
-    """The fullest bin, and the fullest at least `separation_deg` from it."""
+    """Return the centre of the fullest bin, and of the fullest one at least `separation_deg` from it."""
     if not counts.any():
         return ()
     first = float(centres[np.argmax(counts)])
-    apart = np.where(_orientation_difference(centres, first) >= separation_deg, counts, 0)
-    return (first, float(centres[np.argmax(apart)])) if apart.any() else (first,)
+    separated = np.where(_orientation_difference(centres, first) >= separation_deg, counts, 0)
+    return (first, float(centres[np.argmax(separated)])) if separated.any() else (first,)
 
 
 def _vote_vanishing_point(ends: np.ndarray, focal_px: float, options: PaperOptions) -> np.ndarray:
-    """Let segments (n, 2, 2) vote as infinite lines; return the vanishing point (2,).
+    """Vote with segments (n, 2, 2) as infinite lines and return the vanishing point (2,).
 
-    The canvas is the half sphere of viewing directions, by angle from the axis: a line is a great circle on it,
-    and a point at infinity has its place on the rim.
+    The accumulator is the half sphere of viewing directions in equidistant projection: a line is a great circle, and a
+    point at infinity is on the rim.
     """
-    voters = np.linspace(0, len(ends) - 1, min(len(ends), MAX_VOTING_SEGMENTS)).astype(int)
-    votes = _vote_histogram(ends[voters], focal_px)
+    chosen = np.linspace(0, len(ends) - 1, min(len(ends), MAX_VOTING_SEGMENTS)).astype(int)
+    votes = _vote_histogram(ends[chosen], focal_px)
     half = (votes.shape[0] - 1) / 2
     rows, columns = np.nonzero(votes >= options.vote_share * votes.max())
     weight = votes[rows, columns].astype(float)
-    places = np.column_stack([columns - half, rows - half]) * VOTE_CELL_DEG
-    # the rim's two ends of a diameter are one point at infinity: bring all to the side of the strongest
-    strongest = places[np.argmax(weight)]
-    places = np.where((places @ strongest < 0)[:, None], -places, places)
-    mean = weight @ places / weight.sum()
+    cells = np.column_stack([columns - half, rows - half]) * VOTE_CELL_DEG
+    # opposite points of the rim are one point at infinity: bring all cells to the side of the strongest
+    strongest = cells[np.argmax(weight)]
+    cells = np.where((cells @ strongest < 0)[:, None], -cells, cells)
+    mean = weight @ cells / weight.sum()
     distance = max(float(np.hypot(*mean)), 1e-9)
     outward = mean / distance
-    sigma = np.sqrt(weight @ ((places - mean) @ outward) ** 2 / weight.sum())
+    sigma = np.sqrt(weight @ ((cells - mean) @ outward) ** 2 / weight.sum())
     angle = min(distance + options.vote_sigmas * float(sigma), MAX_VANISHING_ANGLE_DEG)
     return focal_px * np.tan(np.radians(angle)) * outward
 
 
 def _vote_histogram(ends: np.ndarray, focal_px: float) -> np.ndarray:
-    """Count the lines of segments (n, 2, 2) that pass each cell of the half sphere, shape (cells, cells)."""
-    half = int(round(90.0 / VOTE_CELL_DEG))
+    """Count the lines of segments (n, 2, 2) through each cell of the half sphere, shape (cells, cells)."""
+    half = round(90.0 / VOTE_CELL_DEG)
     votes = np.zeros((2 * half + 1, 2 * half + 1), int)
     tail, head = (np.column_stack([ends[:, i], np.full(len(ends), focal_px)]) for i in (0, 1))
     normals = np.cross(tail, head)

@@ -1,4 +1,4 @@
-"""Solutions to start from: directions on which straight traffic agrees at trial focal lengths, and lens families."""
+"""Multi-start initialisation from straight tracks: road directions by consensus at trial focal lengths, lens family."""
 
 from __future__ import annotations
 
@@ -15,23 +15,25 @@ from autocalib_ros.estimation.straight.consensus import CONSENSUS_INLIER_PX, con
 from autocalib_ros.lens.camera import Camera
 
 FOCAL_TRIALS = 14
-"""Focal lengths tried as starts: steps of about 17 %, within which the joint problem converges."""
+"""Trial focal lengths: steps of about 17 %, within the basin of convergence of the bundle adjustment."""
 MAX_STARTS = 3
+"""Local maxima of the consensus score over focal length that are adjusted."""
 MIN_INLIER_FRACTION, LOOSE_INLIER_FACTOR = 0.5, 3.0
-"""Below this share of explained tracks, agreement is looked for again with so many times wider limits."""
+"""Below this fraction of inlier tracks the consensus is repeated with an inlier limit wider by the factor."""
 MATCHED_RADIUS_DIAGONALS = 0.3
-"""A radius in image diagonals at which two lenses of one field of view agree about best."""
+"""Image radius, in diagonals, at which a start in another lens family gets the same angle: two lenses of one field of
+view agree about best there."""
 MIN_ROAD_SEPARATION_DEG = 15.0
-"""Roads that differ by less are one road seen with errors."""
+"""Smallest angle between two roads: closer ones are one road with errors. Judgement."""
 
 
 def solve_from_consensus(
     subsample: TrackSet, config: AdjustmentConfig, generator: np.random.Generator
 ) -> tuple[Adjustment, float] | None:
-    """Solve from the directions on which the tracks agree at trial focal lengths; the most probable solution.
+    """Adjust the consensus directions of the best trial focal lengths and return the most probable solution.
 
-    And the contrast: how much better the best trial agreed than the middling one. None without any agreement.
-    Where little is explained the agreement is looked for again less strictly: a lens that is neither centred nor
+    Also returns the contrast: best over median consensus score of the trials, inf for a known focal length. None
+    without consensus. With few inliers the consensus is repeated with a loose limit: a lens that is neither centred nor
     equidistant bends long tracks by many pixels at every trial.
     """
     fits, scores = _from_trials(subsample, config, generator, CONSENSUS_INLIER_PX)
@@ -48,43 +50,39 @@ def solve_from_consensus(
 def _from_trials(
     subsample: TrackSet, config: AdjustmentConfig, generator: np.random.Generator, inlier_px: float
 ) -> tuple[list[Adjustment], np.ndarray]:
-    """Solutions from the trial focal lengths of best agreement, and the scores of all trials, shape (trials,)."""
+    """Return adjusted solutions of the best trials, and the consensus scores of all trials, shape (trials,)."""
     prior = config.prior
     size = (prior.centre.width, prior.centre.height)
     trials = [prior.centre.focal_px] if prior.focal_known else focal_trials(subsample, size, FOCAL_TRIALS)
-    solve_from_consensus = [
-        consensus_directions(prior.start(trial), subsample, generator, inlier_px=inlier_px) for trial in trials
-    ]
-    starts = [
-        initial_state(prior.start(trials[index]), solve_from_consensus[index])
-        for index in _peaks(solve_from_consensus)[:MAX_STARTS]
-    ]
+    found = [consensus_directions(prior.start(trial), subsample, generator, inlier_px=inlier_px) for trial in trials]
+    starts = [initial_state(prior.start(trials[index]), found[index]) for index in _peaks(found)[:MAX_STARTS]]
     fits = [adjust(start, subsample, config) for start in starts]
-    # two roads that fell together describe one road twice, and its errors the better for it
-    return [fit for fit in fits if roads_separated(fit)] or fits, np.array(
-        [item.score for item in solve_from_consensus]
-    )
+    # two coincident roads fit the errors of one road, and so look more probable than they are
+    return [fit for fit in fits if roads_separated(fit)] or fits, np.array([item.score for item in found])
 
 
 def roads_separated(fit: Adjustment) -> bool:
-    """Tell whether the roads of a solution that are next to each other in it differ."""
+    """Return whether consecutive roads of a solution are at least `MIN_ROAD_SEPARATION_DEG` apart."""
     turns = np.abs(np.sin(np.diff(fit.state.angles_rad)))
     return bool(turns.min(initial=1.0) > np.sin(np.radians(MIN_ROAD_SEPARATION_DEG)))
 
 
 def select_lens_family(fit: Adjustment, priors: list[LensPrior], subsample: TrackSet, tracks: TrackSet) -> Adjustment:
-    """Solve for another family of lenses where that makes the traffic clearly more probable; one road cannot tell."""
+    """Adjust with another lens family of `priors` where it is more probable by `MODEL_SELECTION_MARGIN`.
+
+    Models are compared on the subsample. One road without turning vehicles cannot identify the family.
+    """
     if not fit.plane_known or not priors:
         return fit
-    usual = adjust(fit.state, subsample, fit.problem.config, refine=True)
+    default = adjust(fit.state, subsample, fit.problem.config, refine=True)
     best = select_model(
-        [usual, *(_solve_in_family(usual, prior, subsample) for prior in priors)], subsample, MODEL_SELECTION_MARGIN
+        [default, *(_solve_in_family(default, prior, subsample) for prior in priors)], subsample, MODEL_SELECTION_MARGIN
     )
-    return fit if best is usual else adjust(best.state, tracks, best.problem.config)
+    return fit if best is default else adjust(best.state, tracks, best.problem.config)
 
 
 def _solve_in_family(fit: Adjustment, prior: LensPrior, subsample: TrackSet) -> Adjustment:
-    """Solve for a lens of another family, from the one that images the middle of the field at the same place."""
+    """Adjust with the prior of another lens family, from the lens that agrees at `MATCHED_RADIUS_DIAGONALS`."""
     camera = fit.state.camera
     angle, _ = camera.angle(np.array(MATCHED_RADIUS_DIAGONALS * np.hypot(camera.width, camera.height)))
     focal = camera.radius(angle) / replace(prior.centre, focal_px=1.0).radius(angle)
@@ -93,7 +91,7 @@ def _solve_in_family(fit: Adjustment, prior: LensPrior, subsample: TrackSet) -> 
 
 
 def _peaks(found: list[RoadDirections]) -> list[int]:
-    """Indices of trials whose score no neighbour beats, best first; trials without a direction never."""
+    """Return the indices of local maxima of the score, best first, without trials of score 0."""
     scores = np.array([item.score for item in found])
     padded = np.concatenate([[-np.inf], scores, [-np.inf]])
     peaks = np.flatnonzero((scores >= padded[:-2]) & (scores >= padded[2:]) & (scores > 0))
@@ -101,7 +99,10 @@ def _peaks(found: list[RoadDirections]) -> list[int]:
 
 
 def focal_trials(tracks: TrackSet, image_size: tuple[int, int], count: int) -> np.ndarray:
-    """Focal lengths to try, evenly by ratio: from all points within 120 degrees to twice the diagonal."""
+    """Return `count` trial focal lengths in geometric progression.
+
+    From all tracked points within 120 degrees of the axis to twice the image diagonal.
+    """
     centre = Camera.equidistant(*image_size, 1.0).principal_point_px
     farthest = np.hypot(*(tracks.pixels.reshape(-1, 2) - centre).T).max()
     return np.geomspace(farthest / np.radians(120.0), 2.0 * np.hypot(*image_size), count)

@@ -1,4 +1,4 @@
-"""The roads of a solution: which are real, which more there are, and whether two cross at a right angle."""
+"""Roads of a solution: support, search for further roads, right-angle test, main road."""
 
 from __future__ import annotations
 
@@ -15,25 +15,29 @@ from autocalib_ros.estimation.straight.initialisation import MIN_ROAD_SEPARATION
 from autocalib_ros.geometry.great_circles import fit_circles, unproject_rays
 from autocalib_ros.results.statements import Statement, assumption, check
 
+MIN_VEHICLES_PER_ROAD = 4
+"""Distinct vehicles that support a road; fewer may be the manoeuvre of one driver. Judgement."""
 MAX_ROADS = 4
+"""Roads of one solution."""
 MAX_PROPOSAL_TRACKS = 40
-"""Tracks, evenly out of those left, each two of which propose a direction."""
+"""Unexplained tracks, evenly spaced, each pair of which proposes a direction."""
 ROAD_INLIER_DEG = 1.0
-"""A track whose direction in the plane is within this of a further road follows it."""
+"""Angle in degrees between a track's direction and a further road within which the track supports it."""
 RIGHT_ANGLE_SIGMAS = 2.5
 RIGHT_ANGLE_FLOOR_DEG = 2.0
-"""Junctions are built to about a degree, and followed points drift by another across their vehicles' way: within that,
-or so many standard deviations, 90 degrees stay more probable than any other angle (more than half of all junctions are
-square; the others spread over tens of degrees)."""
+"""Two roads are fixed at 90 degrees within this many standard deviations, or within this many degrees: junctions are
+built to about a degree, and tracked points drift by another degree across the driving direction. Within either limit
+90 degrees are more probable than any other angle: more than half of all junctions are square, the others spread over
+tens of degrees."""
 MAX_NOISE_RATIO = 4.0
-"""Tracks on roads may be off by so many times the variance that the vehicles' motion shows; beyond it the roads are
-turns that look alike."""
+"""Largest ratio of the residual scale of tracks on roads to that of turning vehicles (both squared, whitened); above
+it the further road consists of similar turns. Judgement."""
 
 
 def drop_unsupported_roads(
     fit: Adjustment, support: list[np.ndarray], tracks: TrackSet, gate: GateOptions
 ) -> Adjustment:
-    """Solve again with the one road that explains most vehicles when a second has too little behind it."""
+    """Adjust with the best-supported road alone where a road of the solution lacks support."""
     if _all_supported(fit, support, tracks, gate):
         return fit
     inliers = fit.inliers()
@@ -47,12 +51,12 @@ def drop_unsupported_roads(
 
 
 def _all_supported(fit: Adjustment, support: list[np.ndarray], tracks: TrackSet, gate: GateOptions) -> bool:
-    """Whether each road of a solution has enough behind it, and none is another's echo."""
+    """Return whether each road has its own support and consecutive roads are separated."""
     return roads_separated(fit) and all(has_road_support(mask, tracks, gate) for mask in support)
 
 
 def add_second_road(fit: Adjustment, tracks: TrackSet, gate: GateOptions) -> Adjustment:
-    """Look for a second road where one alone is known: a direction on which vehicles agree that do not follow it."""
+    """Add a second road to a solution of one road: the best-supported direction of unexplained straight tracks."""
     if fit.plane_known or len(fit.state.angles_rad) != 1:
         return fit
     direction = _second_direction(fit, tracks)
@@ -65,52 +69,52 @@ def add_second_road(fit: Adjustment, tracks: TrackSet, gate: GateOptions) -> Adj
 
 
 def _second_direction(fit: Adjustment, tracks: TrackSet) -> np.ndarray | None:
-    """Direction (3,) on which most vehicles agree whose straight tracks follow no road, None where three do not."""
+    """Return the direction (3,) supported by most vehicles with unexplained straight tracks, None below three."""
     normals, vehicles = _unexplained_circles(fit, tracks)
-    some = evenly_spaced(len(normals), MAX_PROPOSAL_TRACKS)
-    one, other = (some[index] for index in np.triu_indices(len(some), 1))
-    meeting = np.cross(normals[one], normals[other])
-    size = np.linalg.norm(meeting, axis=1)
-    sure = (size > np.sin(np.radians(ROAD_INLIER_DEG))) & (vehicles[one] != vehicles[other])
-    directions = meeting[sure] / size[sure, None]
+    chosen = evenly_spaced(len(normals), MAX_PROPOSAL_TRACKS)
+    one, other = (chosen[index] for index in np.triu_indices(len(chosen), 1))
+    intersection = np.cross(normals[one], normals[other])
+    size = np.linalg.norm(intersection, axis=1)
+    well_defined = (size > np.sin(np.radians(ROAD_INLIER_DEG))) & (vehicles[one] != vehicles[other])
+    directions = intersection[well_defined] / size[well_defined, None]
     directions = directions[np.abs(directions @ fit.state.directions[0]) < np.cos(np.radians(MIN_ROAD_SEPARATION_DEG))]
     best = _most_supported(np.abs(directions @ normals.T), vehicles, 3)
     return None if best is None else directions[best]
 
 
 def _unexplained_circles(fit: Adjustment, tracks: TrackSet) -> tuple[np.ndarray, np.ndarray]:
-    """Circles' normals (n, 3) and vehicles (n,) of the straight tracks that follow no road."""
+    """Return circle normals (n, 3) and vehicles (n,) of straight tracks (within 1 px) that follow no road."""
     normals, own, _ = fit_circles(unproject_rays(fit.state.camera, tracks.pixels), tracks.weights)
-    left = (fit.labels < 0) & (own < 1.0)
-    return normals[left], tracks.vehicles[left]
+    unexplained = (fit.labels < 0) & (own < 1.0)
+    return normals[unexplained], tracks.vehicles[unexplained]
 
 
-def _most_supported(sines: np.ndarray, vehicles: np.ndarray, least: int) -> int | None:
-    """Index of the proposal with which most vehicles (n,) agree, by the sines (proposals, n) that their tracks are off.
+def _most_supported(sines: np.ndarray, vehicles: np.ndarray, min_vehicles: int) -> int | None:
+    """Return the index of the proposal with the most inlier vehicles, None below `min_vehicles`.
 
-    None where fewer than `least` do.
+    `sines` (proposals, n) are of the angles between proposals and tracks, `vehicles` (n,) of the tracks.
     """
-    agree = sines < np.sin(np.radians(ROAD_INLIER_DEG))
-    counts = np.array([len(np.unique(vehicles[row])) for row in agree])
-    return int(np.argmax(counts)) if counts.max(initial=0) >= least else None
+    inliers = sines < np.sin(np.radians(ROAD_INLIER_DEG))
+    counts = np.array([len(np.unique(vehicles[row])) for row in inliers])
+    return int(np.argmax(counts)) if counts.max(initial=0) >= min_vehicles else None
 
 
 def add_further_roads(fit: Adjustment, tracks: TrackSet, gate: GateOptions) -> Adjustment:
-    """Add roads in a known plane as long as tracks that follow none agree on one."""
+    """Add roads in a known plane while unexplained tracks support one, up to `MAX_ROADS`."""
     while fit.plane_known and len(fit.state.angles_rad) < MAX_ROADS:
         angle = _further_angle(fit, tracks)
         if angle is None:
             return fit
         wider = adjust(_add_road(fit.state, angle), tracks, fit.problem.config, refine=True)
-        turns = wider.problem.config.turning and wider.scale > MAX_NOISE_RATIO * max(1.0, *wider.scales[1:])
-        if turns or not _all_supported(wider, road_support(wider, tracks), tracks, gate):
+        noisy = wider.problem.config.turning and wider.scale > MAX_NOISE_RATIO * max(1.0, *wider.scales[1:])
+        if noisy or not _all_supported(wider, road_support(wider, tracks), tracks, gate):
             return fit
         fit = wider
     return fit
 
 
 def _add_road(state: AdjustmentState, angle: float) -> AdjustmentState:
-    """Return the state with one road more; the first defines the x axis of the plane."""
+    """Return the state with one more road; the first road defines the x axis of the plane."""
     if len(state.angles_rad):
         return replace(state, angles_rad=np.append(state.angles_rad, angle))
     turned = state.rotation @ Rotation.from_rotvec([0.0, 0.0, angle]).as_matrix()
@@ -118,24 +122,28 @@ def _add_road(state: AdjustmentState, angle: float) -> AdjustmentState:
 
 
 def _further_angle(fit: Adjustment, tracks: TrackSet) -> float | None:
-    """Angle in the plane on which most vehicles agree whose tracks follow no road yet, None where two do not."""
+    """Return the angle in the plane supported by most vehicles with unexplained tracks, None below two."""
     normals, vehicles = _unexplained_circles(fit, tracks)
     angles = _angles_in_plane(fit.state, normals)
-    turned = np.abs(np.sin(angles[:, None] - fit.state.angles_rad)).min(axis=1, initial=1.0)
-    away = turned > np.sin(np.radians(MIN_ROAD_SEPARATION_DEG))
-    angles, vehicles = angles[away], vehicles[away]
+    sines = np.abs(np.sin(angles[:, None] - fit.state.angles_rad)).min(axis=1, initial=1.0)
+    separated = sines > np.sin(np.radians(MIN_ROAD_SEPARATION_DEG))
+    angles, vehicles = angles[separated], vehicles[separated]
     best = _most_supported(np.abs(np.sin(angles[:, None] - angles)), vehicles, 2)
     return None if best is None else float(angles[best])
 
 
 def _angles_in_plane(state: AdjustmentState, normals: np.ndarray) -> np.ndarray:
-    """Angle (n,), in the frame of the plane, of the ways on it whose great circles have these normals (n, 3)."""
+    """Return the angles (n,), in the plane frame, of the lines on the plane with great circle normals (n, 3)."""
     along = np.cross(normals, state.rotation[:, 2]) @ state.rotation
     return np.arctan2(along[:, 1], along[:, 0])
 
 
 def fix_right_angle(fit: Adjustment, tracks: TrackSet, options: JointOptions) -> tuple[Adjustment, Statement | None]:
-    """Fix two roads at 90 degrees unless the evidence contradicts it, or at the given angle; and the angle."""
+    """Fix the angle of the first two roads at 90 degrees if the measured one is consistent with it.
+
+    Returns the solution and the angle as an assumption or a check, None with fewer than two roads. An angle given by
+    an option stays fixed; with `road_angle` 'free' none is fixed.
+    """
     if len(fit.state.angles_rad) < 2:
         return fit, None
     angle, config = crossing_deg(fit.state), fit.problem.config
@@ -149,9 +157,9 @@ def fix_right_angle(fit: Adjustment, tracks: TrackSet, options: JointOptions) ->
 
 
 def main_road(fit: Adjustment, tracks: TrackSet) -> tuple[np.ndarray, TrackSet]:
-    """Unit vector (3,), camera frame, along which most vehicles drive, and the tracks that follow that road straight.
+    """Return the unit vector (3,), camera frame, along the road of most vehicles, and the tracks that support it.
 
-    The busiest road; where there is none the middling heading, and no tracks.
+    Without a supported road: the circular mean heading, and no tracks.
     """
     support = road_support(fit, tracks)
     if support:
@@ -159,22 +167,19 @@ def main_road(fit: Adjustment, tracks: TrackSet) -> tuple[np.ndarray, TrackSet]:
         return fit.state.directions[busiest], tracks.subset(support[busiest])
     rays = unproject_rays(fit.state.camera, tracks.pixels)
     normals, _, _ = fit_circles(rays, tracks.weights)
-    # headings to and fro are one: doubled angles make them so
-    twice = np.exp(2j * _angles_in_plane(fit.state, normals)) * tracks.vehicle_weight
-    angle = 0.5 * np.angle(twice.sum())
+    # opposite headings are one undirected heading: average doubled angles
+    doubled = np.exp(2j * _angles_in_plane(fit.state, normals)) * tracks.vehicle_weight
+    angle = 0.5 * np.angle(doubled.sum())
     along = fit.state.rotation @ np.array([np.cos(angle), np.sin(angle), 0.0])
     return along, tracks.subset(np.zeros(0, int))
 
 
-MIN_VEHICLES_PER_ROAD = 4
-"""Vehicles, distinct, that make a road; fewer may be one driver's whim."""
-
-
 def has_road_support(mask: np.ndarray, tracks: TrackSet, gate: GateOptions) -> bool:
-    """Tell whether enough tracks of enough vehicles support a direction."""
-    return mask.sum() >= gate.min_tracks_per_road and len(np.unique(tracks.vehicles[mask])) >= MIN_VEHICLES_PER_ROAD
+    """Return whether the tracks of a mask (tracks,) are enough tracks of enough vehicles for a road."""
+    enough = mask.sum() >= gate.min_tracks_per_road
+    return bool(enough and len(np.unique(tracks.vehicles[mask])) >= MIN_VEHICLES_PER_ROAD)
 
 
 def crossing_deg(state: AdjustmentState) -> float:
-    """Angle at which the first two roads cross, 0 to 90 degrees."""
+    """Return the angle at which the first two roads cross, 0 to 90 degrees."""
     return float(np.degrees(np.arccos(np.clip(abs(np.cos(state.angles_rad[1])), 0.0, 1.0))))
