@@ -33,8 +33,8 @@ def geman_mcclure_bounded_loss(squared: np.ndarray, limit: np.ndarray | float) -
 
 def student_density(residuals: np.ndarray, sigmas: np.ndarray) -> np.ndarray:
     """Return Student's t density of residuals with scales `sigmas`; both broadcast."""
-    apart = 1.0 + (residuals / sigmas) ** 2 / STUDENT_FREEDOM
-    return STUDENT_PEAK_DENSITY / sigmas / (apart * apart * np.sqrt(apart))
+    scaled = 1.0 + (residuals / sigmas) ** 2 / STUDENT_FREEDOM
+    return STUDENT_PEAK_DENSITY / sigmas / (scaled * scaled * np.sqrt(scaled))
 
 
 def student_weight(residuals: np.ndarray, sigmas: np.ndarray) -> np.ndarray:

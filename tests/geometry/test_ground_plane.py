@@ -1,4 +1,4 @@
-"""Pose from road directions and height, and the paper's equations."""
+"""Pose from road directions and height, ray-ground intersection, and the paper's equations."""
 
 from __future__ import annotations
 
@@ -6,13 +6,18 @@ import numpy as np
 import pytest
 
 from autocalib_ros.geometry.ground_plane import (
+    ahead_direction,
+    depression_sine,
     focal_from_vanishing_points,
     ground_plane,
+    ground_points,
+    intersect_ground,
     orient_upward,
     paper_translation,
     rotation_from_vanishing_points,
     tilt_and_roll_deg,
 )
+from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.synthetic.junction import pose
 
 POSE = pose(32.0, -2.0, 35.0)
@@ -68,3 +73,24 @@ def test_tilt_and_roll_of_a_known_pose() -> None:
     np.testing.assert_allclose(tilt_and_roll_deg(pose(32.0, 0.0, 120.0)[:, 2]), (32.0, 0.0), atol=1e-9)
     tilt, roll = tilt_and_roll_deg(pose(0.0, 5.0, 0.0)[:, 2])
     assert (tilt, abs(roll)) == (pytest.approx(0.0), pytest.approx(5.0))
+
+
+def test_rays_meet_the_ground_where_it_is() -> None:
+    generator = np.random.default_rng(0)
+    places = np.column_stack([generator.uniform(5.0, 60.0, 50), generator.uniform(-20.0, 20.0, 50), np.full(50, -8.0)])
+    points = places @ POSE.T
+    distances = np.linalg.norm(points, axis=1)
+    np.testing.assert_allclose(intersect_ground(points / distances[:, None], POSE[:, 2], 8.0), distances)
+
+
+def test_rays_at_the_horizon_and_above_it_are_clamped() -> None:
+    bearings = np.stack([ahead_direction(POSE[:, 2]), POSE[:, 2]])
+    np.testing.assert_allclose(depression_sine(bearings, POSE[:, 2], 0.02), 0.02)
+    np.testing.assert_allclose(intersect_ground(bearings, POSE[:, 2], 8.0, 0.02), 400.0)
+
+
+def test_the_optical_axis_meets_the_ground_straight_ahead() -> None:
+    camera = Camera(1280, 720, 560.0, (639.5, 359.5))
+    ahead, left = ground_points(camera, POSE[:, 2], 8.0, np.array([camera.principal_point_px]))[0]
+    tilt_deg, _ = tilt_and_roll_deg(POSE[:, 2])
+    assert ahead == pytest.approx(8.0 / np.tan(np.radians(tilt_deg))) and left == pytest.approx(0.0, abs=1e-9)

@@ -1,4 +1,4 @@
-"""Families of lenses, and what is held of them."""
+"""Lens families and their fixed parameters."""
 
 from __future__ import annotations
 
