@@ -1,4 +1,4 @@
-"""Closed forms for many small matrices agree with LAPACK's."""
+"""Closed forms for many small matrices agree with LAPACK."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def scatters(least: tuple[float, float], middle: tuple[float, float]) -> np.ndar
         ((0.0, 4.0), (1e5, 9e5)),
     ],
 )  # paths from border to border
-def test_least_axes_are_the_eigenvectors(least: tuple[float, float], middle: tuple[float, float]) -> None:
+def test_smallest_eigenvectors_agree_with_lapack(least: tuple[float, float], middle: tuple[float, float]) -> None:
     matrix = scatters(least, middle)
     axes, values = smallest_eigenvectors(matrix)
     expected, vectors = np.linalg.eigh(matrix)
@@ -45,7 +45,7 @@ def test_cofactors_are_determinant_times_inverse() -> None:
     np.testing.assert_allclose(mixed.T, expected[:, [1, 2, 0], [2, 0, 1]], atol=1e-6 * scale)
 
 
-def test_inverse_factors_whiten() -> None:
+def test_inverse_cholesky_factors_whiten() -> None:
     root = np.random.default_rng(1).normal(size=(COUNT, 10, 10))
     covariance = root @ root.transpose(0, 2, 1) + np.eye(10)
     expected = np.linalg.inv(np.linalg.cholesky(covariance))
@@ -55,7 +55,7 @@ def test_inverse_factors_whiten() -> None:
 
 
 @pytest.mark.parametrize('shapes', [((3,), (3,)), ((7, 3), (3,)), ((7, 5, 3), (7, 1, 3)), ((7, 3), (7, 3))])
-def test_products_are_numpys(shapes: tuple[tuple[int, ...], tuple[int, ...]]) -> None:
+def test_products_agree_with_numpy(shapes: tuple[tuple[int, ...], tuple[int, ...]]) -> None:
     generator = np.random.default_rng(2)
     first, second = (generator.normal(size=shape) for shape in shapes)
     np.testing.assert_allclose(dot(first, second), (first * second).sum(axis=-1), atol=1e-14)

@@ -1,4 +1,4 @@
-"""Cluster-robust covariance against spread that can be counted."""
+"""Cluster-robust covariance against spreads that are known."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_leaving_out_vehicles_gives_the_jackknife_of_a_mean() -> None:
     assert sigma2 == pytest.approx((moves**2).sum() * small_sample_factor(moves)[0] ** 2)
 
 
-def test_few_vehicles_widen_deviations_as_student_does() -> None:
+def test_few_vehicles_widen_deviations_by_students_t() -> None:
     many, one = np.ones((1000, 1)), np.array([[10.0], *[[0.1]] * 40])
     assert small_sample_factor(many)[0] == pytest.approx(1.0, abs=0.01)
     assert small_sample_factor(np.ones((10, 1)))[0] == pytest.approx(
@@ -54,7 +54,7 @@ def test_few_vehicles_widen_deviations_as_student_does() -> None:
     assert small_sample_factor(one)[0] > 1.5
 
 
-def test_few_vehicles_that_agree_by_chance_are_not_believed_beyond_their_noise() -> None:
+def test_few_vehicles_that_agree_by_chance_keep_the_variance_of_their_noise() -> None:
     slopes = np.ones((12, 1))
     quiet, loud = (
         plain(slopes, noise * np.resize([1.0, -1.0], 12), np.arange(12), np.zeros(1))[0, 0] for noise in (0.1, 3.0)
@@ -66,7 +66,7 @@ def test_few_vehicles_that_agree_by_chance_are_not_believed_beyond_their_noise()
     assert many < 0.02 / 1200
 
 
-def test_what_only_the_prior_knows_has_the_spread_of_the_prior() -> None:
+def test_a_parameter_known_from_the_prior_alone_has_its_variance() -> None:
     slopes = np.column_stack([np.ones(50), np.zeros(50)])
     covariance = plain(slopes, np.zeros(50), np.arange(50), np.array([0.0, 1.0]))
     assert covariance[1, 1] == pytest.approx(1.0)
@@ -77,7 +77,7 @@ def test_undetermined_parameters_get_an_infinite_variance() -> None:
     assert np.isinf(plain(slopes, np.ones(20), np.arange(20), np.zeros(2))).all()
 
 
-def test_one_vehicle_says_nothing_of_its_spread() -> None:
+def test_one_vehicle_gives_an_infinite_variance() -> None:
     assert np.isinf(plain(np.ones((5, 1)), np.zeros(5), np.zeros(5, int), np.zeros(1))).all()
 
 
@@ -89,7 +89,7 @@ def test_correlation_is_that_of_a_shared_part() -> None:
     assert intraclass_correlation(groups, pulls) == pytest.approx(0.3, abs=0.08)  # 400 groups: 3 sigma
 
 
-def test_evidence_that_moves_two_parameters_alike_tells_neither() -> None:
+def test_two_collinear_parameters_are_both_unidentifiable() -> None:
     slopes = np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 2.0]])
     left = sigma_without_prior(slopes.T @ slopes, np.zeros(3))
     assert np.isinf(left[:2]).all()

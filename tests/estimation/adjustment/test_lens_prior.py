@@ -13,7 +13,7 @@ from autocalib_ros.lens.camera import Camera
 SIZE = (1280, 720)
 
 
-def test_auto_offers_the_usual_family_first() -> None:
+def test_auto_gives_the_most_common_family_first() -> None:
     assert [prior.family for prior in lens_priors(SIZE, JointOptions())] == [
         'equidistant',
         'distortion_free',
@@ -21,14 +21,14 @@ def test_auto_offers_the_usual_family_first() -> None:
     ]
 
 
-def test_a_distortion_free_lens_images_by_the_tangent() -> None:
+def test_a_distortion_free_lens_projects_by_the_tangent() -> None:
     prior = lens_priors(SIZE, JointOptions(lens_prior='distortion_free'))[0]
     angles = np.radians([10.0, 25.0, 40.0])
     radius = prior.start(500.0).radius(angles)
     np.testing.assert_allclose(radius, 500.0 * np.tan(angles), rtol=1e-3)  # four terms of the series, up to 40 degrees
 
 
-def test_a_sigma_of_zero_holds_a_parameter() -> None:
+def test_a_sigma_of_zero_fixes_a_parameter() -> None:
     prior = lens_priors(SIZE, JointOptions(k1_sigma=0.0, principal_point_sigma_px=0.0))[0]
     moved = prior.moved(prior.start(600.0), np.array([0.1]))
     assert list(prior.free) == [0]
@@ -42,18 +42,18 @@ def test_a_given_focal_length_is_where_solutions_start() -> None:
     assert prior.deviations(prior.moved(prior.centre, np.array([2.0, 0, 0, 0])))[0] == pytest.approx(2.0)
 
 
-def test_deviations_count_in_sigmas() -> None:
+def test_deviations_are_in_sigmas() -> None:
     prior = lens_priors(SIZE, JointOptions(principal_point_sigma_px=10.0, k1_sigma=0.02))[0]
     camera = Camera(1280, 720, 555.0, (649.5, 339.5), (0.06, 0.0, 0.0, 0.0))
     np.testing.assert_allclose(prior.deviations(camera), [0.0, 1.0, -2.0, 3.0])
 
 
-def test_nothing_of_a_known_lens_is_free() -> None:
+def test_a_known_lens_has_no_free_parameters() -> None:
     assert len(known_lens(Camera.equidistant(1280, 720, 500.0)).free) == 0
 
 
 @pytest.mark.parametrize('angle', ['right', '5', '-90', ''])
-def test_an_angle_that_is_none_is_refused_with_what_is_accepted(angle: str) -> None:
+def test_an_invalid_angle_is_refused_with_the_accepted_values(angle: str) -> None:
     with pytest.raises(UsageError, match='degrees between 10 and 170'):
         JointOptions(road_angle=angle)
 

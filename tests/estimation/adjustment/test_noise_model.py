@@ -1,4 +1,4 @@
-"""Whitening turns distances as they are made into independent ones of unit spread."""
+"""Whitening of simulated distances gives independent residuals of unit variance."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_noise_and_wander_come_out_white() -> None:
     np.testing.assert_allclose(white.T @ white / TRACKS, np.eye(SAMPLES), atol=0.1)  # 4000 draws: 4 sigma
 
 
-def test_drift_takes_the_weight_of_a_long_tracks_ends() -> None:
+def test_drift_lowers_the_weight_of_the_ends_of_long_tracks() -> None:
     pixels, mask, road = place()
     steady, drifting = (
         whitening_matrices(
@@ -45,7 +45,7 @@ def test_drift_takes_the_weight_of_a_long_tracks_ends() -> None:
 
 
 @pytest.mark.parametrize('drifting', [False, True])
-def test_samples_that_are_not_there_count_for_nothing(drifting: bool) -> None:
+def test_masked_samples_have_no_weight(drifting: bool) -> None:
     pixels, mask, road = place()
     mask[:, 7:] = False
     whiten = whitening_matrices(pixels, mask, road, OPTIONS, drifting=drifting)[0]

@@ -1,4 +1,4 @@
-"""Focal length from straightness, published and robust."""
+"""Focal length from straightness, as published."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_published_filters_keep_the_longest_of_each_interval() -> None:
         assert len(lengths) <= 10 and lengths == sorted(lengths, reverse=True)
 
 
-def test_published_filters_drop_short_lives() -> None:
+def test_published_filters_drop_short_tracks() -> None:
     evidence = synthetic_evidence(STRAIGHT, np.random.default_rng(0))
     assert not paper_intervals(evidence, PaperOptions(window_s=60.0))
     assert paper_intrinsics(evidence, PaperOptions(window_s=60.0)) is None

@@ -38,12 +38,12 @@ def test_published_quantities_are_reported(result: Calibration) -> None:
     assert result.paper.translation_m is not None and result.paper.translation_m[2] > 8.0
 
 
-def test_no_uncertainty_is_made_up(result: Calibration) -> None:
+def test_no_uncertainty_is_given(result: Calibration) -> None:
     assert result.stddev.focal_px is None
     assert 'paper_uncertainty' in [statement.kind for statement in result.assumptions]
 
 
-def test_without_a_long_life_it_refuses() -> None:
+def test_without_long_tracks_it_refuses() -> None:
     options = Options(camera_height=8.0, method='paper', paper=PaperOptions(window_s=300.0))
     found = solve(synthetic_evidence(CLEAN, np.random.default_rng(0)), options)
     assert isinstance(found, Refusal) and found.code == 'too_few_tracks'

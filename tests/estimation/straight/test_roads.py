@@ -1,4 +1,4 @@
-"""The robust method on made-up traffic: perfect, noisy, and deliberately poisoned."""
+"""The robust method on synthetic traffic: noise-free, noisy and contaminated."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def test_perpendicularity_can_be_asserted() -> None:
     assert first @ second == pytest.approx(0.0, abs=1e-9)
 
 
-def test_an_asserted_angle_that_is_not_90_degrees_is_held() -> None:
+def test_an_asserted_angle_other_than_90_degrees_is_fixed() -> None:
     junction = Junction(road_angles_deg=(0.0, 70.0), vehicles=120)
     result = solved(junction, options=replace(OPTIONS, joint=JointOptions(road_angle='70')))
     assert isinstance(result, Calibration)
@@ -134,7 +134,7 @@ def test_a_focal_length_that_is_given_exactly_is_kept() -> None:
     assert result.camera.focal_px == 560.0
 
 
-def test_a_focal_length_given_with_a_spread_is_weighed() -> None:
+def test_a_focal_length_with_a_sigma_is_a_prior() -> None:
     options = replace(OPTIONS, joint=JointOptions(focal_prior_px=560.0, focal_sigma_px=1.0))
     result = solved(Junction(), options=options)
     assert isinstance(result, Calibration) and result.stddev.focal_px is not None
@@ -152,13 +152,13 @@ def test_a_distortion_free_lens_is_found_when_the_angle_of_the_roads_is_given() 
     assert normal_error_deg(result, junction) < 0.7
 
 
-def test_what_one_road_cannot_tell_is_held_and_said() -> None:
+def test_parameters_that_one_road_cannot_identify_are_fixed_and_reported() -> None:
     result = solved(ONE_ROAD)
     assert isinstance(result, Calibration)
     assert 'parameter_fixed' in [statement.kind for statement in result.assumptions]
 
 
-def test_ground_points_are_less_sure_farther_away() -> None:
+def test_ground_points_are_more_uncertain_farther_away() -> None:
     result = solved(Junction())
     assert isinstance(result, Calibration)
     near, middle, far = result.stddev.ground_point_m
@@ -166,7 +166,7 @@ def test_ground_points_are_less_sure_farther_away() -> None:
     assert 0.0 < near < middle < far < 4.0  # metres; a tenth of the distance at the most
 
 
-def test_one_road_gives_a_lens_and_says_why_there_is_no_plane() -> None:
+def test_one_road_gives_a_lens_and_the_refusal_of_a_plane() -> None:
     result = solved(ONE_ROAD)
     assert isinstance(result, Calibration)
     assert (result.grade, result.ground) == ('lens', None)
@@ -201,7 +201,7 @@ def test_traffic_that_only_turns_is_refused() -> None:
 
 
 @pytest.mark.parametrize('changing_share', [0.3, 0.4])
-def test_a_road_on_which_many_change_lanes_still_gives_the_lens(changing_share: float) -> None:
+def test_frequent_lane_changes_still_give_the_lens(changing_share: float) -> None:
     junction = replace(ONE_ROAD, lane_change_fraction=changing_share)
     result = solved(junction)
     assert isinstance(result, Calibration)
@@ -215,7 +215,7 @@ def test_a_ring_of_which_an_arc_passes_for_a_road_is_refused(points: int) -> Non
     assert isinstance(solved(ring), Refusal)
 
 
-def test_vehicles_of_one_track_each_do_not_tell_whether_they_keep_to_a_road() -> None:
+def test_vehicles_of_one_track_each_cannot_show_lane_keeping() -> None:
     _, evidence = draw_evidence('roundabout', 0, 8)  # two thirds of its tracks, the short ones, pass for straight
     assert isinstance(solve(evidence, OPTIONS), Refusal)
 
@@ -234,14 +234,14 @@ def test_too_few_tracks_are_refused_with_both_numbers() -> None:
     assert result.code == 'too_few_tracks' and '40 needed' in result.message
 
 
-def test_without_a_height_the_lens_still_comes() -> None:
+def test_without_a_height_the_lens_is_still_given() -> None:
     result = solved(Junction(), options=Options())
     assert isinstance(result, Calibration)
     assert result.ground is None and result.grade == 'lens'
     assert result.ground_refusal is not None and result.ground_refusal.code == 'no_height'
 
 
-def test_unit_scale_comes_only_when_asked_for() -> None:
+def test_unit_scale_needs_its_option() -> None:
     result = solved(Junction(), options=Options(allow_unit_scale=True))
     assert isinstance(result, Calibration) and result.ground is not None
     assert (result.grade, result.ground.metric, result.ground.height_m) == ('unit_scale', False, 1.0)
@@ -265,7 +265,7 @@ def test_standard_deviations_have_the_size_of_the_errors() -> None:
     assert 0.2 < np.sqrt(np.mean(np.square(errors))) < 2.0  # eight runs tell a factor of two, no more
 
 
-def test_a_half_without_tracks_is_said_not_to_be_cross_checked() -> None:
+def test_a_half_without_tracks_is_reported_as_not_cross_checked() -> None:
     tracks = select_tracks(synthetic_evidence(Junction(), np.random.default_rng(0)), 500)
     one_vehicle = replace(tracks, vehicles=np.zeros(len(tracks), int))  # then all of it is in the earlier half
     state = AdjustmentState(Junction().camera, Junction().camera_from_ground, np.array([0.0, np.pi / 2]))
