@@ -80,7 +80,8 @@ def test_ray_derivatives_match_finite_differences() -> None:
 
 def test_rays_stay_finite_at_the_principal_point() -> None:
     rays = unproject_rays(CAMERA, np.array(CAMERA.principal_point_px))
-    assert isinstance(rays, Rays) and np.isfinite(rays.distance_px(np.array([1.0, 0.0, 0.0])))
+    assert isinstance(rays, Rays)
+    assert np.isfinite(rays.distance_px(np.array([1.0, 0.0, 0.0])))
 
 
 def test_selection_respects_its_limit_and_spreads_over_vehicles() -> None:

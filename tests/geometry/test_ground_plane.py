@@ -93,4 +93,5 @@ def test_the_optical_axis_meets_the_ground_straight_ahead() -> None:
     camera = Camera(1280, 720, 560.0, (639.5, 359.5))
     ahead, left = ground_points(camera, POSE[:, 2], 8.0, np.array([camera.principal_point_px]))[0]
     tilt_deg, _ = tilt_and_roll_deg(POSE[:, 2])
-    assert ahead == pytest.approx(8.0 / np.tan(np.radians(tilt_deg))) and left == pytest.approx(0.0, abs=1e-9)
+    assert ahead == pytest.approx(8.0 / np.tan(np.radians(tilt_deg)))
+    assert left == pytest.approx(0.0, abs=1e-9)

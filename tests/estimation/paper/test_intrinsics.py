@@ -48,7 +48,8 @@ def test_published_filters_keep_the_longest_of_each_interval() -> None:
     assert len({len(interval.paths) for interval in intervals}) == 1
     for interval in intervals:
         lengths = [np.hypot(*(path[-1] - path[0])) for path in interval.paths]
-        assert len(lengths) <= 10 and lengths == sorted(lengths, reverse=True)
+        assert len(lengths) <= 10
+        assert lengths == sorted(lengths, reverse=True)
 
 
 def test_published_filters_drop_short_tracks() -> None:

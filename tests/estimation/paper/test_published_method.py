@@ -35,7 +35,8 @@ def test_the_ground_normal_is_found(result: Calibration) -> None:
 def test_published_quantities_are_reported(result: Calibration) -> None:
     assert result.paper is not None
     assert result.paper.focal_from_vanishing_points_px is not None
-    assert result.paper.translation_m is not None and result.paper.translation_m[2] > 8.0
+    assert result.paper.translation_m is not None
+    assert result.paper.translation_m[2] > 8.0
 
 
 def test_no_uncertainty_is_given(result: Calibration) -> None:
@@ -46,4 +47,5 @@ def test_no_uncertainty_is_given(result: Calibration) -> None:
 def test_without_long_tracks_it_refuses() -> None:
     options = Options(camera_height=8.0, method='paper', paper=PaperOptions(window_s=300.0))
     found = solve(synthetic_evidence(CLEAN, np.random.default_rng(0)), options)
-    assert isinstance(found, Refusal) and found.code == 'too_few_tracks'
+    assert isinstance(found, Refusal)
+    assert found.code == 'too_few_tracks'

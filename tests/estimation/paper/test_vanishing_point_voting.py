@@ -40,10 +40,11 @@ def test_orientation_peaks_are_separated() -> None:
     evidence = synthetic_evidence(Junction(camera_from_ground=pose(30.0, 0.0, 45.0)), np.random.default_rng(9))
     found = segment_orientations(Camera(1280, 720, 560.0, (639.5, 359.5)), evidence.segments_px, PaperOptions())
     first, second = found.peaks_deg
-    assert 25.0 <= abs((first - second + 90) % 180 - 90)
+    assert abs((first - second + 90) % 180 - 90) >= 25.0
     assert found.histogram.shape == (180, 2)
 
 
 def test_no_segments_have_no_peaks() -> None:
     found = segment_orientations(Camera(1280, 720, 560.0, (639.5, 359.5)), np.zeros((0, 4)), PaperOptions())
-    assert found.peaks_deg == () and vote_vanishing_points(found, 560.0, PaperOptions()).shape == (0, 2)
+    assert found.peaks_deg == ()
+    assert vote_vanishing_points(found, 560.0, PaperOptions()).shape == (0, 2)

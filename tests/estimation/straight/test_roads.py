@@ -137,7 +137,8 @@ def test_a_focal_length_that_is_given_exactly_is_kept() -> None:
 def test_a_focal_length_with_a_sigma_is_a_prior() -> None:
     options = replace(OPTIONS, joint=JointOptions(focal_prior_px=560.0, focal_sigma_px=1.0))
     result = solved(Junction(), options=options)
-    assert isinstance(result, Calibration) and result.stddev.focal_px is not None
+    assert isinstance(result, Calibration)
+    assert result.stddev.focal_px is not None
     assert result.camera.focal_px == pytest.approx(560.0, abs=3.0)  # 3 sigma of what is given
     assert 0.0 < result.stddev.focal_px <= 1.05
 
@@ -162,7 +163,9 @@ def test_ground_points_are_more_uncertain_farther_away() -> None:
     result = solved(Junction())
     assert isinstance(result, Calibration)
     near, middle, far = result.stddev.ground_point_m
-    assert near is not None and middle is not None and far is not None
+    assert near is not None
+    assert middle is not None
+    assert far is not None
     assert 0.0 < near < middle < far < 4.0  # metres; a tenth of the distance at the most
 
 
@@ -170,7 +173,8 @@ def test_one_road_gives_a_lens_and_the_refusal_of_a_plane() -> None:
     result = solved(ONE_ROAD)
     assert isinstance(result, Calibration)
     assert (result.grade, result.ground) == ('lens', None)
-    assert result.ground_refusal is not None and result.ground_refusal.code == 'one_direction'
+    assert result.ground_refusal is not None
+    assert result.ground_refusal.code == 'one_direction'
 
 
 @pytest.mark.parametrize('roll_deg', [-1.5, 0.0, 2.0])
@@ -190,7 +194,8 @@ def test_a_road_level_across_the_image_gives_no_plane_even_where_a_level_camera_
     junction = replace(ONE_ROAD, camera_from_ground=pose(32.0, 0.0, 90.0), centre_m=(16.0, 0.0))
     result = solved(junction, options=replace(OPTIONS, joint=JointOptions(roll_prior_deg=2.0)))
     if isinstance(result, Calibration):
-        assert result.ground is None and result.ground_refusal is not None
+        assert result.ground is None
+        assert result.ground_refusal is not None
         assert result.ground_refusal.code == 'plane_uncertain'
 
 
@@ -231,25 +236,30 @@ def test_a_lens_without_curvature_is_refused() -> None:
 def test_too_few_tracks_are_refused_with_both_numbers() -> None:
     result = solved(Junction(vehicles=5))
     assert isinstance(result, Refusal)
-    assert result.code == 'too_few_tracks' and '40 needed' in result.message
+    assert result.code == 'too_few_tracks'
+    assert '40 needed' in result.message
 
 
 def test_without_a_height_the_lens_is_still_given() -> None:
     result = solved(Junction(), options=Options())
     assert isinstance(result, Calibration)
-    assert result.ground is None and result.grade == 'lens'
-    assert result.ground_refusal is not None and result.ground_refusal.code == 'no_height'
+    assert result.ground is None
+    assert result.grade == 'lens'
+    assert result.ground_refusal is not None
+    assert result.ground_refusal.code == 'no_height'
 
 
 def test_unit_scale_needs_its_option() -> None:
     result = solved(Junction(), options=Options(allow_unit_scale=True))
-    assert isinstance(result, Calibration) and result.ground is not None
+    assert isinstance(result, Calibration)
+    assert result.ground is not None
     assert (result.grade, result.ground.metric, result.ground.height_m) == ('unit_scale', False, 1.0)
 
 
 def test_the_same_evidence_gives_the_same_answer_to_the_last_bit() -> None:
     first, second = solved(Junction()), solved(Junction())
-    assert isinstance(first, Calibration) and isinstance(second, Calibration)
+    assert isinstance(first, Calibration)
+    assert isinstance(second, Calibration)
     assert first.camera == second.camera
     np.testing.assert_array_equal(first.ground.rotation, second.ground.rotation)  # type: ignore[union-attr]
 
@@ -277,4 +287,5 @@ def test_a_half_without_tracks_is_reported_as_not_cross_checked() -> None:
 def test_a_moving_camera_is_refused() -> None:
     evidence: Evidence = replace(synthetic_evidence(Junction(), np.random.default_rng(0)), drift_px=12.0)
     result = solve(evidence, OPTIONS)
-    assert isinstance(result, Refusal) and result.code == 'camera_moving'
+    assert isinstance(result, Refusal)
+    assert result.code == 'camera_moving'
