@@ -45,3 +45,13 @@ def student_weight(residuals: np.ndarray, sigmas: np.ndarray) -> np.ndarray:
 def wrap_undirected(turns_rad: np.ndarray) -> np.ndarray:
     """Bring angles of undirected edges to within a quarter of a turn of 0."""
     return turns_rad - np.pi * np.rint(turns_rad / np.pi)
+
+
+def cauchy_weight(scaled_squares: np.ndarray) -> np.ndarray:
+    """Weight of residuals under the Cauchy kernel; `scaled_squares` are their squares over the squared scale."""
+    return 1.0 / (1.0 + scaled_squares)
+
+
+def cauchy_loss(scaled_squares: np.ndarray) -> np.ndarray:
+    """Loss of residuals under the Cauchy kernel, over the squared scale; its derivative is `cauchy_weight`."""
+    return np.log1p(scaled_squares)

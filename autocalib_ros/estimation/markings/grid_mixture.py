@@ -1,7 +1,7 @@
-"""Which lens and plane bring most lines to two directions square to each other, and to the upright one.
+"""Lens and plane that align most segments with two perpendicular directions on the road and the vertical one.
 
-A mixture of three peaks, each Student's distribution, and a uniform rest: shares and a scale of the noise are fitted,
-the lens, the plane and the angle between the two directions solved by damped Gauss-Newton steps.
+A mixture of three Student's t peaks and uniform outliers, as of a Manhattan frame. Fractions and a noise scale are
+fitted by expectation-maximisation; lens, plane and the angle between the two directions by damped Gauss-Newton steps.
 """
 
 from __future__ import annotations
@@ -19,67 +19,76 @@ from autocalib_ros.geometry.robust_kernels import student_density, student_weigh
 from autocalib_ros.lens.camera import Camera
 
 LINE_END_SIGMA_PX, MARKING_SIGMA_RAD = 0.4, np.radians(0.5)
-"""Standard deviation of an end of a line, across it, in the image; and of painted lines about their direction on the
-road. A scale for both is fitted."""
+"""Standard deviations before scaling: of an end point of a segment, across it, in pixels; and of the direction of
+markings on the road. Judgement."""
 RIGHT_ANGLE_SIGMA_RAD = np.radians(1.0)
-"""Standard deviation of the angle between the two directions from a right one: junctions are built to about that."""
+"""Standard deviation of the angle between the two directions from a right angle: junctions are built to about that."""
 POST_SIGMA_RAD = np.radians(1.0)
-"""Standard deviation of posts from the upright."""
+"""Standard deviation of posts from the vertical. Judgement."""
 MIN_NOISE_SCALE, MAX_NOISE_SCALE = 0.15, 2.0
+"""Limits of the noise scale."""
 MIN_DEPRESSION_SINE = 0.1
-"""Sine of the angle below the horizon from which on lines are on the road: ten heights of the camera away. What is
-farther is too foreshortened to tell from what stands there."""
+"""Sine of the smallest angle below the horizon for segments on the road, ten camera heights away. Farther ones are too
+foreshortened to be told from what stands there."""
 ANNEALING_ROUNDS, FINAL_ROUNDS, MAX_DAMPING_TRIALS = 8, 40, 8
+"""Iterations at each width of the annealing, iterations at the end, and trials of the damping in one iteration."""
 CONVERGED_STEP = 1e-5
+"""Largest component of a step at convergence."""
 START_FRACTIONS = np.array([0.35, 0.35, 0.1])[:, None]
+"""Initial fractions of the two directions and the vertical one."""
 MIN_DIRECTION_FRACTION, MAX_DIRECTION_FRACTION, MAX_ALIGNED_FRACTION = 0.02, 0.9, 0.95
+"""Limits of the fraction of one direction, and of their sum."""
 GRID_DERIVATIVE_STEP = 1e-5
+"""Step of the numerical derivatives."""
 LENS_CACHE_SIZE = 8
-"""Lenses whose sight is kept: that of a pose, and those a step of a parameter away. Most steps leave the lens."""
+"""Lenses whose projected segments are cached: that of a state, and those one parameter step away. Most steps keep the
+lens."""
 
 
 @dataclass(frozen=True)
 class MarkingGrid:
-    """A lens, and a plane with two directions in it, nearly square to each other, to which lines are parallel."""
+    """Lens, plane and two nearly perpendicular directions in it, with which segments are aligned."""
 
     prior: LensPrior
     camera: Camera
     rotation: np.ndarray
     """camera_from_plane, shape (3, 3): the first direction is x, the normal, up, is z."""
     skew_rad: float
-    """How much more than a quarter of a turn the second direction is from the first."""
+    """Angle between the two directions, minus pi / 2."""
     cost: float
-    """Negative logarithm of how probable the lines are, with the prior."""
+    """Negative log-posterior."""
     fractions: np.ndarray
-    """Of the lines along the two directions and the upright one, shape (3,)."""
+    """Fractions of the segments along the two directions and the vertical one, shape (3,)."""
     responsibilities: np.ndarray
-    """Probability of each line to be along each, shape (3, n)."""
+    """Probability of each segment to be along each direction, shape (3, n)."""
     laplace_term: float
-    """Half the logarithm of the determinant of the information: what Laplace's approximation adds to the cost."""
+    """Half the log-determinant of the information: the term that Laplace's approximation adds to the cost."""
     covariance: np.ndarray
-    """Of steps of the free parameters of the lens, turns of the plane about its axes, and `skew_rad`."""
+    """Covariance of steps of the free lens parameters, rotations of the plane about its axes, and `skew_rad`."""
 
     @property
     def negative_log_evidence(self) -> float:
-        """Negative logarithm of how probable the lines are under any lens and plane near this one."""
+        """Negative log-evidence, in nats, by Laplace's approximation."""
         return self.cost + self.laplace_term
 
 
-def annealed_costs(lines: RoadSegments, camera: Camera, planes: np.ndarray, width_rad: float) -> np.ndarray:
-    """Negative logarithm of how probable lines are with widened peaks, seen by a lens over planes (n, 3, 3); (n,)."""
-    projected, sigmas = ProjectedSegments.from_camera(camera, lines.ends_px), np.hypot(_noise_rad(lines), width_rad)
+def annealed_costs(segments: RoadSegments, camera: Camera, planes: np.ndarray, width_rad: float) -> np.ndarray:
+    """Negative log-likelihood of the segments with widened peaks, for one lens and planes (n, 3, 3); shape (n,)."""
+    projected = ProjectedSegments.from_camera(camera, segments.ends_px)
+    sigmas = np.hypot(_noise_rad(segments), width_rad)
     each = START_FRACTIONS * student_density(projected.residuals(planes.transpose(0, 2, 1)), sigmas)
     each[:, :2] *= (planes[:, :, 2] @ projected.bearings.T < -MIN_DEPRESSION_SINE)[:, None]
-    return -np.log(each.sum(axis=1) + (1.0 - START_FRACTIONS.sum()) / np.pi) @ lines.weights
+    return -np.log(each.sum(axis=1) + (1.0 - START_FRACTIONS.sum()) / np.pi) @ segments.weights
 
 
-def _noise_rad(lines: RoadSegments) -> np.ndarray:
-    return LINE_END_SIGMA_PX * np.sqrt(2.0) / lines.lengths_px
+def _noise_rad(segments: RoadSegments) -> np.ndarray:
+    """Standard deviation of the direction of each segment, from the noise of its ends, shape (n,)."""
+    return LINE_END_SIGMA_PX * np.sqrt(2.0) / segments.lengths_px
 
 
 @dataclass(frozen=True)
 class _GridState:
-    """What is solved for: a lens, and a plane with its two directions."""
+    """The estimated state: a lens, and a plane with its two directions."""
 
     camera: Camera
     rotation: np.ndarray
@@ -87,12 +96,12 @@ class _GridState:
 
     @property
     def directions(self) -> np.ndarray:
-        """The two directions, and the upright one, shape (3, 3)."""
+        """The two directions and the vertical one, shape (3, 3)."""
         along, across, up = self.rotation.T
         return np.stack([along, np.cos(self.skew_rad) * across - np.sin(self.skew_rad) * along, up])
 
     def moved(self, step: np.ndarray, prior: LensPrior) -> _GridState:
-        """Return the pose after a step of the lens, of turns about the axes of the plane, and of the angle."""
+        """Return the state after a step of the lens, of rotations about the axes of the plane, and of the skew."""
         lens = len(prior.free)
         return _GridState(
             prior.moved(self.camera, step[:lens]),
@@ -102,104 +111,113 @@ class _GridState:
 
 
 class _GridMixture:
-    """What poses make of lines, while shares and scale are fitted."""
+    """Likelihood of the segments given a state, and the fractions and noise scale that are fitted to them."""
 
-    def __init__(self, lines: RoadSegments, prior: LensPrior) -> None:
-        self.lines, self.prior, self.weights, self._noise = lines, prior, lines.weights, _noise_rad(lines)
+    def __init__(self, segments: RoadSegments, prior: LensPrior) -> None:
+        self.segments, self.prior, self.weights, self._noise = segments, prior, segments.weights, _noise_rad(segments)
         self.fractions, self.scale = START_FRACTIONS[:, 0], 1.0
-        self._through = lru_cache(maxsize=LENS_CACHE_SIZE)(
-            partial(ProjectedSegments.from_camera, ends_px=lines.ends_px)
+        self._project = lru_cache(maxsize=LENS_CACHE_SIZE)(
+            partial(ProjectedSegments.from_camera, ends_px=segments.ends_px)
         )
 
-    def residuals(self, pose: _GridState) -> np.ndarray:
-        """Of each direction, shape (3, n)."""
-        return self._through(pose.camera).residuals(pose.directions)
+    def residuals(self, state: _GridState) -> np.ndarray:
+        """Residuals from each direction, shape (3, n)."""
+        return self._project(state.camera).residuals(state.directions)
 
-    def sigmas(self, pose: _GridState, width_rad: float) -> np.ndarray:
-        """What is expected of them, shape (3, n)."""
-        leverages = self._through(pose.camera).leverages(pose.directions[:2], pose.rotation[:, 2])
-        askew = np.concatenate([MARKING_SIGMA_RAD * leverages, np.full((1, len(self.lines)), POST_SIGMA_RAD)])
-        return np.sqrt(self.scale**2 * (self._noise**2 + askew**2) + width_rad**2)
+    def sigmas(self, state: _GridState, width_rad: float) -> np.ndarray:
+        """Their standard deviations, shape (3, n)."""
+        leverages = self._project(state.camera).leverages(state.directions[:2], state.rotation[:, 2])
+        direction_sigmas = np.concatenate(
+            [MARKING_SIGMA_RAD * leverages, np.full((1, len(self.segments)), POST_SIGMA_RAD)]
+        )
+        return np.sqrt(self.scale**2 * (self._noise**2 + direction_sigmas**2) + width_rad**2)
 
-    def cost(self, pose: _GridState, sigmas: np.ndarray) -> tuple[float, np.ndarray]:
-        """Negative logarithm of the probability, and of each line to be along each direction, shape (3, n)."""
-        projected = self._through(pose.camera)
-        each = self.fractions[:, None] * student_density(projected.residuals(pose.directions), sigmas)
-        each[:2] *= projected.bearings @ pose.rotation[:, 2] < -MIN_DEPRESSION_SINE
+    def cost(self, state: _GridState, sigmas: np.ndarray) -> tuple[float, np.ndarray]:
+        """Negative log-posterior, and the responsibilities (3, n)."""
+        projected = self._project(state.camera)
+        each = self.fractions[:, None] * student_density(projected.residuals(state.directions), sigmas)
+        each[:2] *= projected.bearings @ state.rotation[:, 2] < -MIN_DEPRESSION_SINE
         density = each.sum(axis=0) + (1.0 - self.fractions.sum()) / np.pi
-        known = np.append(self.prior.deviations(pose.camera), pose.skew_rad / RIGHT_ANGLE_SIGMA_RAD)
-        return float(-np.log(density) @ self.weights + 0.5 * known @ known), each / density
+        deviations = np.append(self.prior.deviations(state.camera), state.skew_rad / RIGHT_ANGLE_SIGMA_RAD)
+        return float(-np.log(density) @ self.weights + 0.5 * deviations @ deviations), each / density
 
     def fit_fractions(self, responsibilities: np.ndarray) -> None:
-        """One round of maximisation for the shares."""
+        """Maximisation step of the fractions."""
         fractions = np.clip(
             responsibilities @ self.weights / self.weights.sum(), MIN_DIRECTION_FRACTION, MAX_DIRECTION_FRACTION
         )
         self.fractions = fractions * min(1.0, MAX_ALIGNED_FRACTION / fractions.sum())
 
     def fit_scale(self, responsibilities: np.ndarray, residuals: np.ndarray, sigmas: np.ndarray) -> None:
-        """One round of maximisation for the scale."""
-        squared, held = (residuals / sigmas) ** 2, responsibilities * self.weights
-        trusted = held * student_weight(residuals, sigmas) * squared
-        self.scale *= float(np.sqrt(trusted.sum() / max(held.sum(), 1e-12)))
+        """Maximisation step of the noise scale."""
+        squared, weights = (residuals / sigmas) ** 2, responsibilities * self.weights
+        robust_squares = weights * student_weight(residuals, sigmas) * squared
+        self.scale *= float(np.sqrt(robust_squares.sum() / max(weights.sum(), 1e-12)))
         self.scale = float(np.clip(self.scale, MIN_NOISE_SCALE, MAX_NOISE_SCALE))
 
     def linearised(
-        self, pose: _GridState, responsibilities: np.ndarray, sigmas: np.ndarray
+        self, state: _GridState, responsibilities: np.ndarray, sigmas: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Gradient (n, p) and information (n, p, p) of each line by the parameters, their weights aside."""
-        here, size = self.residuals(pose), len(self.prior.free) + 4
-        slopes = np.stack(
+        """Gradient (n, p) and information (n, p, p) of each segment by the parameters, before its weight."""
+        here, size = self.residuals(state), len(self.prior.free) + 4
+        jacobian = np.stack(
             [
-                wrap_undirected(self.residuals(pose.moved(GRID_DERIVATIVE_STEP * unit, self.prior)) - here)
+                wrap_undirected(self.residuals(state.moved(GRID_DERIVATIVE_STEP * unit, self.prior)) - here)
                 / GRID_DERIVATIVE_STEP
                 for unit in np.eye(size)
             ],
             axis=-1,
         )
-        pull = responsibilities * student_weight(here, sigmas) / sigmas**2
-        return (((pull * here)[..., None] * slopes).sum(axis=0), np.einsum('kn,kni,knj->nij', pull, slopes, slopes))
+        weights = responsibilities * student_weight(here, sigmas) / sigmas**2
+        return (
+            ((weights * here)[..., None] * jacobian).sum(axis=0),
+            np.einsum('kn,kni,knj->nij', weights, jacobian, jacobian),
+        )
 
-    def known(self, pose: _GridState) -> tuple[np.ndarray, np.ndarray]:
-        """Gradient (p,) and information (p,) of what is known before of lens and angle."""
+    def prior_terms(self, state: _GridState) -> tuple[np.ndarray, np.ndarray]:
+        """Gradient (p,) and information (p,) of the prior of lens and skew."""
         lens = len(self.prior.free)
         gradient, information = np.zeros(lens + 4), np.zeros(lens + 4)
-        gradient[:lens], information[:lens] = self.prior.deviations(pose.camera), self.prior.information
-        gradient[-1], information[-1] = pose.skew_rad / RIGHT_ANGLE_SIGMA_RAD**2, RIGHT_ANGLE_SIGMA_RAD**-2
+        gradient[:lens], information[:lens] = self.prior.deviations(state.camera), self.prior.information
+        gradient[-1], information[-1] = state.skew_rad / RIGHT_ANGLE_SIGMA_RAD**2, RIGHT_ANGLE_SIGMA_RAD**-2
         return gradient, information
 
 
 def refine_grid(
-    lines: RoadSegments, prior: LensPrior, camera: Camera, rotation: np.ndarray, widths_rad: tuple[float, ...]
+    segments: RoadSegments, prior: LensPrior, camera: Camera, rotation: np.ndarray, widths_rad: tuple[float, ...]
 ) -> MarkingGrid:
-    """Solve from a start: shares, scale, and damped Gauss-Newton steps on the mixture's probability."""
-    mixture, pose = _GridMixture(lines, prior), _GridState(camera, rotation)
+    """Solve from an initial lens and plane, annealing the widths of the peaks."""
+    mixture, state = _GridMixture(segments, prior), _GridState(camera, rotation)
     for width_rad in widths_rad:
         damping = 1e-3
         for _ in range(ANNEALING_ROUNDS if width_rad else FINAL_ROUNDS):
-            sigmas = mixture.sigmas(pose, width_rad)
-            mixture.fit_fractions(mixture.cost(pose, sigmas)[1])
+            sigmas = mixture.sigmas(state, width_rad)
+            mixture.fit_fractions(mixture.cost(state, sigmas)[1])
             if not width_rad:
-                mixture.fit_scale(mixture.cost(pose, sigmas)[1], mixture.residuals(pose), sigmas)
-                sigmas = mixture.sigmas(pose, width_rad)
-            stepped = _damped_step(mixture, pose, sigmas, damping)
+                mixture.fit_scale(mixture.cost(state, sigmas)[1], mixture.residuals(state), sigmas)
+                sigmas = mixture.sigmas(state, width_rad)
+            stepped = _damped_step(mixture, state, sigmas, damping)
             if stepped is None:
                 break
-            pose, size, damping = stepped
+            state, size, damping = stepped
             if size < CONVERGED_STEP:
                 break
-    sigmas = mixture.sigmas(pose, 0.0)
-    cost, responsibilities = mixture.cost(pose, sigmas)
-    gradients, curvatures = mixture.linearised(pose, responsibilities, sigmas)
-    _, known = mixture.known(pose)
-    covariance = jackknife_covariance(gradients, curvatures, lines.weights, np.zeros(len(lines)), lines.groups, known)
-    units = np.append(np.ones(len(known) - 1), RIGHT_ANGLE_SIGMA_RAD)
-    information = (np.tensordot(lines.weights, curvatures, 1) + np.diag(known + 1e-9)) * np.outer(units, units)
+    sigmas = mixture.sigmas(state, 0.0)
+    cost, responsibilities = mixture.cost(state, sigmas)
+    gradients, curvatures = mixture.linearised(state, responsibilities, sigmas)
+    _, prior_information = mixture.prior_terms(state)
+    covariance = jackknife_covariance(
+        gradients, curvatures, segments.weights, np.zeros(len(segments)), segments.groups, prior_information
+    )
+    units = np.append(np.ones(len(prior_information) - 1), RIGHT_ANGLE_SIGMA_RAD)
+    information = (np.tensordot(segments.weights, curvatures, 1) + np.diag(prior_information + 1e-9)) * np.outer(
+        units, units
+    )
     return MarkingGrid(
         prior,
-        pose.camera,
-        pose.rotation,
-        pose.skew_rad,
+        state.camera,
+        state.rotation,
+        state.skew_rad,
         cost,
         mixture.fractions,
         responsibilities,
@@ -209,18 +227,18 @@ def refine_grid(
 
 
 def _damped_step(
-    mixture: _GridMixture, pose: _GridState, sigmas: np.ndarray, damping: float
+    mixture: _GridMixture, state: _GridState, sigmas: np.ndarray, damping: float
 ) -> tuple[_GridState, float, float] | None:
-    """Return the pose after a step that lowers the cost, its size and the next damping; None where none does."""
-    cost, responsibilities = mixture.cost(pose, sigmas)
-    gradients, curvatures = mixture.linearised(pose, responsibilities, sigmas)
-    pull, known = mixture.known(pose)
-    gradient = mixture.weights @ gradients + pull
-    information = np.tensordot(mixture.weights, curvatures, 1) + np.diag(known)
+    """Return the state after a step that lowers the cost, its size and the next damping; None if no step does."""
+    cost, responsibilities = mixture.cost(state, sigmas)
+    gradients, curvatures = mixture.linearised(state, responsibilities, sigmas)
+    prior_gradient, prior_information = mixture.prior_terms(state)
+    gradient = mixture.weights @ gradients + prior_gradient
+    information = np.tensordot(mixture.weights, curvatures, 1) + np.diag(prior_information)
     for _ in range(MAX_DAMPING_TRIALS):
         damped = information + damping * np.diag(np.diag(information)) + 1e-9 * np.eye(len(gradient))
         step = np.clip(-np.linalg.solve(damped, gradient), -0.5, 0.5)
-        there = pose.moved(step, mixture.prior)
+        there = state.moved(step, mixture.prior)
         if mixture.cost(there, sigmas)[0] <= cost:
             return there, float(np.abs(step).max()), max(damping / 10.0, 1e-6)
         damping *= 10.0

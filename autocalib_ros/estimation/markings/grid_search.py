@@ -1,13 +1,12 @@
-"""Road markings: straight lines on the road that are parallel to one of two directions square to each other.
+"""Road markings: segments on the road that are parallel to one of two perpendicular directions.
 
-Lane lines, stop lines, the stripes of crosswalks, kerbs and slabs mostly are. So the lens and the plane are those that
-bring as many lines as can be to two directions in one plane, a quarter of a turn apart, and to the upright one, of
-posts: a mixture of three peaks and a uniform rest, as `edge_mixture.py` is of edges on vehicles. How an image line
-misses a direction is the angle, on the sphere about the camera, between the line and the way from its middle to where
-that direction vanishes. Lines are no more than chords of what the lens bends: in its middle a chord has the direction
-of the arc.
+Most lane lines, stop lines, stripes of crosswalks, kerbs and slabs are. So lens and plane are those that align most
+segments with two perpendicular directions in one plane, and with the vertical one of posts: a mixture of three peaks
+and uniform outliers, as in `edge_mixture.py` for edges of vehicles. The residual of a segment from a direction is the
+angle, on the unit sphere, between the segment and the great circle from its middle to the vanishing point. With lens
+distortion a segment is the chord of an arc: at its middle both have the same direction.
 
-That markings are square is an assumption. Where the traffic tells less than they do, it has to agree with them.
+Perpendicular markings are an assumption. Where the traffic constrains less than they do, both have to agree.
 """
 
 from __future__ import annotations
@@ -24,104 +23,107 @@ from autocalib_ros.geometry.great_circles import unproject_rays
 from autocalib_ros.lens.camera import Camera
 
 MAX_DISTANCE_TO_TRAFFIC_HEIGHTS = 0.5
-"""The same on the road, once the plane is known: a lane, for a camera as high as usual."""
+"""Largest distance from traffic on the plane, in camera heights: a lane, at the usual height."""
 GRID_FOCAL_DIAGONALS = np.geomspace(0.3, 1.6, 10)
-"""Focal lengths to start from, in image diagonals: half of the ratio of two is bridged by the widened peaks."""
+"""Initial focal lengths in image diagonals: annealing bridges half of the ratio between two."""
 GRID_TILTS_DEG = (5.0, 10.0, 16.0, 23.0, 31.0, 40.0, 50.0, 62.0)
 GRID_ROLLS_DEG = (-9.0, -4.5, 0.0, 4.5, 9.0)
 GRID_HEADINGS_DEG = tuple(range(0, 90, 6))
+"""Initial tilts and rolls of the plane, and headings of the grid: beyond 90 degrees the directions would swap."""
 ANNEALING_WIDTHS_RAD = (np.radians(3.0), np.radians(1.5), np.radians(0.7), 0.0)
-"""The peaks are widened by this, round by round, so that a start some degrees off still reaches the best solution."""
+"""Widening of the peaks, in rounds: initial values several degrees off still reach the best solution."""
 FOCAL_RETRY_RATIOS = (0.8, 0.87, 0.93, 1.07, 1.14, 1.22)
-"""Focal lengths to start from once more, in ones of the best solution: along focal length and distortion, which lines
-hardly tell apart, there are several solutions that single groups of lines hold in place."""
+"""Focal lengths for further attempts, relative to the best solution: focal length and distortion are nearly
+indistinguishable from segments, so there are several local minima, each held by a few groups."""
 MAX_GRID_STARTS = 6
+"""Most initial values that are refined."""
 MIN_EVIDENCE_GAIN_NATS = 4.5
-"""A rarer family of lenses is chosen when that makes the lines so much more probable: the logarithm, three sigmas."""
+"""Log-evidence by which a less usual lens family must be better: 3 sigma."""
 MIN_START_LOG_FOCAL, MIN_START_NORMAL_RAD = 0.3, np.radians(8.0)
-"""Starts differ by so much in the logarithm of the focal length, or in the normal."""
+"""Initial values differ by at least this in log focal length, or in the normal."""
 
 
-def find_grids(lines: RoadSegments, priors: list[LensPrior]) -> list[MarkingGrid]:
-    """Find lenses and planes under which lines are parallel to two directions square to each other, the best first.
+def find_grids(segments: RoadSegments, priors: list[LensPrior]) -> list[MarkingGrid]:
+    """Find lenses and planes with segments along two perpendicular directions, the best first.
 
-    From many starts with the first family of lenses, and from beside the best; the best of these with the others.
+    Multi-start with the first lens family, and again around the best; then the other families from the best.
     """
-    if not _is_determined(lines, priors[0]):
+    if not _is_determined(segments, priors[0]):
         return []
-    grids = [refine_grid(lines, priors[0], *start, ANNEALING_WIDTHS_RAD) for start in _best_starts(lines, priors[0])]
-    best = min(grids, key=lambda grid: grid.negative_log_evidence, default=None)
-    if best:
-        grids += _retry_focal_lengths(lines, best)
-        best = min(grids, key=lambda grid: grid.negative_log_evidence)
-    rarer = []
-    for prior in priors[1:] if best else []:
-        near = replace(prior.start(best.camera.focal_px), principal_point_px=best.camera.principal_point_px)
-        rarer.append(refine_grid(lines, prior, near, best.rotation, ANNEALING_WIDTHS_RAD))
+    grids = [
+        refine_grid(segments, priors[0], *start, ANNEALING_WIDTHS_RAD) for start in _best_starts(segments, priors[0])
+    ]
+    if not grids:
+        return []
+    grids += _retry_focal_lengths(segments, _most_probable(grids))
+    best = _most_probable(grids)
+    for prior in priors[1:]:
+        lens = replace(prior.start(best.camera.focal_px), principal_point_px=best.camera.principal_point_px)
+        grids.append(refine_grid(segments, prior, lens, best.rotation, ANNEALING_WIDTHS_RAD))
     return sorted(
-        [*grids, *rarer],
+        grids,
         key=lambda grid: grid.negative_log_evidence + (MIN_EVIDENCE_GAIN_NATS if grid.prior is not priors[0] else 0.0),
     )
 
 
-def find_grids_near(lines: RoadSegments, prior: LensPrior, camera: Camera, normal: np.ndarray) -> list[MarkingGrid]:
-    """Find those near a lens and a normal (3,), the best first."""
-    if not _is_determined(lines, prior):
+def _most_probable(grids: list[MarkingGrid]) -> MarkingGrid:
+    return min(grids, key=lambda grid: grid.negative_log_evidence)
+
+
+def find_grids_near(segments: RoadSegments, prior: LensPrior, camera: Camera, normal: np.ndarray) -> list[MarkingGrid]:
+    """Find grids near a given lens and normal (3,), the best first."""
+    if not _is_determined(segments, prior):
         return []
-    headings = _start_rotations(normal)
-    costs = annealed_costs(lines, camera, np.array(headings), ANNEALING_WIDTHS_RAD[1])
-    near = refine_grid(lines, prior, camera, headings[int(np.argmin(costs))], ANNEALING_WIDTHS_RAD[1:])
-    return sorted([near, *_retry_focal_lengths(lines, near)], key=lambda grid: grid.negative_log_evidence)
+    rotations = _start_rotations(normal)
+    costs = annealed_costs(segments, camera, np.array(rotations), ANNEALING_WIDTHS_RAD[1])
+    grid = refine_grid(segments, prior, camera, rotations[int(np.argmin(costs))], ANNEALING_WIDTHS_RAD[1:])
+    return sorted([grid, *_retry_focal_lengths(segments, grid)], key=lambda grid: grid.negative_log_evidence)
 
 
-def _retry_focal_lengths(lines: RoadSegments, best: MarkingGrid) -> list[MarkingGrid]:
-    """Solutions from other focal lengths than that of the best, if it is free."""
+def _retry_focal_lengths(segments: RoadSegments, best: MarkingGrid) -> list[MarkingGrid]:
+    """Return solutions from other focal lengths than the best one, if it is free."""
     prior = best.prior
-    return (
-        []
-        if prior.focal_known or not len(prior.free)
-        else [
-            refine_grid(
-                lines, prior, prior.start(ratio * best.camera.focal_px), best.rotation, ANNEALING_WIDTHS_RAD[-2:]
-            )
-            for ratio in FOCAL_RETRY_RATIOS
-        ]
-    )
+    if prior.focal_known or not len(prior.free):
+        return []
+    lenses = [prior.start(ratio * best.camera.focal_px) for ratio in FOCAL_RETRY_RATIOS]
+    return [refine_grid(segments, prior, lens, best.rotation, ANNEALING_WIDTHS_RAD[-2:]) for lens in lenses]
 
 
-def _is_determined(lines: RoadSegments, prior: LensPrior) -> bool:
-    """Whether there are more lines than unknowns."""
-    return len(lines) >= len(prior.free) + 4
+def _is_determined(segments: RoadSegments, prior: LensPrior) -> bool:
+    """Whether there are more segments than unknowns."""
+    return len(segments) >= len(prior.free) + 4
 
 
-def keep_lines_near_traffic(
-    lines: RoadSegments, grid: MarkingGrid, evidence: Evidence
+def keep_segments_near_traffic(
+    segments: RoadSegments, grid: MarkingGrid, evidence: Evidence
 ) -> tuple[RoadSegments, MarkingGrid] | None:
-    """Keep the lines that are beside traffic on the plane of a grid, and settle it with them; None where few are."""
-    places, points = (_on_plane(grid, pixels) for pixels in (traffic_cells(evidence), sample_segments(lines.ends_px)))
-    there = np.isfinite(points).all(axis=(1, 2))
-    kept = there & all_within(
-        np.where(there[:, None, None], points, 0.0),
-        places[np.isfinite(places).all(axis=1)],
+    """Keep the segments near traffic on the plane of a grid, and refine it with them; None if there are too few."""
+    traffic, points = (
+        _on_plane(grid, pixels) for pixels in (traffic_cells(evidence), sample_segments(segments.ends_px))
+    )
+    on_road = np.isfinite(points).all(axis=(1, 2))
+    kept = on_road & all_within(
+        np.where(on_road[:, None, None], points, 0.0),
+        traffic[np.isfinite(traffic).all(axis=1)],
         MAX_DISTANCE_TO_TRAFFIC_HEIGHTS,
     )
-    # posts stand anywhere
+    # vertical segments belong to posts, which may stand away from the traffic
     kept |= grid.responsibilities[2] > 0.5
-    if not _is_determined(lines.subset(kept), grid.prior):
+    near = segments.subset(kept)
+    if not _is_determined(near, grid.prior):
         return None
-    near = lines.subset(kept)
     return near, refine_grid(near, grid.prior, grid.camera, grid.rotation, ANNEALING_WIDTHS_RAD[-2:])
 
 
 def _on_plane(grid: MarkingGrid, pixels: np.ndarray) -> np.ndarray:
-    """Places (..., 2) of pixels (..., 2) on the plane in heights of the camera, nan where they are too far away."""
+    """Positions (..., 2) of pixels (..., 2) on the plane in camera heights, nan where they are too far away."""
     bearings = unproject_rays(grid.camera, pixels).bearings @ grid.rotation
     below = np.where(bearings[..., 2] < -MIN_DEPRESSION_SINE, -bearings[..., 2], np.nan)
     return bearings[..., :2] / below[..., None]
 
 
 def _start_planes() -> np.ndarray:
-    """camera_from_plane (n, 3, 3) of the planes to start from."""
+    """Initial planes, camera_from_plane (n, 3, 3)."""
     found = []
     for tilt in np.radians(GRID_TILTS_DEG):
         for roll in np.radians(GRID_ROLLS_DEG):
@@ -131,7 +133,7 @@ def _start_planes() -> np.ndarray:
 
 
 def _start_rotations(up: np.ndarray) -> list[np.ndarray]:
-    """camera_from_plane (3, 3) of planes with a normal (3,), turned about it."""
+    """Rotations camera_from_plane (3, 3) of a plane with normal (3,) and several headings."""
     right = np.cross([0.0, 0.0, 1.0], up)
     right /= max(np.linalg.norm(right), 1e-9)
     ahead = np.cross(up, right)
@@ -139,13 +141,14 @@ def _start_rotations(up: np.ndarray) -> list[np.ndarray]:
     return [np.column_stack([along, np.cross(up, along), up]) for along in first]
 
 
-def _best_starts(lines: RoadSegments, prior: LensPrior) -> list[tuple[Camera, np.ndarray]]:
-    """Lenses and planes whose widened peaks hold most, distinct."""
-    planes, found = _start_planes(), []
+def _best_starts(segments: RoadSegments, prior: LensPrior) -> list[tuple[Camera, np.ndarray]]:
+    """Initial lenses and planes with the lowest annealed cost, distinct."""
+    planes = _start_planes()
+    found: list[tuple[float, Camera, np.ndarray]] = []
     diagonal = np.hypot(prior.centre.width, prior.centre.height)
     for focal in [prior.centre.focal_px] if prior.focal_known else diagonal * GRID_FOCAL_DIAGONALS:
         camera = prior.start(focal)
-        costs = annealed_costs(lines, camera, planes, ANNEALING_WIDTHS_RAD[0])
+        costs = annealed_costs(segments, camera, planes, ANNEALING_WIDTHS_RAD[0])
         found += [
             (costs[index], camera, planes[index]) for index in np.argsort(costs, kind='stable')[: 5 * MAX_GRID_STARTS]
         ]

@@ -1,4 +1,4 @@
-"""Lens and plane by the markings of the road, and what speaks against them."""
+"""Lens and plane from road markings, and the checks on them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment, ev
 from autocalib_ros.estimation.adjustment.lens_prior import LensPrior
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig, AdjustmentState, Parameterisation
 from autocalib_ros.estimation.markings.grid_mixture import RIGHT_ANGLE_SIGMA_RAD, MarkingGrid
-from autocalib_ros.estimation.markings.grid_search import find_grids, find_grids_near, keep_lines_near_traffic
+from autocalib_ros.estimation.markings.grid_search import find_grids, find_grids_near, keep_segments_near_traffic
 from autocalib_ros.estimation.markings.road_segments import ProjectedSegments, RoadSegments, segments_on_road
 from autocalib_ros.estimation.observations.track_set import TrackSet
 from autocalib_ros.estimation.observations.two_frame_windows import no_windows
@@ -24,87 +24,92 @@ from autocalib_ros.results.refusals import Reason, reason
 from autocalib_ros.results.statements import Statement, assumption
 
 MIN_ALIGNED_FRACTION = 0.1
-"""Of the lines along either direction: by chance a few in a hundred are, and one road's own are along the other."""
+"""Fraction of the segments along either direction: by chance it is a few per cent, and a single road's own markings are
+along the other direction. Judgement."""
 MIN_PLACES, MIN_PLACES_CONFIRMED = 5, 3
-"""Places along either direction, and where the traffic tells lens and plane as well: a single stop line, or the shadow
-of a lamp post, may be askew."""
+"""Distinct groups along either direction, without and with confirmation by the traffic: a single stop line, or the
+shadow of a lamp post, may be askew. Judgement."""
 AMBIGUITY_NATS, MAX_AMBIGUITY_DEG = 5.0, 3.0
-"""Another plane, so far from the best, speaks against it when its probability is no less than e to the minus this of
-the best one's; and so does another focal length that is farther away than its deviation may be."""
+"""A second solution contradicts the best if its log-evidence is at most this much lower, and its plane differs by more
+than this angle, or its focal length by more than the accepted uncertainty. Judgement."""
+"""Code of the refusals made here."""
 MIN_VARIANCE = 1e-12
-"""Lines without noise, as tests make them, leave parameters without any spread."""
+"""Regularisation for segments without noise, as in tests."""
 MAX_SKEW_SIGMAS = 2.5
-"""Markings are square when the angle between them differs by no more from a right one."""
+"""Largest deviation from a right angle, in standard deviations of `RIGHT_ANGLE_SIGMA_RAD`. Judgement."""
 
 
 def fit_to_markings(
     evidence: Evidence, tracks: TrackSet, priors: list[LensPrior], config: AdjustmentConfig, gate: GateOptions
 ) -> tuple[Adjustment, Statement] | Reason:
-    """Estimate lens and plane from the lines on the road; with what was assumed in words, or a reason why not."""
-    every = segments_on_road(evidence)
-    grids = find_grids(every, priors)
-    nearer = _accepted_grid(every, grids, evidence, gate, MIN_PLACES)
-    if isinstance(nearer, Reason):
-        return nearer
-    lines, best = nearer
+    """Estimate lens and plane from segments on the road.
+
+    Returns the adjustment and its assumption in words, or the reason why not.
+    """
+    candidates = segments_on_road(evidence)
+    grids = find_grids(candidates, priors)
+    accepted = _accepted_grid(candidates, grids, evidence, gate, MIN_PLACES)
+    if isinstance(accepted, Reason):
+        return accepted
+    segments, best = accepted
     state = AdjustmentState(best.camera, best.rotation, np.array([0.0, np.pi / 2 + best.skew_rad]))
     fit = evaluate_at(state, tracks, replace(config, prior=best.prior, crossing_rad=None), best.covariance)
     if not fit.focal_sigma <= gate.max_sigma_focal_rel:
         return reason('no_markings', 'focal_length', sigma=min(fit.focal_sigma, 9.99), limit=gate.max_sigma_focal_rel)
-    return check_markings_view(fit, tracks) or (fit, _describe(lines, best))
+    return check_markings_view(fit, tracks) or (fit, _describe(segments, best))
 
 
 def refine_with_markings(
     fit: Adjustment, evidence: Evidence, tracks: TrackSet, prior: LensPrior, gate: GateOptions
 ) -> tuple[Adjustment, Statement] | Reason:
-    """Return the lens and plane near those of a solution to which the lines on the road lead, with its roads.
+    """Refine lens and plane of a solution with the segments on the road; its roads are kept.
 
-    With what was assumed in words, or a reason why not.
+    Returns the adjustment and its assumption in words, or the reason why not.
     """
     up, state = _upward_normal(fit), fit.state
-    every = segments_on_road(evidence)
-    grids = find_grids_near(every, prior, state.camera, up)
-    nearer = _accepted_grid(every, grids, evidence, gate, MIN_PLACES_CONFIRMED)
-    if isinstance(nearer, Reason):
-        return nearer
-    lines, grid = nearer
+    candidates = segments_on_road(evidence)
+    grids = find_grids_near(candidates, prior, state.camera, up)
+    accepted = _accepted_grid(candidates, grids, evidence, gate, MIN_PLACES_CONFIRMED)
+    if isinstance(accepted, Reason):
+        return accepted
+    segments, grid = accepted
     config = replace(fit.problem.config, prior=prior, windows=no_windows(), bundle=None)
     road, normal = state.rotation[:, 0], grid.rotation[:, 2] * np.sign(state.rotation[:, 2] @ grid.rotation[:, 2])
     along = road - (road @ normal) * normal
     along /= np.linalg.norm(along)
     rotation = np.column_stack([along, np.cross(normal, along), normal])
-    there = AdjustmentState(grid.camera, rotation, state.angles_rad)
-    parameters, lens = Parameterisation(there, config), len(prior.free)
+    refined = AdjustmentState(grid.camera, rotation, state.angles_rad)
+    parameters, lens = Parameterisation(refined, config), len(prior.free)
     covariance, angles = np.zeros((parameters.size, parameters.size)), len(parameters.free_angles)
-    # turns about the axes of the grid, as turns about those of the roads
-    turned = block_diag(np.eye(lens), parameters.axes @ rotation.T @ grid.rotation)
-    told = parameters.size - angles
-    covariance[:told, :told] = turned @ grid.covariance[:-1, :-1] @ turned.T
+    # rotations about the axes of the grid become rotations about the axes of the roads
+    to_roads = block_diag(np.eye(lens), parameters.axes @ rotation.T @ grid.rotation)
+    from_grid = parameters.size - angles
+    covariance[:from_grid, :from_grid] = to_roads @ grid.covariance[:-1, :-1] @ to_roads.T
     if angles:
         covariance[-angles:, -angles:] = fit.covariance[-angles:, -angles:]
-    return evaluate_at(there, tracks, config, covariance), _describe(lines, grid)
+    return evaluate_at(refined, tracks, config, covariance), _describe(segments, grid)
 
 
 def _upward_normal(fit: Adjustment) -> np.ndarray:
-    """The normal (3,) of a solution, to the side where the image's top is."""
+    """Ground normal (3,) of a solution, towards the top of the image."""
     normal = fit.state.rotation[:, 2]
     return -normal if normal[1] > 0 else normal
 
 
-def _describe(lines: RoadSegments, grid: MarkingGrid) -> Statement:
+def _describe(segments: RoadSegments, grid: MarkingGrid) -> Statement:
     """Return the assumption that lines along either axis of the grid are parallel or perpendicular."""
     aligned = grid.responsibilities[:2].max(axis=0) > 0.5
     return assumption(
         'lane_markings',
         lines=aligned.sum(),
-        places=len(np.unique(lines.groups[aligned])),
+        places=len(np.unique(segments.groups[aligned])),
         sigma_deg=np.degrees(RIGHT_ANGLE_SIGMA_RAD),
         angle_deg=90.0 + np.degrees(grid.skew_rad),
     )
 
 
 def condition_on_lens(fit: Adjustment) -> Adjustment:
-    """Return a fit with the deviations that it has for somebody who knows its lens."""
+    """Return a fit with its covariance conditioned on the lens."""
     lens, covariance = fit.problem.parameters.lens, np.zeros(fit.covariance.shape)
     information = np.linalg.inv(fit.covariance + MIN_VARIANCE * np.eye(len(covariance)))
     covariance[lens:, lens:] = np.linalg.inv(information[lens:, lens:])
@@ -112,24 +117,24 @@ def condition_on_lens(fit: Adjustment) -> Adjustment:
 
 
 def _accepted_grid(
-    every: RoadSegments, grids: list[MarkingGrid], evidence: Evidence, gate: GateOptions, min_places: int
+    candidates: RoadSegments, grids: list[MarkingGrid], evidence: Evidence, gate: GateOptions, min_places: int
 ) -> tuple[RoadSegments, MarkingGrid] | Reason:
-    """Return the lines beside traffic and the best grid by them, or what speaks against it."""
+    """Return the segments near traffic and the best grid from them, or the reason against it."""
     if not grids:
-        return reason('no_markings', lines=len(every))
-    nearer = keep_lines_near_traffic(every, grids[0], evidence)
-    if nearer is None:
+        return reason('no_markings', lines=len(candidates))
+    accepted = keep_segments_near_traffic(candidates, grids[0], evidence)
+    if accepted is None:
         return reason('no_markings', 'off_road')
-    return _check_ambiguity(every, grids, gate) or _check_axes(*nearer, min_places) or nearer
+    return _check_ambiguity(candidates, grids, gate) or _check_axes(*accepted, min_places) or accepted
 
 
-def _check_ambiguity(lines: RoadSegments, grids: list[MarkingGrid], gate: GateOptions) -> Reason | None:
-    """Say that another plane or lens suits the lines as well, if so."""
+def _check_ambiguity(segments: RoadSegments, grids: list[MarkingGrid], gate: GateOptions) -> Reason | None:
+    """Return a refusal if another plane or lens fits the segments as well."""
     best = grids[0]
     for other in grids[1:]:
         if other.negative_log_evidence > best.negative_log_evidence + AMBIGUITY_NATS:
             continue
-        difference_deg = _normal_difference_deg(lines, best, other)
+        difference_deg = _normal_difference_deg(segments, best, other)
         if difference_deg > MAX_AMBIGUITY_DEG:
             return reason('no_markings', 'two_planes', difference_deg=difference_deg)
         focals = sorted(grid.camera.focal_px for grid in (best, other))
@@ -138,26 +143,26 @@ def _check_ambiguity(lines: RoadSegments, grids: list[MarkingGrid], gate: GateOp
     return None
 
 
-def _normal_difference_deg(lines: RoadSegments, one: MarkingGrid, other: MarkingGrid) -> float:
-    """Angle between the normals of two grids, degrees, once their rays of the lines are turned onto each other.
+def _normal_difference_deg(segments: RoadSegments, one: MarkingGrid, other: MarkingGrid) -> float:
+    """Angle between the normals of two grids in degrees, after aligning their rays of the segments.
 
-    A principal point farther down is an axis that looks farther down: that is no other plane.
+    A lower principal point means an optical axis that looks farther down: that is not a different plane.
     """
     turn, _ = Rotation.align_vectors(
-        *(ProjectedSegments.from_camera(grid.camera, lines.ends_px).bearings for grid in (one, other))
+        *(ProjectedSegments.from_camera(grid.camera, segments.ends_px).bearings for grid in (one, other))
     )
     return unsigned_angle_deg(one.rotation[:, 2], turn.apply(other.rotation[:, 2]))
 
 
-def _check_axes(lines: RoadSegments, grid: MarkingGrid, min_places: int) -> Reason | None:
-    """Say that too little is along either of the two directions, or that these are not square, if so."""
-    places = min(len(np.unique(lines.groups[mask])) for mask in grid.responsibilities[:2] > 0.5)
-    share = grid.fractions[:2].min()
-    if share < MIN_ALIGNED_FRACTION or places < min_places:
+def _check_axes(segments: RoadSegments, grid: MarkingGrid, min_places: int) -> Reason | None:
+    """Return a refusal if too few segments are along one of the directions, or if these are not perpendicular."""
+    places = min(len(np.unique(segments.groups[mask])) for mask in grid.responsibilities[:2] > 0.5)
+    fraction = grid.fractions[:2].min()
+    if fraction < MIN_ALIGNED_FRACTION or places < min_places:
         return reason(
             'no_markings',
             'one_axis',
-            fraction=share,
+            fraction=fraction,
             places=places,
             limit=MIN_ALIGNED_FRACTION,
             limit_places=min_places,

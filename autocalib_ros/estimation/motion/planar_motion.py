@@ -1,8 +1,8 @@
-"""Planar rigid motion: between two instants a vehicle turns about the ground normal and moves along the ground.
+"""Planar rigid motion between two frames: rotation about the ground normal and translation along the ground.
 
-Its points obey an essential matrix E = [t]x R(turn) whose t lies in the ground plane: two unknowns for a window, the
-turn and the heading of t, while the lens and the ground normal are shared by all. It takes no straightness, no
-vanishing point and no height of a point above the road. Distances are Sampson's (Sampson 1982), in observed pixels.
+The points of a vehicle obey an essential matrix E = [t]x R(turn) with t in the ground plane: two unknowns a window,
+the turn and the heading of t, while lens and ground normal are shared by all. Straight paths, vanishing points and
+point heights are not needed. Residuals are Sampson distances (Sampson 1982) in observed pixels.
 """
 
 from __future__ import annotations
@@ -14,41 +14,45 @@ import numpy as np
 from autocalib_ros.config import JointOptions
 from autocalib_ros.estimation.observations.two_frame_windows import TwoFrameWindows
 from autocalib_ros.geometry.great_circles import Rays, unproject_rays
+from autocalib_ros.geometry.robust_kernels import cauchy_loss, cauchy_weight
 from autocalib_ros.geometry.small_matrices import dot
 from autocalib_ros.lens.camera import Camera
 
 START_TURNS_DEG = (0.0, 2.0, 4.5, 7.5, 11.0, 15.0, 20.0, 26.0, 33.0, 42.0, 52.0, 65.0, 80.0, 100.0)
-"""Turns to start from, to either side: dense where most vehicles are, and never far from any."""
+"""Initial turns, to either side: denser where turns are common, and close enough to any turn."""
 CAUCHY_SCALE = 2.0
-"""A point has half its influence when it is so many standard deviations off (Cauchy): groups hold strangers."""
+"""Standard deviations at which a point has half its weight (Cauchy kernel): windows contain points of other vehicles.
+Judgement."""
 WARM_START_ROUNDS = 5
-"""Rounds in which the motion of each window is solved when lens and plane have moved a little."""
+"""Iterations on the motion of each window after a small change of lens and plane."""
 DERIVATIVE_STEP = 1e-6
+"""Step of the numerical derivatives in radians."""
 MIN_TURN_DEG = 5.0
-"""Least turn in a window of a vehicle that is said to turn."""
+"""Smallest turn within a window that counts as turning. Judgement."""
 MAX_SIDE_SLIP_DEG, MAX_SIDE_SLIP_FRACTION = 4.0, 0.25
-"""A wheeled vehicle turns as its path does, to so many degrees and this share: the rest is a change of curvature."""
+"""A wheeled vehicle rotates as its path does. The difference within a window, from changes of curvature, is at most
+this many degrees plus this fraction of the turn. Judgement."""
 MAX_TURN_SIGMA_DEG = 2.0
-"""Largest standard deviation of a window's turn: one that is mostly noise turns and moves as it suits a wrong lens
-(Neyman & Scott 1948). What is sure is told by where its points lie, not by how it seems to turn."""
+"""Largest standard deviation of a window's turn. A turn that is mostly noise adapts to a wrong lens (Neyman & Scott
+1948). The standard deviation follows from where the points lie, not from the estimated turn. Judgement."""
 WALKING_SPEED_M_S = 2.5
-"""Who is slower may be on foot: no rigid body, and free to turn on the spot. A head, seen where its ray meets the road,
-seems faster by a quarter at the usual height."""
+"""Slower objects may be pedestrians: not rigid, and free to turn on the spot. A head, projected to the ground, appears
+a quarter faster at the usual camera height."""
 MAX_SEGMENT_TIME_DIFFERENCE_S = 1.0
-"""What windows of tracks say of a body's turning holds for segments within so long."""
+"""Windows of segments are classified by windows of tracks of the same body within this time."""
 MIN_DEPRESSION_RAD = 0.02
-"""Least angle below the horizon at which a point is placed on the road, radians."""
+"""Smallest angle below the horizon at which rays are intersected with the ground."""
 
 
 @dataclass(frozen=True)
 class PlanarMotion:
-    """Turn about the ground normal and heading of the translation in the plane, of each window (windows,)."""
+    """Motion of each window (windows,): turn about the ground normal, heading of the translation in the plane."""
 
     turn_rad: np.ndarray
     heading_rad: np.ndarray
 
     def moved(self, turn: np.ndarray | float, heading: np.ndarray | float) -> PlanarMotion:
-        """Return the motion changed by steps."""
+        """Return the motion after a step."""
         return PlanarMotion(self.turn_rad + turn, self.heading_rad + heading)
 
     def subset(self, keep: np.ndarray) -> PlanarMotion:
@@ -58,7 +62,7 @@ class PlanarMotion:
 
 @dataclass(frozen=True)
 class WindowRays:
-    """Windows as a camera over a plane sees them: bearings in the frame of the plane, z its normal."""
+    """Windows as rays: bearings in the frame of the plane, whose z axis is the normal."""
 
     first: Rays
     second: Rays
@@ -70,16 +74,16 @@ class WindowRays:
     def of(
         cls, windows: TwoFrameWindows, camera: Camera, camera_from_plane: np.ndarray, options: JointOptions
     ) -> WindowRays:
-        """See windows with a camera over a plane (3, 3)."""
+        """Unproject windows with a camera over a plane (3, 3)."""
         rays = unproject_rays(camera, np.stack([windows.first_px, windows.second_px]))
         first, second = (Rays(rays.bearings[at], rays.radial[at], rays.tangential[at]) for at in (0, 1))
-        way = np.hypot(*np.moveaxis(windows.second_px - windows.first_px, -1, 0))
-        # a followed point drifts as a random walk; half of its variance falls on either end
-        sigma = np.sqrt(options.noise_px**2 + 0.5 * options.drift_px**2 * way)
+        lengths = np.hypot(*np.moveaxis(windows.second_px - windows.first_px, -1, 0))
+        # a tracked point drifts as a random walk; each end gets half of the variance
+        sigma = np.sqrt(options.noise_px**2 + 0.5 * options.drift_px**2 * lengths)
         return cls(first, second, windows.mask, sigma).turned(camera_from_plane)
 
     def turned(self, rotation: np.ndarray) -> WindowRays:
-        """Return the view in a frame that is turned, old_from_new (3, 3)."""
+        """Return the rays in a rotated frame, old_from_new (3, 3)."""
         first, second = (
             Rays(rays.bearings @ rotation, rays.radial @ rotation, rays.tangential @ rotation)
             for rays in (self.first, self.second)
@@ -87,7 +91,7 @@ class WindowRays:
         return replace(self, first=first, second=second)
 
     def distances(self, motion: PlanarMotion) -> np.ndarray:
-        """Signed Sampson distance of each point in standard deviations, shape (windows, points); 0 off the mask."""
+        """Signed Sampson distances in standard deviations, shape (windows, points); 0 outside the mask."""
         cosine, sine = np.cos(motion.turn_rad)[:, None], np.sin(motion.turn_rad)[:, None]
         along, across = np.cos(motion.heading_rad)[:, None], np.sin(motion.heading_rad)[:, None]
         x, y, z = np.moveaxis(self.first.bearings, -1, 0)
@@ -95,9 +99,14 @@ class WindowRays:
         turned = (cosine * x - sine * y, sine * x + cosine * y)
         # the epipolar line of the first point, t x R a, and that of the second, R^T (b x t)
         line = np.stack([across * z, -along * z, along * turned[1] - across * turned[0]], axis=-1)
-        back = (-w * across, w * along)
+        line_back_xy = (-w * across, w * along)
         line_back = np.stack(
-            [cosine * back[0] + sine * back[1], cosine * back[1] - sine * back[0], u * across - v * along], axis=-1
+            [
+                cosine * line_back_xy[0] + sine * line_back_xy[1],
+                cosine * line_back_xy[1] - sine * line_back_xy[0],
+                u * across - v * along,
+            ],
+            axis=-1,
         )
         gradient2 = (
             dot(self.second.radial, line) ** 2
@@ -105,8 +114,8 @@ class WindowRays:
             + dot(self.first.radial, line_back) ** 2
             + dot(self.first.tangential, line_back) ** 2
         )
-        apart = u * line[..., 0] + v * line[..., 1] + w * line[..., 2]
-        return self.mask * apart / (np.sqrt(np.maximum(gradient2, 1e-18)) * self.sigma_px)
+        epipolar_error = u * line[..., 0] + v * line[..., 1] + w * line[..., 2]
+        return self.mask * epipolar_error / (np.sqrt(np.maximum(gradient2, 1e-18)) * self.sigma_px)
 
     def slopes(self, motion: PlanarMotion, here: np.ndarray) -> np.ndarray:
         """Derivatives of the distances `here` by turn and heading, shape (windows, points, 2)."""
@@ -130,7 +139,7 @@ def turn_sigma(view: WindowRays, motion: PlanarMotion) -> np.ndarray:
 
 
 def _normal_matrix(slopes: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, ...]:
-    """The three entries (windows,) of the weighted J^T J of slopes (windows, points, 2), weights (windows, points)."""
+    """Entries (windows,) of the weighted J^T J, of Jacobians (windows, points, 2) and weights (windows, points)."""
     return tuple((weight * slopes[..., i] * slopes[..., j]).sum(axis=1) for i, j in ((0, 0), (0, 1), (1, 1)))
 
 
@@ -142,64 +151,64 @@ def without_side_slip(
     camera_from_plane: np.ndarray,
     height_m: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Which windows show a vehicle that goes as it points, and which of them that it turns, shape (windows,) each.
+    """Return masks (windows,) of the windows without side slip, and of those among them that turn.
 
-    Two vehicles side by side that were taken for one seem to turn when one is faster, on straight paths. How far the
-    path of a point turns does not depend on its height.
+    Two vehicles side by side that are grouped as one seem to turn when one is faster, while their paths are straight.
+    The turn of a point's path does not depend on its height.
     """
     before, after, point_turns_deg = _chords_and_turns(windows, camera, camera_from_plane)
     path_deg, body_deg = _path_and_body_turns_deg(point_turns_deg, motion)
     path_sigma_deg = (point_turns_deg.std(axis=1) / np.sqrt(np.maximum(windows.mask.sum(axis=1), 1))).filled(0.0)
     sigma_deg = np.degrees(turn_sigma(view, motion))
-    alike = (
+    no_slip = (
         np.abs(body_deg - path_deg) < MAX_SIDE_SLIP_DEG + MAX_SIDE_SLIP_FRACTION * np.abs(path_deg) + 2.0 * sigma_deg
     )
-    sure = sigma_deg < MAX_TURN_SIGMA_DEG
-    way = np.hypot(*np.moveaxis(before, -1, 0)) + np.hypot(*np.moveaxis(after, -1, 0))
-    path_m = height_m * np.ma.median(np.ma.array(way, mask=~windows.mask), axis=1).filled(0.0)
-    driven = path_m > WALKING_SPEED_M_S * np.nan_to_num(windows.duration_s)
-    course = alike & sure & driven & ~windows.from_segments
-    turning = course & (np.abs(path_deg) > MIN_TURN_DEG + 2.0 * path_sigma_deg)
-    for row in np.flatnonzero(windows.from_segments & sure):
+    reliable = sigma_deg < MAX_TURN_SIGMA_DEG
+    lengths = np.hypot(*np.moveaxis(before, -1, 0)) + np.hypot(*np.moveaxis(after, -1, 0))
+    path_m = height_m * np.ma.median(np.ma.array(lengths, mask=~windows.mask), axis=1).filled(0.0)
+    fast_enough = path_m > WALKING_SPEED_M_S * np.nan_to_num(windows.duration_s)
+    without_slip = no_slip & reliable & fast_enough & ~windows.from_segments
+    turning = without_slip & (np.abs(path_deg) > MIN_TURN_DEG + 2.0 * path_sigma_deg)
+    for row in np.flatnonzero(windows.from_segments & reliable):
         near = (windows.bodies == windows.bodies[row]) & (
             np.abs(windows.times_s - windows.times_s[row]) < MAX_SEGMENT_TIME_DIFFERENCE_S
         )
         near &= ~windows.from_segments
-        course[row], turning[row] = (near & course).any(), (near & turning).any()
-    return course, turning
+        without_slip[row], turning[row] = (near & without_slip).any(), (near & turning).any()
+    return without_slip, turning
 
 
 def point_slip(windows: TwoFrameWindows, motion: PlanarMotion, camera: Camera, camera_from_plane: np.ndarray) -> float:
-    """By what share bodies that turn seem to turn less than their paths do, 0 where they do not.
+    """Return the fraction by which bodies seem to turn less than their paths, at least 0.
 
-    Followed points slide on a body that turns: those on its outline do not turn with it.
+    Tracked points slip on a turning body: points on its occluding contour do not turn with it.
     """
-    seen = np.flatnonzero(~windows.from_segments)
-    _, _, point_turns_deg = _chords_and_turns(windows.subset(seen), camera, camera_from_plane)
-    path_deg, body_deg = _path_and_body_turns_deg(point_turns_deg, motion.subset(seen))
+    from_tracks = np.flatnonzero(~windows.from_segments)
+    _, _, point_turns_deg = _chords_and_turns(windows.subset(from_tracks), camera, camera_from_plane)
+    path_deg, body_deg = _path_and_body_turns_deg(point_turns_deg, motion.subset(from_tracks))
     turned = np.abs(path_deg) > MIN_TURN_DEG
     return max(1.0 - float(np.median(body_deg[turned] / path_deg[turned])), 0.0) if turned.any() else 0.0
 
 
 def _path_and_body_turns_deg(point_turns_deg: np.ma.MaskedArray, motion: PlanarMotion) -> tuple[np.ndarray, np.ndarray]:
-    """How far the paths of windows turn, by the bends of their points (windows, points), and the bodies, degrees."""
+    """Turns of the paths, from those of their points (windows, points), and turns of the bodies, in degrees."""
     return np.ma.median(point_turns_deg, axis=1).filled(0.0), np.degrees(np.angle(np.exp(1j * motion.turn_rad)))
 
 
 def _chords_and_turns(
     windows: TwoFrameWindows, camera: Camera, camera_from_plane: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ma.MaskedArray]:
-    """Ways (windows, points, 2) on the plane to and from the middle, and how far each point's path turns, degrees."""
+    """Chords (windows, points, 2) on the plane to and from the middle, and the turn of each point's path in degrees."""
     first, middle, second = paths(windows, camera, camera_from_plane)
     before, after = middle - first, second - middle
     across = before[..., 0] * after[..., 1] - before[..., 1] * after[..., 0]
-    # chords from the first instant to the middle and on to the second differ by half of what the path turns
+    # the path turns by twice the angle between its two chords
     turn = 2.0 * np.degrees(np.arctan2(across, (before * after).sum(axis=-1)))
     return before, after, np.ma.array(turn, mask=~windows.mask)
 
 
 def paths(windows: TwoFrameWindows, camera: Camera, camera_from_plane: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Where the points of windows are on the plane, at three instants, in heights; shape (windows, points, 2) each."""
+    """Points of the windows on the plane at three instants, in camera heights; shape (windows, points, 2) each."""
     return tuple(
         _on_plane(unproject_rays(camera, np.nan_to_num(pixels)).bearings @ camera_from_plane)
         for pixels in (windows.first_px, windows.middle_px, windows.second_px)
@@ -209,11 +218,12 @@ def paths(windows: TwoFrameWindows, camera: Camera, camera_from_plane: np.ndarra
 def turning_centres(
     windows: TwoFrameWindows, camera: Camera, camera_from_plane: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Centre (windows, 2) about which each window of tracks turns, in heights, and its distance (windows,)."""
-    seen = windows.subset(np.flatnonzero(~windows.from_segments))
-    share = seen.mask / np.maximum(seen.mask.sum(axis=1, keepdims=True), 1)
+    """Turning centre (windows, 2) of each window of tracks, in camera heights, and its turning radius (windows,)."""
+    from_tracks = windows.subset(np.flatnonzero(~windows.from_segments))
+    point_weights = from_tracks.mask / np.maximum(from_tracks.mask.sum(axis=1, keepdims=True), 1)
     first, middle, second = (
-        (share[..., None] * places).sum(axis=1) for places in paths(seen, camera, camera_from_plane)
+        (point_weights[..., None] * positions).sum(axis=1)
+        for positions in paths(from_tracks, camera, camera_from_plane)
     )
     # the centre of the circle through three points
     a, b = middle - first, second - first
@@ -225,26 +235,26 @@ def turning_centres(
 
 
 def _on_plane(bearings: np.ndarray) -> np.ndarray:
-    """Where bearings (..., 3) in the frame of the plane meet it, in units of the camera's height, shape (..., 2)."""
-    away = bearings[..., 2:] * (np.sign(np.median(bearings[..., 2])) if bearings.size else 1.0)
-    return bearings[..., :2] / np.maximum(away, MIN_DEPRESSION_RAD)
+    """Intersect bearings (..., 3) in the frame of the plane with it, in camera heights, shape (..., 2)."""
+    depth = bearings[..., 2:] * (np.sign(np.median(bearings[..., 2])) if bearings.size else 1.0)
+    return bearings[..., :2] / np.maximum(depth, MIN_DEPRESSION_RAD)
 
 
 def robust_weight(distances: np.ndarray) -> np.ndarray:
-    """Influence of points by their distances in standard deviations: 1 at 0, a half at `CAUCHY_SCALE` (Cauchy)."""
-    return 1.0 / (1.0 + (distances / CAUCHY_SCALE) ** 2)
+    """Cauchy weight of distances in standard deviations: 1 at 0, a half at `CAUCHY_SCALE`."""
+    return cauchy_weight((distances / CAUCHY_SCALE) ** 2)
 
 
 def point_cost(distances: np.ndarray) -> np.ndarray:
-    """Sum over each window of the loss whose derivative is `robust_weight`, shape (windows,)."""
-    return CAUCHY_SCALE**2 * np.log1p((distances / CAUCHY_SCALE) ** 2).sum(axis=1)
+    """Cauchy loss summed over each window, shape (windows,); `robust_weight` is its weight."""
+    return CAUCHY_SCALE**2 * cauchy_loss((distances / CAUCHY_SCALE) ** 2).sum(axis=1)
 
 
 def initial_motion(view: WindowRays) -> PlanarMotion:
-    """Find each window's motion from nothing: the best of many turns, each with its best heading in closed form."""
+    """Initialise the motion of each window: the best of many turns, each with its best heading in closed form."""
     count = len(view.mask)
     best = np.full(count, np.inf)
-    found = PlanarMotion(np.zeros(count), np.zeros(count))
+    best_motion = PlanarMotion(np.zeros(count), np.zeros(count))
     for turn in np.radians([*START_TURNS_DEG, *(-turn for turn in START_TURNS_DEG[1:])]):
         rotated = view.first.bearings @ np.array(
             [[np.cos(turn), np.sin(turn), 0.0], [-np.sin(turn), np.cos(turn), 0.0], [0.0, 0.0, 1.0]]
@@ -261,14 +271,15 @@ def initial_motion(view: WindowRays) -> PlanarMotion:
         cost = point_cost(view.distances(trial))
         better = cost < best
         best = np.where(better, cost, best)
-        found = PlanarMotion(
-            np.where(better, trial.turn_rad, found.turn_rad), np.where(better, trial.heading_rad, found.heading_rad)
+        best_motion = PlanarMotion(
+            np.where(better, trial.turn_rad, best_motion.turn_rad),
+            np.where(better, trial.heading_rad, best_motion.heading_rad),
         )
-    return refined(view, found, 2 * WARM_START_ROUNDS)
+    return refined(view, best_motion, 2 * WARM_START_ROUNDS)
 
 
 def refined(view: WindowRays, motion: PlanarMotion, rounds: int = WARM_START_ROUNDS) -> PlanarMotion:
-    """Improve each window's motion by Levenberg-Marquardt rounds of its own."""
+    """Refine the motion of each window by Levenberg-Marquardt iterations."""
     damping = np.full(len(view.mask), 1e-4)
     here = view.distances(motion)
     cost = point_cost(here)

@@ -1,9 +1,9 @@
-"""Rigid bodies over their lives: bundle adjustment in which a vehicle moves in the plane, points fixed on it.
+"""Bundle adjustment of rigid bodies: each vehicle moves in the ground plane, with points fixed on it.
 
-Lengths are in units of the camera's height over the points' plane, which nothing here tells: a body has a size of its
-own, and lens and ground normal are the same whatever it is. Unknown of each life are the positions of its points at
-one instant, and where the body stands and how it is turned at the others; they are solved inside. Residuals are in
-observed pixels, whitened by what a followed point drifts.
+Lengths are in units of the camera height above the plane of the points. That scale is unobservable and irrelevant:
+each body has a size of its own, and lens and ground normal do not depend on it. The unknowns of a tracklet are the
+positions of its points at a reference instant, and the pose of the body at the other instants. They are eliminated
+from the adjustment of lens and plane. Residuals are in observed pixels, whitened by the drift of tracked points.
 """
 
 from __future__ import annotations
@@ -12,37 +12,41 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from autocalib_ros.estimation.observations.point_drift import drift_covariance, tracked_path_px
 from autocalib_ros.estimation.observations.tracklets import Tracklets
 from autocalib_ros.geometry.great_circles import unproject_rays
+from autocalib_ros.geometry.robust_kernels import cauchy_loss, cauchy_weight
 from autocalib_ros.lens.camera import Camera
 
 DERIVATIVE_STEP = 1e-6
+"""Step of the numerical derivatives, in camera heights."""
 START_DAMPING = 1e-4
-"""Of the first round, share of the diagonal."""
+"""Damping of the first iteration, as a fraction of the diagonal."""
 CAUCHY_SCALE, START_CAUCHY_SCALE = 2.0, 50.0
-"""A point has half its influence when it is so many standard deviations off (Cauchy): bodies hold strangers. And when a
-life is begun from a guess."""
+"""Standard deviations at which a point has half its weight (Cauchy kernel): bodies contain points of other vehicles.
+The second value is for the initialisation. Judgement."""
 START_MIN_DEPRESSION_RAD = 0.03
-"""Least angle below the horizon at which a point is placed on the road to begin with, radians."""
+"""Smallest angle below the horizon at which points are placed on the ground for the initial guess."""
 MIN_EIGENVALUE_FRACTION = 1e-7
-"""Eigenvalues below this share of the largest are of what a life does not show: unseen points, its size."""
+"""Smaller eigenvalues, relative to the largest, belong to what a tracklet does not constrain: unseen points, its
+size."""
 WARM_START_ROUNDS, COLD_START_ROUNDS = 1, 12
-"""Rounds in which lives are solved when lens and plane have moved a little, and from nothing."""
+"""Iterations on each tracklet after a small change of lens and plane, and from the initial guess."""
 
 
 @dataclass(frozen=True)
 class StructureAndMotion:
-    """What is unknown of each life, in the frame of the plane."""
+    """Unknowns of each tracklet, in the frame of the plane."""
 
     points: np.ndarray
-    """Positions of the points at the reference instant, shape (lives, points, 3)."""
+    """Positions of the points at the reference instant, shape (tracklets, points, 3)."""
     translations: np.ndarray
-    """Translation to each instant, shape (lives, instants, 2)."""
+    """Translation to each instant, shape (tracklets, instants, 2)."""
     turns_rad: np.ndarray
-    """Turn to each instant, shape (lives, instants)."""
+    """Rotation to each instant, shape (tracklets, instants)."""
 
     def stepped(self, step: np.ndarray) -> StructureAndMotion:
-        """Return the shapes moved by a step (lives, 3 points + 3 instants)."""
+        """Return the unknowns after a step (tracklets, 3 points + 3 instants)."""
         lives, points, _ = self.points.shape
         poses = step[:, 3 * points :].reshape(lives, -1, 3)
         return StructureAndMotion(
@@ -52,11 +56,11 @@ class StructureAndMotion:
         )
 
     def subset(self, keep: np.ndarray) -> StructureAndMotion:
-        """Return the shapes of the lives that `keep` selects."""
+        """Return the unknowns of the tracklets that `keep` selects."""
         return StructureAndMotion(self.points[keep], self.translations[keep], self.turns_rad[keep])
 
     def where(self, better: np.ndarray, other: StructureAndMotion) -> StructureAndMotion:
-        """Return these shapes with those lives (lives,) from the other."""
+        """Return these unknowns, with those of the other for the tracklets (tracklets,) where it is better."""
         return StructureAndMotion(
             np.where(better[:, None, None], other.points, self.points),
             np.where(better[:, None, None], other.translations, self.translations),
@@ -65,14 +69,11 @@ class StructureAndMotion:
 
 
 class TrackletBundle:
-    """Lives with what their residuals need, whatever the lens and the plane."""
+    """Tracklets with everything their residuals need that does not depend on lens and plane."""
 
     def __init__(self, lives: Tracklets, noise_px: float, drift_px: float) -> None:
         self.lives, self.mask, self._noise_px, self.drift_px = lives, lives.mask, noise_px, drift_px
-        steps = np.hypot(*np.moveaxis(np.diff(lives.pixels, axis=2), -1, 0))
-        steps = steps * (self.mask[..., 1:] & self.mask[..., :-1])
-        way = np.concatenate([np.zeros((*steps.shape[:2], 1)), np.cumsum(steps, axis=2)], axis=2)
-        covariance = drift_px**2 * np.minimum(way[..., :, None], way[..., None, :])
+        covariance = drift_covariance(tracked_path_px(lives.pixels, self.mask), drift_px)
         covariance *= self.mask[..., :, None] & self.mask[..., None, :]
         diagonal = np.arange(self.mask.shape[2])
         covariance[..., diagonal, diagonal] += np.where(self.mask, noise_px**2, 1.0)
@@ -80,26 +81,27 @@ class TrackletBundle:
         factors = np.linalg.inv(np.linalg.cholesky(covariance.reshape(-1, size, size))).reshape(covariance.shape)
         self.whiten = factors * self.mask[..., None, :] * self.mask[..., :, None]
         seen_points, seen_instants = self.mask.any(axis=2), self.mask.any(axis=1)
-        unknown = 3 * seen_points.sum(axis=1) + 3 * (seen_instants.sum(axis=1) - 1) - 1  # its size is free
-        self.dof = np.maximum(2 * self.mask.sum(axis=(1, 2)) - unknown, 1)
-        self.point_freedom = np.maximum(2 * self.mask.sum(axis=2) - 3, 1)
+        # one fewer, because the size of the body is free
+        unknowns = 3 * seen_points.sum(axis=1) + 3 * (seen_instants.sum(axis=1) - 1) - 1
+        self.dof = np.maximum(2 * self.mask.sum(axis=(1, 2)) - unknowns, 1)
+        self._point_dof = np.maximum(2 * self.mask.sum(axis=2) - 3, 1)
         self.reference = np.argmax(self.mask.sum(axis=1), axis=1)
-        """The instant of most points, at which the body's frame is the plane's, shape (lives,)."""
+        """The instant with most points, where the frame of the body is that of the plane, shape (tracklets,)."""
 
     def subset(self, keep: np.ndarray) -> TrackletBundle | None:
-        """Return the lives that `keep` selects, None where it selects none."""
+        """Return the tracklets that `keep` selects, None if it selects none."""
         lives = self.lives.subset(keep)
         return TrackletBundle(lives, self._noise_px, self.drift_px) if len(lives) else None
 
     def without_drift(self) -> TrackletBundle:
-        """Return the same lives of points that do not drift."""
+        """Return the same tracklets with points that do not drift."""
         return TrackletBundle(self.lives, self._noise_px, 0.0)
 
     def noise_cost(self, camera: Camera, camera_from_plane: np.ndarray, shapes: StructureAndMotion) -> float:
-        """Twice the negative logarithm of how probable the residuals of shapes near their best are.
+        """Return twice the negative log-likelihood of the residuals near the best fit.
 
-        The restricted likelihood (Patterson & Thompson 1971), scale fitted: shapes take up some of the noise, and
-        more of the one that wanders.
+        The likelihood is restricted (Patterson & Thompson 1971) and its scale is fitted: the unknowns absorb part of
+        the noise, and more of it if the noise is correlated.
         """
         shapes = self.refined(camera, camera_from_plane, shapes)
         residuals = self.residuals(camera, camera_from_plane, shapes)
@@ -115,7 +117,7 @@ class TrackletBundle:
         return float((self.dof * np.log(max(scale, 1e-9)) - 2.0 * density + volume).sum())
 
     def initial_guess(self, camera: Camera, camera_from_plane: np.ndarray) -> StructureAndMotion:
-        """Place points on the road and move them as a body from instant to instant: a guess to start from."""
+        """Guess the unknowns: points on the ground at first sight, moved as a rigid body from instant to instant."""
         bearings = unproject_rays(camera, self.lives.pixels).bearings @ camera_from_plane
         side = float(np.sign(np.median(bearings[..., 2][self.mask]))) if self.mask.any() else 1.0
         ground = bearings[..., :2] / np.maximum(side * bearings[..., 2:], START_MIN_DEPRESSION_RAD)
@@ -126,10 +128,9 @@ class TrackletBundle:
         shapes.points[..., 2] = side
         for tracklet in range(count):
             placed = np.full((points, 2), np.nan)
-            for instant in sorted(
-                np.flatnonzero(self.mask[tracklet].any(axis=0)),
-                key=lambda other, near=self.reference[tracklet]: abs(int(other) - int(near)),
-            ):
+            seen_instants = np.flatnonzero(self.mask[tracklet].any(axis=0))
+            nearest_first = np.argsort(np.abs(seen_instants - self.reference[tracklet]), kind='stable')
+            for instant in seen_instants[nearest_first]:
                 here, seen = ground[tracklet, :, instant], self.mask[tracklet, :, instant]
                 known = seen & np.isfinite(placed[:, 0])
                 turn, move = _rigid_transform(placed[known], here[known]) if known.sum() >= 2 else (0.0, np.zeros(2))
@@ -140,18 +141,18 @@ class TrackletBundle:
         return shapes
 
     def residuals(self, camera: Camera, camera_from_plane: np.ndarray, shapes: StructureAndMotion) -> np.ndarray:
-        """Whitened residuals (lives, points, instants, 2)."""
+        """Whitened residuals (tracklets, points, instants, 2)."""
         return self.whiten @ self.reprojection_errors_px(camera, camera_from_plane, shapes)
 
     def reprojection_errors_px(
         self, camera: Camera, camera_from_plane: np.ndarray, shapes: StructureAndMotion
     ) -> np.ndarray:
-        """From each observed pixel to where its point should be seen, shape (lives, points, instants, 2)."""
+        """Projected minus observed pixels, shape (tracklets, points, instants, 2)."""
         pixels, _ = camera.project(self._positions(shapes) @ camera_from_plane.T)
         return (pixels - self.lives.pixels) * self.mask[..., None]
 
     def _positions(self, shapes: StructureAndMotion) -> np.ndarray:
-        """Positions (lives, points, instants, 3) in the frame of the plane."""
+        """Positions of the points (tracklets, points, instants, 3) in the frame of the plane."""
         cosine, sine = np.cos(shapes.turns_rad)[:, None], np.sin(shapes.turns_rad)[:, None]
         x, y, z = (shapes.points[:, :, None, axis] for axis in range(3))
         right, ahead = (shapes.translations[:, None, :, axis] for axis in range(2))
@@ -160,29 +161,30 @@ class TrackletBundle:
         )
 
     def robust_weight(self, residuals: np.ndarray, cauchy_scale: float = CAUCHY_SCALE) -> np.ndarray:
-        """Influence (lives, points) of points by their mean squared residuals."""
-        return 1.0 / (1.0 + self._scaled_squares(residuals, cauchy_scale))
+        """Cauchy weight (tracklets, points) of the points by their mean squared residuals."""
+        return cauchy_weight(self._scaled_squares(residuals, cauchy_scale))
 
     def cost(self, residuals: np.ndarray, cauchy_scale: float = CAUCHY_SCALE) -> np.ndarray:
-        """Cost (lives,) whose influence is `robust_weight`."""
-        return (self.point_freedom * cauchy_scale**2 * np.log1p(self._scaled_squares(residuals, cauchy_scale))).sum(
+        """Cauchy loss (tracklets,) whose weight is `robust_weight`."""
+        return (self._point_dof * cauchy_scale**2 * cauchy_loss(self._scaled_squares(residuals, cauchy_scale))).sum(
             axis=1
         )
 
     def _scaled_squares(self, residuals: np.ndarray, cauchy_scale: float) -> np.ndarray:
-        return (residuals**2).sum(axis=(2, 3)) / self.point_freedom / cauchy_scale**2
+        """Mean squared residual of each point over the squared scale, shape (tracklets, points)."""
+        return (residuals**2).sum(axis=(2, 3)) / self._point_dof / cauchy_scale**2
 
     def slopes(
         self, camera: Camera, camera_from_plane: np.ndarray, shapes: StructureAndMotion
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Derivatives of the residuals by the unknowns of each life, and of the pixels by the positions.
+        """Derivatives of the residuals by the unknowns of each tracklet, and of the pixels by the positions.
 
-        Shapes (lives, points, instants, 2, 3 points + 3 instants) and (lives, points, instants, 2, 3).
+        Shapes (tracklets, points, instants, 2, 3 points + 3 instants) and (tracklets, points, instants, 2, 3).
         """
         placed = self._positions(shapes)
         in_camera = placed @ camera_from_plane.T
         here, _ = camera.project(in_camera)
-        # a step of a millionth of the distance, whatever the size of the body
+        # lengths are in camera heights, so one step suits bodies of any size
         by_place = (
             np.stack(
                 [camera.project(in_camera + DERIVATIVE_STEP * axis)[0] - here for axis in camera_from_plane.T], axis=-1
@@ -200,31 +202,31 @@ class TrackletBundle:
         for point in range(points):
             slopes[:, point, ..., 3 * point : 3 * point + 3] = by_point[:, point]
         poses = self.whiten[..., None, None] * by_pose[:, :, None]
-        # the body stands where it is at its reference instant
+        # the pose at the reference instant is fixed
         poses[np.arange(lives), :, :, self.reference] = 0.0
         slopes[..., 3 * points :] = np.moveaxis(poses, 3, 4).reshape(lives, points, instants, 2, -1)
         return slopes, by_place
 
     def _whitened(self, slopes: np.ndarray) -> np.ndarray:
-        """Whiten derivatives (lives, points, instants, 2, n) along the instants."""
+        """Whiten derivatives (tracklets, points, instants, 2, n) along the instants."""
         lives, points, instants = self.mask.shape
         return (self.whiten @ slopes.reshape(lives, points, instants, -1)).reshape(slopes.shape)
 
     def residual_changes(
         self, cameras: list[Camera], camera: Camera, camera_from_plane: np.ndarray, shapes: StructureAndMotion
     ) -> list[np.ndarray]:
-        """Whitened change (lives, points, instants, 2) of the residuals from one camera to each of others."""
+        """Whitened changes (tracklets, points, instants, 2) of the residuals from one camera to each of the others."""
         in_camera = self._positions(shapes) @ camera_from_plane.T
         here, _ = camera.project(in_camera)
         return [self.whiten @ ((other.project(in_camera)[0] - here) * self.mask[..., None]) for other in cameras]
 
     def rotation_jacobian(self, axis: np.ndarray, by_place: np.ndarray, shapes: StructureAndMotion) -> np.ndarray:
-        """Whitened derivative (lives, points, instants, 2) by a turn of the plane about an axis (3,) of its own."""
+        """Whitened derivative (tracklets, points, instants, 2) by rotation of the plane about its axis (3,)."""
         lever = np.cross(axis, self._positions(shapes))
         return self.whiten @ (by_place @ lever[..., None])[..., 0]
 
     def initialised(self, camera: Camera, camera_from_plane: np.ndarray) -> StructureAndMotion:
-        """Solve the lives from nothing: points are doubted only when heights, guessed at first, are found."""
+        """Solve from an initial guess; outliers are down-weighted only once point heights are estimated."""
         shapes = self.initial_guess(camera, camera_from_plane)
         for cauchy_scale in (START_CAUCHY_SCALE, CAUCHY_SCALE):
             shapes = self.refined(camera, camera_from_plane, shapes, COLD_START_ROUNDS, cauchy_scale)
@@ -238,14 +240,14 @@ class TrackletBundle:
         rounds: int = WARM_START_ROUNDS,
         cauchy_scale: float = CAUCHY_SCALE,
     ) -> StructureAndMotion:
-        """Improve the shapes by Levenberg-Marquardt rounds of each life's own."""
+        """Refine the unknowns by Levenberg-Marquardt iterations, each tracklet on its own."""
         damping = np.full(len(self.lives), START_DAMPING)
         here = self.residuals(camera, camera_from_plane, shapes)
         cost = self.cost(here, cauchy_scale)
         for _ in range(rounds):
             slopes, _ = self.slopes(camera, camera_from_plane, shapes)
-            own, weighted_system = self.weighted_system(slopes, here, cauchy_scale)
-            matrix, gradient = own.transpose(0, 2, 1) @ own, own.transpose(0, 2, 1) @ weighted_system[..., None]
+            own, weighted = self.weighted_system(slopes, here, cauchy_scale)
+            matrix, gradient = own.transpose(0, 2, 1) @ own, own.transpose(0, 2, 1) @ weighted[..., None]
             trial = shapes.stepped(-np.linalg.solve(damped(matrix, damping), gradient)[..., 0])
             there = self.residuals(camera, camera_from_plane, trial)
             cost_there = self.cost(there, cauchy_scale)
@@ -262,25 +264,26 @@ class TrackletBundle:
     def weighted_system(
         self, slopes: np.ndarray, residuals: np.ndarray, cauchy_scale: float = CAUCHY_SCALE
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Slopes (lives, residuals, n) and residuals (lives, residuals), each point by the root of its trust."""
+        """Jacobian (tracklets, residuals, n) and residuals (tracklets, residuals), times root weights."""
         root = np.sqrt(self.robust_weight(residuals, cauchy_scale))[:, :, None, None]
         count = len(self.lives)
         return ((slopes * root[..., None]).reshape(count, -1, slopes.shape[-1]), (residuals * root).reshape(count, -1))
 
 
 def damped(matrix: np.ndarray, damping: np.ndarray) -> np.ndarray:
-    """Matrices (lives, n, n) with a lifted diagonal: what is not seen, and the size of a body, stays as it is."""
+    """Damp the diagonal of matrices (tracklets, n, n); unseen points and the size of a body stay as they are."""
     diagonal = np.einsum('lii->li', matrix)
     lift = damping[:, None] * diagonal + 1e-9 * diagonal.max(axis=1, keepdims=True, initial=0.0) + 1e-9
     return matrix + lift[:, :, None] * np.eye(matrix.shape[1])
 
 
 def _rotation(angle_rad: float) -> np.ndarray:
+    """Rotation matrix (2, 2)."""
     return np.array([[np.cos(angle_rad), -np.sin(angle_rad)], [np.sin(angle_rad), np.cos(angle_rad)]])
 
 
 def _rigid_transform(before: np.ndarray, after: np.ndarray) -> tuple[float, np.ndarray]:
-    """Turn and translation that take points (n, 2) to others best (Kabsch 1976 in the plane)."""
+    """Rotation and translation that best align points (n, 2) with others (Kabsch 1976, in the plane)."""
     middle, other = before.mean(axis=0), after.mean(axis=0)
     first, second = before - middle, after - other
     turn = float(np.arctan2((first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]).sum(), (first * second).sum()))

@@ -1,4 +1,4 @@
-"""Which of the evidence is of vehicles."""
+"""Selection of the evidence that comes from vehicles."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from autocalib_ros.evidence.snapshot import Evidence, TrackKind
 
 
 def drop_pedestrians(evidence: Evidence) -> tuple[Evidence, np.ndarray]:
-    """Return the evidence without the tracks of people, and the indices (n,) of those that are left.
+    """Return the evidence without pedestrians and cyclists, and the indices (n,) of the tracks that are kept.
 
-    Who walks or cycles keeps to no lane, sways, and has nothing rigid: no model of a road or of a body is of them.
-    The published method takes the lens from every track; that is left to it.
+    They keep to no lane, sway and are not rigid, so no model of a road or a body fits them. The published method uses
+    every track and is given all of them.
     """
     kept = np.flatnonzero(evidence.track_kinds != TrackKind.PERSON)
     return (evidence if len(kept) == evidence.track_count else evidence.select_tracks(kept)), kept

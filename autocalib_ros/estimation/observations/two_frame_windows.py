@@ -1,7 +1,7 @@
-"""Windows: several points of one vehicle seen at the same two instants.
+"""Two-frame windows: several points of one vehicle, observed at the same two instants.
 
-Between the two a vehicle has moved as a rigid body on the road. Points that are near each other and move alike make
-up a body; what is grouped wrongly has to be borne by whoever uses a window.
+In between the vehicle has moved as a rigid body on the road. Points that are near each other and move alike are
+grouped as one body. Grouping errors occur; consumers must be robust to outlier points.
 """
 
 from __future__ import annotations
@@ -12,50 +12,50 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
-from autocalib_ros.estimation.observations.track_set import SAMPLES_PER_TRACK, count_earlier, kish_weight
+from autocalib_ros.estimation.observations.grouping import component_labels, farthest_points, group_indices, round_robin
+from autocalib_ros.estimation.observations.track_set import SAMPLES_PER_TRACK, kish_weight
 from autocalib_ros.evidence.snapshot import Evidence
 
 RESAMPLING_INTERVAL_S = 0.4
-"""Windows begin, end and have their middle at whole multiples of this."""
+"""Tracks are resampled at whole multiples of this; windows begin, end and have their middle there."""
 WINDOW_LENGTHS = (2, 4)
-"""In intervals, even: long enough that a vehicle turns by degrees, short enough that the same points are still seen."""
+"""Even numbers of intervals: long enough to turn by several degrees, short enough to keep the same points in view."""
 MIN_POINTS = 5
-"""A window's own motion takes two unknowns; fewer points say too little beyond."""
+"""The motion of a window has two unknowns; with fewer points little information is left."""
 MAX_NEIGHBOUR_DISTANCE = 0.06
-"""Points of one body lie within this of a neighbour, share of the image width."""
+"""Largest distance of a point of a body from its nearest neighbour, as a fraction of the image width. Judgement."""
 MIN_WINDOW_DISPLACEMENT = 0.01
-"""Shortest displacement in a window, share of the image width; below it is more noise than motion."""
+"""Smallest displacement within a window, as a fraction of the image width; below, noise dominates. Judgement."""
 MAX_MOTION_DIFFERENCE, MAX_MOTION_DIFFERENCE_PX = 0.25, 2.0
-"""Displacements of neighbours on one body differ by less than this share and so many pixels: it turns, and what is
-nearer or higher moves farther in the image."""
+"""Displacements of neighbours on one body differ by less than this fraction plus this many pixels: the body turns, and
+points that are nearer or higher move farther in the image. Judgement."""
 MIN_SHARED_TRACKS = 3
-"""Two windows with so many tracks in common are of one body."""
+"""Windows with this many tracks in common belong to the same body. Judgement."""
 MAX_TIME_DIFFERENCE_S = 0.6
-"""Segments belong to a body of tracks that is seen at their place within so long."""
+"""Segments belong to a body of tracks that is seen at the same place within this time."""
 
 
 @dataclass(frozen=True)
 class TwoFrameWindows:
-    """Windows in arrays of equal width; a window has a point where `mask` is true."""
+    """Windows as padded arrays; a window has a point where `mask` is true."""
 
     first_px: np.ndarray
-    """Observed pixels at the first instant, shape (windows, SAMPLES, 2)."""
+    """Observed pixels at the first instant, shape (windows, SAMPLES_PER_TRACK, 2)."""
     second_px: np.ndarray
-    """The same points at the second instant, shape (windows, SAMPLES, 2)."""
+    """The same points at the second instant, shape (windows, SAMPLES_PER_TRACK, 2)."""
     middle_px: np.ndarray
-    """The same points halfway in time, nan for segments, shape (windows, SAMPLES, 2)."""
+    """The same points halfway in time, nan for segments, shape (windows, SAMPLES_PER_TRACK, 2)."""
     mask: np.ndarray
-    """Shape (windows, SAMPLES)."""
+    """Shape (windows, SAMPLES_PER_TRACK)."""
     bodies: np.ndarray
-    """Which windows are of one body, shape (windows,)."""
+    """Number of the body of each window, shape (windows,)."""
     times_s: np.ndarray
     """Time of the middle of each window, shape (windows,)."""
     duration_s: np.ndarray
-    """Length of each window, nan for segments, shape (windows,)."""
+    """Duration of each window, nan for segments, shape (windows,)."""
     tracks: np.ndarray
-    """Index in the evidence of each point's track, -1 for segments, shape (windows, SAMPLES)."""
+    """Index in the evidence of each point's track, -1 for segments, shape (windows, SAMPLES_PER_TRACK)."""
 
     def __len__(self) -> int:
         return len(self.bodies)
@@ -75,7 +75,7 @@ class TwoFrameWindows:
 
     @property
     def from_segments(self) -> np.ndarray:
-        """Which windows are of segments, shape (windows,)."""
+        """Mask of the windows that come from segments, shape (windows,)."""
         return ~np.isfinite(self.middle_px[:, 0, 0])
 
     @property
@@ -84,34 +84,27 @@ class TwoFrameWindows:
         return kish_weight(self.bodies, 1.0)
 
     def balanced_subset(self, limit: int) -> TwoFrameWindows:
-        """Return at most `limit` windows, bodies in turn, those of most points and farthest motion first."""
-        way = np.hypot(*np.moveaxis(self.second_px - self.first_px, -1, 0)).mean(axis=1)
-        best_first = np.lexsort((-way, -self.mask.sum(axis=1)))
+        """Return at most `limit` windows, bodies in turn; first those with most points and largest motion."""
+        length = np.hypot(*np.moveaxis(self.second_px - self.first_px, -1, 0)).mean(axis=1)
+        best_first = np.lexsort((-length, -self.mask.sum(axis=1)))
         return self.subset(np.sort(round_robin(self.bodies, best_first)[:limit]))
 
 
-def round_robin(owners: np.ndarray, best_first: np.ndarray) -> np.ndarray:
-    """Order (n,) in which owners (n,) take turns, each with its best first; `best_first` is the order of merit (n,)."""
-    rank = np.empty(len(owners), int)
-    rank[best_first] = count_earlier(owners[best_first])
-    return np.argsort(rank, kind='stable')
-
-
 def no_windows() -> TwoFrameWindows:
-    """Return none at all."""
+    """Return an empty set of windows."""
     return _stack([], 0)
 
 
-def find_windows(evidence: Evidence, instants: ResampledTracks | None = None) -> TwoFrameWindows:
-    """Group the points of tracks, and the segments, into bodies at two instants."""
+def find_windows(evidence: Evidence, resampled: ResampledTracks | None = None) -> TwoFrameWindows:
+    """Group the points of tracks, and of segments, into bodies at two instants."""
     width = evidence.image_size[0]
-    groups = [*_track_groups(evidence, instants or ResampledTracks(evidence)), *_segment_groups(evidence)]
+    groups = [*_track_groups(evidence, resampled or ResampledTracks(evidence)), *_segment_groups(evidence)]
     return _stack(_split_into_bodies(groups, width), width)
 
 
 @dataclass(frozen=True)
 class _PointGroup:
-    """Points (n, 2) at two instants and halfway, with their tracks (n,), and the middle of the window."""
+    """Points (n, 2) at both instants and halfway, their tracks (n,), middle and duration of the window."""
 
     first: np.ndarray
     second: np.ndarray
@@ -127,20 +120,20 @@ class _PointGroup:
         )
 
 
-def _track_groups(evidence: Evidence, grid: ResampledTracks) -> Iterator[_PointGroup]:
-    """Points of what may be one vehicle, by the label that it was seen under."""
-    first_of_all = grid.begin.min(initial=0)
+def _track_groups(evidence: Evidence, resampled: ResampledTracks) -> Iterator[_PointGroup]:
+    """Group points of tracks by the vehicle label under which they were tracked."""
+    first_of_all = resampled.begin.min(initial=0)
     for length in WINDOW_LENGTHS:
         half = length // 2
-        # only instants that hold tracks: between two vehicles of a quiet road lie thousands that do not
-        steps, owners = _expand_ranges(
-            -((first_of_all - grid.begin) // half), (grid.end - length - first_of_all) // half
+        # visit only instants with tracks: a quiet road has thousands without
+        steps, ranges = _expand_ranges(
+            -((first_of_all - resampled.begin) // half), (resampled.end - length - first_of_all) // half
         )
         for together in group_indices(steps, MIN_POINTS):
-            begin, seen = first_of_all + steps[together[0]] * half, owners[together]
+            begin, seen = first_of_all + steps[together[0]] * half, ranges[together]
             for members in group_indices(evidence.track_vehicles[seen], MIN_POINTS):
                 tracks = seen[members]
-                first, middle, second = (grid.at(tracks, begin + step) for step in (0, half, length))
+                first, middle, second = (resampled.positions_at(tracks, begin + step) for step in (0, half, length))
                 yield _PointGroup(
                     first,
                     second,
@@ -152,14 +145,14 @@ def _track_groups(evidence: Evidence, grid: ResampledTracks) -> Iterator[_PointG
 
 
 def _expand_ranges(first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """List the numbers from `first` to `last` (owners,), both included, as numbers (n,) and their owners (n,)."""
+    """List the integers from `first` to `last` (ranges,), inclusive: the integers (n,) and their ranges (n,)."""
     counts = np.maximum(last - first + 1, 0)
-    owners = np.repeat(np.arange(len(counts)), counts)
-    return np.arange(len(owners)) + np.repeat(first - np.cumsum(counts) + counts, counts), owners
+    ranges = np.repeat(np.arange(len(counts)), counts)
+    return np.arange(len(ranges)) + np.repeat(first - np.cumsum(counts) + counts, counts), ranges
 
 
 def _segment_groups(evidence: Evidence) -> Iterator[_PointGroup]:
-    """Segments of one vehicle between the same two masked frames."""
+    """Group the segments of one vehicle between the same two masked frames."""
     _, instant = np.unique(evidence.segment_times_s, return_inverse=True)
     labels = instant.ravel() * (evidence.segment_vehicles.max(initial=0) + 1) + evidence.segment_vehicles
     for members in group_indices(labels, MIN_POINTS):
@@ -173,118 +166,99 @@ def _segment_groups(evidence: Evidence) -> Iterator[_PointGroup]:
         )
 
 
-def group_indices(labels: np.ndarray, least: int = 1) -> list[np.ndarray]:
-    """Indices of the members of each label (n,) that has at least so many, by rising label."""
-    order = np.argsort(labels, kind='stable')
-    parts = np.split(order, np.flatnonzero(np.diff(labels[order])) + 1)
-    return [part for part in parts if len(part) >= least]
-
-
 class ResampledTracks:
-    """Where tracks were at multiples of the interval."""
+    """Positions of the tracks at multiples of `RESAMPLING_INTERVAL_S`."""
 
     def __init__(self, evidence: Evidence) -> None:
         starts, ends = evidence.track_starts[:-1], evidence.track_starts[1:]
         self.begin = np.ceil(evidence.times_s[starts] / RESAMPLING_INTERVAL_S - 1e-9).astype(int)
         last = np.floor(evidence.times_s[ends - 1] / RESAMPLING_INTERVAL_S + 1e-9).astype(int)
-        self.end = np.where(ends - starts > 1, last, self.begin - 1)  # a single point is no way
+        self.end = np.where(ends - starts > 1, last, self.begin - 1)  # a single point has no path
         counts = np.maximum(self.end - self.begin + 1, 0)
         self._offset = np.concatenate([[0], np.cumsum(counts)])
         track = np.repeat(np.arange(len(counts)), counts)
         wanted = (self.begin[track] + np.arange(len(track)) - self._offset[track]) * RESAMPLING_INTERVAL_S
-        # one curve through all tracks, a second between one and the next
+        # one spline through all tracks, with a gap of 1 s between two
         steps = np.diff(evidence.times_s)
         steps[starts[1:] - 1] = 1.0
         along = np.concatenate([[0.0], np.cumsum(steps)])
-        # not along chords: a turning vehicle's lie inside its way by several pixels
-        way = (
+        # not linear: chords cut the curve of a turning vehicle by several pixels
+        curve = (
             CubicHermiteSpline(along, evidence.points_px, _velocities(along, evidence.points_px, starts, ends))
-            if (len(track))
+            if len(track)
             else np.zeros_like
         )
-        self._places = way(along[starts[track]] + wanted - evidence.times_s[starts[track]]).reshape(-1, 2)
+        self._places = curve(along[starts[track]] + wanted - evidence.times_s[starts[track]]).reshape(-1, 2)
 
-    def at(self, tracks: np.ndarray, instant: int) -> np.ndarray:
-        """Positions (n, 2) of tracks (n,) at a multiple of the interval."""
+    def positions_at(self, tracks: np.ndarray, instant: int) -> np.ndarray:
+        """Positions (n, 2) of tracks (n,) at one multiple of the interval."""
         return self._places[self._offset[tracks] + instant - self.begin[tracks]]
 
-    def all(self) -> tuple[np.ndarray, np.ndarray]:
-        """All positions (n, 2), track after track, and where each track begins there, with the end, (tracks + 1,)."""
+    def all_positions(self) -> tuple[np.ndarray, np.ndarray]:
+        """All positions (n, 2), track after track, and the offset of each track in them, with the end (tracks + 1,)."""
         return self._places, self._offset
 
 
-def _velocities(times: np.ndarray, places: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    """Velocity (n, 2) at each place (n, 2) of tracks: of the parabola through it and its neighbours in its track.
+def _velocities(times: np.ndarray, positions: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    """Velocity (n, 2) at each position (n, 2): from the parabola through it and its neighbours in the track.
 
-    A point is not noted again until it has moved on: a long step is one of standing, into which speed is not carried
-    (three times the chord's is what a cubic bears without turning back, Fritsch & Carlson 1980).
+    A point is recorded again only after it has moved: during a long step it stood still, so velocity is limited to
+    three times that of the chord, with which a cubic stays monotonic (Fritsch & Carlson 1980).
     """
     track = np.repeat(np.arange(len(starts)), ends - starts)
     middle = np.clip(np.arange(len(times)), starts[track] + 1, np.maximum(ends[track] - 2, starts[track] + 1))
     middle = np.minimum(middle, len(times) - 1)
-    slopes = np.diff(places, axis=0) / np.diff(times)[:, None]
-    after = np.where((ends - starts)[track] < 3, middle - 1, np.minimum(middle, len(slopes) - 1))  # of two: the chord
-    bend = (slopes[after] - slopes[middle - 1]) / (times[after + 1] - times[middle - 1])[:, None]
-    speeds = slopes[middle - 1] + bend * (2.0 * times - times[middle - 1] - times[middle])[:, None]
-    slowest = 3.0 * np.minimum(np.hypot(*slopes[middle - 1].T), np.hypot(*slopes[after].T))
-    return speeds * np.minimum(1.0, slowest / np.maximum(np.hypot(*speeds.T), 1e-9))[:, None]
+    slopes = np.diff(positions, axis=0) / np.diff(times)[:, None]
+    # a track of two points has only the slope of its chord
+    after = np.where((ends - starts)[track] < 3, middle - 1, np.minimum(middle, len(slopes) - 1))
+    curvature = (slopes[after] - slopes[middle - 1]) / (times[after + 1] - times[middle - 1])[:, None]
+    speeds = slopes[middle - 1] + curvature * (2.0 * times - times[middle - 1] - times[middle])[:, None]
+    max_speed = 3.0 * np.minimum(np.hypot(*slopes[middle - 1].T), np.hypot(*slopes[after].T))
+    return speeds * np.minimum(1.0, max_speed / np.maximum(np.hypot(*speeds.T), 1e-9))[:, None]
 
 
 def _split_into_bodies(groups: list[_PointGroup], width: int) -> list[_PointGroup]:
-    """Take groups apart into bodies: points near each other, at both instants, that move alike."""
+    """Split groups into bodies: connected points that are near each other at both instants and move alike."""
     edges, start = [np.zeros((2, 0), int)], 0
     for group in groups:
-        moves = group.second - group.first
-        far = np.hypot(moves[:, 0], moves[:, 1])
-        moving = far > MIN_WINDOW_DISPLACEMENT * width
+        displacements = group.second - group.first
+        length = np.hypot(displacements[:, 0], displacements[:, 1])
+        moving = length > MIN_WINDOW_DISPLACEMENT * width
         together = (
             (_pairwise_distances(group.first) < MAX_NEIGHBOUR_DISTANCE * width)
             & (_pairwise_distances(group.second) < MAX_NEIGHBOUR_DISTANCE * width)
             & (
-                _pairwise_distances(moves)
-                < MAX_MOTION_DIFFERENCE * np.maximum(far[:, None], far) + MAX_MOTION_DIFFERENCE_PX
+                _pairwise_distances(displacements)
+                < MAX_MOTION_DIFFERENCE * np.maximum(length[:, None], length) + MAX_MOTION_DIFFERENCE_PX
             )
             & moving[:, None]
             & moving
         )
         edges.append(np.array(np.nonzero(together)) + start)
-        start += len(far)
-    pairs = np.concatenate(edges, axis=1)
-    graph = coo_matrix((np.ones(pairs.shape[1], bool), pairs), shape=(start, start))
-    _, labels = connected_components(graph, directed=False)
+        start += len(length)
+    labels = component_labels(np.concatenate(edges, axis=1), start)
     starts = np.cumsum([0, *(len(group.tracks) for group in groups)])
     return [
-        group.subset(farthest_points(body, group.first))
+        group.subset(farthest_points(body, group.first, SAMPLES_PER_TRACK))
         for number, group in enumerate(groups)
         for body in group_indices(labels[starts[number] : starts[number + 1]], MIN_POINTS)
     ]
 
 
-def _pairwise_distances(places: np.ndarray) -> np.ndarray:
-    """Distances (n, n) between places (n, 2)."""
-    return np.hypot(places[:, None, 0] - places[:, 0], places[:, None, 1] - places[:, 1])
-
-
-def farthest_points(body: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Choose at most SAMPLES points of a body, each as far from those before as can be."""
-    if len(body) <= SAMPLES_PER_TRACK:
-        return body
-    chosen = [0]
-    distance = np.hypot(*(places[body] - places[body[0]]).T)
-    while len(chosen) < SAMPLES_PER_TRACK:
-        chosen.append(int(np.argmax(distance)))
-        distance = np.minimum(distance, np.hypot(*(places[body] - places[body[chosen[-1]]]).T))
-    return body[np.sort(chosen)]
+def _pairwise_distances(positions: np.ndarray) -> np.ndarray:
+    """Distances (n, n) between positions (n, 2)."""
+    return np.hypot(positions[:, None, 0] - positions[:, 0], positions[:, None, 1] - positions[:, 1])
 
 
 def _stack(groups: list[_PointGroup], width: int) -> TwoFrameWindows:
+    """Pad groups of at most `SAMPLES_PER_TRACK` points into arrays, and number their bodies."""
     count = len(groups)
     first, second, middle = (np.zeros((count, SAMPLES_PER_TRACK, 2)) for _ in range(3))
     mask, tracks = np.zeros((count, SAMPLES_PER_TRACK), bool), np.full((count, SAMPLES_PER_TRACK), -1)
     for row, group in enumerate(groups):
         points = len(group.tracks)
-        for array, places in ((first, group.first), (second, group.second), (middle, group.middle)):
-            array[row], array[row, :points] = places[0], places
+        for array, positions in ((first, group.first), (second, group.second), (middle, group.middle)):
+            array[row], array[row, :points] = positions[0], positions
         mask[row, :points], tracks[row, :points] = True, group.tracks
     times = np.array([group.time_s for group in groups])
     return TwoFrameWindows(
@@ -299,20 +273,19 @@ def _stack(groups: list[_PointGroup], width: int) -> TwoFrameWindows:
     )
 
 
-def _body_ids(tracks: np.ndarray, times: np.ndarray, places: np.ndarray, reach: float) -> np.ndarray:
-    """Number the bodies: windows of tracks by the tracks that they share, those of segments by time and place."""
+def _body_ids(tracks: np.ndarray, times: np.ndarray, positions: np.ndarray, max_distance: float) -> np.ndarray:
+    """Number the bodies: windows of tracks by shared tracks, windows of segments by time and place."""
     rows, columns = np.nonzero(tracks >= 0)
     members = coo_matrix(
         (np.ones(len(rows)), (rows, tracks[rows, columns])), shape=(len(tracks), int(tracks.max(initial=-1)) + 1)
     ).tocsr()
     common = (members @ members.T).tocoo()
     same = common.data >= MIN_SHARED_TRACKS
-    graph = coo_matrix((np.ones(same.sum()), (common.row[same], common.col[same])), shape=(len(tracks), len(tracks)))
-    _, labels = connected_components(graph, directed=False)
+    labels = component_labels(np.stack([common.row[same], common.col[same]]), len(tracks))
     of_tracks = np.flatnonzero(tracks[:, 0] >= 0)
     for row in np.flatnonzero(tracks[:, 0] < 0):
         near = of_tracks[np.abs(times[of_tracks] - times[row]) <= MAX_TIME_DIFFERENCE_S]
-        distance = np.hypot(*(places[near] - places[row]).T)
-        if distance.min(initial=np.inf) < reach:
+        distance = np.hypot(*(positions[near] - positions[row]).T)
+        if distance.min(initial=np.inf) < max_distance:
             labels[row] = labels[near[np.argmin(distance)]]
     return labels

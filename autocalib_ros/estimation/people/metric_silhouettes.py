@@ -1,6 +1,6 @@
-"""What moves has a size: outlines in the image become lengths across the line of sight and heights, in metres.
+"""Metric width and height of silhouettes that stand on the road.
 
-Azimuths about the upright through the camera do not depend on how high up a body is seen, nor on its height.
+Azimuths about the vertical through the camera do not depend on how high up a body is seen.
 """
 
 from __future__ import annotations
@@ -14,23 +14,23 @@ from autocalib_ros.lens.camera import Camera
 
 @dataclass(frozen=True)
 class SilhouetteSizes:
-    """Of outlines, in metres, each of shape (n,)."""
+    """Sizes of silhouettes in metres, each of shape (n,)."""
 
     azimuth: np.ndarray
-    """Of the middle, from straight ahead to the left."""
+    """Azimuth of the middle, from straight ahead to the left."""
     distance: np.ndarray
-    """From the camera's foot to where the lowest part stands on the road."""
+    """Distance from the camera's foot to the lowest point, on the road."""
     width: np.ndarray
-    """Across the line of sight, at that distance."""
+    """Width across the line of sight, at that distance."""
     height: np.ndarray
-    """Of what is upright there and reaches as far up in the image; deeper bodies seem higher."""
+    """Height of a vertical object there that reaches as far up in the image; depth adds to it."""
 
 
 def measure_silhouettes(
-    outlines_px: np.ndarray, camera: Camera, normal: np.ndarray, height_m: float
+    silhouettes_px: np.ndarray, camera: Camera, normal: np.ndarray, height_m: float
 ) -> SilhouetteSizes:
-    """Measure outlines (n, OUTLINE_COLUMNS), as `Outlines.ends_px`, of what stands on the road."""
-    bearings = camera.unproject(outlines_px[:, :-1].astype(float).reshape(-1, 2))[0].reshape(-1, 8, 3)
+    """Measure silhouettes (n, OUTLINE_COLUMNS), as in `Outlines.ends_px`, of objects that stand on the road."""
+    bearings = camera.unproject(silhouettes_px[:, :-1].astype(float).reshape(-1, 2))[0].reshape(-1, 8, 3)
     ahead = np.array([0.0, 0.0, 1.0]) - normal[2] * normal
     ahead /= np.linalg.norm(ahead)
     x, y, z = bearings @ ahead, bearings @ np.cross(normal, ahead), bearings @ normal

@@ -1,106 +1,99 @@
-"""Who walks or cycles: told from vehicles once lens and plane give speeds, ways and sizes in metres.
+"""Classify pedestrians and cyclists by metric size and speed, once lens and plane are known.
 
-The ground plane is then solved once more without them: they sway, keep to no lane and turn on the spot.
+The ground plane is then solved again without them: they sway, keep to no lane and turn on the spot.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
 from autocalib_ros.estimation.motion.planar_motion import WALKING_SPEED_M_S
-from autocalib_ros.estimation.observations.two_frame_windows import (
-    RESAMPLING_INTERVAL_S,
-    ResampledTracks,
-    group_indices,
-)
-from autocalib_ros.estimation.people.cyclists import MAX_RIDER_DISTANCE_HEIGHTS, cyclists
+from autocalib_ros.estimation.observations.grouping import group_indices
+from autocalib_ros.estimation.observations.two_frame_windows import RESAMPLING_INTERVAL_S
+from autocalib_ros.estimation.people.cyclists import find_cyclists
+from autocalib_ros.estimation.people.ground_positions import GroundPositions, project_tracks
 from autocalib_ros.evidence.snapshot import Evidence
-from autocalib_ros.geometry.ground_plane import ground_points
 from autocalib_ros.lens.camera import Camera
 
 MAX_PEDESTRIAN_WIDTH_M = 0.8
-"""Nobody is wider, seen from anywhere; a car is twice as wide. People in a group are."""
+"""Largest width of a pedestrian from any side; a car is twice as wide. Groups of people may be wider."""
 MIN_GROUP_PATH_M = 6.0
-"""A vehicle that goes on for as far as from one to the next in a queue gets faster than people walk."""
+"""A vehicle that moves this far, the distance between two in a queue, exceeds walking speed."""
 MIN_PATH_M = 2.0
-"""What was seen over a shorter way is not told: a vehicle that stops, or that leaves the view."""
+"""Shorter paths are not classified: a vehicle that stops or leaves the view. Judgement."""
 SPEED_INTERVALS = 3
-"""Of `RESAMPLING_INTERVAL_S`: the time over which speed is taken; the noise of the places is small over so long."""
+"""Intervals of `RESAMPLING_INTERVAL_S` over which speed is measured; position noise is small over that time."""
 FLOW_QUANTILE, MIN_FLOW_RATIO = 0.75, 2.0
-"""Traffic flows when this quantile of the highest speeds of all movers is so many times that of who walks."""
+"""Traffic is flowing if this quantile of the highest speeds of all objects exceeds this multiple of walking speed.
+Judgement."""
 
 
 @dataclass(frozen=True)
 class MovingObject:
-    """Something that moved, in metres on the road."""
+    """A moving object, in metres on the road."""
 
     speed_m_s: float
-    """Highest speed, 0 where it was seen too briefly."""
+    """Highest speed, 0 if it was seen too briefly."""
     width_m: float
-    """Across the line of sight, where two points and more of it are seen."""
+    """Width across the line of sight, where at least two of its points are seen."""
     path_m: float
-    """The farthest that one of its points went."""
+    """Largest displacement of any of its points."""
 
     def is_pedestrian(self, *, groups: bool) -> bool:
-        """Whether it is one who walks, or, where these can be told, several together."""
+        """Whether it is a pedestrian or, with `groups`, several pedestrians together."""
         slow = 0 < self.speed_m_s < WALKING_SPEED_M_S and self.path_m >= MIN_PATH_M
-        return slow and (self.width_m < MAX_PEDESTRIAN_WIDTH_M or groups and self.path_m >= MIN_GROUP_PATH_M)
+        return slow and (self.width_m < MAX_PEDESTRIAN_WIDTH_M or (groups and self.path_m >= MIN_GROUP_PATH_M))
 
 
 def people(evidence: Evidence, camera: Camera, normal: np.ndarray, height_m: float) -> np.ndarray:
-    """Numbers of those, of `evidence.track_vehicles`, that walk or cycle, ascending."""
+    """Return the pedestrians and cyclists among `evidence.track_vehicles`, ascending."""
     return np.union1d(
-        find_pedestrians(evidence, camera, normal, height_m), cyclists(evidence, camera, normal, height_m)
+        find_pedestrians(evidence, camera, normal, height_m), find_cyclists(evidence, camera, normal, height_m)
     )
 
 
 def find_pedestrians(evidence: Evidence, camera: Camera, normal: np.ndarray, height_m: float) -> np.ndarray:
-    """Numbers of those, of `evidence.track_vehicles`, that walk, ascending.
+    """Return the pedestrians among `evidence.track_vehicles`, ascending.
 
-    What is seen too briefly or too far away to be told counts as a vehicle. Groups are told by going on slowly, which
-    says nothing where all the traffic crawls.
+    What is seen too briefly or too far away counts as a vehicle. Groups are recognised by a long slow path, which
+    means nothing while all traffic crawls.
     """
-    instants = ResampledTracks(evidence)
-    pixels, starts = instants.all()
-    places = ground_points(camera, normal, height_m, pixels)
-    near = np.hypot(*places.T) < MAX_RIDER_DISTANCE_HEIGHTS * height_m
-    times = np.arange(len(places)) + np.repeat(instants.begin - starts[:-1], np.diff(starts))
-    paths = [np.arange(*ends)[near[slice(*ends)]] for ends in zip(starts[:-1], starts[1:], strict=True)]
+    ground = project_tracks(evidence, camera, normal, height_m)
+    paths = [np.arange(begin, end)[ground.near[begin:end]] for begin, end in pairwise(ground.offsets)]
     groups = group_indices(evidence.track_vehicles)
-    moving_objects = [_measure(places, times, [paths[track] for track in tracks]) for tracks in groups]
+    moving_objects = [_measure(ground, [paths[track] for track in tracks]) for tracks in groups]
     speeds = np.array([moving.speed_m_s for moving in moving_objects if moving.speed_m_s > 0])
-    flows = len(speeds) > 0 and bool(np.quantile(speeds, FLOW_QUANTILE) > MIN_FLOW_RATIO * WALKING_SPEED_M_S)
+    flowing = len(speeds) > 0 and bool(np.quantile(speeds, FLOW_QUANTILE) > MIN_FLOW_RATIO * WALKING_SPEED_M_S)
     return np.array(
         [
             evidence.track_vehicles[tracks[0]]
             for tracks, moving in zip(groups, moving_objects, strict=True)
-            if moving.is_pedestrian(groups=flows)
+            if moving.is_pedestrian(groups=flowing)
         ],
         int,
     )
 
 
-def _measure(places: np.ndarray, times: np.ndarray, paths: list[np.ndarray]) -> MovingObject:
-    """Measure what has some paths, indices of places (n, 2) on the road at times (n,) in intervals."""
-    speed, way = 0.0, 0.0
+def _measure(ground: GroundPositions, paths: list[np.ndarray]) -> MovingObject:
+    """Measure an object with some paths, each of them indices of positions on the road."""
+    positions, instants = ground.positions_m, ground.instants
+    speed, length = 0.0, 0.0
     for path in paths:
         if len(path) > SPEED_INTERVALS:
-            steps = np.hypot(*(places[path[SPEED_INTERVALS:]] - places[path[:-SPEED_INTERVALS]]).T)
-            speed = max(
-                speed,
-                float((steps / (times[path[SPEED_INTERVALS:]] - times[path[:-SPEED_INTERVALS]])).max())
-                / RESAMPLING_INTERVAL_S,
-            )
-            way = max(way, float(np.hypot(*(places[path[-1]] - places[path[0]]))))
+            before, after = path[:-SPEED_INTERVALS], path[SPEED_INTERVALS:]
+            steps = np.hypot(*(positions[after] - positions[before]).T)
+            speed = max(speed, float((steps / (instants[after] - instants[before])).max()) / RESAMPLING_INTERVAL_S)
+            length = max(length, float(np.hypot(*(positions[path[-1]] - positions[path[0]]))))
     own = np.concatenate(paths)
-    spans = [_width_across(places[own[together]]) for together in group_indices(times[own], 2)]
-    return MovingObject(speed, float(np.median(spans)) if spans else 0.0, way)
+    widths = [_width_across(positions[own[together]]) for together in group_indices(instants[own], 2)]
+    return MovingObject(speed, float(np.median(widths)) if widths else 0.0, length)
 
 
-def _width_across(places: np.ndarray) -> float:
-    """Width in metres across the line of sight of places (n, 2) on the road from the camera's foot."""
-    middle = places.mean(axis=0)
+def _width_across(positions: np.ndarray) -> float:
+    """Width in metres, across the line of sight, of positions (n, 2) on the road relative to the camera's foot."""
+    middle = positions.mean(axis=0)
     across = np.array([-middle[1], middle[0]]) / max(float(np.hypot(*middle)), 1e-9)
-    return float(np.ptp(places @ across))
+    return float(np.ptp(positions @ across))

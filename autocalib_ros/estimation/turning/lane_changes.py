@@ -1,7 +1,7 @@
-"""The rotation of the ground plane about a lone road, from vehicles that change lanes or merge.
+"""Rotation of the ground plane about a single road, from vehicles that change lanes or merge.
 
-Their ways lie in the plane as all ways do, and not along the road: a few degrees off it, so that one vehicle tells the
-rotation to tens of degrees, and hundreds to a few.
+Their paths lie in the plane but a few degrees off the road direction. One vehicle constrains the rotation to tens of
+degrees, hundreds constrain it to a few.
 """
 
 from __future__ import annotations
@@ -19,19 +19,20 @@ from autocalib_ros.estimation.observations.two_frame_windows import TwoFrameWind
 from autocalib_ros.geometry.great_circles import unproject_rays
 
 LANE_CHANGE_DEG = 1.5, 20.0
-"""A window is of a change of lanes when it leads aside from the road by more than drivers wander, and less than who
-turns off."""
+"""Range of the angle between path and road in a lane change: above the wander within a lane, below turning off.
+Judgement."""
 MIN_LANE_CHANGING_VEHICLES = 8
-"""Fewer may be wrong groups each."""
+"""Fewer vehicles may be groups of points from several vehicles. Judgement."""
 MAX_LANE_CHANGE_WINDOWS = 300
+"""Windows in one adjustment."""
 
 
 def refine_with_lane_changes(
     fit: Adjustment, tracks: TrackSet, windows: TwoFrameWindows
 ) -> tuple[Adjustment, int] | None:
-    """Solve again with the vehicles that leave their lanes on the one road of a solution; None where they are few.
+    """Adjust again with the vehicles that leave their lanes on the only road; None if there are too few.
 
-    With the number of those vehicles.
+    Returns the adjustment and the number of those vehicles.
     """
     if fit.plane_known or len(fit.state.angles_rad) != 1:
         return None
@@ -39,15 +40,17 @@ def refine_with_lane_changes(
     up = upward_normal(fit.state, config, unproject_rays(camera, tracks.pixels))
     plane = np.column_stack([road, np.cross(up, road), up])
     view = WindowRays.of(windows, camera, plane, config.options)
-    course, _ = without_side_slip(
+    without_slip, _ = without_side_slip(
         windows, view, initial_motion(view), camera, plane, config.height_m or DEFAULT_CAMERA_HEIGHT_M
     )
-    chosen = np.flatnonzero(course & ~windows.from_segments)
+    chosen = np.flatnonzero(without_slip & ~windows.from_segments)
     first, _, second = paths(windows.subset(chosen), camera, plane)
-    away = ~windows.mask[chosen]
-    along, aside = (np.ma.array((second - first)[..., axis], mask=away).mean(axis=1).filled(0.0) for axis in (0, 1))
-    off_deg = np.degrees(np.arctan2(np.abs(aside), np.abs(along)))
-    chosen = chosen[(off_deg > LANE_CHANGE_DEG[0]) & (off_deg < LANE_CHANGE_DEG[1])]
+    outside = ~windows.mask[chosen]
+    along, sideways = (
+        np.ma.array((second - first)[..., axis], mask=outside).mean(axis=1).filled(0.0) for axis in (0, 1)
+    )
+    angle_deg = np.degrees(np.arctan2(np.abs(sideways), np.abs(along)))
+    chosen = chosen[(angle_deg > LANE_CHANGE_DEG[0]) & (angle_deg < LANE_CHANGE_DEG[1])]
     vehicles = len(np.unique(windows.bodies[chosen]))
     if vehicles < MIN_LANE_CHANGING_VEHICLES:
         return None

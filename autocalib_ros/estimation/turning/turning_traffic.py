@@ -1,4 +1,4 @@
-"""Vehicles that turn: a solution from nothing but them, and those that a solution can use."""
+"""Lens and ground plane from turning vehicles, on their own or to refine another solution."""
 
 from __future__ import annotations
 
@@ -25,50 +25,57 @@ from autocalib_ros.estimation.verification.consistency import compare_solutions
 from autocalib_ros.results.refusals import Reason, reason
 
 START_FOCAL_DIAGONALS = (0.35, 0.55, 0.85)
-"""Focal lengths to start from, in image diagonals: lenses of about 100, 75 and 50 degrees across the diagonal."""
+"""Initial focal lengths in image diagonals: lenses of about 100, 75 and 50 degrees across the diagonal."""
 START_TILTS_DEG = (20.0, 45.0)
-"""Tilts of the optical axis below the horizontal to start from, without roll."""
+"""Initial tilts of the optical axis below the horizontal, without roll."""
 MAX_START_WINDOWS = 60
+"""Windows used in the multi-start."""
 MAX_TURNING_WINDOWS, MAX_TRACKLETS = 300, 100
+"""Windows and tracklets in one adjustment."""
 MAX_CENTRE_SPREAD = 0.5
-"""Vehicles that all turn about one centre show it by half of them lying within this share of their radius of it."""
+"""Largest median distance of the turning centres from their common centre, in median turning radii, for which all
+vehicles count as turning about one point. Judgement."""
 MAX_SIGMA_FOCAL_ONE_CENTRE = 0.02
-"""Largest relative standard deviation of a focal length that rests on one centre. What noise biases grows as its
-variance does, and faster than the deviation: on simulated rings they are alike at 2.5 %, a half of it at 1.5 %."""
+"""Largest accepted relative standard deviation of the focal length if all vehicles turn about one point. The bias from
+noise grows with the variance, so faster than the standard deviation: on simulated roundabouts both are equal at 2.5 %,
+and the bias is half the standard deviation at 1.5 %."""
 MAX_TRACKLET_DIFFERENCE_SIGMAS = 3.0
-"""Standard deviations of the less sure one by which solutions by windows and by lives may differ."""
+"""Largest difference between the solutions from windows and from tracklets, in standard deviations of the less certain.
+Judgement."""
 MAX_RESTARTS = 4
-"""Most times that lives are begun anew."""
+"""Most rounds of re-initialising tracklets."""
 MIN_RESTART_GAIN = 1.0
-"""A life begun anew is another one when its cost is lower by this: twice the negative logarithm of a probability."""
+"""Cost decrease for which a re-initialised tracklet replaces the old one. Cost is twice the negative log-likelihood.
+Judgement."""
 POINT_SLIP_SIGMA_FOCAL = 0.4
-"""Relative standard deviation of a focal length by turning traffic, for all of the turn that sliding points take away:
-it was off by 0.2 and 0.7 of that on two rendered roundabouts."""
+"""Relative standard deviation of the focal length for a point slip of 1, that is all of the turn lost. On two rendered
+roundabouts the focal length was wrong by 0.2 and 0.7 of the slip."""
 MIN_TURNING_VEHICLES = 8
-"""So many vehicles that turn, distinct, make up evidence; fewer may be one driver's whim or a wrong group each."""
+"""Fewest distinct vehicles that turn; fewer may be one unusual manoeuvre, or groups of points from several vehicles.
+Judgement."""
 
 
 def fit_turning_traffic(tracks: TrackSet, windows: TwoFrameWindows, config: AdjustmentConfig) -> Adjustment | None:
-    """Solve for lens and plane from the motion of vehicles alone, from several starts; None where too few turn."""
-    nothing = tracks.subset(np.zeros(0, int))
+    """Estimate lens and plane from turning vehicles alone, by multi-start; None if too few vehicles turn."""
+    no_tracks = tracks.subset(np.zeros(0, int))
     few = replace(config, windows=windows.balanced_subset(MAX_START_WINDOWS))
     if len(np.unique(few.windows.bodies)) < MIN_TURNING_VEHICLES:
         return None
     centre = config.prior.centre
     diagonal = np.hypot(centre.width, centre.height)
-    lenses = [config.prior.start(diagonal * share) for share in START_FOCAL_DIAGONALS]
+    lenses = [config.prior.start(diagonal * ratio) for ratio in START_FOCAL_DIAGONALS]
     starts = [
         AdjustmentState(lens, _level_plane(tilt), np.zeros(0))
         for lens in (lenses[:1] if config.prior.focal_known else lenses)
         for tilt in START_TILTS_DEG
     ]
-    best = select_model([adjust(start, nothing, few) for start in starts], nothing)
-    turning = refine_with_turning(best, nothing, windows)
+    best = select_model([adjust(start, no_tracks, few) for start in starts], no_tracks)
+    turning = refine_with_turning(best, no_tracks, windows)
     return refine_with_turning(turning, tracks, windows) if turning else None
 
 
 def refine_with_turning(fit: Adjustment, tracks: TrackSet, windows: TwoFrameWindows) -> Adjustment | None:
-    """Solve again with the vehicles that turn in the plane of a solution; None where they are too few."""
+    """Adjust again with the vehicles that turn in the plane of a solution; None if there are too few."""
     chosen = _turning_windows(fit, windows)
     if chosen is None:
         return None
@@ -80,38 +87,28 @@ def refine_with_turning(fit: Adjustment, tracks: TrackSet, windows: TwoFrameWind
 def refine_with_tracklets(
     fit: Adjustment, tracks: TrackSet, windows: TwoFrameWindows, instants: ResampledTracks
 ) -> tuple[Adjustment, AdjustmentState | None]:
-    """Solve a last time with those vehicles over their lives, where they are followed, and how they correlate.
+    """Run the final adjustment with tracklets where there are any, and with correlated errors within each vehicle.
 
-    Windows and lives are cut from the same tracks: solutions by the one and by the other that differ by more than
-    either knows mean that one of the two models is wrong. Then windows stand, which assume less, and the state that
-    lives lead to comes with them.
+    Windows and tracklets come from the same tracks. If their solutions differ by more than their uncertainty, one of
+    the two models is wrong: then the window solution is returned, which assumes less, together with the state from the
+    tracklets.
     """
     config = replace(fit.problem.config, vehicle_correlation=fit.vehicle_correlation)
-    chosen = _turning_windows(fit, windows) if config.turning else None
-    lives = no_tracklets() if chosen is None else find_tracklets(chosen, instants, MAX_TRACKLETS)
-    tracklet_state = (
-        None
-        if chosen is None or not len(lives)
-        else _adjust_with_tracklets(
-            fit,
-            tracks,
-            replace(
-                config,
-                windows=chosen.subset(chosen.from_segments).balanced_subset(MAX_TURNING_WINDOWS),
-                bundle=TrackletBundle(lives, config.options.noise_px, config.options.drift_px),
-            ),
-        )
-    )
-    if tracklet_state is not None and not compare_solutions(fit, tracklet_state).exceeds(
-        MAX_TRACKLET_DIFFERENCE_SIGMAS
-    ):
-        return tracklet_state, None
-    window_fit = adjust(fit.state, tracks, config, refine=True, warm_start=fit.problem.warm_start)
-    return window_fit, None if tracklet_state is None else tracklet_state.state
+    turning = _turning_windows(fit, windows) if config.turning else None
+    tracklets = no_tracklets() if turning is None else find_tracklets(turning, instants, MAX_TRACKLETS)
+    with_tracklets = None
+    if turning is not None and len(tracklets):
+        segments_only = turning.subset(turning.from_segments).balanced_subset(MAX_TURNING_WINDOWS)
+        bundle = TrackletBundle(tracklets, config.options.noise_px, config.options.drift_px)
+        with_tracklets = _adjust_with_tracklets(fit, tracks, replace(config, windows=segments_only, bundle=bundle))
+        if not compare_solutions(fit, with_tracklets).exceeds(MAX_TRACKLET_DIFFERENCE_SIGMAS):
+            return with_tracklets, None
+    with_windows = adjust(fit.state, tracks, config, refine=True, warm_start=fit.problem.warm_start)
+    return with_windows, None if with_tracklets is None else with_tracklets.state
 
 
 def _adjust_with_tracklets(fit: Adjustment, tracks: TrackSet, config: AdjustmentConfig) -> Adjustment:
-    """Solve with a bundle, of points that drift or of such that do not: whichever makes them more probable."""
+    """Adjust with tracklets, with or without point drift, whichever has the higher likelihood."""
     solved = adjust(fit.state, tracks, config, refine=True)
     drifting, (_, _, shapes) = solved.problem.config.bundle, solved.problem.warm_start
     if drifting is None or shapes is None:
@@ -129,10 +126,10 @@ def _adjust_with_tracklets(fit: Adjustment, tracks: TrackSet, config: Adjustment
 
 
 def restart_tracklets(fit: Adjustment, tracks: TrackSet) -> Adjustment:
-    """Solve again with lives begun anew at a solution, where that suits any better than how it was carried there.
+    """Adjust again with tracklets re-initialised at the solution, where that lowers their cost.
 
-    A life has more than one shape that no small change improves. Where lives are few, a single one that was begun far
-    from the solution, and is stuck in such a shape, holds the solution back by degrees.
+    A tracklet may have several local minima. Where tracklets are few, a single one that was initialised far from the
+    solution and is stuck in a wrong minimum shifts the solution by degrees.
     """
     for _ in range(MAX_RESTARTS):
         bundle, (_, motion, shapes) = fit.problem.config.bundle, fit.problem.warm_start
@@ -140,10 +137,10 @@ def restart_tracklets(fit: Adjustment, tracks: TrackSet) -> Adjustment:
             return fit
         camera, plane = fit.state.camera, fit.state.rotation
         restarted = bundle.initialised(camera, plane)
-        carried_cost, restarted_cost = (
+        current_cost, restarted_cost = (
             bundle.cost(bundle.residuals(camera, plane, each)) for each in (shapes, restarted)
         )
-        better = restarted_cost < carried_cost - MIN_RESTART_GAIN
+        better = restarted_cost < current_cost - MIN_RESTART_GAIN
         if not better.any():
             return fit
         fit = adjust(
@@ -157,7 +154,7 @@ def restart_tracklets(fit: Adjustment, tracks: TrackSet) -> Adjustment:
 
 
 def widen_by_tracklet_difference(fit: Adjustment, tracklet_state: AdjustmentState | None) -> Adjustment:
-    """Widen the deviations of a solution by how far the state is that lives led to, where that was not believed."""
+    """Add the difference to a rejected tracklet solution, if there is one, to the covariance."""
     if tracklet_state is None:
         return fit
     step = fit.problem.parameters.step_to(tracklet_state)
@@ -165,14 +162,14 @@ def widen_by_tracklet_difference(fit: Adjustment, tracklet_state: AdjustmentStat
 
 
 def check_turning_centres(fit: Adjustment, windows: TwoFrameWindows) -> Reason | None:
-    """Say that all vehicles turn about one point and that this is not enough, if so.
+    """Return a refusal if all vehicles turn about one point and the focal length is too uncertain for that.
 
-    One axis for all motion tells lens and plane so weakly that noise biases them by more than the stated deviations,
-    unless these are small.
+    A single axis of rotation constrains lens and plane so weakly that the bias from noise exceeds the stated standard
+    deviations, unless these are small.
     """
     sigma = fit.focal_sigma
-    rests = fit.problem.config.turning and sigma >= MAX_SIGMA_FOCAL_ONE_CENTRE
-    chosen = _turning_windows(fit, windows) if rests else None
+    depends_on_turning = fit.problem.config.turning and sigma >= MAX_SIGMA_FOCAL_ONE_CENTRE
+    chosen = _turning_windows(fit, windows) if depends_on_turning else None
     if chosen is None:
         return None
     centres, radii = turning_centres(chosen, fit.state.camera, fit.state.rotation)
@@ -188,10 +185,10 @@ def check_turning_centres(fit: Adjustment, windows: TwoFrameWindows) -> Reason |
 
 
 def widen_by_point_slip(fit: Adjustment, windows: TwoFrameWindows) -> Adjustment:
-    """Widen the deviation of a focal length that rests on turning traffic by what sliding points may do to it."""
+    """Widen the standard deviation of a focal length from turning traffic by the estimated effect of point slip."""
     state, prior = fit.state, fit.problem.config.prior
-    rests = len(state.angles_rad) < 2 and fit.problem.config.turning and 0 in prior.free
-    chosen = _turning_windows(fit, windows) if rests else None
+    depends_on_turning = len(state.angles_rad) < 2 and fit.problem.config.turning and 0 in prior.free
+    chosen = _turning_windows(fit, windows) if depends_on_turning else None
     if chosen is None:
         return fit
     view = WindowRays.of(chosen, state.camera, state.rotation, fit.problem.config.options)
@@ -204,19 +201,21 @@ def widen_by_point_slip(fit: Adjustment, windows: TwoFrameWindows) -> Adjustment
 
 
 def _turning_windows(fit: Adjustment, windows: TwoFrameWindows) -> TwoFrameWindows | None:
-    """Windows of vehicles that turn in the plane of a solution; None where they are too few.
+    """Return the windows of vehicles that turn in the plane of a solution; None if there are too few.
 
-    Of those that turn, what they show before and after counts too, unless two roads tell more of it: whoever never
-    turns may be two, side by side.
+    Unless there are two roads, straight windows of the turning vehicles are included. Vehicles that never turn are
+    not: such a group may be two vehicles side by side.
     """
     state = fit.state
     view = WindowRays.of(windows, state.camera, state.rotation, fit.problem.config.options)
     height_m = fit.problem.config.height_m or DEFAULT_CAMERA_HEIGHT_M
-    course, turning = without_side_slip(windows, view, initial_motion(view), state.camera, state.rotation, height_m)
+    without_slip, turning = without_side_slip(
+        windows, view, initial_motion(view), state.camera, state.rotation, height_m
+    )
     bodies = np.unique(windows.bodies[turning])
     if len(bodies) < MIN_TURNING_VEHICLES:
         return None
-    chosen = turning if len(state.angles_rad) > 1 else course & np.isin(windows.bodies, bodies)
+    chosen = turning if len(state.angles_rad) > 1 else without_slip & np.isin(windows.bodies, bodies)
     return windows.subset(np.flatnonzero(chosen))
 
 

@@ -1,13 +1,14 @@
-"""The rotation of the ground plane about a road, from edges that vehicles have across the road and upright.
+"""Rotation of the ground plane about a road, from transverse and vertical edges of vehicles.
 
-Bumpers, windscreens and roof lines are perpendicular to the motion, in the plane of the road; pillars are perpendicular
-to both. An image edge lies on a great circle with a normal m. The directions perpendicular to the road d are
+Bumpers, windscreens and roof lines are perpendicular to the motion, in the plane of the road; pillars are
+perpendicular to both. An image edge lies on a great circle with a normal m. The directions perpendicular to the road d
+are
 
     v(turn) = across cos(turn) + (d x across) sin(turn)
 
-and an edge along one of them says which: m . v(turn) = 0. So the turns of many vehicles' edges gather at the direction
-across the road, and a quarter of a turn from there at the upright one, whatever the rest does (`edge_mixture.py`).
-Which of the two is which is told by a camera that is not rolled by 45 degrees.
+and an edge along one of them determines it: m . v(turn) = 0. So the turns of the edges of many vehicles cluster at the
+transverse direction and, 90 degrees from there, at the vertical one, among outliers (`edge_mixture.py`). Which is
+which follows from a camera roll below 45 degrees.
 """
 
 from __future__ import annotations
@@ -28,25 +29,24 @@ from autocalib_ros.lens.camera import Camera
 from autocalib_ros.results.statements import Statement, assumption
 
 MAX_EDGES = 1000
-"""Edges in one estimate, the longest of each vehicle in turn."""
+"""Most edges in one estimate, the longest of each vehicle in turn."""
 MAX_TIME_TO_TRACK_S = 0.3
-"""An edge is of the straight ride of its vehicle when it was seen during a track of it on the road, or so near to it:
-between two searches for points."""
+"""Edges count if they were seen during a track of their vehicle on the road, or within this time of it."""
 EDGE_END_SIGMA_PX = 0.5
-"""Standard deviation of an end of an edge, across it."""
+"""Standard deviation of an end point of an edge, across the edge. Judgement."""
 MIN_ANGLE_TO_ROAD_RAD = np.radians(20.0)
-"""An edge that leads so nearly towards the road's vanishing point runs along the vehicle."""
+"""Edges nearer to the direction of the road's vanishing point run along the vehicle. Judgement."""
 MAX_EDGE_SIGMA_RAD = np.radians(5.0)
-"""An edge whose noise leaves its turn less sure tells nothing: a short one, or one seen squarely from the side."""
+"""Largest standard deviation of the turn of an edge: short edges, and edges seen squarely from the side, exceed it."""
 MIN_PEAK_VEHICLES = 8
-"""Vehicles whose edges make the peaks; of fewer, one askew or one that changes lanes counts too much."""
+"""Fewest vehicles in the peaks; among fewer, one that stands askew or changes lanes weighs too much. Judgement."""
 MAX_TURN_SIGMA_RAD = np.radians(4.0)
-"""An estimate that is less sure is none: where there are no peaks, the resampled ones lie all over."""
+"""Largest accepted standard deviation: where there are no peaks, the bootstrap samples scatter widely. Judgement."""
 
 
 @dataclass(frozen=True)
 class VehicleEdges:
-    """Edges on vehicles that drive along a road."""
+    """Edges of vehicles that drive along a road."""
 
     ends_px: np.ndarray
     """x0, y0, x1, y1, shape (n, 4)."""
@@ -62,7 +62,7 @@ class VehicleEdges:
 
 
 def select_vehicle_edges(evidence: Evidence, tracks: TrackSet) -> VehicleEdges:
-    """Return the edges seen on vehicles while they left tracks, all of which follow one road straight."""
+    """Return the edges of vehicles seen during their tracks, all of which follow one road straight."""
     keep = np.zeros(len(evidence.edges_px), bool)
     for vehicle in np.unique(tracks.vehicles):
         times = tracks.sample_times_s[tracks.vehicles == vehicle]
@@ -74,7 +74,7 @@ def select_vehicle_edges(evidence: Evidence, tracks: TrackSet) -> VehicleEdges:
 
 
 def edge_turns(camera: Camera, along: np.ndarray, across: np.ndarray, ends_px: np.ndarray) -> EdgeTurns:
-    """Return the turns about a road `along` (3,), counted from `across` (3,), of edges (n, 4)."""
+    """Return the turns of edges (n, 4) about a road `along` (3,), counted from `across` (3,)."""
     middle, step = (ends_px[:, :2] + ends_px[:, 2:]) / 2, ends_px[:, 2:] - ends_px[:, :2]
     length = np.maximum(np.hypot(*step.T), 1e-9)
     rays, unit = unproject_rays(camera, middle), step / length[:, None]
@@ -102,25 +102,26 @@ def edge_turns(camera: Camera, along: np.ndarray, across: np.ndarray, ends_px: n
 
 @dataclass(frozen=True)
 class TransverseDirection:
-    """The direction across the road of a solution, by edges of vehicles that are taken as square to it."""
+    """Direction across the road of a solution, from vehicle edges that are assumed square to it."""
 
     edges: VehicleEdges
     weights: np.ndarray
-    """How much each pulls on the direction, shape (n,)."""
+    """Weight of each edge in the direction, shape (n,)."""
     origin: np.ndarray
-    """Unit vector (3,) from which turns are counted: the direction across the road at the solution, by edges alone."""
+    """Unit vector (3,) from which turns are counted: the transverse direction at the solution, from edges alone."""
     reference_turns_rad: np.ndarray
     """Turns of the edges at the solution, shape (n,)."""
     step_sigma_rad: float
-    """Standard deviation of the rotation about the road for a known lens."""
+    """Standard deviation of the rotation about the road, for a known lens."""
     vehicles: int
+    """Vehicles whose edges were used."""
     turn_rad: float = 0.0
-    """A rotation about the road that another assumption adds."""
+    """Rotation about the road that another assumption adds."""
     level_sigma_deg: float | None = None
     """Sigma of the roll, degrees, if the direction combines the edges with a level camera."""
 
     def across(self, state: AdjustmentState, step_rad: float = 0.0) -> np.ndarray:
-        """Direction (3,) across the first road at a state near the solution, rotated about the road by a step."""
+        """Direction (3,) across the first road at a state near the solution, after a rotation about the road."""
         along = state.directions[0]
         across = self.origin - (self.origin @ along) * along
         across /= np.linalg.norm(across)
@@ -144,7 +145,7 @@ class TransverseDirection:
 def find_transverse_direction(
     evidence: Evidence, fit: Adjustment, tracks: TrackSet, generator: np.random.Generator
 ) -> TransverseDirection | None:
-    """Find the direction across the first road by edges of the vehicles that follow it; None where they do not tell."""
+    """Find the direction across the first road from edges of the vehicles on it; None if undetermined."""
     following = tracks.subset(fit.inliers() & (fit.labels == 0))
     return transverse_direction_at(select_vehicle_edges(evidence, following), fit.state, generator)
 
@@ -152,7 +153,7 @@ def find_transverse_direction(
 def transverse_direction_at(
     edges: VehicleEdges, state: AdjustmentState, generator: np.random.Generator
 ) -> TransverseDirection | None:
-    """Find the direction across the first road of a state by edges on its vehicles; None where they do not tell."""
+    """Find the direction across the first road of a state from edges; None if undetermined."""
     along = state.directions[0]
     # turns are counted from where a camera without roll has that direction
     level = np.cross(level_normal(along), along)

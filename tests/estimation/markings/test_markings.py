@@ -1,4 +1,4 @@
-"""Lens and plane by lines painted on the road: true where given, within what is said of them, and confirmed."""
+"""Lens and plane from road markings: accuracy, honesty of the uncertainty, and confirmation by traffic."""
 
 from __future__ import annotations
 
@@ -36,16 +36,16 @@ from road_lines import Paint, painted_lines, post_lines, random_lines
 WIDTH, HEIGHT = 1280, 720
 CENTRE = (639.5, 359.5)
 NEAR_EQUIDISTANT = JointOptions(lens_prior='equidistant')
-"""One family of lenses: the others take three quarters of a second each."""
+"""One lens family; each of the others takes 0.75 s more."""
 JUNCTION = Junction(vehicles=16, points_per_vehicle=5)
-"""Both roads are driven on, so that lines on both are beside traffic."""
+"""Traffic on both roads, so that the markings of both are near traffic."""
 LONE_ROAD = Junction(road_angles_deg=(0.0,), vehicles=40, points_per_vehicle=2, turning_fraction=0.25)
-"""Its traffic gives the lens alone; the few that turn show that there is road across, too."""
+"""Traffic that gives the lens only; a few turning vehicles show that the crossing road exists."""
 RING = Junction(drive=partial(drive_ring, radius_m=15.0), vehicles=22, points_per_vehicle=6)
-"""Traffic that is refused: all of it circles about one point."""
+"""Traffic that is refused: all of it turns about one point."""
 PAINT = Paint()
 FINE = Paint(askew_deg=0.05, noise_px=0.1)
-"""Seen as in an average of many images."""
+"""Standard deviation as in an average of many images."""
 OPTIONS = Options(camera_height=8.0, joint=NEAR_EQUIDISTANT)
 
 
@@ -58,7 +58,7 @@ def seen(junction: Junction, lines: np.ndarray) -> Evidence:
 
 
 def painted(junction: Junction, paint: Paint = PAINT, seed: int = 1) -> Evidence:
-    """The evidence of a junction with painted roads and a few posts."""
+    """Evidence of a junction with road markings and a few posts."""
     generator = np.random.default_rng(seed)
     return seen(
         junction, np.concatenate([painted_lines(junction, generator, paint), post_lines(junction, generator, 6, paint)])
@@ -66,7 +66,7 @@ def painted(junction: Junction, paint: Paint = PAINT, seed: int = 1) -> Evidence
 
 
 def told(evidence: Evidence, lens: Camera | None = None) -> tuple[Adjustment, TrackSet, str] | Reason:
-    """What the lines alone tell."""
+    """Solve from the segments alone."""
     options = OPTIONS.joint
     tracks = select_tracks(evidence, options.max_tracks)
     priors = (
@@ -99,7 +99,7 @@ def angle_deg(one: np.ndarray, other: np.ndarray) -> float:
 
 
 def tilt_and_roll_sigmas(fit: Adjustment, tracks: TrackSet, junction: Junction) -> np.ndarray:
-    """How many of their own standard deviations tilt and roll are off, shape (2,)."""
+    """Errors of tilt and roll in their standard deviations, shape (2,)."""
     sigmas = PlaneEstimate.of(fit, tracks).sigma(lambda _, normal: tilt_and_roll_deg(normal))
     return np.abs(
         np.subtract(tilt_and_roll_deg(fit.state.rotation[:, 2]), tilt_and_roll_deg(junction.normal_in_camera)) / sigmas
@@ -109,14 +109,14 @@ def tilt_and_roll_sigmas(fit: Adjustment, tracks: TrackSet, junction: Junction) 
 def require_true(
     fit: Adjustment, tracks: TrackSet, junction: Junction, *, focal: float = 0.02, normal_deg: float = 1.0
 ) -> None:
-    """Require a lens and a plane near the truth, and as near as they say."""
+    """Require errors of lens and plane that are small, and covered by their standard deviations."""
     assert abs(focal_error(fit, junction)) < min(focal, 3.0 * fit.focal_sigma)
-    assert fit.focal_sigma < 0.03  # it may not say that it knows nothing
+    assert fit.focal_sigma < 0.03  # the stated uncertainty must be small too
     up = fit.state.rotation[:, 2]
     assert angle_deg(up, junction.normal_in_camera) < normal_deg
     assert (tilt_and_roll_sigmas(fit, tracks, junction) < 3.0).all()
     assert PlaneEstimate.of(fit, tracks).worst_sigma_deg < 1.5
-    # any heading does: distances on the road are what is compared
+    # any heading will do, because distances on the road are compared
     across = np.cross(up, [0.0, 0.0, 1.0])
     across /= np.linalg.norm(across)
     ground = GroundPlane(np.stack([np.cross(across, up), across, up]), junction.height_m)
@@ -134,22 +134,22 @@ LENSES = {
 
 
 @pytest.mark.parametrize('lens', LENSES)
-def test_lines_tell_lens_and_plane(lens: str) -> None:
+def test_lines_determine_lens_and_plane(lens: str) -> None:
     junction = replace(JUNCTION, camera=LENSES[lens])
     fit, tracks, words = fit_of(painted(junction))
     require_true(fit, tracks, junction, focal=0.025)
     assert 'taken as parallel or square to each other: 90 +- 1 degrees' in words
-    # the principal point is far from the middle where it is, and nobody said so before
+    # the true principal point is far from the centre, which the prior does not know
     assert abs(fit.state.camera.principal_point_px[0] - LENSES[lens].principal_point_px[0]) < 0.03 * WIDTH
 
 
 def test_exact_lines_give_the_truth() -> None:
     exact = Paint(askew_deg=0.0, lean_deg=0.0, noise_px=0.0)
     fit, _, _ = fit_of(painted(JUNCTION, exact))
-    # a chord has the direction of its arc in the middle but for terms of the third order
+    # at its middle a chord has the direction of its arc up to third-order terms
     assert abs(focal_error(fit, JUNCTION)) < 2e-3
     assert angle_deg(fit.state.rotation[:, 2], JUNCTION.normal_in_camera) < 0.1
-    # who knows the lens knows the plane no worse, though nothing is left of noise
+    # conditioning on the lens must not widen the plane, even without noise
     for known in (condition_on_lens(fit), condition_on_lens(replace(fit, covariance=0.0 * fit.covariance))):
         assert PlaneEstimate(known, 1.0).worst_sigma_deg <= PlaneEstimate(fit, 1.0).worst_sigma_deg + 1e-3
 
@@ -159,12 +159,12 @@ def test_half_of_the_lines_may_be_clutter() -> None:
     clutter = random_lines(JUNCTION, np.random.default_rng(2), len(evidence.still_lines_px))
     lines = np.concatenate([evidence.still_lines_px, clutter])
     beside = segments_on_road(seen(JUNCTION, lines))
-    assert len(beside) > 1.15 * len(segments_on_road(evidence))  # some of it is where vehicles drive
+    assert len(beside) > 1.15 * len(segments_on_road(evidence))  # some clutter is on the road
     fit, tracks, _ = fit_of(seen(JUNCTION, lines))
     require_true(fit, tracks, JUNCTION, focal=0.03, normal_deg=1.2)
 
 
-def test_posts_are_told_from_the_lines_across_the_road() -> None:
+def test_posts_are_distinguished_from_lines_across_the_road() -> None:
     generator = np.random.default_rng(3)
     posts = post_lines(JUNCTION, generator, 30)
     evidence = seen(JUNCTION, np.concatenate([painted_lines(JUNCTION, generator), posts]))
@@ -178,11 +178,11 @@ def test_posts_are_told_from_the_lines_across_the_road() -> None:
     assert angle_deg(grid.rotation[:, 2], JUNCTION.normal_in_camera) < 1.0
 
 
-def test_without_lines_nothing_is_told() -> None:
+def test_without_lines_there_is_no_solution() -> None:
     assert refused(seen(JUNCTION, np.zeros((0, 4)))).endswith('there are 0')
 
 
-def test_lines_where_nobody_drives_are_not_on_the_road() -> None:
+def test_lines_away_from_traffic_are_not_on_the_road() -> None:
     lone = replace(JUNCTION, road_angles_deg=(0.0,), turning_fraction=0.0, vehicles=24, points_per_vehicle=2)
     places = driven(lone).points_px
     lines = painted_lines(lone, np.random.default_rng(1))
@@ -191,20 +191,20 @@ def test_lines_where_nobody_drives_are_not_on_the_road() -> None:
     assert refused(seen(lone, lines[away > 0.1 * WIDTH])).endswith('there are 0')
 
 
-def test_lines_of_one_direction_tell_no_plane() -> None:
+def test_lines_of_one_direction_give_no_plane() -> None:
     lines = painted_lines(JUNCTION, np.random.default_rng(1), Paint(angles_deg=(0.0,), across=False))
     assert len(lines) > 40
     message = refused(seen(JUNCTION, lines))
     assert 'they suit two planes' in message or 'are along the second of two directions' in message
 
 
-def test_lines_at_random_tell_nothing() -> None:
+def test_random_lines_give_no_solution() -> None:
     message = refused(seen(JUNCTION, random_lines(JUNCTION, np.random.default_rng(0), 150)))
     assert 'they suit two planes' in message or 'of two directions' in message or 'focal length' in message
 
 
-def test_lines_only_far_away_tell_nothing() -> None:
-    # a lens so low that all that it sees of the road is more than ten of its heights away
+def test_distant_lines_alone_give_no_solution() -> None:
+    # a horizon so low in the image that all visible road is more than ten camera heights away
     low = replace(JUNCTION, camera_from_ground=pose(8.0, 1.0, 35.0), height_m=0.9)
     lines = painted_lines(low, np.random.default_rng(1))
     assert len(lines) > 20
@@ -212,16 +212,16 @@ def test_lines_only_far_away_tell_nothing() -> None:
 
 
 @pytest.mark.parametrize('crossing_deg', [70.0, 80.0])
-def test_roads_that_cross_askew_are_never_believed_to_be_square(crossing_deg: float) -> None:
+def test_roads_that_cross_askew_are_never_assumed_square(crossing_deg: float) -> None:
     junction = replace(JUNCTION, camera=LENSES['wide'], road_angles_deg=(0.0, crossing_deg))
     found = told(painted(junction, Paint(angles_deg=(0.0, crossing_deg))))
     if isinstance(found, Reason):
         assert found.code == 'no_markings'
-    else:  # stop lines are square to their roads whatever these do
+    else:  # stop lines are square to their own road at any crossing angle
         require_true(*found[:2], junction, focal=0.05, normal_deg=2.0)
 
 
-def test_lines_tell_the_pose_of_a_lens_that_is_known() -> None:
+def test_lines_give_the_pose_of_a_known_lens() -> None:
     fit, tracks, _ = fit_of(painted(JUNCTION), JUNCTION.camera)
     assert fit.state.camera == JUNCTION.camera
     assert angle_deg(fit.state.rotation[:, 2], JUNCTION.normal_in_camera) < 0.5
@@ -229,7 +229,7 @@ def test_lines_tell_the_pose_of_a_lens_that_is_known() -> None:
 
 
 def by_traffic(evidence: Evidence, tracks: TrackSet, lens: Camera) -> Solution | Reason:
-    """What the traffic alone shows to who knows the lens."""
+    """Solve from the traffic alone with a known lens."""
     return find_solution(
         evidence,
         tracks,
@@ -248,14 +248,14 @@ def test_traffic_that_shows_another_plane_contradicts_lines() -> None:
     assert isinstance(doubt, Reason) and doubt.code == 'markings_contradicted'
     assert 'the road of the traffic and the lines along it are ' in doubt.message
     assert 'joint.road_markings' in doubt.remedy
-    # one voice that contradicts outweighs another that agrees
+    # one contradiction outweighs an agreement
     own, own_tracks, _ = fit_of(painted(LONE_ROAD))
     agreeing = PlaneEstimate.of(own, own_tracks)
     assert not isinstance(verify_with_traffic(own, [agreeing]), Reason)
     assert verify_with_traffic(fit, [PlaneEstimate.of(fit, tracks), plane]) == doubt
 
 
-def test_lines_that_no_traffic_confirms_are_not_believed() -> None:
+def test_lines_that_no_traffic_confirms_are_refused() -> None:
     fit, tracks, _ = fit_of(painted(JUNCTION))
     doubt = verify_with_traffic(fit, [])
     assert isinstance(doubt, Reason) and doubt.code == 'markings_unconfirmed'
@@ -271,14 +271,14 @@ def test_traffic_that_contradicts_keeps_its_own_result(alone: Calibration) -> No
     lines = painted_lines(elsewhere, np.random.default_rng(1))
     result = solve(seen(LONE_ROAD, lines), OPTIONS)
     assert (result.camera, result.grade, result.ground) == (alone.camera, alone.grade, alone.ground)
-    # what was tried is said with what is missing
+    # the refusal reports both attempts
     assert result.ground_refusal.message.startswith(alone.ground_refusal.message)
     assert 'the road of the traffic and the lines along it are ' in result.ground_refusal.message
 
 
 @pytest.fixture(scope='module')
 def alone() -> Calibration:
-    """The result without lines."""
+    """Calibrate without lines."""
     result = solve(driven(LONE_ROAD), OPTIONS)
     assert isinstance(result, Calibration)
     return result
@@ -292,7 +292,7 @@ def assumed() -> Calibration:
 
 
 def ground_errors(result: Calibration, junction: Junction) -> tuple[float, float]:
-    """Angle of the normal in degrees, and how many standard deviations of tilt and roll together that is."""
+    """Error of the normal in degrees, and in standard deviations of tilt and roll."""
     assert result.ground is not None
     sigma = np.hypot(result.stddev.tilt_deg, result.stddev.roll_deg)
     error = angle_deg(result.ground.normal_in_camera, junction.normal_in_camera)
@@ -325,15 +325,15 @@ def test_the_same_lines_give_the_same_numbers(assumed: Calibration) -> None:
     np.testing.assert_array_equal(again.covariance, assumed.covariance)
 
 
-def test_lines_are_not_used_where_that_is_not_wanted(alone: Calibration) -> None:
+def test_lines_are_not_used_if_switched_off(alone: Calibration) -> None:
     options = replace(OPTIONS, joint=replace(OPTIONS.joint, road_markings=False))
     assert to_json(solve(painted(LONE_ROAD), options)) == to_json(alone)
 
 
 BUSY = Junction(vehicles=30, points_per_vehicle=3)
-"""Traffic that gives all by itself."""
+"""Traffic that determines lens and plane on its own."""
 HELD = replace(OPTIONS, joint=replace(NEAR_EQUIDISTANT, k1_sigma=0.0))
-"""With the distortion known, the few lines that are painted here are surer than that traffic."""
+"""With known distortion the few lines here constrain more than that traffic."""
 
 
 @pytest.fixture(scope='module')
@@ -343,7 +343,7 @@ def by_busy_traffic() -> Calibration:
     return result
 
 
-def test_lines_sharpen_what_the_traffic_gives(by_busy_traffic: Calibration) -> None:
+def test_lines_refine_the_solution_from_traffic(by_busy_traffic: Calibration) -> None:
     result = solve(painted(BUSY, FINE), HELD)
     assert isinstance(result, Calibration) and result.grade == 'full'
     assert result.stddev.focal_px < 0.7 * by_busy_traffic.stddev.focal_px
@@ -357,7 +357,7 @@ def test_lines_sharpen_what_the_traffic_gives(by_busy_traffic: Calibration) -> N
     assert [statement.kind for statement in result.assumptions].count('lane_markings') == 1
 
 
-def test_lines_that_disagree_with_full_traffic_are_not_used(by_busy_traffic: Calibration) -> None:
+def test_lines_that_contradict_sufficient_traffic_are_not_used(by_busy_traffic: Calibration) -> None:
     elsewhere = replace(BUSY, camera_from_ground=pose(36.0, 4.0, 35.0))
     result = solve(seen(BUSY, painted_lines(elsewhere, np.random.default_rng(1))), HELD)
     assert isinstance(result, Calibration) and result.grade == 'full'
@@ -366,7 +366,7 @@ def test_lines_that_disagree_with_full_traffic_are_not_used(by_busy_traffic: Cal
     assert all(check.values['used'] is False for check in result.checks[len(by_busy_traffic.checks) :])
 
 
-def test_lines_give_all_where_traffic_circles_about_one_point() -> None:
+def test_lines_suffice_where_all_traffic_turns_about_one_point() -> None:
     result = solve(painted(RING), OPTIONS)
     assert isinstance(result, Calibration) and result.grade == 'assumed'
     assert abs(result.camera.focal_px - 560.0) < min(3.0 * result.stddev.focal_px, 0.03 * 560.0)
@@ -375,7 +375,7 @@ def test_lines_give_all_where_traffic_circles_about_one_point() -> None:
     assert 'markings_and_traffic_normal' in [check.kind for check in result.checks]
 
 
-def test_lines_complete_a_lens_that_is_known() -> None:
+def test_lines_complete_a_known_lens() -> None:
     alone, result = (
         solve(evidence, OPTIONS, lens=LONE_ROAD.camera) for evidence in (driven(LONE_ROAD), painted(LONE_ROAD))
     )
@@ -387,7 +387,7 @@ def test_lines_complete_a_lens_that_is_known() -> None:
 
 
 def drawn(seed: int) -> tuple[Junction, Evidence]:
-    """A junction of any pose, lens and traffic, with paint, posts and clutter."""
+    """A junction with random pose, lens and traffic, with markings, posts and clutter."""
     generator = np.random.default_rng([seed, 77])
     junction = replace(standard_junction(generator), tracks=None, vehicles=16, points_per_vehicle=3)
     evidence = synthetic_evidence(junction, generator)
@@ -400,14 +400,14 @@ def drawn(seed: int) -> tuple[Junction, Evidence]:
     )
 
 
-def test_another_focal_length_that_suits_the_lines_as_well_is_a_doubt() -> None:
-    # the first start leads to a focal length 9 % too short, which another one hardly beats
-    junction, evidence = drawn(14)
+def test_a_second_focal_length_that_fits_as_well_is_refused() -> None:
+    # the first initial value leads to a focal length 9 % too short, and another one is hardly better
+    _, evidence = drawn(14)
     assert 'they suit two focal lengths, ' in refused(evidence)
 
 
-def test_errors_are_within_what_is_said_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(markings, 'MAX_GRID_STARTS', 1)  # the others serve to find doubts: without them less is refused
+def test_errors_are_covered_by_their_standard_deviations(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(markings, 'MAX_GRID_STARTS', 1)  # more starts only find ambiguities: with one, less is refused
     ratios = []
     for seed in range(8):
         junction, evidence = drawn(seed)
@@ -418,5 +418,5 @@ def test_errors_are_within_what_is_said_of_them(monkeypatch: pytest.MonkeyPatch)
         ratios.append([abs(focal_error(fit, junction)) / fit.focal_sigma, *tilt_and_roll_sigmas(fit, tracks, junction)])
     assert len(ratios) >= 8
     assert np.max(ratios) < 3.5
-    # nor may they be said to be far larger than they are
+    # nor may the standard deviations be far too large
     assert 0.5 < np.sqrt(np.mean(np.square(ratios))) < 1.5

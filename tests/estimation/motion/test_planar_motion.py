@@ -1,4 +1,4 @@
-"""Vehicles as rigid bodies in the plane: what obeys it, what does not, and how residuals change."""
+"""Planar two-frame motion: estimation, derivatives, and the side-slip test."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ POINTS = 8
 
 
 def window(positions: np.ndarray, headings: np.ndarray, bodies: list[np.ndarray]) -> np.ndarray:
-    """Pixels (3, POINTS, 2) of points on bodies that stand at positions (bodies, 3, 2) with headings (bodies, 3)."""
+    """Pixels (3, POINTS, 2) of points on bodies at positions (bodies, 3, 2) with headings (bodies, 3)."""
     seen = []
     for where, heading, body in zip(positions, headings, bodies, strict=True):
         forward = np.column_stack([np.cos(heading), np.sin(heading)])
@@ -39,7 +39,7 @@ def window(positions: np.ndarray, headings: np.ndarray, bodies: list[np.ndarray]
 
 
 def windows_of(pixels: np.ndarray) -> TwoFrameWindows:
-    """Windows of pixels (windows, 3, POINTS, 2), each a body of its own."""
+    """Windows of pixels (windows, 3, POINTS, 2), one body each."""
     count = len(pixels)
     return TwoFrameWindows(
         first_px=pixels[:, 0],
@@ -58,7 +58,7 @@ def car(generator: np.random.Generator, points: int = POINTS) -> np.ndarray:
 
 
 def turning(generator: np.random.Generator, turn_deg: float, speed_m: float = 8.0) -> np.ndarray:
-    """One car that turns steadily by `turn_deg` on its way."""
+    """One car that turns by `turn_deg` at constant rate."""
     heading = generator.uniform(0, 2 * np.pi) + np.radians(turn_deg) * np.array([0.0, 0.5, 1.0])
     chords = (
         0.5
@@ -70,7 +70,7 @@ def turning(generator: np.random.Generator, turn_deg: float, speed_m: float = 8.
 
 
 def crossing(generator: np.random.Generator) -> np.ndarray:
-    """Two cars on straight ways of their own that are taken for one."""
+    """Two cars on straight paths, grouped as one."""
     heading = generator.uniform(0, 2 * np.pi) + np.array([0.0, generator.uniform(0.3, 1.2)])
     forward = np.column_stack([np.cos(heading), np.sin(heading)])
     start = generator.uniform([14.0, -5.0], [20.0, 5.0])
@@ -83,7 +83,7 @@ def view_of(windows: TwoFrameWindows) -> WindowRays:
 
 
 @pytest.mark.parametrize('turn_deg', [-70.0, -12.0, 3.0, 25.0, 90.0])
-def test_a_turning_car_obeys_the_motion_that_is_found_from_nothing(turn_deg: float) -> None:
+def test_the_motion_of_a_turning_car_is_found_without_an_initial_value(turn_deg: float) -> None:
     generator = np.random.default_rng(3)
     view = view_of(windows_of(np.stack([turning(generator, turn_deg) for _ in range(5)])))
     motion = refined(view, initial_motion(view), rounds=30)
@@ -119,7 +119,7 @@ def test_the_distance_is_in_observed_pixels_over_their_standard_deviation() -> N
     assert (view.sigma_px > JointOptions().noise_px).all()
 
 
-def test_settling_comes_back_from_a_motion_nearby_and_ignores_a_stranger() -> None:
+def test_refinement_converges_from_nearby_and_ignores_an_outlier() -> None:
     generator = np.random.default_rng(5)
     windows = windows_of(turning(generator, 20.0)[None])
     view = view_of(windows)
@@ -130,7 +130,7 @@ def test_settling_comes_back_from_a_motion_nearby_and_ignores_a_stranger() -> No
     assert refined(view_of(windows), true, 20).turn_rad == pytest.approx(true.turn_rad, abs=np.radians(1.0))
 
 
-def test_only_what_is_steered_counts_as_turning() -> None:
+def test_only_steered_motion_counts_as_turning() -> None:
     generator = np.random.default_rng(6)
     kinds = {
         'turning': [turning(generator, sign * turn) for turn in (12.0, 20.0, 35.0, 60.0) for sign in (-1, 1)],
@@ -144,13 +144,13 @@ def test_only_what_is_steered_counts_as_turning() -> None:
         motion = initial_motion(view)
         shares[kind] = without_side_slip(windows, view, motion, CAMERA, POSE, HEIGHT_M)[1].mean()
         if kind == 'crossing':
-            assert np.median(np.abs(np.degrees(motion.turn_rad))) > 5.0  # by their displacements they do seem to turn
-    assert shares['turning'] > 0.5  # some are too small to tell
+            assert np.median(np.abs(np.degrees(motion.turn_rad))) > 5.0  # their displacements look like a turn
+    assert shares['turning'] > 0.5  # some turns are too small
     assert shares['straight'] == 0.0
     assert shares['crossing'] < 0.1
 
 
-def test_residuals_change_as_their_derivatives_say() -> None:
+def test_derivatives_match_finite_differences() -> None:
     generator = np.random.default_rng(7)
     pixels = np.stack([turning(generator, turn) for turn in (15.0, -30.0, 40.0)])
     windows = windows_of(pixels + generator.normal(scale=0.05, size=pixels.shape))
@@ -169,6 +169,6 @@ def test_residuals_change_as_their_derivatives_say() -> None:
     assert changed == pytest.approx(foretold, rel=0.03)
 
 
-def test_motion_keeps_its_place_in_a_selection() -> None:
+def test_a_subset_of_motions_keeps_its_order() -> None:
     motion = PlanarMotion(np.array([0.1, 0.2]), np.array([1.0, 2.0]))
     assert motion.subset(np.array([1])).heading_rad.tolist() == [2.0]

@@ -1,4 +1,4 @@
-"""Bundle adjustment of bodies in the plane: exact on perfect motion, its derivatives, and what drifts."""
+"""Bundle adjustment of rigid bodies: exact motion, derivatives, outliers and drift."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ NOISE_PX = 0.3
 
 
 def life(generator: np.random.Generator, turn_deg: float, points: int = SAMPLES_PER_TRACK) -> np.ndarray:
-    """Pixels (SAMPLES, INSTANTS, 2) of a car that turns by `turn_deg`."""
+    """Pixels (SAMPLES_PER_TRACK, MAX_INSTANTS, 2) of a car that turns by `turn_deg`."""
     heading = generator.uniform(0, 2 * np.pi) + np.radians(turn_deg) * np.linspace(0, 1, MAX_INSTANTS)
     steps = 1.5 * np.column_stack([np.cos(heading), np.sin(heading)])
     where = generator.uniform([14.0, -5.0], [20.0, 5.0]) + np.cumsum(steps, axis=0)
@@ -58,14 +58,14 @@ def test_perfect_motion_leaves_no_residual() -> None:
     assert np.degrees(np.ptp(shapes.turns_rad, axis=1)) == pytest.approx([60.0, 10.0, 0.0, 25.0, 80.0], abs=0.5)
 
 
-def test_noise_is_as_large_as_it_is_said_to_be() -> None:
+def test_whitened_residuals_have_unit_variance() -> None:
     bundle = TrackletBundle(noisy(np.random.default_rng(2)), NOISE_PX, 0.0)
     shapes = bundle.initialised(CAMERA, POSE)
     squared = (bundle.residuals(CAMERA, POSE, shapes) ** 2).sum(axis=(1, 2, 3)) / bundle.dof
     assert squared.mean() == pytest.approx(1.0, abs=0.25)
 
 
-def test_a_stranger_on_the_body_is_not_believed() -> None:
+def test_an_outlier_on_the_body_is_down_weighted() -> None:
     generator = np.random.default_rng(3)
     lives = noisy(generator, 4)
     lives.pixels[0, 0] += np.linspace(0, 60, MAX_INSTANTS)[:, None]
@@ -75,7 +75,7 @@ def test_a_stranger_on_the_body_is_not_believed() -> None:
     assert robust_weight[0, 0] < 0.1 < 0.5 < np.median(robust_weight)
 
 
-def test_residuals_change_as_their_derivatives_say() -> None:
+def test_derivatives_match_finite_differences() -> None:
     prior = lens_priors((1280, 720), JointOptions())[0]
     bundle = TrackletBundle(noisy(np.random.default_rng(4), 5), NOISE_PX, 0.0)
     steps = Parameterisation(
@@ -93,7 +93,7 @@ def test_residuals_change_as_their_derivatives_say() -> None:
         assert changed == pytest.approx(foretold, rel=0.1, abs=2e-3)
 
 
-def test_the_residuals_tell_whether_points_drift() -> None:
+def test_the_likelihood_shows_whether_points_drift() -> None:
     generator = np.random.default_rng(5)
     without_drift = noisy(generator, 20)
     walk = np.cumsum(generator.normal(scale=0.5, size=without_drift.pixels.shape), axis=2)
@@ -107,7 +107,7 @@ def test_the_residuals_tell_whether_points_drift() -> None:
         assert more_probable == drifts
 
 
-def test_lives_follow_the_tracks_of_a_body_and_take_bodies_in_turn() -> None:
+def test_tracklets_follow_the_tracks_of_a_body_and_take_bodies_in_turn() -> None:
     _, evidence = draw_evidence('turning', 0, 0)
     instants = ResampledTracks(evidence)
     windows = find_windows(evidence, instants)

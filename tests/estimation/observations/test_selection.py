@@ -1,4 +1,4 @@
-"""People among the traffic: no solution of the robust method rests on them."""
+"""Pedestrians in the evidence: the robust method does not use them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from autocalib_ros.results.calibration import Calibration, Refusal
 
 
 def with_people(evidence: Evidence, count: int, generator: np.random.Generator) -> Evidence:
-    """Put tracks of people before those of the vehicles: straight, long, and across everything."""
+    """Add tracks of pedestrians before those of the vehicles: long, straight, and in all directions."""
     samples, (width, height) = 20, evidence.image_size
     ends = generator.uniform([0, 0.4 * height], [width, height], (count, 2, 2))
     along = np.linspace(0, 1, samples)[:, None]
@@ -32,7 +32,7 @@ def with_people(evidence: Evidence, count: int, generator: np.random.Generator) 
     )
 
 
-def test_people_change_nothing_of_the_lens_and_the_plane_nor_of_what_became_of_each_vehicle() -> None:
+def test_pedestrians_change_neither_lens_nor_plane_nor_the_labels_of_vehicles() -> None:
     evidence = synthetic_evidence(Junction(), np.random.default_rng(3))
     crowd = with_people(evidence, 80, np.random.default_rng(4))
     alone, among = (solve(one, Options(camera_height=8.0)) for one in (evidence, crowd))
@@ -43,16 +43,16 @@ def test_people_change_nothing_of_the_lens_and_the_plane_nor_of_what_became_of_e
     np.testing.assert_array_equal(among.figures.track_labels[80:], alone.figures.track_labels)
 
 
-def test_tracks_of_vehicles_are_missing_where_most_are_of_people() -> None:
+def test_vehicle_tracks_are_too_few_if_most_are_of_pedestrians() -> None:
     evidence = synthetic_evidence(Junction(), np.random.default_rng(3))
     kinds = np.where(np.arange(evidence.track_count) < 10, TrackKind.VEHICLE, TrackKind.PERSON).astype(np.uint8)
     refused = solve(replace(evidence, track_kinds=kinds), Options(camera_height=8.0))
     assert isinstance(refused, Refusal) and refused.code == 'too_few_tracks'
     assert refused.message.startswith('10 tracks of the 40 needed')
-    assert len(refused.figures.paper_tracks)  # the published method takes the lens from everything
+    assert len(refused.figures.paper_tracks)  # the published method uses all tracks
 
 
-def test_unknown_tracks_are_taken_for_vehicles() -> None:
+def test_unclassified_tracks_count_as_vehicles() -> None:
     evidence = synthetic_evidence(Junction(), np.random.default_rng(3))
     traffic, kept = drop_pedestrians(evidence)
     assert traffic is evidence and len(kept) == evidence.track_count

@@ -1,4 +1,4 @@
-"""Points that move together become bodies, others do not."""
+"""Grouping of points into two-frame windows of bodies."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_points_of_one_vehicle_are_one_body_at_every_instant() -> None:
     assert not windows.from_segments.any()
 
 
-def test_vehicles_apart_or_of_another_way_are_other_bodies() -> None:
+def test_separate_or_diverging_vehicles_are_different_bodies() -> None:
     tracks = driving((100, 300), (120, 0), 1) + driving((600, 300), (120, 0), 1)  # one label for both
     assert len(np.unique(find_windows(evidence_of(tracks)).bodies)) == 2
     tracks = driving((100, 300), (120, 0), 1) + driving((110, 305), (-120, 0), 1)
@@ -69,7 +69,7 @@ def test_too_few_points_and_standing_ones_make_no_window() -> None:
     assert not len(no_windows())
 
 
-def test_points_seen_one_after_the_other_do_not_meet() -> None:
+def test_points_seen_at_different_times_make_no_window() -> None:
     tracks = [
         track
         for number, point in enumerate(CORNERS)
@@ -78,17 +78,17 @@ def test_points_seen_one_after_the_other_do_not_meet() -> None:
     assert not len(find_windows(evidence_of(tracks)))
 
 
-def test_a_crowded_vehicle_keeps_points_that_lie_far_apart() -> None:
+def test_a_vehicle_with_many_points_keeps_the_farthest() -> None:
     grid = np.stack(np.meshgrid(np.arange(0.0, 60.0, 6.0), np.arange(0.0, 30.0, 6.0)), axis=-1).reshape(-1, 2)
     windows = find_windows(evidence_of(driving((100, 300), (120, 0), 1, points=grid)))
     assert (windows.mask.sum(axis=1) == SAMPLES_PER_TRACK).all()
-    balanced_subset = np.ptp(windows.first_px[0], axis=0)
-    assert (balanced_subset >= [48.0, 24.0]).all()
+    extent = np.ptp(windows.first_px[0], axis=0)
+    assert (extent >= [48.0, 24.0]).all()
 
 
-def test_segments_of_two_frames_are_a_window_of_the_body_at_their_place() -> None:
+def test_segments_make_a_window_of_the_body_at_the_same_place() -> None:
     tracks = driving((100, 300), (120, 0), 1)
-    ends = np.hstack([CORNERS + [160.0, 300.0], CORNERS + [208.0, 300.0]])
+    ends = np.hstack([CORNERS + (160.0, 300.0), CORNERS + (208.0, 300.0)])
     here = Segments(0.9, np.full(len(ends), 7), ends)
     elsewhere = replace(here, ends_px=ends + 350.0)
     windows = find_windows(evidence_of(tracks, [here, elsewhere]))
@@ -113,12 +113,10 @@ def test_a_track_of_one_point_is_no_body() -> None:
 
 
 def test_hours_without_traffic_change_no_window() -> None:
-    apart_s = 36_000.0  # a whole number of windows, so that both vehicles meet the same instants
+    gap_s = 36_000.0  # a whole number of windows, so that both vehicles meet the same instants
     lone = find_windows(evidence_of(driving((100, 300), (120, 0), 1)))
-    both = find_windows(
-        evidence_of(driving((100, 300), (120, 0), 1) + driving((100, 300), (120, 0), 2, begin_s=apart_s))
-    )
+    both = find_windows(evidence_of(driving((100, 300), (120, 0), 1) + driving((100, 300), (120, 0), 2, begin_s=gap_s)))
     assert len(both) == 2 * len(lone)
-    later = both.subset(both.times_s > apart_s)
-    assert np.allclose(np.sort(later.times_s) - apart_s, np.sort(lone.times_s))
+    later = both.subset(both.times_s > gap_s)
+    assert np.allclose(np.sort(later.times_s) - gap_s, np.sort(lone.times_s))
     assert np.allclose(later.first_px, lone.first_px, atol=1e-6)

@@ -1,4 +1,4 @@
-"""Tracks that move as one body are judged together."""
+"""Grouping of tracks into vehicles, and their weights."""
 
 from __future__ import annotations
 
@@ -41,17 +41,19 @@ def test_points_that_stay_together_are_one_body() -> None:
     ('start', 'speed', 'begin'),
     [
         ((0, 30), (8, 0), 0.0),  # far away
-        ((1, 1), (-8, 0), 0.0),  # the other way
+        ((1, 1), (-8, 0), 0.0),  # the opposite direction
         ((0, 0), (8, 0), 2.8),
     ],
 )  # seen together for 0.2 s only
-def test_points_that_part_are_two_bodies(start: tuple[float, float], speed: tuple[float, float], begin: float) -> None:
+def test_points_that_separate_are_two_bodies(
+    start: tuple[float, float], speed: tuple[float, float], begin: float
+) -> None:
     tracks, ground = moving([(0, 0), start], [(8, 0), speed], [0.0, begin])
     first, second = group_into_bodies(tracks, ground)
     assert first != second
 
 
-def test_a_body_is_followed_from_track_to_track() -> None:
+def test_a_body_is_linked_from_track_to_track() -> None:
     tracks, ground = moving([(0, 0), (8, 0), (16, 0)], [(8, 0)] * 3, [0.0, 1.0, 2.0])
     assert len(set(group_into_bodies(tracks, ground))) == 1
 
@@ -65,24 +67,24 @@ def test_a_track_that_leaves_its_road_by_a_degree_has_a_heading_of_one_degree() 
     assert off[0] == pytest.approx(1.0, rel=1e-3)
 
 
-def test_a_vehicle_that_turns_loses_all_its_tracks_influence() -> None:
+def test_all_tracks_of_a_turning_vehicle_lose_their_weight() -> None:
     generator = np.random.default_rng(0)
     vehicles = np.repeat(np.arange(20), 4)
     off = 0.1 * generator.normal(size=80)
-    off[vehicles == 7] += 3.0  # all four tracks of one vehicle are three degrees off
-    off[0] = 3.0  # one drifting track of another vehicle is off alone
+    off[vehicles == 7] += 3.0  # all four tracks of one vehicle, by three degrees
+    off[0] = 3.0  # a single drifting track of another vehicle
     weight = corroboration_weights(off, np.full(80, 0.1), vehicles, np.zeros(80, int))
     assert weight[vehicles == 7].max() < 0.05
     assert weight[0] > 0.3
 
 
-def test_tracks_that_nothing_corroborates_count_less() -> None:
+def test_uncorroborated_tracks_weigh_less() -> None:
     vehicles = np.concatenate([np.repeat(np.arange(15), 3), [99]])
     weight = corroboration_weights(np.zeros(46), np.full(46, 0.1), vehicles, np.zeros(46, int))
     assert weight[-1] == pytest.approx(SINGLE_TRACK_WEIGHT)
     assert weight[0] == pytest.approx(1.0)
 
 
-def test_where_no_vehicle_has_witnesses_none_is_judged() -> None:
+def test_without_corroborated_vehicles_all_weights_are_one() -> None:
     weight = corroboration_weights(np.linspace(-3, 3, 30), np.full(30, 0.1), np.arange(30), np.zeros(30, int))
     np.testing.assert_array_equal(weight, 1.0)

@@ -1,4 +1,4 @@
-"""Who cycles is told from who drives by the size of what moves."""
+"""Cyclists are distinguished from vehicles by the size of their silhouettes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from autocalib_ros.config import Options
 from autocalib_ros.estimation.estimate import solve
-from autocalib_ros.estimation.people.cyclists import cyclists
+from autocalib_ros.estimation.people.cyclists import find_cyclists
 from autocalib_ros.evidence.snapshot import Evidence, Outlines, Track
 from autocalib_ros.offline.synthetic.junction import Junction, evidence_from_tracks, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration
@@ -22,7 +22,7 @@ FIRST_RIDER, FIRST_CAR = 1000, 2000
 def ridden(
     number: int, size_m: tuple[float, float, float], speed_m_s: float | None, generator: np.random.Generator
 ) -> tuple[list[Track], list[Outlines]]:
-    """A body that crosses the junction along one of its roads, either way."""
+    """Silhouettes of a body that crosses the junction along one of its roads, in either direction."""
     heading = np.pi / 2 * generator.integers(4)
     speed = speed_m_s or generator.uniform(4.0, 7.0)
     way = np.array([np.cos(heading), np.sin(heading)])
@@ -41,10 +41,10 @@ def several(
 def told(tracks: list[Track], outlines: list[Outlines]) -> np.ndarray:
     newest = max(float(track.times_s[-1]) for track in tracks)
     evidence = with_outlines(evidence_from_tracks(tracks, JUNCTION.image_size, newest), outlines)
-    return cyclists(evidence, JUNCTION.camera, JUNCTION.normal_in_camera, JUNCTION.height_m)
+    return find_cyclists(evidence, JUNCTION.camera, JUNCTION.normal_in_camera, JUNCTION.height_m)
 
 
-def test_riders_are_told_from_cars_of_the_same_speed() -> None:
+def test_riders_are_distinguished_from_cars_of_the_same_speed() -> None:
     riders, cars = several(FIRST_RIDER, 20, RIDER_M), several(FIRST_CAR, 30, CAR_M)
     found = told(riders[0] + cars[0], riders[1] + cars[1])
     assert (found < FIRST_CAR).all()
@@ -52,11 +52,11 @@ def test_riders_are_told_from_cars_of_the_same_speed() -> None:
 
 
 @pytest.mark.parametrize('size_m', [(2.7, 1.66, 1.55), (3.6, 1.6, 1.5), (11.0, 2.5, 3.0)])
-def test_no_vehicle_that_is_seen_whole_is_told(size_m: tuple[float, float, float]) -> None:
+def test_no_vehicle_that_is_seen_whole_is_a_cyclist(size_m: tuple[float, float, float]) -> None:
     assert not len(told(*several(FIRST_CAR, 20, size_m)))
 
 
-def test_who_is_faster_than_bicycles_is_a_vehicle() -> None:
+def test_faster_than_bicycles_is_a_vehicle() -> None:
     assert not len(told(*several(FIRST_RIDER, 20, RIDER_M, speed_m_s=13.0)))
 
 
@@ -66,8 +66,8 @@ def test_a_part_of_a_car_that_is_as_low_as_a_bumper_is_no_rider() -> None:
     assert not len(told(tracks, outlines))
 
 
-def test_what_is_seen_whole_now_and_then_is_told_by_that() -> None:
-    """A car of which a quarter of the outlines are whole, and the rest of a part as narrow as a rider."""
+def test_a_car_is_recognised_by_the_silhouettes_that_are_whole() -> None:
+    """A car with a quarter of its silhouettes whole, and the others a part as narrow as a rider."""
     tracks, whole = several(FIRST_CAR, 20, CAR_M)
     _, parts = several(FIRST_CAR, 20, RIDER_M)
     now_and_then = {(each.time_s, int(each.vehicles[0])): each for each in whole[::4]}
@@ -75,13 +75,13 @@ def test_what_is_seen_whole_now_and_then_is_told_by_that() -> None:
 
 
 @pytest.mark.parametrize('gap_px', [0.0, 7.0])
-def test_what_touches_something_else_is_not_told(gap_px: float) -> None:
+def test_a_silhouette_that_touches_another_is_not_classified(gap_px: float) -> None:
     tracks, outlines = several(FIRST_RIDER, 20, RIDER_M)
     touching = [replace(each, ends_px=np.column_stack([each.ends_px[:, :-1], [gap_px]])) for each in outlines]
     assert not len(told(tracks, touching))
 
 
-def test_what_is_torn_in_two_is_not_told() -> None:
+def test_a_fragmented_silhouette_is_not_classified() -> None:
     tracks, outlines = several(FIRST_RIDER, 20, RIDER_M)
     torn = [
         Outlines(
@@ -92,7 +92,7 @@ def test_what_is_torn_in_two_is_not_told() -> None:
     assert not len(told(tracks, torn))
 
 
-def test_three_outlines_tell_nothing() -> None:
+def test_three_silhouettes_are_too_few() -> None:
     tracks, outlines = several(FIRST_RIDER, 20, RIDER_M)
     seen: dict[int, list[Outlines]] = {}
     for each in outlines:
@@ -100,21 +100,21 @@ def test_three_outlines_tell_nothing() -> None:
     assert not len(told(tracks, [each for one in seen.values() for each in one[:3]]))
 
 
-def test_evidence_without_outlines_has_no_cyclists() -> None:
+def test_evidence_without_silhouettes_has_no_cyclists() -> None:
     tracks, _ = several(FIRST_RIDER, 10, RIDER_M)
     assert not len(told(tracks, []))
 
 
 @pytest.fixture(scope='module')
 def street() -> tuple[Evidence, Evidence]:
-    """Thirty vehicles; and the same with twenty riders among them."""
+    """Evidence of thirty vehicles, and the same with twenty riders."""
     vehicles = synthetic_evidence(JUNCTION, np.random.default_rng(5))
     tracks, outlines = several(FIRST_RIDER, 20, RIDER_M)
     both = [*vehicles.tracks(), *tracks]
     return vehicles, with_outlines(evidence_from_tracks(both, JUNCTION.image_size, 100.0), outlines)
 
 
-def test_lens_and_plane_are_of_the_vehicles_alone(street: tuple[Evidence, Evidence]) -> None:
+def test_lens_and_plane_come_from_vehicles_alone(street: tuple[Evidence, Evidence]) -> None:
     alone, among = (solve(each, Options(camera_height=JUNCTION.height_m)) for each in street)
     assert isinstance(alone, Calibration) and isinstance(among, Calibration)
     found = among.evidence.people
@@ -127,7 +127,9 @@ def test_lens_and_plane_are_of_the_vehicles_alone(street: tuple[Evidence, Eviden
     assert off_deg < 3.0 * np.hypot(among.stddev.tilt_deg, among.stddev.roll_deg)
 
 
-def test_where_too_few_vehicles_are_left_the_plane_is_of_all_and_says_so(street: tuple[Evidence, Evidence]) -> None:
+def test_with_too_few_vehicles_left_cyclists_stay_in_the_plane_and_are_reported(
+    street: tuple[Evidence, Evidence],
+) -> None:
     options = Options(camera_height=JUNCTION.height_m)
     _, among = street
     least = int((among.track_vehicles < FIRST_RIDER).sum()) + 20

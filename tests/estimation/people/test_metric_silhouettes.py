@@ -1,4 +1,4 @@
-"""Sizes of bodies on the road, from their outlines in the image."""
+"""Metric sizes of bodies on the road, from their silhouettes."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ def test_the_width_is_that_across_the_line_of_sight(place_m: tuple[float, float]
     length, width, turned = 4.0, 1.7, np.radians(turned_deg)
     sizes = measured((length, width, 1.5), place_m, np.arctan2(place_m[1], place_m[0]) + turned)
     across = length * np.sin(turned) + width * np.cos(turned)
-    # taken at the nearest corner, where it may be seen from farther back; eight points miss a little of a body
+    # tolerance: the distance is that of the nearest corner, and eight points miss a little of the body
     assert 0.8 * across < sizes.width[0] < 1.15 * across
     assert sizes.azimuth[0] == pytest.approx(np.arctan2(place_m[1], place_m[0]), abs=0.05)
 
 
 @pytest.mark.parametrize('distance_m', [10.0, 20.0, 30.0])
-def test_the_height_of_what_is_thin_is_its_own(distance_m: float) -> None:
+def test_the_height_of_a_thin_object_is_exact(distance_m: float) -> None:
     sizes = measured((0.1, 0.5, 1.8), (distance_m, 0.0), 0.0)
     assert sizes.height[0] == pytest.approx(1.8, abs=0.1)
     assert sizes.distance[0] == pytest.approx(distance_m, abs=0.1 + 0.02 * distance_m)
 
 
-def test_a_rider_is_half_as_wide_as_a_car_wherever_and_however_it_goes() -> None:
+def test_a_rider_is_half_as_wide_as_a_car_at_any_place_and_heading() -> None:
     generator = np.random.default_rng(1)
     for _ in range(50):
         place, heading = generator.uniform([8.0, -12.0], [30.0, 12.0]), generator.uniform(0, 2 * np.pi)

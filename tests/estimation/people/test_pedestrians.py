@@ -1,4 +1,4 @@
-"""Who walks is told from who drives, by speed, width and way in metres."""
+"""Pedestrians are distinguished from vehicles by metric speed, width and path."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from autocalib_ros.offline.synthetic.junction import Junction, evidence_from_tra
 from autocalib_ros.results.calibration import Calibration
 
 FIRST_WALKER = 1000
-"""Numbers from here on are people."""
+"""Vehicle numbers from here on are pedestrians."""
 TIMES_S = np.arange(0.0, 24.0, 0.4)
 
 
@@ -27,7 +27,7 @@ def _body(
     half_m: np.ndarray,
     generator: np.random.Generator,
 ) -> list[Track]:
-    """Tracks of six points of a body, `half_m` (3,) large, that goes along a path (n, 2) on the road."""
+    """Tracks of six points of a body with half sizes `half_m` (3,) along a path (n, 2) on the road."""
     tracks = []
     for _ in range(6):
         offset = generator.uniform((-half_m[0], -half_m[1], 0.1), half_m)
@@ -41,7 +41,7 @@ def _body(
 
 
 def _walker(junction: Junction, number: int, generator: np.random.Generator) -> list[Track]:
-    """Somebody 0.5 m wide and 1.7 m high who walks 1 to 1.7 m/s, swaying a little."""
+    """A pedestrian, 0.5 m wide and 1.7 m high, at 1 to 1.7 m/s with some sway."""
     heading, speed = generator.uniform(0, 2 * np.pi), generator.uniform(1.0, 1.7)
     start = np.array(junction.centre_m) + generator.uniform(-8.0, 8.0, 2)
     way = np.array([np.cos(heading), np.sin(heading)])
@@ -51,7 +51,7 @@ def _walker(junction: Junction, number: int, generator: np.random.Generator) -> 
 
 
 def _stroller(junction: Junction, number: int, generator: np.random.Generator) -> list[Track]:
-    """The same on the pavement along the first road, from one side of it to the other and back."""
+    """A pedestrian on the pavement of the first road, who crosses it and returns."""
     speed = generator.choice([-1.0, 1.0]) * generator.uniform(1.0, 1.7)
     along = generator.uniform(-8.0, 8.0) + speed * (TIMES_S - 8.0)
     aside = generator.choice([-7.0, 7.0]) + 0.5 * np.sin(along / 3.0 + generator.uniform(0, 6))
@@ -73,14 +73,14 @@ def _joined(junction: Junction, evidence: Evidence, tracks: list[Track]) -> Evid
 
 @pytest.fixture(scope='module')
 def street() -> tuple[Junction, Evidence]:
-    """Return forty vehicles and thirty people."""
+    """Return evidence of forty vehicles and thirty pedestrians."""
     generator = np.random.default_rng(5)
     junction = Junction(vehicles=40, points_per_vehicle=6)
     people = [track for number in range(30) for track in _walker(junction, FIRST_WALKER + number, generator)]
     return junction, _joined(junction, synthetic_evidence(junction, generator), people)
 
 
-def test_who_walks_is_told_from_who_drives(street):
+def test_pedestrians_are_distinguished_from_vehicles(street):
     junction, evidence = street
     told = find_pedestrians(evidence, junction.camera, junction.normal_in_camera, junction.height_m)
     people = np.unique(evidence.track_vehicles[evidence.track_vehicles >= FIRST_WALKER])
@@ -89,17 +89,17 @@ def test_who_walks_is_told_from_who_drives(street):
     assert np.isin(people, told).mean() > 0.8
 
 
-def test_cars_in_a_jam_are_no_people():
+def test_cars_in_a_jam_are_not_pedestrians():
     generator = np.random.default_rng(6)
     junction = Junction()
     crawling = [track for number in range(20) for track in _crawler(junction, number, generator)]
     evidence = evidence_from_tracks(crawling, junction.image_size, 80.0)
     told = find_pedestrians(evidence, junction.camera, junction.normal_in_camera, junction.height_m)
-    # Six points fall anywhere over a width of 1.6 m: of one car in twenty or so all fall within half of it.
+    # Six points are spread at random over 1.6 m: on about one car in twenty all are within half of that.
     assert len(told) <= 3
 
 
-def test_a_calibration_counts_vehicles_without_people_and_is_no_worse_for_them(street):
+def test_a_calibration_counts_pedestrians_apart_from_vehicles_and_is_no_worse(street):
     junction, evidence = street
     result = solve(evidence, replace(Options(), camera_height=junction.height_m))
     assert isinstance(result, Calibration)
@@ -109,12 +109,12 @@ def test_a_calibration_counts_vehicles_without_people_and_is_no_worse_for_them(s
     assert off_deg < 3.0 * np.hypot(result.stddev.tilt_deg, result.stddev.roll_deg)
 
 
-def test_people_beside_a_lone_road_do_not_pass_for_turning_traffic():
+def test_pedestrians_beside_a_single_road_are_not_turning_traffic():
     generator = np.random.default_rng(7)
     junction = Junction(road_angles_deg=(0.0,), turning_fraction=0.0, vehicles=25, points_per_vehicle=6)
     people = [track for number in range(25) for track in _stroller(junction, FIRST_WALKER + number, generator)]
     evidence = _joined(junction, synthetic_evidence(junction, generator), people)
-    # A third and more of all that moved follows no road.
+    # More than a third of all objects follow no road.
     assert (np.unique(evidence.track_vehicles) >= FIRST_WALKER).mean() > 0.35
     result = solve(evidence, replace(Options(), camera_height=junction.height_m))
     assert isinstance(result, Calibration), result

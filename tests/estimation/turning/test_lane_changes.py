@@ -1,4 +1,4 @@
-"""The rotation about a lone road, from vehicles that change lanes on a motorway."""
+"""Rotation of the plane about a single road, from lane changes on a motorway."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SEED = 4
 
 
 def watched(vehicles: int) -> tuple[Junction, Evidence]:
-    """A motorway of which so many vehicles were seen, a third of them changing lanes; no edges, no lines."""
+    """Evidence of a motorway on which a third of the vehicles change lanes; no edges, no lines."""
     generator = np.random.default_rng(SEED)
     junction = replace(motorway(generator), vehicles=vehicles)
     return junction, synthetic_evidence(junction, generator)
@@ -36,7 +36,7 @@ def many() -> tuple[Junction, Calibration]:
     return junction, solved(junction, evidence)
 
 
-def test_many_lane_changes_tell_the_plane(many):
+def test_many_lane_changes_determine_the_plane(many):
     junction, result = many
     assert result.grade == 'assumed' and result.ground is not None
     cosine = abs(float(result.ground.normal_in_camera @ junction.camera_from_ground[:, 2]))
@@ -46,7 +46,7 @@ def test_many_lane_changes_tell_the_plane(many):
     assert sigma_deg < 1.5
 
 
-def test_they_are_named_with_their_deviation(many):
+def test_they_are_reported_with_their_standard_deviation(many):
     (named,) = (statement for statement in many[1].assumptions if statement.kind == 'lane_changes')
     assert named.values['vehicles'] >= 8 and 0.0 < named.values['sigma_deg'] < 1.5
 

@@ -1,4 +1,4 @@
-"""Lives that are stuck, lives that contradict windows, and halves that contradict the whole."""
+"""Tracklets in a wrong minimum, tracklets that contradict windows, and halves that contradict the whole."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def evidence_of(seed: int) -> Evidence:
 
 
 def slid(evidence: Evidence, generator: np.random.Generator, reach_px: float) -> Evidence:
-    """Let each followed point slide on its vehicle, to and fro over some 600 px of its way."""
+    """Let each tracked point slip on its vehicle, back and forth with a period of about 600 px of path."""
     points = evidence.points_px.copy()
     for begin, end in zip(evidence.track_starts[:-1], evidence.track_starts[1:], strict=True):
         steps = np.hypot(*np.diff(points[begin:end], axis=0).T)
@@ -49,7 +49,7 @@ def slid(evidence: Evidence, generator: np.random.Generator, reach_px: float) ->
 
 
 def sigmas_off(result: Calibration) -> float:
-    """How far tilt or roll is off in standard deviations of its own, whichever is more."""
+    """Larger error of tilt and roll, in their standard deviations."""
     assert result.ground is not None
     sigma = np.array([result.stddev.tilt_deg, result.stddev.roll_deg], float)
     off_deg = tilt_and_roll_deg(result.ground.normal_in_camera) - tilt_and_roll_deg(TURNING.normal_in_camera)
@@ -57,7 +57,7 @@ def sigmas_off(result: Calibration) -> float:
 
 
 @pytest.mark.parametrize('seed', range(4))
-def test_few_vehicles_whose_points_slide_do_not_mislead(seed: int) -> None:
+def test_few_vehicles_with_slipping_points_do_not_mislead(seed: int) -> None:
     generator = np.random.default_rng(seed)
     evidence = slid(synthetic_evidence(TURNING, generator), generator, 1.0)
     result = solve(evidence, Options(camera_height=8.0), lens=TURNING.camera)
@@ -66,7 +66,7 @@ def test_few_vehicles_whose_points_slide_do_not_mislead(seed: int) -> None:
 
 
 def turned_lives(windows: TwoFrameWindows, instants: ResampledTracks, limit: int, *, by_deg: float) -> Tracklets:
-    """Find lives as a camera turned a little would see them: bodies that move in another plane."""
+    """Find tracklets as a slightly rotated camera would see them: bodies that move in another plane."""
     lives = find_tracklets(windows, instants, limit)
     bearings, _ = TURNING.camera.unproject(lives.pixels)
     turn = Rotation.from_rotvec(np.radians([by_deg, 0.0, 0.0])).as_matrix()
@@ -74,7 +74,7 @@ def turned_lives(windows: TwoFrameWindows, instants: ResampledTracks, limit: int
     return replace(lives, pixels=np.where(lives.mask[..., None], pixels, 0.0))
 
 
-def test_lives_that_contradict_windows_are_not_believed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tracklets_that_contradict_windows_are_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(turning, 'find_tracklets', partial(turned_lives, by_deg=8.0))
     result = solve(evidence_of(1), Options(camera_height=8.0), lens=TURNING.camera)
     if isinstance(result, Calibration) and result.ground is not None:
@@ -88,11 +88,11 @@ def test_lives_that_contradict_windows_are_not_believed(monkeypatch: pytest.Monk
     before, after = compare_solutions(kept, kept).sigmas[1], compare_solutions(widened, widened).sigmas[1]
     apart_deg = np.degrees(np.arccos(kept.state.rotation[:, 2] @ tracklet_state.rotation[:, 2]))
     assert apart_deg > 5.0
-    assert after**2 - before**2 == pytest.approx(2 * apart_deg**2, rel=0.05)  # as if of two, each so far off
+    assert after**2 - before**2 == pytest.approx(2 * apart_deg**2, rel=0.05)  # as of two estimates with that error each
 
 
 def by_windows(evidence: Evidence) -> tuple[TwoFrameWindows, Adjustment, TrackSet]:
-    """Solve with windows alone, from the truth."""
+    """Adjust with windows alone, starting at the truth."""
     windows = find_windows(evidence, ResampledTracks(evidence))
     nothing = select_tracks(evidence, 500).subset(np.zeros(0, int))
     fit = adjust(
@@ -101,7 +101,7 @@ def by_windows(evidence: Evidence) -> tuple[TwoFrameWindows, Adjustment, TrackSe
     return windows, turning.refine_with_turning(fit, nothing, windows) or fit, nothing
 
 
-def test_a_stuck_life_is_begun_anew() -> None:
+def test_a_tracklet_in_a_wrong_minimum_is_restarted() -> None:
     evidence = evidence_of(3)
     windows, fit, nothing = by_windows(evidence)
     lives = find_tracklets(windows, ResampledTracks(evidence), 100)
@@ -110,7 +110,7 @@ def test_a_stuck_life_is_begun_anew() -> None:
     good = adjust(TRUTH, nothing, config, refine=True)
     shapes = good.problem.warm_start[2]
     assert shapes is not None
-    # a body that turns the other way: nothing small leads from there to how it moved
+    # a body that turns the other way: no small step leads to its true motion
     turns_rad = np.where(np.arange(len(lives))[:, None] < 3, -shapes.turns_rad, shapes.turns_rad)
     stuck = replace(shapes, turns_rad=turns_rad)
     bad = adjust(TRUTH, nothing, config, refine=True, warm_start=(None, None, stuck))
@@ -119,7 +119,7 @@ def test_a_stuck_life_is_begun_anew() -> None:
     assert (mended.turning2[:3] < 1.1 * good.turning2[:3]).all()
 
 
-def test_halves_answer_for_the_deviation_of_the_whole() -> None:
+def test_halves_bound_the_standard_deviation_of_the_whole() -> None:
     generator = np.random.default_rng(1)
     _, fit, nothing = by_windows(slid(synthetic_evidence(TURNING, generator), generator, 8.0))
     assert isinstance(check_halves(fit, nothing, GateOptions()), str)
@@ -128,7 +128,7 @@ def test_halves_answer_for_the_deviation_of_the_whole() -> None:
     assert isinstance(doubt, Reason) and doubt.code == 'halves_disagree'
 
 
-def test_halves_that_tell_alike_differ_by_twice_the_deviation_of_the_whole() -> None:
+def test_equally_informative_halves_differ_by_twice_the_deviation_of_the_whole() -> None:
     _, fit, _ = by_windows(evidence_of(2))
     half = replace(fit, information=0.5 * fit.information)
     whole = compare_solutions(fit, fit).sigmas / np.sqrt(2)

@@ -1,4 +1,4 @@
-"""Calibration from vehicles that turn, and what only looks like turning."""
+"""Calibration from turning vehicles, and motion that only looks like turning."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_turning_traffic_alone_calibrates_even_when_groups_are_wrong(joined: flo
     assert sigma.focal_px < 0.05 * 560.0
 
 
-def test_cars_side_by_side_on_one_road_tell_no_plane() -> None:
+def test_cars_side_by_side_on_one_road_give_no_plane() -> None:
     junction = Junction(
         road_angles_deg=(0.0,),
         camera_from_ground=pose(30.0, 1.0, 60.0),
@@ -87,7 +87,7 @@ def test_turning_traffic_completes_a_single_road() -> None:
 
 
 @pytest.mark.parametrize('seed', [0, 1])
-def test_a_ring_alone_is_refused_unless_it_tells_the_lens(seed: int) -> None:
+def test_a_roundabout_alone_is_refused_unless_the_lens_is_certain(seed: int) -> None:
     result = solved(replace(TURNING, drive=partial(drive_ring, radius_m=20.0)), seed)
     if isinstance(result, Refusal):
         assert result.code in ('one_centre', 'turning_traffic', 'too_little_turning')
@@ -96,7 +96,7 @@ def test_a_ring_alone_is_refused_unless_it_tells_the_lens(seed: int) -> None:
         assert abs(result.camera.focal_px - 560.0) < 3.0 * result.stddev.focal_px
 
 
-def test_people_on_foot_are_no_rigid_bodies() -> None:
+def test_pedestrians_are_not_rigid_bodies() -> None:
     result = solved(Junction(drive=walk_along_road, vehicles=60, points_per_vehicle=8))
     assert isinstance(result, Refusal)
 

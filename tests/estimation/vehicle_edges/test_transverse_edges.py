@@ -1,4 +1,4 @@
-"""The direction across a road from edges of boxes that drive on it, with clutter."""
+"""Transverse direction of a road from edges of boxes that drive on it, with clutter."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ ONE_ROAD = Junction(
     centre_m=(6.0, -10.0),
 )
 BOX_M = np.array([[length, width, up] for length in (-2.2, 2.2) for width in (-0.9, 0.9) for up in (0.0, 1.5)])
-"""Corners of a vehicle about its middle on the road, x ahead."""
+"""Corners of a vehicle relative to its middle on the road, x ahead."""
 SIDES = [(a, b) for a in range(8) for b in range(a + 1, 8) if bin(a ^ b).count('1') == 1]
 
 
@@ -50,7 +50,7 @@ def box_edges(
     clutter: float = 0.5,
     noise_px: float = 0.4,
 ) -> np.ndarray:
-    """Edges (n, 4) of a box on the road, the nearer half of them seen, and a share of clutter about it."""
+    """Visible edges (n, 4) of a box on the road, with a fraction of clutter around it."""
     cosine, sine = np.cos(np.radians(yaw_deg)), np.sin(np.radians(yaw_deg))
     turned = BOX_M @ np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]])
     corners = np.append(middle_m, -HEIGHT_M) + turned
@@ -76,7 +76,7 @@ def traffic(
     yaw_deg: float = 0.0,
     clutter: float = 0.5,
 ) -> VehicleEdges:
-    """Edges of boxes that drive along ground x on three lanes, each seen a few times."""
+    """Edges of boxes on three lanes along ground x, each seen several times."""
     ends, owners = [], []
     heading = np.linalg.inv(camera_from_ground) @ [0.0, 0.0, 1.0]
     for vehicle in range(vehicles):
@@ -90,7 +90,7 @@ def traffic(
 
 
 def state_of(camera_from_ground: np.ndarray, camera: Camera = CAMERA) -> AdjustmentState:
-    """The state of one road along ground x, its plane turned about the road as it would be where that is unknown."""
+    """State with one road along ground x and an arbitrary rotation of the plane about it."""
     along = camera_from_ground[:, 0]
     helper = np.cross(along, [0.3, 0.5, 0.8])
     helper /= np.linalg.norm(helper)
@@ -113,12 +113,12 @@ def test_boxes_give_the_direction_across_their_road(tilt: float, roll: float, he
     found = transverse_direction_at(traffic(camera_from_ground, generator), state_of(camera_from_ground), generator)
     assert found is not None
     sigma = np.degrees(found.step_sigma_rad)
-    assert sigma < 1.5  # degrees: what bodies have in common, and a little for their number
+    assert sigma < 1.5  # degrees: the common error of all vehicles, and little for their number
     assert abs(error_deg(found, camera_from_ground)) < 2.0 * sigma
 
 
 @pytest.mark.parametrize('seed', range(4))
-def test_clutter_alone_tells_nothing(seed: int) -> None:
+def test_clutter_alone_gives_no_direction(seed: int) -> None:
     generator = np.random.default_rng(seed)
     camera_from_ground = pose(30.0, 0.0, 30.0)
     boxes = traffic(camera_from_ground, generator)
@@ -128,14 +128,14 @@ def test_clutter_alone_tells_nothing(seed: int) -> None:
     assert transverse_direction_at(clutter, state_of(camera_from_ground), generator) is None
 
 
-def test_few_vehicles_tell_nothing() -> None:
+def test_few_vehicles_give_no_direction() -> None:
     generator = np.random.default_rng(0)
     camera_from_ground = pose(30.0, 0.0, 20.0)
     edges = traffic(camera_from_ground, generator, vehicles=6)
     assert transverse_direction_at(edges, state_of(camera_from_ground), generator) is None
 
 
-def test_no_edges_tell_nothing() -> None:
+def test_no_edges_give_no_direction() -> None:
     edges = VehicleEdges(np.zeros((0, 4)), np.zeros(0, int))
     assert transverse_direction_at(edges, state_of(pose(30.0, 0.0, 20.0)), np.random.default_rng(0)) is None
 
@@ -143,7 +143,7 @@ def test_no_edges_tell_nothing() -> None:
 def test_one_vehicle_seen_very_often_does_not_outweigh_the_others() -> None:
     camera_from_ground, generator = pose(30.0, 2.0, 25.0), np.random.default_rng(3)
     many = traffic(camera_from_ground, generator)
-    # a load that leans by 8 degrees about the road, in a jam
+    # a vehicle in a jam with a load that leans by 8 degrees about the road
     leaning = camera_from_ground @ np.array([[1, 0, 0], [0, 0.990, -0.139], [0, 0.139, 0.990]])
     jam = np.concatenate(
         [box_edges(CAMERA, leaning, np.array([14.0, 0.0]), generator, clutter=0.0) for _ in range(300)]
@@ -154,7 +154,7 @@ def test_one_vehicle_seen_very_often_does_not_outweigh_the_others() -> None:
     assert abs(error_deg(found, camera_from_ground)) < 1.5
 
 
-def test_the_standard_deviation_covers_what_is_missed() -> None:
+def test_the_standard_deviation_covers_the_error() -> None:
     misses = []
     for seed in range(12):
         generator = np.random.default_rng(seed)
@@ -192,7 +192,7 @@ def test_the_direction_moves_with_the_road_as_the_edges_do(axis: np.ndarray) -> 
     assert np.degrees(np.arccos(min(abs(moved @ anew.across(turned)), 1.0))) < 0.35
 
 
-def test_a_level_camera_and_edges_are_joined_by_their_variances() -> None:
+def test_a_level_camera_and_edges_are_combined_by_their_variances() -> None:
     camera_from_ground = pose(30.0, 2.0, 5.0)
     edges = traffic(camera_from_ground, np.random.default_rng(5))
     state = state_of(camera_from_ground)
@@ -200,14 +200,14 @@ def test_a_level_camera_and_edges_are_joined_by_their_variances() -> None:
     assert square is not None
     joined, apart_deg = combine_assumptions(LevelCamera(1.0), square, state)
     assert joined is not None
-    # along the road ahead the roll and the turn about it are nearly the same
+    # for a road straight ahead, roll and rotation about the road are nearly the same
     assert apart_deg == pytest.approx(2.0, abs=1.0)
     assert joined.step_sigma_rad < square.step_sigma_rad
     before, after = error_deg(square, camera_from_ground), error_deg(joined, camera_from_ground)
     assert 0.1 < abs(after - before) < apart_deg
 
 
-def test_a_level_camera_that_edges_contradict_is_noticed() -> None:
+def test_edges_that_contradict_a_level_camera_are_noticed() -> None:
     camera_from_ground = pose(30.0, 8.0, 5.0)
     state = state_of(camera_from_ground)
     square = transverse_direction_at(
@@ -219,7 +219,7 @@ def test_a_level_camera_that_edges_contradict_is_noticed() -> None:
 
 
 def with_boxes(junction: Junction, clutter: float = 0.5) -> Evidence:
-    """Evidence of a junction with edges of boxes around its vehicles, at times of their tracks."""
+    """Evidence of a junction with edges of boxes at its vehicles, at the times of their tracks."""
     evidence, generator = synthetic_evidence(junction, np.random.default_rng(0)), np.random.default_rng(1)
     ends, owners, times = [], [], []
     for track in evidence.tracks():
@@ -253,14 +253,14 @@ def test_one_road_and_edges_give_an_assumed_plane_of_a_rolled_camera() -> None:
     assert error < 1.5 and error < 2.5 * np.hypot(result.stddev.roll_deg, result.stddev.tilt_deg)
 
 
-def test_edges_are_not_asked_where_that_is_not_wanted() -> None:
+def test_edges_are_not_used_if_switched_off() -> None:
     options = Options(camera_height=HEIGHT_M, joint=JointOptions(transverse_edges=False))
     result = solve(with_boxes(ROLLED), options)
     assert isinstance(result, Calibration) and result.ground_refusal is not None
     assert result.ground_refusal.code == 'one_direction'
 
 
-def test_edges_that_contradict_a_level_camera_leave_no_plane_and_say_so() -> None:
+def test_edges_that_contradict_a_level_camera_are_refused_with_a_reason() -> None:
     junction = replace(ONE_ROAD, camera_from_ground=pose(35.0, 9.0, 60.0))
     result = solve(with_boxes(junction), Options(camera_height=HEIGHT_M, joint=JointOptions(roll_prior_deg=1.0)))
     assert isinstance(result, Calibration) and result.ground is None and result.ground_refusal is not None
@@ -281,18 +281,18 @@ def assumed() -> Solution:
     return solution
 
 
-def test_a_plane_through_the_traffic_is_doubted(assumed: Solution) -> None:
+def test_a_plane_through_the_traffic_is_refused(assumed: Solution) -> None:
     assert assumed.plane.fraction_below_horizon > 0.99 and check_plane(assumed.plane, GateOptions()) is None
     doubt = check_plane(replace(assumed.plane, fraction_below_horizon=0.8), GateOptions())
     assert doubt is not None and doubt.code == 'horizon'
 
 
-def test_the_plane_is_no_surer_about_its_road_than_the_edges_are(assumed: Solution) -> None:
+def test_the_plane_is_no_more_certain_about_its_road_than_the_edges(assumed: Solution) -> None:
     plane, along = assumed.plane, assumed.fit.state.directions[0]
     across = np.cross(along, plane.normal(plane.fit.state))
     sigma = float(plane.sigma(lambda _, normal: np.atleast_1d(normal @ across))[0])
     told = float(assumed.fit.sigma(lambda state: np.atleast_1d(plane.normal(state) @ across))[0])
     assert plane.assumed is not None
     assert sigma == pytest.approx(np.hypot(plane.assumed.step_sigma_rad, told), rel=1e-3)
-    # and the lens adds something of its own, through the edges' own circles
+    # and the lens adds its own uncertainty, through the great circles of the edges
     assert told > 1e-4
