@@ -73,15 +73,8 @@ class _Stream:
         """Take one image and gather what it shows."""
         time_s = (stamp_ns - self.first_stamp_ns) * 1e-9
         observed = self.observer.observe(image, time_s)
-        for track in observed.tracks:
-            self.buffer.add_track(track)
+        self.buffer.add(observed.tracks, observed.segments, observed.edges, observed.outlines)
         self.tracks_seen += len(observed.tracks)
-        if observed.segments is not None:
-            self.buffer.add_segments(observed.segments)
-        if observed.edges is not None:
-            self.buffer.add_edges(observed.edges)
-        if observed.outlines is not None:
-            self.buffer.add_outlines(observed.outlines)
         if time_s >= self._next_forget_s:
             self._forget(time_s, options)
         self.newest_stamp_ns = stamp_ns

@@ -1,24 +1,28 @@
-"""DOCSTRING."""
+"""Bounded buffer of observations; when it is full, the least novel vehicles are evicted."""
 
 from __future__ import annotations
+
+from collections.abc import Iterable
 
 import numpy as np
 
 from autocalib_ros.config import BufferOptions
 from autocalib_ros.evidence.retention import RetentionIndex
-from autocalib_ros.evidence.snapshot import OUTLINE_COLUMNS, Edges, Evidence, Outlines, Segments, Track, _track_arrays
+from autocalib_ros.evidence.snapshot import Edges, Evidence, Outlines, Segments, Track, track_arrays
+from autocalib_ros.evidence.tables import EDGES, OUTLINES, SEGMENTS, ObservationTable, merged
 
 
 class _LineTable:
-    """Lines of vehicles, or outlines of them, in arrays: what adds least goes when there is no room."""
+    """Preallocated arrays of one kind of observation; the least novel vehicles are evicted when they are full."""
 
-    def __init__(self, limit: int, columns: int = 4, dtype: type = float) -> None:
-        self._ends_px = np.zeros((limit, columns), dtype)
+    def __init__(self, table: ObservationTable, limit: int, dtype: type = float) -> None:
+        self._table = table
+        self._ends_px: np.ndarray = np.zeros((limit, table.columns), dtype)
         self._vehicles = np.zeros(limit, int)
         self.retention = RetentionIndex(limit)
 
     def add(self, lines: Segments | Edges | Outlines) -> None:
-        """Take the lines of one time; where there is no room, vehicles that add least make some."""
+        """Add the observations of one image; evict the least novel vehicles if there is no room."""
         limit = len(self._ends_px)
         ends, vehicles = lines.ends_px[:limit], lines.vehicles[:limit]
         if not len(ends):
@@ -31,35 +35,46 @@ class _LineTable:
         self.retention.add(vehicles, 0.5 * (first + last), last - first, lines.time_s)
 
     def keep(self, rows: np.ndarray) -> None:
-        """Keep the lines of these rows."""
+        """Keep only these rows, by rising index."""
         if len(rows) < self.retention.count:
             self.retention.keep(rows)
             self._ends_px[: len(rows)], self._vehicles[: len(rows)] = self._ends_px[rows], self._vehicles[rows]
 
-    def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Ends (lines, columns), vehicles (lines,) and times (lines,) of all that is held."""
-        count = self.retention.count
-        return self._ends_px[:count].copy(), self._vehicles[:count].copy(), self.retention.times_s.copy()
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return copies of the arrays by their names in `Evidence`."""
+        count, table = self.retention.count, self._table
+        columns = (self._ends_px[:count].copy(), self._vehicles[:count].copy(), self.retention.times_s.copy())
+        return dict(zip((table.values, table.vehicles, table.times), columns, strict=True))
 
 
 class EvidenceBuffer:
-    """Finished tracks, segments, edges and outlines, bounded in number: what adds least goes first, by whole vehicles.
+    """Finished tracks, segments, edges and outlines, bounded in number; eviction removes whole vehicles.
 
-    A track holds at most `tracking.max_samples` points of 24 bytes and 0.4 kB of its own, a segment or an
-    edge 80 bytes, an outline 120: with the default options no more than 26 MB are held, however long it runs.
+    Memory: a track takes up to `tracking.max_samples` points of 24 bytes plus 0.4 kB, a segment or an edge 80 bytes,
+    an outline 120 bytes; at most 26 MB with the default options, independent of the running time.
     """
 
     def __init__(self, options: BufferOptions) -> None:
         self._tracks: list[Track] = []
         self._track_retention = RetentionIndex(options.max_tracks)
         self._max_tracks = options.max_tracks
-        self._segments = _LineTable(options.max_segments)
-        self._edges = _LineTable(options.max_edges)
-        self._outlines = _LineTable(options.max_outlines, OUTLINE_COLUMNS, np.float32)
+        self._segments = _LineTable(SEGMENTS, options.max_segments)
+        self._edges = _LineTable(EDGES, options.max_edges)
+        self._outlines = _LineTable(OUTLINES, options.max_outlines, np.float32)
         self._line_tables = (self._segments, self._edges, self._outlines)
 
+    def add(
+        self, tracks: Iterable[Track], segments: Segments | None, edges: Edges | None, outlines: Outlines | None
+    ) -> None:
+        """Add the observations of one image: the tracks that ended with it, and lines of each kind that it has."""
+        for track in tracks:
+            self.add_track(track)
+        for table, lines in zip(self._line_tables, (segments, edges, outlines), strict=True):
+            if lines is not None:
+                table.add(lines)
+
     def add_track(self, track: Track) -> None:
-        """Take a finished track; where there is no room, vehicles that add least make some."""
+        """Add a finished track; evict the least novel vehicles if there is no room."""
         if self._track_retention.count == self._max_tracks:
             self._keep_tracks(self._track_retention.rows_after_eviction(1))
         points = track.points_px
@@ -69,25 +84,25 @@ class EvidenceBuffer:
         self._tracks.append(track)
 
     def add_segments(self, segments: Segments) -> None:
-        """Take the segments of one pair of frames."""
+        """Add the segments of one pair of frames."""
         self._segments.add(segments)
 
     def add_edges(self, edges: Edges) -> None:
-        """Take the edges of one image."""
+        """Add the edges of one image."""
         self._edges.add(edges)
 
     def add_outlines(self, outlines: Outlines) -> None:
-        """Take the outlines of one image."""
+        """Add the outlines of one image."""
         self._outlines.add(outlines)
 
     def forget_replaced(self, time_s: float) -> None:
-        """Drop the vehicles last seen before `time_s` in whose place there are enough newer ones."""
+        """Drop vehicles last seen before `time_s` that enough newer ones replace."""
         self._keep_tracks(self._track_retention.rows_not_replaced(time_s))
         for lines in self._line_tables:
             lines.keep(lines.retention.rows_not_replaced(time_s))
 
     def forget_before(self, time_s: float) -> None:
-        """Drop all that ended before `time_s`: the camera may have stood otherwise then."""
+        """Drop all observations that ended before `time_s`: the camera may have moved since."""
         self._keep_tracks(self._track_retention.rows_since(time_s))
         for lines in self._line_tables:
             lines.keep(lines.retention.rows_since(time_s))
@@ -99,12 +114,12 @@ class EvidenceBuffer:
 
     @property
     def track_count(self) -> int:
-        """Number of finished tracks held."""
+        """Number of finished tracks in the buffer."""
         return len(self._tracks)
 
     @property
     def oldest_s(self) -> float:
-        """When the oldest of what is held ended; infinite where there is nothing."""
+        """End time of the oldest observation; infinite if there is none."""
         return min(
             retention.oldest_s
             for retention in (self._track_retention, *(lines.retention for lines in self._line_tables))
@@ -120,24 +135,13 @@ class EvidenceBuffer:
         drift_px: float,
         unfinished: list[Track],
     ) -> Evidence:
-        """Freeze what is held, with the tracks that are still being followed."""
-        segments_px, segment_vehicles, segment_times_s = self._segments.arrays()
-        edges_px, edge_vehicles, edge_times_s = self._edges.arrays()
-        outlines_px, outline_vehicles, outline_times_s = self._outlines.arrays()
+        """Return the observations so far, with the tracks that are still being followed."""
         return Evidence(
             image_size=image_size,
             first_stamp_ns=first_stamp_ns,
             newest_stamp_ns=newest_stamp_ns,
             frames=frames,
             drift_px=drift_px,
-            segments_px=segments_px,
-            segment_vehicles=segment_vehicles,
-            segment_times_s=segment_times_s,
-            edges_px=edges_px,
-            edge_vehicles=edge_vehicles,
-            edge_times_s=edge_times_s,
-            outlines_px=outlines_px,
-            outline_vehicles=outline_vehicles,
-            outline_times_s=outline_times_s,
-            **_track_arrays([*self._tracks, *unfinished]),
+            **merged([lines.arrays() for lines in self._line_tables]),
+            **track_arrays([*self._tracks, *unfinished]),
         )

@@ -1,7 +1,8 @@
-"""What evidence adds to what is newer, and so what may go when memory is full.
+"""Retention policy of the evidence buffer: which observations to evict when memory is full.
 
-Evidence is about as good as the next of its kind: another vehicle that went the same way through the same part of the
-image. Its kind is an image cell with a heading, and what counts is how many newer vehicles there are of that kind.
+Observations are interchangeable with those of another vehicle that drove in the same direction through the same part of
+the image. They are binned by image cell and heading; the novelty of a vehicle falls with the number of newer vehicles
+in its bins.
 """
 
 from __future__ import annotations
@@ -9,26 +10,27 @@ from __future__ import annotations
 import numpy as np
 
 CELLS_PER_SIDE = 8
-"""Cells along the longer side of the box that holds the traffic; they are square. A road far away fills few pixels."""
+"""Square cells along the longer side of the bounding box of the traffic: a distant road fills few pixels. Judgement."""
 HEADING_BINS = 8
+"""Bins of 45 degrees, centred on the image axes. Judgement."""
 CORROBORATING_TRACKS = 3
-"""So many tracks of a vehicle corroborate each other; a lone one may be a shadow or a leaf, and is worth its share."""
+"""Rows of a vehicle that corroborate each other; fewer scale its novelty down: it may be a shadow or a leaf."""
 REPLACING_VEHICLES = 25
-"""So many newer vehicles of its kind replace one: random errors are then down to a fifth of one vehicle's."""
+"""Newer vehicles of a bin that replace an older one: random errors have fallen to 1/sqrt(25), a fifth."""
 EVICTION_FRACTION = 0.1
-"""Share of the buffer that is emptied at once when it is full: choosing costs milliseconds, adding microseconds."""
+"""Fraction of the buffer that one eviction frees: choosing takes milliseconds, adding microseconds."""
 MAX_VEHICLE_FRACTION = 0.125
-"""A label that more of the buffer comes from goes on as another vehicle, so that one alone cannot fill it."""
+"""Fraction of the buffer after which a vehicle id counts as a new passage, so that one id cannot fill the buffer."""
 
 
 def headings(displacements_px: np.ndarray) -> np.ndarray:
-    """Number the heading (n,) of displacements (n, 2); a road along an axis of the image is not split by noise."""
+    """Return the heading bin (n,) of displacements (n, 2); bins are centred on the image axes, as roads are."""
     turns = np.arctan2(displacements_px[:, 1], displacements_px[:, 0]) * (HEADING_BINS / (2 * np.pi))
     return np.floor(turns + 0.5) % HEADING_BINS
 
 
 def cell_heading_bins(midpoints_px: np.ndarray, heading: np.ndarray) -> np.ndarray:
-    """Number the kind (n,) of what passed `midpoints_px` (n, 2) under a heading (n,)."""
+    """Return the joint bin (n,) of image cell and heading, for midpoints (n, 2) and headings (n,)."""
     corner = midpoints_px.min(axis=0)
     side = max(float((midpoints_px.max(axis=0) - corner).max()), 1e-9) / CELLS_PER_SIDE
     column, row = np.minimum((midpoints_px - corner) / side, CELLS_PER_SIDE - 1).astype(int).T
@@ -36,10 +38,10 @@ def cell_heading_bins(midpoints_px: np.ndarray, heading: np.ndarray) -> np.ndarr
 
 
 def novelty(vehicles: np.ndarray, newest_s: np.ndarray, bins: np.ndarray) -> np.ndarray:
-    """Return what each vehicle adds per row, 0 to 1, shape (max(vehicles) + 1,).
+    """Return the mean novelty of the rows of each vehicle, 0 to 1, shape (max(vehicles) + 1,).
 
-    `vehicles` (n,) are the rows' owners, numbered from 0, `newest_s` (vehicles,) their last times and `bins` (n,)
-    the rows' kinds. A row is worth one over one more than the newer vehicles of its kind.
+    `vehicles` (n,) are the vehicle indices of the rows, from 0; `newest_s` (vehicles,) the last time of each vehicle;
+    `bins` (n,) the bins of the rows. The novelty of a row is 1 / (1 + newer vehicles in its bin).
     """
     count = len(newest_s)
     age = np.empty(count, int)
@@ -53,7 +55,7 @@ def novelty(vehicles: np.ndarray, newest_s: np.ndarray, bins: np.ndarray) -> np.
 
 
 class RetentionIndex:
-    """Who left each row that is held, where and when: at most `limit` rows, in the order in which they came."""
+    """Vehicle, place, heading and time of each row of a bounded table: at most `limit` rows, in order of arrival."""
 
     def __init__(self, limit: int) -> None:
         self._limit = limit
@@ -71,16 +73,13 @@ class RetentionIndex:
         The caller makes room for them first.
         """
         part = slice(self.count, self.count + len(vehicles))
-        self._midpoints_px[part], self._headings[part], self._times_s[part] = (
-            midpoints_px,
-            headings(displacements_px),
-            time_s,
-        )
+        self._midpoints_px[part], self._times_s[part] = midpoints_px, time_s
+        self._headings[part] = headings(displacements_px)
         self._passage_ids[part] = [self._passage_id(vehicle) for vehicle in vehicles.tolist()]
         self.count += len(vehicles)
 
     def _passage_id(self, vehicle: int) -> int:
-        """Number the passage of a vehicle: a label that a queue hands on for ever is not one vehicle."""
+        """Return the passage id of a vehicle id: an id that passes from car to car in a queue is not one vehicle."""
         passage_id, rows = self._passages.get(vehicle, (-1, 0))
         if passage_id < 0 or rows >= self._limit * MAX_VEHICLE_FRACTION:
             passage_id, rows, self._next_passage_id = self._next_passage_id, 0, self._next_passage_id + 1
@@ -88,7 +87,7 @@ class RetentionIndex:
         return passage_id
 
     def rows_after_eviction(self, wanted: int) -> np.ndarray:
-        """Return the rows to keep so that `wanted` more fit: a batch of vehicles that add least goes, whole."""
+        """Return the rows to keep so that `wanted` more fit; a batch of the least novel vehicles is evicted whole."""
         vehicles, newest_s, added = self._novelty()
         goal = min(self._limit * (1.0 - EVICTION_FRACTION), self._limit - wanted)
         order = np.lexsort((newest_s, added))
@@ -97,7 +96,7 @@ class RetentionIndex:
         return np.flatnonzero(~np.isin(vehicles, going))
 
     def rows_not_replaced(self, time_s: float) -> np.ndarray:
-        """Return the rows of vehicles seen since `time_s`, and of older ones that newer ones do not yet replace."""
+        """Return the rows of vehicles seen since `time_s`, and of older ones that too few newer ones replace."""
         if not self.count or self.oldest_s >= time_s:
             return np.arange(self.count)
         vehicles, newest_s, added = self._novelty()
@@ -108,16 +107,13 @@ class RetentionIndex:
         return np.flatnonzero(self._times_s[: self.count] >= time_s)
 
     def _novelty(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Vehicle of each row (n,), numbered in the order they came; last time and worth of each vehicle."""
+        """Return the vehicle index of each row (n,), and the last time and novelty of each vehicle."""
         held = slice(self.count)
         _, vehicles = np.unique(self._passage_ids[held], return_inverse=True)
         newest_s = np.full(vehicles.max() + 1, -np.inf)
         np.maximum.at(newest_s, vehicles, self._times_s[held])
-        return (
-            vehicles,
-            newest_s,
-            novelty(vehicles, newest_s, cell_heading_bins(self._midpoints_px[held], self._headings[held])),
-        )
+        bins = cell_heading_bins(self._midpoints_px[held], self._headings[held])
+        return vehicles, newest_s, novelty(vehicles, newest_s, bins)
 
     def keep(self, rows: np.ndarray) -> None:
         """Keep only these rows (n,), by rising index."""
@@ -134,5 +130,5 @@ class RetentionIndex:
 
     @property
     def oldest_s(self) -> float:
-        """Time of the oldest row; infinite where there is none."""
+        """Time of the oldest row; infinite if there is none."""
         return float(self.times_s.min(initial=np.inf))

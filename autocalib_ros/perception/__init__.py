@@ -1,1 +1,1 @@
-"""Images to observations: the only rooms that track, detect or match."""
+"""Images to observations: background, motion mask, KLT tracks, SIFT segments, edges, silhouettes and detections."""

@@ -1,4 +1,4 @@
-"""The road without its traffic: the median of a few images far apart in time."""
+"""Background image: the temporal median of a few images far apart in time, in which traffic cancels out."""
 
 from __future__ import annotations
 
@@ -6,17 +6,19 @@ import cv2
 import numpy as np
 
 MAX_SAMPLES = 9
+"""Images in memory; bounds memory and the cost of the median."""
 FIRST_INTERVAL_S = 1.0
+"""First sampling interval, seconds."""
 MAX_INTERVAL_S = 600.0
-"""Light, dirt and new paint: what is older than `MAX_SAMPLES` of these is no longer how the road looks."""
+"""Longest sampling interval: images older than `MAX_SAMPLES` of these show other light, dirt and road paint."""
 MIN_SAMPLES = 5
-"""Of fewer images the median shows what drove by as well."""
+"""The median of fewer images still shows passing vehicles. Judgement."""
 
 
 class Background:
-    """Keeps a few images as JPEG; whenever it is full, every second one goes and the interval doubles.
+    """Bounded set of JPEG samples; when it is full, every second one is dropped and the sampling interval doubles.
 
-    From `MAX_INTERVAL_S` on, the oldest goes instead.
+    Once the interval has reached `MAX_INTERVAL_S`, the oldest sample is dropped instead.
     """
 
     def __init__(self) -> None:
@@ -25,7 +27,7 @@ class Background:
         self._next_s = 0.0
 
     def update(self, image: np.ndarray, time_s: float) -> None:
-        """Look at a grey or BGR uint8 image; few are kept."""
+        """Add a grey or BGR uint8 image if the sampling interval has passed."""
         if time_s < self._next_s:
             return
         if len(self._samples) == MAX_SAMPLES:
@@ -43,7 +45,7 @@ class Background:
         self._interval_s *= 2
 
     def forget_before(self, time_s: float) -> None:
-        """Drop the images from before `time_s`, when the camera stood otherwise, but for the newest."""
+        """Drop images taken before `time_s`, when the camera pose was different; keep at least the newest one."""
         newer = [sample for sample in self._samples if sample[0] >= time_s]
         if len(newer) < len(self._samples):
             self._samples = newer or self._samples[-1:]
@@ -51,25 +53,27 @@ class Background:
 
     @property
     def times_s(self) -> tuple[float, ...]:
-        """When the images were taken of which the background is made."""
+        """Times of the images that the background is computed from."""
         return tuple(time_s for time_s, _ in self._samples)
 
     def image(self) -> np.ndarray | None:
-        """Return the median image, BGR uint8 (H, W, 3), or None before the first."""
+        """Return the median image, BGR uint8 (H, W, 3); None before the first image."""
         return self._median(cv2.IMREAD_COLOR) if self._samples else None
 
     def grey(self) -> np.ndarray | None:
-        """Return the median image in grey, uint8 (H, W), or None before it is free of traffic."""
+        """Return the median image in grey, uint8 (H, W); None while there are fewer than `MIN_SAMPLES`."""
         return self._median(cv2.IMREAD_GRAYSCALE) if len(self._samples) >= MIN_SAMPLES else None
 
     def _median(self, flags: int) -> np.ndarray:
-        return median([cv2.imdecode(encoded, flags) for _, encoded in self._samples])
+        images = [cv2.imdecode(encoded, flags) for _, encoded in self._samples]
+        return median([image for image in images if image is not None])
 
 
 def median(images: list[np.ndarray]) -> np.ndarray:
-    """Return the median of images of one shape, pixel by pixel; of an even number the upper one.
+    """Return the pixelwise median of images of one shape; the upper median of an even number.
 
-    By exchanges of neighbours, which OpenCV does for a whole image at a time: odd-even transposition sort.
+    Odd-even transposition sort (Knuth, TAOCP vol. 3, 5.2.2): each exchange is one OpenCV minimum and maximum of whole
+    images.
     """
     images = list(images)
     for turn in range(len(images)):

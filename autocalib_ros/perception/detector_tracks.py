@@ -1,6 +1,6 @@
-"""Vehicles by a detector: its boxes, matched from one detection to the next and carried by the points on them.
+"""Tracking by detection: detector boxes associated over time by IoU and propagated by the KLT points inside them.
 
-What stands still, a parked car or a wall that looks like one, has a box too and gives no region.
+Stationary objects, parked cars or false detections, also have boxes but yield no region.
 """
 
 from __future__ import annotations
@@ -16,32 +16,32 @@ from autocalib_ros.perception.klt_tracker import PointTracker
 from autocalib_ros.perception.motion_mask import Region
 
 MIN_IOU = 0.3
-"""A box is that of a detection when they share so much of their union (Bewley et al. 2016)."""
+"""Least intersection over union of a track and its detection (SORT, Bewley et al. 2016)."""
 MAX_UNSEEN_S = 1.0
-"""A box that was not detected for so long is given up: detectors miss a vehicle now and then."""
+"""Time without a detection after which a track ends: detectors miss a vehicle now and then."""
 MIN_MOVING_FRACTION = 0.2
-"""Least share of a box that differs from the background: a vehicle fills most of its box, and what passes behind a
-parked one little."""
+"""Least fraction of a moving box covered by the motion mask: a vehicle fills most of its box, traffic passing behind a
+parked one little of it. Judgement."""
 MIN_SPEED_PER_S = 0.1
-"""A box moves when the points on it go so far in a second, share of its longer side."""
+"""Least speed of a moving box by its points, longer sides of the box per second. Judgement."""
 MIN_POINTS_PER_BOX = 3
-"""So many points tell how a vehicle moves; fewer may hold on to something else."""
+"""Least number of points that propagate a box; fewer may lie on another object. Judgement."""
 
 
 @dataclass
 class _Box:
-    """One vehicle or person that was detected and may be again."""
+    """Track of one detected vehicle or person."""
 
     vehicle: int
     edges_px: np.ndarray
-    """Left, top, right, bottom in pixels of the tracked image, where (0, 0) is its corner, shape (4,)."""
+    """Left, top, right, bottom in pixels of the tracked image, origin at the image corner, shape (4,)."""
     seen_s: float
     speed_px_s: float = 0.0
-    """Of the points on it, 0 where there are too few."""
+    """Median speed of the points inside; 0 if there are too few."""
 
 
 class DetectorTracks:
-    """Follows the boxes of one stream of images; the detector may be shared, one image at a time."""
+    """Tracks the boxes of one image stream; the detector may be shared between streams but not called concurrently."""
 
     def __init__(self, detector: VehicleDetector, options: DetectorOptions) -> None:
         self._detector, self._every_s = detector, options.every_s
@@ -51,13 +51,13 @@ class DetectorTracks:
         self._detected_s, self._time_s = -np.inf, -np.inf
 
     def follow(self, image: np.ndarray, time_s: float, tracker: PointTracker, reduction: float) -> None:
-        """Carry the boxes into a new image by their points, and detect anew where it is time.
+        """Propagate the boxes to a new image by their points, and run the detector every `every_s` seconds.
 
-        `image` (H, W) or (H, W, 3) is `reduction` times as large as the tracked one.
+        `image` (H, W) or (H, W, 3) is `reduction` times the size of the tracked image.
         """
         points, vehicle_ids = tracker.positions()
         self._propagate(vehicle_ids, tracker.steps(), time_s)
-        # the image nearest to the time that is due: stamps jitter
+        # detect on the image nearest to the due time: stamps jitter
         if time_s + 0.5 * min(time_s - self._time_s, self._every_s) >= self._detected_s + self._every_s:
             found = self._detector.detect(image)
             self._associate(found, found.edges_px / reduction, points + 0.5, vehicle_ids, time_s)
@@ -68,9 +68,10 @@ class DetectorTracks:
     def regions(
         self, moving: list[Region], shape: tuple[int, int], excluded: np.ndarray | None = None
     ) -> tuple[list[Region], np.ndarray]:
-        """Return what moves of each box, nearest first, and the vehicles (n,), given what moves in the image (H, W).
+        """Return the moving part of each moving box, nearest first, and the vehicle ids (n,).
 
-        No region reaches to where an image (H, W) is `excluded`, not 0.
+        `moving` are the regions of the motion mask, `shape` the size (H, W) of the image; pixels where the mask
+        `excluded` (H, W) is not 0 belong to no region.
         """
         differs = np.zeros(shape, np.uint8)
         for region in moving:
@@ -79,7 +80,7 @@ class DetectorTracks:
         found, free = [], np.full(shape, 255, np.uint8)
         if excluded is not None:
             free[excluded > 0] = 0
-        # A person stands before the vehicle that its box overlaps; of two vehicles the lower one is nearer.
+        # A person is in front of a vehicle whose box overlaps; of two vehicles the lower one is nearer.
         for box in sorted(
             self._boxes, key=lambda box: (self.kind(box.vehicle) is not TrackKind.PERSON, -box.edges_px[3])
         ):
@@ -97,12 +98,12 @@ class DetectorTracks:
         return [region for region, _ in found], np.array([vehicle for _, vehicle in found], int)
 
     def kind(self, vehicle: int) -> TrackKind:
-        """What most detections of a vehicle say that it is."""
+        """Return the class of a vehicle by the score-weighted majority of its detections."""
         votes = self._votes.get(vehicle)
         return TrackKind.UNKNOWN if votes is None else TrackKind.PERSON if votes < 0 else TrackKind.VEHICLE
 
     def _propagate(self, vehicle_ids: np.ndarray, steps: np.ndarray, time_s: float) -> None:
-        """Move each box by the median step (n, 2) of the points on its vehicle since the image before."""
+        """Move each box by the median displacement of the points of its vehicle since the previous image."""
         for box in self._boxes:
             mine = steps[vehicle_ids == box.vehicle]
             box.speed_px_s = 0.0
@@ -114,7 +115,7 @@ class DetectorTracks:
     def _associate(
         self, found: Detections, edges_px: np.ndarray, points: np.ndarray, vehicle_ids: np.ndarray, time_s: float
     ) -> None:
-        """Give each detection its box: the one that overlaps it most, else that of the points in it, else a new one."""
+        """Associate each detection with a track by IoU, else by the points inside it, else start a new track."""
         matched = _greedy_iou_matches(edges_px, np.array([box.edges_px for box in self._boxes]).reshape(-1, 4))
         taken = {self._boxes[index].vehicle for index in matched.values()}
         unseen = [box for index, box in enumerate(self._boxes) if index not in matched.values()]
@@ -137,13 +138,13 @@ class DetectorTracks:
         return self._vehicles
 
     def _drop_stale_votes(self, vehicle_ids: np.ndarray) -> None:
-        """Forget what vehicles are that have neither a box nor a point left."""
+        """Drop the class votes of vehicles that have neither a box nor a point left."""
         alive = {box.vehicle for box in self._boxes} | set(vehicle_ids.tolist())
         self._votes = {vehicle: votes for vehicle, votes in self._votes.items() if vehicle in alive}
 
 
 def _greedy_iou_matches(detected: np.ndarray, known: np.ndarray) -> dict[int, int]:
-    """Pair detections (n, 4) with boxes (m, 4), best overlap first."""
+    """Match detections (n, 4) to boxes (m, 4) greedily, highest IoU first."""
     overlap = _ious(detected, known)
     pairs: dict[int, int] = {}
     order = np.argsort(-overlap.ravel(), kind='stable')
@@ -156,7 +157,7 @@ def _greedy_iou_matches(detected: np.ndarray, known: np.ndarray) -> dict[int, in
 
 
 def _ious(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Intersection over union of boxes (n, 4) with boxes (m, 4), shape (n, m)."""
+    """Return the intersection over union of boxes (n, 4) with boxes (m, 4), shape (n, m)."""
     left_top = np.maximum(first[:, None, :2], second[None, :, :2])
     right_bottom = np.minimum(first[:, None, 2:], second[None, :, 2:])
     shared = np.maximum(right_bottom - left_top, 0.0).prod(axis=-1)
@@ -165,7 +166,7 @@ def _ious(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def _vehicle_of_points(edges: np.ndarray, points: np.ndarray, vehicle_ids: np.ndarray, taken: set[int]) -> int:
-    """Return the vehicle of most points (n, 2) inside a box, those taken apart; 0 where there is none."""
+    """Return the vehicle id of most points (n, 2) inside a box, ids in `taken` excluded; 0 if there is none."""
     inside = ((points >= edges[:2]) & (points < edges[2:])).all(axis=1)
     votes = np.bincount(
         np.array([owner for owner in vehicle_ids[inside].tolist() if owner not in taken], int), minlength=1
@@ -174,7 +175,7 @@ def _vehicle_of_points(edges: np.ndarray, points: np.ndarray, vehicle_ids: np.nd
 
 
 def _pixel_bounds(edges: np.ndarray, shape: tuple[int, int]) -> tuple[int, int, int, int]:
-    """Whole pixels that a box covers of an image (height, width)."""
+    """Return the pixel range left, top, right, bottom that a box covers of an image (height, width)."""
     left, top = np.maximum(np.floor(edges[:2]), 0).astype(int)
     right, bottom = np.minimum(np.ceil(edges[2:]), shape[::-1]).astype(int)
     return int(left), int(top), int(right), int(bottom)

@@ -1,4 +1,4 @@
-"""Straight edges on vehicles: bumpers, windscreens, pillars, the gaps between a lorry and its load."""
+"""Straight edges on moving vehicles by LSD (Grompone von Gioi et al. 2010): bumpers, windscreens, pillars."""
 
 from __future__ import annotations
 
@@ -10,32 +10,36 @@ import numpy as np
 from autocalib_ros.perception.motion_mask import Region
 
 MIN_EDGE_LENGTH = 0.012
-"""Shortest edge, share of the image width; below, its direction is hardly known."""
+"""Shortest edge, fraction of the image width; the direction of shorter ones is too uncertain. Judgement."""
 MIN_EDGE_LENGTH_PX = 10.0
+"""Shortest edge, pixels of the tracked image; LSD directions of shorter ones are noisy."""
 EDGE_FULL_RESOLUTION_SIDE_PX = 96
-"""Regions beyond this side are searched at half size, beyond twice this at a quarter: large edges lose nothing."""
+"""Longer side up to which regions are searched at full size; up to twice this at half size, beyond at a quarter, which
+large edges survive."""
 MAX_REGIONS = 8
-"""Regions looked at in one image, largest first; smaller ones have hardly an edge."""
+"""Regions searched per image, largest first; smaller ones rarely have edges. Bounds the cost."""
 MAX_EDGES_PER_REGION = 24
+"""Most edges per region, longest first."""
 SAMPLES_PER_EDGE = 7
-"""Points along an edge at which it is checked."""
+"""Points along an edge at which mask and contrast are sampled."""
 CONTRAST_OFFSET_PX = 2.0
-"""How far beside an edge its contrast is taken."""
+"""Distance from the edge at which its contrast is sampled, to each side."""
 MIN_CONTRAST_CHANGE = 0.5
-"""An edge whose contrast differed by less than this share of it, at the same place in an earlier image, stands
-still: a lane marking or a kerb that shows beside the vehicle."""
+"""Least change of contrast at the place of a moving edge since earlier images, fraction of its contrast; static edges,
+lane markings or kerbs next to the vehicle, change less. Judgement."""
 EARLIER_IMAGES = 2
+"""Images before the present one with which contrast is compared."""
 
 
 class EdgeFinder:
-    """Finds straight edges that move, in pixels of the tracked image."""
+    """Finds moving straight edges, in pixels of the tracked image."""
 
     def __init__(self) -> None:
         self._detector = cv2.createLineSegmentDetector(cv2.LSD_REFINE_STD)
         self._earlier: deque[np.ndarray] = deque(maxlen=EARLIER_IMAGES)
 
     def find(self, grey: np.ndarray, regions: list[Region]) -> tuple[np.ndarray, np.ndarray]:
-        """Return edges x0, y0, x1, y1 (n, 4) of a grey image (H, W) and the index of the region of each (n,)."""
+        """Return edges x0, y0, x1, y1 (n, 4) of a grey image (H, W) and the region index of each (n,)."""
         found = [self._in_region(grey, region) for region in regions[:MAX_REGIONS]] if self._earlier else []
         labels = [np.full(len(edges), index) for index, edges in enumerate(found)]
         self._earlier.append(grey)
@@ -58,7 +62,7 @@ class EdgeFinder:
         return edges[np.argsort(-length, kind='stable')[:MAX_EDGES_PER_REGION]]
 
     def _detect_lines(self, crop: np.ndarray) -> np.ndarray:
-        """Line segments (n, 4) in pixels of a crop (h, w)."""
+        """Return line segments (n, 4) in pixels of a crop (h, w)."""
         height, width = crop.shape
         halvings = (
             0
@@ -76,14 +80,14 @@ class EdgeFinder:
         return (found.reshape(-1, 4).astype(float) + 0.5) * ([width / size[0], height / size[1]] * 2) - 0.5
 
     def _is_moving(self, grey: np.ndarray, edges: np.ndarray) -> np.ndarray:
-        """Say which edges (n, 4) were not there in the earlier images, shape (n,)."""
+        """Return the mask (n,) of edges (n, 4) that were absent from all earlier images."""
         now = _contrast(grey, edges)
         changes = [np.abs(_contrast(image, edges) - now) for image in self._earlier]
         return np.min(changes, axis=0) > MIN_CONTRAST_CHANGE * np.abs(now)
 
 
 def _sample_points(edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points along edges (n, 4), shape (n, SAMPLES, 2), and the edges' unit normals (n, 2)."""
+    """Return points along edges (n, 4), shape (n, SAMPLES, 2), and the edges' unit normals (n, 2)."""
     share = (np.arange(SAMPLES_PER_EDGE) + 0.5) / SAMPLES_PER_EDGE
     step = edges[:, 2:] - edges[:, :2]
     normals = np.column_stack([-step[:, 1], step[:, 0]]) / np.maximum(np.hypot(*step.T), 1e-9)[:, None]
@@ -91,14 +95,14 @@ def _sample_points(edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _contrast(image: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Mean difference of grey levels between the two sides of edges (n, 4), shape (n,)."""
+    """Return the mean grey level difference (n,) between the two sides of edges (n, 4)."""
     points, normals = _sample_points(edges)
     aside = CONTRAST_OFFSET_PX * normals[:, None]
     return (_nearest_pixels(image, points + aside).astype(float) - _nearest_pixels(image, points - aside)).mean(axis=1)
 
 
 def _nearest_pixels(image: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Values of an image (H, W) at the pixels nearest to points (..., 2), clipped to it."""
+    """Return the values of an image (H, W) at the pixels nearest to points (..., 2), clipped to the image."""
     height, width = image.shape
     columns, rows = np.round(points).astype(int).T
     return image[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)].T

@@ -1,7 +1,7 @@
-"""Pictures that show no new view: repeated, frozen or hidden by a shutter; and what has changed behind it.
+"""Frame gate: detects repeated frames, frames of a closed shutter, and jumps of the grey levels.
 
-A thermal core closes a shutter every few minutes to correct its pixels. Meanwhile it repeats the last picture or
-sends that of the shutter, for 0.3 to 1 s; afterwards offset and pattern of its grey levels are others.
+A thermal camera closes a shutter every few minutes for non-uniformity correction (NUC). For 0.3 to 1 s it repeats the
+last frame or sends images of the shutter; afterwards offset and fixed pattern of the grey levels differ.
 """
 
 from __future__ import annotations
@@ -12,35 +12,35 @@ import cv2
 import numpy as np
 
 COMPARISON_WIDTH_PX = 64
-"""Width at which two pictures are compared as views: finer than lorries, coarser than noise."""
+"""Width in pixels at which views are compared: resolves lorries, averages noise."""
 MIN_VIEW_CORRELATION = 0.3
-"""Least correlation between two pictures of one view: what drives through leaves much more, another view none."""
+"""Least correlation of two frames of one view: traffic leaves much more, another view none. Judgement."""
 VIEW_CHANGE_RATIO = 0.5
-"""Another view changes most pixels by as much as they differ among themselves, at least by this share of it. What
-drives changes few, however bright it is: the rest of a dark or foggy road stays, though its correlation is lost."""
+"""Least robust spread of the change to another view, fraction of the spread of the image. Traffic changes few pixels,
+however bright: the rest of a dark or foggy road is unchanged, even if the correlation is lost. Judgement."""
 MAX_SHUTTER_S = 2.0
-"""A shutter is open again after this; what is seen then is the view."""
+"""Longest shutter closure, seconds; a view that lasts longer is accepted as the new view."""
 MIN_SPREAD_LEVELS = 1.0
-"""Spread, in grey levels, below which a picture shows nothing that could be found again."""
+"""Least spread, grey levels, of an image that can be compared with others."""
 LEVEL_SHIFT_THRESHOLD = 6.0
-"""Half of the picture changed by more than this at once: the light, the gain or the offset leapt, for the motion mask
-calls moving what changes by ten levels, and nothing that drives covers half of the picture from one image to the next.
+"""Median absolute change, grey levels, above which light, gain or offset have jumped. The motion mask marks changes of
+ten levels as moving, and no vehicle covers half of the image from one frame to the next.
 """
 OFFSET_MEDIAN_PX = 15
-"""Side of the median, in pixels of the reduced picture, that tells the camera's own change from that of traffic."""
+"""Window of the median filter, pixels of the reduced image, that separates the offset field from traffic."""
 
 
 class FrameStatus(Enum):
-    """What a picture is beside the last one used."""
+    """A frame in relation to the last accepted one."""
 
-    NEW = 'the same view, later'
-    REPEATED = 'the same picture again'
-    HIDDEN = 'another view, for a moment'
-    LEVEL_SHIFT = 'a view whose grey levels have nothing to do with those before'
+    NEW = 'new frame of the same view'
+    REPEATED = 'repeated frame'
+    HIDDEN = 'another view, for a short time'
+    LEVEL_SHIFT = 'grey levels unrelated to those of earlier frames'
 
 
 class FrameGate:
-    """Compares the pictures of one stream; what is `REPEATED` or `HIDDEN` is not to be used."""
+    """Classifies the frames of one stream; frames that are `REPEATED` or `HIDDEN` must not be used."""
 
     def __init__(
         self,
@@ -48,60 +48,58 @@ class FrameGate:
         level_shift_threshold: float = np.inf,
         min_spread_levels: float = MIN_SPREAD_LEVELS,
     ) -> None:
-        self._max_repeat_difference, self._level_shift_threshold, self._min_spread_levels = (
-            max_repeat_difference,
-            level_shift_threshold,
-            min_spread_levels,
-        )
+        self._max_repeat_difference = max_repeat_difference
+        self._level_shift_threshold = level_shift_threshold
+        self._min_spread_levels = min_spread_levels
         self._last: np.ndarray | None = None
         self._before = np.zeros((0, 0), np.float32)
         self._last_s = 0.0
 
-    def classify(self, picture: np.ndarray, time_s: float) -> FrameStatus:
-        """Compare a reduced grey picture (h, w), of any type, with the last one used."""
-        now = _downsampled(picture)
-        seen = FrameStatus.NEW if self._last is None else self._compare(picture, now, time_s)
-        if seen is not FrameStatus.HIDDEN:
+    def classify(self, image: np.ndarray, time_s: float) -> FrameStatus:
+        """Compare a reduced grey image (h, w) of any type with the last accepted one."""
+        current = _downsampled(image)
+        status = FrameStatus.NEW if self._last is None else self._compare(self._last, image, current, time_s)
+        if status is not FrameStatus.HIDDEN:
             self._last_s = time_s
-        if seen in (FrameStatus.NEW, FrameStatus.LEVEL_SHIFT):
-            self._last, self._before = picture, now
-        return seen
+        if status in (FrameStatus.NEW, FrameStatus.LEVEL_SHIFT):
+            self._last, self._before = image, current
+        return status
 
-    def _compare(self, picture: np.ndarray, now: np.ndarray, time_s: float) -> FrameStatus:
-        if cv2.absdiff(self._last, picture).max() <= self._max_repeat_difference:
+    def _compare(self, last: np.ndarray, image: np.ndarray, current: np.ndarray, time_s: float) -> FrameStatus:
+        if cv2.absdiff(last, image).max() <= self._max_repeat_difference:
             return FrameStatus.REPEATED
-        before, change = self._before, now - self._before
+        before, change = self._before, current - self._before
         spread = _robust_spread(before)
-        gone = VIEW_CHANGE_RATIO * spread if spread >= self._min_spread_levels else np.inf
-        # a spread is at most three times the median change: where that is small, as mostly, nothing else need be known
-        if 2 * np.count_nonzero(np.abs(change) > min(self._level_shift_threshold, gone / 3)) < change.size:
+        min_change = VIEW_CHANGE_RATIO * spread if spread >= self._min_spread_levels else np.inf
+        # cheap early exit: a robust spread is at most three times the median absolute change
+        if 2 * np.count_nonzero(np.abs(change) > min(self._level_shift_threshold, min_change / 3)) < change.size:
             return FrameStatus.NEW
-        if _robust_spread(change) > gone and _correlation(before, now) < MIN_VIEW_CORRELATION:
+        if _robust_spread(change) > min_change and _correlation(before, current) < MIN_VIEW_CORRELATION:
             return FrameStatus.HIDDEN if time_s - self._last_s <= MAX_SHUTTER_S else FrameStatus.LEVEL_SHIFT
         return FrameStatus.LEVEL_SHIFT if np.median(np.abs(change)) > self._level_shift_threshold else FrameStatus.NEW
 
 
 def match_grey_levels(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Give a grey uint8 image (H, W) the offset, slowly varying over the image, of a later one of the same view."""
+    """Return a grey uint8 image (H, W) with the smooth grey level offset to a later image of the same view applied."""
     change = np.clip(_downsampled(after) - _downsampled(before) + 128.0, 0, 255).astype(np.uint8)
     field = cv2.medianBlur(change, OFFSET_MEDIAN_PX).astype(np.float32) - 128.0
     return np.clip(before + cv2.resize(field, before.shape[::-1]) + 0.5, 0, 255).astype(np.uint8)
 
 
-def _downsampled(picture: np.ndarray) -> np.ndarray:
-    """Reduce a picture (h, w) to `COMPARISON_WIDTH_PX`, float32."""
-    height, width = picture.shape
+def _downsampled(image: np.ndarray) -> np.ndarray:
+    """Return an image (h, w) reduced to `COMPARISON_WIDTH_PX`, float32."""
+    height, width = image.shape
     columns = min(COMPARISON_WIDTH_PX, width)
     size = (columns, max(1, height * columns // width))
-    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
 
 
-def _robust_spread(picture: np.ndarray) -> float:
-    """Standard deviation of most of a picture, by the median of the deviations from its median."""
-    return 1.4826 * float(np.median(np.abs(picture - np.median(picture))))
+def _robust_spread(image: np.ndarray) -> float:
+    """Return the robust standard deviation of an image, 1.4826 times the median absolute deviation."""
+    return 1.4826 * float(np.median(np.abs(image - np.median(image))))
 
 
-def _correlation(before: np.ndarray, now: np.ndarray) -> float:
-    """Correlation coefficient of two pictures; 0 where one is flat."""
-    before, now = before - before.mean(), now - now.mean()
-    return float((before * now).sum() / max(np.sqrt((before**2).sum() * (now**2).sum()), 1e-9))
+def _correlation(before: np.ndarray, current: np.ndarray) -> float:
+    """Return the correlation coefficient of two images; 0 if one is flat."""
+    before, current = before - before.mean(), current - current.mean()
+    return float((before * current).sum() / max(np.sqrt((before**2).sum() * (current**2).sum()), 1e-9))

@@ -1,7 +1,7 @@
-"""Any sensor_msgs image as grey (H, W) or BGR (H, W, 3) uint8, without cv_bridge.
+"""Decode sensor_msgs images to grey (H, W) or BGR (H, W, 3) uint8, without cv_bridge.
 
-Messages are read by their attributes alone: those of rclpy (data is an array.array) and of rosbags (data is
-a read-only ndarray) serve alike. What needs no conversion is returned as a view of the message's own data.
+Messages are read by attribute, so those of rclpy (data is an array.array) and of rosbags (data is a read-only ndarray)
+both work. An image that needs no conversion is returned as a view of the message data.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from autocalib_ros.perception.intensity_normalisation import IntensityNormaliser
 
 LOG = logging.getLogger(__name__)
 
-COLOUR_CODES = {
+COLOUR_CODES: dict[str, int | None] = {
     'rgb': cv2.COLOR_RGB2BGR,
     'bgr': None,
     'rgba': cv2.COLOR_RGBA2BGR,
@@ -41,14 +41,14 @@ PACKED_ENCODINGS = {
     '16SC1': ('mono', 16),
     '32FC1': ('mono', 32),
 }
-"""Encoding to the order of its channels and the bits of each; what has more than 8 is stretched.
+"""Encoding to channel order and bits per channel; more than 8 bits are stretched to 8.
 
-Sensors of 10, 12 or 14 bits come in 16, at either end of them. Allied Vision's driver calls its Bayer images of 10
-and 12 bits 16SC1; thermal drivers send temperatures as 32FC1 or 16SC1, with or without NaN. Formats packed below a byte
-boundary (Mono10p, BayerRG12Packed) are unpacked by their drivers.
+Data of 10, 12 or 14 bits come in 16, left- or right-aligned. The Allied Vision driver calls its Bayer images of 10 and
+12 bits 16SC1; thermal drivers send temperatures as 32FC1 or 16SC1, with or without NaN. Bit-packed formats (Mono10p,
+BayerRG12Packed) are unpacked by their drivers.
 """
 NUMBER_FORMATS = {'16SC1': 'i2', '32FC1': 'f4'}
-"""Kinds of number that are not unsigned."""
+"""NumPy type of encodings that are not unsigned integers."""
 YUV422_ENCODINGS = {
     'yuv422': cv2.COLOR_YUV2BGR_UYVY,
     'uyvy': cv2.COLOR_YUV2BGR_UYVY,
@@ -56,7 +56,7 @@ YUV422_ENCODINGS = {
     'yuyv': cv2.COLOR_YUV2BGR_YUY2,
 }
 ASSUMED_ENCODINGS = {'8UC1': 'mono8', '8UC3': 'bgr8', '8UC4': 'bgra8', '16UC3': 'bgr16'}
-"""Encodings that do not say what they mean, and what they are taken for."""
+"""Encodings without a channel order, and the interpretation assumed for them."""
 BT601 = np.array(
     [
         [1.164, 2.018, 0.0, -16 * 1.164 - 128 * 2.018],
@@ -66,20 +66,20 @@ BT601 = np.array(
 )
 """ITU-R BT.601, limited range: B, G, R from Y, U, V, 1."""
 JPEG_END_WITHIN = 4096
-"""Bytes at the end of a JPEG among which its end marker stands; some cameras pad their buffers."""
+"""Bytes at the end of a JPEG that are searched for the end marker; some cameras pad their buffers."""
 
 
 class ImageDecoder:
-    """Decodes the images of one stream; remembers only how dark and bright its images of more than 8 bits are."""
+    """Decodes the images of one stream; its only state is the intensity range of images of more than 8 bits."""
 
     def __init__(self) -> None:
         self._normaliser = IntensityNormaliser()
         self._warned: set[str] = set()
 
     def decode(self, message: Any) -> np.ndarray:
-        """Return a sensor_msgs Image or CompressedImage as grey or BGR uint8; never changes the message.
+        """Return a sensor_msgs Image or CompressedImage as grey or BGR uint8; the message is unchanged.
 
-        The result may be a read-only view of the message. Raises InputError with the reason.
+        The result may be a read-only view of the message. InputError if it cannot be decoded.
         """
         try:
             if hasattr(message, 'encoding'):
@@ -113,35 +113,36 @@ class ImageDecoder:
             rows = np.ascontiguousarray(rows).view(('>' if message.is_bigendian else '<') + numbers)
             rows = self._normaliser.to_8_bit(rows, message.encoding, _stamp_s(message))
         pixels = rows.reshape(message.height, message.width, channels) if channels > 1 else rows
-        code = COLOUR_CODES[order]
+        code: int | None = COLOUR_CODES[order]
         pixels = np.ascontiguousarray(pixels)
         return pixels if code is None else cv2.cvtColor(pixels, code)
 
     def _compressed(self, message: Any) -> np.ndarray:
-        said = str(message.format)
-        if 'compressedDepth' in said:
-            raise InputError(f"compressed image of format '{said}' holds depths, not a picture")
-        image = decompress(np.frombuffer(message.data, np.uint8), said)
+        stated_format = str(message.format)
+        if 'compressedDepth' in stated_format:
+            raise InputError(f"compressed image of format '{stated_format}' holds depths, not intensities")
+        image = decompress(np.frombuffer(message.data, np.uint8), stated_format)
         if image.dtype == np.uint16:
-            image = self._normaliser.to_8_bit(image, said, _stamp_s(message))
-        # image_transport compresses a raw Bayer mosaic as it is: grey, with its pattern in the format
-        pattern = said.split(';')[0].rstrip('168')
+            image = self._normaliser.to_8_bit(image, stated_format, _stamp_s(message))
+        # image_transport compresses a raw Bayer mosaic as grey and names the pattern in the format
+        pattern = stated_format.split(';')[0].rstrip('168')
         if image.ndim == 2 and pattern.startswith('bayer_') and pattern in COLOUR_CODES:
-            return cv2.cvtColor(image, COLOUR_CODES[pattern])
+            code = COLOUR_CODES[pattern]
+            return image if code is None else cv2.cvtColor(image, code)
         return image
 
     def _warn_once(self, encoding: str) -> None:
         if encoding not in self._warned:
             self._warned.add(encoding)
             LOG.warning(
-                "image encoding '%s' does not name its colours; taken for %s", encoding, ASSUMED_ENCODINGS[encoding]
+                "image encoding '%s' has no channel order; interpreted as %s", encoding, ASSUMED_ENCODINGS[encoding]
             )
 
 
 def image_rows(message: Any, row_bytes: int, planes: float) -> np.ndarray:
-    """Return the image's rows without their padding, a view of shape (rows, row_bytes), after checking lengths.
+    """Return the image rows without padding as a view of shape (rows, row_bytes); InputError if data are missing.
 
-    `planes` is the number of rows in units of the image's height.
+    `planes` is the number of rows divided by the image height.
     """
     if message.step < row_bytes:
         raise InputError(
@@ -159,7 +160,7 @@ def image_rows(message: Any, row_bytes: int, planes: float) -> np.ndarray:
 
 
 def canonical_encoding(encoding: str) -> str:
-    """Return the name of an encoding as it stands here: some drivers write NV12 or YUV420 in capitals."""
+    """Return the canonical name of an encoding: some drivers write NV12 or YUV420 in capitals."""
     lower = encoding.lower()
     return (
         lower
@@ -170,21 +171,21 @@ def canonical_encoding(encoding: str) -> str:
 
 
 def _nv21(message: Any) -> np.ndarray:
-    """Y at full size, then V and U in turns at half the height and width."""
+    """Decode a Y plane at full size followed by interleaved V and U at half height and width."""
     rows = image_rows(PlanarMessage(message, 1.5), message.width, 1.5)
     return cv2.cvtColor(np.ascontiguousarray(rows), cv2.COLOR_YUV2BGR_NV21)
 
 
 def _nv12(message: Any) -> np.ndarray:
-    """Y at full size, then U and V in turns: Isaac ROS and the drivers of D-Robotics boards publish it."""
+    """Decode a Y plane followed by interleaved U and V; published by Isaac ROS and drivers of D-Robotics boards."""
     rows = image_rows(PlanarMessage(message, 1.5), message.width, 1.5)
     return cv2.cvtColor(np.ascontiguousarray(rows), cv2.COLOR_YUV2BGR_NV12)
 
 
 def _yuv420(message: Any) -> np.ndarray:
-    """Y at full size, then all of U and all of V at half the height and width, rows of half the step.
+    """Decode a Y plane at full size followed by U and V planes at half height and width, with half the step.
 
-    TI's robotics SDK and nodes around libcamera-vid publish it.
+    Published by the robotics SDK of TI and by nodes around libcamera-vid.
     """
     message = PlanarMessage(message, 1.5)
     height, width, step = message.height, message.width, message.step
@@ -199,7 +200,7 @@ def _yuv420(message: Any) -> np.ndarray:
 
 
 def _nv24(message: Any) -> np.ndarray:
-    """Y at full size, then U and V in turns at full size: OpenCV has no conversion of its own."""
+    """Decode Y at full size followed by interleaved U and V at full size; OpenCV has no conversion for it."""
     message = PlanarMessage(message, 3)
     height, width, step = message.height, message.width, message.step
     image_rows(message, width, 3)
@@ -218,10 +219,9 @@ PLANAR_ENCODINGS: dict[str, Callable[[Any], np.ndarray]] = {
 
 
 class PlanarMessage:
-    """A planar message whose step is that of its luma plane.
+    """View of a planar message whose step is that of the luma plane.
 
-    Drivers disagree: some give the bytes of a luma row, some those of a whole pixel row of all planes; the length
-    of the data tells.
+    Drivers disagree on `step`: bytes of a luma row, or bytes of all planes per pixel row. The data length decides.
     """
 
     def __init__(self, message: Any, planes: float) -> None:
@@ -231,29 +231,33 @@ class PlanarMessage:
         self.step = message.width if tight else message.step
 
 
-def decompress(data: np.ndarray, said: str) -> np.ndarray:
-    """Return the image of a JPEG or PNG, bytes (n,), that is `said` to be of some format; InputError or cv2.error."""
-    _check_container(data, said)
-    # the pixels as the sensor delivered them: a turn asked for by EXIF would change the camera's geometry
+def decompress(data: np.ndarray, stated_format: str) -> np.ndarray:
+    """Decode a JPEG or PNG, bytes (n,), with the format stated in its message; InputError or cv2.error if invalid."""
+    _check_container(data, stated_format)
+    # keep the pixels as the sensor delivered them: applying the EXIF orientation would change the camera geometry
     image = cv2.imdecode(data, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
-        raise InputError(f"compressed image of format '{said}', {len(data)} bytes, cannot be decoded")
+        raise InputError(f"compressed image of format '{stated_format}', {len(data)} bytes, cannot be decoded")
     return image
 
 
-def _check_container(data: np.ndarray, said: str) -> None:
-    """Go by the bytes: `format` is often wrong, and OpenCV fills what a torn JPEG lacks with grey."""
+def _check_container(data: np.ndarray, stated_format: str) -> None:
+    """Check the signature: `format` is often wrong, and OpenCV fills the missing part of a truncated JPEG with grey."""
     head = data[:8].tobytes()
     if head.startswith(b'\xff\xd8\xff'):
         if b'\xff\xd9' not in data[-JPEG_END_WITHIN:].tobytes():
-            raise InputError(f"compressed image of format '{said}' is a JPEG cut off after {len(data)} bytes")
+            raise InputError(
+                f"compressed image of format '{stated_format}' is a JPEG truncated after {len(data)} bytes"
+            )
     elif head != b'\x89PNG\r\n\x1a\n':
         begin = head.hex(' ') or 'nothing'
-        raise InputError(f"compressed image of format '{said}' is neither JPEG nor PNG, it begins with {begin}")
+        raise InputError(
+            f"compressed image of format '{stated_format}' is neither JPEG nor PNG, it begins with {begin}"
+        )
 
 
 def _stamp_s(message: Any) -> float | None:
-    """Return the stamp of a message in seconds, None where it has none."""
+    """Return the stamp of a message in seconds; None if it has none."""
     stamp = getattr(getattr(message, 'header', None), 'stamp', None)
     return None if stamp is None else stamp.sec + 1e-9 * stamp.nanosec
 

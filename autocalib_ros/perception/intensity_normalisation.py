@@ -1,4 +1,4 @@
-"""Images of 16 bits, or of temperatures, as 8 bits, with limits that follow the scene unnoticed by tracking."""
+"""Normalise images of 16 bits or of temperatures to 8 bits, with limits that adapt too slowly to disturb tracking."""
 
 from __future__ import annotations
 
@@ -7,26 +7,29 @@ import numpy as np
 from autocalib_ros.perception.frame_gate import FrameGate, FrameStatus
 
 PERCENTILES = (1.0, 99.0)
+"""Percentiles of the samples that become black and white."""
 TIME_CONSTANT_S = 20.0
-"""Time constant, twice in a row, with which the limits go to the percentiles of the present: a bus, hot and near,
-passes in 5 s and moves them by a fifth of a grey level per image; after another weather they have settled in a minute.
+"""Time constant, seconds, of the two low-pass filters in series through which the limits follow the percentiles. A hot
+bus nearby passes in 5 s and shifts them by a fifth of a grey level per image; after a change of weather they converge
+within a minute.
 """
 MIN_SPAN, MIN_FLOAT_SPAN = 16.0, 0.1
-"""Counts, or kelvins: an image flatter than this (a lens cap, a dark start) fixes no limits."""
+"""Least range, counts or kelvins: a flatter image (lens cap, dark start) sets no limits."""
 MAX_ABSOLUTE_VALUE = 1e9
-"""Beyond any temperature or count, and small enough to be squared."""
+"""Clip limit of floating-point images: above any temperature or count, and its square is finite."""
 CLIPPED_FRACTION, CLIPPED_S = 0.25, 2.0
-"""Where so much of the image has been outside the limits for so long, new ones are taken at once."""
+"""Fraction of clipped pixels, and seconds after which the limits are then reset. Judgement."""
 HISTOGRAM_SAMPLES = 128
+"""Samples along each side of the image for the percentiles."""
 DEFAULT_INTERVAL_S = 0.1
-"""Taken for the time between two images whose stamps do not tell."""
+"""Frame interval assumed if the stamps are unusable, seconds."""
 
 
 class IntensityNormaliser:
-    """Percentile stretch of one stream; shifting right by 8 alone would leave a 12-bit camera black.
+    """Percentile stretch of one stream; a plain shift by 8 bits would leave the images of a 12-bit camera black.
 
-    What all pixels gain or lose from one image to the next, as by the drift of a thermal core or its shutter, moves
-    the limits along at once: the grey levels stay. What a shutter shows or freezes moves nothing.
+    A change common to all pixels, such as the drift of a thermal core or its NUC, moves the limits at once, so that the
+    grey levels stay the same. Frames of a closed shutter move nothing.
     """
 
     def __init__(self) -> None:
@@ -35,15 +38,16 @@ class IntensityNormaliser:
         self._reset()
 
     def _reset(self) -> None:
-        self._limits = self._target_limits = np.zeros(2)
+        self._limits: np.ndarray = np.zeros(2)
+        self._target_limits = self._limits
         self._last_samples: np.ndarray | None = None
         self._time_s = self._last_within_limits_s = 0.0
         self._frame_gate: FrameGate | None = None
 
     def to_8_bit(self, image: np.ndarray, encoding: str, stamp_s: float | None = None) -> np.ndarray:
-        """Return an image of any shape and number type as uint8, black where it holds no number.
+        """Return an image of any shape and numeric type as uint8, with NaN as black.
 
-        `stamp_s` is its time, None where unknown.
+        `stamp_s` is its time in seconds; None if unknown.
         """
         self._min_span, self._quantum = MIN_SPAN, 1.0
         if image.dtype.kind == 'f':
@@ -58,7 +62,7 @@ class IntensityNormaliser:
 
     def _update_limits(self, image: np.ndarray, encoding: str, stamp_s: float | None) -> None:
         every_y, every_x = (max(1, side // HISTOGRAM_SAMPLES) for side in image.shape[:2])
-        samples = image[::every_y, ::every_x].reshape(-(-image.shape[0] // every_y), -1).astype(np.float32)
+        samples: np.ndarray = image[::every_y, ::every_x].reshape(-(-image.shape[0] // every_y), -1).astype(np.float32)
         if np.isnan(samples).any():
             known = samples[~np.isnan(samples)]
             samples = np.where(np.isnan(samples), np.median(known) if len(known) else np.float32(0), samples)
@@ -69,21 +73,19 @@ class IntensityNormaliser:
         self._frame_gate = self._frame_gate or FrameGate(
             max_repeat_difference=0.0, min_spread_levels=self._min_span / 4
         )
-        seen = self._frame_gate.classify(samples, self._time_s)
-        if seen in (FrameStatus.REPEATED, FrameStatus.HIDDEN):
+        status = self._frame_gate.classify(samples, self._time_s)
+        if status in (FrameStatus.REPEATED, FrameStatus.HIDDEN):
             self._last_within_limits_s += step_s
             return
-        now = np.percentile(samples, PERCENTILES)
+        now: np.ndarray = np.percentile(samples, PERCENTILES)
         unset = self._limits[1] - self._limits[0] < self._min_span
-        if unset or seen is FrameStatus.LEVEL_SHIFT or self._last_samples is None or self._clipped_too_long(samples):
+        if unset or status is FrameStatus.LEVEL_SHIFT or self._last_samples is None or self._clipped_too_long(samples):
             self._limits = self._target_limits = now
         else:
-            common, share = (
-                _common_change(self._last_samples, samples, self._quantum),
-                1 - np.exp(-step_s / TIME_CONSTANT_S),
-            )
-            self._target_limits = self._target_limits + common + share * (now - self._target_limits - common)
-            self._limits = self._limits + common + share * (self._target_limits - self._limits - common)
+            common = _common_change(self._last_samples, samples, self._quantum)
+            gain = 1 - np.exp(-step_s / TIME_CONSTANT_S)
+            self._target_limits = self._target_limits + common + gain * (now - self._target_limits - common)
+            self._limits = self._limits + common + gain * (self._target_limits - self._limits - common)
         self._last_samples = samples
 
     def _step_s(self, stamp_s: float | None) -> float:
@@ -91,7 +93,7 @@ class IntensityNormaliser:
         return step_s if step_s > 0 else DEFAULT_INTERVAL_S
 
     def _clipped_too_long(self, samples: np.ndarray) -> bool:
-        """Say whether much of the image has been outside the limits for a while."""
+        """Whether more than `CLIPPED_FRACTION` of the samples has been outside the limits for `CLIPPED_S`."""
         outside = (samples < self._limits[0]) | (samples > self._limits[1])
         if outside.mean() < CLIPPED_FRACTION:
             self._last_within_limits_s = self._time_s
@@ -99,8 +101,8 @@ class IntensityNormaliser:
 
 
 def _common_change(before: np.ndarray, now: np.ndarray, quantum: float) -> float:
-    """Mean change of those samples that changed as most did: neither traffic nor rounding moves it."""
+    """Return the mean change of the samples near the median change; robust to traffic and to rounding."""
     change = now - before
     middle = np.median(change)
-    aside = np.abs(change - middle)
-    return float(change[aside <= 2 * np.median(aside) + quantum].mean())
+    deviation = np.abs(change - middle)
+    return float(change[deviation <= 2 * np.median(deviation) + quantum].mean())

@@ -1,4 +1,4 @@
-"""Points on moving objects, followed by pyramidal Lucas-Kanade optical flow (KLT)."""
+"""KLT tracker: points on moving objects, tracked by pyramidal Lucas-Kanade optical flow (Bouguet 2001)."""
 
 from __future__ import annotations
 
@@ -10,36 +10,36 @@ from autocalib_ros.evidence.snapshot import Track
 from autocalib_ros.perception.frame_gate import match_grey_levels
 
 MAX_TRACK_SAMPLES = 256
-"""Images of one track at the most; a longer one is finished and goes on as a new one."""
+"""Most images of one track; a longer one is finished and continued as a new track."""
 MIN_TRACK_SAMPLES = 6
+"""Least number of samples of a kept track."""
 MIN_DISPLACEMENT = 0.02
-"""Shortest displacement of a track worth keeping, share of the image width."""
+"""Shortest displacement of a kept track, fraction of the image width. Judgement."""
 STATIONARY_S = 1.0
+"""Time over which a point must move, seconds."""
 STATIONARY_PX = 1.5
-"""A point that moved less than this in `STATIONARY_S` stands still: its track ends."""
+"""Least displacement in `STATIONARY_S`, pixels; the track of a slower point ends."""
 MAX_GAP_S = 1.0
-"""Across a longer gap between two images nothing is followed."""
+"""Longest interval between two images, seconds; a longer one ends all tracks."""
 GAP_INTERVALS = 2.3
-"""A gap is so many times the interval before: points are then looked for where their speed will have taken them."""
+"""Ratio to the previous frame interval above which an interval is a gap, across which velocity predicts."""
 GAP_TOLERANCE = 0.25
-"""Across a gap a point arrives within this share of its way, or `MAX_TURN_PX`, of where it is looked for: in a second a
-vehicle at 10 m/s that brakes hard misses that place by a fifth of the way.
+"""Largest distance from the predicted position after a gap, fraction of the displacement, at least `MAX_TURN_PX`: a
+vehicle at 10 m/s that brakes hard for a second misses the prediction by a fifth.
 """
 MAX_TURN_PX = 3.0
 MAX_TURN_FRACTION = 0.6
 MIN_STEP_RATIO, MAX_STEP_RATIO = 0.3, 2.3
-"""A step goes on from the one before, faster than `MAX_TURN_PX`, when it leaves its line by no more than `MAX_TURN_PX`
-or
-`MAX_TURN_FRACTION` of it, and is not much below half nor above twice as long: so much an image that came late or was
-lost
-does to it. A point that stops dead holds on to what hides the vehicle; one that jumps has found something else.
+"""Continuity of a point that moves more than `MAX_TURN_PX` per image: its next step deviates sideways by at most
+`MAX_TURN_PX` or `MAX_TURN_FRACTION` of the step, and its length ratio lies within these limits, which a late or lost
+image can cause. A point that stops dead has stuck to an occluder; one that jumps has found another object. Judgement.
 """
 
 
 class PointTracker:
-    """Follows points from image to image and hands out finished tracks, in pixels of the tracked image.
+    """Tracks points from image to image and returns finished tracks, in pixels of the tracked image.
 
-    A point ends where the image (H, W) `excluded` is not 0.
+    Tracks end where the mask `excluded` (H, W) is not 0.
     """
 
     def __init__(self, options: TrackingOptions, excluded: np.ndarray | None = None) -> None:
@@ -53,7 +53,7 @@ class PointTracker:
         self._step = np.zeros((slots, 2))
 
     def follow(self, grey: np.ndarray, time_s: float) -> list[Track]:
-        """Follow all points into a new grey image (H, W); return the tracks that ended."""
+        """Track all points into a new grey image (H, W); return the tracks that ended."""
         finished: list[Track] = []
         if self._grey is not None:
             interval_s = time_s - self._time_s
@@ -68,7 +68,7 @@ class PointTracker:
         return finished
 
     def _follow(self, before: np.ndarray, after: np.ndarray, time_s: float, steps: float) -> list[Track]:
-        """Follow all points, which will have gone on by `steps` steps like their last: one, or more across a gap."""
+        """Track all points, predicted `steps` times their last step ahead: 1, or more across a gap."""
         active = np.flatnonzero(self._count)
         if not len(active):
             return []
@@ -90,7 +90,7 @@ class PointTracker:
     def _flow(
         self, before: np.ndarray, after: np.ndarray, start: np.ndarray, guess: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Follow forwards from a guess, then back at full resolution; both have to agree."""
+        """Track forwards from a guess and back at full resolution; return positions (n, 2) and their validity (n,)."""
         side = self._options.window_px
         criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.02)
         origin = _as_opencv_points(start)
@@ -114,21 +114,23 @@ class PointTracker:
             criteria=criteria,
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
         )
-        miss = np.hypot(*(back - origin)[:, 0].T)
+        round_trip_px = np.hypot(*(back - origin)[:, 0].T)
         found = found[:, 0].astype(float)
         margin, (height, width) = side / 2, after.shape
         inside = ((found >= margin) & (found < [width - margin, height - margin])).all(axis=1)
         if self._excluded is not None:
             columns, rows = np.round(np.clip(found, 0, [width - 1, height - 1])).astype(int).T
             inside &= self._excluded[rows, columns] == 0
-        good = (forward.ravel() == 1) & (backward.ravel() == 1) & (miss <= self._options.round_trip_px) & inside
+        good = (
+            (forward.ravel() == 1) & (backward.ravel() == 1) & (round_trip_px <= self._options.round_trip_px) & inside
+        )
         return found, good
 
     def _current_positions(self, slots: np.ndarray) -> np.ndarray:
         return self._history[slots, self._count[slots] - 1, 1:]
 
     def _is_stationary(self, slots: np.ndarray, time_s: float) -> np.ndarray:
-        """Which of the points have moved less than `STATIONARY_PX` in the last `STATIONARY_S`, shape of `slots`."""
+        """Return the mask of the slots whose points moved less than `STATIONARY_PX` in the last `STATIONARY_S`."""
         if not len(slots):
             return np.zeros(0, bool)
         times = self._history[slots, :, 0]
@@ -139,16 +141,16 @@ class PointTracker:
         return old_enough & (np.hypot(*(self._current_positions(slots) - then).T) < STATIONARY_PX)
 
     def positions(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return where the followed points are now (n, 2) and their vehicles (n,)."""
+        """Return the current positions (n, 2) of the tracked points and their vehicle ids (n,)."""
         active = np.flatnonzero(self._count)
         return self._current_positions(active), self._vehicle[active]
 
     def steps(self) -> np.ndarray:
-        """Return how far the followed points came since the image before, (n, 2) as `positions`."""
+        """Return the displacements (n, 2) since the previous image, in the order of `positions`."""
         return self._step[np.flatnonzero(self._count)]
 
     def add_points(self, points_px: np.ndarray, vehicles: np.ndarray) -> None:
-        """Begin to follow points (n, 2), best first, that keep their distance from those followed already."""
+        """Start tracks at points (n, 2), best first, in cells of the spacing that no tracked point occupies."""
         spacing = self._options.min_spacing_px
         near, _ = self.positions()
         taken = {(int(x), int(y)) for x, y in near // spacing}
@@ -166,16 +168,16 @@ class PointTracker:
             self._count[slot], self._vehicle[slot], self._step[slot] = 1, vehicle, 0.0
 
     def tails(self, steps: int) -> np.ndarray:
-        """Return where the points followed now were in the last images, (n, steps, 2), newest last.
+        """Return the last positions of the tracked points, (n, steps, 2), newest last.
 
-        A point that is followed for fewer images stands still before.
+        The first position is repeated for points with a shorter history.
         """
         active = np.flatnonzero(self._count)
         newest = self._count[active, None] - 1
         return self._history[active[:, None], np.maximum(newest - np.arange(steps)[::-1], 0), 1:]
 
     def unfinished(self) -> list[Track]:
-        """Return the tracks so far of the points still followed."""
+        """Return the tracks so far of the points still tracked."""
         return self._tracks(np.flatnonzero(self._count))
 
     def finish_all(self) -> list[Track]:
@@ -188,7 +190,7 @@ class PointTracker:
         return tracks
 
     def _restart_full(self, slots: np.ndarray) -> list[Track]:
-        """Finish tracks that are full; their points are followed on."""
+        """Finish tracks that are full and continue their points as new tracks."""
         tracks = self._tracks(slots)
         self._history[slots, 0] = self._history[slots, MAX_TRACK_SAMPLES - 1]
         self._count[slots] = 1
@@ -199,7 +201,7 @@ class PointTracker:
         return [track for track in tracks if track is not None]
 
     def _track(self, slot: int) -> Track | None:
-        """Thin a point's path to samples spread evenly along it; None when it is too short to say anything."""
+        """Resample the path of a point evenly by arc length; None if it is too short."""
         path = self._history[slot, : self._count[slot]]
         width = self._grey.shape[1] if self._grey is not None else 1
         if len(path) < MIN_TRACK_SAMPLES or np.hypot(*(path[-1, 1:] - path[0, 1:])) < MIN_DISPLACEMENT * width:
@@ -213,20 +215,20 @@ class PointTracker:
 
 
 def _near_prediction(predicted: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Say which steps (n, 2) across a gap end near where they were foreseen to (n, 2), shape (n,)."""
+    """Return the mask (n,) of steps (n, 2) across a gap that end near their predictions (n, 2)."""
     return np.hypot(*(step - predicted).T) <= np.maximum(MAX_TURN_PX, GAP_TOLERANCE * np.hypot(*predicted.T))
 
 
 def _is_discontinuous(before: np.ndarray, now: np.ndarray) -> np.ndarray:
-    """Say which steps (n, 2) do not go on from the steps before (n, 2), shape (n,)."""
+    """Return the mask (n,) of steps (n, 2) that do not continue the previous steps (n, 2)."""
     speed = np.maximum(np.hypot(*before.T), 1e-9)
     along = (before * now).sum(axis=1) / speed
-    aside = np.abs(before[:, 0] * now[:, 1] - before[:, 1] * now[:, 0]) / speed
-    astray = aside > np.maximum(MAX_TURN_PX, MAX_TURN_FRACTION * speed)
+    deviation = np.abs(before[:, 0] * now[:, 1] - before[:, 1] * now[:, 0]) / speed
+    astray = deviation > np.maximum(MAX_TURN_PX, MAX_TURN_FRACTION * speed)
     uneven = (along < MIN_STEP_RATIO * speed) | (along > np.maximum(MAX_STEP_RATIO * speed, speed + MAX_TURN_PX))
     return (speed > MAX_TURN_PX) & (astray | uneven)
 
 
 def _as_opencv_points(points_px: np.ndarray) -> np.ndarray:
-    """Return points (n, 2) in the layout that OpenCV writes into, (n, 1, 2) float32."""
+    """Return points (n, 2) as a new contiguous array (n, 1, 2) float32, as OpenCV needs it."""
     return np.ascontiguousarray(points_px, np.float32).reshape(-1, 1, 2)

@@ -1,4 +1,4 @@
-"""Straight lines of the scene that stands still: markings on the road, kerbs, slabs, and whatever else is there."""
+"""Line segments of the static scene by LSD on the background image: lane markings, kerbs, joints of slabs."""
 
 from __future__ import annotations
 
@@ -6,33 +6,34 @@ import cv2
 import numpy as np
 
 MIN_LINE_LENGTH = 0.02
-"""Shortest line, share of the image width: a dash or a stripe of a crosswalk fills more, far away or not."""
+"""Shortest segment, fraction of the image width: dashes and crosswalk stripes are longer. Judgement."""
 MIN_LINE_LENGTH_PX = 10.0
+"""Shortest segment, pixels of the tracked image."""
 MAX_LINES = 800
-"""The longest are kept: 26 kB."""
+"""Most segments, the longest first: 26 kB."""
 SAMPLES_PER_LINE = 7
-"""Points along a line at which it is looked whether it is to be left out."""
+"""Points along a segment at which the ignore mask is sampled."""
 
 
 class LineSegmentDetector:
-    """Finds straight lines in the background, anew only where that has changed."""
+    """Detects line segments in the background; the result is cached until the background changes."""
 
     def __init__(self, ignored: np.ndarray | None) -> None:
-        """Lines are taken where the image (H, W) `ignored` is 0."""
+        """Segments are kept where the mask `ignored` (H, W) is 0."""
         self._detector = cv2.createLineSegmentDetector(cv2.LSD_REFINE_ADV)
         self._ignored = ignored
         self._source_times_s: tuple[float, ...] | None = None
         self._lines = np.zeros((0, 4))
 
     def is_current(self, times_s: tuple[float, ...]) -> bool:
-        """Tell whether the lines are those of the background that is made of images of these times."""
+        """Whether the cached segments belong to the background computed from images of these times."""
         return times_s == self._source_times_s
 
     def find(self, grey: np.ndarray | None, times_s: tuple[float, ...]) -> None:
-        """Look into a background (H, W) made of images of these times; None is no background yet."""
-        self._source_times_s, found = times_s, None if grey is None else self._detector.detect(grey)[0]
-        if found is None:
-            self._lines = np.zeros((0, 4))
+        """Detect segments in a background (H, W) computed from images of these times; None if there is none yet."""
+        self._source_times_s, self._lines = times_s, np.zeros((0, 4))
+        found = None if grey is None else self._detector.detect(grey)[0]
+        if grey is None or found is None:
             return
         lines = found.reshape(-1, 4).astype(float)
         length = np.hypot(lines[:, 2] - lines[:, 0], lines[:, 3] - lines[:, 1])
@@ -42,7 +43,7 @@ class LineSegmentDetector:
         self._lines = lines[~self._touches_ignored(lines)][:MAX_LINES]
 
     def _touches_ignored(self, lines: np.ndarray) -> np.ndarray:
-        """Tell which lines (n, 4) touch what is ignored, shape (n,)."""
+        """Return the mask (n,) of segments (n, 4) that touch the ignored regions."""
         if self._ignored is None:
             return np.zeros(len(lines), bool)
         share = np.linspace(0.0, 1.0, SAMPLES_PER_LINE)[:, None]
@@ -53,5 +54,5 @@ class LineSegmentDetector:
 
     @property
     def lines_px(self) -> np.ndarray:
-        """What was found: x0, y0, x1, y1 in pixels of the image as given, the longest first, shape (n, 4)."""
+        """Segments x0, y0, x1, y1 in pixels of the background passed to `find`, longest first, shape (n, 4)."""
         return self._lines

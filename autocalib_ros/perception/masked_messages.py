@@ -1,4 +1,4 @@
-"""Image messages with their `ignore_regions` black, for recordings that pass images on; their kind stays."""
+"""Black out `ignore_regions` in image messages without changing their encoding, for recordings that contain images."""
 
 from __future__ import annotations
 
@@ -24,10 +24,11 @@ from autocalib_ros.perception.images import (
 BLACK_LUMA, NO_CHROMA = 16, 128
 """Black in limited-range YUV."""
 MASKED_JPEG_QUALITY = 95
+"""Quality of re-encoded JPEG images."""
 
 
 def require_maskable(message: Any) -> None:
-    """Raise UsageError unless `mask_message` knows the kind of a sensor_msgs Image or CompressedImage."""
+    """Raise UsageError unless `mask_message` supports the encoding of a sensor_msgs Image or CompressedImage."""
     if hasattr(message, 'encoding'):
         encoding = canonical_encoding(message.encoding)
         known, kind = (
@@ -39,15 +40,15 @@ def require_maskable(message: Any) -> None:
     if not known:
         raise UsageError(
             f"'ignore_regions' cannot be made black in images of {kind}: write the bag without images, or "
-            'leave the regions out'
+            'remove the option'
         )
 
 
 def mask_message(message: Any, polygons: Polygons) -> np.ndarray:
-    """Return the data (n,) uint8 of an Image or CompressedImage with the polygons black; never changes the message.
+    """Return the data (n,) uint8 of an Image or CompressedImage with the polygons blacked out; `message` is unchanged.
 
-    InputError where the image is broken. What has more than 8 bits gets the darkest value of the rest: zero among
-    counts of 6000 would take all contrast from whoever stretches them.
+    InputError if the image is invalid. Pixels of more than 8 bits get the darkest value outside the polygons: zero
+    among counts of 6000 would ruin the contrast of a percentile stretch downstream.
     """
     if not hasattr(message, 'encoding'):
         return _mask_compressed(message, polygons)
@@ -72,7 +73,7 @@ def mask_message(message: Any, polygons: Polygons) -> np.ndarray:
 
 
 class _MessageCopy:
-    """A message with other data."""
+    """Header fields of an image message with replaced data."""
 
     def __init__(self, message: Any, data: np.ndarray) -> None:
         self.encoding, self.width, self.height = message.encoding, message.width, message.height
@@ -89,7 +90,7 @@ def _mask_packed(message: Any, mask: np.ndarray, encoding: str) -> None:
 
 
 def _with_dark_mask(values: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Return a copy of values (h, w, channels), of which the first three are colours, dark in the mask (h, w)."""
+    """Return a copy of values (h, w, channels) whose colours, the first three channels, are dark in the mask (h, w)."""
     dark, rest = values.copy(), values[~mask][:, :3]
     rest = rest[np.isfinite(rest)] if values.dtype.kind == 'f' else rest
     dark[mask, :3] = rest.min() if values.dtype.itemsize > 1 and rest.size else 0
@@ -97,7 +98,7 @@ def _with_dark_mask(values: np.ndarray, mask: np.ndarray) -> np.ndarray:
 
 
 def _mask_yuv422(rows: np.ndarray, mask: np.ndarray, *, luma_first: bool) -> None:
-    """Two pixels share a chroma: where one is black, both lose their colour."""
+    """Black out rows of 4:2:2 data in place; two pixels share a chroma value, so both become grey."""
     pairs = mask.copy()
     even = mask.shape[1] // 2 * 2
     pairs[:, :even] = np.repeat(mask[:, :even:2] | mask[:, 1:even:2], 2, axis=1)
@@ -129,7 +130,7 @@ def _mask_compressed(message: Any, polygons: Polygons) -> np.ndarray:
     data = np.frombuffer(message.data, np.uint8)
     try:
         image = decompress(data, str(message.format))
-    except cv2.error as error:  # a size that no memory holds
+    except cv2.error as error:  # an image size too large for memory
         raise InputError(
             f"compressed image of format '{message.format}', {len(data)} bytes, cannot be decoded"
         ) from error

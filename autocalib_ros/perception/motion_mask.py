@@ -1,6 +1,6 @@
-"""Where something moves: a mask of what differs from a slowly learned background.
+"""Motion mask by background subtraction (MOG2, Zivkovic 2004) and its connected regions.
 
-These regions are the vehicles where there is no detector, and tell moving boxes from still ones where there is one.
+Without a detector the regions are the vehicles; with one they separate moving boxes from stationary ones.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from autocalib_ros.config import MotionOptions
 
 MOG2_VARIANCE_THRESHOLD = 25.0
-"""Squared distance, in variances of the background, beyond which a pixel is moving: five sigmas."""
+"""Squared Mahalanobis distance from the background above which a pixel is foreground: five sigmas."""
 
 
 @dataclass(frozen=True)
@@ -23,11 +23,11 @@ class Region:
     x: int
     y: int
     mask: np.ndarray
-    """255 where something moves, uint8, shape (height, width)."""
+    """255 in the foreground, uint8, shape (height, width)."""
 
 
 class MotionMask:
-    """Learns the background at a reduced size and says what differs from it."""
+    """Adaptive background model at reduced size."""
 
     def __init__(self, options: MotionOptions) -> None:
         self._options = options
@@ -37,7 +37,7 @@ class MotionMask:
         self._newest_s = 0.0
 
     def update(self, grey: np.ndarray, time_s: float) -> None:
-        """Learn from a grey image (H, W); `time_s` is its time in seconds."""
+        """Update the model with a grey image (H, W) taken at `time_s` seconds."""
         height, width = grey.shape
         reduced_width = min(self._options.width_px, width)
         reduced = cv2.resize(
@@ -62,11 +62,14 @@ class MotionMask:
 
     @property
     def dilation_px(self) -> tuple[float, float]:
-        """By how many pixels of the tracked image, along x and y, regions are larger than what moves, on each side."""
-        return (0.0, 0.0) if self._mask is None else tuple(np.divide(self._size, self._mask.shape[::-1]).tolist())
+        """Dilation of the regions on each side, x and y in pixels of the tracked image."""
+        if self._mask is None:
+            return 0.0, 0.0
+        height, width = self._mask.shape
+        return self._size[0] / width, self._size[1] / height
 
     def _region(self, inside: np.ndarray, stats: np.ndarray) -> Region:
-        """Bring one region to the size of the tracked image, grown by one reduced pixel for its outline."""
+        """Scale one region to the tracked image, dilated by one reduced pixel to include the silhouette."""
         width, height = self._size
         factor_x, factor_y = width / inside.shape[1], height / inside.shape[0]
         x0, y0 = max(stats[0] - 1, 0), max(stats[1] - 1, 0)
@@ -79,7 +82,7 @@ class MotionMask:
 
 
 def exclude_pixels(regions: list[Region], excluded: np.ndarray | None) -> list[Region]:
-    """Return what is left of regions where an image (H, W) is `excluded`, not 0; all of them without such an image."""
+    """Return the regions without the pixels where the mask `excluded` (H, W) is not 0; empty regions are dropped."""
     if excluded is None:
         return regions
     left = []

@@ -1,4 +1,4 @@
-"""One image in, observations out: the order in which the perception rooms are visited."""
+"""Perception pipeline of one image stream: images in, observations out."""
 
 from __future__ import annotations
 
@@ -23,19 +23,20 @@ from autocalib_ros.perception.segments import Keypoints, find_keypoints, match_s
 from autocalib_ros.perception.silhouettes import outlines_of
 
 MOTION_MASK_PERIOD = 2
-"""Images between two updates of the background: traffic needs no finer step in time."""
+"""Frames between updates of the motion mask: traffic needs no finer time step."""
 EDGE_SEARCH_PERIOD = 2
-"""Searches for points between two for edges: they cost as much, and a vehicle's edges are much the same after."""
+"""Keypoint detections between edge searches, which cost as much; edges change little in between."""
 
 
 MAX_REPEAT_DIFFERENCE = 4
-"""A reduced image that differs from the last one used by no more than this anywhere is the same picture again."""
+"""Largest pixel difference, grey levels, between a reduced frame and its repetition."""
 GATE_WIDTH_PX = 320
+"""Width at which frames are compared with the frame gate."""
 
 
 @dataclass(frozen=True)
-class Observations:
-    """What one image added, in pixels of the full image."""
+class FrameObservations:
+    """FrameObservations from one image, in pixels of the full image."""
 
     tracks: list[Track]
     segments: Segments | None
@@ -44,9 +45,9 @@ class Observations:
 
 
 class Observer:
-    """Watches one stream of images of one size; times are seconds since its first image.
+    """Processes one stream of images of one size; times are seconds since its first image.
 
-    Vehicles are what moves or, given a detector, what it finds and moves.
+    Vehicles are the regions of the motion mask or, with a detector, its moving boxes.
     """
 
     def __init__(self, options: Options, image_size: tuple[int, int], detector: VehicleDetector | None = None) -> None:
@@ -64,7 +65,7 @@ class Observer:
         self._drift_monitor = DriftMonitor(options.buffer.seconds, self._ignored)
         self._background = Background()
         self._line_detector = LineSegmentDetector(self._excluded)
-        self._sift = cv2.SIFT_create(contrastThreshold=0.03)
+        self._sift = cv2.SIFT_create(contrastThreshold=0.03)  # type: ignore[attr-defined]  # for OpenCV 4.5
         self._keypoints: Keypoints | None = None
         self._frame_gate = FrameGate(MAX_REPEAT_DIFFERENCE, LEVEL_SHIFT_THRESHOLD)
         self._frames = 0
@@ -72,14 +73,14 @@ class Observer:
         self._edge_finder = EdgeFinder()
         self._detections = 0
 
-    def observe(self, image: np.ndarray, time_s: float) -> Observations:
-        """Take a grey (H, W) or BGR (H, W, 3) uint8 image."""
+    def observe(self, image: np.ndarray, time_s: float) -> FrameObservations:
+        """Process a grey (H, W) or BGR (H, W, 3) uint8 image; repeated frames and closed shutters yield nothing."""
         image = black_out(image, self._polygons)
         grey = self._tracked_image(image)
-        seen = self._frame_gate.classify(_downsampled(grey, self._ignored), time_s)
-        if seen in (FrameStatus.REPEATED, FrameStatus.HIDDEN):
-            return Observations([], None, None)
-        ended = self._reset_appearance() if seen is FrameStatus.LEVEL_SHIFT else []
+        status = self._frame_gate.classify(_downsampled(grey, self._ignored), time_s)
+        if status in (FrameStatus.REPEATED, FrameStatus.HIDDEN):
+            return FrameObservations([], None, None)
+        ended = self._reset_appearance() if status is FrameStatus.LEVEL_SHIFT else []
         self._background.update(image, time_s)
         tracks = [self._to_full_size(track) for track in (*ended, *self._tracker.follow(grey, time_s))]
         detect = self._frames % self._options.tracking.detect_every == 0
@@ -90,10 +91,10 @@ class Observer:
         segments, edges, outlines = self._detect(grey, time_s) if detect else (None, None, None)
         self._drift_monitor.update(grey, time_s)
         self._frames += 1
-        return Observations(tracks, segments, edges, outlines)
+        return FrameObservations(tracks, segments, edges, outlines)
 
     def _reset_appearance(self) -> list[Track]:
-        """Forget all that rests on earlier grey levels; return the tracks that so end."""
+        """Reset all state that depends on earlier grey levels; return the tracks that end."""
         self._motion, self._edge_finder, self._keypoints = MotionMask(self._options.motion), EdgeFinder(), None
         return self._tracker.finish_all()
 
@@ -109,12 +110,12 @@ class Observer:
         return round(width / self._reduction), round(height / self._reduction)
 
     def _detect(self, grey: np.ndarray, time_s: float) -> tuple[Segments | None, Edges | None, Outlines | None]:
-        """Look into the moving regions for edges and keypoints, which start tracks, and matched are segments."""
+        """Detect silhouettes, keypoints and edges in the moving regions; start tracks and match segments."""
         regions, vehicles, people = self._moving_regions(grey.shape)
         outlines = self._find_outlines(regions, vehicles, grey.shape, time_s)
         keypoints = find_keypoints(grey, regions, self._sift)
         of_keypoint, of_person = vehicles[keypoints.regions], people[keypoints.regions]
-        order = np.lexsort((-keypoints.responses, of_person))  # the strongest first, and people last
+        order = np.lexsort((-keypoints.responses, of_person))  # by response, people last
         self._tracker.add_points(keypoints.points_px[order], of_keypoint[order])
         keypoints, of_keypoint = keypoints.subset(~of_person), of_keypoint[~of_person]
         edges = self._find_edges(
@@ -131,7 +132,7 @@ class Observer:
         return segments, edges, outlines
 
     def _moving_regions(self, shape: tuple[int, int]) -> tuple[list[Region], np.ndarray, np.ndarray]:
-        """What moves: regions, the vehicle of each (n,), and whether that is known as a person (n,)."""
+        """Return the moving regions, the vehicle id of each (n,), and whether it is a detected person (n,)."""
         regions = exclude_pixels(self._motion.regions(), self._excluded)
         if self._detector_tracks is None:
             return regions, self._assign_vehicles(regions), np.zeros(len(regions), bool)
@@ -143,7 +144,7 @@ class Observer:
         )
 
     def _find_edges(self, grey: np.ndarray, regions: list[Region], vehicles: np.ndarray, time_s: float) -> Edges | None:
-        """Look for straight edges in every `EDGE_SEARCH_PERIOD`th image with regions."""
+        """Find straight edges, in every `EDGE_SEARCH_PERIOD`th detection."""
         self._detections += 1
         if self._detections % EDGE_SEARCH_PERIOD:
             return None
@@ -153,7 +154,7 @@ class Observer:
     def _find_outlines(
         self, regions: list[Region], vehicles: np.ndarray, shape: tuple[int, int], time_s: float
     ) -> Outlines | None:
-        """Outline what moves; a detector tells cyclists by itself."""
+        """Return the silhouettes of the regions; None with a detector, which classifies cyclists itself."""
         if self._detector_tracks is not None or not regions:
             return None
         return Outlines(
@@ -161,7 +162,7 @@ class Observer:
         )
 
     def _assign_vehicles(self, regions: list[Region]) -> np.ndarray:
-        """Give each region (n,) the vehicle that most points followed inside it belong to, or a new one."""
+        """Return the vehicle id (n,) of each region: the majority of the tracked points inside, or a new one."""
         points, vehicle_ids = self._tracker.positions()
         columns, rows = np.round(points).astype(int).T
         vehicles = np.zeros(len(regions), int)
@@ -178,33 +179,33 @@ class Observer:
         return vehicles
 
     def unfinished(self) -> list[Track]:
-        """Return the tracks so far of what is still followed."""
+        """Return the tracks so far of the points still tracked."""
         return [self._to_full_size(track) for track in self._tracker.unfinished()]
 
     def followed(self, steps: int) -> np.ndarray:
-        """Return where what is followed now was in the last images, pixels (n, steps, 2), newest last."""
+        """Return the last positions of the tracked points, pixels (n, steps, 2), newest last."""
         return self._to_full_pixels(self._tracker.tails(steps))
 
     @property
     def drift_px(self) -> float:
-        """How far the background has moved, pixels of the full image."""
+        """Largest displacement of the background, pixels of the full image."""
         return self._drift_monitor.drift_px * self._reduction
 
     @property
     def lost_s(self) -> float:
-        """When the background was last lost from sight, minus infinity where never."""
+        """Time at which the background was last lost; minus infinity if never."""
         return self._drift_monitor.lost_s
 
     def compare_since(self, time_s: float) -> None:
-        """Let `drift_px` go back to `time_s`, that of the oldest evidence, where that is before `buffer.seconds`."""
+        """Compute `drift_px` since `time_s`, that of the oldest evidence, if that is older than `buffer.seconds`."""
         self._drift_monitor.compare_since(time_s)
 
     def forget_view_before(self, time_s: float) -> None:
-        """Let the background begin at `time_s` at the earliest: the camera stood otherwise before."""
+        """Drop background images from before `time_s`, when the camera pose was different."""
         self._background.forget_before(time_s)
 
     def still_lines(self) -> np.ndarray:
-        """Return straight lines of the background, pixels of the full image, x0, y0, x1, y1, shape (n, 4)."""
+        """Return the line segments of the background, x0, y0, x1, y1 in pixels of the full image, shape (n, 4)."""
         times = self._background.times_s
         if not self._line_detector.is_current(times):
             grey = self._background.grey()
@@ -212,23 +213,25 @@ class Observer:
         return self._to_full_pixels(self._line_detector.lines_px.reshape(-1, 2)).reshape(-1, 4)
 
     def background(self) -> np.ndarray | None:
-        """Return the road without its traffic, BGR uint8 (H, W, 3)."""
+        """Return the background image, BGR uint8 (H, W, 3); None before the first image."""
         image = self._background.image()
-        return None if image is None else black_out(image, self._polygons)  # JPEG rings at the border
+        return (
+            None if image is None else black_out(image, self._polygons)
+        )  # JPEG ringing at the borders of the polygons
 
     def _to_full_size(self, track: Track) -> Track:
         kind = TrackKind.UNKNOWN if self._detector_tracks is None else self._detector_tracks.kind(track.vehicle)
         return Track(track.vehicle, track.times_s, self._to_full_pixels(track.points_px), kind)
 
     def _to_full_pixels(self, points_px: np.ndarray) -> np.ndarray:
-        """Bring pixels (n, 2) of the tracked image to the full one; pixel centres lie at whole numbers."""
+        """Convert pixels (n, 2) of the tracked image to the full image; pixel centres are at integer coordinates."""
         return (points_px + 0.5) * self._reduction - 0.5 if self._reduction > 1 else points_px
 
 
 def _downsampled(grey: np.ndarray, ignored: np.ndarray | None) -> np.ndarray:
-    """Reduce a grey image (H, W) to `GATE_WIDTH_PX`: where noise is weak and a moving vehicle is not.
+    """Reduce a grey image (H, W) to `GATE_WIDTH_PX`, which averages noise but keeps moving vehicles.
 
-    What is `ignored`, not 0 in (H, W), gets the mean of the rest: it neither repeats nor hides anything.
+    Pixels where the mask `ignored` (H, W) is not 0 get the mean of the others, so that they affect no comparison.
     """
     if ignored is not None and not ignored.all():
         grey = np.where(ignored > 0, np.uint8(grey[ignored == 0].mean()), grey)

@@ -1,4 +1,4 @@
-"""SIFT keypoints inside the vehicle mask, and segments: matches between consecutive masked frames."""
+"""SIFT keypoints in the motion mask, and motion segments: keypoint matches between consecutive masked frames."""
 
 from __future__ import annotations
 
@@ -10,13 +10,15 @@ import numpy as np
 from autocalib_ros.perception.motion_mask import Region
 
 LOWE_RATIO = 0.75
-"""A match counts when its distance is below this share of the second best's (Lowe 2004)."""
+"""Largest ratio of the distances of the best and the second-best match (Lowe 2004)."""
 FULL_RESOLUTION_SIDE_PX = 48
-"""Regions beyond this side are searched at half size: their finest texture is noise, and costs most."""
+"""Longer side up to which regions are searched at full size; larger ones at half size, which skips mostly noise."""
 MAX_KEYPOINTS_PER_REGION = 60
+"""Most keypoints per region, by response."""
 MIN_SEGMENT_LENGTH_PX = 5.0
+"""Shortest segment, pixels of the tracked image; the direction of shorter ones is noise."""
 MAX_SEGMENT_LENGTH = 0.2
-"""Longest plausible motion between two masked frames, share of the image width."""
+"""Longest plausible motion between two masked frames, fraction of the image width. Judgement."""
 
 
 @dataclass(frozen=True)
@@ -28,17 +30,17 @@ class Keypoints:
     responses: np.ndarray
     """Shape (n,)."""
     regions: np.ndarray
-    """Index of the region of each, shape (n,)."""
+    """Region index of each, shape (n,)."""
     descriptors: np.ndarray
     """Shape (n, 128), float32."""
 
     def subset(self, keep: np.ndarray) -> Keypoints:
-        """Return the keypoints that `keep` (n,) selects."""
+        """Return the keypoints that `keep`, a mask or indices (n,), selects."""
         return Keypoints(self.points_px[keep], self.responses[keep], self.regions[keep], self.descriptors[keep])
 
 
 def find_keypoints(grey: np.ndarray, regions: list[Region], sift: cv2.SIFT) -> Keypoints:
-    """Find SIFT keypoints inside the moving regions of a grey image (H, W)."""
+    """Detect SIFT keypoints inside the regions of a grey image (H, W)."""
     found = [_region_keypoints(grey, region, sift) for region in regions]
     labels = [np.full(len(points), index) for index, (points, _, _) in enumerate(found)]
     return Keypoints(
@@ -68,11 +70,11 @@ def _region_keypoints(grey: np.ndarray, region: Region, sift: cv2.SIFT) -> tuple
     points = np.array([found[index].pt for index in best])
     if coarse:
         points = (points + 0.5) * [width / size[0], height / size[1]] - 0.5
-    return points + [region.x, region.y], responses[best], descriptors[best]
+    return points + np.array([region.x, region.y]), responses[best], descriptors[best]
 
 
 def match_segments(before: Keypoints, after: Keypoints, image_width: int) -> tuple[np.ndarray, np.ndarray]:
-    """Match two masked frames: segments x0, y0, x1, y1 (n, 4) and the index in `after` of each (n,)."""
+    """Match two masked frames; return segments x0, y0, x1, y1 (n, 4) and the index in `after` of each (n,)."""
     if len(before.points_px) < 2 or len(after.points_px) < 2:
         return np.zeros((0, 4)), np.zeros(0, int)
     pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(after.descriptors, before.descriptors, k=2)

@@ -1,15 +1,15 @@
-"""Outlines of what moves, eight points of each: small enough to keep, and their size tells a rider from a car."""
+"""Silhouettes of moving regions as eight extreme points: compact, and their size separates cyclists from cars."""
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
 
-from autocalib_ros.evidence.snapshot import OUTLINE_COLUMNS
+from autocalib_ros.evidence.tables import OUTLINE_COLUMNS
 from autocalib_ros.perception.motion_mask import Region
 
 EXTREME_DIRECTIONS = np.array([(-1, -1), (1, 1), (-1, 1), (1, -1), (-1, 0), (1, 0), (0, -1), (0, 1)])
-"""In which an outline's points are its farthest, as `Outlines.ends_px` has them."""
+"""Directions of the extreme points, in the order of `Outlines.ends_px`."""
 
 
 def outlines_of(
@@ -19,10 +19,10 @@ def outlines_of(
     reduction: float,
     excluded: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Outline each region of an image (H, W), without what it was `dilation_px` by; rows as `Outlines.ends_px`.
+    """Return the silhouettes of the regions of an image (H, W), shape (n, OUTLINE_COLUMNS) as `Outlines.ends_px`.
 
-    The full image is `reduction` times as large. What is beside a place that is `excluded`, not 0 in an image (H, W),
-    has no gap.
+    `dilation_px` (x, y) of the regions is removed. The result is in pixels of the full image, `reduction` times the
+    size. The gap of a region whose box contains a pixel of the mask `excluded` (H, W) is 0.
     """
     ends = np.zeros((len(regions), OUTLINE_COLUMNS))
     if not regions:
@@ -32,7 +32,7 @@ def outlines_of(
     ends[:, -1] = _gaps_to_nearest(ends[:, :-1].reshape(-1, len(EXTREME_DIRECTIONS), 2), shape)
     ends[:, -1] *= [not _touches_excluded(region, excluded) for region in regions]
     ends *= reduction
-    ends[:, :-1] -= 0.5  # from the corner of the image to the centre of its first pixel
+    ends[:, :-1] -= 0.5  # origin from the image corner to the centre of the first pixel
     return ends
 
 
@@ -42,18 +42,18 @@ def _touches_excluded(region: Region, excluded: np.ndarray | None) -> bool:
 
 
 def _extreme_points(region: Region) -> np.ndarray:
-    """Points (8, 2) where a region reaches farthest in each direction; (0, 0) is the corner of the image."""
+    """Return the extreme points (8, 2) of a region, with the origin at the image corner."""
     contours, _ = cv2.findContours(region.mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     points = np.concatenate(contours).reshape(-1, 2)
     reach = points @ EXTREME_DIRECTIONS.T
     farthest = reach == reach.max(axis=0)
-    # the middle of a side, where a whole one is as far
+    # ties, as along a straight side, are averaged
     places = farthest.T @ points / farthest.sum(axis=0)[:, None]
     return places + [region.x + 0.5, region.y + 0.5] + 0.5 * EXTREME_DIRECTIONS
 
 
 def _gaps_to_nearest(points: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Gap (n,) between the box of each outline (n, 8, 2) and the nearest other or the border of the image (H, W)."""
+    """Return the gap (n,) from the box of each silhouette (n, 8, 2) to the nearest other box or the image border."""
     height, width = shape
     least, most = points.min(axis=1), points.max(axis=1)
     apart = np.maximum(least[:, None] - most, least - most[:, None]).max(axis=2)

@@ -1,1 +1,1 @@
-"""Pictures for people: what a calibration makes of an image. Shared by the shells."""
+"""Visualisation of a calibration on camera images, with OpenCV: overlays, top views and undistorted views."""

@@ -1,6 +1,6 @@
-"""Lines, text and views laid over images, with OpenCV: what stays is drawn once, and laid over image after image.
+"""Drawing primitives with OpenCV: lines, text and overlays that are drawn once and composited with each image.
 
-Pictures are BGR uint8; colours are given as in HTML. Paths are in pixels, whole numbers at the centres of pixels.
+Pictures are BGR uint8; colours are HTML hex strings. Paths are in pixels with pixel centres at integer coordinates.
 """
 
 from __future__ import annotations
@@ -13,46 +13,46 @@ import numpy as np
 
 INK, PAPER, GREY = '#1c2733', '#ffffff', '#9aa5ae'
 ROAD_COLOURS = ('#0077bb', '#ee7733', '#009988', '#cc3377', '#ddaa33')
-"""One for each road direction; told apart with every common form of colour blindness."""
+"""One per road direction; distinguishable with all common forms of colour blindness (Paul Tol, vibrant)."""
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 TEXT_HEIGHT_FRACTION = 0.032
 MIN_TEXT_HEIGHT_PX, MAX_TEXT_HEIGHT_PX = 13.0, 34.0
-"""Height of a line of text, as a share of the picture's height, and at which it is still read, or large enough."""
+"""Height of a line of text, fraction of the height of the picture, and its limits for legibility and size."""
 FONT_HEIGHT_PX = 30.0
-"""Height of a line of OpenCV's font at the scale 1, from the top of an l to the foot of a g."""
+"""Line height of the OpenCV font at scale 1, from the top of an l to the bottom of a g."""
 STROKE_FRACTION = 0.055
-"""Width of the strokes of letters, as a share of their line's height."""
+"""Stroke width of letters, fraction of the line height."""
 CAPTION_FRACTION = 0.4
-"""The most of a picture's height that the caption may take."""
+"""Largest fraction of the height of a picture that the caption takes."""
 PANEL_OPACITY = 0.9
 LINE_FRACTION = 0.002
-"""Width of a line, as a share of the picture's height."""
+"""Width of a line, fraction of the height of the picture."""
 FRACTION_BITS = 4
-"""OpenCV takes points in whole numbers of 1/16 px."""
+"""OpenCV draws with fixed-point coordinates in units of 1/16 px."""
 MAX_COORDINATE_PX = 30000
-"""Beyond this OpenCV's whole numbers would overflow."""
+"""Limit of coordinates: larger ones overflow the fixed-point format."""
 
 
 def bgr(colour: str) -> tuple[int, int, int]:
-    """Return a colour such as '#0077bb' as OpenCV takes it."""
+    """Return a colour such as '#0077bb' as a BGR triple."""
     return int(colour[5:7], 16), int(colour[3:5], 16), int(colour[1:3], 16)
 
 
 def text_height_px(height: int) -> float:
-    """Return the height of a line of text in a picture of a height."""
+    """Return the text line height for a picture of this height, pixels."""
     return min(max(TEXT_HEIGHT_FRACTION * height, MIN_TEXT_HEIGHT_PX), MAX_TEXT_HEIGHT_PX)
 
 
 def line_px(height: int) -> int:
-    """Return the width of a line that is seen in a picture of a height."""
+    """Return the line width for a picture of this height, pixels."""
     return max(1, round(LINE_FRACTION * height))
 
 
 def draw_paths(picture: np.ndarray, paths: Sequence[np.ndarray] | np.ndarray, colour: str | int, width_px: int) -> None:
-    """Draw polylines, each (n, 2), smoothly; in a mask the colour is a number."""
+    """Draw anti-aliased polylines, each (n, 2); the colour is an intensity if the picture is a mask."""
     if not len(paths):
         return
-    steps = [_fixed_point(path) for path in paths] if isinstance(paths, (list, tuple)) else list(_fixed_point(paths))
+    steps = list(_fixed_point(paths)) if isinstance(paths, np.ndarray) else [_fixed_point(path) for path in paths]
     cv2.polylines(
         picture, steps, False, bgr(colour) if isinstance(colour, str) else colour, width_px, cv2.LINE_AA, FRACTION_BITS
     )
@@ -69,18 +69,18 @@ def _fixed_point(path: np.ndarray) -> np.ndarray:
 
 
 def text_size(text: str, text_height: float) -> tuple[int, int]:
-    """Return the width of a text in pixels, and the height of its line."""
+    """Return the width and the line height of a text in pixels."""
     (width, _), _ = cv2.getTextSize(text, FONT, text_height / FONT_HEIGHT_PX, stroke_px(text_height))
     return width, round(text_height)
 
 
 def stroke_px(text_height: float) -> int:
-    """Return how thick letters are."""
+    """Return the stroke width of letters in pixels."""
     return max(1, round(STROKE_FRACTION * text_height))
 
 
 def draw_text(picture: np.ndarray, text: str, left: float, top: float, text_height: float, colour: str) -> None:
-    """Write one line whose upper left corner is given; OpenCV's font knows ASCII alone."""
+    """Draw one line of text with its upper left corner at (left, top); the OpenCV font has ASCII only."""
     plain = text.encode('ascii', 'replace').decode()
     cv2.putText(
         picture,
@@ -95,7 +95,7 @@ def draw_text(picture: np.ndarray, text: str, left: float, top: float, text_heig
 
 
 def wrap_text(text: str, text_height: float, width_px: float, most: int) -> list[str]:
-    """Break a text into at most so many lines that fit into a width; what does not fit is left out, with '...'."""
+    """Wrap a text into at most `most` lines of a width; the rest is replaced by '...'."""
     lines: list[str] = []
     line = ''
     for word in text.split():
@@ -111,7 +111,7 @@ def wrap_text(text: str, text_height: float, width_px: float, most: int) -> list
 
 
 def truncate_text(line: str, text_height: float, width_px: float) -> str:
-    """Return as much of a line as fits into a width."""
+    """Return a line truncated to a width, with '...'."""
     if text_size(line, text_height)[0] <= width_px:
         return line
     while line and text_size(f'{line} ...', text_height)[0] > width_px:
@@ -120,12 +120,12 @@ def truncate_text(line: str, text_height: float, width_px: float) -> str:
 
 
 class Overlay:
-    """What is laid over every image of a size: drawn once, with any transparency."""
+    """Semi-transparent drawing for images of one size: drawn once, composited with each image."""
 
     def __init__(self, height: int, width: int) -> None:
         self._ink = np.zeros((height, width, 3), np.uint8)
         self._clear = np.full((height, width, 3), 255, np.uint8)
-        """How much of the image is seen through, 0 to 255 in each channel."""
+        """Transparency, 0 to 255 in each channel."""
 
     def add_paths(self, paths: Sequence[np.ndarray], colour: str, width_px: int, opacity: float = 1.0) -> None:
         """Add polylines, each (n, 2)."""
@@ -134,7 +134,7 @@ class Overlay:
         self._cover(mask, np.array(bgr(colour), np.uint8), opacity)
 
     def add_box(self, left: int, top: int, right: int, bottom: int, colour: str, opacity: float) -> None:
-        """Add a filled rectangle; its right and bottom ends are left out."""
+        """Add a filled rectangle; right and bottom are exclusive."""
         mask = np.zeros(self._ink.shape[:2], np.uint8)
         mask[max(top, 0) : max(bottom, 0), max(left, 0) : max(right, 0)] = 255
         self._cover(mask, np.array(bgr(colour), np.uint8), opacity)
@@ -152,7 +152,7 @@ class Overlay:
         self._clear[rows, columns] = np.round(self._clear[rows, columns] * (1 - share))
 
     def composite(self, image: np.ndarray) -> np.ndarray:
-        """Return an image of its size, grey or BGR, with this laid over it."""
+        """Return a grey or BGR image of this size with the overlay composited."""
         colour = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if image.ndim == 2 else image
         picture = cv2.multiply(colour, self._clear, scale=1 / 255)
         return cv2.add(picture, self._ink, picture)
@@ -160,7 +160,7 @@ class Overlay:
 
 @dataclass(frozen=True)
 class Caption:
-    """What a picture says in words."""
+    """Caption of a picture."""
 
     title: str
     text: str = ''
@@ -169,7 +169,7 @@ class Caption:
 
 
 def caption_panel(caption: Caption, height: int, width: int) -> np.ndarray:
-    """Return the words for the upper left corner of a picture of a size, no larger than they need, BGR."""
+    """Return the caption as a BGR panel for the upper left corner of a picture of this size, as small as possible."""
     text_height = text_height_px(height)
     margin, leading = round(0.5 * text_height), round(1.15 * text_height)
     room = width - 2 * margin
@@ -185,27 +185,27 @@ def caption_panel(caption: Caption, height: int, width: int) -> np.ndarray:
 
 
 def draw_panel(picture: np.ndarray, panel: np.ndarray) -> None:
-    """Lay a panel over the upper left corner of a picture, which shines through a little."""
+    """Blend a panel over the upper left corner of a picture, in place."""
     rows, columns = panel.shape[:2]
     corner = picture[:rows, :columns]
     cv2.addWeighted(panel, PANEL_OPACITY, corner, 1 - PANEL_OPACITY, 0, corner)
 
 
 class RemapTable:
-    """A view of the images of one camera, in the form in which OpenCV makes it fastest."""
+    """Remapping of the images of one camera, in the fixed-point format that OpenCV processes fastest."""
 
     def __init__(self, sources: np.ndarray, empty_grey: int) -> None:
-        """Take where each pixel of the view lies in the image, float32 (rows, columns, 2)."""
-        self._maps = cv2.convertMaps(sources, None, cv2.CV_16SC2)
+        """Take the source pixel in the image of each pixel of the view, float32 (rows, columns, 2)."""
+        self._maps = cv2.convertMaps(sources, None, cv2.CV_16SC2)  # type: ignore[call-overload]  # the stub lacks None
         self._empty = (empty_grey,) * 3
         self._view: np.ndarray | None = None
 
     def of(self, image: np.ndarray) -> np.ndarray:
-        """Return the view of an image, grey or BGR like it; the next view is written over it.
+        """Return the view of an image, grey or BGR like the image; the next call overwrites it.
 
-        Fresh memory for each would cost as much as a third of the view itself.
+        Allocating a new view would add a third to the cost.
         """
         shape = (*self._maps[0].shape[:2], *image.shape[2:])
         if self._view is None or self._view.shape != shape:
             self._view = np.empty(shape, np.uint8)
-        return cv2.remap(image, *self._maps, cv2.INTER_LINEAR, dst=self._view, borderValue=self._empty)
+        return cv2.remap(image, self._maps[0], self._maps[1], cv2.INTER_LINEAR, dst=self._view, borderValue=self._empty)

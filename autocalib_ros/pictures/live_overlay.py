@@ -1,6 +1,6 @@
-"""The pictures of a running calibration: what is drawn over the camera's image, and the road from above.
+"""Live pictures of a running calibration: debug overlay, top view and undistorted image.
 
-Each is made once for a calibration and then drawn for image after image; what does not change is kept.
+Each is prepared once per calibration and drawn for each image; static parts are cached.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import numpy as np
 
 from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.lens.camera import Camera
+from autocalib_ros.pictures.annotations import add_label, add_scale_bar
 from autocalib_ros.pictures.drawing import (
     GREY,
     INK,
@@ -27,57 +28,53 @@ from autocalib_ros.pictures.drawing import (
     text_height_px,
     text_size,
 )
-from autocalib_ros.pictures.road import GroundGrid
+from autocalib_ros.pictures.scene_geometry import ScaleBar, SceneGeometry
 from autocalib_ros.pictures.views import (
     EMPTY_GREY,
     TopView,
     format_length,
     grid_step,
-    project_great_circle,
-    project_road_lines,
     rectification_map,
-    round_length,
     visible_road,
 )
 from autocalib_ros.results.calibration import Calibration
 
 TRACKED_COLOUR, HORIZON_COLOUR, AXIS_COLOURS = '#ffe14d', '#ff7bd5', ('#ff5544', '#55cc55')
-"""Colours: points followed now, the horizon, x and y of the ground frame."""
+"""Colours of tracked points, horizon, and x and y axes of the ground frame."""
 MAX_PATHS = 80
-"""Tracks of a road, or rejected, that are drawn: more would hide the road."""
+"""Most tracks drawn per label: more would hide the road."""
 LIVE_TOP_VIEW_PX = 640
-SCALE_BAR_FRACTION = 0.2
-"""Length of the scale bar, share of the picture's width at the most."""
+"""Longer side of the top view, pixels."""
 FOOT_MARGIN_HEIGHTS = 0.6
-"""Around the camera's foot, units of its height."""
+"""Margin of the top view around the nadir of the camera, camera heights."""
 
 
 @dataclass(frozen=True)
 class LabelledTracks:
-    """What became of the tracks in a solution."""
+    """Tracks with the labels that a solution gave them."""
 
     image_size: tuple[int, int]
     points_px: np.ndarray
-    """Of all tracks one after another, shape (points, 2)."""
+    """Points of all tracks, concatenated, shape (points, 2)."""
     starts: np.ndarray
-    """Where each track begins, with the total at the end, shape (tracks + 1,)."""
+    """Index at which each track starts, then the number of points, shape (tracks + 1,)."""
     labels: np.ndarray
-    """For each track -1 not used, -2 rejected, else the index of its road direction, shape (tracks,)."""
+    """Road index of each track; -1 not used, -2 rejected; shape (tracks,)."""
 
     def of(self, label: int) -> list[np.ndarray]:
-        """Return the paths (n, 2) of a label; where there are too many to draw, every so manieth."""
+        """Return the paths (n, 2) of a label, evenly subsampled to at most `MAX_PATHS`."""
         indices = np.flatnonzero(self.labels == label)
         indices = indices[:: max(1, -(-len(indices) // MAX_PATHS))]
         return [self.points_px[self.starts[index] : self.starts[index + 1]] for index in indices]
 
 
 class DebugPicture:
-    """The camera's image with tracks, horizon, a grid on the road, and the state in words."""
+    """Camera image with tracks, horizon, ground grid and a caption."""
 
     def __init__(
         self, image_size: tuple[int, int], calibration: Calibration | None, labelled_tracks: LabelledTracks | None
     ) -> None:
-        """Take what is known for images of that size: nothing yet, or a lens, or a lens and the plane."""
+        """Prepare the overlay for images of a size; without a ground plane it has no horizon and no grid."""
         width, height = image_size
         self._overlay = Overlay(height, width)
         self._entries = [(TRACKED_COLOUR, 'followed now')]
@@ -89,7 +86,7 @@ class DebugPicture:
         self._add_legend(height, width)
 
     def draw(self, image: np.ndarray, followed_px: np.ndarray, caption: Caption) -> np.ndarray:
-        """Return the picture of an image, grey or BGR, with where points went of late (n, steps, 2), newest last."""
+        """Return the picture of a grey or BGR image with the recent positions (n, steps, 2) of tracked points."""
         picture = self._overlay.composite(image)
         width_px = line_px(len(picture))
         draw_paths(picture, followed_px, TRACKED_COLOUR, width_px)
@@ -111,25 +108,25 @@ class DebugPicture:
             self._entries.append((colour, f'road {road + 1}'))
 
     def _add_road(self, camera: Camera, ground: GroundPlane, height: int) -> None:
-        """Add the horizon, and a grid about the middle of the road that is in the image."""
+        """Add the horizon and the ground grid."""
         width_px = line_px(height)
-        self._overlay.add_paths(project_great_circle(camera, ground.normal_in_camera), HORIZON_COLOUR, 2 * width_px)
+        scene = SceneGeometry.of(camera, ground)
+        self._overlay.add_paths(scene.horizon_px(), HORIZON_COLOUR, 2 * width_px)
         self._entries.append((HORIZON_COLOUR, 'horizon'))
-        grid = GroundGrid.of(camera, ground)
-        if grid is None:
+        if scene.grid is None:
             return
-        lines = project_road_lines(camera, ground, grid.lines_m)
+        lines = scene.grid_px()
         self._overlay.add_paths(lines, INK, 3 * width_px, 0.2)
         self._overlay.add_paths(lines, PAPER, width_px, 0.6)
-        self._entries.append((PAPER, f'squares of {format_length(grid.step_m, ground)}'))
-        for axis, (name, colour) in enumerate(zip('xy', AXIS_COLOURS, strict=True)):
-            arm = np.linspace([*grid.middle_m, 0], [*(grid.middle_m + grid.step_m * np.eye(2)[axis]), 0], 20)
-            for path in project_road_lines(camera, ground, [arm]):
+        self._entries.append((PAPER, f'squares of {format_length(scene.grid.step_m, ground)}'))
+        for (name, paths), colour in zip(scene.axes_px().items(), AXIS_COLOURS, strict=True):
+            for path in paths:
                 self._overlay.add_paths([path], colour, 2 * width_px)
-                self._overlay.add_text(name, *(path[-1] + width_px), text_height_px(height), colour)
+                x, y = path[-1] + width_px
+                self._overlay.add_text(name, x, y, text_height_px(height), colour)
 
     def _add_legend(self, height: int, width: int) -> None:
-        """Say what is what along the lower border, in as many rows as it takes."""
+        """Add the legend along the lower border, in as many rows as necessary."""
         text_height = text_height_px(height)
         stroke, gap = round(1.4 * text_height), round(0.5 * text_height)
         places, left, row = [], gap, 0
@@ -152,7 +149,7 @@ class DebugPicture:
 
 
 class TopPicture:
-    """The road from straight above, x of the ground frame to the right, with a scale and the camera."""
+    """Top view of the road, x of the ground frame to the right, with scale bar and camera position."""
 
     def __init__(self, view: TopView, camera: Camera, ground: GroundPlane) -> None:
         self.view = view
@@ -160,30 +157,33 @@ class TopPicture:
         self._overlay = Overlay(view.rows, view.columns)
         text_height = text_height_px(view.rows)
         self._add_camera(ground, text_height)
-        self._add_scale(ground, text_height)
+        bar, margin = ScaleBar.of(view, ground), text_height
+        add_scale_bar(self._overlay, bar, margin, view.rows - margin, text_height, line_px(view.rows))
 
     @classmethod
     def of(cls, calibration: Calibration) -> TopPicture | None:
-        """Show the road of a calibration; None where that has no plane, or the image shows no road."""
+        """Prepare the top view of a calibration; None if it has no ground plane or the image shows no road."""
         camera, ground = calibration.camera, calibration.ground
-        seen = np.zeros((0, 2)) if ground is None else visible_road(camera, ground)
-        if len(seen) < 2:
+        if ground is None:
+            return None
+        visible = visible_road(camera, ground)
+        if len(visible) < 2:
             return None
         foot = FOOT_MARGIN_HEIGHTS * ground.height_m * np.array([[-1.0, -1.0], [1.0, 1.0]])
-        around = np.concatenate([seen, foot])
+        around = np.concatenate([visible, foot])
         return cls(TopView.between(around.min(axis=0), around.max(axis=0), LIVE_TOP_VIEW_PX), camera, ground)
 
     def draw(self, image: np.ndarray) -> np.ndarray:
-        """Return the picture of an image, grey or BGR."""
+        """Return the top view of a grey or BGR image."""
         return self._overlay.composite(self._lookup.of(image))
 
     def _add_camera(self, ground: GroundPlane, text_height: float) -> None:
-        """Mark the camera's foot by an arrow to where it looks, and the axes of the ground frame by arms."""
+        """Mark the nadir of the camera by an arrow in its viewing direction, and draw the axes of the ground frame."""
         foot, width_px = self.view.pixels(np.zeros(2)), line_px(self.view.rows)
         for axis, (name, colour) in enumerate(zip('xy', AXIS_COLOURS, strict=True)):
             end = self.view.pixels(0.8 * grid_step(ground) * np.eye(2)[axis])
             self._overlay.add_paths([np.array([foot, end])], colour, 2 * width_px)
-            self._overlay.add_text(name, *(end + [2, -text_height / 2]), text_height, colour)
+            self._overlay.add_text(name, end[0] + 2, end[1] - text_height / 2, text_height, colour)
         ahead = ground.rotation[:2, 2] * [1.0, -1.0]
         ahead = ahead / max(float(np.hypot(*ahead)), 1e-9)
         aside = np.array([-ahead[1], ahead[0]])
@@ -195,32 +195,17 @@ class TopPicture:
         text, beside = 'camera', 1.5 * text_height
         left = foot[0] - beside - text_size(text, text_height)[0]
         arms = 0.8 * grid_step(ground) * self.view.px_per_m
-        self._write(text, left if left > 2 else foot[0] + beside + arms, foot[1] - text_height / 2, text_height)
-
-    def _add_scale(self, ground: GroundPlane, text_height: float) -> None:
-        bar_m = round_length(SCALE_BAR_FRACTION * self.view.columns / self.view.px_per_m)
-        left, foot, width_px = text_height, self.view.rows - text_height, line_px(self.view.rows)
-        bar = np.array([[left, foot], [left + bar_m * self.view.px_per_m, foot]])
-        self._overlay.add_paths([bar], PAPER, 6 * width_px)
-        self._overlay.add_paths([bar], INK, 3 * width_px)
-        self._write(format_length(bar_m, ground), left, foot - 1.6 * text_height, text_height)
-
-    def _write(self, text: str, left: float, top: float, text_height: float) -> None:
-        """Write dark on a light box: what lies below may be anything."""
-        width, height = text_size(text, text_height)
-        self._overlay.add_box(
-            round(left) - 2, round(top) - 1, round(left) + width + 2, round(top) + height + 1, PAPER, 0.75
-        )
-        self._overlay.add_text(text, left, top, text_height, INK)
+        left = left if left > 2 else foot[0] + beside + arms
+        add_label(self._overlay, text, left, foot[1] - text_height / 2, text_height)
 
 
 class RectifiedPicture:
-    """The image without distortion, by the P of the calibration's camera_info; black where the lens does not see."""
+    """Undistorted image by P of the CameraInfo message; black outside the field of view."""
 
     def __init__(self, calibration: Calibration) -> None:
         matrix = np.array(calibration.camera_info.p).reshape(3, 4)[:, :3]
         self._lookup = RemapTable(rectification_map(calibration.camera, matrix), 0)
 
     def draw(self, image: np.ndarray) -> np.ndarray:
-        """Return an image, grey or BGR, as the distortion-free camera of P takes it."""
+        """Return the undistorted view of a grey or BGR image."""
         return self._lookup.of(image)

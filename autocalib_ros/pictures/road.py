@@ -1,4 +1,4 @@
-"""What is drawn of a calibration in the ground frame: a grid on the road, the field of view, how sure points are."""
+"""Geometry of a calibration in the ground frame: grid, viewing frustum and error ellipses."""
 
 from __future__ import annotations
 
@@ -13,58 +13,73 @@ from autocalib_ros.pictures.views import grid_lines, grid_step, visible_road
 from autocalib_ros.results.calibration import GROUND_DISTANCES_M, Calibration
 
 POINTS_PER_SIDE = 12
-"""Points along each side of the image through which its field of view is drawn: a wide lens bends the sides."""
+"""Points along each image side of the frustum: a wide-angle lens bends the sides."""
+AXIS_POINTS = 20
+"""Points along an axis: it bends in the image of a wide-angle lens."""
 FRUSTUM_HEIGHTS = 0.3
-"""Length of the rays of the field of view, units of the camera's height."""
+"""Length of the rays of the frustum, camera heights."""
 OUTLINE_POINTS = 49
+"""Points along the outline of an ellipse."""
 ELLIPSE_FRACTION = 0.1
+"""Largest half axis of an enlarged ellipse, fraction of its distance."""
 ENLARGEMENTS = (1, 2, 5, 10, 20, 50, 100)
-"""Ellipses are enlarged until the largest is seen, `ELLIPSE_FRACTION` of its distance at the most."""
+"""Enlargements of ellipses; the largest is chosen with all half axes below `ELLIPSE_FRACTION` of the distance."""
 
 
 @dataclass(frozen=True)
 class GroundGrid:
-    """Squares on the road about the middle of what the image shows of it."""
+    """Grid of squares on the road."""
 
     step_m: float
     middle_m: np.ndarray
-    """A corner of a square, shape (2,)."""
+    """Central grid corner, shape (2,)."""
     lines_m: list[np.ndarray]
-    """Each fine, as lines bend in the image, shape (n, 3)."""
+    """Finely sampled lines, because they bend in the image, each of shape (n, 3)."""
+
+    @classmethod
+    def around(cls, points_m: np.ndarray, ground: GroundPlane) -> GroundGrid:
+        """Return the grid around the median of road points (n, 2)."""
+        step = grid_step(ground)
+        middle = np.round(np.median(points_m, axis=0) / step) * step
+        return cls(step, middle, grid_lines(middle, step))
 
     @classmethod
     def of(cls, camera: Camera, ground: GroundPlane) -> GroundGrid | None:
-        """Return the grid that suits a calibration; None where the image shows no road."""
+        """Return the grid around the visible part of the road; None if the image shows no road."""
         visible = visible_road(camera, ground)
-        if not len(visible):
-            return None
-        step = grid_step(ground)
-        middle = np.round(np.median(visible, axis=0) / step) * step
-        return cls(step, middle, grid_lines(middle, step))
+        return cls.around(visible, ground) if len(visible) else None
+
+    def axes_m(self) -> dict[str, np.ndarray]:
+        """Return lines (n, 3) from the central corner to the next along x and y, by name."""
+        start = [*self.middle_m, 0.0]
+        return {
+            name: np.linspace(start, [*(self.middle_m + self.step_m * direction), 0.0], AXIS_POINTS)
+            for name, direction in zip('xy', np.eye(2), strict=True)
+        }
 
 
 @dataclass(frozen=True)
 class ErrorEllipse:
-    """Where a point of the road that is so far ahead of the camera's foot may be, by the calibration: one sigma."""
+    """One-sigma ellipse of the position of a road point ahead of the camera, by the calibration uncertainty."""
 
     distance_m: float
     sigma_m: float
-    """Of its place, both directions together."""
+    """Root of the trace of the covariance."""
     centre_m: np.ndarray
     """Shape (2,)."""
     axes_m: np.ndarray
     """Half axes as rows, the longer one last, shape (2, 2)."""
 
     def outline(self, enlargement: float) -> np.ndarray:
-        """Return the ellipse, so many times as large, as a closed line (n, 2)."""
+        """Return the ellipse, scaled by `enlargement`, as a closed line (n, 2)."""
         angles = np.linspace(0.0, 2 * np.pi, OUTLINE_POINTS)
         return self.centre_m + enlargement * np.column_stack([np.cos(angles), np.sin(angles)]) @ self.axes_m
 
 
 def error_ellipses(result: Calibration) -> list[ErrorEllipse]:
-    """Return the ellipses `GROUND_DISTANCES_M` ahead that are in the image; none where the calibration tells nothing.
+    """Return the ellipses at `GROUND_DISTANCES_M` ahead of the camera that are in the image.
 
-    That takes a plane in metres and its covariance.
+    Empty without a metric ground plane and its covariance.
     """
     if result.ground is None or not result.ground.metric or result.covariance is None:
         return []
@@ -77,6 +92,8 @@ def error_ellipses(result: Calibration) -> list[ErrorEllipse]:
         <= np.array([camera.width, camera.height]) / 2
     ).all(axis=1)
     found = ground.points(np.where(visible[:, None], pixels, 0.0))
+    if found.covariance_m2 is None or found.sigma_m is None:
+        return []
     found_ellipses = []
     for index in np.flatnonzero(visible & found.valid):
         values, vectors = np.linalg.eigh(found.covariance_m2[index])
@@ -88,15 +105,15 @@ def error_ellipses(result: Calibration) -> list[ErrorEllipse]:
 
 
 def enlargement(shown: list[ErrorEllipse]) -> int:
-    """Return by how much ellipses are enlarged so that they are seen beside the road."""
+    """Return the factor by which to enlarge ellipses so that they are visible at the scale of the road."""
     most = max((np.hypot(*ellipse.axes_m[-1]) / ellipse.distance_m for ellipse in shown), default=ELLIPSE_FRACTION)
     return max(factor for factor in ENLARGEMENTS if factor == 1 or factor * most <= ELLIPSE_FRACTION)
 
 
 def view_frustum(camera: Camera, ground: GroundPlane) -> list[np.ndarray]:
-    """Return lines (n, 3) in the ground frame: from the camera to the image's corners, and around its border.
+    """Return the frustum as lines (n, 3) in the ground frame: from the camera to the image corners, and the border.
 
-    All rays are of one length, so that a lens of 180 degrees and more is shown as it is.
+    All rays have one length, which also shows lenses of 180 degrees and more correctly.
     """
     left, top, right, bottom = -0.5, -0.5, camera.width - 0.5, camera.height - 0.5
     corners = np.array([[left, top], [right, top], [right, bottom], [left, bottom]])

@@ -1,26 +1,24 @@
-"""One picture that tells what a calibration is: the image with a grid on the road and the horizon; the road from above.
-
-Both halves show the same squares of the same moment, bent by the lens at the left and square at the right.
-"""
+"""Picture of a calibration: the image with ground grid and horizon, next to a top view with the same grid."""
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
-from matplotlib.axes import Axes
 
 from autocalib_ros.errors import InputError
 from autocalib_ros.geometry.ground_plane import GroundPlane
-from autocalib_ros.lens.camera import Camera, field_of_view_deg, pixel_grid
-from autocalib_ros.pictures.drawing import bgr
-from autocalib_ros.pictures.plotted import PLATE_COLOUR, POINTS_PER_PX, WHITE, PlotOverlay, draw_plate, draw_scale_bar
+from autocalib_ros.lens.camera import Lens, field_of_view_deg, pixel_grid
+from autocalib_ros.pictures.annotations import add_scale_bar
+from autocalib_ros.pictures.drawing import INK, PAPER, Overlay, bgr, text_size
+from autocalib_ros.pictures.known_views import require_ground
+from autocalib_ros.pictures.scene_geometry import ScaleBar
 from autocalib_ros.pictures.views import (
     TopView,
+    format_length,
     grid_lines,
     grid_step,
     ground_to_image,
     in_image,
-    length_unit,
     nearby_road_points,
     project_great_circle,
     resample,
@@ -28,52 +26,44 @@ from autocalib_ros.pictures.views import (
 from autocalib_ros.results.saved_camera import SavedCamera
 
 IMAGE_PX, VIEW_PX, GAP_PX, STRIP_PX = 1080, 508, 12, 92
-"""Widths of the image, of the view from above and of the gap between them; height of the captions below."""
-TITLE_PX, SMALL_PX = 27.0, 20.0
-"""A page shows the picture at about half its size."""
-GRID_COLOUR, HORIZON_COLOUR = '#5ad1c8', '#ffb347'
-GRID_PX, HORIZON_PX = 2.2, 3.2
+"""Widths of the image, of the top view and of the gap between them; height of the caption strip."""
+TITLE_PX, SMALL_PX = 30.0, 24.0
+"""Text heights; web pages show the picture at about half its size."""
+GRID_COLOUR, HORIZON_COLOUR, SUBTITLE_COLOUR = '#5ad1c8', '#ffb347', '#a9b6c2'
+GRID_PX, HORIZON_PX, RIM_PX = 2, 3, 1
+"""Line widths, and the additional width of the dark rim."""
+LINE_OPACITY, RIM_OPACITY, PLATE_OPACITY = 0.75, 0.3, 0.72
 NEAR_HEIGHTS = 6.0
-"""The view from above is about the middle of the road that is nearer than this, so many camera heights."""
+"""The top view is centred on the visible road within this distance, camera heights."""
 SPAN_HEIGHTS = 5.5
-"""Camera heights that it shows from top to bottom: beyond, a pixel of the image covers too much."""
-HORIZON_SAMPLES = 48
+"""Height of the top view, camera heights: farther away, an image pixel covers too much road."""
+ROAD_SAMPLES_PER_SIDE = 48
+"""Samples along each image side for the extent of the road."""
 
 
 def showcase(known: SavedCamera, image: np.ndarray) -> np.ndarray:
-    """Return the picture, BGR uint8, of a camera with a plane and one of its images, BGR uint8 (H, W, 3).
+    """Return the picture, BGR uint8, of a camera and one of its images, BGR uint8 (H, W, 3).
 
-    InputError where there is no plane, or no road nearby in the image.
+    InputError if there is no ground plane or no road nearby in the image.
     """
-    if known.ground is None:
-        raise InputError('it holds no ground plane: calibrate with --camera-height')
+    upright = _upright(require_ground(known))
     rows = round(IMAGE_PX * known.height / known.width)
     small = known.scaled_to(IMAGE_PX, rows)
-    camera, ground = small.lens, _upright(known.ground)
-    view = _view(camera, ground, rows)
-    page = np.full((rows + STRIP_PX, IMAGE_PX + GAP_PX + VIEW_PX, 3), bgr(PLATE_COLOUR), np.uint8)
+    view = _centred_view(small, upright, rows)
+    page = np.full((rows + STRIP_PX, IMAGE_PX + GAP_PX + VIEW_PX, 3), bgr(INK), np.uint8)
     page[:rows, :IMAGE_PX] = cv2.resize(image, (IMAGE_PX, rows), interpolation=cv2.INTER_AREA)
-    page[:rows, IMAGE_PX + GAP_PX :] = _from_above(known, _upright(known.ground), image, view)
-    step = grid_step(ground)
-    lines = _clipped_to_both(small, ground, view, grid_lines((np.array(view.low_m) + view.high_m) / 2, step))
-
-    def draw(axes: Axes) -> None:
-        for line in lines:
-            _line(axes, ground_to_image(camera, ground, line), GRID_COLOUR, GRID_PX)
-            _line(axes, view.pixels(line) + [IMAGE_PX + GAP_PX, 0], GRID_COLOUR, GRID_PX)
-        for line in project_great_circle(camera, ground.normal_in_camera):
-            _line(axes, np.where(in_image(small, line)[:, None], line, np.nan), HORIZON_COLOUR, HORIZON_PX)
-        _name_horizon(axes, camera, ground)
-        draw_scale_bar(
-            axes, view, 'm' if ground.metric else 'heights', (IMAGE_PX + GAP_PX + 14.0, rows - 14.0), SMALL_PX
-        )
-        _captions(axes, small, step, rows)
-
-    return PlotOverlay.render(page.shape[1], page.shape[0], draw).composite(page)
+    page[:rows, IMAGE_PX + GAP_PX :] = _top_view(known, upright, image, view)
+    overlay = Overlay(*page.shape[:2])
+    _add_grid(overlay, small, upright, view)
+    _add_horizon(overlay, small, upright)
+    bar = ScaleBar.of(view, upright)
+    add_scale_bar(overlay, bar, IMAGE_PX + GAP_PX + SMALL_PX, rows - SMALL_PX, SMALL_PX, GRID_PX)
+    _add_captions(overlay, small, upright, rows)
+    return overlay.composite(page)
 
 
 def _upright(ground: GroundPlane) -> GroundPlane:
-    """Turn the ground frame by quarters until the camera looks up in a view from above, so that roads stay square."""
+    """Rotate the ground frame by quarter turns so that the camera looks up in a top view; roads stay axis-aligned."""
     ahead = ground.rotation[:, 2]
     quarters = round(float((np.pi / 2 - np.arctan2(ahead[1], ahead[0])) / (np.pi / 2)))
     cosine, sine = round(np.cos(quarters * np.pi / 2)), round(np.sin(quarters * np.pi / 2))
@@ -81,10 +71,12 @@ def _upright(ground: GroundPlane) -> GroundPlane:
     return GroundPlane(turn @ ground.rotation, ground.height_m, ground.metric)
 
 
-def _view(camera: Camera, ground: GroundPlane, rows: int) -> TopView:
-    near = nearby_road_points(camera, ground, pixel_grid(camera, HORIZON_SAMPLES, HORIZON_SAMPLES), NEAR_HEIGHTS)
+def _centred_view(camera: Lens, ground: GroundPlane, rows: int) -> TopView:
+    near = nearby_road_points(
+        camera, ground, pixel_grid(camera, ROAD_SAMPLES_PER_SIDE, ROAD_SAMPLES_PER_SIDE), NEAR_HEIGHTS
+    )
     if len(near) < 2:
-        raise InputError(f'its image shows no road nearer than {NEAR_HEIGHTS:g} times the height of the camera')
+        raise InputError(f'its image shows no road within {NEAR_HEIGHTS:g} camera heights')
     middle = (near.min(axis=0) + near.max(axis=0)) / 2
     span = SPAN_HEIGHTS * ground.height_m * np.array([VIEW_PX / rows, 1.0])
     px_per_m = rows / span[1]
@@ -92,72 +84,71 @@ def _view(camera: Camera, ground: GroundPlane, rows: int) -> TopView:
     return TopView((float(low[0]), float(low[1])), float(px_per_m), VIEW_PX, rows)
 
 
-def _from_above(known: SavedCamera, ground: GroundPlane, image: np.ndarray, view: TopView) -> np.ndarray:
-    """Return the view of the image, in the colour of the page where that does not reach."""
-    sources = view.sources(known.lens, ground)
-    seen = ((sources >= 0) & (sources <= [known.width - 1, known.height - 1])).all(axis=-1)
-    return np.where(seen[..., None], resample(image, sources), np.array(bgr(PLATE_COLOUR), np.uint8))
+def _top_view(known: SavedCamera, ground: GroundPlane, image: np.ndarray, view: TopView) -> np.ndarray:
+    """Return the top view of the image, with the page colour outside the image."""
+    sources = view.sources(known, ground)
+    covered = np.all((sources >= 0) & (sources <= [known.width - 1, known.height - 1]), axis=-1, keepdims=True)
+    return np.where(covered, resample(image, sources), np.array(bgr(INK), np.uint8))
 
 
-def _clipped_to_both(
-    known: SavedCamera, ground: GroundPlane, view: TopView, lines: list[np.ndarray]
-) -> list[np.ndarray]:
-    """Return lines (n, 3) on the road with nan where they are not in the image and in the view from above."""
+def _add_grid(overlay: Overlay, known: SavedCamera, ground: GroundPlane, view: TopView) -> None:
+    """Add the grid around the centre of the top view to both halves, where both show the road."""
     low, high = np.array(view.low_m), np.array(view.high_m)
-    return [
-        np.where(
-            (
-                in_image(known, ground_to_image(known.lens, ground, line))
-                & ((line[:, :2] > low) & (line[:, :2] < high)).all(axis=1)
-            )[:, None],
-            line,
-            np.nan,
-        )
-        for line in lines
-    ]
+    paths = []
+    for line in grid_lines((low + high) / 2, grid_step(ground)):
+        pixels = ground_to_image(known, ground, line)
+        shown = in_image(known, pixels) & ((line[:, :2] > low) & (line[:, :2] < high)).all(axis=1)
+        paths += _visible_parts(pixels, shown)
+        paths += _visible_parts(view.pixels(line) + np.array([IMAGE_PX + GAP_PX, 0]), shown)
+    _add_rimmed(overlay, paths, GRID_COLOUR, GRID_PX)
 
 
-def _line(axes: Axes, points: np.ndarray, colour: str, width_px: float) -> None:
-    """Draw a polyline (n, 2) that is interrupted where it is nan, with a dark rim."""
-    axes.plot(*points.T, color=PLATE_COLOUR, linewidth=(width_px + 1.6) * POINTS_PER_PX, alpha=0.3)
-    axes.plot(*points.T, color=colour, linewidth=width_px * POINTS_PER_PX, alpha=0.85)
+def _visible_parts(path: np.ndarray, shown: np.ndarray) -> list[np.ndarray]:
+    """Split a polyline (n, 2) into the parts where the mask `shown` (n,) is true."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], shown, [False]]).astype(int)))
+    return [path[begin:end] for begin, end in zip(edges[::2], edges[1::2], strict=True) if end - begin > 1]
 
 
-def _name_horizon(axes: Axes, camera: Camera, ground: GroundPlane) -> None:
-    """Write its name at the left end of the horizon, below it, where it is in the image."""
-    points = np.concatenate([np.zeros((0, 2)), *project_great_circle(camera, ground.normal_in_camera)])
+def _add_rimmed(overlay: Overlay, paths: list[np.ndarray], colour: str, width_px: int) -> None:
+    """Add polylines (n, 2) with a dark rim."""
+    overlay.add_paths(paths, INK, width_px + RIM_PX, RIM_OPACITY)
+    overlay.add_paths(paths, colour, width_px, LINE_OPACITY)
+
+
+def _add_horizon(overlay: Overlay, camera: Lens, ground: GroundPlane) -> None:
+    """Add the horizon inside the image, labelled below its left end."""
+    lines = project_great_circle(camera, ground.normal_in_camera)
+    _add_rimmed(
+        overlay,
+        [part for line in lines for part in _visible_parts(line, in_image(camera, line))],
+        HORIZON_COLOUR,
+        HORIZON_PX,
+    )
+    points = np.concatenate([np.zeros((0, 2)), *lines])
     inside = points[(points >= 0).all(axis=1) & (points < [camera.width, camera.height - 3 * SMALL_PX]).all(axis=1)]
     if not len(inside):
         return
-    x, y = inside[np.argmin(inside[:, 0])] + [14.0, 10.0]
-    draw_plate(axes, x, y, x + 4.6 * SMALL_PX, y + 1.6 * SMALL_PX)
-    axes.text(
-        x + 2.3 * SMALL_PX,
-        y + 0.8 * SMALL_PX,
-        'horizon',
-        color=HORIZON_COLOUR,
-        fontsize=SMALL_PX * POINTS_PER_PX,
-        ha='center',
-        va='center_baseline',
-    )
+    left, top = (int(value) for value in inside[np.argmin(inside[:, 0])] + [14.0, 10.0])
+    width, height = text_size('horizon', SMALL_PX)
+    margin = height // 3
+    overlay.add_box(left, top, left + width + 2 * margin, top + height + 2 * margin, INK, PLATE_OPACITY)
+    overlay.add_text('horizon', left + margin, top + margin, SMALL_PX, HORIZON_COLOUR)
 
 
-def _captions(axes: Axes, known: SavedCamera, step: float, rows: int) -> None:
-    sigma = known.stddev
-    tilt = float(np.degrees(np.arcsin(np.clip(-known.ground.normal_in_camera[2], -1, 1))))
-    height = f' from {known.ground.height_m:.1f} m' if known.ground.metric else ''
-    field = field_of_view_deg(known)[0]
-    left = (
-        f'Lens, horizon and road found from the traffic: squares of {step:g} {length_unit(known.ground)}',
-        f'{field:.0f} degrees wide, looks {_with_sigma(tilt, sigma.tilt_deg)} degrees down{height}',
+def _add_captions(overlay: Overlay, known: SavedCamera, ground: GroundPlane, rows: int) -> None:
+    tilt = float(np.degrees(np.arcsin(np.clip(-ground.normal_in_camera[2], -1, 1))))
+    height = f', {ground.height_m:.1f} m above the road' if ground.metric else ''
+    field = field_of_view_deg(known)[0]  # type: ignore[arg-type]  # any lens with a principal point
+    squares = format_length(grid_step(ground), ground)
+    image_caption = (
+        f'Lens, horizon and ground plane from traffic: squares of {squares}',
+        f'field of view {field:.0f} degrees, tilt {_with_sigma(tilt, known.stddev.tilt_deg)} degrees{height}',
     )
-    right = ('The same moment from above', 'the same squares, to scale')
-    for x, (title, words) in ((16.0, left), (IMAGE_PX + GAP_PX + 4.0, right)):
-        axes.text(
-            x, rows + 34.0, title, color=WHITE, fontsize=TITLE_PX * POINTS_PER_PX, va='baseline', fontweight='medium'
-        )
-        axes.text(x, rows + 70.0, words, color='#a9b6c2', fontsize=SMALL_PX * POINTS_PER_PX, va='baseline')
+    view_caption = ('Top view', 'the same squares, to scale')
+    for left, (title, subtitle) in ((16.0, image_caption), (IMAGE_PX + GAP_PX + 4.0, view_caption)):
+        overlay.add_text(title, left, rows + 12.0, TITLE_PX, PAPER)
+        overlay.add_text(subtitle, left, rows + 52.0, SMALL_PX, SUBTITLE_COLOUR)
 
 
 def _with_sigma(value: float, sigma: float | None) -> str:
-    return f'{value:.1f}' if sigma is None else f'{value:.1f} ± {sigma:.1f}'
+    return f'{value:.1f}' if sigma is None else f'{value:.1f} +- {sigma:.1f}'

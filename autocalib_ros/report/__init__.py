@@ -1,4 +1,4 @@
-"""report.html: one page that a stranger understands. Shared by the shells.
+"""HTML report of a calibration with figures, and its summary texts.
 
-`page` needs matplotlib and jinja2, and seconds; the other modules cost nothing to import.
+`page` imports matplotlib and jinja2 and takes seconds; `scene` and `text` are cheap to import.
 """

@@ -1,8 +1,9 @@
-"""What all figures share: size, colours, the image underneath, PNG and JPEG."""
+"""Common elements of the figures: size, colours, image background, legend, colour bar and encoding."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -13,14 +14,14 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patheffects import withStroke
+from matplotlib.patheffects import AbstractPathEffect, withStroke
 
 from autocalib_ros.pictures.drawing import ROAD_COLOURS
 from autocalib_ros.report.scene import NOT_USED, REJECTED, ReportScene
 
 WIDTH_IN, DPI = 7.0, 160
-"""Letters stay readable on a telephone that shows a figure a third as wide as it is."""
-STYLE = {
+"""Text stays legible on a phone that shows the figure at a third of its width."""
+STYLE: dict[Any, Any] = {
     'font.size': 11.0,
     'axes.labelsize': 11.0,
     'legend.fontsize': 10.0,
@@ -28,18 +29,20 @@ STYLE = {
     'ytick.labelsize': 10.0,
 }
 LEFT_IN, BELOW_IN, EDGE_IN = 0.85, 0.6, 0.12
-"""Room for the letters beside and below a diagram, and at its other edges."""
+"""Margins of a diagram, inches: left and below for labels, and the other sides."""
 BAR_IN, BAR_ROOM_IN = 0.16, 0.75
-"""Thickness of a scale of colours, and room for it with its letters."""
+"""Height of a colour bar, and with its labels, inches."""
 PNG_EFFORT, JPEG_QUALITY = 3, 85
-"""More effort takes three times as long to save a tenth of the size."""
-INK, MUTED_COLOUR, PANEL_COLOUR, WHITE = '#1c2733', '#8a97a3', '#e9edf0', '#ffffff'
+"""A higher PNG compression level takes three times as long and saves a tenth of the size."""
+MUTED_COLOUR, PANEL_COLOUR, WHITE = '#8a97a3', '#e9edf0', '#ffffff'
 OTHER_COLOURS = {NOT_USED: '#8a97a3', REJECTED: '#222222'}
 LEGEND_LINE = 2.5
+"""Least width of lines in the legend, points."""
+LegendPlace = Literal['best', 'upper right', 'upper left', 'upper center']
 TURNING_COLOUR = '#7733aa'
-"""What is known of vehicles that turn."""
-HALO = [withStroke(linewidth=3, foreground=WHITE)]
-"""Around letters that stand in a picture."""
+"""Colour of turning vehicles."""
+HALO: list[AbstractPathEffect] = [withStroke(linewidth=3, foreground=WHITE)]
+"""White halo around text on images."""
 
 
 def road_colour(index: int) -> str:
@@ -48,12 +51,12 @@ def road_colour(index: int) -> str:
 
 
 def label_colour(label: int) -> str:
-    """Return the colour of tracks of a label."""
+    """Return the colour of tracks with a label."""
     return OTHER_COLOURS[label] if label in OTHER_COLOURS else road_colour(label)
 
 
 def chart(height_in: float = 3.6, rows: int = 1) -> tuple[Figure, list[Axes]]:
-    """Return a figure with axes for diagrams, one below the other, that share their x axis."""
+    """Return a figure with stacked axes that share their x axis."""
     figure = Figure(figsize=(WIDTH_IN, height_in), dpi=DPI)
     panels = list(np.atleast_1d(figure.subplots(rows, 1, sharex=True)))
     figure.subplots_adjust(
@@ -73,9 +76,9 @@ def chart(height_in: float = 3.6, rows: int = 1) -> tuple[Figure, list[Axes]]:
 def image_axes(
     scene: ReportScene, *, margin: float = 0.0, picture: np.ndarray | None = None, fade: float = 0.25
 ) -> tuple[Figure, Axes]:
-    """Return a figure that shows the road, lightened by `fade`, in pixel coordinates.
+    """Return a figure with axes in pixel coordinates over the background image, lightened by `fade`.
 
-    `margin` is the share of the image that is shown around it.
+    `margin` is the width of the border shown around the image, fraction of its size.
     """
     width, height = scene.evidence.image_size
     shown_w, shown_h = width * (1 + 2 * margin), height * (1 + 2 * margin)
@@ -97,7 +100,7 @@ def image_axes(
 
 
 def faded_rgb(picture: np.ndarray, fade: float) -> np.ndarray:
-    """Return a BGR or grey picture as RGB, mixed with white so that lines stand out."""
+    """Return a BGR or grey image as RGB, blended with white so that lines are visible."""
     rgb = picture[..., ::-1] if picture.ndim == 3 else np.repeat(picture[..., None], 3, axis=2)
     return (rgb * (1 - fade) + 255 * fade).astype(np.uint8)
 
@@ -111,15 +114,15 @@ def plot_paths(
     width: float = 1.1,
     alpha: float = 0.8,
 ) -> None:
-    """Draw polylines (n, 2), with one entry in the legend."""
+    """Draw polylines, each (n, 2), with one legend entry."""
     if len(paths):
         axes.add_collection(
             LineCollection(list(paths), colors=colour, linewidths=width, alpha=alpha, label=label), autolim=False
         )
 
 
-def draw_legend(axes: Axes, place: str = 'upper right') -> None:
-    """Add a legend where there is something to explain; its lines are broad whatever theirs are."""
+def draw_legend(axes: Axes, place: LegendPlace = 'upper right') -> None:
+    """Add a legend with wide lines, if there are labelled artists."""
     if not axes.get_legend_handles_labels()[0]:
         return
     legend = axes.legend(loc=place, framealpha=0.9, edgecolor='none')
@@ -129,24 +132,24 @@ def draw_legend(axes: Axes, place: str = 'upper right') -> None:
 
 
 def render_bgr(figure: Figure) -> np.ndarray:
-    """Return a figure as a BGR picture."""
+    """Render a figure to a BGR image."""
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., 2::-1]
 
 
 def png(picture: np.ndarray) -> bytes:
-    """Return a picture as PNG."""
+    """Encode an image as PNG."""
     return cv2.imencode('.png', picture, [cv2.IMWRITE_PNG_COMPRESSION, PNG_EFFORT])[1].tobytes()
 
 
 def jpeg(picture: np.ndarray) -> bytes:
-    """Return a picture as JPEG, a fraction of the size where it is a photograph."""
+    """Encode an image as JPEG, much smaller than PNG for photographs."""
     return cv2.imencode('.jpg', picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
 
 
 def cell_map(scene: ReportScene, values: np.ma.MaskedArray, scale: Normalize, label: str) -> Figure:
-    """Return a figure that shows a number for each cell (rows, columns) of the image, where it is not masked."""
+    """Return a figure that shows values (rows, columns) of image cells as colours; masked cells stay clear."""
     width, height = scene.evidence.image_size
     height_in = WIDTH_IN * height / width + BAR_ROOM_IN
     figure = Figure(figsize=(WIDTH_IN, height_in), dpi=DPI)
@@ -171,7 +174,7 @@ def cell_map(scene: ReportScene, values: np.ma.MaskedArray, scale: Normalize, la
 
 
 def colour_bar(figure: Figure, mapped: ScalarMappable, label: str, *, exceeded: bool) -> Axes:
-    """Add a scale of colours at the bottom of a figure, in the `BAR_ROOM_IN` there; return its axes."""
+    """Add a colour bar in the lowest `BAR_ROOM_IN` inches of a figure; return its axes."""
     height_in = figure.get_figheight()
     left, below = LEFT_IN / WIDTH_IN, (BAR_ROOM_IN - BAR_IN - 0.07) / height_in
     axes = figure.add_axes((left, below, 1 - left - 3 * EDGE_IN / WIDTH_IN, BAR_IN / height_in))

@@ -1,4 +1,4 @@
-"""Directions: of short pieces of motion in the image, and of the roads in space."""
+"""Figures of directions: orientations of motion segments, horizon and vanishing points."""
 
 from __future__ import annotations
 
@@ -9,28 +9,20 @@ from matplotlib.figure import Figure
 from autocalib_ros.estimation.paper.vanishing_point_voting import segment_orientations
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.lens.camera_info import rectified_matrix
+from autocalib_ros.pictures.drawing import INK
 from autocalib_ros.pictures.views import project_great_circle
-from autocalib_ros.report.canvas import (
-    INK,
-    MUTED_COLOUR,
-    WHITE,
-    chart,
-    draw_legend,
-    image_axes,
-    plot_paths,
-    road_colour,
-)
+from autocalib_ros.report.canvas import MUTED_COLOUR, WHITE, chart, draw_legend, image_axes, plot_paths, road_colour
 from autocalib_ros.report.scene import ReportScene
 
 HORIZON_COLOUR = '#aa3377'
 MARGIN = 0.35
-"""Share of the image shown around it, where vanishing points may lie."""
+"""Border shown around the image, fraction of its size: vanishing points may lie there."""
 MAX_SEGMENTS = 2500
-"""Segments drawn of a cluster: more hide each other."""
+"""Most segments drawn per cluster: more would hide each other."""
 
 
 def orientation_histogram(scene: ReportScene) -> Figure | None:
-    """Draw how many segments run in each orientation, and the two peaks with their clusters."""
+    """Draw the histogram of segment orientations with the two peaks and their clusters."""
     figures = scene.result.figures
     counts, half = figures.orientation_histogram, scene.options.paper.cluster_deg
     if not len(counts):
@@ -52,7 +44,7 @@ def orientation_histogram(scene: ReportScene) -> Figure | None:
 
 
 def clusters(scene: ReportScene) -> Figure | None:
-    """Draw the segments of the two clusters where they are in the undistorted image."""
+    """Draw the segments of the two clusters in the undistorted image."""
     peaks, calibration = scene.result.figures.orientation_peaks_deg, scene.calibration
     if calibration is None or not peaks or not len(scene.evidence.segments_px):
         return None
@@ -60,7 +52,7 @@ def clusters(scene: ReportScene) -> Figure | None:
 
     found = segment_orientations(calibration.camera, scene.evidence.segments_px, scene.options.paper)
     matrix = rectified_matrix(calibration.camera)
-    # its segments are of a camera with the same focal length whose principal point is at 0
+    # the segments refer to a camera with the same focal length and principal point (0, 0)
     ends = found.ends_px * (matrix[[0, 1], [0, 1]] / calibration.camera.focal_px) + matrix[:2, 2]
     figure, axes = undistorted_axes(scene)
     for index, peak in enumerate(peaks):
@@ -72,12 +64,12 @@ def clusters(scene: ReportScene) -> Figure | None:
 
 
 def orientation_difference_deg(orientations_deg: np.ndarray, peak_deg: float) -> np.ndarray:
-    """Return the angle between undirected orientations, 0 to 90 degrees."""
+    """Return the angle between undirected orientations (n,) and a peak, 0 to 90 degrees."""
     return np.abs((orientations_deg - peak_deg + 90.0) % 180.0 - 90.0)
 
 
 def directions(scene: ReportScene) -> Figure | None:
-    """Draw the horizon, the vanishing directions and the lines that run to them, in the distorted image."""
+    """Draw the horizon, the vanishing points and lines through them in the original image."""
     if scene.calibration is None:
         return None
     camera, ground = scene.calibration.camera, scene.calibration.ground
@@ -93,7 +85,7 @@ def directions(scene: ReportScene) -> Figure | None:
 
 
 def _draw_direction(axes: Axes, camera: Camera, direction: np.ndarray, index: int) -> None:
-    """Draw great circles through a direction and points of the image, and where the direction itself is seen."""
+    """Draw great circles through a direction and points of the image, and its vanishing points."""
     across = np.linspace(0.1, 0.9, 5) * camera.width
     down = np.linspace(0.35, 0.95, 3) * camera.height
     bearings, _ = camera.unproject(np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2))

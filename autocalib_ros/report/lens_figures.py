@@ -1,4 +1,4 @@
-"""What the lens does and how sure it is."""
+"""Figures of the lens: undistorted image, straightness, and error against focal length."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from matplotlib.figure import Figure
 
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.lens.camera_info import rectified_matrix
+from autocalib_ros.pictures.drawing import INK
 from autocalib_ros.pictures.views import rectification_map, resample
 from autocalib_ros.report.canvas import (
-    INK,
     MUTED_COLOUR,
     chart,
     draw_legend,
@@ -23,11 +23,11 @@ from autocalib_ros.report.scene import ReportScene
 from autocalib_ros.results.calibration import Calibration
 
 MIN_ERROR_PX = 1e-3
-"""Below this a track counts as straight; it keeps the logarithmic axes finite."""
+"""Lower limit of straightness errors, for logarithmic axes."""
 
 
 def undistorted(scene: ReportScene) -> Figure | None:
-    """Show the road as a distortion-free camera would see it, with the kept tracks, which are straight there."""
+    """Draw the undistorted background with the kept tracks, which should be straight there."""
     if scene.calibration is None or (scene.background is None and not scene.groups()):
         return None
     camera = scene.calibration.camera
@@ -41,15 +41,15 @@ def undistorted(scene: ReportScene) -> Figure | None:
 
 
 def undistorted_axes(scene: ReportScene) -> tuple[Figure, Axes]:
-    """Return a figure that shows the undistorted image, in its pixels."""
-    camera, picture = scene.calibration.camera, scene.background
+    """Return a figure with axes in pixel coordinates over the undistorted background."""
+    camera, picture = scene.calibrated.camera, scene.background
     if picture is not None:
         picture = resample(picture, rectification_map(camera, rectified_matrix(camera)))
     return image_axes(scene, picture=picture)
 
 
 def in_undistorted(camera: Camera, matrix: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Return where pixels (n, 2) lie in the distortion-free picture; nan where it does not reach."""
+    """Return pixels (n, 2) in the undistorted image with matrix (3, 3); nan 90 degrees or more off the axis."""
     bearings, valid = camera.unproject(pixels)
     ahead = valid & (bearings[:, 2] > 1e-6)
     flat = bearings[:, :2] / np.where(ahead, bearings[:, 2], np.nan)[:, None]
@@ -57,7 +57,7 @@ def in_undistorted(camera: Camera, matrix: np.ndarray, pixels: np.ndarray) -> np
 
 
 def straightness(scene: ReportScene) -> Figure | None:
-    """Compare how far each kept track strays from its line before and after undistortion."""
+    """Draw the straightness error of each kept track before and after undistortion."""
     if scene.calibration is None or not scene.roads:
         return None
     figure, (axes,) = chart(4.4)
@@ -90,14 +90,14 @@ def straightness(scene: ReportScene) -> Figure | None:
 
 
 def line_error_px(points: np.ndarray) -> float:
-    """Return the root mean square distance of points (n, 2) from their best line."""
+    """Return the root mean square distance of points (n, 2) from their least-squares line."""
     if not np.isfinite(points).all():
         return np.nan
     return float(np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[-1] / np.sqrt(len(points)))
 
 
 def focal_sweep(scene: ReportScene) -> Figure | None:
-    """Draw the straightness error over trial focal lengths, with what was chosen."""
+    """Draw the straightness error over trial focal lengths, with the result."""
     sweep = scene.result.figures.focal_sweep_px
     sweep = sweep[np.isfinite(sweep).all(axis=1)] if len(sweep) else sweep
     if not len(sweep):
@@ -110,21 +110,21 @@ def focal_sweep(scene: ReportScene) -> Figure | None:
         _mark_focal(axes, scene.calibration)
         axes.set_xlim(*_around(scene.calibration, sweep[:, 0]))
     axes.set_xlabel('trial focal length, px', color=INK)
-    axes.set_ylabel('error of straightness, px²', color=INK)
+    axes.set_ylabel('straightness error, px²', color=INK)
     draw_legend(axes, 'upper center')
     return figure
 
 
 def _around(calibration: Calibration, trials: np.ndarray) -> tuple[float, float]:
-    """Return the range of trial focal lengths from half to twice what was found."""
+    """Return the plotted range of trial focal lengths, from half to twice the results."""
     found = [calibration.camera.focal_px] + ([calibration.paper.focal_px] if calibration.paper else [])
     return max(0.5 * min(found), float(trials.min())), min(2.0 * max(found), float(trials.max()))
 
 
 def _mark_focal(axes: Axes, calibration: Calibration) -> None:
-    """Mark the result with its interval of two sigma, and what the published method takes."""
+    """Mark the result with its two-sigma interval, and the result of the published method."""
     focal, sigma = calibration.camera.focal_px, calibration.stddev.focal_px
-    published = calibration.paper is not None and calibration.method != 'paper'
+    paper = calibration.paper if calibration.method != 'paper' else None
     spread = f' ± {sigma:.1f}' if sigma else ''
     axes.axvline(focal, color=road_colour(0), linewidth=2, label=f'result: {focal:.1f}{spread} px')
     if sigma:
@@ -136,11 +136,11 @@ def _mark_focal(axes: Axes, calibration: Calibration) -> None:
             linewidth=0,
             label=f'95 % interval: {focal - 2 * sigma:.1f} to {focal + 2 * sigma:.1f} px',
         )
-    if published:
+    if paper is not None:
         axes.axvline(
-            calibration.paper.focal_px,
+            paper.focal_px,
             color=road_colour(1),
             linestyle='--',
             linewidth=1.6,
-            label=f'by the published method: {calibration.paper.focal_px:.1f} px',
+            label=f'published method: {paper.focal_px:.1f} px',
         )

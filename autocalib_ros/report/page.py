@@ -1,4 +1,4 @@
-"""The page with its figures inside and beside it."""
+"""HTML report: the page with embedded figures, and the figures as PNG files."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ from autocalib_ros.results.calibration import Calibration, Refusal
 from autocalib_ros.util.files import write_atomically
 
 JPEG_SAVES = 1.5
-"""A diagram is sharper as PNG, and hardly larger."""
+"""Least saving in size for which a figure is embedded as JPEG: diagrams are sharper as PNG and hardly larger."""
 CHAPTERS = ROAD, TRAFFIC, LENS, DIRECTIONS, TIME = (
-    'Where the road lies',
-    'What was seen',
-    'The lens',
+    'Ground plane',
+    'Traffic',
+    'Lens',
     'Directions',
-    'How it settled',
+    'Convergence',
 )
 
 
 @dataclass(frozen=True)
 class _Entry:
-    """A figure of the report: its file's name, chapter, heading, what to look for in it, and how it is drawn."""
+    """Figure of the report: file name, chapter, title, caption and drawing function."""
 
     name: str
     chapter: str
@@ -51,34 +51,34 @@ class _Entry:
     draw: Callable[[ReportScene], Figure | None]
     wide: bool = True
     more: Callable[[ReportScene], str] | None = None
-    """What depends on the scene is said after the caption."""
+    """Returns text about the scene that is appended to the caption."""
 
 
 ENTRIES = (
     _Entry(
         'ground_grid',
         ROAD,
-        'The ground in the image',
-        'Equal squares on the road, bent by the lens as the road is. They should lie flat on the road and run along'
-        ' its markings. x and y are measured from the point of the road below the camera.',
+        'Ground grid in the image',
+        'Squares of equal size on the ground plane, distorted by the lens. They should lie flat on the road and run'
+        ' along its markings. The origin of x and y is the point of the road below the camera.',
         road_figures.ground_grid,
     ),
     _Entry(
         'top_view',
         ROAD,
-        'The road from above',
-        'The image spread out on the ground plane. Lanes should be straight and of even width; known lengths, such'
-        ' as lane markings, can be checked against the scale. What stands above the road is drawn out, away from'
-        ' the camera.',
+        'Top view of the road',
+        'The image projected to the ground plane. Lanes should be straight and of constant width; check known'
+        ' lengths, such as lane markings, against the scale bar. Objects above the road are stretched away from the'
+        ' camera.',
         road_figures.top_view,
         more=road_figures.accuracy_note,
     ),
     _Entry(
         'speeds',
         ROAD,
-        'Vehicles in metres',
-        'The trajectories on the ground plane, coloured by speed. Where nobody brakes one lane should have one speed'
-        ' along its whole way: if all seem to slow down or to speed up with the distance, the plane is tilted.',
+        'Trajectories on the ground',
+        'Trajectories on the ground plane, coloured by speed. Without braking, the speed along a lane should be'
+        ' constant: if all vehicles seem to slow down or speed up with distance, the estimated plane is tilted.',
         speed_figures.speeds_above,
         wide=False,
         more=speed_figures.speed_note,
@@ -87,8 +87,9 @@ ENTRIES = (
         'speed_histogram',
         ROAD,
         'Speeds',
-        'Are these the speeds of this road? They grow and shrink with what was given as the scale. Each metre of the'
-        ' way counts alike, so that waiting does not count; who follows no road turns, cycles or walks.',
+        'Check these against the usual speeds of this road: they are proportional to the scale. Weighted by'
+        ' distance, so stopped vehicles do not count. Trajectories on no road belong to turning vehicles, cyclists'
+        ' or pedestrians.',
         speed_figures.speed_histogram,
         wide=False,
     ),
@@ -96,23 +97,24 @@ ENTRIES = (
         'all_tracks',
         TRAFFIC,
         'All trajectories',
-        'Every point that was followed, over the road without its traffic.',
+        'All tracked points, over the background image.',
         traffic_figures.all_tracks,
     ),
     _Entry(
         'kept_tracks',
         TRAFFIC,
         'Kept trajectories',
-        'Coloured by the road that they were found to follow. Rejected ones turn, change lanes or were followed'
-        ' wrongly; those not used are short, or say what others say already. Vehicles that turn count by their'
-        ' points, as bodies that move in the plane.',
+        'Coloured by road direction. Rejected trajectories turn, change lanes or are tracking errors; those not used'
+        ' are short or redundant. Turning vehicles are used as rigid bodies moving in the plane, shown by their'
+        ' points.',
         traffic_figures.kept_tracks,
     ),
     _Entry(
         'coverage',
         TRAFFIC,
         'Coverage of the image',
-        'Where trajectories crossed the image. A lens is best known where traffic was, above all near the borders.',
+        'Trajectories per image cell. The lens is determined best where there was traffic, especially near the'
+        ' borders.',
         traffic_figures.coverage,
         more=traffic_figures.coverage_note,
     ),
@@ -120,24 +122,24 @@ ENTRIES = (
         'undistorted',
         LENS,
         'Undistorted image',
-        'The image as a lens without distortion would show it. Kerbs, lane markings and the trajectories should be'
-        ' straight.',
+        'The image without lens distortion. Kerbs, lane markings and trajectories should be straight.',
         lens_figures.undistorted,
     ),
     _Entry(
         'straightness',
         LENS,
         'Straightness before and after',
-        'Each kept trajectory is a dot: the farther below the line, the more undistortion has straightened it.',
+        'One dot per kept trajectory: the farther below the diagonal, the more undistortion has straightened it.',
         lens_figures.straightness,
         wide=False,
     ),
     _Entry(
         'focal_sweep',
         LENS,
-        'Focal length against error',
-        'How crooked the few trajectories that the published method (Jain and Saunier) keeps remain for each trial'
-        ' focal length. A clear valley is a sure result; without one, straightness alone does not tell.',
+        'Straightness error against focal length',
+        'Straightness error of the trajectories kept by the published method (Jain and Saunier) for each trial focal'
+        ' length. A sharp minimum means a well-constrained estimate; a flat curve, that straightness alone does not'
+        ' determine the focal length.',
         lens_figures.focal_sweep,
         wide=False,
     ),
@@ -145,8 +147,8 @@ ENTRIES = (
         'residuals',
         LENS,
         'Residuals',
-        'How far the points that the solution rests on are from where it has them, in pixels of the image as it was'
-        ' observed. Points cannot be followed much better than to half a pixel, and drivers swerve.',
+        'Distances between observed and predicted points, pixels of the original image. Tracking is accurate to'
+        ' about half a pixel, and drivers swerve.',
         residual_figures.residuals,
         wide=False,
     ),
@@ -154,16 +156,16 @@ ENTRIES = (
         'residual_map',
         LENS,
         'Residuals over the image',
-        'The same by place. Near the camera a swerve is many pixels; elsewhere, a border or a corner that stands out'
-        ' is where the lens is not what the model says.',
+        'Median residual per image cell. Near the camera, swerving causes large residuals; large ones at a border or'
+        ' a corner elsewhere show where the lens model does not fit.',
         residual_figures.residual_map,
     ),
     _Entry(
         'orientation_histogram',
         DIRECTIONS,
         'Orientation of motion',
-        'Short pieces of motion by their direction in the undistorted image. The two peaks are the clusters that the'
-        ' published method starts from; in perspective one road covers many orientations.',
+        'Motion segments by orientation in the undistorted image. The two peaks are the clusters from which the'
+        ' published method starts; in perspective, one road covers many orientations.',
         direction_figures.orientation_histogram,
         wide=False,
     ),
@@ -171,23 +173,23 @@ ENTRIES = (
         'clusters',
         DIRECTIONS,
         'The two clusters',
-        'Where those pieces of motion are, in the undistorted image.',
+        'Motion segments of the two clusters in the undistorted image.',
         direction_figures.clusters,
     ),
     _Entry(
         'directions',
         DIRECTIONS,
         'Horizon and vanishing points',
-        'Lines that are parallel on the road meet in its vanishing points; all of these lie on the horizon. Both are'
-        ' drawn as this lens shows them, beyond the borders of the image too.',
+        'Parallel lines on the road meet in its vanishing points, which lie on the horizon. Both are drawn with lens'
+        ' distortion, also outside the image.',
         direction_figures.directions,
     ),
     _Entry(
         'settling',
         TIME,
         'Focal length and tilt over time',
-        'What the solutions that were tried on the way said. Two in three of the later ones should lie within the'
-        ' bars of an earlier one.',
+        'Intermediate solutions over time. About two thirds of the later ones should lie within the one-sigma bars'
+        ' of an earlier one.',
         settling_figures.settling,
         wide=False,
     ),
@@ -200,7 +202,7 @@ class _Drawn:
     caption: str
     png: bytes
     shown: bytes
-    """What the page holds: JPEG where that is smaller by `JPEG_SAVES`."""
+    """Embedded image: JPEG if it is smaller by `JPEG_SAVES`, else PNG."""
 
     @property
     def kind(self) -> str:
@@ -212,9 +214,12 @@ class _Drawn:
 
 
 def write_report(path: Path, scene: ReportScene, figures: Path | None = None) -> None:
-    """Write the page to `path` and its figures into a folder, `figures` beside it; earlier ones there are removed."""
+    """Write the page to `path` and its figures into a folder, default `figures` next to it; replace earlier figures.
+
+    InputError if that fails.
+    """
     folder = figures or path.parent / 'figures'
-    _clear(folder)  # before seconds of drawing: it may not be possible to write there
+    _clear(folder)  # fail early if the folder is not writable: drawing takes seconds
     with rc_context(STYLE):
         drawn = [one for entry in ENTRIES if (one := _drawn(entry, scene)) is not None]
     _write_figures(folder, {one.entry.name: one.png for one in drawn})

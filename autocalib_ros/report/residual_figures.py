@@ -1,4 +1,4 @@
-"""What the solution leaves unexplained, in observed pixels."""
+"""Figures of the residuals of a solution, in observed pixels."""
 
 from __future__ import annotations
 
@@ -7,18 +7,20 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from autocalib_ros.evidence.snapshot import COVERAGE_CELLS
-from autocalib_ros.report.canvas import INK, TURNING_COLOUR, cell_map, chart, draw_legend, road_colour
+from autocalib_ros.pictures.drawing import INK
+from autocalib_ros.report.canvas import TURNING_COLOUR, cell_map, chart, draw_legend, road_colour
 from autocalib_ros.report.scene import ReportScene
 
 SHOWN_QUANTILE = 0.98
-"""Share of the residuals that a diagram reaches to; the few beyond are the mistakes of tracking."""
+"""Quantile of the residuals at which the axis ends; larger ones are tracking errors."""
 BINS = 50
+"""Bins of the histogram of residuals."""
 MIN_RESIDUALS_PER_CELL = 10
-"""Fewer residuals say nothing of their cell."""
+"""Least number of residuals for the median of a cell."""
 
 
 def residuals(scene: ReportScene) -> Figure | None:
-    """Draw how far observed points lie from where the solution has them, for each road and for what turns."""
+    """Draw the distribution of residuals of each road and of turning vehicles."""
     found = scene.result.figures.residuals
     if not len(found.distance_px):
         return None
@@ -26,7 +28,7 @@ def residuals(scene: ReportScene) -> Figure | None:
     edges = np.linspace(0, max(np.quantile(found.distance_px, SHOWN_QUANTILE), 1e-3), BINS + 1)
     for road in np.unique(found.roads):
         distance = found.distance_px[found.roads == road]
-        name = 'vehicles that turn' if road < 0 else f'road {road + 1}'
+        name = 'turning vehicles' if road < 0 else f'road {road + 1}'
         share = np.histogram(distance, edges)[0] / len(distance)
         axes.stairs(
             100 * share,
@@ -36,14 +38,14 @@ def residuals(scene: ReportScene) -> Figure | None:
             label=f'{name}: median {np.median(distance):.2f} px, {len(distance)} points',
         )
     axes.set_xlim(0, edges[-1])
-    axes.set_xlabel('distance of an observed point from its place in the solution, px', color=INK)
-    axes.set_ylabel('share of the points, %', color=INK)
+    axes.set_xlabel('distance between observed and predicted point, px', color=INK)
+    axes.set_ylabel('fraction of the points, %', color=INK)
     draw_legend(axes)
     return figure
 
 
 def residual_map(scene: ReportScene) -> Figure | None:
-    """Colour the cells of the image by the median residual in each."""
+    """Draw the median residual of each image cell."""
     found = scene.result.figures.residuals
     if not len(found.distance_px):
         return None
@@ -60,5 +62,5 @@ def residual_map(scene: ReportScene) -> Figure | None:
         scene,
         np.ma.masked_invalid(medians.reshape(rows, columns)),
         Normalize(0, np.nanquantile(medians, SHOWN_QUANTILE)),
-        'median distance in a cell, px',
+        'median residual in a cell, px',
     )

@@ -1,4 +1,4 @@
-"""Where the road lies: metres in the image and from above."""
+"""Figures of the ground plane: grid in the image and top view."""
 
 from __future__ import annotations
 
@@ -8,26 +8,26 @@ from matplotlib.figure import Figure
 
 from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.ground import Ground
+from autocalib_ros.pictures.drawing import INK
+from autocalib_ros.pictures.road import GroundGrid
+from autocalib_ros.pictures.scene_geometry import ScaleBar, SceneGeometry
 from autocalib_ros.pictures.views import (
+    GRID_CELLS,
     TopView,
     format_length,
-    grid_lines,
     grid_step,
     ground_to_image,
     image_to_ground,
     in_image,
     length_unit,
     nearby_road_points,
-    project_road_lines,
     resample,
-    round_length,
 )
 from autocalib_ros.report.canvas import (
     BELOW_IN,
     DPI,
     EDGE_IN,
     HALO,
-    INK,
     LEFT_IN,
     PANEL_COLOUR,
     WHITE,
@@ -41,51 +41,51 @@ from autocalib_ros.report.canvas import (
 from autocalib_ros.report.scene import ReportScene
 
 TOP_VIEW_PX = 1100
+"""Longer side of the top view, pixels."""
 CONTOURS_M = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
+"""Candidate levels of the contours of position uncertainty, metres."""
 MAX_CONTOURS = 5
+"""Most contours, the largest levels first."""
 CONTOUR_SAMPLES = 90
-"""Along the longer side of the top view, where the standard deviation is computed."""
+"""Samples of the standard deviation along the longer side of the top view."""
 GRID_COLOUR, CONTOUR_COLOUR = '#117733', '#aa0044'
 X_AXIS, Y_AXIS = '#cc3311', '#0055aa'
 LABEL_SPACING_FRACTION = 0.06
-"""Of the image's width: least distance between two marks in it."""
+"""Least distance between two labels, fraction of the image width."""
 
 
 def ground_grid(scene: ReportScene) -> Figure | None:
-    """Draw a grid of equal squares on the road over the distorted image, with its metres along two lines."""
-    calibration = scene.calibration
-    if calibration is None or calibration.ground is None:
+    """Draw a grid of squares on the road over the original image, with coordinates along two lines."""
+    if not scene.has_ground:
         return None
-    camera, ground = calibration.camera, calibration.ground
+    camera, ground = scene.calibrated.camera, scene.ground
     points = tracked_road_points(scene)
     if not len(points):
         view = TopView.of_image(camera, ground, 2)
         if view is None:
             return None
         points = np.array([view.low_m, view.high_m])
-    step = grid_step(ground)
-    middle = np.round(np.median(points, axis=0) / step) * step
+    geometry = SceneGeometry(camera, ground, GroundGrid.around(points, ground))
     figure, axes = image_axes(scene, fade=0.15)
-    lines = project_road_lines(camera, ground, grid_lines(middle, step))
+    lines = geometry.grid_px()
     plot_paths(axes, lines, WHITE, width=2.0, alpha=0.5)
-    plot_paths(axes, lines, GRID_COLOUR, f'squares of {format_length(step, ground)}', width=0.9, alpha=0.9)
+    plot_paths(axes, lines, GRID_COLOUR, f'squares of {format_length(grid_step(ground), ground)}', width=0.9, alpha=0.9)
     taken: list[np.ndarray] = []
-    for index, name in enumerate(('x: along the main traffic', 'y: to its left')):
-        colour = (X_AXIS, Y_AXIS)[index]
-        arm = np.linspace([*middle, 0], [*(middle + step * np.eye(2)[index]), 0], 20)
-        plot_paths(axes, project_road_lines(camera, ground, [arm]), colour, f'{name}, {length_unit(ground)}', width=4)
-        _mark(axes, scene, middle, index, step, colour, taken)
+    for index, (name, paths) in enumerate(geometry.axes_px().items()):
+        colour, direction = (X_AXIS, Y_AXIS)[index], ('along the main traffic', 'to its left')[index]
+        plot_paths(axes, paths, colour, f'{name}: {direction}, {length_unit(ground)}', width=4)
+        _mark(axes, geometry, index, colour, taken)
     draw_legend(axes)
     return figure
 
 
-def _mark(
-    axes: Axes, scene: ReportScene, middle: np.ndarray, index: int, step: float, colour: str, taken: list[np.ndarray]
-) -> None:
-    """Write the coordinate where the grid crosses one of its middle lines, nearest first, where there is room."""
-    camera, ground = scene.calibration.camera, scene.calibration.ground
-    for offset in sorted(np.arange(-8, 9), key=abs):
-        place = middle + offset * step * np.eye(2)[index]
+def _mark(axes: Axes, geometry: SceneGeometry, index: int, colour: str, taken: list[np.ndarray]) -> None:
+    """Label the grid crossings along a central line with their coordinates, nearest first, where there is room."""
+    camera, ground, grid = geometry.camera, geometry.ground, geometry.grid
+    if grid is None:
+        return
+    for offset in sorted(np.arange(-GRID_CELLS, GRID_CELLS + 1), key=abs):
+        place = grid.middle_m + offset * grid.step_m * np.eye(2)[index]
         (pixel,) = ground_to_image(camera, ground, np.array([[*place, 0.0]]))
         room = LABEL_SPACING_FRACTION * camera.width
         low, high = np.array([0.5, 0.3]) * room, np.array([camera.width, camera.height]) - np.array([0.5, 0.3]) * room
@@ -94,7 +94,8 @@ def _mark(
             continue
         taken.append(pixel)
         axes.text(
-            *pixel,
+            pixel[0],
+            pixel[1],
             f'{"xy"[index]} {place[index]:g}',
             color=colour,
             fontsize=9,
@@ -105,15 +106,15 @@ def _mark(
 
 
 def tracked_road_points(scene: ReportScene) -> np.ndarray:
-    """Return tracked points on the road that are not too far away, shape (n, 2)."""
-    return nearby_road_points(scene.calibration.camera, scene.calibration.ground, scene.evidence.points_px)
+    """Return the tracked points on the road, up to `MAX_DISTANCE_HEIGHTS`, shape (n, 2)."""
+    return nearby_road_points(scene.calibrated.camera, scene.ground, scene.evidence.points_px)
 
 
 def top_view(scene: ReportScene) -> Figure | None:
-    """Show the road from above, the main traffic to the right, with a scale and how sure places on it are."""
-    if scene.calibration is None or scene.calibration.ground is None:
+    """Draw the top view of the road, main traffic to the right, with scale bar and contours of position uncertainty."""
+    if not scene.has_ground:
         return None
-    camera, ground = scene.calibration.camera, scene.calibration.ground
+    camera, ground = scene.calibrated.camera, scene.ground
     view = TopView.around(tracked_road_points(scene), ground, TOP_VIEW_PX) or TopView.of_image(
         camera, ground, TOP_VIEW_PX
     )
@@ -139,7 +140,7 @@ def top_view(scene: ReportScene) -> Figure | None:
 
 
 def ground_axes(view: TopView, ground: GroundPlane, below_in: float = 0.0) -> tuple[Figure, Axes]:
-    """Return a figure with axes of the ground frame, with `below_in` inches of room under it."""
+    """Return a figure with axes of the ground frame and `below_in` inches of free space below."""
     (low_x, low_y), (high_x, high_y) = view.low_m, view.high_m
     width_in = WIDTH_IN - LEFT_IN - EDGE_IN
     shown_in = min(width_in * (high_y - low_y) / (high_x - low_x), 1.2 * WIDTH_IN)
@@ -156,26 +157,26 @@ def ground_axes(view: TopView, ground: GroundPlane, below_in: float = 0.0) -> tu
 
 
 def position_sigma_m(scene: ReportScene, points_m: np.ndarray) -> np.ndarray | None:
-    """Return one sigma in metres of places (n, 2) on the road, nan outside the image; None where it is not told."""
-    calibration = scene.calibration
-    if not calibration.ground.metric or calibration.covariance is None:
+    """Return one sigma in metres of road points (n, 2), nan outside the image; None if it is unknown."""
+    calibration = scene.calibrated
+    if not scene.ground.metric or calibration.covariance is None:
         return None
     camera = calibration.camera
-    pixels = ground_to_image(camera, calibration.ground, np.pad(points_m, ((0, 0), (0, 1))))
+    pixels = ground_to_image(camera, scene.ground, np.pad(points_m, ((0, 0), (0, 1))))
     inside = in_image(camera, pixels)
     sigma = Ground.of(calibration).points(np.where(inside[:, None], pixels, np.nan)).sigma_m
     return None if sigma is None else np.where(inside, sigma, np.nan)
 
 
 def accuracy_note(scene: ReportScene) -> str:
-    """Say what the contours are, or that there are none."""
-    if scene.calibration.ground.metric and scene.calibration.covariance is not None:
-        return 'Dashed lines: how sure a place on the road is, by lens, pose and scale together.'
-    return 'How sure places are is not told for this result.'
+    """Describe the contours of the top view, or say that there are none."""
+    if scene.ground.metric and scene.calibrated.covariance is not None:
+        return 'Dashed lines: one sigma of the position of a road point, from lens, pose and scale.'
+    return 'The position uncertainty of this result is unknown.'
 
 
 def _draw_contours(axes: Axes, scene: ReportScene, view: TopView) -> None:
-    """Draw where a place on the road is known to so many metres."""
+    """Draw contours of equal position uncertainty."""
     size = np.array([view.columns, view.rows])
     x, y = (
         np.linspace(view.low_m[axis], view.high_m[axis], count)
@@ -199,19 +200,19 @@ def _draw_contours(axes: Axes, scene: ReportScene, view: TopView) -> None:
     )
     for letters in axes.clabel(lines, fmt='± %g m', fontsize=9, inline=False):
         letters.set_path_effects(HALO)
-    axes.plot([], [], '--', color=CONTOUR_COLOUR, linewidth=1.4, label='a place is known to (1 sigma)')
+    axes.plot([], [], '--', color=CONTOUR_COLOUR, linewidth=1.4, label='position uncertainty (1 sigma)')
 
 
 def _draw_scale(axes: Axes, view: TopView, ground: GroundPlane) -> None:
     low, high = np.array(view.low_m), np.array(view.high_m)
-    length = round_length(0.2 * (high[0] - low[0]))
+    bar = ScaleBar.of(view, ground)
     begin = low + 0.04 * (high - low)
-    axes.plot([begin[0], begin[0] + length], [begin[1]] * 2, color=WHITE, linewidth=7, solid_capstyle='butt')
-    axes.plot([begin[0], begin[0] + length], [begin[1]] * 2, color=INK, linewidth=4, solid_capstyle='butt')
+    axes.plot([begin[0], begin[0] + bar.length_m], [begin[1]] * 2, color=WHITE, linewidth=7, solid_capstyle='butt')
+    axes.plot([begin[0], begin[0] + bar.length_m], [begin[1]] * 2, color=INK, linewidth=4, solid_capstyle='butt')
     axes.text(
         begin[0],
         begin[1] + 0.025 * (high[1] - low[1]),
-        format_length(length, ground),
+        bar.text,
         va='bottom',
         color=INK,
         bbox={'boxstyle': 'round,pad=0.2', 'facecolor': WHITE, 'edgecolor': 'none', 'alpha': 0.8},

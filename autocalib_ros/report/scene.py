@@ -1,4 +1,4 @@
-"""What a report is about, as a value: it may go to another process."""
+"""Data of a report as a picklable value."""
 
 from __future__ import annotations
 
@@ -9,29 +9,30 @@ import numpy as np
 
 from autocalib_ros.config import Options
 from autocalib_ros.evidence.snapshot import Evidence
-from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
+from autocalib_ros.geometry.ground_plane import GroundPlane, tilt_and_roll_deg
 from autocalib_ros.results.calibration import Calibration, Refusal
 
 NOT_USED, REJECTED = -1, -2
 MAX_SNAPSHOTS = 64
+"""Most intermediate solutions in memory."""
 
 
 @dataclass(frozen=True)
 class SolutionSnapshot:
-    """What a solution said when it was tried."""
+    """Result of one intermediate solution."""
 
     seconds: float
-    """Of recording, since its first image."""
+    """Recording time since the first image."""
     focal_px: float | None = None
     focal_sigma_px: float | None = None
     tilt_deg: float | None = None
     tilt_sigma_deg: float | None = None
     code: str = ''
-    """Of the refusal, '' for a calibration."""
+    """Code of the refusal; '' for a calibration."""
 
     @classmethod
     def of(cls, result: Calibration | Refusal) -> SolutionSnapshot:
-        """Take down what a result says."""
+        """Summarise a result."""
         seconds = result.evidence.seconds
         if isinstance(result, Refusal):
             return cls(seconds, code=result.code)
@@ -43,7 +44,7 @@ class SolutionSnapshot:
 def append_snapshot(
     moments: tuple[SolutionSnapshot, ...], result: Calibration | Refusal
 ) -> tuple[SolutionSnapshot, ...]:
-    """Add a result to those before; of many every second one goes, and of two at one time the older."""
+    """Append a result; replace snapshots of the same or a later time, and drop every second one of `MAX_SNAPSHOTS`."""
     latest = SolutionSnapshot.of(result)
     kept = tuple(moment for moment in moments if moment.seconds < latest.seconds)
     return (*(kept if len(kept) < MAX_SNAPSHOTS else kept[::2]), latest)
@@ -51,27 +52,46 @@ def append_snapshot(
 
 @dataclass(frozen=True, kw_only=True)
 class ReportScene:
-    """What a report is about."""
+    """Result with the data that its figures need."""
 
     result: Calibration | Refusal
     evidence: Evidence
-    """That the result rests on; any other shows where traffic was seen."""
+    """Evidence of the result; any other evidence only shows where there was traffic."""
     background: np.ndarray | None
     """BGR or grey uint8 of the full size."""
     options: Options
     source: str
-    """Name of the recording or of the camera."""
+    """Name of the recording or the camera."""
     accepted_at_s: float | None = None
     moments: tuple[SolutionSnapshot, ...] = ()
 
     @property
     def calibration(self) -> Calibration | None:
-        """The result where it is a calibration."""
+        """The result if it is a calibration."""
         return self.result if isinstance(self.result, Calibration) else None
+
+    @property
+    def calibrated(self) -> Calibration:
+        """The calibration, for figures that are drawn only if there is one; ValueError for a refusal."""
+        if isinstance(self.result, Refusal):
+            raise ValueError('the result is a refusal')
+        return self.result
+
+    @property
+    def ground(self) -> GroundPlane:
+        """The ground plane, for figures that are drawn only if there is one; ValueError otherwise."""
+        if self.calibrated.ground is None:
+            raise ValueError('the result has no ground plane')
+        return self.calibrated.ground
+
+    @property
+    def has_ground(self) -> bool:
+        """Whether the result is a calibration with a ground plane."""
+        return self.calibration is not None and self.calibration.ground is not None
 
     @cached_property
     def labels(self) -> np.ndarray:
-        """For each track -1 not used, -2 rejected, else its road direction; 0 of what the published method keeps."""
+        """Road index of each track; -1 not used, -2 rejected; 0 for tracks kept by the published method."""
         count, labels = self.evidence.track_count, np.asarray(self.result.figures.track_labels)
         if len(labels) != count:
             return np.full(count, NOT_USED)
@@ -82,28 +102,28 @@ class ReportScene:
 
     @property
     def roads(self) -> range:
-        """Labels of the roads that tracks follow."""
+        """Road indices that occur in the labels."""
         return range(int(self.labels.max(initial=NOT_USED)) + 1)
 
     def road_name(self, label: int) -> str:
-        """Name what tracks of a label are for a person."""
+        """Return a legend text for a label."""
         if label in (NOT_USED, REJECTED):
             return 'not used' if label == NOT_USED else 'rejected'
         return 'kept by the published method' if self.result.method == 'paper' else f'road {label + 1}'
 
     @property
     def turning_px(self) -> np.ndarray:
-        """Points of vehicles that turn which the solution rests on, pixels (n, 2)."""
+        """Points of turning vehicles used in the solution, pixels (n, 2)."""
         found = self.result.figures.residuals
         return found.points_px[found.roads < 0]
 
     def groups(self) -> list[tuple[str, int, list[np.ndarray]]]:
-        """Name, label and tracks of what follows each road; all as not used where none is known to follow any."""
+        """Return name, label and tracks of each road; all tracks as not used if no track has a road."""
         if not self.roads:
             every = [track.points_px for track in self.evidence.tracks()]
             return [('all trajectories', NOT_USED, every)] if every else []
         return [(self.road_name(label), label, self.paths(label)) for label in self.roads]
 
     def paths(self, label: int) -> list[np.ndarray]:
-        """Return the tracks of a label, pixels (n, 2) each."""
-        return [self.evidence.track(index).points_px for index in np.flatnonzero(self.labels == label)]
+        """Return the tracks with a label, pixels (n, 2) each."""
+        return [self.evidence.track(int(index)).points_px for index in np.flatnonzero(self.labels == label)]

@@ -1,4 +1,4 @@
-"""How the result settled while traffic went by."""
+"""Figure of the convergence of intermediate solutions over time."""
 
 from __future__ import annotations
 
@@ -6,20 +6,22 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from autocalib_ros.report.canvas import INK, MUTED_COLOUR, chart, draw_legend, road_colour
+from autocalib_ros.pictures.drawing import INK
+from autocalib_ros.report.canvas import MUTED_COLOUR, chart, draw_legend, road_colour
 from autocalib_ros.report.scene import ReportScene, SolutionSnapshot
 
 
 def settling(scene: ReportScene) -> Figure | None:
-    """Draw focal length and tilt of the solutions that were tried on the way, with one sigma."""
-    found = [moment for moment in scene.moments if moment.focal_px is not None]
-    if len(scene.moments) < 2 or not found:
+    """Draw focal length and tilt of the intermediate solutions with one sigma."""
+    moments = scene.moments
+    focal = [(one.seconds, one.focal_px, one.focal_sigma_px) for one in moments if one.focal_px is not None]
+    if len(moments) < 2 or not focal:
         return None
-    tilted = [moment for moment in found if moment.tilt_deg is not None]
-    figure, panels = chart(4.4 if tilted else 2.8, 2 if tilted else 1)
-    _draw(panels[0], [(m.seconds, m.focal_px, m.focal_sigma_px) for m in found], 'focal length, px', road_colour(0))
-    if tilted:
-        _draw(panels[1], [(m.seconds, m.tilt_deg, m.tilt_sigma_deg) for m in tilted], 'tilt, degrees', road_colour(1))
+    tilt = [(one.seconds, one.tilt_deg, one.tilt_sigma_deg) for one in moments if one.tilt_deg is not None]
+    figure, panels = chart(4.4 if tilt else 2.8, 2 if tilt else 1)
+    _draw(panels[0], focal, 'focal length, px', road_colour(0))
+    if tilt:
+        _draw(panels[1], tilt, 'tilt, degrees', road_colour(1))
     _draw_refusals(panels, scene.moments)
     panels[-1].set_xlabel('seconds since the first image', color=INK)
     return figure

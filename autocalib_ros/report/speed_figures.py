@@ -1,8 +1,9 @@
-"""How fast vehicles go on the ground plane: what everybody can check."""
+"""Figures of vehicle speeds on the ground plane, a plausibility check of plane and scale."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from matplotlib.collections import LineCollection
@@ -10,46 +11,48 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from autocalib_ros.pictures.drawing import INK
 from autocalib_ros.pictures.views import MAX_DISTANCE_HEIGHTS, TopView, image_to_ground, round_length
-from autocalib_ros.report.canvas import BAR_ROOM_IN, INK, chart, colour_bar, draw_legend, label_colour
+from autocalib_ros.report.canvas import BAR_ROOM_IN, chart, colour_bar, draw_legend, label_colour
 from autocalib_ros.report.road_figures import TOP_VIEW_PX, ground_axes
 from autocalib_ros.report.scene import NOT_USED, ReportScene
 
 KM_H = 3.6
 CHORD_S = 0.5
-"""Speeds are of the chord over so long: noise hardly lengthens it, a bend hardly shortens it."""
+"""Duration of the chord over which speed is measured: noise hardly lengthens it, a bend hardly shortens it."""
 MIN_TRACK_S = 1.0
-"""A track that was seen on the road for a shorter time tells no speed."""
+"""Least duration on the road of a track with a speed, seconds."""
 SCALE_QUANTILE = 0.98
-"""Share of the pieces, and of the vehicles, that the scales reach to."""
+"""Quantile of chords and vehicles at which the scales end."""
 MIN_BINS = 15
+"""Least number of bins of the speed histogram."""
 
 
 @dataclass(frozen=True)
 class TrackPieces:
-    """Tracks on the ground plane in pieces of `CHORD_S`."""
+    """Tracks on the ground plane, cut into chords of `CHORD_S`."""
 
     points: list[np.ndarray]
-    """Of each piece, shape (n, 2), metres, or heights of the camera."""
+    """Points of each piece, shape (n, 2), metres or camera heights."""
     lengths: np.ndarray
     """Shape (pieces,)."""
     speeds: np.ndarray
-    """Km/h, or heights a second, shape (pieces,)."""
+    """Km/h or camera heights per second, shape (pieces,)."""
     tracks: np.ndarray
     """Index of the track in the evidence, shape (pieces,)."""
 
 
 def point_height(scene: ReportScene) -> float:
-    """Return the share of the camera's height at which tracked points are taken to be."""
-    ground = scene.calibration.ground
+    """Return the assumed height of tracked points as a fraction of the camera height."""
+    ground = scene.ground
     return min(scene.options.scale.point_height_m / ground.height_m, 0.5) if ground.metric else 0.0
 
 
 def track_pieces_on_road(scene: ReportScene) -> TrackPieces | None:
-    """Lay the tracks on the plane in which tracked points are, and tell their speeds; None where there are none."""
-    if scene.calibration is None or scene.calibration.ground is None:
+    """Project the tracks to the plane of the tracked points and measure their speeds; None if there are none."""
+    if not scene.has_ground:
         return None
-    camera, ground = scene.calibration.camera, scene.calibration.ground
+    camera, ground = scene.calibrated.camera, scene.ground
     evidence, lower = scene.evidence, 1.0 - point_height(scene)
     everywhere = lower * image_to_ground(camera, ground, evidence.points_px)
     points, times, tracks = [], [], []
@@ -61,7 +64,7 @@ def track_pieces_on_road(scene: ReportScene) -> TrackPieces | None:
             continue
         ends = np.linspace(times_s[0], times_s[-1], int((times_s[-1] - times_s[0]) / CHORD_S) + 1)
         at = np.unique(np.searchsorted(times_s, ends).clip(max=len(way) - 1))
-        for begin, end in zip(at[:-1], at[1:], strict=True):
+        for begin, end in pairwise(at):
             points.append(way[begin : end + 1])
             times.append(times_s[end] - times_s[begin])
             tracks.append(index)
@@ -73,9 +76,9 @@ def track_pieces_on_road(scene: ReportScene) -> TrackPieces | None:
 
 
 def vehicle_speeds(scene: ReportScene, pieces: TrackPieces) -> tuple[np.ndarray, np.ndarray]:
-    """Return the speed (vehicles,) of each vehicle, and the road (vehicles,) of most of its tracks.
+    """Return the speed (vehicles,) of each vehicle and the road (vehicles,) of the majority of its tracks.
 
-    As loops along the way would count: each metre weighs alike, so that waiting does not count.
+    Speeds are weighted by distance, so stopped vehicles do not count.
     """
     vehicles, owner = np.unique(scene.evidence.track_vehicles[pieces.tracks], return_inverse=True)
     way = np.bincount(owner, pieces.lengths)
@@ -90,12 +93,14 @@ def vehicle_speeds(scene: ReportScene, pieces: TrackPieces) -> tuple[np.ndarray,
 
 
 def speeds_above(scene: ReportScene) -> Figure | None:
-    """Draw the tracks from above, coloured by speed."""
+    """Draw the tracks in the top view, coloured by speed."""
     pieces = track_pieces_on_road(scene)
     if pieces is None:
         return None
-    ground = scene.calibration.ground
+    ground = scene.ground
     view = TopView.around(np.concatenate(pieces.points), ground, TOP_VIEW_PX)
+    if view is None:
+        return None
     figure, axes = ground_axes(view, ground, below_in=BAR_ROOM_IN)
     lines = LineCollection(
         pieces.points,
@@ -111,18 +116,18 @@ def speeds_above(scene: ReportScene) -> Figure | None:
 
 
 def speed_histogram(scene: ReportScene) -> Figure | None:
-    """Draw how many vehicles went how fast on each road."""
+    """Draw the histogram of vehicle speeds on each road."""
     pieces = track_pieces_on_road(scene)
     if pieces is None:
         return None
     speeds, roads = vehicle_speeds(scene, pieces)
-    named = scene.roads if scene.result.method == 'joint' else range(0)  # the published method tells no roads apart
+    named = scene.roads if scene.result.method == 'joint' else range(0)  # the published method does not separate roads
     roads = roads if named else np.full(len(roads), NOT_USED)
     figure, (axes,) = chart(3.2)
     fastest = max(1.2 * np.quantile(speeds, SCALE_QUANTILE), 1e-3)
     bin_width = round_length(fastest / MIN_BINS)
     edges = bin_width * np.arange(np.ceil(fastest / bin_width) + 1)
-    digits = 0 if scene.calibration.ground.metric else 2
+    digits = 0 if scene.ground.metric else 2
     most = 1
     for label in (*named, NOT_USED):
         own = speeds[roads == label]
@@ -139,7 +144,7 @@ def speed_histogram(scene: ReportScene) -> Figure | None:
             )
     axes.set(xlim=(0, edges[-1]), ylim=(0, 1.4 * most))  # room for the legend
     axes.yaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.set_xlabel(f'speed of a road user, averaged over the way, {speed_unit(scene)}', color=INK)
+    axes.set_xlabel(f'mean speed of a road user, weighted by distance, {speed_unit(scene)}', color=INK)
     axes.set_ylabel('road users', color=INK)
     draw_legend(axes)
     return figure
@@ -147,20 +152,20 @@ def speed_histogram(scene: ReportScene) -> Figure | None:
 
 def speed_unit(scene: ReportScene) -> str:
     """Return the unit of speeds."""
-    return 'km/h' if scene.calibration.ground.metric else 'camera heights a second'
+    return 'km/h' if scene.ground.metric else 'camera heights per second'
 
 
 def speed_note(scene: ReportScene) -> str:
-    """Say what the speeds rest on."""
-    ground, given = scene.calibration.ground, scene.options.scale
+    """Describe the assumptions behind the speeds."""
+    ground, given = scene.ground, scene.options.scale
     if not ground.metric:
         return (
-            'Tracked points are on vehicles, above the road, so that all speeds look too high by one factor, some'
-            ' 10 % under a camera 8 m high.'
+            'Tracked points are on vehicles, above the road, which overestimates all speeds by one factor, about'
+            ' 10 % for a camera 8 m high.'
         )
     spread = 100 * given.point_height_sigma_m / (ground.height_m - given.point_height_m)
     return (
-        f'Tracked points are on vehicles, above the road: they are taken to be {given.point_height_m:g} ±'
-        f' {given.point_height_sigma_m:g} m above it, which leaves the speeds unsure by {spread:.0f} %; a lorry'
-        ' looks faster than it is.'
+        f'Tracked points are on vehicles: their height above the road is assumed to be {given.point_height_m:g} ±'
+        f' {given.point_height_sigma_m:g} m, which makes the speeds uncertain by {spread:.0f} %; speeds of lorries'
+        ' are overestimated.'
     )

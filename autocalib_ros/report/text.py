@@ -1,4 +1,4 @@
-"""A result in a person's words: for the report and for the terminal."""
+"""Text of a result for the report and the terminal: verdict, uncertainty, next step, tables and requirements."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from autocalib_ros.results.statements import SCALE_KINDS
 
 @dataclass(frozen=True)
 class TableRow:
-    """One number with its name, its standard deviation and what it means; all as text."""
+    """Table row as text: name, value, standard deviation and note."""
 
     name: str
     value: str
@@ -28,7 +28,7 @@ class TableRow:
 
 
 def verdict(result: Calibration | Refusal) -> str:
-    """Say what came out and how sure it is, and where something is missing, why."""
+    """Return the result in one sentence with uncertainties, or the reason why something is missing."""
     if isinstance(result, Refusal):
         return f'Not calibrated: {_sentence(result.message)}'
     focal = f'focal length {_with_sigma(result.camera.focal_px, result.stddev.focal_px, 1)} px'
@@ -38,13 +38,13 @@ def verdict(result: Calibration | Refusal) -> str:
     down, _ = tilt_and_roll_deg(result.ground.normal_in_camera)
     pose = f'the camera looks {_with_sigma(down, result.stddev.tilt_deg, 1)} degrees down'
     if result.ground.metric:
-        done = 'Calibrated, the ground by an assumption' if result.grade == 'assumed' else 'Calibrated'
+        done = 'Calibrated, ground plane by assumption' if result.grade == 'assumed' else 'Calibrated'
         return f'{done}: {focal}; {pose} from {result.ground.height_m:.2f} m above the road.'
-    return f"Calibrated: {focal}; {pose}; lengths on the road are in units of the camera's height, which was not given."
+    return f'Calibrated: {focal}; {pose}; lengths on the road are in camera heights, because the height was not given.'
 
 
 def remedy(result: Calibration | Refusal) -> str:
-    """Say what would help, '' where nothing is missing."""
+    """Return the remedy of the refusal as a sentence; '' if nothing is missing."""
     refusal = result if isinstance(result, Refusal) else result.ground_refusal
     return '' if refusal is None else _sentence(_capital(refusal.remedy))
 
@@ -63,7 +63,7 @@ def _sentence(text: str) -> str:
 
 
 def number_rows(result: Calibration | Refusal, accepted_at_s: float | None = None) -> list[TableRow]:
-    """List what is known: the lens, the ground plane, the evidence."""
+    """Return the table rows of lens, ground plane, published method and evidence."""
     rows = [] if isinstance(result, Refusal) else [*_lens_rows(result), *_ground_rows(result), *_paper_rows(result)]
     return rows + _evidence_rows(result, accepted_at_s)
 
@@ -81,7 +81,7 @@ def _lens_rows(result: Calibration) -> list[TableRow]:
         TableRow('focal length', f'{camera.focal_px:.2f} px', _number(sigma.focal_px, 2)),
         TableRow('principal point', f'{cx:.2f}, {cy:.2f} px', point),
         *[row for row, value in zip(coefficients, camera.k, strict=True) if value or row.name == 'k1'],
-        TableRow('field of view', f'{across:.1f} x {down:.1f} degrees', note='between the middles of opposite borders'),
+        TableRow('field of view', f'{across:.1f} x {down:.1f} degrees', note='between the centres of opposite borders'),
     ]
 
 
@@ -93,10 +93,10 @@ def _ground_rows(result: Calibration) -> list[TableRow]:
     note = next((statement.text for statement in result.assumptions if statement.kind in SCALE_KINDS), '')
     return [
         TableRow('camera height', height, _number(result.stddev.height_m, 2), note),
-        TableRow('looks down by', f'{down:.2f} degrees', _number(result.stddev.tilt_deg, 2)),
-        TableRow('rolled by', f'{roll:.2f} degrees', _number(result.stddev.roll_deg, 2)),
+        TableRow('tilt', f'{down:.2f} degrees', _number(result.stddev.tilt_deg, 2), 'below the horizontal'),
+        TableRow('roll', f'{roll:.2f} degrees', _number(result.stddev.roll_deg, 2)),
         *[
-            TableRow(f'road {distance:g} m ahead', 'on the road', f'{sigma:.2f} m', 'of where a pixel meets it')
+            TableRow(f'road {distance:g} m ahead', 'position', f'{sigma:.2f} m', 'of the ground point of a pixel')
             for distance, sigma in zip(GROUND_DISTANCES_M, result.stddev.ground_point_m, strict=False)
             if sigma is not None
         ],
@@ -119,9 +119,9 @@ def _paper_rows(result: Calibration) -> list[TableRow]:
 
 
 def file_rows(result: Calibration | Refusal, evidence: Evidence) -> list[TableRow]:
-    """List what programs read in the files, and how the solution was made."""
+    """Return the table rows of the values in the output files, and of the method."""
     rows = [
-        TableRow('background moved by', f'{evidence.drift_px:.2f} px', note='at most'),
+        TableRow('background motion', f'{evidence.drift_px:.2f} px', note='maximum'),
         TableRow('method', result.method),
     ]
     if isinstance(result, Refusal):
@@ -133,7 +133,7 @@ def file_rows(result: Calibration | Refusal, evidence: Evidence) -> list[TableRo
             TableRow('residual', f'{np.median(residuals.distance_px):.2f} px', note='median of all points used')
         )
     rows += [
-        TableRow(f'direction of road {index}', _list(direction, 4), note='in the camera: x right, y down, z forward')
+        TableRow(f'direction of road {index}', _list(direction, 4), note='camera frame: x right, y down, z forward')
         for index, direction in enumerate(result.road_directions, start=1)
     ]
     info = result.camera_info
@@ -157,7 +157,7 @@ def file_rows(result: Calibration | Refusal, evidence: Evidence) -> list[TableRo
             TableRow(
                 "the paper's f_new",
                 f'{paper.focal_from_vanishing_points_px:.1f} px',
-                note='by its two vanishing points',
+                note='from its two vanishing points',
             )
         )
     if paper is not None and paper.translation_m is not None:
@@ -187,14 +187,14 @@ def _number(value: float | None, digits: int) -> str:
 
 
 def how_sure(result: Calibration | Refusal) -> str:
-    """Say how far off the result may be, at one standard deviation; '' where nothing is told."""
+    """Return the uncertainty of the result, one standard deviation, as text; '' for a refusal."""
     if isinstance(result, Refusal):
         return ''
     sigma, parts = result.stddev, []
     if result.method == 'paper':
-        return 'Nobody knows: the published method tells no uncertainty.'
+        return 'Unknown: the published method gives no uncertainty.'
     if sigma.focal_px == 0:
-        parts.append('the lens is taken as exact')
+        parts.append('the lens is assumed exact')
     elif sigma.focal_px is not None:
         parts.append(f'focal length ± {100 * sigma.focal_px / result.camera.focal_px:.2g} %')
     if sigma.tilt_deg is not None and sigma.roll_deg is not None:
@@ -204,30 +204,27 @@ def how_sure(result: Calibration | Refusal) -> str:
         for distance, sigma_m in zip(GROUND_DISTANCES_M, sigma.ground_point_m, strict=False)
         if sigma_m is not None
     ]
-    parts += [f'a place on the road {", ".join(places)}'] if places else []
-    return _sentence(_capital('; '.join(parts))) + ' (One standard deviation: two results in three are closer.)'
+    parts += [f'position on the road {", ".join(places)}'] if places else []
+    return _sentence(_capital('; '.join(parts))) + ' (One standard deviation: two thirds of results are closer.)'
 
 
 def next_step(result: Calibration | Refusal) -> str:
-    """Say what the reader should do now."""
-    if remedy(result):
+    """Return the recommended next step."""
+    if isinstance(result, Refusal) or remedy(result):
         return remedy(result)
     if result.method == 'paper':
-        return 'Solve with the method joint, which tells how sure it is, and compare.'
+        return 'Solve with method joint, which estimates uncertainties, and compare.'
     if result.grade == 'unit_scale':
         return 'Give the height of the camera above the road to get metres.'
-    check = 'Look whether the grid below lies flat along the markings of the road'
+    check = 'Check that the ground grid lies flat along the road markings'
     if result.grade == 'assumed':
-        return (
-            f'{check}; the ground plane rests on what is assumed, until traffic across the main road, or that '
-            'turns, is seen.'
-        )
-    return f'{check}, and whether the speeds are those of this road; then use the files.'
+        return f'{check}; the ground plane depends on an assumption until crossing or turning traffic is observed.'
+    return f'{check} and that the speeds are plausible for this road; then use the files.'
 
 
 @dataclass(frozen=True)
 class ReportRequirement:
-    """One thing that a calibration needs, what was found of it, and whether that was enough."""
+    """Requirement of a calibration with the value found, the value needed and whether it is met."""
 
     name: str
     found: str
@@ -236,7 +233,7 @@ class ReportRequirement:
 
 
 def needs(result: Calibration | Refusal, evidence: Evidence, gate: GateOptions) -> list[ReportRequirement]:
-    """List what a calibration needs of the traffic and what stopped this one; nothing where nothing is missing."""
+    """Return the requirements with the one that was not met; empty if the calibration is complete."""
     refusal = result if isinstance(result, Refusal) else result.ground_refusal
     if refusal is None:
         return []
@@ -245,9 +242,9 @@ def needs(result: Calibration | Refusal, evidence: Evidence, gate: GateOptions) 
         (
             ('camera_moving',),
             ReportRequirement(
-                'the camera stands still',
-                f'the background moved by {evidence.drift_px:.1f} px',
-                f'{limit:.1f} px at the most',
+                'stationary camera',
+                f'background motion {evidence.drift_px:.1f} px',
+                f'at most {limit:.1f} px',
                 evidence.drift_px <= limit,
             ),
         ),
@@ -256,16 +253,16 @@ def needs(result: Calibration | Refusal, evidence: Evidence, gate: GateOptions) 
             ReportRequirement(
                 'tracks of moving traffic',
                 f'{evidence.track_count}',
-                f'{gate.min_tracks} or more',
+                f'at least {gate.min_tracks}',
                 evidence.track_count >= gate.min_tracks,
             ),
         ),
         (
             ('poor_coverage',),
             ReportRequirement(
-                'image crossed by traffic',
+                'image coverage',
                 f'{100 * evidence.coverage:.0f} %',
-                f'{100 * gate.min_coverage:.0f} % or more',
+                f'at least {100 * gate.min_coverage:.0f} %',
                 evidence.coverage >= gate.min_coverage,
             ),
         ),

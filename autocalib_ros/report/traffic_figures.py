@@ -1,4 +1,4 @@
-"""Where traffic was seen and what was kept of it."""
+"""Figures of the observed traffic: all tracks, kept tracks and image coverage."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from autocalib_ros.report.scene import NOT_USED, REJECTED, ReportScene
 
 
 def all_tracks(scene: ReportScene) -> Figure | None:
-    """Draw every trajectory over the road; the road alone where there is none."""
+    """Draw all trajectories over the background; None if there are neither."""
     if scene.background is None and not scene.evidence.track_count:
         return None
     figure, axes = image_axes(scene)
@@ -20,13 +20,13 @@ def all_tracks(scene: ReportScene) -> Figure | None:
     plot_paths(axes, paths, '#3355bb', f'{len(paths)} trajectories', width=0.9, alpha=0.55)
     if paths:
         ends = np.array([path[-1] for path in paths])
-        axes.plot(*ends.T, '.', color='#1b2f77', markersize=2.5, label='where each ends')
+        axes.plot(*ends.T, '.', color='#1b2f77', markersize=2.5, label='end points')
     draw_legend(axes)
     return figure
 
 
 def kept_tracks(scene: ReportScene) -> Figure | None:
-    """Draw the trajectories in the colour of their road, and what turns; None when nothing was kept."""
+    """Draw the trajectories coloured by road, and turning vehicles; None if nothing was kept."""
     if not scene.roads and not len(scene.turning_px):
         return None
     figure, axes = image_axes(scene)
@@ -46,14 +46,14 @@ def kept_tracks(scene: ReportScene) -> Figure | None:
             '.',
             color=TURNING_COLOUR,
             markersize=2,
-            label=f'on vehicles that turn: {len(scene.turning_px)} points',
+            label=f'on turning vehicles: {len(scene.turning_px)} points',
         )
     draw_legend(axes)
     return figure
 
 
 def coverage(scene: ReportScene) -> Figure | None:
-    """Colour the cells of the image by how many tracks have crossed each; cells without any stay as they are."""
+    """Draw the number of tracks that cross each image cell; empty cells stay clear."""
     evidence = scene.evidence
     if not evidence.track_count:
         return None
@@ -67,6 +67,6 @@ def coverage(scene: ReportScene) -> Figure | None:
 
 
 def coverage_note(scene: ReportScene) -> str:
-    """Say how much of the image is covered, and how much has to be."""
+    """State the coverage and the required coverage."""
     least = scene.options.gate.min_coverage
-    return f'Here {100 * scene.evidence.coverage:.0f} % of the image; {100 * least:.0f} % is the least.'
+    return f'Here {100 * scene.evidence.coverage:.0f} % of the image; at least {100 * least:.0f} % required.'

@@ -113,7 +113,7 @@ def test_a_lone_point_is_worth_less_than_a_vehicle() -> None:
     assert 1 <= (owners >= 50_000).sum() < (owners < 50_000).sum() / 2
 
 
-def test_what_is_old_stays_until_enough_newer_replace_it() -> None:
+def test_old_vehicles_stay_until_enough_newer_ones_replace_them() -> None:
     buffer = EvidenceBuffer(BufferOptions())
     filled(buffer, [drive(0, 0.0, MAIN), drive(1, 10.0, SIDE)], 8000)
     for number in range(2, REPLACING_VEHICLES + 2):
@@ -126,7 +126,7 @@ def test_what_is_old_stays_until_enough_newer_replace_it() -> None:
         assert np.unique(owners).tolist() == list(range(1, REPLACING_VEHICLES + 2))
 
 
-def test_what_is_young_stays_however_many_there_are() -> None:
+def test_recent_vehicles_stay_however_many_there_are() -> None:
     buffer = filled(EvidenceBuffer(BufferOptions()), busy(0.1), 8000)
     before = snapshot(buffer).track_count
     buffer.forget_replaced(-1.0)
@@ -152,7 +152,7 @@ def test_the_same_traffic_leaves_the_same_evidence_to_the_last_bit() -> None:
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name), err_msg=name)
 
 
-def test_what_is_held_keeps_its_order() -> None:
+def test_rows_keep_their_order() -> None:
     evidence = snapshot(filled(EvidenceBuffer(BufferOptions(max_tracks=500)), busy(1.0), 500))
     ends = evidence.times_s[evidence.track_starts[1:] - 1]
     assert (np.diff(evidence.track_vehicles) >= 0).all() and ends.max() == ends[-1]
@@ -160,7 +160,7 @@ def test_what_is_held_keeps_its_order() -> None:
 
 
 @pytest.mark.parametrize('seed', range(5))
-def test_worth_is_counted_as_its_definition_says(seed: int) -> None:
+def test_novelty_matches_its_definition(seed: int) -> None:
     generator = np.random.default_rng(seed)
     vehicles = generator.integers(0, 8, 60)
     newest, bins = generator.permutation(8).astype(float), generator.integers(0, 5, 60)

@@ -11,19 +11,8 @@ import pytest
 from autocalib_ros.config import BufferOptions
 from autocalib_ros.errors import InputError
 from autocalib_ros.evidence.buffer import EvidenceBuffer
-from autocalib_ros.evidence.snapshot import (
-    EDGE_ARRAYS,
-    OUTLINE_ARRAYS,
-    OUTLINE_COLUMNS,
-    STILL_LINES_PX,
-    TRACK_KINDS,
-    Edges,
-    Evidence,
-    Outlines,
-    Segments,
-    Track,
-    TrackKind,
-)
+from autocalib_ros.evidence.snapshot import TRACK_KINDS, Edges, Evidence, Outlines, Segments, Track, TrackKind
+from autocalib_ros.evidence.tables import EDGES, OUTLINE_COLUMNS, OUTLINES, STILL_LINES
 
 
 def track(vehicle: int, end_s: float) -> Track:
@@ -76,7 +65,7 @@ def test_kinds_of_tracks_survive_their_file(tmp_path: Path) -> None:
     assert after.summary().vehicles == 2
 
 
-def test_without_a_detector_a_file_is_what_it_was_before_there_were_kinds(tmp_path: Path) -> None:
+def test_without_a_detector_a_file_has_no_track_kinds(tmp_path: Path) -> None:
     of_kinds(TrackKind.UNKNOWN, TrackKind.UNKNOWN).save(tmp_path / 'evidence.npz')
     with np.load(tmp_path / 'evidence.npz') as data:
         assert TRACK_KINDS not in data.files
@@ -102,7 +91,7 @@ def rewritten(tmp_path: Path, keep: tuple[str, ...]) -> Path:
     path = tmp_path / 'evidence.npz'
     snapshot(buffer).save(path)
     with np.load(path) as data:
-        arrays = {name: data[name] for name in data.files if name not in EDGE_ARRAYS or name in keep}
+        arrays = {name: data[name] for name in data.files if name not in EDGES.names or name in keep}
     np.savez(path, **arrays)
     return path
 
@@ -123,12 +112,12 @@ def test_a_file_without_outlines_has_none(tmp_path: Path) -> None:
     buffer.add_track(track(3, 5.0))
     snapshot(buffer).save(tmp_path / 'evidence.npz')
     with np.load(tmp_path / 'evidence.npz') as data:
-        assert not set(OUTLINE_ARRAYS) & set(data.files)
+        assert not set(OUTLINES.names) & set(data.files)
     evidence = Evidence.load(tmp_path / 'evidence.npz')
     assert evidence.outlines_px.shape == (0, OUTLINE_COLUMNS) and evidence.outline_times_s.shape == (0,)
 
 
-@pytest.mark.parametrize('missing', OUTLINE_ARRAYS)
+@pytest.mark.parametrize('missing', OUTLINES.names)
 def test_outlines_that_are_not_all_there_are_an_input_error(tmp_path: Path, missing: str) -> None:
     buffer = EvidenceBuffer(BufferOptions())
     buffer.add_track(track(3, 5.0))
@@ -177,14 +166,14 @@ def test_still_lines_survive_their_file_to_the_last_bit(tmp_path: Path) -> None:
     before.save(tmp_path / 'evidence.npz')
     after = Evidence.load(tmp_path / 'evidence.npz')
     np.testing.assert_array_equal(after.still_lines_px, before.still_lines_px)
-    # what is chosen of the tracks has no bearing on what stands still
+    # selecting tracks does not affect the still lines
     np.testing.assert_array_equal(after.select_tracks(np.array([1])).still_lines_px, before.still_lines_px)
 
 
-def test_without_still_lines_a_file_is_what_it_was_before_they_were_looked_for(tmp_path: Path) -> None:
+def test_without_still_lines_a_file_has_no_such_array(tmp_path: Path) -> None:
     with_lines(0).save(tmp_path / 'evidence.npz')
     with np.load(tmp_path / 'evidence.npz') as data:
-        assert STILL_LINES_PX not in data.files
+        assert STILL_LINES.values not in data.files
     assert Evidence.load(tmp_path / 'evidence.npz').still_lines_px.shape == (0, 4)
 
 
@@ -206,7 +195,7 @@ def test_still_lines_that_are_none_are_an_input_error(tmp_path: Path, lines: np.
     with_lines(3).save(path)
     with np.load(path) as data:
         arrays = {name: data[name] for name in data.files}
-    np.savez(path, **{**arrays, STILL_LINES_PX: lines})
+    np.savez(path, **{**arrays, STILL_LINES.values: lines})
     with pytest.raises(InputError, match='not a file of saved evidence'):
         Evidence.load(path)
 
@@ -277,7 +266,7 @@ def test_a_damaged_byte_is_an_input_error_or_does_no_harm(tmp_path: Path, positi
 
 
 @pytest.mark.parametrize(
-    ('changes', 'told'),
+    ('changes', 'expected'),
     [
         ({'points_px': np.zeros((9, 2))}, 'times_s of float64'),
         ({'points_px': np.zeros(10)}, 'points_px of float64'),
@@ -298,7 +287,7 @@ def test_a_damaged_byte_is_an_input_error_or_does_no_harm(tmp_path: Path, positi
         ({'frames': 'many'}, 'not a file'),
     ],
 )
-def test_evidence_that_does_not_fit_together_is_an_input_error(tmp_path: Path, changes: dict, told: str) -> None:
+def test_evidence_that_does_not_fit_together_is_an_input_error(tmp_path: Path, changes: dict, expected: str) -> None:
     buffer = EvidenceBuffer(BufferOptions())
     buffer.add_track(track(3, 5.0))
     path = tmp_path / 'evidence.npz'
@@ -306,7 +295,7 @@ def test_evidence_that_does_not_fit_together_is_an_input_error(tmp_path: Path, c
     with np.load(path) as data:
         arrays = {name: data[name] for name in data.files}
     np.savez(path, **{**arrays, **changes})
-    with pytest.raises(InputError, match=told):
+    with pytest.raises(InputError, match=expected):
         Evidence.load(path)
 
 

@@ -68,7 +68,7 @@ def test_the_summary_has_the_numbers_with_their_sigmas(full):
     lines = summary_lines(full.result, full.accepted_at_s)
     assert re.fullmatch(r' +value +1 sigma', lines[0])
     assert re.match(r'  focal length +140.00 px +± 1.50$', lines[1])
-    assert any(re.match(r'  looks down by +40.00 degrees +± 0.20$', line) for line in lines)
+    assert any(re.match(r'  tilt +40.00 degrees +± 0.20$', line) for line in lines)
     assert '  assumed:    the two roads are perpendicular' in lines
     sigma_column = lines[0].index('1 sigma')
     assert {line.index('±') for line in lines if '±' in line} == {sigma_column}

@@ -237,13 +237,13 @@ def test_a_lens_without_a_plane_makes_no_view_from_above(name, command, saved):
 def test_a_plane_without_metres_is_shown_in_heights_of_the_camera(command, saved, monkeypatch):
     unit = replace(calibration(), grade='unit_scale', camera=LENS, ground=GroundPlane(POSE.rotation, 1.0, False))
     write_calibration_json(saved / 'calibration.json', unit)
-    labels = []
-    monkeypatch.setattr('matplotlib.axes.Axes.text', lambda axes, x, y, words, **how: labels.append(words))
+    told = []
+    monkeypatch.setattr('autocalib_ros.pictures.drawing.draw_text', lambda picture, text, *_: told.append(text))
     assert command('topview', saved / 'image.png', saved / 'out.png')[0] == 0
     assert command('picture', saved / 'image.png', saved / 'out.png')[0] == 0
-    assert labels[0].endswith(' camera heights')
-    assert any(words.endswith('squares of 0.5 camera heights') for words in labels)
-    assert not any(words.endswith(' m') for words in labels)
+    assert told[0].endswith(' camera height')
+    assert any(words.endswith('squares of 0.5 camera heights') for words in told)
+    assert not any(words.endswith(' m') for words in told)
 
 
 def test_a_lens_that_folds_back_inside_the_image_cannot_be_undistorted(saved, capsys):

@@ -1,4 +1,4 @@
-"""Detectors of every layout: told from what they show of themselves, fed as they want it, read as they mean it."""
+"""Detectors of every layout: recognition, preprocessing and decoding."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_every_layout_is_tried() -> None:
 
 
 @pytest.mark.parametrize('name', MODELS)
-def test_a_layout_is_told_and_its_boxes_are_where_they_were_drawn(name: str) -> None:
+def test_a_layout_is_recognised_and_its_boxes_are_where_they_were_drawn(name: str) -> None:
     detector = VehicleDetector(model(name), options_for(name))
     assert detector.layout == MODELS[name][0]
     found = detector.detect(picture((640, 400), BOXES))
@@ -107,7 +107,7 @@ def test_two_classes_of_one_van_are_one_vehicle_and_two_vans_are_two() -> None:
     assert len(detector.detect(picture((416, 416), side_by_side)).scores) == 2
 
 
-def test_what_is_less_sure_is_left_out() -> None:
+def test_detections_below_the_least_score_are_dropped() -> None:
     image = picture((416, 416), {CAR: [(100, 100, 160, 140)]})
     assert len(VehicleDetector(model('yolox'), DetectorOptions(confidence=0.7)).detect(image).scores) == 1
     assert len(VehicleDetector(model('yolox'), DetectorOptions(confidence=0.75)).detect(image).scores) == 0
@@ -128,7 +128,7 @@ def test_grey_images_are_taken() -> None:
         ({'layout': 'yolox_decoded'}, 'layout yolox_decoded'),
     ],
 )
-def test_what_is_set_wins_over_what_is_told(how: dict, says: str) -> None:
+def test_options_override_the_recognised_layout(how: dict, says: str) -> None:
     assert says in str(VehicleDetector(model('yolox'), DetectorOptions(**how)))
 
 
@@ -137,7 +137,7 @@ def test_colours_in_another_order_are_other_classes() -> None:
     assert VehicleDetector(model('yolox'), DetectorOptions(channel_order='rgb')).detect(image).people.tolist() == [True]
 
 
-def test_names_in_the_model_say_what_is_a_vehicle() -> None:
+def test_class_names_in_the_model_select_the_vehicles() -> None:
     names = {0: 'Van', 1: 'tree', 2: 'pedestrian'}
     seeing = SeeingModel(
         lambda found, size: onnx_models.yolov8([(edges, 2 if kind == PERSON else 0) for edges, kind in found], size, 3),
@@ -176,7 +176,7 @@ def test_six_columns_are_classes_or_probabilities(end2end: str, values: float, l
         ({'a': (1, 84, 3549)}, {'input_size': 640}, 'this one takes 416x416'),
     ],
 )
-def test_what_is_not_understood_is_wrong_usage_at_the_start(outputs: dict, options: dict, says: str) -> None:
+def test_an_unsupported_model_is_a_usage_error_at_the_start(outputs: dict, options: dict, says: str) -> None:
     seeing = SeeingModel(lambda found, size: {name: np.zeros(shape, np.float32) for name, shape in outputs.items()})
     with pytest.raises(UsageError, match=says):
         VehicleDetector(seeing, DetectorOptions(**options))
@@ -191,7 +191,7 @@ def test_names_without_a_vehicle_are_listed() -> None:
 def test_an_input_that_is_no_picture_is_wrong_usage() -> None:
     seeing = model('yolox')
     seeing.get_inputs = lambda: [SimpleNamespace(name='x', shape=[1, 10], type='tensor(float)')]
-    with pytest.raises(UsageError, match=r'does not take one picture.*x \[1, 10\]'):
+    with pytest.raises(UsageError, match=r'must have one image input.*x \[1, 10\]'):
         VehicleDetector(seeing, DetectorOptions())
 
 
@@ -211,10 +211,12 @@ def test_a_model_that_is_no_file_is_wrong_usage(tmp_path: Path) -> None:
         open_detector(DetectorOptions(model=str(tmp_path / 'none.onnx')))
 
 
-def test_without_onnxruntime_one_line_says_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_onnxruntime_the_error_has_one_line_with_a_remedy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / 'model.onnx').touch()
     monkeypatch.setitem(sys.modules, 'onnxruntime', None)
-    with pytest.raises(UsageError, match='needs onnxruntime.*pip install onnxruntime') as caught:
+    with pytest.raises(UsageError, match=r'needs onnxruntime.*pip install onnxruntime') as caught:
         open_detector(DetectorOptions(model=str(tmp_path / 'model.onnx')))
     assert len(str(caught.value).splitlines()) == 1
 
@@ -230,7 +232,7 @@ def test_without_onnxruntime_one_line_says_what_to_do(tmp_path: Path, monkeypatc
         ({'providers': ''}, 'asks for none; this onnxruntime has'),
     ],
 )
-def test_what_onnxruntime_cannot_run_is_wrong_usage(tmp_path: Path, how: dict, says: str) -> None:
+def test_a_model_that_onnxruntime_cannot_run_is_a_usage_error(tmp_path: Path, how: dict, says: str) -> None:
     pytest.importorskip('onnxruntime', reason='onnxruntime is not installed')
     (tmp_path / 'model.onnx').write_bytes(b'no model at all')
     with pytest.raises(UsageError, match=says):

@@ -64,7 +64,7 @@ class World:
         return noisy(image, int(time_s * 1000))
 
     def detect(self, image: np.ndarray) -> Detections:
-        """Say where everything is, in pixels of the image given."""
+        """Return all boxes, in pixels of the image given."""
         self.calls += 1
         scale = image.shape[1] / SIZE[1]
         corners = self.at(self.time_s)
@@ -117,13 +117,13 @@ def test_a_vehicle_that_the_detector_misses_for_a_while_stays_the_same() -> None
 def test_a_parked_car_starts_no_tracks() -> None:
     tracks, segments, edges = watched(World([(20, 100), (300, 250)], [40.0, 0.0]), 5.0)
     assert owners(tracks, 100)
-    # the parked car differs from the empty road at first; what starts then stands still and is no track
+    # the parked car differs from the empty road at first; points that start there are static and yield no track
     assert not owners(tracks, 250)
     for lines in (*segments, *edges):
         assert not ((lines.ends_px[:, 1] > 250) & (lines.time_s > 3.5)).any()
 
 
-def test_people_are_told_and_leave_neither_segments_nor_edges() -> None:
+def test_people_are_classified_and_yield_neither_segments_nor_edges() -> None:
     tracks, segments, edges = watched(World([(20, 100), (500, 250)], [40.0, -40.0], people=(1,)), 5.0)
     kinds = {track.kind for track in tracks if track.vehicle in owners(tracks, 250)}
     assert kinds == {TrackKind.PERSON}
@@ -170,7 +170,7 @@ def test_between_detections_a_box_goes_with_its_points() -> None:
     assert moving[0].x == pytest.approx(20 + 60.0 * 3.0, abs=3)
 
 
-def test_of_two_boxes_the_nearer_has_what_both_cover() -> None:
+def test_the_overlap_of_two_boxes_belongs_to_the_nearer() -> None:
     world = World([(100, 100), (120, 130)], [0.0, 0.0])
     vehicles, tracker = DetectorTracks(world, DetectorOptions()), PointTracker(Options().tracking)
     at(world, 0.0, vehicles, tracker)
@@ -180,7 +180,7 @@ def test_of_two_boxes_the_nearer_has_what_both_cover() -> None:
     assert not far.mask[top:, left:].any() and (far.mask[:top] > 0).all()
 
 
-def test_evidence_by_a_detector_knows_kinds_and_says_so_when_solved() -> None:
+def test_evidence_of_a_detector_has_track_kinds_and_the_result_reports_them() -> None:
     world = World([(20, 100), (500, 250)], [40.0, -40.0], people=(1,))
     calibrator = AutoCalibrator(Options(), detector=world)
     for index in range(70):

@@ -1,4 +1,4 @@
-"""A camera that stands still is known as such by night too, and one that does not is found out."""
+"""A stationary camera is recognised by day and night, and camera motion is detected."""
 
 from __future__ import annotations
 

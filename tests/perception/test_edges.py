@@ -1,4 +1,4 @@
-"""Straight edges on moving vehicles, and none of what stands still beside them."""
+"""Straight edges on moving vehicles, and none on static objects next to them."""
 
 from __future__ import annotations
 

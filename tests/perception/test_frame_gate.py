@@ -160,7 +160,7 @@ def test_another_view_that_lasts_is_taken_after_two_seconds() -> None:
     )
 
 
-def test_what_follows_a_flat_start_is_taken_at_once() -> None:
+def test_a_view_after_a_flat_start_is_accepted_at_once() -> None:
     view = FrameGate(4.0, LEVEL_SHIFT_THRESHOLD)
     view.classify(np.full((90, 160), 70.0), 0.0)
     assert view.classify(128 + 40 * texture(5, (90, 160), 8.0), 0.1) is FrameStatus.LEVEL_SHIFT

@@ -79,7 +79,7 @@ def test_grey_stays_grey(encoding, padding):
 
 
 @pytest.mark.parametrize(('encoding', 'rows'), [('mono8', scene()[:, :, 0]), ('bgr8', scene())])
-def test_what_needs_no_conversion_is_not_copied(encoding, rows):
+def test_images_without_conversion_are_not_copied(encoding, rows):
     msg = message(encoding, rows)
     assert np.shares_memory(ImageDecoder().decode(msg), msg.data)
 
@@ -128,7 +128,7 @@ def test_signed_counts_fill_the_range(padding, is_bigendian):
 
 @pytest.mark.parametrize('is_bigendian', [0, 1])
 @pytest.mark.parametrize('padding', [0, 4])
-def test_temperatures_fill_the_range_and_what_is_none_is_black(padding, is_bigendian):
+def test_temperatures_fill_the_range_and_nan_is_black(padding, is_bigendian):
     kelvin = np.linspace(283.0, 310.0, HEIGHT * WIDTH).reshape(HEIGHT, WIDTH)
     low, high = np.percentile(kelvin, [1, 99])
     holes = kelvin.copy()
@@ -168,7 +168,7 @@ def test_the_stretch_follows_time_and_not_the_number_of_images(interval_s):
     assert 90 < shift[59.6 if interval_s == 0.4 else 59.95] < 170
 
 
-def test_what_all_pixels_gain_moves_no_grey_level():
+def test_a_common_offset_of_all_pixels_changes_no_grey_level():
     decoder, rng = ImageDecoder(), np.random.default_rng(0)
     grey = rng.integers(1000, 2000, (HEIGHT, WIDTH))
     before = decoder.decode(message('mono16', grey.astype('<u2'))).astype(int)
@@ -292,7 +292,7 @@ def compressed(data: bytes, said: str) -> SimpleNamespace:
     return SimpleNamespace(format=said, data=array.array('B', data))
 
 
-def test_jpeg_by_its_content_whatever_the_format_says():
+def test_jpeg_is_recognised_by_content_not_by_format():
     data = cv2.imencode('.jpg', scene(), [cv2.IMWRITE_JPEG_QUALITY, 100])[1].tobytes()
     image = decoded(compressed(data, 'rgb8; png compressed'))
     # chroma is halved by JPEG
@@ -347,7 +347,7 @@ JPEG = cv2.imencode('.jpg', scene())[1].tobytes()
     ('data', 'said', 'reason'),
     [
         (JPEG, '16UC1; compressedDepth png', 'holds depths'),
-        (JPEG[: len(JPEG) // 2], 'jpeg', 'is a JPEG cut off after'),
+        (JPEG[: len(JPEG) // 2], 'jpeg', 'is a JPEG truncated after'),
         (b'GIF89a' + bytes(20), 'jpeg', 'neither JPEG nor PNG, it begins with 47 49 46'),
         (b'', 'jpeg', 'it begins with nothing'),
         (b'\x89PNG\r\n\x1a\n' + bytes(50), 'png', 'cannot be decoded'),
@@ -363,5 +363,5 @@ def test_an_encoding_without_colours_is_warned_of_once(caplog):
     for _ in range(3):
         decoder.decode(message('8UC3', scene()))
     assert [record.message for record in caplog.records] == [
-        "image encoding '8UC3' does not name its colours; taken for bgr8"
+        "image encoding '8UC3' has no channel order; interpreted as bgr8"
     ]

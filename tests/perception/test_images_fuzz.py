@@ -1,4 +1,4 @@
-"""Broken headers and data: an error in words or an image of the size told, never anything else."""
+"""Broken headers and data: either an InputError or an image of the stated size."""
 
 from __future__ import annotations
 

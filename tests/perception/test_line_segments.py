@@ -1,4 +1,4 @@
-"""Straight lines of what stands still: where they are drawn, and nowhere else."""
+"""Line segments of the static scene: where they are drawn, and nowhere else."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from autocalib_ros.perception.observer import Observer
 
 WIDTH, HEIGHT = 640, 360
 FINE = 8
-"""Drawn so many times finer, and reduced."""
+"""Supersampling factor of the drawing."""
 STRIPES = (
     np.array(
         [[[60 + 50 * n, 240], [80 + 50 * n, 240], [100 + 50 * n, 330], [76 + 50 * n, 330]] for n in range(6)], float
@@ -77,7 +77,7 @@ def watched(options: Options, factor: int = 1) -> Observer:
     return observer
 
 
-def test_every_stripe_is_found_where_it_is_and_nothing_of_what_passes() -> None:
+def test_every_stripe_is_found_and_passing_traffic_is_not() -> None:
     lines = watched(Options()).still_lines()
     assert misses(lines, edges()).max() < WITHIN_PX
     sides = edges()[1::2]  # the long ones
@@ -98,11 +98,11 @@ def test_the_longest_come_first_and_short_ones_not_at_all() -> None:
     assert length.min() >= MIN_LINE_LENGTH * WIDTH
 
 
-def test_no_line_touches_what_is_ignored() -> None:
+def test_no_line_touches_an_ignored_region() -> None:
     right = 220
     lines = watched(Options(ignore_regions=f'{right} 200 639 200 639 359 {right} 359')).still_lines()
     assert len(lines) and lines[:, ::2].max() < right
-    assert misses(lines, edges()).max() < WITHIN_PX  # none along its border, which stands still
+    assert misses(lines, edges()).max() < WITHIN_PX  # none along its border, which is static
     everywhere = watched(Options()).still_lines()
     assert everywhere[:, ::2].max() > right + 50
 

@@ -142,7 +142,7 @@ def test_slow_drift_is_seen_as_far_back_as_evidence_goes() -> None:
     assert stillness.drift_px < 0.5
 
 
-def test_what_hides_the_view_for_a_moment_is_no_loss() -> None:
+def test_a_short_occlusion_does_not_lose_the_background() -> None:
     stillness = DriftMonitor(600.0)
     for index in range(60):
         hidden = 20 <= index < 28

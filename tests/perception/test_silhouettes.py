@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from autocalib_ros.config import MotionOptions, Options
-from autocalib_ros.evidence.snapshot import OUTLINE_COLUMNS
+from autocalib_ros.evidence.tables import OUTLINE_COLUMNS
 from autocalib_ros.perception.motion_mask import MotionMask, Region
 from autocalib_ros.perception.observer import Observer
 from autocalib_ros.perception.silhouettes import outlines_of
@@ -48,7 +48,7 @@ def test_gaps_are_to_the_nearest_region_or_border() -> None:
     np.testing.assert_allclose(outlines_of(regions, (0.0, 0.0), SHAPE, 1.0)[:, -1], [20, 20, 10])
 
 
-def test_what_is_beside_an_ignored_place_has_no_gap() -> None:
+def test_a_silhouette_next_to_an_ignored_region_has_no_gap() -> None:
     ignored = np.zeros(SHAPE, np.uint8)
     ignored[60:, :105] = 255
     regions = [region(100, 50, 40, 20), region(160, 50, 40, 20)]
@@ -79,7 +79,7 @@ def test_the_outline_of_a_moving_block_is_its_own_to_a_pixel_of_the_mask() -> No
 
 
 @pytest.mark.parametrize('reduced_width', [640, 320])
-def test_an_observer_outlines_what_moves_in_pixels_of_the_full_image(reduced_width: int) -> None:
+def test_silhouettes_are_in_pixels_of_the_full_image(reduced_width: int) -> None:
     observer = Observer(Options(max_image_width=reduced_width), (SHAPE[1], SHAPE[0]))
     noise = np.random.default_rng(0).integers(-3, 4, (8, *SHAPE))
     found = []

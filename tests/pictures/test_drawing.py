@@ -49,7 +49,7 @@ def test_lines_break_between_words_and_fit():
     assert max(text_size(line, 15.0)[0] for line in lines) <= 300
 
 
-def test_what_finds_no_room_ends_in_dots():
+def test_text_without_room_is_truncated_with_dots():
     lines = wrap_text(LONG, 15.0, 300.0, 3)
     assert len(lines) == 3 and lines[-1].endswith(' ...')
     assert text_size(lines[-1], 15.0)[0] <= 300
@@ -76,7 +76,7 @@ def test_points_far_outside_do_no_harm(path):
     draw_paths(np.zeros((100, 100, 3), np.uint8), [np.array(path)], PAPER, 1)
 
 
-def test_an_overlay_covers_as_much_as_it_is_told_to():
+def test_an_overlay_covers_by_its_opacity():
     overlay = Overlay(40, 60)
     overlay.add_box(10, 5, 30, 25, PAPER, 0.5)
     overlay.add_box(10, 5, 20, 25, GREY, 1.0)

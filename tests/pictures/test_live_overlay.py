@@ -87,7 +87,7 @@ def bend_px(picture: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize('balance', [0.0, 0.5, 1.0])
-def test_rectified_is_what_opencv_makes_of_the_published_camera_info(camera, ground, calibration, balance):
+def test_rectified_equals_the_result_of_opencv_for_the_published_camera_info(camera, ground, calibration, balance):
     info = camera_info(camera, rectified_balance=balance)
     maps = cv2.fisheye.initUndistortRectifyMap(
         np.reshape(info.k, (3, 3)),
@@ -143,7 +143,7 @@ def test_the_grid_is_on_the_road(camera, ground, calibrated):
     assert grid.step_m == 5.0
 
 
-def test_what_is_followed_is_drawn_with_its_tail(calibrated):
+def test_tracked_points_are_drawn_with_their_tails(calibrated):
     tail = np.column_stack([np.linspace(200, 260, 16), np.full(16, 300.0)])
     picture = DebugPicture(SIZE, None, None).draw(BLACK, tail[None], WORDS)
     # smooth lines are a little fainter than their colour

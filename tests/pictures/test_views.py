@@ -65,7 +65,7 @@ def test_a_view_of_no_road_is_none(ground):
     assert TopView.around(np.zeros((1, 2)), ground, 500) is None
 
 
-def test_what_the_lens_does_not_see_is_empty(ground):
+def test_pixels_outside_the_field_of_view_are_empty(ground):
     behind = TopView.between(np.array([-60.0, -4.0]), np.array([-50.0, 4.0]), 50)
     assert (resample(checks(ground), behind.sources(CAMERA, ground)) == EMPTY_GREY).all()
 

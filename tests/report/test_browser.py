@@ -49,10 +49,10 @@ def test_a_touch_enlarges_a_picture_and_leaves_the_page_as_wide(page, written):
     assert page.value('document.documentElement.scrollWidth <= document.documentElement.clientWidth')
 
 
-def test_the_browser_hears_what_a_page_complains_of(tmp_path):
+def test_the_browser_collects_the_complaints_of_a_page(tmp_path):
     path = tmp_path / 'bad.html'
     path.write_text('<img src="https://example.invalid/a.png"><script>console.error("broken"); nothing.there</script>')
     with browser() as one:
         one.open(path, 390)
-        told = ' '.join(one.complaints)
-    assert 'broken' in told and 'nothing is not defined' in told and 'example.invalid' in told
+        complaints = ' '.join(one.complaints)
+    assert 'broken' in complaints and 'nothing is not defined' in complaints and 'example.invalid' in complaints

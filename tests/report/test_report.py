@@ -79,15 +79,15 @@ def test_names_of_files_cannot_break_the_page(written):
     assert 'clip &lt;1&gt;.mp4' in written('full').read_text()
 
 
-def test_the_opening_says_how_sure_what_was_assumed_and_what_to_do(written):
+def test_the_opening_has_uncertainty_assumptions_and_next_step(written):
     opening = text_of(written('full')).partition('<nav>')[0]
     assert 'focal length 140.0 ± 1.5 px; the camera looks 40.0 ± 0.2 degrees down from 8.00 m' in opening
     assert 'Focal length ± 1.1 %; tilt ± 0.20 and roll ± 0.10 degrees' in opening
     assert re.search('Assumed:.*the two roads are perpendicular', opening)
-    assert re.search('What to do next:.*use the files', opening)
+    assert re.search('Next step:.*use the files', opening)
 
 
-def test_a_lens_without_ground_says_why(written):
+def test_a_lens_without_ground_plane_gives_the_reason(written):
     text = text_of(written('lens_only'))
     assert 'one_direction' in text
     assert 'Aim at a crossing.' in text
@@ -106,25 +106,25 @@ def test_a_refusal_explains_itself_and_replaces_an_older_report(tmp_path, refuse
 
 def test_the_paper_s_method_shows_the_tracks_it_kept_and_knows_no_sigma(full):
     sigmas = replace(full.result.stddev, focal_px=None, tilt_deg=None, roll_deg=None, height_m=None)
-    told = replace(full.result.figures, track_labels=np.full(full.evidence.track_count, -1), residuals=Residuals())
-    paper = replace(full, result=replace(full.result, method='paper', covariance=None, stddev=sigmas, figures=told))
-    assert 'tells no uncertainty' in how_sure(paper.result)
-    assert 'is not told' in accuracy_note(paper)
-    assert len(paper.paths(0)) == len(told.paper_tracks) > 0
+    given = replace(full.result.figures, track_labels=np.full(full.evidence.track_count, -1), residuals=Residuals())
+    paper = replace(full, result=replace(full.result, method='paper', covariance=None, stddev=sigmas, figures=given))
+    assert 'gives no uncertainty' in how_sure(paper.result)
+    assert 'is unknown' in accuracy_note(paper)
+    assert len(paper.paths(0)) == len(given.paper_tracks) > 0
     assert drawn(paper) == ALL - {'residuals', 'residual_map'}
 
 
-def test_traffic_that_only_turns_shows_what_it_rests_on(full):
-    told = full.result.figures
+def test_a_result_of_turning_traffic_alone_shows_its_points(full):
+    given = full.result.figures
     turning = replace(
-        told,
+        given,
         track_labels=np.full(full.evidence.track_count, -1),
-        residuals=replace(told.residuals, roads=np.full(len(told.residuals.roads), -1)),
+        residuals=replace(given.residuals, roads=np.full(len(given.residuals.roads), -1)),
     )
     scene = replace(full, result=replace(full.result, road_directions=np.zeros((0, 3)), figures=turning))
     assert drawn(scene) == ALL - {'straightness'}
     words = [text.get_text() for text in kept_tracks(scene).findobj(Text)]
-    assert f'on vehicles that turn: {len(scene.turning_px)} points' in words
+    assert f'on turning vehicles: {len(scene.turning_px)} points' in words
 
 
 @pytest.mark.parametrize('background', [True, False])
@@ -177,12 +177,12 @@ def test_the_same_scene_gives_the_same_page(tmp_path, refused, written):
 @pytest.mark.parametrize(
     ('code', 'change', 'missing'),
     [
-        ('camera_moving', {'drift_px': 9.0}, 'the camera stands still'),
+        ('camera_moving', {'drift_px': 9.0}, 'stationary camera'),
         ('too_few_tracks', {}, 'tracks of moving traffic'),
-        ('no_agreement', {}, 'agreement of the traffic'),
+        ('no_agreement', {}, 'agreement of the traffic with the model'),
     ],
 )
-def test_what_is_missing_stands_in_a_table(full, code, change, missing):
+def test_a_missing_requirement_is_in_a_table(full, code, change, missing):
     evidence = replace(full.evidence, **change)
     if code == 'no_agreement':  # enough of everything
         evidence = replace(evidence, track_vehicles=np.zeros(99, int))
@@ -192,7 +192,7 @@ def test_what_is_missing_stands_in_a_table(full, code, change, missing):
     assert all(row.found for row in rows)
 
 
-def test_what_is_missing_of_a_ground_plane_is_told_and_nothing_of_a_whole_calibration(full, lens_only):
+def test_requirements_are_listed_for_a_missing_ground_plane_but_not_for_a_full_calibration(full, lens_only):
     assert 'One direction only.' in [row.found for row in needs(lens_only.result, full.evidence, full.options.gate)]
     assert not needs(full.result, full.evidence, full.options.gate)
 

@@ -1,4 +1,4 @@
-"""What the pictures say of places on the road, against the truth of made-up traffic."""
+"""Positions on the road in the figures against the truth of synthetic traffic."""
 
 from __future__ import annotations
 
@@ -72,12 +72,12 @@ def test_the_top_view_shows_places_where_the_truth_has_them(scene):
     assert (errors_m(scene, places[near], sources[near]) < SIGMAS * sigma + 1e-3).all()
 
 
-def test_sigma_of_places_is_that_of_the_numbers_told(scene):
-    told = scene.result.stddev.ground_point_m
+def test_sigma_of_positions_equals_the_reported_numbers(scene):
+    reported = scene.result.stddev.ground_point_m
     heading = ahead(scene.calibration.ground)
     places = np.array([[np.cos(heading), np.sin(heading)]]) * np.array([[10.0], [20.0], [40.0]])
-    assert position_sigma_m(scene, places) == pytest.approx(np.array(told, float), rel=0.1, nan_ok=True)
+    assert position_sigma_m(scene, places) == pytest.approx(np.array(reported, float), rel=0.1, nan_ok=True)
 
 
-def test_outside_the_image_no_sigma_is_told(scene):
+def test_outside_the_image_there_is_no_sigma(scene):
     assert np.isnan(position_sigma_m(scene, np.array([[-100.0, 0.0], [0.0, 0.0]]))).all()

@@ -39,7 +39,7 @@ def test_save_writes_the_report_beside_the_calibration(bench, ros_home):
     text = store.report.read_text()
     assert 'focal length 311.0 ± 1.0 px' in text and 'north, live on /image' in text
     assert (store.figures / 'ground_grid.png').exists()
-    assert 'How it settled' not in text  # of one solution there is nothing to compare
+    assert 'Convergence' not in text  # of one solution there is nothing to compare
 
 
 def test_a_report_shows_the_evidence_that_the_calibration_rests_on(reports):

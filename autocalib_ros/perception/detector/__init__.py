@@ -1,1 +1,1 @@
-"""Vehicles and people in an image by a detector in ONNX; onnxruntime is imported only when one is asked for."""
+"""Object detection of vehicles and people by an ONNX model; onnxruntime is imported only if a model is configured."""

@@ -1,4 +1,4 @@
-"""Which of a model's classes are vehicles, and which are people."""
+"""Mapping of model classes to vehicles and people."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ PEOPLE_NAMES = frozenset(
 
 @dataclass(frozen=True)
 class ClassIds:
-    """Numbers of a model's classes of vehicles and of people, cyclists among them."""
+    """Class ids of vehicles, and of people including cyclists."""
 
     vehicles: tuple[int, ...]
     people: tuple[int, ...]
@@ -41,13 +41,13 @@ class ClassIds:
 
 COCO_80 = ClassIds(vehicles=(2, 3, 5, 7), people=(0, 1))
 COCO_91 = ClassIds(vehicles=(3, 4, 6, 8), people=(1, 2))
-"""COCO's own numbers, with gaps, which TensorFlow's and DETR's models keep."""
+"""Original COCO ids with gaps, as used by the models of TensorFlow and DETR."""
 
 
 def chosen_classes(options: DetectorOptions, names: Mapping[int, str], layout: str, count: int | None) -> ClassIds:
-    """Choose by the options, else by the names in the model, else COCO; UsageError where none of them tells.
+    """Return the class ids from the options, else from the names in the model, else of COCO; UsageError if none apply.
 
-    `count` is the number of classes, None where the layout does not tell it.
+    `count` is the number of classes; None if the layout does not determine it.
     """
     vehicles, people = options.chosen_classes
     if vehicles:

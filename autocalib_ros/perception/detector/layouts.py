@@ -1,4 +1,4 @@
-"""How detectors say their boxes, and by what each kind is told: shapes, names and what a grey image gives."""
+"""Output layouts of detectors, and how to recognise them by the names, shapes and values of their outputs."""
 
 from __future__ import annotations
 
@@ -11,21 +11,23 @@ from autocalib_ros.perception.detector import decoding
 from autocalib_ros.perception.detector.decoding import Decode, Outputs, Size, boxes_and_classes
 
 MAX_QUERIES = 1000
-"""Detectors that choose their boxes themselves put out a few hundred; those that leave it to us have thousands."""
+"""Most rows of an output after selection by the model, a few hundred; raw outputs have thousands."""
 MASK_COLUMNS = 32
-"""What a model that segments puts behind the classes."""
+"""Mask coefficients that a segmentation model appends to the classes."""
 ANCHORS_PER_CELL = 3
+"""Anchor boxes per grid cell of the YOLOv5 family."""
 ANCHOR_STRIDES = ((8, 16, 32), (8, 16, 32, 64), (16, 32))
+"""Strides of the grids of the variants of the YOLOv5 family, pixels."""
 
 
 @dataclass(frozen=True)
 class Layout:
-    """How to feed a kind of detector and to read it, where options do not say otherwise."""
+    """Decoder and default preprocessing of one layout; options override them."""
 
     decode: Decode
     resize_mode: str
     needs_no_nms: bool = False
-    """It gives each object one box by itself."""
+    """The model outputs one box per object."""
     channel_order: str = 'rgb'
     input_scale: float = 1.0
     imagenet: bool = False
@@ -52,28 +54,28 @@ LAYOUTS = {
 
 @dataclass(frozen=True)
 class ModelProbe:
-    """What a model has shown of itself: in its file, and by its answer to a grey image."""
+    """Properties of a model: metadata of its file and the outputs of a trial run on a grey image."""
 
     inputs: int
     outputs: Outputs
     size: Size
-    """Width and height of that image as it was fed in."""
+    """Width and height of the model input in the trial run."""
     names: dict[int, str]
-    """Classes by number, empty where it does not name them."""
+    """Class names by id; empty if the model does not name them."""
     end_to_end: bool
-    """It says so."""
+    """Stated in the metadata."""
     shapes: str
-    """Its inputs and outputs in words."""
+    """Inputs and outputs as text for error messages."""
 
 
 def detect_layout(probe: ModelProbe) -> str:
-    """Tell the layout; UsageError, with the shapes, where it is none that is known."""
+    """Return the name of the layout; UsageError with the shapes if it is unknown."""
     found = _layout_by_name(probe) or _by_dimensions(probe)
     if found:
         return found
     if all(array.ndim in (4, 5) for array in probe.outputs.values()):
         raise UsageError(
-            f'the model puts out raw heads, which say no boxes without their anchors ({probe.shapes}): '
+            f'the model outputs raw heads, which need anchors to decode ({probe.shapes}): '
             'export it with its detection layer'
         )
     raise UsageError(
@@ -104,11 +106,11 @@ def _by_dimensions(probe: ModelProbe) -> str | None:
 
 
 def _by_rows(probe: ModelProbe, array: np.ndarray) -> str | None:
-    """Tell by the one output [1, rows, columns]."""
+    """Return the layout of a single output [1, rows, columns]; None if unknown."""
     _, rows, columns = array.shape
     cells = _cells(probe.size)
     if columns == 6 and rows <= MAX_QUERIES and rows != cells:
-        # six columns are also a query model of two classes; a number of a class is whole, a probability is not
+        # six columns may also be a query model of two classes: class ids are integers, probabilities are not
         whole = (array[..., 5] == np.round(array[..., 5])).all()
         return 'end_to_end' if probe.end_to_end or whole or len(probe.names) != 2 else 'ultralytics_rtdetr'
     if rows <= MAX_QUERIES and probe.names and columns == 4 + len(probe.names):
@@ -126,12 +128,12 @@ def _by_rows(probe: ModelProbe, array: np.ndarray) -> str | None:
 
 
 def _cells(size: Size, strides: tuple[int, ...] = decoding.YOLOX_STRIDES) -> int:
-    """Number of cells of all the grids over an input (width, height)."""
+    """Return the number of cells of all grids over an input (width, height)."""
     return sum((size[0] // stride) * (size[1] // stride) for stride in strides)
 
 
 def count_classes(layout: str, probe: ModelProbe) -> int | None:
-    """Number of classes, None where the layout does not tell it."""
+    """Return the number of classes; None if the layout does not determine it."""
     if probe.names:
         return max(probe.names) + 1
     rows = [array for array in probe.outputs.values() if array.ndim == 3]

@@ -1,4 +1,4 @@
-"""An image as a detector wants it: size, padding, order and range of the colours."""
+"""Image preprocessing for detectors: resizing, padding, channel order and normalisation."""
 
 from __future__ import annotations
 
@@ -8,35 +8,35 @@ import cv2
 import numpy as np
 
 PAD_LEVEL = 114
-"""Grey of what is padded, as the YOLO family was trained with."""
+"""Grey level of the padding with which the YOLO family is trained."""
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-"""Of red, green and blue, as shares of white."""
+"""Of red, green and blue, as fractions of white."""
 SIZE_MULTIPLE_PX = 32
-"""Detectors take sizes in multiples of this."""
+"""Input sizes of detectors are multiples of this."""
 
 
 @dataclass(frozen=True)
 class Placement:
-    """Where an image lies in the input of a model: pixel = factor * pixel of the image + offset."""
+    """Position of an image in the input of a model: input pixel = factor * image pixel + offset."""
 
     input_size: tuple[int, int]
     """Width and height."""
     image_size: tuple[int, int]
-    """The image's in the input."""
+    """Size of the resized image in the input."""
     factor: tuple[float, float]
     offset: tuple[int, int]
 
     def to_image(self, edges_px: np.ndarray) -> np.ndarray:
-        """Bring edges (n, 4) of boxes in the input back to the image."""
+        """Convert box edges (n, 4) from the input to the image."""
         return (edges_px - self.offset * 2) / (self.factor * 2)
 
 
 def place_in_input(
     image_size: tuple[int, int], model_size: tuple[int | None, int | None], mode: str, longest: int
 ) -> Placement:
-    """Place an image of (width, height); a model that takes any size gets the image's, up to `longest`.
+    """Place an image of (width, height); a model with dynamic size gets the size of the image, up to `longest`.
 
-    Nothing is ever enlarged: what is not there in the image does not help, and blurred vehicles are missed.
+    Images are never enlarged: interpolation adds no detail, and blurred vehicles are missed.
     """
     width, height = image_size
     free = min(1.0, longest / max(image_size))
@@ -57,20 +57,20 @@ def place_in_input(
 
 @dataclass(frozen=True)
 class ColourFormat:
-    """What a model takes for colours."""
+    """Colour format of the model input."""
 
     order: str
     """bgr or rgb."""
     white: float
-    """255 or 1."""
+    """Value of white, 255 or 1."""
     imagenet: bool
-    """Normalised by ImageNet's mean and standard deviation."""
+    """Normalised by mean and standard deviation of ImageNet."""
 
 
 def tensor(
-    image: np.ndarray, placement: Placement, colours: ColourFormat, kind: np.dtype, *, channels_last: bool
+    image: np.ndarray, placement: Placement, colours: ColourFormat, kind: type[np.generic], *, channels_last: bool
 ) -> np.ndarray:
-    """Turn a grey (H, W) or BGR (H, W, 3) image, uint8, into the input [1, 3, h, w], or [1, h, w, 3]."""
+    """Return a grey (H, W) or BGR (H, W, 3) image, uint8, as the model input [1, 3, h, w] or [1, h, w, 3]."""
     if placement.image_size != (image.shape[1], image.shape[0]):
         image = cv2.resize(image, placement.image_size, interpolation=cv2.INTER_LINEAR)
     if image.ndim == 2:
