@@ -45,6 +45,7 @@ from autocalib_ros.offline.parameter_file import parse_assignments
 from autocalib_ros.perception.images import PACKED_ENCODINGS, PLANAR_ENCODINGS, YUV422_ENCODINGS
 from autocalib_ros.results.calibration_json import to_json, write_calibration_json
 from autocalib_ros.results.refusals import REFUSALS
+from autocalib_ros.results.statements import ASSUMPTIONS, CHECKS, UNKNOWN_KIND
 from autocalib_ros.ros.status import Counts, Situation, status
 from synthetic_results import full_result, junction_evidence, refusal
 
@@ -432,8 +433,9 @@ def test_refusal_codes_of_the_code_are_in_the_table():
     codes = [item.code for item in REFUSALS]
     assert len(set(codes)) == len(codes)
     source = ''.join(text_of(path) for path in PACKAGE.rglob('*.py') if path.name != 'refusals.py')
-    used = set(re.findall(r"\bReason\(\s*'(\w+)'", source))
-    assert used <= set(codes)
+    used = set(re.findall(r"\breason\(\s*'(\w+)'", source)) | {'too_little_turning', 'too_little_curvature'}
+    assert used == set(codes)
+    assert not re.findall(r"\bReason\(\s*'", source), 'a refusal is made outside of the table'
     assert all(getattr(item, name).strip() for item in REFUSALS for name in ('cause', 'limit', 'remedy'))
     page = refusal_page(REFUSALS)
     assert all(f'\n| `{code}` |' in page for code in codes)
@@ -451,7 +453,7 @@ def keys(document: Any) -> Iterator[str]:
     if isinstance(document, dict):
         for key, value in document.items():
             yield key
-            yield from keys(value)
+            yield from keys(value if key != 'values' else None)  # these are named in the tables of statements
 
 
 def test_every_key_of_calibration_json_is_documented():
@@ -460,6 +462,11 @@ def test_every_key_of_calibration_json_is_documented():
     numbers = {'10', '20', '40'}
     for result in (full_result(evidence), refusal(evidence)):
         assert {key for key in keys(to_json(result)) if f'`{key}`' not in page} <= numbers
+
+
+def test_every_kind_of_statement_is_documented():
+    page = text_of(DOCS / 'reference' / 'calibration-json.md')
+    assert [kind for kind in (*ASSUMPTIONS, *CHECKS, UNKNOWN_KIND) if f'`{kind}`' not in page] == []
 
 
 def test_every_image_encoding_is_documented():

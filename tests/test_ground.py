@@ -516,7 +516,7 @@ def test_a_file_is_read(tmp_path, pixels):
         ('{', 'is not JSON'),
         ('[]', 'holds no names with values'),
         ('{"version": 1}', 'holds no calibration'),
-        (json.dumps(document() | {'version': 2}), 'its version is 2, and only 1 is read'),
+        (json.dumps(document() | {'version': 3}), 'its version is 3; versions 1 and 2 can be read'),
         (
             json.dumps(document() | {'state': 'refused', 'refusal': {'code': 'no_motion', 'message': 'nothing moves'}}),
             'no calibration .no_motion: nothing moves.',

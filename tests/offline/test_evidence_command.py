@@ -172,7 +172,7 @@ def test_the_speed_of_the_traffic_gives_the_height(without_height):
 def test_the_height_and_its_source_are_summed_up(without_height):
     _, stdout, _ = without_height('--camera-height', '8', '-p', 'camera_height_sigma=0.1')
     assert re.search(r'camera height +8.00 m +± 0.10\n', stdout)
-    assert 'assumed:    scale by the camera height of 8 +- 0.1 m (given)' in stdout
+    assert 'assumed:    scale from the camera height of 8 +- 0.1 m (given)' in stdout
 
 
 def test_a_distance_above_the_horizon_leaves_the_lens(without_height):

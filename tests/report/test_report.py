@@ -179,7 +179,7 @@ def test_the_same_scene_gives_the_same_page(tmp_path, refused, written):
     [
         ('camera_moving', {'drift_px': 9.0}, 'stationary camera'),
         ('too_few_tracks', {}, 'tracks of moving traffic'),
-        ('no_agreement', {}, 'agreement of the traffic with the model'),
+        ('no_agreement', {}, 'an identifiable focal length'),
     ],
 )
 def test_a_missing_requirement_is_in_a_table(full, code, change, missing):

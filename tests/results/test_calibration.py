@@ -48,7 +48,7 @@ def test_json_of_a_refusal_keeps_code_message_and_remedy() -> None:
     refusal = Refusal(code='no_motion', message='nothing', remedy='wait', method='joint', evidence=EVIDENCE)
     document = to_json(refusal)
     assert document['state'] == 'refused' and document['camera'] is None
-    assert document['refusal'] == {'code': 'no_motion', 'message': 'nothing', 'remedy': 'wait'}
+    assert document['refusal'] == {'code': 'no_motion', 'message': 'nothing', 'remedy': 'wait', 'values': {}}
 
 
 def test_json_says_why_a_calibrated_lens_has_no_plane() -> None:

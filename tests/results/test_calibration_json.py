@@ -10,8 +10,9 @@ import pytest
 
 from autocalib_ros.errors import InputError
 from autocalib_ros.results.calibration import Refusal
-from autocalib_ros.results.calibration_json import calibration_from_json, calibration_json, read_json
+from autocalib_ros.results.calibration_json import calibration_from_json, calibration_json, read_json, to_json
 from autocalib_ros.results.refusals import Reason
+from autocalib_ros.results.statements import SCALE_KINDS
 from stored_results import calibration, lens_only
 
 WHOLE = calibration()
@@ -64,7 +65,9 @@ POSE = broken()['ground_from_camera']
 @pytest.mark.parametrize(
     ('document', 'told'),
     [
-        (broken(version=2), 'version is 2'),
+        (broken(version=3), 'version is 3; versions 1 and 2 can be read'),
+        (broken(assumptions=[{'kind': 'a', 'text': 'b', 'values': [1]}]), 'numbers, texts or null were expected'),
+        (broken(checks=[{'kind': 'a', 'text': 'b', 'values': {'c': [1]}}]), 'numbers, texts or null were expected'),
         (broken(state='refused'), "state is 'refused'"),
         (broken(camera=None), 'no whole calibration.json'),
         (broken(image_size=[640]), 'not 2 numbers'),
@@ -78,6 +81,15 @@ POSE = broken()['ground_from_camera']
 def test_document_that_cannot_be_used_says_why(document, told):
     with pytest.raises(InputError, match=told):
         calibration_from_json(document)
+
+
+def test_a_file_of_version_1_keeps_its_texts_and_the_source_of_its_scale():
+    old = to_json(WHOLE) | {'version': 1, 'assumptions': ['square pixels', 'scale by 10 m (given)'], 'checks': ['fine']}
+    found = calibration_from_json(json.loads(json.dumps(old)))
+    assert [statement.text for statement in found.assumptions] == ['square pixels', 'scale by 10 m (given)']
+    assert [statement.kind in SCALE_KINDS for statement in found.assumptions] == [False, True]
+    assert [statement.kind for statement in found.checks] == ['unknown']
+    assert found.camera == WHOLE.camera and found.stddev == WHOLE.stddev
 
 
 def test_refusal_is_no_calibration():
