@@ -1,10 +1,11 @@
-"""Finds how two calibrations of one camera differ.
+"""Comparison of two calibrations of one camera: differences as values, and a verdict.
 
-The same pixels are followed through both lenses and poses; a side that states no deviations is taken as exact. Lenses
-are compared as they stand, and after the rotation of B that brings its rays nearest to A's, as two lenses may trade
-principal point against rotation. On the road the camera's foot is one and the same point, and the heading of the
-ground frames, which each calibration chooses for itself, is turned so that the pixels of the near road lie in the same
-directions.
+The same pixels are traced through both lenses and poses. A side without standard deviations is taken as exact. Lenses
+are compared as they are, and after the rotation of B that aligns its rays with A's, because two lenses can trade
+principal point against rotation. On the road both share the camera's foot point, and the heading of B's ground frame,
+a free choice of each calibration, is aligned on the pixels of the near road.
+
+Every difference is B minus A, and is counted in combined standard deviations where any are stated.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 
@@ -22,13 +24,19 @@ from autocalib_ros.results.calibration import GROUND_DISTANCES_M
 from autocalib_ros.results.saved_camera import SavedCamera
 
 COMPARISON_GRID = (49, 28)
-"""Pixels across and down at which two lenses are compared, borders included."""
+"""Pixels horizontally and vertically at which two lenses are compared, borders included."""
 COMPARABLE_COEFFICIENTS = 2
-"""More than k1 and k2 trade against each other, so that k1 of such a lens is no number by itself."""
+"""Number of coefficients up to which k1 and k2 are comparable: further ones are correlated with them."""
+AGREEMENT_SIGMAS = 3.0
+"""Two calibrations of one camera differ by more than this in one number out of 400."""
+SAME_LENS_TOLERANCE_PX = 0.5
+"""Maximum distance in pixels between the images of one direction in two lenses that are equivalent in use."""
+EQUAL_RTOL = 1e-9
+"""Relative tolerance below which two numbers are equal."""
 
 
 def compare_calibrations(first: SavedCamera, second: SavedCamera) -> Comparison:
-    """Compare B, `second`, with A, `first`; UsageError where their images are of different shapes."""
+    """Compare B, `second`, with A, `first`; UsageError if the aspect ratios of their images differ."""
     notes = []
     if (first.width, first.height) != (second.width, second.height):
         notes.append(f'B is scaled from {second.width}x{second.height} to {first.width}x{first.height}')
@@ -39,13 +47,12 @@ def compare_calibrations(first: SavedCamera, second: SavedCamera) -> Comparison:
         for name, has_sigma, other in zip('AB', stated, stated[::-1], strict=True)
         if not has_sigma and other
     ]
-    both = first.ground is not None and second.ground is not None
-    metric = both and first.ground.metric and second.ground.metric
-    ahead = (
-        pixels_ahead(first.lens, first.ground.normal_in_camera, first.ground.height_m, np.array(GROUND_DISTANCES_M))
-        if metric
-        else np.zeros((0, 2))
-    )
+    ground_a, ground_b = first.ground, second.ground
+    metric = ground_a is not None and ground_b is not None and ground_a.metric and ground_b.metric
+    ahead = np.zeros((0, 2))
+    if ground_a is not None and metric:
+        lens_a = cast(Camera, first.lens)  # pixels_ahead works with any Lens
+        ahead = pixels_ahead(lens_a, ground_a.normal_in_camera, ground_a.height_m, np.array(GROUND_DISTANCES_M))
     grid = pixel_grid(first, *COMPARISON_GRID)
     sides = _PerturbedRays.of(first, np.vstack([grid, ahead])), _PerturbedRays.of(second, np.vstack([grid, ahead]))
     everywhere = sides[0].subset(slice(len(grid))), sides[1].subset(slice(len(grid)))
@@ -55,11 +62,11 @@ def compare_calibrations(first: SavedCamera, second: SavedCamera) -> Comparison:
     return Comparison(
         lens=lens,
         lens_px=max_lens_difference_px(first, second),
-        rays=_ray_difference(*everywhere, grid, align_columns=False),
-        rays_aligned=_ray_difference(*everywhere, grid, align_columns=True),
+        rays=_ray_difference(*everywhere, grid, aligned=False),
+        rays_aligned=_ray_difference(*everywhere, grid, aligned=True),
         alignment_deg=_rotation_angle_deg(best_rotation(everywhere[0].nominal.rays, everywhere[1].nominal.rays)),
         pose=pose,
-        normal_deg=_normal_angle_deg(first.ground, second.ground) if both else None,
+        normal_deg=None if ground_a is None or ground_b is None else _normal_angle_deg(ground_a, ground_b),
         road=road,
         stated=stated,
         notes=(*notes, *lens_notes, *pose_notes, *road_notes),
@@ -67,7 +74,7 @@ def compare_calibrations(first: SavedCamera, second: SavedCamera) -> Comparison:
 
 
 def max_lens_difference_px(first: SavedCamera | Camera, second: SavedCamera | Camera) -> float:
-    """Return how far apart at the most two lenses of one image size image the same direction, pixels."""
+    """Return the largest distance in pixels between the images of one direction in two lenses of one image size."""
     pixels = pixel_grid(first, *COMPARISON_GRID)
     bearings, reached = first.unproject(pixels)
     seen, valid = second.project(np.where(reached[:, None], bearings, [0.0, 0.0, 1.0]))
@@ -94,9 +101,9 @@ def _lens_differences(first: SavedCamera, second: SavedCamera) -> tuple[tuple[Di
         for index, axis in enumerate('xy')
     ]
     if first.k is None or second.k is None:
-        return tuple(found), ['k1 and k2 are not compared: a lens is not near to Kannala-Brandt, see the rays']
+        return tuple(found), ['k1 and k2 are not compared: one lens is not close to Kannala-Brandt, see the rays']
     if any(first.k[COMPARABLE_COEFFICIENTS:]) or any(second.k[COMPARABLE_COEFFICIENTS:]):
-        return tuple(found), ['k1 and k2 are not compared: a lens has more coefficients than these, see the rays']
+        return tuple(found), ['k1 and k2 are not compared: one lens has further coefficients, see the rays']
     found += [
         _difference('k1', '', first.k[0], second.k[0], first.stddev.k1, second.stddev.k1),
         _difference('k2', '', first.k[1], second.k[1], first.stddev.k2, second.stddev.k2),
@@ -105,21 +112,20 @@ def _lens_differences(first: SavedCamera, second: SavedCamera) -> tuple[tuple[Di
 
 
 def _pose_differences(first: SavedCamera, second: SavedCamera) -> tuple[tuple[Difference, ...], list[str]]:
-    missing = [name for name, known in (('A', first), ('B', second)) if known.ground is None]
-    if missing:
+    if first.ground is None or second.ground is None:
+        missing = [name for name, known in (('A', first), ('B', second)) if known.ground is None]
         return (), [
-            f'poses are not compared: {" and ".join(missing)} {"holds" if len(missing) == 1 else "hold"}'
-            ' no ground plane'
+            f'poses are not compared: {" and ".join(missing)} {"has" if len(missing) == 1 else "have"} no ground plane'
         ]
-    angles = [tilt_and_roll_deg(known.ground.normal_in_camera) for known in (first, second)]
+    angles = [tilt_and_roll_deg(ground.normal_in_camera) for ground in (first.ground, second.ground)]
     sigmas = [(known.stddev.tilt_deg, known.stddev.roll_deg) for known in (first, second)]
     found = [
         _difference(name, 'deg', float(angles[0][index]), float(angles[1][index]), sigmas[0][index], sigmas[1][index])
         for index, name in enumerate(('tilt', 'roll'))
     ]
     if not (first.ground.metric and second.ground.metric):
-        return tuple(found), ["heights and metres are not compared: a plane is in units of its camera's height"]
-    # a height that was given has no deviation: it is exact
+        return tuple(found), ['heights and road points are not compared: one plane is in units of the camera height']
+    # a given height without standard deviation is exact
     height = Difference(
         'height',
         'm',
@@ -137,7 +143,7 @@ def _difference(name: str, unit: str, first: float, second: float, *sigmas: floa
 
 @dataclass(frozen=True)
 class _PixelRays:
-    """Unit rays (n, 3) of pixels, nan where the lens does not reach, and the pose where there is one."""
+    """Unit rays (n, 3) of pixels, nan outside the range of the lens, and the pose if there is one."""
 
     rays: np.ndarray
     ground: GroundPlane | None
@@ -152,7 +158,9 @@ class _PixelRays:
         return _PixelRays(self.rays[which], self.ground)
 
     def ground_points(self) -> np.ndarray:
-        """Where the rays meet the road in the ground frame, x + iy (n,); nan at and above the horizon."""
+        """Ground points of the rays in the ground frame, x + iy (n,); nan at and above the horizon."""
+        if self.ground is None:
+            raise ValueError('rays without a ground plane have no ground points')
         rays = self.rays @ self.ground.rotation.T
         down = np.where(rays[:, 2] < -1e-6, rays[:, 2], np.nan)
         return rays[:, :2] @ [1.0, 1.0j] * (-self.ground.height_m / down)
@@ -160,12 +168,12 @@ class _PixelRays:
 
 @dataclass(frozen=True)
 class _PerturbedRays:
-    """What A or B makes of pixels."""
+    """Rays of pixels in A or B, and their uncertainty."""
 
     nominal: _PixelRays
     perturbed: list[_PixelRays] | None
-    """And a little to both sides along each axis of its covariance; none where it is exact, None where it states
-    deviations without a covariance."""
+    """Rays after a small step to both sides along each principal axis of the covariance; empty if the calibration is
+    exact, None if it has standard deviations without a covariance."""
 
     @classmethod
     def of(cls, known: SavedCamera, pixels: np.ndarray) -> _PerturbedRays:
@@ -178,11 +186,14 @@ class _PerturbedRays:
             camera_m=known.ground.translation_m,
             covariance=known.covariance,
         )
+        perturbations = ground.perturbations
+        if perturbations is None:
+            return cls(nominal, None)
         return cls(
             nominal,
             [
                 _PixelRays.of(lens, GroundPlane(rotation, float(camera_m[2])), pixels)
-                for lens, rotation, camera_m in ground.perturbations
+                for lens, rotation, camera_m in perturbations
             ],
         )
 
@@ -194,10 +205,10 @@ class _PerturbedRays:
 
 
 def _ray_difference(
-    first: _PerturbedRays, second: _PerturbedRays, pixels: np.ndarray, *, align_columns: bool
+    first: _PerturbedRays, second: _PerturbedRays, pixels: np.ndarray, *, aligned: bool
 ) -> RayDifference:
     def difference(one: _PixelRays, other: _PixelRays) -> np.ndarray:
-        return (other.rays @ best_rotation(one.rays, other.rays).T if align_columns else other.rays) - one.rays
+        return (other.rays @ best_rotation(one.rays, other.rays).T if aligned else other.rays) - one.rays
 
     chords = np.linalg.norm(difference(first.nominal, second.nominal), axis=1)
     seen = np.isfinite(chords)
@@ -209,7 +220,7 @@ def _ray_difference(
     return RayDifference(
         float(angles_deg[seen].mean()),
         float(angles_deg[worst]),
-        tuple(map(float, pixels[worst])),
+        _as_pixel(pixels[worst]),
         None if sigma is None else math.degrees(sigma),
     )
 
@@ -217,13 +228,14 @@ def _ray_difference(
 def _road_differences(
     first: _PerturbedRays, second: _PerturbedRays, ahead: np.ndarray
 ) -> tuple[tuple[RoadDifference, ...], list[str]]:
-    """Compare where the pixels `ahead` (m, 2), the last of both sides, meet the road; nan is not in the image."""
+    """Compare the ground points of the pixels `ahead` (m, 2), the last of both sides; nan is outside the image."""
     far, count = max(GROUND_DISTANCES_M), len(ahead)
-    near = np.logical_and(*(np.abs(side.nominal.ground_points()) <= far for side in (first, second)))  # nan is not near
+    near = np.logical_and(*(np.abs(side.nominal.ground_points()) <= far for side in (first, second)))  # nan is False
     near[-count:] = False
     if np.count_nonzero(near) < 2:
-        return (), [f'the road is not compared: hardly a pixel shows it within {far:g} m in both']
-    found, notes = [], []
+        return (), [f'the road is not compared: hardly any pixel shows it within {far:g} m in both']
+    found: list[RoadDifference] = []
+    notes: list[str] = []
     for index, (distance, pixel) in enumerate(zip(GROUND_DISTANCES_M, ahead, strict=True)):
         if not np.isfinite(pixel).all():
             notes.append(f'{distance:g} m straight ahead is not in the image')
@@ -240,7 +252,7 @@ def _road_differences(
         found.append(
             RoadDifference(
                 distance,
-                tuple(map(float, pixel)),
+                _as_pixel(pixel),
                 math.inf if math.isnan(separation_m) else separation_m,
                 _sigma(first, second, difference),
             )
@@ -251,7 +263,7 @@ def _road_differences(
 def _sigma(
     first: _PerturbedRays, second: _PerturbedRays, difference: Callable[[_PixelRays, _PixelRays], np.ndarray]
 ) -> float | None:
-    """Return one sigma of the length of `difference` of the two (n,), None where no covariance is known."""
+    """Return one sigma of the length of `difference` (n,) by both covariances; None if one is unknown."""
     if first.perturbed is None or second.perturbed is None:
         return None
     moves = [difference(view, second.nominal) for view in first.perturbed] + [
@@ -264,7 +276,7 @@ def _sigma(
 
 
 def best_rotation(ones: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return the rotation (3, 3) that brings rays `others` (n, 3) nearest to `ones`, in the least-squares sense."""
+    """Return the rotation (3, 3) that best aligns rays `others` (n, 3) with `ones` in least squares (Kabsch 1976)."""
     both = np.isfinite(ones).all(axis=1) & np.isfinite(others).all(axis=1)
     if not both.any():
         return np.eye(3)
@@ -272,27 +284,23 @@ def best_rotation(ones: np.ndarray, others: np.ndarray) -> np.ndarray:
     return left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
 
 
-def _rotation_angle_deg(turn: np.ndarray) -> float:
-    """Return the angle of a rotation (3, 3)."""
-    off = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
-    return float(np.degrees(np.arctan2(np.linalg.norm(off), np.trace(turn) - 1.0)))
+def _as_pixel(values: np.ndarray) -> tuple[float, float]:
+    return float(values[0]), float(values[1])
+
+
+def _rotation_angle_deg(rotation: np.ndarray) -> float:
+    """Return the angle of a rotation (3, 3) in degrees."""
+    axis = np.array([rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]])
+    return float(np.degrees(np.arctan2(np.linalg.norm(axis), np.trace(rotation) - 1.0)))
 
 
 def _normal_angle_deg(first: GroundPlane, second: GroundPlane) -> float:
     return float(angles_deg(first.normal_in_camera, second.normal_in_camera))
 
 
-AGREEMENT_SIGMAS = 3.0
-"""Two calibrations of one camera are farther apart than this in one number out of 400."""
-SAME_LENS_TOLERANCE_PX = 0.5
-"""Two lenses that image every direction closer together than this serve every consumer alike."""
-EQUAL_RTOL = 1e-9
-"""Numbers relatively closer than this are one number."""
-
-
 @dataclass(frozen=True)
 class Difference:
-    """One number of A and of B, and one combined sigma of their difference, None where it cannot be told."""
+    """One parameter of A and of B, and the combined sigma of their difference, None if unknown."""
 
     name: str
     unit: str
@@ -302,18 +310,18 @@ class Difference:
 
     @property
     def difference(self) -> float:
-        """B less A."""
+        """B minus A."""
         return self.second - self.first
 
     @property
     def sigmas(self) -> float | None:
-        """How many combined sigmas that is."""
+        """The difference in combined sigmas."""
         return _sigma_count(abs(self.difference), self.sigma, max(abs(self.first), abs(self.second)))
 
 
 @dataclass(frozen=True)
 class RayDifference:
-    """Angles between the rays of equal pixels, over the whole image; sigma of the largest where it is."""
+    """Angles between the rays of equal pixels over the whole image, and one sigma of the largest."""
 
     mean_deg: float
     largest_deg: float
@@ -322,13 +330,13 @@ class RayDifference:
 
     @property
     def sigmas(self) -> float | None:
-        """How many combined sigmas the largest is."""
+        """The largest angle in combined sigmas."""
         return _sigma_count(self.largest_deg, self.sigma_deg, 1.0)
 
 
 @dataclass(frozen=True)
 class RoadDifference:
-    """How far apart A and B place the pixel in which A sees the road straight ahead at a distance."""
+    """Distance on the road between A's and B's ground points of the pixel that A sees straight ahead at a distance."""
 
     distance_m: float
     pixel: tuple[float, float]
@@ -337,40 +345,40 @@ class RoadDifference:
 
     @property
     def sigmas(self) -> float | None:
-        """How many combined sigmas that is."""
+        """The distance in combined sigmas."""
         return _sigma_count(self.separation_m, self.sigma_m, self.distance_m)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Comparison:
-    """All differences between A and B; what one of them does not hold is None or empty."""
+    """All differences between A and B; None or empty where one of them lacks the quantity."""
 
     lens: tuple[Difference, ...]
-    """Focal length, principal point x and y, and k1 and k2 where both are of one kind."""
+    """Focal length, principal point x and y, and k1 and k2 if comparable."""
     lens_px: float
-    """Largest distance between the images of one direction in the two lenses."""
+    """Largest distance in pixels between the images of one direction in the two lenses."""
     rays: RayDifference
     rays_aligned: RayDifference
-    """After the best rotation between the two."""
+    """The same after the rotation that aligns B's rays with A's."""
     alignment_deg: float
-    """The angle of that rotation."""
+    """Angle of that rotation."""
     pose: tuple[Difference, ...] = ()
-    """Tilt, roll, and height where both are in metres."""
+    """Tilt, roll, and height if both are in metres."""
     normal_deg: float | None = None
-    """Angle between the two normals of the road in the camera."""
+    """Angle between the ground normals in the camera frame."""
     road: tuple[RoadDifference, ...] = ()
     stated: tuple[bool, bool] = (True, True)
     """Whether A and B state standard deviations."""
     notes: tuple[str, ...] = ()
-    """What was not compared, and why."""
+    """Quantities that were not compared, and why."""
 
     @property
     def same_lens(self) -> bool:
-        """Whether the lenses serve every consumer alike, whatever their numbers."""
+        """Whether the lenses are equivalent in use, whatever their parameters."""
         return self.lens_px <= SAME_LENS_TOLERANCE_PX
 
     def terms(self) -> list[tuple[str, float | None]]:
-        """Return what the verdict goes by, with how many sigmas each is; None where nothing tells."""
+        """Return the terms of the verdict with their difference in sigmas; None if unknown."""
         lens = [*((item.name, item.sigmas) for item in self.lens)]
         if self.rays_aligned.sigma_deg is not None:
             lens.append(('the shape of the lens', self.rays_aligned.sigmas))
@@ -382,30 +390,31 @@ class Comparison:
 
     @property
     def agrees(self) -> bool | None:
-        """Whether everything is within AGREES_SIGMAS; None where nothing tells."""
+        """Whether all terms are within `AGREEMENT_SIGMAS`; None if that is unknown."""
         sigmas = [sigmas for _, sigmas in self.terms()]
         if any(value is not None and value > AGREEMENT_SIGMAS for value in sigmas):
             return False
         return None if None in sigmas else True
 
     def verdict(self) -> str:
-        """Say it in one sentence."""
+        """Return the verdict as one sentence."""
         what = 'The calibrations' if self.pose else 'The lenses'
         if self.agrees is None:
             return (
-                f'Whether {what.lower()} agree cannot be told: neither states standard deviations, and the lenses'
-                f' are up to {self.lens_px:.3g} px apart.'
+                f'Agreement of {what.lower()} is unknown: neither states standard deviations, and the lenses'
+                f' differ by up to {self.lens_px:.3g} px.'
             )
         if self.agrees:
-            largest, sigmas = max(self.terms(), key=lambda pair: pair[1], default=('', 0.0))
-            far = (
-                f'; farthest apart is {largest}, {sigmas:.1f} sigmas'
+            known = [(name, sigmas) for name, sigmas in self.terms() if sigmas is not None]
+            largest, sigmas = max(known, key=lambda pair: pair[1], default=('', 0.0))
+            detail = (
+                f'; the largest difference is {largest}, {sigmas:.1f} sigmas'
                 if largest
-                else (f': up to {self.lens_px:.2g} px apart')
+                else f': they differ by up to {self.lens_px:.2g} px'
             )
-            return f'{what} agree within {AGREEMENT_SIGMAS:g} combined sigmas{far}.'
+            return f'{what} agree within {AGREEMENT_SIGMAS:g} combined sigmas{detail}.'
         beyond = [
-            f'{name} ({_sigmas_words(sigmas)})'
+            f'{name} ({_format_sigmas(sigmas)})'
             for name, sigmas in self.terms()
             if sigmas is not None and sigmas > AGREEMENT_SIGMAS
         ]
@@ -420,7 +429,7 @@ def _sigma_count(difference: float, sigma: float | None, size: float) -> float |
     return difference / sigma if sigma > 0 else math.inf
 
 
-def _sigmas_words(sigmas: float) -> str:
+def _format_sigmas(sigmas: float) -> str:
     return f'{sigmas:.1f} sigmas' if math.isfinite(sigmas) else 'both exact'
 
 

@@ -1,7 +1,7 @@
-"""Every option of the program and its default: they live here and nowhere else.
+"""All options of the program with their defaults, units and permitted ranges.
 
-The replay, the live node and `config/autocalib.yaml` walk these dataclasses. An option's full name is
-its path, `tracking.max_points` say; an unknown name is an error.
+Each default stands here only. The replay, the live node and `config/autocalib.yaml` walk these dataclasses. The full
+name of an option is its path, for example `tracking.max_points`; an unknown name raises UsageError.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from autocalib_ros.errors import UsageError
 def option(
     default: Any, doc: str, *, low: float | None = None, high: float | None = None, choices: tuple[str, ...] = ()
 ) -> Any:
-    """Declare a field with its default, description and permitted values."""
+    """Declare a dataclass field with its default, description and permitted values."""
     return field(default=default, metadata={'doc': doc, 'low': low, 'high': high, 'choices': choices})
 
 
 class _Validated:
-    """Checks every field against its declared type, range and choices."""
+    """Validates each field against its declared type, range and choices."""
 
     def __post_init__(self) -> None:
         for item in dataclasses.fields(self):  # type: ignore[arg-type]
@@ -33,7 +33,7 @@ class _Validated:
 
 
 def _validated(item: dataclasses.Field, value: Any) -> Any:
-    """Return the value of `item` in its declared type, or say what would be accepted."""
+    """Return `value` in the declared type of `item`; raise UsageError that names the accepted values."""
     kind, meta = type(item.default), item.metadata
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
@@ -49,34 +49,36 @@ def _validated(item: dataclasses.Field, value: Any) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class TrackingOptions(_Validated):
-    """Points on moving objects, followed by pyramidal Lucas-Kanade optical flow."""
+    """Keypoints on moving objects, tracked by pyramidal Lucas-Kanade optical flow."""
 
-    max_points: int = option(200, 'points followed at once', low=20, high=5000)
-    window_px: int = option(11, 'side of the square patch that is followed', low=5, high=61)
-    pyramid_levels: int = option(3, 'image pyramid levels above the full resolution', low=0, high=6)
-    detect_every: int = option(6, 'frames between two searches for new points and segments', low=1, high=100)
-    min_spacing_px: float = option(10.0, 'side of the cells of which each holds one point at the most', low=1, high=100)
-    round_trip_px: float = option(0.7, 'a point is lost when following it back misses by more', low=0.05, high=10)
-    max_samples: int = option(100, 'points kept of one track, spread evenly along it', low=8, high=500)
+    max_points: int = option(200, 'maximum number of points tracked at a time', low=20, high=5000)
+    window_px: int = option(11, 'side of the square tracking window, pixels', low=5, high=61)
+    pyramid_levels: int = option(3, 'image pyramid levels above full resolution', low=0, high=6)
+    detect_every: int = option(6, 'frames between two detections of keypoints and segments', low=1, high=100)
+    min_spacing_px: float = option(
+        10.0, 'side of the grid cells that hold at most one point each, pixels', low=1, high=100
+    )
+    round_trip_px: float = option(0.7, 'maximum forward-backward error of a tracked point, pixels', low=0.05, high=10)
+    max_samples: int = option(100, 'maximum points stored per track, evenly spaced along it', low=8, high=500)
 
 
 @dataclass(frozen=True, kw_only=True)
 class MotionOptions(_Validated):
-    """Vehicle mask by motion: what differs from a slowly learned background."""
+    """Motion mask: background subtraction with a slowly updated background."""
 
-    width_px: int = option(320, 'width at which motion is looked for', low=80, high=1920)
-    history_s: float = option(20.0, 'time constant of the learned background', low=1, high=600)
-    min_area: float = option(0.00015, 'least area of a moving region, share of the image', low=0, high=0.1)
+    width_px: int = option(320, 'image width for background subtraction, pixels', low=80, high=1920)
+    history_s: float = option(20.0, 'time constant of the background model, seconds', low=1, high=600)
+    min_area: float = option(0.00015, 'minimum area of a moving region, fraction of the image', low=0, high=0.1)
 
 
 @dataclass(frozen=True, kw_only=True)
 class DetectorOptions(_Validated):
-    """Vehicles by a detector in ONNX; auto goes by what the model says of itself, whatever else is set wins."""
+    """Vehicle detector in ONNX. auto: taken from the metadata, inputs and outputs of the model."""
 
-    model: str = option('', "ONNX file of the detector; '' is none: vehicles are what moves")
+    model: str = option('', 'path of the ONNX file; empty: no detector, moving regions are taken as vehicles')
     layout: str = option(
         'auto',
-        'how the model says its boxes: auto tells by the shapes and names of its outputs',
+        'output layout of the model; auto: recognised by the shapes and names of its outputs',
         choices=(
             'auto',
             'yolox',
@@ -96,65 +98,64 @@ class DetectorOptions(_Validated):
     )
     input_size: int = option(
         0,
-        'longest side of the image for a model that takes any size, pixels; 0 is that of the '
-        'camera up to 1280; smaller images are never enlarged',
+        'longest side of the input image for a model with dynamic input size, pixels; 0: that of the camera, '
+        'at most 1280. Images are never enlarged',
         low=0,
         high=8192,
     )
-    confidence: float = option(0.4, 'least score of a detection', low=0.01, high=1)
+    confidence: float = option(0.4, 'minimum score of a detection', low=0.01, high=1)
     nms_iou: float = option(
         0.5,
-        'of two boxes whose overlap is a larger share of their union, one is left, whatever their classes',
+        'non-maximum suppression: maximum intersection over union of two detections, across classes',
         low=0.05,
         high=1,
     )
     class_ids: str = option(
         '',
-        "numbers of the model's classes that are vehicles and, after a slash, people, as text: "
-        "'2 3 5 7 / 0 1' is COCO; '' goes by the names in the model, else COCO",
+        "class ids of vehicles and, after a slash, of people, as text: '2 3 5 7 / 0 1' for COCO; empty: by the "
+        'class names in the model, else COCO',
     )
     channel_order: str = option(
         'auto',
-        'order of the colours that the model takes; auto: bgr for yolox, else rgb',
+        'channel order of the input; auto: bgr for yolox, else rgb',
         choices=('auto', 'bgr', 'rgb'),
     )
     input_scale: float = option(
-        0.0, 'what the model takes for white, 255 or 1; 0 is auto: 255 for yolox, else 1', low=0, high=65535
+        0.0, 'input value of a white pixel, 255 or 1; 0: automatic, 255 for yolox, else 1', low=0, high=65535
     )
     mean_std: str = option(
         'auto',
-        "whether colours are normalised by ImageNet's mean and standard deviation; auto: for detr",
+        'input normalisation by the ImageNet mean and standard deviation; auto: imagenet for detr, else none',
         choices=('auto', 'none', 'imagenet'),
     )
     resize_mode: str = option(
         'auto',
-        'how an image comes to the size of the model: padded at the right and below, padded all around, or '
-        'stretched; auto goes by the layout',
+        'how images are resized to the input size: top_left pads at the right and below, centred pads on all sides, '
+        'stretch does not keep the aspect ratio; auto: by the layout',
         choices=('auto', 'top_left', 'centred', 'stretch'),
     )
     providers: str = option(
         'CPUExecutionProvider',
-        'execution providers of onnxruntime, the preferred one first, as '
-        "text: 'TensorrtExecutionProvider CUDAExecutionProvider' say",
+        "execution providers of onnxruntime in order of preference, as text: 'TensorrtExecutionProvider "
+        "CUDAExecutionProvider' for example",
     )
-    threads: int = option(1, 'threads of one detection on the processor', low=1, high=256)
+    threads: int = option(1, 'CPU threads for one inference', low=1, high=256)
     every_s: float = option(
         0.2,
-        'seconds between two detections: every sixth image at 30 Hz; in between boxes follow '
-        'the points on their vehicles',
+        'seconds between two detections, every sixth image at 30 Hz; between them boxes follow the tracked points',
         low=0.01,
         high=10,
     )
 
     def __post_init__(self) -> None:
         if isinstance(self.class_ids, int) and not isinstance(self.class_ids, bool):
-            object.__setattr__(self, 'class_ids', str(self.class_ids))  # YAML reads one class as a number
+            object.__setattr__(self, 'class_ids', str(self.class_ids))  # YAML parses a single class id as an int
         super().__post_init__()
         _ = self.chosen_classes
 
     @property
     def chosen_classes(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
-        """Classes of vehicles and of people in `class_ids`; two empty tuples where it is empty."""
+        """Class ids of vehicles and of people from `class_ids`; two empty tuples if it is empty."""
         vehicles, _, people = self.class_ids.replace(',', ' ').partition('/')
         try:
             chosen = tuple(map(int, vehicles.split())), tuple(map(int, people.split()))
@@ -162,39 +163,39 @@ class DetectorOptions(_Validated):
             chosen = (), (-1,)
         if min(sum(chosen, ()), default=0) < 0 or (self.class_ids.strip() and not chosen[0]):
             raise UsageError(
-                "option 'class_ids' is whole numbers in one text, vehicles first and people after a "
-                f"slash, '2 3 5 7 / 0 1' for example; got {self.class_ids!r}"
+                "option 'class_ids' takes whole numbers in one text, vehicles first, people after a slash, for example "
+                f"'2 3 5 7 / 0 1'; got {self.class_ids!r}"
             )
         return chosen
 
 
 @dataclass(frozen=True, kw_only=True)
 class BufferOptions(_Validated):
-    """The buffer of evidence, bounded in number."""
+    """Evidence buffer: age and number of stored observations."""
 
     seconds: float = option(
         900.0,
-        'evidence older than this is forgotten where enough newer vehicles went the same way through the same '
-        'part of the image, and all of it when the camera moved',
+        'maximum age of evidence, seconds. Older evidence is dropped once enough newer vehicles took the same path '
+        'through the same part of the image, and all of it after the camera moved',
         low=5,
         high=86400,
     )
     max_tracks: int = option(
-        8000, 'tracks kept at the most; vehicles that add least to newer ones go first', low=50, high=100000
+        8000, 'maximum number of tracks; the most redundant vehicles are dropped first', low=50, high=100000
     )
     max_segments: int = option(
-        20000, 'segments kept at the most; vehicles that add least to newer ones go first', low=100, high=1000000
+        20000, 'maximum number of segments; the most redundant vehicles are dropped first', low=100, high=1000000
     )
     max_edges: int = option(
         10000,
-        'straight edges on vehicles kept at the most; vehicles that add least to newer ones go first',
+        'maximum number of straight vehicle edges; the most redundant vehicles are dropped first',
         low=100,
         high=1000000,
     )
     max_outlines: int = option(
         8000,
-        'outlines of what moves kept at the most, by which cyclists are told; those that '
-        'add least to newer ones go first',
+        'maximum number of silhouettes of moving objects, used to classify cyclists; the most redundant vehicles are '
+        'dropped first',
         low=100,
         high=1000000,
     )
@@ -202,85 +203,96 @@ class BufferOptions(_Validated):
 
 @dataclass(frozen=True, kw_only=True)
 class PaperOptions(_Validated):
-    """Constants of Jain & Saunier's method as published."""
+    """Constants of the published method (Jain & Saunier, arXiv 2001.07243)."""
 
-    window_s: float = option(6.0, 'observed interval that a track has to fill', low=1, high=600)
-    min_lifetime: float = option(0.8, 'least share of the interval that a track lived', low=0, high=1)
-    max_path_ratio: float = option(1.2, 'largest path length / displacement', low=1, high=10)
-    longest: int = option(10, 'number of tracks used for the focal length', low=1, high=10000)
-    focal_steps: int = option(300, 'trial focal lengths up to the image diagonal', low=10, high=10000)
-    cluster_deg: float = option(5.0, 'half width of a cluster of orientations', low=0.5, high=30)
-    min_separation_deg: float = option(25.0, 'least angle between the two orientations', low=5, high=90)
-    vote_share: float = option(0.8, 'a cell counts when it has this share of the most votes', low=0.1, high=1)
-    vote_sigmas: float = option(2.0, 'the vanishing point lies so many sigmas outwards of the mean', low=0, high=5)
+    window_s: float = option(6.0, 'observation interval that a track must span, seconds', low=1, high=600)
+    min_lifetime: float = option(
+        0.8, 'minimum lifetime of a track, fraction of the observation interval', low=0, high=1
+    )
+    max_path_ratio: float = option(1.2, 'maximum ratio of path length to displacement', low=1, high=10)
+    longest: int = option(10, 'number of longest tracks used for the focal length', low=1, high=10000)
+    focal_steps: int = option(300, 'number of trial focal lengths up to the image diagonal', low=10, high=10000)
+    cluster_deg: float = option(5.0, 'half width of an orientation cluster, degrees', low=0.5, high=30)
+    min_separation_deg: float = option(25.0, 'minimum angle between the two orientations, degrees', low=5, high=90)
+    vote_share: float = option(0.8, 'threshold of the vanishing point votes, fraction of the maximum', low=0.1, high=1)
+    vote_sigmas: float = option(
+        2.0, 'outward offset of the vanishing point from the mean, standard deviations', low=0, high=5
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
 class JointOptions(_Validated):
-    """The robust method."""
+    """Robust method: joint bundle adjustment of lens, roads and ground plane."""
 
-    max_tracks: int = option(1500, 'tracks in one solution, spread over image, roads and time', low=20, high=10000)
-    noise_px: float = option(0.3, 'standard deviation of a tracked position', low=0.01, high=10)
-    wander_m: float = option(0.06, "standard deviation of a driver's way from a straight line, metres", low=0, high=2)
+    max_tracks: int = option(
+        1500, 'maximum number of tracks in one solution, spread over image, roads and time', low=20, high=10000
+    )
+    noise_px: float = option(0.3, 'standard deviation of a tracked position, pixels', low=0.01, high=10)
+    wander_m: float = option(
+        0.06, 'standard deviation of the lateral deviation from a straight path, metres', low=0, high=2
+    )
     drift_px: float = option(
         0.05,
-        'where tracked points drift: standard deviation after a way of one pixel, which grows with the root of the way',
+        'tracking drift: standard deviation after one pixel of travel; grows with the square root of the travel',
         low=0,
         high=1,
     )
     heading_deg: float = option(
-        0.25, "where tracked points drift: standard deviation of a track's heading from that of its road", low=0, high=5
+        0.25, "tracking drift: standard deviation of a track's heading about its road, degrees", low=0, high=5
     )
     lens_prior: str = option(
         'auto',
-        'family of the lens: let the traffic choose, near equidistant, free of distortion, or any in between',
+        'lens family: auto selects by the traffic, kannala_brandt allows any lens between the other two',
         choices=('auto', 'equidistant', 'distortion_free', 'kannala_brandt'),
     )
-    focal_prior_px: float = option(0.0, 'focal length that is known beforehand; 0 is unknown', low=0, high=1e6)
-    focal_sigma_px: float = option(0.0, 'standard deviation of focal_prior_px; 0 holds it', low=0, high=1e6)
-    k1_sigma: float = option(0.03, "standard deviation of k1 about its family's; 0 holds it", low=0, high=1)
+    focal_prior_px: float = option(0.0, 'prior focal length, pixels; 0: unknown', low=0, high=1e6)
+    focal_sigma_px: float = option(
+        0.0, 'standard deviation of focal_prior_px, pixels; 0: fixed at the prior', low=0, high=1e6
+    )
+    k1_sigma: float = option(
+        0.03, 'standard deviation of k1 about the value of its family; 0: fixed at that value', low=0, high=1
+    )
     principal_point_sigma_px: float = option(
         -1.0,
-        'standard deviation of the principal point about the image centre; 0 holds it there, negative is 1 % '
-        'of the width',
+        'standard deviation of the principal point about the image centre, pixels; 0: fixed at the centre, '
+        'negative: 1 % of the image width',
         low=-1,
         high=10000,
     )
     road_angle: str = option(
         'auto',
-        'angle between the two busiest roads: auto tests whether it is 90 degrees, free never uses it, a '
-        'number of degrees asserts it',
+        'angle between the two busiest roads, degrees; auto: test whether it is 90, free: do not use it',
     )
     roll_prior_deg: float = option(
         0.0,
-        'where one road alone is seen: standard deviation of the roll of a camera that is taken for level, in '
-        'degrees; it then gives a ground plane of grade assumed; 0 does not allow that',
+        'single road: standard deviation of the roll of a level camera, degrees; gives a ground plane of grade '
+        'assumed; 0: no such assumption',
         low=0,
         high=10,
     )
     transverse_edges: bool = option(
         True,
-        'where one road alone is seen: take bumpers, windscreens and roof lines of vehicles for square to it; '
-        'they then give a ground plane of grade assumed',
+        'single road: assume that bumpers, windscreens and roof lines of vehicles are perpendicular to it; gives a '
+        'ground plane of grade assumed',
     )
     road_markings: bool = option(
         True,
-        'where the traffic alone gives no full result: take lane lines, stop lines, crosswalks and kerbs for '
-        'parallel or square to each other; where the traffic agrees they give lens and ground plane, of grade assumed',
+        'when traffic alone gives no full result: assume that lane lines, stop lines, crosswalks and kerbs are '
+        'parallel or perpendicular; gives lens and ground plane of grade assumed if traffic confirms them',
     )
 
     def __post_init__(self) -> None:
         if isinstance(self.road_angle, (int, float)) and not isinstance(self.road_angle, bool):
-            object.__setattr__(self, 'road_angle', f'{self.road_angle:g}')  # YAML reads degrees as a number
+            object.__setattr__(self, 'road_angle', f'{self.road_angle:g}')  # YAML parses an angle as a number
         super().__post_init__()
         if self.road_angle not in ('auto', 'free') and self.crossing_deg is None:
             raise UsageError(
-                f"option 'road_angle' is auto, free, or degrees between 10 and 170; got {self.road_angle!r}"
+                f"option 'road_angle' is auto, free, or an angle between 10 and 170 degrees; got {self.road_angle!r}"
             )
 
     @property
     def crossing_deg(self) -> float | None:
-        """The asserted angle between the roads in degrees, None where none is."""
+        """The given angle between the roads in degrees; None for auto and free."""
         try:
             angle = float(self.road_angle)
         except ValueError:
@@ -289,124 +301,139 @@ class JointOptions(_Validated):
 
 
 MIN_PIXEL_SEPARATION_SIGMAS = 10.0
-"""Pixels that bound a known length are at least so many of their standard deviations apart."""
+"""Minimum distance of the two pixels of a known length, in units of their standard deviation: 10 % of the scale."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ScaleOptions(_Validated):
-    """What tells the scale of the ground plane when scale_from is not height."""
+    """Metric scale of the ground plane from a known distance or speed, for scale_from other than height."""
 
     distance_px: str = option(
-        '', "two pixels of the full image on the road a known distance apart, as text: 'u1 v1 u2 v2'"
+        '', "two road pixels of the full image with a known distance between them, as text: 'u1 v1 u2 v2'"
     )
-    distance_m: float = option(0.0, 'metres between them, straight over the road; 0 is unknown', low=0, high=1000)
-    distance_sigma_m: float = option(0.05, 'standard deviation of distance_m', low=0, high=100)
-    pixel_sigma_px: float = option(1.0, 'standard deviation of each coordinate of distance_px', low=0, high=100)
+    distance_m: float = option(0.0, 'straight distance between them on the road, metres; 0: unknown', low=0, high=1000)
+    distance_sigma_m: float = option(0.05, 'standard deviation of distance_m, metres', low=0, high=100)
+    pixel_sigma_px: float = option(1.0, 'standard deviation of each coordinate of distance_px, pixels', low=0, high=100)
     speed_km_h: float = option(
         0.0,
-        'mean speed of the traffic that flows on the busiest road, as a loop or a radar counts it; 0 is unknown',
+        'mean speed of free-flowing traffic on the busiest road, as measured by a loop or a radar, km/h; 0: unknown',
         low=0,
         high=300,
     )
-    speed_sigma_km_h: float = option(5.0, 'standard deviation of speed_km_h, as a mean', low=0, high=100)
+    speed_sigma_km_h: float = option(5.0, 'standard deviation of the mean speed speed_km_h, km/h', low=0, high=100)
     point_height_m: float = option(
-        0.75, 'mean height above the road of the points tracked on vehicles: half the height of a car', low=0, high=5
+        0.75,
+        'mean height above the road of tracked points on vehicles, about half the height of a car, metres',
+        low=0,
+        high=5,
     )
-    point_height_sigma_m: float = option(0.3, 'standard deviation of point_height_m, as a mean', low=0, high=5)
+    point_height_sigma_m: float = option(
+        0.3, 'standard deviation of the mean height point_height_m, metres', low=0, high=5
+    )
 
     def __post_init__(self) -> None:
         pixels = self.pixels
         super().__post_init__()
-        apart = math.dist(*pixels) if pixels else math.inf
-        if apart < max(MIN_PIXEL_SEPARATION_SIGMAS * self.pixel_sigma_px, 1.0):
+        separation = math.dist(*pixels) if pixels else math.inf
+        if separation < max(MIN_PIXEL_SEPARATION_SIGMAS * self.pixel_sigma_px, 1.0):
             raise UsageError(
-                f"the pixels of 'scale.distance_px' are {apart:.1f} px apart, which tells no scale when "
-                f'each is known to {self.pixel_sigma_px:g} px: take two that are far from each other'
+                f"the pixels of 'scale.distance_px' are {separation:.1f} px apart, too close for a scale when "
+                f'each has a standard deviation of {self.pixel_sigma_px:g} px: choose two pixels farther apart'
             )
 
     @property
     def pixels(self) -> tuple[tuple[float, float], ...]:
-        """The two pixels (u, v) of `distance_px`; none where it is empty."""
+        """The two pixels (u, v) of `distance_px`; empty if it is empty."""
         try:
             numbers = [float(word) for word in self.distance_px.replace(',', ' ').split()]
-        except (ValueError, AttributeError):  # words, or what is no text at all
+        except (ValueError, AttributeError):  # not numbers, or not text
             numbers = [math.nan]
         if len(numbers) not in (0, 4) or not all(map(math.isfinite, numbers)):
             raise UsageError(
-                "option 'scale.distance_px' is four numbers in one text, '412 530 888 530' for example; "
+                "option 'scale.distance_px' takes four numbers in one text, for example '412 530 888 530'; "
                 f'got {self.distance_px!r}'
             )
         return tuple(zip(numbers[::2], numbers[1::2], strict=True))
 
     def require_inside(self, width: int, height: int) -> None:
-        """Raise UsageError when a pixel lies outside images of that size."""
+        """Raise UsageError if a pixel of `distance_px` lies outside an image of `width` x `height`."""
         for u, v in self.pixels:
             if not (-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5):
                 raise UsageError(
-                    f"pixel ({u:g}, {v:g}) of 'scale.distance_px' lies outside the images, which have "
-                    f'{width}x{height}: give pixels of the full image as the camera sends it'
+                    f"pixel ({u:g}, {v:g}) of 'scale.distance_px' lies outside the images, which have {width}x{height}:"
+                    ' give pixels of the full image as the camera sends it'
                 )
 
 
 @dataclass(frozen=True, kw_only=True)
 class GateOptions(_Validated):
-    """What has to hold before a calibration is accepted."""
+    """Acceptance limits of a calibration."""
 
-    min_tracks: int = option(40, 'tracks needed', low=4, high=100000)
-    min_tracks_per_road: int = option(10, 'tracks needed of each of two roads', low=2, high=100000)
-    min_coverage: float = option(0.15, 'share of image cells that tracks have crossed', low=0, high=1)
-    max_sigma_focal_rel: float = option(0.05, 'largest standard deviation of the focal length, relative', low=0, high=1)
-    max_sigma_tilt_deg: float = option(1.5, 'largest standard deviation of the ground normal', low=0, high=45)
-    max_sigma_height_rel: float = option(
-        0.2, "largest standard deviation of the camera's height, relative", low=0, high=1
+    min_tracks: int = option(40, 'minimum number of tracks', low=4, high=100000)
+    min_tracks_per_road: int = option(10, 'minimum number of tracks on each of two roads', low=2, high=100000)
+    min_coverage: float = option(0.15, 'minimum fraction of image cells crossed by tracks', low=0, high=1)
+    max_sigma_focal_rel: float = option(
+        0.05, 'maximum standard deviation of the focal length, fraction of it', low=0, high=1
     )
-    max_drift_px: float = option(3.0, 'background drift that a fixed camera stays below, at 1280 px width', low=0.1)
+    max_sigma_tilt_deg: float = option(1.5, 'maximum standard deviation of the ground normal, degrees', low=0, high=45)
+    max_sigma_height_rel: float = option(
+        0.2, 'maximum standard deviation of the camera height, fraction of it', low=0, high=1
+    )
+    max_drift_px: float = option(
+        3.0, 'maximum background drift of a fixed camera, pixels at an image width of 1280', low=0.1
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Options(_Validated):
-    """All that the core is told from outside."""
+    """Options of the core, shared by replay and live node."""
 
-    method: str = option('joint', "'joint' is the robust method, 'paper' the published one", choices=('joint', 'paper'))
+    method: str = option(
+        'joint',
+        'estimation method; joint: robust bundle adjustment, paper: as published by Jain & Saunier',
+        choices=('joint', 'paper'),
+    )
     scale_from: str = option(
         'height',
-        "what tells the scale: the camera's height, a distance on the road, or the mean speed of the traffic",
+        'source of the metric scale: camera height, a distance on the road, or the mean traffic speed',
         choices=('height', 'distance', 'speed'),
     )
-    camera_height: float = option(0.0, 'height of the camera above the road, metres; 0 is unknown', low=0, high=500)
-    camera_height_sigma: float = option(
-        0.0, 'standard deviation of camera_height, metres; 0 takes it as exact', low=0, high=100
+    camera_height: float = option(0.0, 'height of the camera above the road, metres; 0: unknown', low=0, high=500)
+    camera_height_sigma: float = option(0.0, 'standard deviation of camera_height, metres; 0: exact', low=0, high=100)
+    allow_unit_scale: bool = option(
+        False, 'publish the ground plane in units of the camera height if the height is unknown'
     )
-    allow_unit_scale: bool = option(False, 'without a height, give the ground plane in units of the height')
     distortion_model: str = option(
         'auto',
-        'how camera_info says the lens: auto is equidistant, which is exact; the others are fitted to what the '
-        'image shows, and refused where they are off by more than 0.5 px',
+        'distortion model of the published CameraInfo; auto: equidistant, which is exact. The others are fitted to '
+        'the visible field and refused if the error exceeds 0.5 px',
         choices=('auto', 'equidistant', 'rational_polynomial', 'plumb_bob'),
     )
     rectified_balance: float = option(
         0.0,
-        'P of camera_info, the camera of the rectified image: at 0 it holds valid pixels only, at 1 all that the '
-        'lens shows up to 80 degrees from its axis',
+        'crop of the rectified image, P of CameraInfo; 0: valid pixels only, 1: the whole field of view up to 80 '
+        'degrees from the optical axis',
         low=0,
         high=1,
     )
     tf_parent: str = option(
         'ground',
-        'parent frame of the ground transform: with ground, the child is the camera; '
-        'with camera, for a camera whose frame has a parent already, it is the ground',
+        'parent frame of the ground transform; camera: for a camera frame that already has a parent, so that the '
+        'ground frame is the child',
         choices=('ground', 'camera'),
     )
-    max_image_width: int = option(1280, 'wider images are reduced to this width for tracking', low=160, high=16384)
+    max_image_width: int = option(
+        1280, 'maximum image width for tracking, pixels; wider images are scaled down', low=160, high=16384
+    )
     ignore_regions: str = option(
         '',
-        "polygons in pixels of the full image, as text 'u1 v1 u2 v2 u3 v3; ...', that are never tracked, and black "
-        'in every picture that is written',
+        "polygons in pixels of the full image, as text 'u1 v1 u2 v2 u3 v3; ...', excluded from tracking and blacked "
+        'out in all written pictures',
     )
     random_seed: int = option(0, 'seed of the consensus searches', low=0)
-    first_solve_s: float = option(10.0, 'seconds of recording before the first solution is tried', low=0)
-    solve_growth: float = option(1.2, 'a new solution is tried when the evidence has grown by this factor', low=1.01)
-    solve_interval_s: float = option(5.0, 'least seconds of recording between two solutions', low=0.1)
+    first_solve_s: float = option(10.0, 'recording time before the first solution, seconds', low=0)
+    solve_growth: float = option(1.2, 'growth factor of the evidence that triggers a new solution', low=1.01)
+    solve_interval_s: float = option(5.0, 'minimum recording time between two solutions, seconds', low=0.1)
     tracking: TrackingOptions = field(default_factory=TrackingOptions)
     motion: MotionOptions = field(default_factory=MotionOptions)
     detector: DetectorOptions = field(default_factory=DetectorOptions)
@@ -423,13 +450,13 @@ class Options(_Validated):
 
     @property
     def ignored_polygons(self) -> tuple[tuple[tuple[float, float], ...], ...]:
-        """The polygons of `ignore_regions`, each of three points (u, v) or more; none where it is empty."""
+        """Polygons of `ignore_regions`, each of at least three points (u, v); empty if it is empty."""
         return tuple(
             _polygon(text) for text in self.ignore_regions.strip().rstrip(';').split(';') if self.ignore_regions.strip()
         )
 
     def _require_one_scale(self) -> None:
-        """Raise UsageError unless what is given of the scale is what `scale_from` names, whole."""
+        """Raise UsageError unless exactly the values that `scale_from` needs are given."""
         scale = self.scale
         given = {
             'height': {'camera_height': self.camera_height > 0},
@@ -440,84 +467,91 @@ class Options(_Validated):
             extra = [name for name, there in parts.items() if there]
             if source != self.scale_from and extra:
                 raise UsageError(
-                    f"the scale comes from one source: 'scale_from' is {self.scale_from}, and "
-                    f"'{extra[0]}' is given too; leave that out, or set 'scale_from' to {source} and give "
-                    'nothing else'
+                    f"the scale comes from one source: 'scale_from' is {self.scale_from}, but '{extra[0]}' is given "
+                    f"too; remove it, or set 'scale_from' to {source} and give only the values for that"
                 )
         missing = [name for name, there in given[self.scale_from].items() if not there]
         if self.scale_from != 'height' and missing:
-            raise UsageError(f"'scale_from' is {self.scale_from}, which needs '{missing[0]}': give it")
+            raise UsageError(f"'scale_from' {self.scale_from} needs '{missing[0]}'")
         if self.camera_height_sigma > 0 and not self.camera_height > 0:
-            raise UsageError("'camera_height_sigma' is given without 'camera_height': give both or neither")
+            raise UsageError("'camera_height_sigma' needs 'camera_height': give both or neither")
         if self.scale_from == 'speed' and self.method == 'paper':
             raise UsageError(
-                "the published method tells no road's traffic apart: with 'method' paper, 'scale_from' is "
-                'height or distance'
+                "'method' paper does not assign traffic to roads: use 'scale_from' height or distance with it"
             )
 
 
 @dataclass(frozen=True, kw_only=True)
 class NodeOptions(_Validated):
-    """What only the live node needs; the replay accepts these names in a shared file and ignores them."""
+    """Options of the live node; the replay accepts and ignores them in a shared file."""
 
     image_transport: str = option(
-        'raw', 'image topic: sensor_msgs/Image or CompressedImage on <image>/compressed', choices=('raw', 'compressed')
+        'raw',
+        'image topic type: sensor_msgs/Image, or CompressedImage on <image>/compressed',
+        choices=('raw', 'compressed'),
     )
     image_reliability: str = option(
         'auto',
-        "reliability of the image subscription; 'auto' matches the publisher",
+        'reliability of the image subscription; auto: that of the publisher',
         choices=('auto', 'reliable', 'best_effort'),
     )
-    camera_name: str = option('', "name used for frames and files; '' takes the namespace or the image's frame_id")
-    camera_frame: str = option('', "frame of the camera; '' takes the image's frame_id")
-    ground_frame: str = option('', "frame of the ground plane; '' is <camera_name>_ground")
-    camera_info_file: str = option(
-        '', "file with the lens, as camera_info_manager writes it: only the pose is then solved; '' finds the lens too"
+    camera_name: str = option(
+        '', 'name used for frames and files; empty: the namespace, else the frame_id of the images'
     )
-    publish_tf: bool = option(True, 'publish the ground transform on /tf_static too, where tf2_msgs is there')
+    camera_frame: str = option('', 'frame of the camera; empty: the frame_id of the images')
+    ground_frame: str = option('', 'frame of the ground plane; empty: <camera_name>_ground')
+    camera_info_file: str = option(
+        '',
+        'path of a known lens in the format of camera_info_manager, then only the pose is estimated; empty: the '
+        'lens is estimated too',
+    )
+    publish_tf: bool = option(True, 'also publish the ground transform on /tf_static, if tf2_msgs is installed')
     camera_info_url: str = option(
         '',
-        "where the calibration is kept, in camera_info_manager's syntax: file:///..., "
-        "package://PACKAGE/..., with ${NAME} and ${ROS_HOME}; '' is "
-        'file://${ROS_HOME}/camera_info/${NAME}.yaml',
+        'where the calibration is stored, in the URL syntax of camera_info_manager: file:///... or '
+        'package://PACKAGE/..., with ${NAME} and ${ROS_HOME}; empty: file://${ROS_HOME}/camera_info/${NAME}.yaml',
     )
     autosave: bool = option(
-        True, 'keep each new calibration at camera_info_url, at most once a minute; off: only ~/save writes'
+        True, 'store each new calibration at camera_info_url, at most once a minute; false: only ~/save writes'
     )
     upload_to_driver: bool = option(
-        False, "send each new calibration to the driver's set_camera_info, at most once a minute"
+        False, "send each new calibration to the driver's set_camera_info service, at most once a minute"
     )
     use_driver_camera_info: bool = option(
         False,
-        "subscribe the driver's CameraInfo on camera_info_in: its binning and roi are published too, and its "
-        'size is compared with that of the images',
+        "subscribe to the driver's CameraInfo on camera_info_in, copy its binning and roi, and compare its size with "
+        'that of the images',
     )
     camera_info_mode: str = option(
-        'per_image', 'publish camera_info with each image or when it changes', choices=('per_image', 'latched_only')
+        'per_image',
+        'when camera_info is published: with each image, or only when it changes',
+        choices=('per_image', 'latched_only'),
     )
     debug_rate_hz: float = option(
         5.0,
-        'most pictures a second on each of debug_image, top_view and image_rect, drawn while somebody subscribes',
+        'maximum rate of each of debug_image, top_view and image_rect, Hz; drawn only while subscribed',
         low=0.1,
         high=1000,
     )
-    idle_solve_s: float = option(3.0, 'when no image came for this long, what is left is solved', low=0.1)
+    idle_solve_s: float = option(
+        3.0, 'time without images after which the remaining evidence is solved, seconds', low=0.1
+    )
 
 
 MAX_PIXEL_COORDINATE = 1e5
-"""No image has a pixel beyond."""
+"""Maximum absolute pixel coordinate of a polygon; no image is larger."""
 
 
 def _polygon(text: str) -> tuple[tuple[float, float], ...]:
-    """Read one polygon of `ignore_regions`, or say what is wrong with it."""
+    """Parse one polygon of `ignore_regions`; raise UsageError with the expected form."""
     try:
         numbers = [float(word) for word in text.replace(',', ' ').split()]
     except ValueError:
         numbers = []
     if len(numbers) < 6 or len(numbers) % 2 or not all(abs(number) <= MAX_PIXEL_COORDINATE for number in numbers):
         raise UsageError(
-            "option 'ignore_regions' is polygons of at least three pixels u v each, with ; between them, "
-            f"'0 0 200 0 0 150; 900 0 1279 0 1279 90' for example; got {text.strip()!r} for a polygon"
+            "option 'ignore_regions' is polygons of at least three pixels u v each, separated by ;, for example "
+            f"'0 0 200 0 0 150; 900 0 1279 0 1279 90'; got the polygon {text.strip()!r}"
         )
     return tuple(zip(numbers[::2], numbers[1::2], strict=True))
 
@@ -540,18 +574,18 @@ RECONFIGURABLE = (
     'debug_rate_hz',
     'idle_solve_s',
 )
-"""Options, and groups of them, that are read anew at each solution or publication, so that they may change while a
-node runs; all others shape the evidence from the first image on, or name what others rely on."""
+"""Options and groups of options that a running node can change: they are read at each solution or publication. All
+others shape the evidence from the first image on, or other settings depend on them."""
 
 
 def is_reconfigurable(name: str) -> bool:
-    """Say whether an option, by its full name, may change while a node runs."""
+    """Return whether a running node can change the option of this full name."""
     return name in RECONFIGURABLE or name.partition('.')[0] in RECONFIGURABLE
 
 
 @dataclass(frozen=True)
 class OptionSpec:
-    """One option by its full name, as the node's parameters and the documented YAML need it."""
+    """One option by its full name, as ROS parameters, the YAML file and the reference page list it."""
 
     name: str
     default: Any
@@ -562,7 +596,7 @@ class OptionSpec:
 
 
 def walk_options(options: Any, prefix: str = '') -> Iterator[OptionSpec]:
-    """Walk an option dataclass instance, yielding each option with its present value as the default."""
+    """Yield each option of a dataclass instance by its full name, its present value as the default."""
     for item in dataclasses.fields(options):
         value = getattr(options, item.name)
         if dataclasses.is_dataclass(value):
@@ -573,7 +607,7 @@ def walk_options(options: Any, prefix: str = '') -> Iterator[OptionSpec]:
 
 
 def with_overrides(options: Any, values: Mapping[str, Any]) -> Any:
-    """Return `options` with the values given by full name, or raise UsageError at an unknown name."""
+    """Return `options` with the values given by full name; raise UsageError at an unknown name."""
     names = [item.name for item in walk_options(options)]
     for name in values:
         if name not in names:
@@ -595,7 +629,7 @@ def _replace_nested(options: Any, values: Mapping[str, Any], prefix: str) -> Any
 
 
 def flatten(tree: Mapping[str, Any], prefix: str = '') -> dict[str, Any]:
-    """Turn a nested mapping, as YAML gives it, into values by full name."""
+    """Return a nested mapping, as YAML gives it, as values by full name."""
     flat: dict[str, Any] = {}
     for key, value in tree.items():
         if isinstance(value, Mapping):

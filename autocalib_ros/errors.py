@@ -1,15 +1,15 @@
-"""Misuse and unreadable input; "not enough evidence yet" is a value, never an exception."""
+"""Exceptions for wrong usage and unreadable input. Insufficient evidence is a Refusal, a value, not an exception."""
 
 from __future__ import annotations
 
 
 class AutocalibError(Exception):
-    """Root of all errors the program raises on purpose; the message stands on one line."""
+    """Base class of all exceptions raised on purpose; the message is one line."""
 
 
 class UsageError(AutocalibError):
-    """An option or argument that cannot be used as given."""
+    """An option or argument is invalid."""
 
 
 class InputError(AutocalibError):
-    """A file, recording or image that cannot be read."""
+    """A file, recording or image cannot be read."""

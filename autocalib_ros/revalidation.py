@@ -1,7 +1,7 @@
-"""What a calibration in force stands on, and what a new solution makes of it.
+"""Revalidation: reconciles the published calibration with a new solution.
 
-A calibration that was kept from an earlier run is published at once, but vouched for by nobody until the traffic
-of this run gives a solution of its own. Both are compared in units of their stated standard deviations.
+A calibration stored by an earlier run is published at once, as not verified, until the traffic of this run gives a
+solution of its own. The two are compared in units of their stated standard deviations.
 """
 
 from __future__ import annotations
@@ -20,83 +20,72 @@ from autocalib_ros.results.calibration import Calibration, StandardDeviations
 from autocalib_ros.results.statements import SCALE_KINDS
 
 GRADES = ('lens', 'unit_scale', 'assumed', 'full')
-"""From the least that a calibration gives to the most."""
+"""Grades in ascending order."""
 
 
 class CalibrationState(Enum):
-    """What the published calibration rests on."""
+    """State of the published calibration."""
 
     NONE = 'none'
     """Nothing is published."""
     RESTORED = 'restored'
-    """From an earlier run, not yet verified."""
+    """Stored by an earlier run, not yet verified."""
     VERIFIED = 'verified'
-    """From evidence that is gone, of an earlier run or from before time stepped, and the traffic has vouched for it."""
+    """From evidence that is gone, of an earlier run or before a time jump, and confirmed by present traffic."""
     CALIBRATED = 'calibrated'
-    """Solved from the evidence at hand."""
+    """Solved from the present evidence."""
 
 
 @dataclass(frozen=True)
 class Decision:
-    """What is in force after a new solution, and why."""
+    """The calibration to publish after a new solution, and why."""
 
     state: CalibrationState
     calibration: Calibration
-    words: str = ''
-    """For the log; '' where there is nothing to tell but the solution itself."""
+    text: str = ''
+    """For the log; '' if there is nothing to report but the solution itself."""
     contradicted: bool = False
-    """Whether the calibration before was wrong for this camera, all of it."""
+    """Whether the previous calibration was wrong for this camera in all its parts."""
 
 
 def reconcile(state: CalibrationState, before: Calibration | None, fresh: Calibration) -> Decision:
-    """Say what a new solution makes of the calibration in force.
+    """Decide between the published calibration and a new solution.
 
-    One of this run is replaced by the newer, unless that has lost the plane. One of an earlier run is confirmed where
-    lens and plane agree; it then stays until a solution is as sure as itself. It is replaced where either does not
-    agree. A solution without a plane confirms the lens alone, which leaves the state as it was.
+    A calibration of this run is replaced by a newer one, unless that lost the ground plane. One of an earlier run is
+    confirmed if lens and plane agree, and stays until a solution is at least as precise; it is replaced if either
+    disagrees. A solution without a plane confirms the lens only and leaves the state unchanged.
     """
     if before is None or state is CalibrationState.NONE:
         return Decision(CalibrationState.CALIBRATED, fresh)
     if state is CalibrationState.CALIBRATED:
-        # consumers would go on to use the plane that is latched, with a lens that it does not belong to
-        loses = before.ground is not None and fresh.ground is None
-        return (
-            Decision(state, before, 'the calibration before stays: the new one has no ground plane')
-            if loses
-            else (Decision(state, fresh))
-        )
+        # the latched plane would remain with a lens that it does not belong to
+        if before.ground is not None and fresh.ground is None:
+            return Decision(state, before, 'keeping the previous calibration: the new one has no ground plane')
+        return Decision(state, fresh)
     differences = [*_lens_differences(before, fresh), *_plane_differences(before, fresh)]
     if differences:
         found = ', '.join(filter(None, differences))
+        text = (
+            f'stored calibration is inconsistent with current traffic; replaced: {found}'
+            if found
+            else 'stored calibration replaced: it cannot be checked without standard deviations'
+        )
+        return Decision(CalibrationState.CALIBRATED, fresh, text, contradicted=True)
+    if before.ground is not None and fresh.ground is None:
+        why = f': {fresh.ground_refusal.message}' if fresh.ground_refusal else ''
+        return Decision(state, before, f'current traffic confirms the stored lens; ground plane not verified{why}')
+    if _at_least_as_precise(fresh, before):
         return Decision(
             CalibrationState.CALIBRATED,
             fresh,
-            contradicted=True,
-            words=(
-                f'the earlier calibration does not hold any more and is replaced: {found}'
-                if found
-                else 'the earlier '
-                'calibration is replaced: without standard deviations nothing tells whether it still holds'
-            ),
+            'stored calibration confirmed, and replaced by one that is at least as precise',
         )
-    if before.ground is not None and fresh.ground is None:
-        why = f': {fresh.ground_refusal.message}' if fresh.ground_refusal else ''
-        return Decision(state, before, f'the traffic confirms the earlier lens; its ground plane is not verified{why}')
-    if _at_least_as_precise(fresh, before):
-        return Decision(
-            CalibrationState.CALIBRATED, fresh, 'the earlier calibration is confirmed, and replaced by one as sure'
-        )
-    return Decision(
-        CalibrationState.VERIFIED,
-        before,
-        ''
-        if state is CalibrationState.VERIFIED
-        else 'the traffic confirms the earlier calibration, which is surer and stays in force',
-    )
+    text = 'current traffic agrees with the stored calibration; keeping it (smaller uncertainty)'
+    return Decision(CalibrationState.VERIFIED, before, '' if state is CalibrationState.VERIFIED else text)
 
 
 def _lens_differences(before: Calibration, fresh: Calibration) -> list[str | None]:
-    """Name what differs beyond its deviations; None stands for what has none."""
+    """Return a text for each significant difference; None for one without standard deviations."""
     if max_lens_difference_px(before.camera, fresh.camera) <= SAME_LENS_TOLERANCE_PX:
         return []
     return _differences(_lens_estimates(before), _lens_estimates(fresh))
@@ -132,7 +121,7 @@ def _lens_estimates(result: Calibration) -> list[_Estimate]:
 
 def _plane_estimates(ground: GroundPlane, sigma: StandardDeviations) -> list[_Estimate]:
     tilt, roll = tilt_and_roll_deg(ground.normal_in_camera)
-    # a height that was given has no deviation: it is exact
+    # a given height without standard deviation is exact
     return [
         _Estimate('tilt', float(tilt), sigma.tilt_deg, ' deg'),
         _Estimate('roll', float(roll), sigma.roll_deg, ' deg'),
@@ -150,14 +139,14 @@ def _differences(before: list[_Estimate], fresh: list[_Estimate]) -> list[str | 
             found.append(None)
         elif difference > AGREEMENT_SIGMAS * math.hypot(old.sigma, new.sigma):
             found.append(
-                f'{old.name} {old.value:.4g} +- {old.sigma:.2g}{old.unit} was kept, {new.value:.4g} +- '
-                f'{new.sigma:.2g}{new.unit} was found'
+                f'{old.name} stored {old.value:.4g} +- {old.sigma:.2g}{old.unit}, new {new.value:.4g} +- '
+                f'{new.sigma:.2g}{new.unit}'
             )
     return found
 
 
 def _at_least_as_precise(fresh: Calibration, before: Calibration) -> bool:
-    """Whether a solution gives as much as the other, as surely, or a ground plane where that has none."""
+    """Whether grade and precision of a solution are at least those of the other, or it alone has a ground plane."""
     if before.ground is None and fresh.ground is not None:
         return True
     sigmas = [(fresh.stddev.focal_px, before.stddev.focal_px)]
@@ -177,17 +166,16 @@ def _rank(grade: str) -> int:
 
 
 def with_current_options(kept: Calibration, options: Options, lens: Camera | None) -> Calibration:
-    """Return a kept calibration under the options of today; UsageError where it does not fit them.
+    """Return a stored calibration under the present options; UsageError if it does not fit them.
 
-    The plane takes the scale that is given now, where that needs no traffic; otherwise it keeps its own. A lens
-    that is given now has to be the kept one.
+    The plane takes the scale that is given now, if that needs no traffic; otherwise it keeps its own. A lens given
+    now must be the stored one.
     """
-    form = {'distortion_model': options.distortion_model, 'rectified_balance': options.rectified_balance}
-    if any(getattr(kept, name) != value for name, value in form.items()):
-        kept = replace(kept, **form)
+    if (kept.distortion_model, kept.rectified_balance) != (options.distortion_model, options.rectified_balance):
+        kept = replace(kept, distortion_model=options.distortion_model, rectified_balance=options.rectified_balance)
     size = kept.evidence.image_size
     if lens is not None and max_lens_difference_px(lens.scaled_to(*size), kept.camera) > SAME_LENS_TOLERANCE_PX:
-        raise UsageError("its lens is not that of 'camera_info_file': it is left out")
+        raise UsageError("its lens differs from that of 'camera_info_file'")
     given_now = options.camera_height > 0 or options.scale_from == 'distance'
     if kept.ground is None or not given_now:
         return kept
@@ -216,6 +204,6 @@ def _scaled(kept: Calibration, ground: GroundPlane, scale: Scale) -> Calibration
         ground=replace(ground, height_m=height, metric=True),
         assumptions=(*others, *scale.assumption(height)),
         covariance=None,
-        # road points so many metres away are others now, and nothing is left that tells how sure they are
+        # the accuracy at fixed distances is unknown after rescaling
         stddev=replace(kept.stddev, height_m=scale.sigma or None, ground_point_m=()),
     )

@@ -1,8 +1,8 @@
-"""The nodes of many cameras, a process each, from a file with a list of cameras.
+"""Start the nodes of many cameras, one process each, from a file with a list of cameras.
 
     ros2 launch autocalib_ros cameras.launch.py cameras:=cameras.yaml
 
-config/cameras.yaml is an example; autocalib_ros/ros/cameras.py says what such a file may hold.
+config/cameras.yaml is an example; autocalib_ros/ros/cameras.py documents the format.
 """
 
 from launch import LaunchContext, LaunchDescription
@@ -14,7 +14,7 @@ from autocalib_ros.ros.cameras import NODE_NAME, read_cameras
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Declare the file's argument and start what it asks for."""
+    """Declare the argument and start the nodes that the file describes."""
     return LaunchDescription(
         [
             DeclareLaunchArgument('cameras', description='YAML file with the list of cameras'),

@@ -67,14 +67,14 @@ def test_the_image_given_is_not_changed(colour: bool) -> None:
     np.testing.assert_array_equal(before, np.repeat(image(0)[..., None], 3, axis=2) if colour else image(0))
 
 
-def test_a_backward_stamp_begins_anew() -> None:
+def test_a_backward_stamp_restarts_the_evidence() -> None:
     calibrator = fed(30)
     calibrator.add_image(0, image(0))
     evidence = calibrator.snapshot()
     assert evidence is not None and evidence.frames == 1
 
 
-def test_a_new_size_begins_anew() -> None:
+def test_a_new_size_restarts_the_evidence() -> None:
     calibrator = fed(30)
     calibrator.add_image(3_000_000_000, image(0, (240, 320)))
     evidence = calibrator.snapshot()
@@ -101,11 +101,11 @@ def test_a_repeated_or_late_stamp_is_left_out(stamp_ns: int) -> None:
         (1_000_000_000, (240, 320), ImageIntake.RESIZED),
     ],
 )
-def test_what_became_of_an_image_is_told(stamp_ns: int, size: tuple[int, int], expected: ImageIntake) -> None:
+def test_what_became_of_an_image_is_reported(stamp_ns: int, size: tuple[int, int], expected: ImageIntake) -> None:
     assert fed(10).add_image(stamp_ns, image(30, size)) is expected
 
 
-def test_first_image_is_told() -> None:
+def test_first_image_is_reported() -> None:
     assert AutoCalibrator(OPTIONS).add_image(0, image(0)) is ImageIntake.FIRST
 
 
@@ -190,7 +190,7 @@ def test_evidence_from_before_a_bump_is_forgotten() -> None:
     assert evidence is not None and evidence.drift_px < 0.5  # and with it what it was compared with
 
 
-def test_a_bump_is_told_while_evidence_from_before_is_held() -> None:
+def test_a_bump_is_reported_while_evidence_from_before_is_held() -> None:
     progress = watched(200.0, moved_at_s=150.0).progress()
     assert 'the camera moves' in str(progress) and not progress.outlook
 

@@ -127,10 +127,12 @@ def test_the_verdict_names_what_is_beyond_three_sigmas():
 def test_within_three_sigmas_is_agreement_with_the_farthest_named():
     result = compare_calibrations(known(sure=True), known(ground=pose(28.4), sure=True))
     assert result.agrees
-    assert result.verdict() == ('The calibrations agree within 3 combined sigmas; farthest apart is tilt, 1.9 sigmas.')
+    assert result.verdict() == (
+        'The calibrations agree within 3 combined sigmas; the largest difference is tilt, 1.9 sigmas.'
+    )
 
 
-def test_a_side_that_states_nothing_is_taken_as_exact_and_that_is_told():
+def test_a_side_that_states_nothing_is_taken_as_exact_and_that_is_reported():
     result = compare_calibrations(known(sure=True), known(replace(CAMERA, focal_px=572.0)))
     assert number(result, 'focal length').sigmas == pytest.approx(4.0)
     assert 'B states no standard deviations and is taken as exact' in result.notes
@@ -140,7 +142,7 @@ def test_a_side_that_states_nothing_is_taken_as_exact_and_that_is_told():
 def test_where_nobody_states_deviations_only_equal_lenses_agree():
     assert compare_calibrations(known(), known(replace(CAMERA, focal_px=572.0))).agrees is None
     result = compare_calibrations(known(), known(replace(CAMERA, focal_px=572.0)))
-    assert result.verdict().startswith('Whether the calibrations agree cannot be told: neither states')
+    assert result.verdict().startswith('Agreement of the calibrations is unknown: neither states')
     assert compare_calibrations(known(), known(replace(CAMERA, focal_px=560.1))).agrees
 
 
@@ -153,7 +155,7 @@ def test_heights_that_were_given_differently_differ():
 
 
 def draws(count: int) -> list[SavedCamera]:
-    """Return cameras as one would be that is drawn from the covariance, which has correlations as real ones have."""
+    """Return cameras drawn from a covariance with realistic correlations."""
     generator = np.random.default_rng(4)
     ground = Ground(lens=CAMERA, rotation=pose().rotation, camera_m=pose().translation_m)
     found = []
@@ -216,7 +218,7 @@ def test_a_checkerboards_rational_lens_is_compared_by_its_rays():
     assert result.rays.largest_deg < np.degrees(0.1 / 560)
     assert result.pose == () and result.road == ()
     assert result.verdict().startswith('The lenses agree')
-    assert 'poses are not compared: B holds no ground plane' in result.notes
+    assert 'poses are not compared: B has no ground plane' in result.notes
 
 
 def test_a_plane_without_metres_is_compared_by_its_angles_only():

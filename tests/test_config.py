@@ -1,4 +1,4 @@
-"""Options: one home for defaults, checked at the door."""
+"""Options: defaults, types and ranges."""
 
 from __future__ import annotations
 
@@ -49,10 +49,10 @@ PIXELS = '412 530 888 530'
 @pytest.mark.parametrize(
     ('values', 'says'),
     [
-        ({'scale_from': 'distance'}, "which needs 'scale.distance_px'"),
-        ({'scale_from': 'distance', 'scale.distance_px': PIXELS}, "which needs 'scale.distance_m'"),
-        ({'scale_from': 'distance', 'scale.distance_m': 10.0}, "which needs 'scale.distance_px'"),
-        ({'scale_from': 'speed'}, "which needs 'scale.speed_km_h'"),
+        ({'scale_from': 'distance'}, "needs 'scale.distance_px'"),
+        ({'scale_from': 'distance', 'scale.distance_px': PIXELS}, "needs 'scale.distance_m'"),
+        ({'scale_from': 'distance', 'scale.distance_m': 10.0}, "needs 'scale.distance_px'"),
+        ({'scale_from': 'speed'}, "needs 'scale.speed_km_h'"),
         ({'scale_from': 'guess'}, 'one of height, distance, speed'),
         ({'scale_from': 'speed', 'scale.speed_km_h': 50.0, 'camera_height': 8.0}, "'camera_height' is given too"),
         ({'scale.speed_km_h': 50.0, 'camera_height': 8.0}, "'scale.speed_km_h' is given too"),
@@ -61,7 +61,7 @@ PIXELS = '412 530 888 530'
             {'scale_from': 'speed', 'scale.speed_km_h': 50.0, 'scale.distance_m': 10.0},
             "'scale.distance_m' is given too",
         ),
-        ({'camera_height_sigma': 0.1}, "without 'camera_height'"),
+        ({'camera_height_sigma': 0.1}, "needs 'camera_height'"),
         ({'scale_from': 'speed', 'scale.speed_km_h': 50.0, 'method': 'paper'}, 'height or distance'),
         ({'scale_from': 'distance', 'scale.distance_px': PIXELS, 'scale.distance_m': -1.0}, 'lies between 0 and 1000'),
         ({'scale.distance_px': '1 2 3'}, "four numbers in one text.* got '1 2 3'"),
@@ -69,10 +69,10 @@ PIXELS = '412 530 888 530'
         ({'scale.distance_px': 'here there now then'}, 'four numbers'),
         ({'scale.distance_px': [412.0, 530.0, 888.0, 530.0]}, 'four numbers in one text'),
         ({'scale.distance_px': '412 530 412 530'}, '0.0 px apart'),
-        ({'scale.distance_px': '412 530 418 538'}, 'are 10.0 px apart.* known to 2 px'),
+        ({'scale.distance_px': '412 530 418 538'}, 'are 10.0 px apart.* standard deviation of 2 px'),
     ],
 )
-def test_a_scale_is_told_by_one_source_and_whole(values: dict[str, object], says: str) -> None:
+def test_the_scale_comes_from_one_complete_source(values: dict[str, object], says: str) -> None:
     more = {'scale.pixel_sigma_px': 2.0} if '418' in str(values) else {}
     with pytest.raises(UsageError, match=says):
         with_overrides(Options(), {**values, **more})

@@ -189,7 +189,7 @@ def test_pixels_come_back(lens, pixels):
 
 
 def test_the_published_lens_of_a_calibration_gives_the_points_of_its_file(pixels):
-    camera = Camera(*SIZE, 560.0, (630.0, 371.0))  # its CameraInfo has 1e-9 for 0: nobody may notice
+    camera = Camera(*SIZE, 560.0, (630.0, 371.0))  # its CameraInfo has 1e-9 for 0: the difference must not matter
     fields = camera_info(camera)
     published = Ground.from_messages(info(fields.distortion_model, tuple(fields.k), tuple(fields.d)), transform())
     saved = Ground.from_document(document(camera))
@@ -223,7 +223,7 @@ def test_a_ground_frame_elsewhere_gives_points_in_that_frame(places):
 
 @pytest.mark.parametrize(('parent', 'child'), [('road', 'other'), ('other', 'road'), ('cam', 'cam')])
 def test_a_transform_of_another_frame_is_refused(parent, child):
-    with pytest.raises(InputError, match=f"joins '{parent}' and '{child}', and one of the two should be .*'cam'"):
+    with pytest.raises(InputError, match=f"joins '{parent}' and '{child}', but not the camera's frame 'cam'"):
         Ground.from_messages(info(), transform(parent, child))
 
 
@@ -255,7 +255,7 @@ def test_a_rotation_that_is_none_is_refused():
     [
         ({'k': (0.0,) * 9}, 'not calibrated'),
         ({'model': 'kannala_brandt'}, 'distortion model'),
-        ({'d': (0.0,) * 9}, '9 numbers, expected 4'),
+        ({'d': (0.0,) * 9}, '9 numbers, expected at most 4'),
     ],
 )
 def test_what_is_no_lens_is_refused(given, said):
@@ -351,7 +351,7 @@ def test_pixels_of_a_rectified_image_go_by_p_and_r(places):
 
 
 def test_a_rectified_image_needs_p():
-    with pytest.raises(InputError, match="'p' holds no projection"):
+    with pytest.raises(InputError, match="'p' has no valid projection"):
         Ground.from_messages(info(), transform(), rectified=True)
 
 
@@ -426,7 +426,7 @@ def test_sigma_is_the_spread_of_what_might_have_been_published():
         draws.append(-(HEIGHT_M + height) / rays[:, 2:] * rays[:, :2])
     found = ground.points(pixels)
     expected = np.array([np.cov(draw.T) for draw in np.swapaxes(draws, 0, 1)])
-    # 3000 draws tell a variance to 2.6 %, and the farther points are a little beyond linear
+    # 3000 draws give a variance to 2.6 %, and the farther points are a little beyond linear
     scale = np.sqrt(np.trace(expected, axis1=1, axis2=2))
     np.testing.assert_allclose(found.sigma_m, scale, rtol=0.08)
     np.testing.assert_allclose(
@@ -444,13 +444,13 @@ def test_sigma_grows_towards_the_horizon_beyond_the_distance_itself():
     assert share[0] > 1.0 and share[-1] < 0.1
 
 
-def test_the_noise_of_pixels_is_told_and_adds_to_sigma():
+def test_the_noise_of_pixels_is_reported_and_adds_to_sigma():
     pixel = np.array([[640.0, 400.0]])
     shaken = pixel + np.random.default_rng(0).normal(0.0, 0.5, (4000, 2))
     live, saved = Ground.from_messages(info(), transform()), Ground.from_document(document())
     spread = np.cov(live.points(shaken).points_m[:, :2].T)
     noise = live.points(pixel, pixel_sigma_px=0.5).noise_m2[0]
-    np.testing.assert_allclose(noise, spread, atol=0.08 * np.trace(spread))  # 4000 draws tell a variance to 2.2 %
+    np.testing.assert_allclose(noise, spread, atol=0.08 * np.trace(spread))  # 4000 draws give a variance to 2.2 %
     found, exact = saved.points(pixel, pixel_sigma_px=0.5), saved.points(pixel)
     assert exact.noise_m2 is None
     np.testing.assert_allclose(found.sigma_m**2, exact.sigma_m**2 + np.trace(found.noise_m2[0]), rtol=1e-9)
@@ -536,6 +536,6 @@ def test_a_file_without_a_ground_plane_in_metres_is_refused(tmp_path, text, said
     assert str(path) in str(error.value)
 
 
-def test_a_missing_file_is_told(tmp_path):
+def test_a_missing_file_is_reported(tmp_path):
     with pytest.raises(InputError, match='cannot read'):
         Ground.from_file(tmp_path / 'none.json')

@@ -1,4 +1,4 @@
-"""When a restored calibration holds, and when it is replaced."""
+"""Confirmation and replacement of a restored calibration."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from stored_results import SIZE, calibration, lens_only
 NONE, RESTORED, VERIFIED, CALIBRATED = CalibrationState
 KEPT = calibration()
 VAGUE = calibration(302.0, tilt_deg=12.5, sigmas=3.0)
-"""Agrees with what was kept, and is less sure."""
+"""Agrees with the stored calibration, and is less precise."""
 
 
 def test_first_solution_is_taken():
     decision = reconcile(NONE, None, KEPT)
-    assert (decision.state, decision.calibration, decision.words) == (CALIBRATED, KEPT, '')
+    assert (decision.state, decision.calibration, decision.text) == (CALIBRATED, KEPT, '')
 
 
 def test_solution_of_this_run_is_replaced_by_the_newer_whatever_it_says():
@@ -38,34 +38,34 @@ def test_solution_of_this_run_is_replaced_by_the_newer_whatever_it_says():
 def test_vague_solution_that_agrees_confirms_the_kept_one_which_stays(state):
     decision = reconcile(state, KEPT, VAGUE)
     assert (decision.state, decision.calibration, decision.contradicted) == (VERIFIED, KEPT, False)
-    assert bool(decision.words) == (state is RESTORED)
+    assert bool(decision.text) == (state is RESTORED)
 
 
-def test_solution_that_agrees_and_is_as_sure_takes_over():
+def test_solution_that_agrees_and_is_as_precise_takes_over():
     fresh = calibration(300.5, tilt_deg=12.4)
     decision = reconcile(RESTORED, KEPT, fresh)
     assert (decision.state, decision.calibration, decision.contradicted) == (CALIBRATED, fresh, False)
-    assert 'is confirmed' in decision.words
+    assert 'stored calibration confirmed' in decision.text
 
 
 @pytest.mark.parametrize(
-    ('fresh', 'told'),
+    ('fresh', 'expected'),
     [
-        (calibration(310.0, sigmas=3.0), 'focal length 300 +- 1 px was kept, 310 +- 3 px was found'),
-        (calibration(tilt_deg=14.5, sigmas=3.0), 'tilt 12.3 +- 0.2 deg was kept, 14.5 +- 0.6 deg'),
+        (calibration(310.0, sigmas=3.0), 'focal length stored 300 +- 1 px, new 310 +- 3 px'),
+        (calibration(tilt_deg=14.5, sigmas=3.0), 'tilt stored 12.3 +- 0.2 deg, new 14.5 +- 0.6 deg'),
         (calibration(roll_deg=3.0, sigmas=3.0), 'roll'),
-        (calibration(height_m=8.7, sigmas=3.0), 'height 8.1 +- 0.05 m was kept, 8.7 +- 0.15 m'),
+        (calibration(height_m=8.7, sigmas=3.0), 'height stored 8.1 +- 0.05 m, new 8.7 +- 0.15 m'),
         (replace(VAGUE, camera=replace(VAGUE.camera, principal_point_px=(340.0, 179.5))), 'principal point x'),
     ],
 )
-def test_solution_that_does_not_agree_replaces_the_kept_one(fresh, told):
+def test_solution_that_does_not_agree_replaces_the_kept_one(fresh, expected):
     decision = reconcile(RESTORED, KEPT, fresh)
     assert (decision.state, decision.calibration, decision.contradicted) == (CALIBRATED, fresh, True)
-    assert told in decision.words
+    assert expected in decision.text
 
 
 def test_difference_counts_by_both_deviations():
-    # 4 px apart: 4 sigmas of the kept one alone, 2.8 of both together
+    # 4 px apart: 4 sigmas of the stored one alone, 2.8 of both together
     agrees, differs = (calibration(304.0, sigmas=sigmas) for sigmas in (1.0, 0.5))
     assert not reconcile(RESTORED, KEPT, agrees).contradicted
     assert reconcile(RESTORED, KEPT, differs).contradicted
@@ -75,7 +75,7 @@ def test_lens_alone_confirms_the_lens_and_leaves_the_plane_unverified():
     fresh = replace(lens_only(VAGUE), ground_refusal=Reason('one_direction', 'one road only.', 'wait'))
     decision = reconcile(RESTORED, KEPT, fresh)
     assert (decision.state, decision.calibration) == (RESTORED, KEPT)
-    assert 'confirms the earlier lens' in decision.words and 'one road only.' in decision.words
+    assert 'confirms the stored lens' in decision.text and 'one road only.' in decision.text
 
 
 def test_other_lens_without_a_plane_replaces_lens_and_plane():
@@ -98,7 +98,7 @@ def test_without_deviations_the_newer_is_taken():
     published = replace(calibration(310.0), stddev=StandardDeviations())
     decision = reconcile(RESTORED, KEPT, published)
     assert (decision.state, decision.calibration) == (CALIBRATED, published)
-    assert 'without standard deviations' in decision.words
+    assert 'without standard deviations' in decision.text
 
 
 def test_solutions_of_one_camera_agree_and_of_a_turned_one_do_not():

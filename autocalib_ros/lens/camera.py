@@ -1,12 +1,12 @@
-"""The lens: a central Kannala-Brandt camera.
+"""Lens model: the central Kannala-Brandt camera.
 
 A bearing at the angle theta from the optical axis is imaged at the distance
 
     r(theta) = focal_px * (theta + k1 theta^3 + k2 theta^5 + k3 theta^7 + k4 theta^9)
 
-from the principal point (Kannala & Brandt 2006, equation 6). An equidistant lens is k = 0, a
-distortion-free one k1 = 1/3, k2 = 2/15. Pixel (0, 0) is the centre of the top-left pixel; the camera
-optical frame is x right, y down, z forward (REP-103).
+from the principal point (Kannala & Brandt 2006, equation 6). k = 0 is the equidistant lens; k1 = 1/3, k2 = 2/15 is
+the series of the distortion-free one, tan(theta). Pixel (0, 0) is the centre of the top-left pixel. Camera optical
+frame: x right, y down, z forward (REP-103).
 """
 
 from __future__ import annotations
@@ -21,22 +21,27 @@ import numpy as np
 from autocalib_ros.errors import UsageError
 
 MAX_ANGLE_ITERATIONS = 20
-"""Most: Newton's iteration doubles its digits, so that four or five are the rule."""
+"""Upper limit: Newton's method doubles the number of correct digits, so four or five iterations are usual."""
 MONOTONICITY_GRID_RAD = np.linspace(0.0, np.pi, 721)
-"""Where it is looked for that r(theta) falls."""
+"""Angles at which r(theta) is checked for monotonicity, every 0.25 degrees."""
 
 
 class Lens(Protocol):
-    """Any lens in images of a size."""
+    """A lens for images of a given size."""
 
-    width: int
-    height: int
+    @property
+    def width(self) -> int:
+        """Image width in pixels."""
+
+    @property
+    def height(self) -> int:
+        """Image height in pixels."""
 
     def project(self, bearings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return pixels (..., 2) of bearings (..., 3), and where they are valid (...)."""
+        """Return pixels (..., 2) of bearings (..., 3), and which are valid (...)."""
 
     def unproject(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return unit bearings (..., 3) of pixels (..., 2), and where they are valid (...)."""
+        """Return unit bearings (..., 3) of pixels (..., 2), and which are valid (...)."""
 
 
 @dataclass(frozen=True)
@@ -56,13 +61,13 @@ class Camera:
 
     @classmethod
     def equidistant(cls, width: int, height: int, focal_px: float) -> Camera:
-        """Return the equidistant camera whose principal point is the image centre."""
+        """Return an equidistant camera with the principal point at the image centre."""
         return cls(width, height, float(focal_px), image_centre(width, height))
 
     def scaled_to(self, width: int, height: int) -> Camera:
-        """Return the same lens for images of another size but the same shape; UsageError for another shape.
+        """Return the lens for images of another size; UsageError if their aspect ratio differs.
 
-        The image's borders are scaled, which lie half a pixel outside the centres of its outer pixels.
+        The image borders are scaled, which lie half a pixel outside the centres of the outer pixels.
         """
         if (width, height) == (self.width, self.height):
             return self
@@ -78,12 +83,12 @@ class Camera:
 
     @property
     def matrix(self) -> np.ndarray:
-        """K, shape (3, 3), pixels."""
+        """K, shape (3, 3), in pixels."""
         cx, cy = self.principal_point_px
         return np.array([[self.focal_px, 0.0, cx], [0.0, self.focal_px, cy], [0.0, 0.0, 1.0]])
 
     def radius(self, theta_rad: np.ndarray) -> np.ndarray:
-        """Return the image radius in pixels of the angles `theta_rad`."""
+        """Return the image radius in pixels for angles from the optical axis."""
         return self.focal_px * theta_rad * _power_series(self.k, theta_rad * theta_rad)
 
     def radius_derivative(self, theta_rad: np.ndarray) -> np.ndarray:
@@ -98,14 +103,14 @@ class Camera:
 
     @cached_property
     def max_angle_rad(self) -> float:
-        """Largest theta up to which r(theta) grows: beyond it the model folds back on itself."""
+        """Largest angle up to which r(theta) increases; beyond it the polynomial is not invertible."""
         if not any(self.k):
             return float(np.pi)
         falling = np.flatnonzero(self.radius_derivative(MONOTONICITY_GRID_RAD) <= 0)
         return float(MONOTONICITY_GRID_RAD[falling[0] - 1]) if len(falling) else float(np.pi)
 
     def project(self, bearings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Project bearings (..., 3), of any length, to pixels (..., 2); and say where that is valid (...)."""
+        """Return pixels (..., 2) of bearings (..., 3) of any length, and which are valid (...)."""
         bearings = np.asarray(bearings, float)
         across = np.hypot(bearings[..., 0], bearings[..., 1])
         theta = np.arctan2(across, bearings[..., 2])
@@ -115,7 +120,7 @@ class Camera:
         return pixels, theta <= self.max_angle_rad
 
     def unproject(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return unit bearings (..., 3) of pixels (..., 2), and where the lens model reaches them (...)."""
+        """Return unit bearings (..., 3) of pixels (..., 2), and which are inside the range of the lens model (...)."""
         offset = np.asarray(pixels, float) - self.principal_point_px
         r = np.hypot(offset[..., 0], offset[..., 1])
         theta, valid = self.angle(r)
@@ -124,7 +129,7 @@ class Camera:
         return np.concatenate([scale[..., None] * offset, np.cos(theta)[..., None]], axis=-1), valid
 
     def angle(self, radius_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Invert r(theta) by Newton's method: angles in radians, and where the inversion holds."""
+        """Return the angles in radians of image radii, by Newton's method, and where it converged."""
         radius = np.asarray(radius_px, float) / self.focal_px
         limit = self.max_angle_rad
         theta = np.clip(radius, 0.0, limit)
@@ -134,16 +139,16 @@ class Camera:
                 error = theta * _power_series(self.k, t2) - radius
                 theta = theta - error / np.maximum(_power_series(self._derivative_k, t2), 1e-3)
                 theta = np.minimum(np.maximum(theta, 0.0), limit)
-                # the digits double with a step; where the model does not reach, the angle stays at its limit
+                # converged: each step doubles the digits; out of range the angle stays at its limit
                 if np.abs(theta - before).max(initial=0.0) < 1e-8:
                     break
         return theta, np.abs(theta * _power_series(self.k, theta * theta) - radius) < 1e-6
 
     def undistort(self, pixels: np.ndarray, focal_px: float | None = None) -> np.ndarray:
-        """Map pixels (..., 2) to those of a distortion-free camera with the same principal point.
+        """Return pixels (..., 2) of a distortion-free camera with the same principal point.
 
-        Equation of the paper's section on undistortion, `x_u = x_d tan(theta) / theta_d`, for any lens
-        of the model. Pixels at 90 degrees from the axis or more have no image there: nan.
+        Generalises `x_u = x_d tan(theta) / theta_d` of Jain & Saunier (arXiv 2001.07243) to all lenses of the model.
+        Pixels at 90 degrees from the optical axis or more give nan.
         """
         bearings, valid = self.unproject(pixels)
         ahead = valid & (bearings[..., 2] > 1e-6)
@@ -152,9 +157,9 @@ class Camera:
 
 
 def scale_factors(calibrated: tuple[int, int], images: tuple[int, int]) -> tuple[float, float]:
-    """Return how many times wider and higher images are than those of a calibration; UsageError for another shape."""
+    """Return the ratios of width and height of images to those of a calibration; UsageError if their shape differs."""
     across, down = images[0] / calibrated[0], images[1] / calibrated[1]
-    # rounding to whole pixels may have changed the shape by half of one
+    # allows for rounding to whole pixels
     if min(abs(calibrated[1] * across - images[1]), abs(calibrated[0] * down - images[0])) > 0.5:
         raise UsageError(
             f'the lens was calibrated in images of {calibrated[0]}x{calibrated[1]}, and these images have'
@@ -164,7 +169,7 @@ def scale_factors(calibrated: tuple[int, int], images: tuple[int, int]) -> tuple
 
 
 def _power_series(k: tuple[float, ...], t2: np.ndarray) -> np.ndarray:
-    """Return 1 + k1 t2 + k2 t2^2 + ..., shape of `t2`; coefficients of 0 at the end cost nothing."""
+    """Return 1 + k1 t2 + k2 t2^2 + ..., with the shape of `t2`; trailing zero coefficients cost nothing."""
     order = max((power for power, factor in enumerate(k, 1) if factor), default=0)
     if not order:
         return np.ones_like(t2)
@@ -181,9 +186,9 @@ def image_centre(width: int, height: int) -> tuple[float, float]:
 
 
 def field_of_view_deg(camera: Camera) -> tuple[float, float]:
-    """Return the angles between the middles of the left and right, and of the top and bottom border.
+    """Return horizontal and vertical field of view in degrees, through the principal point.
 
-    Of a Camera, or of any other Lens with a principal point.
+    Works for any Lens with a principal point.
     """
     cx, cy = camera.principal_point_px
     right, bottom = camera.width - 1, camera.height - 1
@@ -194,6 +199,6 @@ def field_of_view_deg(camera: Camera) -> tuple[float, float]:
 
 
 def pixel_grid(camera: Lens, columns: int, rows: int) -> np.ndarray:
-    """Return pixels (columns * rows, 2) evenly over the image, those of its borders included, row by row."""
+    """Return pixels (columns * rows, 2) evenly spaced over the image including its borders, row by row."""
     across, down = np.linspace(0, camera.width - 1, columns), np.linspace(0, camera.height - 1, rows)
     return np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)

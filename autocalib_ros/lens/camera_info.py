@@ -1,4 +1,4 @@
-"""The lens as ROS knows it: the fields of sensor_msgs/CameraInfo and camera_info_manager's file."""
+"""The fields of sensor_msgs/CameraInfo that describe a lens: distortion models, K, D, P, and the sensor readout."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from autocalib_ros.lens.opencv_lens import (
 )
 
 EQUIDISTANT_K1_FLOOR = 1e-9
-"""image_proc and image_geometry take an all-zero D for "no distortion" whatever the model is called."""
+"""Minimum k1 of an equidistant D: image_proc and image_geometry take an all-zero D as "no distortion" in any model."""
 RECTIFIED_LIMIT_DEG = 80.0
-"""A distortion-free image ends at this angle from the axis at the latest: at 90 it would be infinitely large, and
-already here its border is magnified 33 times as much as its middle."""
+"""Maximum angle from the axis in a rectified image: at 90 degrees it would be infinitely large, and at 80 its border
+is already magnified 33 times as much as its centre."""
 DISTORTION_MODELS = {
     'plumb_bob': (4, 5),
     'rational_polynomial': (8,),
     'equidistant': (0, 1, 2, 3, 4),
     'fisheye': (0, 1, 2, 3, 4),
 }
-"""The distortion models that are read, and how many coefficients each may have."""
+"""Distortion models that can be read, with the permitted numbers of coefficients."""
 
 
 @dataclass(frozen=True)
 class CameraInfo:
-    """The fields of sensor_msgs/CameraInfo that a lens decides; lists as the message wants them."""
+    """Fields of sensor_msgs/CameraInfo, as lists as in the message."""
 
     width: int
     height: int
@@ -42,30 +42,31 @@ class CameraInfo:
     r: list[float]
     p: list[float]
     error_px: float = 0.0
-    """Largest distance in pixels, over the whole image, between this and the lens that it says."""
+    """Maximum distance in pixels, over the whole image, between this and the lens it represents."""
 
 
 @dataclass(frozen=True)
 class Readout:
-    """Which pixels of the sensor an image shows, in pixels of the full resolution (REP-104)."""
+    """Part of the sensor that an image shows, in pixels of the full resolution (REP-104)."""
 
     width: int
     height: int
     """Full resolution of the sensor."""
     binning: tuple[int, int] = (1, 1)
-    """Pixels across and down that make one of the image; 0 is 1."""
+    """Sensor pixels per image pixel, horizontally and vertically; 0 means 1."""
     offset: tuple[int, int] = (0, 0)
+    """Top-left corner of the region of interest."""
     window: tuple[int, int] = (0, 0)
-    """Region of interest: where it begins, and its size before binning; 0 is all."""
+    """Size of the region of interest before binning; 0 means the full width or height."""
 
     @property
     def bins(self) -> tuple[int, int]:
-        """The binning, at least 1."""
+        """Binning, at least 1."""
         return max(self.binning[0], 1), max(self.binning[1], 1)
 
 
 class ModelMisfit(UsageError):
-    """A distortion model was asked for that cannot say the lens."""
+    """The requested distortion model cannot represent the lens."""
 
     def __init__(self, message: str, remedy: str) -> None:
         super().__init__(f'{message} {remedy}')
@@ -73,10 +74,10 @@ class ModelMisfit(UsageError):
 
 
 def camera_info(camera: Camera, distortion_model: str = 'auto', rectified_balance: float = 0.0) -> CameraInfo:
-    """Return the CameraInfo of a lens; K is the same in every distortion model, and R identity.
+    """Return the CameraInfo of a lens; K is the same in every distortion model, and R is the identity.
 
-    'auto' is 'equidistant', which says every lens of this program exactly; 'rational_polynomial' and 'plumb_bob' are
-    fitted to what the image shows. Raises ModelMisfit where such a fit misses by more than MAX_ERROR_PX.
+    'auto' is 'equidistant', which represents every Camera exactly; 'rational_polynomial' and 'plumb_bob' are fitted
+    to the visible field. ModelMisfit if the error of the fit exceeds `MAX_MODEL_ERROR_PX`.
     """
     model = 'equidistant' if distortion_model == 'auto' else distortion_model
     coefficients, error_px = _coefficients(camera, model)
@@ -96,14 +97,14 @@ def camera_info(camera: Camera, distortion_model: str = 'auto', rectified_balanc
 
 
 def to_full_resolution(info: CameraInfo, readout: Readout) -> CameraInfo:
-    """Return what was calibrated in the pixels of binned or cut-out images in those of the whole sensor.
+    """Return a CameraInfo calibrated in cropped or binned images in pixels of the whole sensor.
 
-    image_geometry goes back by subtracting the offset and dividing by the binning, and so is right in the image to the
-    last digit. InputError where images of such a readout would have another size than those of the calibration.
+    image_geometry reverses this exactly, by subtracting the offset and dividing by the binning. InputError if images
+    of this readout would have another size than those of the calibration.
     """
     mismatch = check_readout(readout, (info.width, info.height))
     if mismatch:
-        raise InputError(f'{mismatch}: its binning and region of interest are not theirs and are left out')
+        raise InputError(f'{mismatch}: its binning and region of interest are ignored')
     return replace(
         info,
         width=readout.width,
@@ -114,34 +115,31 @@ def to_full_resolution(info: CameraInfo, readout: Readout) -> CameraInfo:
 
 
 def check_readout(readout: Readout, image_size: tuple[int, int]) -> str:
-    """Say why images of a size (width, height) are not of a readout, '' where they may be."""
+    """Return why images of a size (width, height) do not come from this readout; '' if they may."""
     (across, down), (width, height) = readout.bins, image_size
     window = readout.window[0] or readout.width, readout.window[1] or readout.height
     # drivers round half a bin up or down
     if abs(width * across - window[0]) >= across or abs(height * down - window[1]) >= down:
         return (
-            f"the driver's camera_info is of images of {window[0] // across}x{window[1] // down}, and these have"
+            f"the driver's camera_info is for images of {window[0] // across}x{window[1] // down}, these have"
             f' {width}x{height}'
         )
     if readout.offset[0] + readout.window[0] > readout.width or readout.offset[1] + readout.window[1] > readout.height:
-        return (
-            "the region of interest in the driver's camera_info reaches beyond its"
-            f' {readout.width}x{readout.height} pixels'
-        )
+        return f"the region of interest in the driver's camera_info exceeds its {readout.width}x{readout.height} pixels"
     return ''
 
 
 def _to_full_resolution(
     matrix: list[float], columns: int, binning: tuple[int, int], offset: tuple[int, int]
 ) -> list[float]:
-    """Return K or P for the whole sensor."""
+    """Return K or P in pixels of the whole sensor."""
     rows = np.array(matrix).reshape(3, columns) * np.array([[binning[0]], [binning[1]], [1]])
     rows[:2, 2] += offset
     return [float(value) for value in rows.ravel()]
 
 
 def _coefficients(camera: Camera, model: str) -> tuple[list[float], float]:
-    """Return D in a model, and by how many pixels it misses the lens at the most."""
+    """Return D in a distortion model, and its maximum error in pixels."""
     if model == 'equidistant':
         coefficients = [float(value) for value in camera.k]
         if not any(abs(value) >= EQUIDISTANT_K1_FLOOR for value in coefficients):
@@ -152,7 +150,7 @@ def _coefficients(camera: Camera, model: str) -> tuple[list[float], float]:
 
 
 def _model_misfit(camera: Camera, model: str, error_px: float) -> ModelMisfit:
-    """Say how far a model is from the lens, and which model to choose."""
+    """Return the error for a model that cannot represent the lens, with a model that can."""
     angle_deg = float(np.degrees(max_visible_angle_rad(camera)))
     if np.isfinite(error_px):
         message = (
@@ -173,11 +171,11 @@ def _model_misfit(camera: Camera, model: str, error_px: float) -> ModelMisfit:
 
 
 def rectified_matrix(camera: Lens, balance: float = 0.0) -> np.ndarray:
-    """Return the K, shape (3, 3), of a distortion-free image of equal size.
+    """Return K, shape (3, 3), of a distortion-free image of the same size.
 
-    At `balance` 0 the lens fills it wholly: the largest axis-parallel rectangle about the axis inside the undistorted
-    border decides. At 1 it holds all that the lens shows: the smallest one around that border. Between them the matrix
-    is interpolated, as OpenCV does. Border points beyond RECTIFIED_LIMIT_DEG are brought in to it.
+    `balance` 0: only valid pixels, the largest axis-parallel rectangle about the axis inside the undistorted border.
+    1: the whole field of view, the smallest rectangle around that border. Values between interpolate the matrix, as in
+    OpenCV. Border points beyond `RECTIFIED_LIMIT_DEG` are clipped to it.
     """
     left, right, top, bottom = _normalised_borders(camera)
     filled = _matrix_for_rectangle(camera, left.max(), right.min(), top.max(), bottom.min(), max)
@@ -186,7 +184,7 @@ def rectified_matrix(camera: Lens, balance: float = 0.0) -> np.ndarray:
 
 
 def _normalised_borders(camera: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the slopes x of the left and right border's pixels and y of the upper and lower border's, each (n,)."""
+    """Return normalised x of the left and right border's pixels and y of the top and bottom border's, each (n,)."""
     width, height = camera.width, camera.height
     across, down = np.linspace(0, width - 1, 257), np.linspace(0, height - 1, 257)
     limit = np.radians(RECTIFIED_LIMIT_DEG)
@@ -208,7 +206,7 @@ def _normalised_borders(camera: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarra
 def _matrix_for_rectangle(
     camera: Lens, left: float, right: float, top: float, bottom: float, choose: Callable[[float, float], float]
 ) -> np.ndarray:
-    """Return the K with square pixels that shows a rectangle of slopes in its middle, one of its sides exactly."""
+    """Return K with square pixels that centres a rectangle of normalised coordinates and fits one of its sides."""
     width, height = camera.width, camera.height
     focal = choose((width - 1) / max(right - left, 1e-6), (height - 1) / max(bottom - top, 1e-6))
     return np.array(

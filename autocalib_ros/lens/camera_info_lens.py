@@ -1,7 +1,7 @@
-"""The lens of a sensor_msgs/CameraInfo, exact both ways, in the pixels of the images that it comes with.
+"""Exact projection and unprojection by a sensor_msgs/CameraInfo, in the pixels of the images that come with it.
 
-K and D are of the full resolution of the sensor (REP-104). Its images may be cut out and binned: a pixel u of the
-image is u * binning + offset of the region of interest in full resolution, as image_geometry has it.
+K and D are in the full resolution of the sensor (REP-104). Images may be cropped and binned: a pixel u of the image is
+u * binning + offset of the region of interest in full resolution, as in image_geometry.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from autocalib_ros.lens.camera_info_yaml import lens_from_fields
 from autocalib_ros.lens.opencv_lens import OpencvLens, distort, distortion_jacobian, invertible_radii
 
 MAX_UNDISTORT_ITERATIONS = 12
-"""Most: from the table of radii four or five steps reach the last digit."""
+"""Upper limit: from the lookup table four or five iterations reach full precision."""
 UNDISTORT_TOLERANCE = 1e-10
-"""A slope counts as found when it is imaged so near to what was asked for, in focal lengths: below 1e-6 px."""
+"""Maximum residual in focal lengths for a converged inversion: less than 1e-6 px."""
 LENS_FIELDS = ('width', 'height', 'distortion_model', 'k', 'd')
 
 
 @dataclass(frozen=True)
 class CameraInfoLens:
-    """A lens in pixels of delivered images: full resolution less the `offset_px`, divided by the `binning`."""
+    """A lens in pixels of the delivered images: full resolution minus `offset_px`, divided by `binning`."""
 
     full: OpencvLens
     binning: tuple[int, int] = (1, 1)
@@ -34,17 +34,17 @@ class CameraInfoLens:
 
     @classmethod
     def of(cls, info: Any, *, rectified: bool = False) -> CameraInfoLens:
-        """Read an object with the attributes of a CameraInfo, K and D of ROS 1 too; InputError where it is no lens.
+        """Return the lens of an object with the attributes of a CameraInfo, also of ROS 1; InputError if it is invalid.
 
-        The `rectified` lens is that of image_proc's image_rect: P, without distortion.
+        `rectified` gives the lens of image_proc's image_rect: P, without distortion.
         """
         fields = {name: message_field(info, name) for name in LENS_FIELDS}
         if rectified:
             projection = _numbers(message_field(info, 'p'))
             if len(projection) != 12 or not (projection[0] > 0 and projection[5] > 0):
                 raise InputError(
-                    "its 'p' holds no projection: rectified images come with 12 numbers, focal lengths"
-                    ' above 0 among them; take the image that is not rectified, or calibrate'
+                    "its 'p' has no valid projection: rectified images need 12 numbers with positive focal lengths;"
+                    ' use the unrectified image, or calibrate'
                 )
             fields |= {
                 'k': [*projection[0:3], *projection[4:7], *projection[8:11]],
@@ -62,7 +62,7 @@ class CameraInfoLens:
 
     @cached_property
     def _polynomial(self) -> Camera:
-        """The equidistant lens of focal length 1 about the pixel (0, 0)."""
+        """Equidistant lens with focal length 1 and principal point (0, 0)."""
         k1, k2, k3, k4 = self.full.coefficients[:4]
         return Camera(self.full.width, self.full.height, 1.0, (0.0, 0.0), (k1, k2, k3, k4))
 
@@ -71,7 +71,7 @@ class CameraInfoLens:
         return invertible_radii(self.full.coefficients)
 
     def project(self, bearings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Project bearings (n, 3), of any length, to pixels (n, 2), nan where invalid; and say where valid (n,)."""
+        """Return pixels (n, 2) of bearings (n, 3) of any length, nan where invalid, and which are valid (n,)."""
         if self.full.equidistant:
             ideal, valid = self._polynomial.project(bearings)
         else:
@@ -83,7 +83,7 @@ class CameraInfoLens:
         return np.where(valid[:, None], (full - self.offset_px) / self.binning, np.nan), valid
 
     def unproject(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return unit bearings (n, 3) of pixels (n, 2), nan where no bearing is imaged there; and where valid (n,)."""
+        """Return unit bearings (n, 3) of pixels (n, 2), nan where invalid, and which are valid (n,)."""
         full = np.asarray(pixels, float) * self.binning + self.offset_px
         ideal = np.linalg.solve(self.full.matrix[:2, :2], (full - self.full.matrix[:2, 2]).T).T
         if self.full.equidistant:
@@ -95,12 +95,12 @@ class CameraInfoLens:
         return np.where(valid[:, None], bearings, np.nan), valid
 
     def _undistort(self, ideal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Invert the distortion by Newton's method from the radial table; and where that succeeds."""
+        """Invert the distortion by Newton's method, started from the radial table; and return where it converged."""
         radius, imaged = self._radial_table
         length = np.hypot(*ideal.T)
         ideal = np.where(length[:, None] < imaged[-1], ideal, np.nan)
         normalised = ideal * (np.interp(length, imaged, radius) / np.maximum(length, 1e-12))[:, None]
-        with np.errstate(all='ignore'):  # near the fold not all converge, and those are refused below
+        with np.errstate(all='ignore'):  # some diverge at the edge of the invertible range and are rejected below
             for _ in range(MAX_UNDISTORT_ITERATIONS):
                 error = distort(normalised, self.full.coefficients) - ideal
                 xx, xy, yy = distortion_jacobian(normalised, self.full.coefficients)
@@ -117,7 +117,7 @@ class CameraInfoLens:
 
 
 def message_field(message: Any, name: str) -> Any:
-    """Return a field of a message; ROS 1 writes matrices in upper case."""
+    """Return a field of a message; ROS 1 names matrices in upper case."""
     return getattr(message, name if hasattr(message, name) else name.upper())
 
 

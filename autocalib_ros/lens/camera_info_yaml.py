@@ -1,4 +1,4 @@
-"""DOCSTRING."""
+"""Reading and writing of camera_info_manager's YAML, and reading of a CameraInfo printed by `ros2 topic echo`."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ from autocalib_ros.lens.opencv_lens import OpencvLens, fit_kannala_brandt
 from autocalib_ros.util.files import write_atomically
 
 MAX_YAML_BYTES = 1_000_000
-"""No camera_info is nearly so long."""
+"""Maximum file size: no camera_info comes near it."""
 MAX_ABS_VALUE = 1e9
-"""Beyond this nothing is meant in earnest, and powers of it would leave the numbers of a computer."""
+"""Maximum absolute value of a number: larger ones are errors, and their powers would overflow."""
 Parsed = TypeVar('Parsed')
-EXPECTED_INPUT = 'give the file of camera_info_manager, or what `ros2 topic echo --once` prints of a CameraInfo'
+EXPECTED_INPUT = 'give the file of camera_info_manager, or the output of `ros2 topic echo --once` of a CameraInfo'
 
 
 def write_camera_info_yaml(
     path: Path, camera: Camera, camera_name: str, distortion_model: str = 'auto', rectified_balance: float = 0.0
 ) -> None:
-    """Write the file of camera_info_manager, atomically; `camera_name` is reduced to letters, digits and _."""
+    """Write the file of camera_info_manager atomically; `camera_name` is reduced to letters, digits and _."""
     write_atomically(path, camera_info_yaml(camera_info(camera, distortion_model, rectified_balance), camera_name))
 
 
 def sanitised_name(name: str) -> str:
-    """Return a name in letters, digits and _, as camera_info_manager and frames want it."""
+    """Return a name with all but letters, digits and _ replaced, as camera_info_manager and frames need it."""
     return re.sub(r'[^A-Za-z0-9_]', '_', name)
 
 
@@ -58,7 +58,7 @@ def camera_info_yaml(info: CameraInfo, camera_name: str) -> str:
 
 
 def read_camera_info_fields(path: Path) -> CameraInfo:
-    """Read camera_info_manager's file as it stands, whatever lens it tells of; InputError where it is none."""
+    """Return the fields of camera_info_manager's file without conversion; InputError if it is invalid."""
     return _read(path, _parse_camera_info)
 
 
@@ -75,19 +75,19 @@ def _parse_camera_info(fields: Mapping[str, Any]) -> CameraInfo:
     )
 
 
-def read_camera_info(path: Path) -> Camera:
-    """Read the lens from the YAML of camera_info_manager, or of a CameraInfo as `ros2 topic echo --once` prints it.
+def read_camera_info(path: Path | str) -> Camera:
+    """Return the lens of camera_info_manager's YAML, or of a CameraInfo as `ros2 topic echo --once` prints it.
 
-    'equidistant' is taken as it stands, other models as the nearest Kannala-Brandt lens. Raises InputError that says
-    what is wrong with the file, what was expected and what to do.
+    'equidistant' is converted exactly, other models to the closest Kannala-Brandt lens. InputError names the fault,
+    what was expected and the remedy.
     """
     return _read(path, lambda fields: fit_kannala_brandt(lens_from_fields(fields)))
 
 
 def read_exact_lens(path: Path) -> tuple[OpencvLens, np.ndarray | None]:
-    """Read from the same files the lens as it stands, and P R, shape (3, 3), which images its rectified picture.
+    """Return the lens of such a file without conversion, and P R, shape (3, 3), which projects to its rectified image.
 
-    The latter is None where the file does not tell it. InputError as of `read_camera_info`.
+    P R is None if the file has none. InputError as of `read_camera_info`.
     """
     return _read(path, lambda fields: (lens_from_fields(fields), _rectified_projection(fields)))
 
@@ -105,10 +105,10 @@ def _rectified_projection(fields: Mapping[str, Any]) -> np.ndarray | None:
     return projection[:, :3] @ rectification if is_valid else None
 
 
-def _read(path: Path, make: Callable[[Mapping[str, Any]], Parsed]) -> Parsed:
-    """Return what is made of the fields of a file; InputError names the file."""
+def _read(path: Path | str, parse: Callable[[Mapping[str, Any]], Parsed]) -> Parsed:
+    """Return the fields of a file as parsed; InputError names the file."""
     try:
-        return make(_fields(Path(os.path.expanduser(path))))
+        return parse(_fields(Path(os.path.expanduser(path))))
     except OSError as error:
         raise InputError(f'cannot read {path}: {error.strerror or error}') from error
     except AutocalibError as error:
@@ -123,16 +123,16 @@ def _fields(path: Path) -> Mapping[str, Any]:
         raise InputError(f'it is longer than {MAX_YAML_BYTES} bytes, so it is no camera_info; {EXPECTED_INPUT}')
     try:
         document = next(yaml.safe_load_all(text), None)
-    except Exception as error:  # tags and numbers that YAML cannot make sense of leave PyYAML as errors of any kind
-        said = ' '.join(str(error).split())[:200]
-        raise InputError(f'it is not YAML ({said or type(error).__name__}); {EXPECTED_INPUT}') from error
+    except Exception as error:  # PyYAML raises errors of any type at unknown tags and malformed numbers
+        reason = ' '.join(str(error).split())[:200]
+        raise InputError(f'it is not YAML ({reason or type(error).__name__}); {EXPECTED_INPUT}') from error
     if not isinstance(document, Mapping):
         raise InputError(f'it holds no names with values; {EXPECTED_INPUT}')
     return {str(key).lower(): value for key, value in document.items() if isinstance(key, str)}
 
 
 def lens_from_fields(fields: Mapping[str, Any]) -> OpencvLens:
-    """Return the lens of a CameraInfo given by the names of its fields, lists as lists; InputError where it is none."""
+    """Return the lens of the fields of a CameraInfo, matrices as lists; InputError if they are invalid."""
     width, height = (
         _parse_pixel_count(fields, 'image_width', 'width'),
         _parse_pixel_count(fields, 'image_height', 'height'),
@@ -145,12 +145,12 @@ def lens_from_fields(fields: Mapping[str, Any]) -> OpencvLens:
     equidistant = model in ('equidistant', 'fisheye')
     coefficients = (*given, *[0.0] * ((4 if equidistant else 8) - len(given)))
     if coefficients == (EQUIDISTANT_K1_FLOOR, 0.0, 0.0, 0.0):
-        coefficients = (0.0,) * 4  # the floor that `camera_info` puts in
+        coefficients = (0.0,) * 4  # `camera_info` adds this floor
     return OpencvLens(width=width, height=height, matrix=matrix, equidistant=equidistant, coefficients=coefficients)
 
 
 def _first_field(fields: Mapping[str, Any], *names: str) -> Any:
-    """Return the value under the first of the names that is there."""
+    """Return the value of the first of these names that is present."""
     for name in names:
         if name in fields:
             return fields[name]
@@ -162,8 +162,8 @@ def _parse_model(fields: Mapping[str, Any]) -> tuple[str, tuple[int, ...]]:
     name = given.strip().lower() if isinstance(given, str) else ''
     if name not in DISTORTION_MODELS:
         raise InputError(
-            f'its distortion model is {_abbreviated(given)}, and only {", ".join(DISTORTION_MODELS)} are read;'
-            ' calibrate the camera anew with one of these, or leave the file out'
+            f'its distortion model is {_abbreviated(given)}, supported are {", ".join(DISTORTION_MODELS)};'
+            ' recalibrate the camera with one of these, or leave the file out'
         )
     return name, DISTORTION_MODELS[name]
 
@@ -176,39 +176,38 @@ def _parse_pixel_count(fields: Mapping[str, Any], *names: str) -> int:
 
 
 def _parse_numbers(fields: Mapping[str, Any], sizes: tuple[int, ...], *names: str) -> list[float]:
-    """Return a matrix of camera_info_manager, which has rows, cols and data, or a plain list."""
+    """Return the numbers of a matrix, given as rows, cols and data or as a plain list."""
     value = _first_field(fields, *names)
     if isinstance(value, Mapping):
         value = value.get('data')
     if not isinstance(value, list):
-        raise InputError(f"its '{names[0]}' holds no list of numbers; {EXPECTED_INPUT}")
+        raise InputError(f"its '{names[0]}' is not a list of numbers; {EXPECTED_INPUT}")
     if len(value) not in sizes:
-        expected = ' or '.join(map(str, sizes)) if len(sizes) < 3 else f'{sizes[-1]} at the most'
-        raise InputError(f"its '{names[0]}' holds {len(value)} numbers, expected {expected}; {EXPECTED_INPUT}")
+        expected = ' or '.join(map(str, sizes)) if len(sizes) < 3 else f'at most {sizes[-1]}'
+        raise InputError(f"its '{names[0]}' has {len(value)} numbers, expected {expected}; {EXPECTED_INPUT}")
     return [_parse_number(item, names[0]) for item in value]
 
 
 def _parse_number(value: Any, name: str) -> float:
-    """Return a number; YAML takes `1e-05`, without a point, for text."""
+    """Return a finite number; YAML parses `1e-05`, without a point, as text."""
     try:
         number = float(value) if isinstance(value, (int, float, str)) and not isinstance(value, bool) else None
     except (ValueError, OverflowError):
         number = None
     if number is None or not abs(number) <= MAX_ABS_VALUE:
-        raise InputError(f"its '{name}' holds {_abbreviated(value)}, not a finite number; {EXPECTED_INPUT}")
+        raise InputError(f"its '{name}' contains {_abbreviated(value)}, not a finite number; {EXPECTED_INPUT}")
     return number
 
 
 def _abbreviated(value: Any) -> str:
-    """Return a value for a message; of what a hostile file has folded together no more than its kind."""
+    """Return a value for a message; of a list or mapping, which may be huge, only its type."""
     return f'a {type(value).__name__}' if isinstance(value, (list, Mapping)) else reprlib.repr(value)
 
 
 def _require_calibrated(matrix: np.ndarray) -> None:
     if matrix[0, 0] == 0 or matrix[1, 1] == 0:
         raise InputError(
-            'it is of a camera that is not calibrated, its focal length is 0:'
-            ' calibrate the camera, or leave the file out'
+            'its camera is not calibrated, the focal length is 0: calibrate the camera, or leave the file out'
         )
     if min(matrix[0, 0], matrix[1, 1]) < 1 or matrix[1, 0] != 0 or matrix[2].tolist() != [0, 0, 1]:
         raise InputError(
@@ -217,12 +216,12 @@ def _require_calibrated(matrix: np.ndarray) -> None:
 
 
 def _require_full_frame(fields: Mapping[str, Any], width: int, height: int) -> None:
-    """Refuse a region of interest: its images are cut out, and nothing in them tells from where."""
+    """Raise InputError at a region of interest: the offset of its images in the full frame is unknown."""
     region = fields.get('roi')
     if not isinstance(region, Mapping) or not region.get('width') or not region.get('height'):
         return
     if (region['width'], region['height']) != (width, height):
         raise InputError(
-            'it is of a camera that sends only a region of interest (roi);'
+            'its camera sends only a region of interest (roi);'
             ' give a calibration of the size of the images, without roi'
         )

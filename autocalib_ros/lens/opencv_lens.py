@@ -1,12 +1,12 @@
-"""The lens models of OpenCV, the Kannala-Brandt camera that comes nearest to one of them, and the way back.
+"""Lens models of OpenCV, and conversion between them and the Kannala-Brandt camera.
 
-A bearing with the slopes (x, y) = (X / Z, Y / Z) and r^2 = x^2 + y^2 is imaged at K (x', y', 1) with
+A bearing with normalised coordinates (x, y) = (X / Z, Y / Z) and r^2 = x^2 + y^2 is imaged at K (x', y', 1) with
 
     x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)
     y' = y (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y
 
-by 'rational_polynomial' and, without k4 to k6, by 'plumb_bob'. The distortion-free lens is all zero. 'equidistant'
-is the polynomial of camera.py with an x and a y focal length.
+in the model 'rational_polynomial' and, without k4 to k6, in 'plumb_bob'. Without distortion all are zero.
+'equidistant' is the polynomial of camera.py with separate focal lengths for x and y.
 """
 
 from __future__ import annotations
@@ -20,27 +20,30 @@ from autocalib_ros.errors import InputError
 from autocalib_ros.lens.camera import Camera
 
 MAX_MODEL_ERROR_PX = 0.5
-"""As much as the position of a tracked point is good for: more would spoil the pose."""
+"""Maximum error of a converted lens in pixels, the accuracy of a tracked point: more would bias the pose."""
 MIN_FISHEYE_COVERAGE = 0.25
-"""Least share of the image that a fisheye shows."""
+"""Minimum fraction of the image that a fisheye covers, as a disc in the middle."""
 MIN_FIELD_OF_VIEW_DEG = 1.0
+"""Minimum angle between image corners in degrees: less comes from wrong numbers, not from a camera."""
 COMPARISON_GRID_SIDE = 41
 """Pixels along each side of the grid on which two lenses are compared, borders included."""
 MAX_PINHOLE_ANGLE_RAD = np.radians(89.0)
+"""Largest angle from the axis at which normalised coordinates, tan(theta), are used."""
 RADIAL_TABLE_SIZE = 8192
+"""Entries of the lookup table that inverts the radial distortion."""
 TANGENTIAL_ITERATIONS = 20
-"""Fixed-point steps: the tangential terms are small, and each step is closer by their share."""
+"""Fixed-point iterations: tangential terms are small, and each iteration reduces the error by that factor."""
 INVERSION_TOLERANCE_PX = 0.05
-"""A pixel counts as reached when the bearing found for it is imaged this near to it."""
+"""Maximum reprojection error in pixels for which an inversion counts as successful."""
 RADIAL_FIT_SAMPLES = 400
-"""Angles, from the axis to the farthest corner, on which a model is fitted to a lens; four times as many check it."""
+"""Angles from the axis to the farthest corner for the fit of a model; four times as many validate it."""
 MAX_LAWSON_ITERATIONS = 20
-"""Fits, each weighted by the errors of the one before: a dozen bring the largest error near to its least."""
+"""Reweighted fits (Lawson 1961): about a dozen bring the maximum error near to its minimum."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class OpencvLens:
-    """A lens as a camera_info gives it."""
+    """A lens as CameraInfo describes it."""
 
     width: int
     height: int
@@ -48,15 +51,15 @@ class OpencvLens:
     """K, shape (3, 3), pixels."""
     equidistant: bool
     coefficients: tuple[float, ...]
-    """k1 to k4 of an equidistant lens, otherwise k1, k2, p1, p2, k3, k4, k5, k6."""
+    """k1 to k4 of an equidistant lens, otherwise k1, k2, p1, p2, k3, k4, k5, k6, as in D."""
 
     @property
     def has_square_pixels(self) -> bool:
-        """Whether pixels are square and not skewed, as those of a Camera."""
+        """Whether pixels are square and not skewed, as in a Camera."""
         return self.matrix[0, 0] == self.matrix[1, 1] and self.matrix[0, 1] == 0.0
 
     def grid(self) -> np.ndarray:
-        """Return pixels all over the image, shape (n, 2)."""
+        """Return pixels evenly over the image, shape (n, 2)."""
         across, down = (
             np.linspace(0, self.width - 1, COMPARISON_GRID_SIDE),
             np.linspace(0, self.height - 1, COMPARISON_GRID_SIDE),
@@ -64,7 +67,7 @@ class OpencvLens:
         return np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
 
     def unproject_and_reproject(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return bearings (n, 3), exactly where they are imaged (n, 2), and whether that is at `pixels` (n, 2)."""
+        """Return bearings (n, 3), their reprojection (n, 2), and whether that is at `pixels` (n, 2)."""
         ideal = np.linalg.solve(self.matrix, np.column_stack([pixels, np.ones(len(pixels))]).T).T[:, :2]
         if self.equidistant:
             bearings, valid = _camera(self, 1.0, np.zeros(2), self.coefficients).unproject(ideal)
@@ -76,10 +79,10 @@ class OpencvLens:
 
 
 def fit_kannala_brandt(lens: OpencvLens) -> Camera:
-    """Return the Kannala-Brandt camera that images the field of the lens's image as the lens does.
+    """Return the Kannala-Brandt camera closest to the lens over its image.
 
-    An equidistant lens with square pixels is one itself; any other is fitted. Raises InputError where the lens leaves
-    the image empty, and where the fit misses by more than MAX_ERROR_PX.
+    An equidistant lens with square pixels converts exactly, others by a fit. InputError if the lens leaves part of
+    the image without a bearing, or if the error of the fit exceeds `MAX_MODEL_ERROR_PX`.
     """
     bearings, imaged, invertible = lens.unproject_and_reproject(lens.grid())
     _require_coverage(lens, float(invertible.mean()))
@@ -91,34 +94,34 @@ def fit_kannala_brandt(lens: OpencvLens) -> Camera:
     error_px = np.where(valid, np.hypot(*(pixels - imaged[invertible]).T), np.inf).max()
     if not error_px <= MAX_MODEL_ERROR_PX:
         raise InputError(
-            f'the nearest Kannala-Brandt lens misses this one by up to {error_px:.2f} px, and more than'
-            f' {MAX_MODEL_ERROR_PX:g} px would spoil the pose; {_misfit_cause(lens)}, or leave the file out'
+            f'the nearest Kannala-Brandt lens differs from this one by up to {error_px:.2f} px, more than the'
+            f' {MAX_MODEL_ERROR_PX:g} px that the pose allows; {_misfit_cause(lens)}, or leave the file out'
         )
     return camera
 
 
-def _require_coverage(lens: OpencvLens, share: float) -> None:
-    """Raise InputError unless enough of the image is reached; a fisheye's picture may be a disc in the middle."""
-    if share < (MIN_FISHEYE_COVERAGE if lens.equidistant else 1.0):
+def _require_coverage(lens: OpencvLens, fraction: float) -> None:
+    """Raise InputError unless enough of the image has a bearing; a fisheye may cover only a disc in the middle."""
+    if fraction < (MIN_FISHEYE_COVERAGE if lens.equidistant else 1.0):
         raise InputError(
-            f'its distortion folds back and leaves {100 * (1 - share):.0f} % of the image empty;'
-            ' calibrate the camera anew, with the pattern near the borders too or with a fisheye model'
+            f'its distortion is not invertible for {100 * (1 - fraction):.0f} % of the image;'
+            ' recalibrate the camera with the pattern near the borders too, or with a fisheye model'
         )
 
 
 def _require_field_of_view(bearings: np.ndarray) -> None:
-    """Raise InputError when bearings from all over the image are nearly one: the numbers are not of a camera."""
+    """Raise InputError if opposite corners have nearly the same bearing: the numbers are not those of a camera."""
     one, other = bearings[[0, -1]] / np.linalg.norm(bearings[[0, -1]], axis=1)[:, None]
     field_deg = np.degrees(np.arctan2(np.linalg.norm(np.cross(one, other)), one @ other))
     if field_deg < MIN_FIELD_OF_VIEW_DEG:
         raise InputError(
-            f'its lens sees {field_deg:.1g} degrees from corner to corner, which cannot be meant;'
-            ' calibrate the camera anew, or leave the file out'
+            f'its field of view is {field_deg:.1g} degrees from corner to corner, which is implausible;'
+            ' recalibrate the camera, or leave the file out'
         )
 
 
 def _misfit_cause(lens: OpencvLens) -> str:
-    """Say what a Camera does not have, and how to calibrate so that it is not needed."""
+    """Return what a Camera cannot represent, and how to calibrate without it."""
     (fx, skew, _), (_, fy, _), _ = lens.matrix
     causes = {
         f'two focal lengths, {fx:.1f} and {fy:.1f} px (--fix-aspect-ratio)': fx != fy,
@@ -127,8 +130,8 @@ def _misfit_cause(lens: OpencvLens) -> str:
     }
     found = [cause for cause, there in causes.items() if there]
     if not found:
-        return 'its angle is too wide: calibrate the camera anew with a fisheye model'
-    return f'it has {" and ".join(found)}: calibrate the camera anew without, by the options of camera_calibration'
+        return 'its field of view is too wide: recalibrate the camera with a fisheye model'
+    return f'it has {" and ".join(found)}: recalibrate the camera without, by the options of camera_calibration'
 
 
 def _camera(lens: OpencvLens, focal_px: float, principal_point_px: np.ndarray, k: Sequence[float]) -> Camera:
@@ -138,7 +141,7 @@ def _camera(lens: OpencvLens, focal_px: float, principal_point_px: np.ndarray, k
 
 
 def _fit_camera(lens: OpencvLens, bearings: np.ndarray, imaged: np.ndarray) -> Camera:
-    """Solve for principal point and f, f k1 to f k4: the pixels are linear in them, so there is no iteration."""
+    """Solve for principal point, f and f k1 to f k4 by linear least squares: the pixels are linear in them."""
     across = np.hypot(bearings[:, 0], bearings[:, 1])
     powers = np.arctan2(across, bearings[:, 2])[:, None] ** [1, 3, 5, 7, 9]
     outwards = bearings[:, :2] / np.maximum(across, 1e-12)[:, None]
@@ -154,12 +157,10 @@ def _fit_camera(lens: OpencvLens, bearings: np.ndarray, imaged: np.ndarray) -> C
 
 
 def fit_opencv_coefficients(camera: Camera, *, rational: bool) -> tuple[tuple[float, ...], float]:
-    """Return k1, k2, p1, p2, k3 to k6 of the OpenCV lens with the camera's K that comes nearest to it, and its error.
+    """Return k1, k2, p1, p2, k3 to k6 of the OpenCV lens closest to `camera`, with the same K, and its error.
 
-    The error is the largest distance in pixels between the images of one bearing in the two lenses, over the whole
-    image; infinite where the image shows bearings at `MAX_PINHOLE_ANGLE_RAD` from the axis or more, which have no
-    slopes
-    to speak of. Without `rational`, k4 to k6 are 0.
+    The error is the largest distance in pixels between the images of one bearing, over the whole image; infinite if
+    the image shows bearings at `MAX_PINHOLE_ANGLE_RAD` from the axis or more. Without `rational`, k4 to k6 are 0.
     """
     field_rad = max_visible_angle_rad(camera)
     if not field_rad < MAX_PINHOLE_ANGLE_RAD:
@@ -167,14 +168,15 @@ def fit_opencv_coefficients(camera: Camera, *, rational: bool) -> tuple[tuple[fl
     normalised, radii = _radial_samples(camera, field_rad, RADIAL_FIT_SAMPLES)
     checked = _radial_samples(camera, field_rad, 4 * RADIAL_FIT_SAMPLES)
     weights, denominator = np.ones(RADIAL_FIT_SAMPLES), np.ones(RADIAL_FIT_SAMPLES)
-    best, least_px = (0.0,) * 8, np.inf
+    best: tuple[float, ...] = (0.0,) * 8
+    least_px = np.inf
     for _ in range(MAX_LAWSON_ITERATIONS):
         coefficients = _radial_fit(normalised, radii, np.sqrt(weights) / denominator, rational=rational)
         error_px = camera.focal_px * _radial_error(*checked, coefficients).max()
         if error_px < least_px:
             best, least_px = coefficients, float(error_px)
         denominator = _denominator(normalised * normalised, coefficients)
-        # Lawson's weights: they turn the least sum of squares into the least largest error
+        # Lawson's weights turn the least-squares fit into a minimax fit
         weights = weights * _radial_error(normalised, radii, coefficients)
         if not np.isfinite(weights).all() or not weights.any():
             break
@@ -183,20 +185,20 @@ def fit_opencv_coefficients(camera: Camera, *, rational: bool) -> tuple[tuple[fl
 
 
 def max_visible_angle_rad(camera: Camera) -> float:
-    """Return the largest angle from the axis that the image shows: of a corner, or of the edge of a fisheye's disc."""
+    """Return the largest visible angle from the axis: of a corner, or of the edge of a fisheye's disc."""
     corners = np.array([(x, y) for x in (0, camera.width - 1) for y in (0, camera.height - 1)], float)
     return float(camera.angle(np.hypot(*(corners - camera.principal_point_px).T).max())[0])
 
 
 def _radial_samples(camera: Camera, field_rad: float, steps: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return slopes r = tan(theta) from the axis to the end of the field and their image radii in focal lengths."""
+    """Return normalised radii r = tan(theta) up to the edge of the field and their image radii in focal lengths."""
     theta = np.linspace(0.0, field_rad, steps + 1)[1:]
     return np.tan(theta), camera.radius(theta) / camera.focal_px
 
 
 def _radial_fit(normalised: np.ndarray, radii: np.ndarray, weights: np.ndarray, *, rational: bool) -> tuple[float, ...]:
-    """Fit r (1 + k1 r^2 + ...) = radius (1 + k4 r^2 + ...), which is linear in the coefficients, shape (n,) each."""
-    unit = normalised[-1]  # slopes of a wide lens to the seventh power would leave the digits of a double
+    """Fit r (1 + k1 r^2 + ...) = radius (1 + k4 r^2 + ...), linear in the coefficients, to samples (n,)."""
+    unit = normalised[-1]  # scaled: radii of a wide lens to the seventh power would exhaust double precision
     exponents = np.array([2, 4, 6])
     powers = (normalised[:, None] / unit) ** exponents
     columns = np.hstack([normalised[:, None] * powers, *([-radii[:, None] * powers] if rational else [])])
@@ -207,7 +209,7 @@ def _radial_fit(normalised: np.ndarray, radii: np.ndarray, weights: np.ndarray, 
 
 
 def _radial_error(normalised: np.ndarray, radii: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
-    """Return by how much each radius is missed, in focal lengths; infinite where the model has a pole on the way."""
+    """Return the error of each radius in focal lengths; infinite if the model has a pole in the field."""
     r2 = normalised * normalised
     if not (_denominator(r2, coefficients) > 0).all():
         return np.full_like(normalised, np.inf)
@@ -215,14 +217,14 @@ def _radial_error(normalised: np.ndarray, radii: np.ndarray, coefficients: tuple
 
 
 def distort(normalised: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
-    """Return x', y' of slopes x, y, shape (n, 2)."""
+    """Return the distorted x', y' of normalised coordinates x, y, shape (n, 2)."""
     return normalised * _radial(np.sum(normalised * normalised, axis=1), coefficients)[:, None] + _tangential(
         normalised, coefficients
     )
 
 
 def undistort(ideal: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
-    """Invert `distort` as well as it can be: beyond the radius where the model folds back, nothing is right."""
+    """Return the inverse of `distort`; not defined beyond the radius where the model stops being monotonic."""
     radius, imaged = invertible_radii(coefficients)
     normalised = np.zeros_like(ideal)
     for _ in range(TANGENTIAL_ITERATIONS):
@@ -233,7 +235,7 @@ def undistort(ideal: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
 
 
 def invertible_radii(coefficients: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Return slopes' lengths (n,) and where they are imaged (n,), both growing, as far as the model can be inverted."""
+    """Return normalised radii (n,) and their distorted radii (n,) over the range where the model is monotonic."""
     radius = np.tan(np.linspace(0.0, MAX_PINHOLE_ANGLE_RAD, RADIAL_TABLE_SIZE))
     imaged = radius * _radial(radius * radius, coefficients)
     folds = np.flatnonzero(~(np.diff(imaged) > 0))
@@ -244,7 +246,7 @@ def invertible_radii(coefficients: tuple[float, ...]) -> tuple[np.ndarray, np.nd
 def distortion_jacobian(
     normalised: np.ndarray, coefficients: tuple[float, ...]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return dx'/dx, dx'/dy = dy'/dx and dy'/dy of `distort` at slopes (n, 2), each (n,)."""
+    """Return dx'/dx, dx'/dy = dy'/dx and dy'/dy of `distort` at normalised coordinates (n, 2), each (n,)."""
     k1, k2, p1, p2, k3, k4, k5, k6 = coefficients
     x, y = normalised.T
     r2 = x * x + y * y

@@ -1,6 +1,6 @@
-"""What a saved file tells of a camera: its lens, and where there is one its pose, with how sure both are.
+"""A camera from a saved file: its lens, and if known its pose and their uncertainty.
 
-The files are calibration.json, the node's NAME.autocalib.json, and a camera_info.yaml of any hand.
+The files are calibration.json, the node's NAME.autocalib.json, and any camera_info.yaml.
 """
 
 from __future__ import annotations
@@ -24,26 +24,26 @@ from autocalib_ros.results.calibration_json import calibration_from_json, read_j
 
 @dataclass(frozen=True, kw_only=True)
 class SavedCamera:
-    """A lens in images of a size, and what else is known; lengths in pixels unless named otherwise."""
+    """A lens for images of a given size, and what else is known of the camera; lengths in pixels."""
 
     width: int
     height: int
     lens: Camera | CameraInfoLens
-    """Exact both ways."""
+    """Exact in both directions."""
     matrix: np.ndarray
     """K, shape (3, 3)."""
     k: tuple[float, ...] | None = None
-    """Kannala-Brandt coefficients, of the nearest such lens for another model; None where none comes near."""
+    """Kannala-Brandt coefficients, for another model those of the closest such lens; None if none is close enough."""
     rectified: np.ndarray | None = None
-    """What images bearings in the rectified picture that the file tells of, P R, shape (3, 3)."""
+    """P R, shape (3, 3), which projects bearings to the rectified image of the file."""
     ground: GroundPlane | None = None
     stddev: StandardDeviations = field(default_factory=StandardDeviations)
     covariance: np.ndarray | None = None
-    """Of `calibration.COVARIANCE_PARAMETERS`, shape (10, 10)."""
+    """Covariance of `calibration.COVARIANCE_PARAMETERS`, shape (10, 10)."""
 
     @classmethod
     def of(cls, result: Calibration, rectified: np.ndarray | None = None) -> SavedCamera:
-        """Return what a calibration tells."""
+        """Return the camera of a calibration."""
         camera = result.camera
         return cls(
             width=camera.width,
@@ -59,10 +59,10 @@ class SavedCamera:
 
     @classmethod
     def from_opencv_lens(cls, lens: OpencvLens, rectified: np.ndarray | None = None) -> SavedCamera:
-        """Return what a camera_info tells: no pose, and no deviations."""
+        """Return the camera of a CameraInfo, without pose and uncertainty."""
         try:
             camera = fit_kannala_brandt(lens)
-        except InputError:  # then there is no such lens; it is told by its rays all the same
+        except InputError:  # no Kannala-Brandt lens is close; its rays are still known
             camera = None
         return cls(
             width=lens.width,
@@ -75,30 +75,30 @@ class SavedCamera:
 
     @property
     def focal_px(self) -> float:
-        """Focal length, the geometric mean of the two where the pixels are not square."""
+        """Focal length, the geometric mean of x and y if the pixels are not square."""
         return float(np.sqrt(self.matrix[0, 0] * self.matrix[1, 1]))
 
     @property
     def principal_point_px(self) -> tuple[float, float]:
-        """Principal point."""
+        """Principal point in pixels."""
         return float(self.matrix[0, 2]), float(self.matrix[1, 2])
 
     def project(self, bearings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Project bearings (..., 3) to pixels (..., 2), and say where that is valid (...)."""
+        """Return pixels (..., 2) of bearings (..., 3), and which are valid (...)."""
         pixels, valid = self.lens.project(np.reshape(bearings, (-1, 3)))
         return pixels.reshape(*bearings.shape[:-1], 2), valid.reshape(bearings.shape[:-1])
 
     def unproject(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return unit bearings (..., 3) of pixels (..., 2), and where the lens reaches them (...)."""
+        """Return unit bearings (..., 3) of pixels (..., 2), and which are valid (...)."""
         bearings, valid = self.lens.unproject(np.reshape(pixels, (-1, 2)))
         return bearings.reshape(*pixels.shape[:-1], 3), valid.reshape(pixels.shape[:-1])
 
     def scaled_to(self, width: int, height: int) -> SavedCamera:
-        """Return the same for images of another size; UsageError where these are of another shape."""
+        """Return the camera for images of another size; UsageError if their aspect ratio differs."""
         if (width, height) == (self.width, self.height):
             return self
         across, down = scale_factors((self.width, self.height), (width, height))
-        # borders of the image are scaled, half a pixel outside the centres of its outer pixels
+        # image borders are scaled, which lie half a pixel outside the centres of the outer pixels
         scale = np.array([[across, 0, (across - 1) / 2], [0, down, (down - 1) / 2], [0, 0, 1]])
         matrix, focal = scale @ self.matrix, np.sqrt(across * down)
         lens = (
@@ -126,7 +126,7 @@ class SavedCamera:
 
 
 def read_saved_camera(path: Path) -> SavedCamera:
-    """Read any of the files; InputError says what is wrong with it and what was expected."""
+    """Return the camera of any of the files; InputError names the fault and what was expected."""
     if path.suffix.lower() != '.json':
         return SavedCamera.from_opencv_lens(*read_exact_lens(path))
     document = read_json(path)
@@ -139,7 +139,7 @@ def read_saved_camera(path: Path) -> SavedCamera:
 
 
 def _rectified_projection(document: Mapping[str, Any]) -> np.ndarray | None:
-    """Return P of the document's camera_info, whose R is identity; None where it does not hold one."""
+    """Return P of the document's camera_info, whose R is the identity; None if it has no valid one."""
     try:
         projection = np.array(document['camera_info']['p'], float).reshape(3, 4)
     except (KeyError, TypeError, ValueError):

@@ -1,13 +1,13 @@
-"""The calibration kept on disk: camera_info_manager's file for all, and beside it what that cannot hold.
+"""The calibration on disk: camera_info_manager's YAML, and a JSON file for what that cannot hold.
 
-    NAME.yaml            the lens as camera_info_manager reads it
-    NAME.autocalib.json  calibration.json with the pose, the deviations, the evidence, and what NAME.yaml says
-    *.bak                the pair before
-    NAME.report.html     for people, with its figures in NAME.figures; nothing reads them
+    NAME.yaml            the lens in the format of camera_info_manager
+    NAME.autocalib.json  calibration.json with pose, standard deviations and evidence, and the content of NAME.yaml
+    *.bak                the previous pair
+    NAME.report.html     the report, with its figures in NAME.figures; never read back
 
-Each file is replaced in one step, the JSON before the YAML. Whoever is killed between the two leaves a YAML that
-says what the JSON before says; so the lens in the YAML tells which of the two JSONs belongs to it, and a YAML that
-belongs to neither comes from another hand.
+Each file is replaced atomically, the JSON before the YAML. A crash between the two leaves a YAML that matches the
+previous JSON. So the lens in the YAML identifies the JSON that belongs to it, and a YAML that matches neither was
+written by another program.
 """
 
 from __future__ import annotations
@@ -32,52 +32,57 @@ from autocalib_ros.util.files import keep_copy, remove_temporaries, write_atomic
 
 DEFAULT_URL = 'file://${ROS_HOME}/camera_info/${NAME}.yaml'
 STORED_LENS_TOLERANCE = 1e-6
-"""A driver's camera_info_manager, told the same lens, writes it with fewer digits: relative, and absolute below 1."""
+"""Tolerance, relative and below 1 absolute, of equal lenses: a driver's camera_info_manager writes fewer digits."""
 
 Content = TypeVar('Content')
 
 
 @dataclass(frozen=True)
 class StoredCalibration:
-    """A calibration with what it was published as."""
+    """A calibration with the CameraInfo, name and frame that it was published with."""
 
     calibration: Calibration
     info: CameraInfo
     camera_name: str
     image_frame: str
-    """The frame_id of the images."""
+    """frame_id of the images."""
 
 
 class StoreState(Enum):
-    """What stands at the place of a stored calibration."""
+    """State of the stored files."""
 
-    EMPTY = 'nothing'
-    INTACT = 'whole'
-    INTERRUPTED = 'cut off'
-    CORRUPT = 'broken'
+    EMPTY = 'empty'
+    """There is no YAML."""
+    INTACT = 'intact'
+    """YAML and JSON belong together."""
+    INTERRUPTED = 'interrupted'
+    """A write ended between JSON and YAML; the previous JSON belongs to the YAML."""
+    CORRUPT = 'corrupt'
+    """A file cannot be read."""
     FOREIGN = 'foreign'
+    """The YAML was written by another program."""
 
 
 @dataclass(frozen=True)
 class LoadResult:
-    """What was found, the calibration that can be used of it, and what a person has to be told; '' is nothing."""
+    """State of the files, the calibration to use, and a warning for the log; '' for none."""
 
-    kind: StoreState
+    state: StoreState
     stored: StoredCalibration | None = None
     note: str = ''
 
 
 def resolve_url(url: str, camera_name: str, environment: Mapping[str, str] = os.environ) -> Path:
-    """Return the file that a URL of camera_info_manager names; UsageError where it names none.
+    """Return the file of a URL of camera_info_manager; UsageError if it names none.
 
-    '' is `DEFAULT_URL`. `${NAME}` is the camera's name, `${ROS_HOME}` the environment's or ~/.ros.
+    '' means `DEFAULT_URL`. `${NAME}` is the camera's name, `${ROS_HOME}` that of the environment or ~/.ros.
     """
     home = environment.get('ROS_HOME') or os.path.join(environment.get('HOME') or os.path.expanduser('~'), '.ros')
     known = {'NAME': camera_name, 'ROS_HOME': home}
 
     def value(match: re.Match[str]) -> str:
         if match[1] not in known:
-            raise UsageError(f"'camera_info_url' holds {match[0]}: only ${{NAME}} and ${{ROS_HOME}} are replaced")
+            raise UsageError(f"'camera_info_url' contains {match[0]}: only ${{NAME}} and ${{ROS_HOME}} are replaced")
         return known[match[1]]
 
     resolved = re.sub(r'\$\{(\w*)\}', value, url or DEFAULT_URL)
@@ -94,19 +99,19 @@ def resolve_url(url: str, camera_name: str, environment: Mapping[str, str] = os.
 
 
 def _share_folder(package: str, environment: Mapping[str, str]) -> Path:
-    """Return the share folder of a package by the ament index; pip's packages are not in AMENT_PREFIX_PATH."""
+    """Return the share folder of a package in the ament index, also of pip packages outside AMENT_PREFIX_PATH."""
     prefixes = [*filter(None, environment.get('AMENT_PREFIX_PATH', '').split(os.pathsep)), sys.prefix]
     for prefix in map(Path, prefixes):
         if (prefix / 'share' / 'ament_index' / 'resource_index' / 'packages' / package).is_file():
             return prefix / 'share' / package
     raise UsageError(
-        f"'camera_info_url' names the package '{package}', which no ament index knows: source its "
+        f"'camera_info_url' names the package '{package}', which is in no ament index: source its "
         'workspace, or write file:///FOLDER/FILE.yaml'
     )
 
 
 class Store:
-    """The files of one camera; it holds no file open, and no calibration."""
+    """The files of one camera; reads and writes them, and keeps no state."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -115,43 +120,45 @@ class Store:
         self.figures = path.with_name(f'{path.stem}.figures')
 
     def remove_leftovers(self) -> None:
-        """Remove what a writer left that was killed; not to be called while another writes."""
+        """Remove temporary files of a killed writer; not to be called during a write."""
         for path in (self.path, self.json_path):
             remove_temporaries(path)
             remove_temporaries(_backup(path))
 
     def save(self, stored: StoredCalibration, *, replace_foreign: bool = False) -> None:
-        """Write both files; InputError where they cannot be written or the YAML is somebody else's.
+        """Write both files; InputError if that fails or the YAML was written by another program.
 
-        A pair that belongs together is kept as .bak. `replace_foreign` keeps somebody else's YAML as .orig.
+        The previous pair is kept as .bak. `replace_foreign` keeps a YAML of another program as .orig.
         """
         found = self.load()
-        if found.kind is StoreState.FOREIGN:
+        if found.state is StoreState.FOREIGN:
             self._back_up_foreign(replace_foreign)
-        if found.kind is StoreState.INTACT:
+        if found.state is StoreState.INTACT:
             for path in (self.json_path, self.path):
                 keep_copy(path, _backup(path))
         write_atomically(self.json_path, stored_json(stored))
         write_atomically(self.path, camera_info_yaml(stored.info, stored.camera_name))
 
     def load(self) -> LoadResult:
-        """Return what is kept; a file that cannot be used is told, never raised."""
+        """Return the stored calibration; an unusable file is reported in the result, not raised."""
         lens = _try_read(self.path, read_camera_info_fields)
         current, before = (_try_read(path, _read_stored_json) for path in (self.json_path, _backup(self.json_path)))
         if lens is None:
             return LoadResult(
                 StoreState.EMPTY,
                 None,
-                '' if current is None else f'{self.path} is missing beside {self.json_path.name}: nothing is restored',
+                '' if current is None else f'{self.path} is missing next to {self.json_path.name}; nothing is restored',
             )
-        if _is_consistent(lens, current):
-            return LoadResult(StoreState.INTACT, current)
-        if _is_consistent(lens, before):
+        intact = _if_consistent(lens, current)
+        if intact is not None:
+            return LoadResult(StoreState.INTACT, intact)
+        previous = _if_consistent(lens, before)
+        if previous is not None:
             return LoadResult(
                 StoreState.INTERRUPTED,
-                before,
-                f'{self.path} and {self.json_path.name} do not belong together, a write '
-                'was cut off: the calibration before is taken',
+                previous,
+                f'{self.path} and {self.json_path.name} are inconsistent (interrupted write); using the previous '
+                'calibration',
             )
         fault = next((item for item in (lens, current) if isinstance(item, InputError)), None)
         if current is None or fault is None:
@@ -159,33 +166,34 @@ class Store:
             return LoadResult(
                 StoreState.FOREIGN,
                 None,
-                f'{self.path} was not written by this node, or changed since{why}: it is '
-                'not published. Give it as camera_info_file to use its lens',
+                f'{self.path} was not written by this node, or changed since{why}: not restored. Set '
+                'camera_info_file to use its lens',
             )
-        if _is_consistent(_try_read(_backup(self.path), read_camera_info_fields), before):
+        previous = _if_consistent(_try_read(_backup(self.path), read_camera_info_fields), before)
+        if previous is not None:
             return LoadResult(
-                StoreState.CORRUPT, before, f'{fault}: the pair before, {_backup(self.path).name}, is taken'
+                StoreState.CORRUPT, previous, f'{fault}; using the previous pair, {_backup(self.path).name}'
             )
-        return LoadResult(StoreState.CORRUPT, None, f'{fault}: nothing is restored')
+        return LoadResult(StoreState.CORRUPT, None, f'{fault}; nothing is restored')
 
     def _back_up_foreign(self, allowed: bool) -> None:
-        """Keep somebody else's YAML, or raise InputError."""
+        """Keep a YAML of another program as .orig; InputError if that is not allowed or possible."""
         aside = self.path.with_name(self.path.name + '.orig')
         if not allowed:
             raise InputError(
-                f'{self.path} was not written by this node, or changed since, and is left alone: call '
+                f'{self.path} was not written by this node, or changed since, and is not overwritten: call '
                 f'~/save to replace it and keep it as {aside.name}, or set camera_info_url'
             )
         if aside.exists():
             raise InputError(
-                f'{self.path} was not written by this node, or changed since, and {aside.name} is there '
+                f'{self.path} was not written by this node, or changed since, and {aside.name} exists '
                 'already: move one of them away'
             )
         keep_copy(self.path, aside)
 
 
 def stored_json(stored: StoredCalibration) -> str:
-    """Return the text of the file beside the YAML: calibration.json, and what that is not told."""
+    """Return the text of the JSON file: calibration.json, and the content of the YAML."""
     kept = {'camera_name': stored.camera_name, 'image_frame': stored.image_frame, 'camera_info': asdict(stored.info)}
     return json.dumps({**to_json(stored.calibration), 'stored': kept}, indent=1, allow_nan=False) + '\n'
 
@@ -195,7 +203,7 @@ def _backup(path: Path) -> Path:
 
 
 def _try_read(path: Path, read: Callable[[Path], Content]) -> Content | InputError | None:
-    """Return what a file holds, the InputError where it cannot be used, None where there is no file."""
+    """Return the content of a file, the InputError if it is unusable, None if it does not exist."""
     try:
         path.stat()
         return read(path)
@@ -223,17 +231,20 @@ def _read_stored_json(path: Path) -> StoredCalibration:
         raise InputError(f'{path}: it was not written by this node ({type(error).__name__}: {error})') from error
 
 
-def _is_consistent(lens: CameraInfo | InputError | None, stored: StoredCalibration | InputError | None) -> bool:
-    """Say whether a YAML says the lens that a stored calibration was published as."""
+def _if_consistent(
+    lens: CameraInfo | InputError | None, stored: StoredCalibration | InputError | None
+) -> StoredCalibration | None:
+    """Return the stored calibration if the lens of the YAML is the one it was published with, else None."""
     if not isinstance(lens, CameraInfo) or not isinstance(stored, StoredCalibration):
-        return False
+        return None
     ours = stored.info
     if (lens.width, lens.height, lens.distortion_model) != (ours.width, ours.height, ours.distortion_model):
-        return False
+        return None
     try:
-        return all(
+        same = all(
             math.isclose(a, b, rel_tol=STORED_LENS_TOLERANCE, abs_tol=STORED_LENS_TOLERANCE)
             for a, b in zip((*lens.k, *lens.d, *lens.r, *lens.p), (*ours.k, *ours.d, *ours.r, *ours.p), strict=True)
         )
-    except (TypeError, ValueError):  # other numbers of coefficients, or of another kind
-        return False
+    except (TypeError, ValueError):  # another number of coefficients, or not numbers
+        return None
+    return stored if same else None

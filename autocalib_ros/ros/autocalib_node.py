@@ -1,10 +1,11 @@
-"""The live node: declares, converts, calls, publishes. What it knows about cameras is in the core."""
+"""The live node: parameters, services, topics and log. The calibration itself needs no ROS."""
 
 from __future__ import annotations
 
 import concurrent.futures
 import time
 import traceback
+from functools import partial
 from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
@@ -17,9 +18,10 @@ from std_srvs.srv import Trigger
 
 from autocalib_ros.config import NodeOptions, Options
 from autocalib_ros.errors import AutocalibError
+from autocalib_ros.lens.camera import Camera
 from autocalib_ros.lens.camera_info import camera_info
 from autocalib_ros.lens.camera_info_yaml import read_camera_info
-from autocalib_ros.perception.detector.detector import open_detector
+from autocalib_ros.perception.detector.detector import VehicleDetector, open_detector
 from autocalib_ros.perception.images import ImageDecoder
 from autocalib_ros.results.calibration import Calibration, Refusal
 from autocalib_ros.results.store import Store, StoredCalibration, resolve_url
@@ -41,22 +43,20 @@ from autocalib_ros.ros.store_writer import StoreWriter
 from autocalib_ros.ros.worker import CalibrationWorker, Result, Solve
 
 PROGRESS_LOG_PERIOD_S = 10.0
+"""Real seconds between two log lines of progress."""
 LOG_REPEAT_PERIOD_S = 60.0
-"""Real seconds between two lines of progress, and before an unchanged complaint is repeated."""
+"""Real seconds before an unchanged warning is repeated."""
 SHUTDOWN_S = 4.0
-"""Launch kills a node 5 s after the interrupt: by then it should have ended by itself."""
+"""Time limit of the shutdown: `ros2 launch` kills a node 5 s after the interrupt."""
 
 
 class AutocalibNode(Node):
-    """Node `autocalib`; `solve` may be replaced by another solver of the same signature, which runs in a thread."""
+    """Node `autocalib`. `solve` replaces the solver process by a function that runs in the solver thread."""
 
     def __init__(self, *, solve: Solve | None = None, **node_arguments: Any) -> None:
         super().__init__('autocalib', automatically_declare_parameters_from_overrides=True, **node_arguments)
         self.options, self.node_options = declare_parameters(self)
-        lens_file = self.node_options.camera_info_file
-        self._lens = read_camera_info(lens_file) if lens_file else None
-        if self._lens is not None:
-            camera_info(self._lens, self.options.distortion_model)  # a model that cannot say it is wrong usage at once
+        self._lens = self._read_lens()
         detector = open_detector(self.options.detector)
         self._headers = Headers(
             self.node_options,
@@ -64,24 +64,27 @@ class AutocalibNode(Node):
             self.get_logger().warning,
             lambda: self.get_clock().now().nanoseconds,
         )
+        # state of the log and of /diagnostics
         self._logged_at: dict[str, float] = {}
         self._unreadable = self._withdrawn = ''
-        self._recent = RateCounter()
-        self._driver = DriverInfo(self, self.node_options)
+        self._rate_counter = RateCounter()
+        # destinations of an accepted calibration: disk, report, driver
         self._store = self._open_store('')
         self.store_writer = StoreWriter(
             lambda fault: self.get_logger().error(f'the calibration was not saved: {fault}')
         )
-        self._reports = ReportWriter(lambda text, good: self._say(text, good=good))
-        self._upload = DriverUpload(self, self._say) if self.node_options.upload_to_driver else None
+        self._reports = ReportWriter(lambda text, good: self._log(text, good=good))
+        self._upload = DriverUpload(self, self._log) if self.node_options.upload_to_driver else None
+        # topics
+        self._driver = DriverInfo(self, self.node_options)
         self.publication = CalibrationPublisher(
             self,
             self.options,
             self.node_options,
             self._headers,
             driver=self._driver,
-            taken=self._on_accepted,
-            withdrawn=self._on_withdrawn,
+            on_accepted=self._on_accepted,
+            on_withdrawn=self._on_withdrawn,
         )
         self._pictures = LivePictures(
             self,
@@ -92,8 +95,34 @@ class AutocalibNode(Node):
             failed=self.failed,
             progress=lambda: self._worker.progress,
         )
+        self._worker = self._start_worker(solve, detector)
+        if self._store is not None:
+            self._restore(self._store)
+        # inputs: last, because their callbacks use all of the above
+        self._create_services()
+        self._input = ImageInput(self, self.node_options, self._on_image)
+        self._live_parameters = LiveParameters(
+            self, self.options, self.node_options, self._change, lambda: self.publication.image_size
+        )
+        self._diagnostics = Diagnostics(
+            self, self._situation, lambda: self._headers.camera_name(self.publication.image_frame or DEFAULT_FRAME)
+        )
+        self.create_timer(PROGRESS_LOG_PERIOD_S, self._log_progress, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        if detector is not None:
+            self.get_logger().info(f'vehicle detector: {detector}')
+        self.get_logger().info(f'waiting for images on {self._input.topic}')
+
+    def _read_lens(self) -> Camera | None:
+        """Return the lens of `camera_info_file`, None without one; UsageError if `distortion_model` does not fit it."""
+        if not self.node_options.camera_info_file:
+            return None
+        lens = read_camera_info(self.node_options.camera_info_file)
+        camera_info(lens, self.options.distortion_model)
+        return lens
+
+    def _start_worker(self, solve: Solve | None, detector: VehicleDetector | None) -> CalibrationWorker:
         solver = SolverProcess()
-        self._worker = CalibrationWorker(
+        return CalibrationWorker(
             self.options,
             idle_solve_s=self.node_options.idle_solve_s,
             decode=ImageDecoder().decode,
@@ -104,68 +133,61 @@ class AutocalibNode(Node):
             detector=detector,
             stop_solving=solver.close,
         )
-        if self._store is not None:
-            self._restore(self._store)
-        # While a caller waits for a solution or a disk, everything outside its group goes on.
-        self.create_service(Trigger, '~/calibrate', self._on_calibrate, callback_group=MutuallyExclusiveCallbackGroup())
-        self.create_service(Trigger, '~/save', self._on_save, callback_group=MutuallyExclusiveCallbackGroup())
-        self.create_service(Trigger, '~/reset', self._on_reset, callback_group=MutuallyExclusiveCallbackGroup())
-        self._input = ImageInput(self, self.node_options, self._on_image)
-        self._live_parameters = LiveParameters(
-            self, self.options, self.node_options, self._change, lambda: self.publication.image_size
-        )
-        self._diagnostics = Diagnostics(
-            self, self._situation, lambda: self._headers.camera_name(self.publication.image_frame or DEFAULT_FRAME)
-        )
-        self.create_timer(PROGRESS_LOG_PERIOD_S, self._log_progress, clock=Clock(clock_type=ClockType.STEADY_TIME))
-        if detector is not None:
-            self.get_logger().info(f'vehicles by a {detector}')
-        self.get_logger().info(f'waiting for images on {self._input.topic}')
+
+    def _create_services(self) -> None:
+        """Create the services, each in a callback group of its own: a caller that waits blocks no other callback."""
+        for name, callback in (
+            ('~/calibrate', self._on_calibrate),
+            ('~/save', self._on_save),
+            ('~/reset', self._on_reset),
+        ):
+            self.create_service(Trigger, name, callback, callback_group=MutuallyExclusiveCallbackGroup())
 
     def close(self) -> None:
-        """Stop the threads; to be called once before the node is destroyed."""
+        """Stop the threads. Call this once, before `destroy_node`."""
         deadline = time.monotonic() + SHUTDOWN_S
         if not self.store_writer.close(SHUTDOWN_S / 2):
-            self.get_logger().warning('a calibration was still being written at shutdown and is abandoned')
+            self.get_logger().warning('shutdown: a calibration was still being written and is lost')
         self._reports.close()
         if not self._worker.close(deadline - time.monotonic()):
-            self.get_logger().warning('a solution was still running at shutdown and is abandoned')
+            self.get_logger().warning('shutdown: a solution was still running and is lost')
         self._pictures.close(max(0.0, deadline - time.monotonic()))
-        self.get_logger().info(f'shut down: {self._worker.counters}')
+        self.get_logger().info(f'shutdown: {self._worker.counters}')
 
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
-        """Refuse in words that help: rclpy turns a wrong type down before it asks any callback."""
+        """Reject parameters with a helpful reason: rclpy rejects a wrong type before any callback."""
         return self._live_parameters.refusal(parameter_list) or super().set_parameters_atomically(parameter_list)
 
     def _change(self, options: Options, node_options: NodeOptions) -> None:
-        """Take other options: what rests on them is solved anew."""
+        """Use other options: the evidence is solved again with them."""
         self.options, self.node_options = options, node_options
         self.publication.change(options, node_options)
         self._pictures.rate_hz = node_options.debug_rate_hz
         self._worker.change(options, node_options.idle_solve_s)
 
     def _on_image(self, message: Any) -> None:
-        """Keep the image for the perception thread and give it its camera_info; nothing here takes long."""
+        """Queue the image for the perception thread and publish its CameraInfo; returns within microseconds."""
         frame_id = self._headers.frame_id(message.header.frame_id)
         self._worker.offer(self._headers.stamp_ns(message.header.stamp), message)
         foreign = self.publication.on_image(message, frame_id)
         if foreign is not None:
             self.get_logger().warning(
-                f"the restored calibration is of the frame '{foreign.image_frame}', and images "
-                f"are of '{frame_id}': it is withdrawn and collecting goes on"
+                f"restored calibration withdrawn: its frame is '{foreign.image_frame}', that of the images "
+                f"'{frame_id}'; still collecting evidence"
             )
         if self._store is None:
-            store = self._store = self._open_store(frame_id)
-            self.store_writer.run(lambda: self._restore(store))
+            self._store = store = self._open_store(frame_id)
+            if store is not None:
+                self.store_writer.run(partial(self._restore, store))
 
     async def _on_calibrate(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if not self._worker.counters.used:
-            response.success, response.message = False, f'no image yet on {self._input.topic}'
+            response.success, response.message = False, f'no image received yet on {self._input.topic}'
             return response
         result = await self._wrap_future(self._worker.solve_now())
         response.success = isinstance(result, Calibration)
         response.message = (
-            'no solution: a reset came in between, no image came since it, or see the log of the node'
+            'no solution: the evidence was reset meanwhile, or no image arrived since; else see the log of the node'
             if result is None
             else describe(result)
         )
@@ -175,50 +197,50 @@ class AutocalibNode(Node):
         published, state, store = self.publication.published, self.publication.state, self._store
         if published is None or store is None:
             response.success = False
-            response.message = f'nothing to save: no calibration yet; {describe_progress(self._worker.progress)}'
+            response.message = f'nothing to save, no calibration yet; {describe_progress(self._worker.progress)}'
             return response
         stored = self._to_stored(published)
         error = await self._wrap_future(self.store_writer.run(lambda: store.save(stored, replace_foreign=True)))
         if error is None and self.publication.published is published:
-            self.store_writer.withdraw()  # the same would be written once more
+            self.store_writer.withdraw()  # already written
         response.success = error is None
         response.message = (
             f'not saved: {error}'
             if error
             else f'saved the {state.value} calibration to {store.path} and {store.json_path}; '
-            f'the report follows in {store.report}'
+            f'the report will be written to {store.report}'
         )
         if error is None:
             self._report(published, store)
         return response
 
     def _report(self, published: Published, store: Store) -> None:
-        """Have the report of a calibration written: whoever saves it need not wait, the log says when it is there."""
+        """Start to write the report of a calibration; the log reports when it is done."""
         source = f'{self._headers.camera_name(published.image_frame) or "camera"}, live on {self._input.topic}'
 
-        def go_on(looked: concurrent.futures.Future) -> None:
-            scene = self._reports.scene(published.result, looked.result(), self.options, source)
+        def write(snapshot: concurrent.futures.Future) -> None:
+            scene = self._reports.scene(published.result, snapshot.result(), self.options, source)
             self._reports.write(ReportPaths(store.report, store.figures), scene)
 
-        self._worker.request_snapshot().add_done_callback(go_on)
+        self._worker.request_snapshot().add_done_callback(write)
 
     def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Forget the evidence and withdraw the calibration; what is stored stays until the next is saved."""
+        """Drop the evidence and withdraw the calibration; the stored one stays until the next is saved."""
         self._worker.reset()
         self._pictures.forget()
         was = self.publication.withdraw()
         self._reports.forget()
         response.success = True
         response.message = (
-            'the evidence is forgotten'
-            + ('' if was is CalibrationState.NONE else f', the {was.value} calibration is withdrawn')
-            + ('; collecting starts anew')
+            'evidence dropped'
+            + ('' if was is CalibrationState.NONE else f', {was.value} calibration withdrawn')
+            + '; collecting new evidence'
         )
         self.get_logger().info(f'reset: {response.message}')
         return response
 
     def _wrap_future(self, running: concurrent.futures.Future) -> Future:
-        """Return what another thread works out, to be awaited; that thread wakes the executor for it."""
+        """Return an awaitable for the result of another thread; that thread then wakes the executor."""
         executor = self.executor
         awaited = Future(executor=executor)
 
@@ -231,20 +253,20 @@ class AutocalibNode(Node):
         return awaited
 
     def _situation(self) -> Situation:
-        """Return what is known now, for diagnostics."""
+        """Return the present state of the node for /diagnostics."""
         published = self.publication.published
         counts = Counts(**vars(self._worker.counters), lost=self._input.lost)
         unsaved = f'the calibration is not saved: {self.store_writer.fault}' if self.store_writer.fault else ''
         return Situation(
             topic=self._input.topic,
             counts=counts,
-            rates_hz=self._recent.rates_hz(time.monotonic(), counts),
+            rates_hz=self._rate_counter.rates_hz(time.monotonic(), counts),
             result=None if published is None else published.result,
             restored=self.publication.state is CalibrationState.RESTORED,
             progress=self._worker.progress,
             image_age_s=self._input.age_s,
             encoding=self._input.encoding,
-            silence=self._input.silence,
+            no_image=self._input.no_image,
             unreadable=self._unreadable,
             errors=tuple(filter(None, [self._withdrawn, self.publication.conflict])),
             warnings=tuple(
@@ -261,35 +283,35 @@ class AutocalibNode(Node):
         )
 
     def _other_publishers(self) -> str:
-        """Say who else publishes where our camera_info goes: two authorities on one lens."""
+        """Return a warning if other nodes publish to our camera_info topic; '' if not."""
         topic = self.publication.topic
         if self.count_publishers(topic) < 2:
             return ''
         names = {
             f'{info.node_namespace.rstrip("/")}/{info.node_name}' for info in self.get_publishers_info_by_topic(topic)
         } - {self.get_fully_qualified_name()}
-        words = (
-            f'{", ".join(sorted(names)) or "a node of the same name"} publishes {topic} too: remap one of them, '
-            '-r ~/camera_info:=... here'
+        text = (
+            f'{", ".join(sorted(names)) or "a node of the same name"} also publishes {topic}: remap one of the two, '
+            'here with -r ~/camera_info:=...'
         )
-        self._log_throttled('rivals', words, error=False)
-        return words
+        self._log_throttled('other publishers', text, error=False)
+        return text
 
     def _log_progress(self) -> None:
         if self.publication.state in (CalibrationState.NONE, CalibrationState.RESTORED) and self._worker.counters.used:
             self.get_logger().info(describe_progress(self._worker.progress))
 
     def _open_store(self, image_frame: str) -> Store | None:
-        """Return where the calibration is kept; None while that is named after a frame that is not known yet."""
+        """Return the store of the calibration; None while its name depends on the frame of the first image."""
         url, name = self.node_options.camera_info_url, self._headers.camera_name(image_frame)
         path = resolve_url(url, name or 'camera')
         return Store(path) if name or path == resolve_url(url, 'another') else None
 
     def _restore(self, store: Store) -> None:
-        """Publish what an earlier run kept, as not yet verified."""
+        """Publish the stored calibration of an earlier run, as not yet verified."""
         store.remove_leftovers()
         found = store.load()
-        self._say(found.note, good=False)
+        self._log(found.note, good=False)
         if found.stored is None:
             self.get_logger().info(f'no stored calibration at {store.path}')
             return
@@ -297,7 +319,7 @@ class AutocalibNode(Node):
             restored = with_current_options(found.stored.calibration, self.options, self._lens)
             self.publication.restore(restored, found.stored.image_frame)
         except AutocalibError as error:
-            self.get_logger().warning(f'the calibration of {store.path} is not restored: {error}')
+            self.get_logger().warning(f'the calibration in {store.path} is not restored: {error}')
             return
         self.get_logger().info(f'restored from {store.path}, not yet verified: {describe(restored)}')
 
@@ -307,7 +329,7 @@ class AutocalibNode(Node):
         )
 
     def _on_accepted(self, published: Published, save: bool) -> None:
-        """Give a calibration that this run's traffic vouches for to the store and the driver, where that is wanted."""
+        """Pass a calibration that the traffic of this run has confirmed to store and driver, if enabled."""
         if save:
             self._reports.set_evidence(published.result, self._worker.reported_evidence)
         if save and self.node_options.autosave and self._store is not None:
@@ -316,41 +338,41 @@ class AutocalibNode(Node):
             self._upload.offer(self.publication.camera_info(published))
 
     def _on_withdrawn(self) -> None:
-        """Keep what is withdrawn from the store and the driver, where it has not gone there yet."""
+        """Cancel writes and uploads of the withdrawn calibration that are still pending."""
         self.store_writer.withdraw()
         if self._upload is not None:
             self._upload.withdraw()
 
     def image_accepted(self, width: int, height: int) -> None:
-        """Withdraw the calibration of another image size: the lens was calibrated in its pixels."""
+        """Withdraw a calibration of another image size, because its lens is in pixels of that size."""
         self._unreadable = ''
         withdrawn = self.publication.on_image_size(width, height)
         if withdrawn is not None:
             state, published = withdrawn
             old_width, old_height = published.result.evidence.image_size
             self._withdrawn = (
-                f'the {state.value} calibration is of images of {old_width}x{old_height}, these have '
-                f'{width}x{height}: it is withdrawn'
+                f'{state.value} calibration withdrawn: its images have {old_width}x{old_height} pixels, the present '
+                f'ones {width}x{height}'
             )
-            self.get_logger().warning(f'{self._withdrawn} and collecting starts anew')
+            self.get_logger().warning(f'{self._withdrawn}; collecting new evidence')
 
     def on_evidence_reset(self, why: str) -> None:
-        """Log that the evidence so far was dropped; a calibration from it stays in force until one is as sure."""
+        """Log that the evidence was dropped; the calibration stays until a new one is as precise."""
         self._pictures.forget()
         self.publication.on_evidence_reset()
-        self._log_throttled(f'anew {why}', f'{why}: the evidence is collected anew', error=False)
+        self._log_throttled(f'reset {why}', f'{why}: collecting new evidence', error=False)
 
     def image_unreadable(self, error: AutocalibError) -> None:
-        """Log an image that could not be used."""
+        """Log an image that cannot be used."""
         self._unreadable = str(error)
-        self._log_throttled('unreadable', f'image left out: {error} ({self._worker.counters})')
+        self._log_throttled('unreadable', f'image skipped: {error} ({self._worker.counters})')
 
     def failed(self, error: Exception) -> None:
-        """Log a fault of the program itself, for a bug report."""
+        """Log a fault of the program with its traceback, for a bug report."""
         self._log_throttled(f'fault {type(error).__name__}', ''.join(traceback.format_exception(error)).rstrip())
 
     def solved(self, result: Result) -> None:
-        """Publish a calibration, unless what is in force tells more; a refusal changes nothing."""
+        """Publish a calibration unless the current one is more precise; only log a refusal."""
         self._reports.solved(result)
         if isinstance(result, Refusal):
             self._log_throttled(f'refusal {result.code}', describe(result), error=False)
@@ -360,11 +382,11 @@ class AutocalibNode(Node):
             return
         self._withdrawn = ''
         self._logged_at = {}
-        self._say(decision.words, good=not decision.contradicted)
+        self._log(decision.text, good=not decision.contradicted)
         self.get_logger().info(describe(result))
 
-    def _say(self, text: str, *, good: bool) -> None:
-        """Log a line as information or as a warning; '' is nothing to say."""
+    def _log(self, text: str, *, good: bool) -> None:
+        """Log a line as information or warning; '' logs nothing."""
         # rclpy allows one severity for each place in the code.
         if text and good:
             self.get_logger().info(text)
@@ -372,7 +394,7 @@ class AutocalibNode(Node):
             self.get_logger().warning(text)
 
     def _log_throttled(self, topic: str, text: str, *, error: bool = True) -> None:
-        """Log a line unless the same was said less than REPEAT_S ago."""
+        """Log a line unless one of the same topic was logged less than LOG_REPEAT_PERIOD_S ago."""
         now = time.monotonic()
         if now - self._logged_at.get(topic, -LOG_REPEAT_PERIOD_S) < LOG_REPEAT_PERIOD_S:
             return

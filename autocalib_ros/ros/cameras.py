@@ -1,7 +1,7 @@
-"""Many cameras from one file: one node each, and nothing that two of them would share by mistake. Needs no ROS.
+"""Launch configuration of many cameras from one file: one node each, without shared names. Needs no ROS.
 
-config/cameras.yaml is an example. `defaults` holds for every camera; each has a `namespace` of its own, and as it
-needs them the other `CAMERA_KEYS`.
+config/cameras.yaml is an example. `defaults` applies to all cameras; each camera has its own `namespace` and
+optionally the other `CAMERA_KEYS`.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.lens.camera_info_yaml import sanitised_name
 
 CAMERA_KEYS = ('namespace', 'image', 'camera_height', 'camera_info', 'params_file', 'parameters')
-"""What may be said of a camera: its image topic is `image_raw` unless told; `camera_info` is where that goes when the
-driver publishes none; `params_file` is relative to the file; `parameters` are options by name."""
+"""Entries of a camera. `image`: image topic, default `image_raw`. `camera_info`: topic to publish CameraInfo on, if the
+driver publishes none. `params_file`: path relative to this file. `parameters`: options by name."""
 NODE_NAME = 'autocalib'
 NAMESPACE = re.compile(r'/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*', re.ASCII)
 
 
 @dataclass(frozen=True)
 class CameraNode:
-    """How to start the node of one camera: files and values of parameters, later ones win, and remappings."""
+    """How to start the node of one camera: parameter files and values, of which later ones win, and remappings."""
 
     namespace: str
     parameters: tuple[str | dict[str, Any], ...]
     remappings: tuple[tuple[str, str], ...]
 
 
-def read_cameras(path: Path) -> list[CameraNode]:
-    """Return the nodes that a file asks for; UsageError or InputError with the reason."""
+def read_cameras(path: Path | str) -> list[CameraNode]:
+    """Return the nodes that a file describes; UsageError or InputError with the reason."""
     path = Path(path)
     try:
         tree = yaml.safe_load(path.read_text(encoding='utf-8'))
@@ -51,9 +51,9 @@ def read_cameras(path: Path) -> list[CameraNode]:
 
 
 def camera_nodes(tree: Any, folder: Path) -> list[CameraNode]:
-    """Return the nodes for the content of a file that lies in `folder`."""
+    """Return the nodes for the content of a file in `folder`."""
     if not isinstance(tree, Mapping) or not isinstance(tree.get('cameras'), list) or not tree['cameras']:
-        raise UsageError("it holds no list 'cameras' with at least one camera, each with its namespace")
+        raise UsageError("it has no list 'cameras' with at least one camera, each with its namespace")
     _require_known(tree, ('defaults', 'cameras'))
     defaults = _camera(tree.get('defaults') or {}, 'defaults')
     cameras = [_camera(item, f'camera {number}') for number, item in enumerate(tree['cameras'], 1)]
@@ -63,19 +63,21 @@ def camera_nodes(tree: Any, folder: Path) -> list[CameraNode]:
     for number, camera in enumerate(cameras, 1):
         name = camera.get('namespace')
         if not isinstance(name, str) or not NAMESPACE.fullmatch(name):
-            raise UsageError(f"camera {number} has the namespace {name!r}: give it one of its own, 'cam{number}' say")
+            raise UsageError(
+                f"camera {number} has the namespace {name!r}: give it a unique name, such as 'cam{number}'"
+            )
     _require_unique(cameras)
     return [_node(camera, folder) for camera in cameras]
 
 
 def _camera(given: Any, where: str) -> dict[str, Any]:
-    """Return one camera's entries, its parameters by full name."""
+    """Return the entries of one camera, its parameters by full name."""
     if not isinstance(given, Mapping):
-        raise UsageError(f'{where} is {given!r}, not names with values such as namespace: cam1')
+        raise UsageError(f'{where} is {given!r}, expected names with values such as namespace: cam1')
     _require_known(given, CAMERA_KEYS)
     parameters = given.get('parameters') or {}
     if not isinstance(parameters, Mapping):
-        raise UsageError(f"'parameters' of {where} are {parameters!r}, not names with values")
+        raise UsageError(f"'parameters' of {where} are {parameters!r}, expected names with values")
     return {**given, 'parameters': flatten(parameters)}
 
 
@@ -89,7 +91,7 @@ def _require_known(given: Mapping[str, Any], known: tuple[str, ...]) -> None:
 
 
 def _require_unique(cameras: list[dict[str, Any]]) -> None:
-    """Raise UsageError where two cameras share what tells cameras apart."""
+    """Raise UsageError if two cameras share a name, frame or topic."""
     for what, of_camera in UNIQUE_BY.items():
         seen: dict[str, str] = {}
         for camera in cameras:
@@ -116,7 +118,7 @@ UNIQUE_BY = {
     'image topic': lambda camera: _resolved(camera, camera.get('image', 'image_raw')),
     'camera_info topic': lambda camera: _resolved(camera, camera.get('camera_info') or f'{NODE_NAME}/camera_info'),
 }
-"""What two cameras must not share, and what it is for each."""
+"""Properties that must differ between cameras, with functions that return them."""
 
 
 def _node(camera: dict[str, Any], folder: Path) -> CameraNode:
@@ -129,7 +131,7 @@ def _node(camera: dict[str, Any], folder: Path) -> CameraNode:
         for item in walk_options(options)
         if isinstance(item.default, float)
     }
-    # ROS refuses 8 where 8.0 is meant; in a file of our own it is plain what is meant.
+    # ROS rejects 8 for 8.0; in this file the intention is clear, so ints are converted
     values = {name: float(value) if name in floats and type(value) is int else value for name, value in values.items()}
     parameters: list[str | dict[str, Any]] = []
     if camera.get('params_file'):

@@ -1,13 +1,14 @@
-"""The options of config.py as ROS parameters: declared by walking the dataclasses, read back into them."""
+"""ROS parameters from the dataclasses of config.py: declaration, and back into options."""
 
 from __future__ import annotations
 
 import sys
 from difflib import get_close_matches
-from typing import Any
+from typing import Any, cast
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 
 from autocalib_ros.config import NodeOptions, Options, OptionSpec, is_reconfigurable, walk_options, with_overrides
 from autocalib_ros.errors import UsageError
@@ -18,14 +19,16 @@ INT64_MAX = 2**63 - 1
 
 
 def declare_parameters(node: Node) -> tuple[Options, NodeOptions]:
-    """Declare every option as a parameter and return what was given, or raise UsageError.
+    """Declare every option as a parameter and return the options with the given values; UsageError if one is invalid.
 
-    The node has to be created with `automatically_declare_parameters_from_overrides=True`: rclpy has no
-    other public way to see a parameter that was given but that nobody declares, a misspelt one.
+    Create the node with `automatically_declare_parameters_from_overrides=True`: rclpy has no other public way to see
+    a parameter that was given but not declared, such as a misspelt one.
     """
+    # rclpy annotates plain values here, but returns parameters
+    parameters = cast('dict[str, Parameter]', node.get_parameters_by_prefix(''))
     given = {
         name: parameter.value
-        for name, parameter in node.get_parameters_by_prefix('').items()
+        for name, parameter in parameters.items()
         if name not in ROS_PARAMETERS and not name.startswith('qos_overrides.')
     }
     options, node_options = read(given)
@@ -37,7 +40,7 @@ def declare_parameters(node: Node) -> tuple[Options, NodeOptions]:
 
 
 def read(given: dict[str, Any]) -> tuple[Options, NodeOptions]:
-    """Return the options with the parameters that were given, by full name."""
+    """Return the options with the given parameters, by full name; UsageError if one is unknown or invalid."""
     items = {item.name: item for item in (*walk_options(Options()), *walk_options(NodeOptions()))}
     for name, value in given.items():
         if name not in items:
@@ -51,7 +54,7 @@ def read(given: dict[str, Any]) -> tuple[Options, NodeOptions]:
 
 
 def unknown_parameter(name: str) -> str:
-    """Say that there is no such parameter, and which was meant."""
+    """Return the message for an unknown parameter, with the closest name."""
     names = [item.name for options in (Options(), NodeOptions()) for item in walk_options(options)]
     near = get_close_matches(name, names, n=1)
     hint = f"did you mean '{near[0]}'?" if near else 'config/autocalib.yaml lists all of them'
@@ -59,24 +62,24 @@ def unknown_parameter(name: str) -> str:
 
 
 def require_float(item: OptionSpec, value: Any) -> None:
-    """Raise UsageError at an int for a float: ROS keeps the type of a parameter, here and for good."""
+    """Raise UsageError at an int for a float parameter: ROS does not convert types."""
     if type(item.default) is float and type(value) is int:
         raise UsageError(f"parameter '{item.name}' is a float: write {item.name}:={float(value)}, not {value}")
 
 
 def descriptor(item: OptionSpec) -> ParameterDescriptor:
-    """Describe one option."""
-    describe = ParameterDescriptor(name=item.name, description=item.doc, read_only=not is_reconfigurable(item.name))
+    """Return type, range and description of one option for ROS tools."""
+    result = ParameterDescriptor(name=item.name, description=item.doc, read_only=not is_reconfigurable(item.name))
     if item.choices:
-        describe.additional_constraints = f'one of: {", ".join(repr(choice) for choice in item.choices)}'
+        result.additional_constraints = f'one of: {", ".join(repr(choice) for choice in item.choices)}'
     if item.low is None and item.high is None:
-        return describe
+        return result
     if isinstance(item.default, float):
         low = -sys.float_info.max if item.low is None else float(item.low)
         high = sys.float_info.max if item.high is None else float(item.high)
-        describe.floating_point_range = [FloatingPointRange(from_value=low, to_value=high, step=0.0)]
+        result.floating_point_range = [FloatingPointRange(from_value=low, to_value=high, step=0.0)]
     else:
         low = -INT64_MAX if item.low is None else int(item.low)
         high = INT64_MAX if item.high is None else int(item.high)
-        describe.integer_range = [IntegerRange(from_value=low, to_value=high, step=1)]
-    return describe
+        result.integer_range = [IntegerRange(from_value=low, to_value=high, step=1)]
+    return result

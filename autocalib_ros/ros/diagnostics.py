@@ -1,4 +1,4 @@
-"""/diagnostics at 1 Hz on a steady clock: converts what `status` says, and publishes it."""
+"""Publishes /diagnostics at 1 Hz on a steady clock; `status` makes its content."""
 
 from __future__ import annotations
 
@@ -12,29 +12,30 @@ from autocalib_ros.ros.messages import validated
 from autocalib_ros.ros.status import Situation, status
 
 PERIOD_S = 1.0
+"""Real seconds between two messages."""
 QUEUE = 10
 
 
 class Diagnostics:
-    """Asks the node for its situation each second and publishes what follows from it."""
+    """Publishes the status of the node once a second."""
 
     def __init__(self, node: Node, situation: Callable[[], Situation], hardware_id: Callable[[], str]) -> None:
         self._node, self._situation, self._hardware_id = node, situation, hardware_id
-        # With its namespace, so that an aggregator tells the nodes of several cameras apart.
+        # the namespace lets an aggregator separate the nodes of several cameras
         self._name = f'{node.get_fully_qualified_name().lstrip("/")}: calibration'
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', QUEUE)
         node.create_timer(PERIOD_S, self._publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _publish(self) -> None:
-        told = status(self._situation())
+        current = status(self._situation())
         message = DiagnosticArray(
             status=[
                 DiagnosticStatus(
-                    level=bytes([told.level]),
+                    level=bytes([current.level]),
                     name=self._name,
-                    message=told.message,
+                    message=current.message,
                     hardware_id=self._hardware_id(),
-                    values=[KeyValue(key=key, value=value) for key, value in told.values],
+                    values=[KeyValue(key=key, value=value) for key, value in current.values],
                 )
             ]
         )

@@ -1,4 +1,4 @@
-"""What the driver says of its camera: the newest CameraInfo on `camera_info_in`, where that is wanted."""
+"""The driver's own CameraInfo on `camera_info_in`, with `use_driver_camera_info`."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from autocalib_ros.lens.camera_info import check_readout
 from autocalib_ros.ros.messages import readout
 
 DRIVER_INFO_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-"""It hears every publisher, whatever that offers; messages this small are not lost."""
+"""Best effort connects to every publisher; messages this small are not lost."""
 
 
 class DriverInfo:
-    """Subscribes `camera_info_in` when `use_driver_camera_info` is set."""
+    """Subscribes to `camera_info_in` if `use_driver_camera_info` is set."""
 
     def __init__(self, node: Node, options: NodeOptions) -> None:
         self.newest: CameraInfo | None = None
-        """The newest message; None before the first, and always where it is not wanted."""
+        """Newest message; None before the first, and always without `use_driver_camera_info`."""
         self.topic = node.resolve_topic_name('camera_info_in') if options.use_driver_camera_info else ''
         if self.topic:
             node.create_subscription(CameraInfo, self.topic, self._take, DRIVER_INFO_QOS)
@@ -28,19 +28,19 @@ class DriverInfo:
         self.newest = message
 
     def check(self, image_size: tuple[int, int] | None) -> str:
-        """Say what is wrong with the driver's message, '' where nothing is or none is wanted."""
+        """Return what is wrong with the driver's message; '' if nothing is, or none is used."""
         if not self.topic:
             return ''
         if self.newest is None:
-            return f'no CameraInfo comes on {self.topic}: remap camera_info_in, or set use_driver_camera_info:=false'
+            return f'no CameraInfo on {self.topic}: remap camera_info_in, or set use_driver_camera_info:=false'
         return check_size(self.newest, image_size) if image_size else ''
 
 
 def check_size(info: CameraInfo, image_size: tuple[int, int]) -> str:
-    """Say why images of a size (width, height) are not what the driver's binning and roi leave of its own.
+    """Return why images of a size (width, height) do not fit the driver's size, binning and roi; '' if they do.
 
-    A driver that tells no size is not doubted.
+    A driver that gives no size passes.
     """
-    told = (info.roi.width or info.width) and (info.roi.height or info.height)
-    check = check_readout(readout(info), image_size) if told else ''
-    return f'{check}: is camera_info_in of this camera?' if check else ''
+    has_size = (info.roi.width or info.width) and (info.roi.height or info.height)
+    mismatch = check_readout(readout(info), image_size) if has_size else ''
+    return f'{mismatch}: is camera_info_in from this camera?' if mismatch else ''

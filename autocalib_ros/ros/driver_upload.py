@@ -1,4 +1,4 @@
-"""Client of the driver's set_camera_info: the calibration goes where a checkerboard's would have gone."""
+"""Client of the driver's set_camera_info service: uploads the calibration, as camera_calibration does."""
 
 from __future__ import annotations
 
@@ -13,24 +13,25 @@ from sensor_msgs.msg import CameraInfo
 from sensor_msgs.srv import SetCameraInfo
 
 UPLOAD_POLL_S = 0.5
+"""Real seconds between two checks of a running or pending call."""
 DRIVER_TIMEOUT_S = 10.0
-"""A driver that writes to its camera's own memory takes seconds."""
+"""Real seconds to wait for the answer: a driver that writes to the camera's memory takes seconds."""
 UPLOAD_PERIOD_S = 60.0
-"""Real seconds between two calls: a driver may write each to flash memory."""
+"""Minimum real seconds between two calls: a driver may write each to flash memory."""
 NO_DRIVER_REMINDER_S = 60.0
-"""Real seconds before a driver that is missing, or does not answer, is told again."""
+"""Real seconds before the warning of a missing driver is repeated."""
 
 
 class DriverUpload:
-    """Calls `set_camera_info` with the newest message offered, never twice at once.
+    """Calls `set_camera_info` with the newest message offered, one call at a time.
 
-    `say(text, good=)` hears what came of it.
+    `log(text, good=)` is called with the outcome.
     """
 
-    def __init__(self, node: Node, say: Callable[..., None]) -> None:
+    def __init__(self, node: Node, log: Callable[..., None]) -> None:
         self._client = node.create_client(SetCameraInfo, 'set_camera_info')
         self._name = node.resolve_service_name('set_camera_info')
-        self._say = say
+        self._log = log
         self._lock = threading.Lock()
         self._pending: CameraInfo | None = None
         self._call: Future | None = None
@@ -39,30 +40,30 @@ class DriverUpload:
         node.create_timer(UPLOAD_POLL_S, self._poll, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def offer(self, message: CameraInfo) -> None:
-        """Send this soon, unless a newer one comes before; from any thread."""
+        """Upload this, unless a newer one replaces it; thread-safe."""
         with self._lock:
             self._pending = message
 
     def withdraw(self) -> None:
-        """Send nothing that has not been sent; from any thread."""
+        """Drop the pending upload; thread-safe."""
         with self._lock:
             self._pending = None
 
     def _poll(self) -> None:
-        """Look after the call that runs, or start the next; in the executor's thread."""
+        """Check the running call, or start the next; in the executor's thread."""
         now = time.monotonic()
         if self._call is not None:
             if now - self._called_at > DRIVER_TIMEOUT_S:
                 self._client.remove_pending_request(self._call)
                 self._call = None
-                self._say(f'{self._name}: the driver did not answer within {DRIVER_TIMEOUT_S:.0f} s', good=False)
+                self._log(f'{self._name}: no answer from the driver within {DRIVER_TIMEOUT_S:.0f} s', good=False)
             return
         if self._pending is None or now - self._called_at < UPLOAD_PERIOD_S:
             return
         if not self._client.service_is_ready():
             if now - self._warned_at > NO_DRIVER_REMINDER_S:
                 self._warned_at = now
-                self._say(
+                self._log(
                     f'no driver serves {self._name}: remap it with -r set_camera_info:=/your/driver/set_camera_info',
                     good=False,
                 )
@@ -77,11 +78,11 @@ class DriverUpload:
 
     def _answered(self, call: Future) -> None:
         if call is not self._call:
-            return  # given up already
+            return  # timed out before
         self._call = None
         answer = call.result()
         if answer is not None and answer.success:
-            self._say(f'{self._name}: the driver took the calibration', good=True)
+            self._log(f'{self._name}: the driver accepted the calibration', good=True)
         else:
             why = getattr(answer, 'status_message', '') or 'no reason given'
-            self._say(f'{self._name}: the driver refused the calibration: {why}', good=False)
+            self._log(f'{self._name}: the driver rejected the calibration: {why}', good=False)

@@ -2,16 +2,17 @@
 
     ground_points_node --ros-args -r __ns:=/cam1/autocalib -r pixels:=/cam1/wheels
 
-`pixels` is a geometry_msgs/PolygonStamped, which any detector can fill without further packages: x and y of each
-point are a pixel, z is its height above the road in metres, 0 where a vehicle touches it. Stamp and frame are those
-of the image. `ground_points` is a PointCloud2 in the ground frame with the stamp of the image: the same number of
-points in the same order, nan where a pixel shows no ground.
+`pixels` is a geometry_msgs/PolygonStamped, which any detector can publish without further packages: x and y of each
+point are a pixel, z is its height above the road in metres, 0 at a contact point of a vehicle. Stamp and frame are
+those of the image. `ground_points` is a PointCloud2 in the ground frame with the stamp of the image: the same number
+of points in the same order, nan where a pixel does not show the ground.
 """
 
 from __future__ import annotations
 
 import sys
 from array import array
+from typing import Any
 
 import numpy as np
 import rclpy
@@ -28,20 +29,21 @@ from autocalib_ros.ros.messages import header, validated
 from autocalib_ros.ros.qos import LATCHED
 
 WARN_PERIOD_S = 10.0
+"""Real seconds between two warnings."""
 
 
 class GroundPointsNode(Node):
-    """Node `ground_points`: keeps the newest calibration, and answers each message of pixels with one of points."""
+    """Node `ground_points`: keeps the newest calibration and converts each message of pixels to points."""
 
-    def __init__(self, **node_arguments: object) -> None:
+    def __init__(self, **node_arguments: Any) -> None:
         super().__init__('ground_points', **node_arguments)
-        self.declare_parameter('camera_frame', '')  # only where autocalib was given one too
+        self.declare_parameter('camera_frame', '')  # only if autocalib has this option set
         self._info: CameraInfo | None = None
         self._transform: TransformStamped | None = None
         self._points = self.create_publisher(PointCloud2, 'ground_points', 10)
         self.create_subscription(CameraInfo, 'camera_info', self._on_info, LATCHED)
         self.create_subscription(TransformStamped, 'ground_transform', self._on_transform, LATCHED)
-        # Best effort connects to publishers of either kind, and messages as small as these are not lost.
+        # best effort connects to publishers of either kind, and messages this small are not lost
         self.create_subscription(PolygonStamped, 'pixels', self._on_pixels, qos_profile_sensor_data)
 
     def _on_info(self, info: CameraInfo) -> None:
@@ -53,20 +55,20 @@ class GroundPointsNode(Node):
     def _on_pixels(self, message: PolygonStamped) -> None:
         if self._info is None or self._transform is None:
             missing = 'camera_info' if self._info is None else 'ground_transform'
-            self._warn(f'pixels are left out: no {missing} yet on {self.resolve_topic_name(missing)}')
+            self._warn(f'pixels skipped: no {missing} yet on {self.resolve_topic_name(missing)}')
             return
         try:
-            # A calibration may be replaced at any time. To build from it takes less time than to see whether it was.
+            # The calibration can change at any time; building from it is faster than checking whether it has.
             ground = Ground.from_messages(
                 self._info, self._transform, camera_frame=self.get_parameter('camera_frame').value
             )
             if message.header.frame_id != self._info.header.frame_id:
                 raise InputError(
-                    f"their frame is '{message.header.frame_id}' and that of the calibration"
-                    f" '{self._info.header.frame_id}': send them with the header of the image"
+                    f"their frame is '{message.header.frame_id}', that of the calibration "
+                    f"'{self._info.header.frame_id}': publish them with the header of the image"
                 )
         except InputError as error:
-            self._warn(f'pixels are left out: {error}')
+            self._warn(f'pixels skipped: {error}')
             return
         given = np.array([(point.x, point.y, point.z) for point in message.polygon.points]).reshape(-1, 3)
         found = ground.points(given[:, :2], height_m=given[:, 2])

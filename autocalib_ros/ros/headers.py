@@ -1,4 +1,4 @@
-"""What image headers say, put right where drivers get it wrong, with one warning for each kind of fault."""
+"""Time stamps and frames of image headers; corrects faults of drivers, with one warning for each."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from autocalib_ros.ros.messages import stamp_ns
 
 DEFAULT_FRAME = 'camera_optical_frame'
 MAX_REPEATED_STAMPS = 30
-"""A clock that gives so many images in a row one stamp stands still, or counts whole seconds: it tells no time."""
+"""Images in a row with one time stamp after which the clock counts as stopped, or as one of whole seconds."""
 
 
 class Headers:
-    """Stamps and frames of one camera; `warn` and `now_ns` come from the node."""
+    """Time stamps and frames of one camera; `warn` and `now_ns` come from the node."""
 
     def __init__(
         self, options: NodeOptions, namespace: str, warn: Callable[[str], None], now_ns: Callable[[], int]
@@ -28,12 +28,12 @@ class Headers:
     def stamp_ns(self, stamp: Time) -> int:
         """Return the time of an image in nanoseconds.
 
-        That is the time of receipt when the driver sets none, and for good once it gave `MAX_REPEATED_STAMPS` images
-        one.
+        It is the time of receipt if the driver sets none, and from then on once `MAX_REPEATED_STAMPS` images in a row
+        had the same stamp.
         """
         given_ns = stamp_ns(stamp)
         if not given_ns:
-            self._warn_once('images carry no time stamp: the time of receipt is used')
+            self._warn_once('images have no time stamp: using the time of receipt')
             return self._now_ns()
         if self._repeats < MAX_REPEATED_STAMPS:
             self._repeats = self._repeats + 1 if given_ns == self._given_ns else 1
@@ -41,18 +41,18 @@ class Headers:
         if self._repeats < MAX_REPEATED_STAMPS:
             return given_ns
         self._warn_once(
-            f'{MAX_REPEATED_STAMPS} images in a row carry one time stamp: the time of receipt is used from now on'
+            f'{MAX_REPEATED_STAMPS} images in a row have the same time stamp: using the time of receipt from now on'
         )
         return self._now_ns()
 
     def frame_id(self, given: str) -> str:
-        """Return the frame that tf2 knows an image by: as given but for a leading '/', and never empty."""
+        """Return the frame of an image in tf2: as given without a leading '/', never empty."""
         if not given:
             frame = self._options.camera_frame.lstrip('/') or DEFAULT_FRAME
-            self._warn_once(f"images carry no frame_id: '{frame}' is used")
+            self._warn_once(f"images have no frame_id: using '{frame}'")
             return frame
         if given.startswith('/'):
-            self._warn_once(f"images carry the frame_id '{given}': its leading '/' is left out, tf2 rejects it")
+            self._warn_once(f"images have the frame_id '{given}': the leading '/' is removed, tf2 rejects it")
         return given.lstrip('/') or DEFAULT_FRAME
 
     def camera_frame(self, image_frame: str) -> str:
@@ -60,14 +60,14 @@ class Headers:
         return self._options.camera_frame.lstrip('/') or image_frame
 
     def camera_name(self, image_frame: str) -> str:
-        """Return the camera's name in letters, digits and _, as camera_info_manager wants it.
+        """Return the camera's name in letters, digits and _, as camera_info_manager needs it.
 
-        '' when it is named after a frame that is not known yet.
+        '' if it depends on the frame of the first image.
         """
         return sanitised_name(self._options.camera_name or self._namespace or image_frame)
 
     def ground_frame(self, image_frame: str) -> str:
-        """Return the frame of the ground plane; it holds the camera's name, so that two cameras do not collide."""
+        """Return the frame of the ground plane; it contains the camera's name, so that cameras do not collide."""
         return self._options.ground_frame.lstrip('/') or f'{self.camera_name(image_frame)}_ground'
 
     def _warn_once(self, text: str) -> None:

@@ -1,4 +1,4 @@
-"""The image subscription: finds its publisher, matches its reliability, and says why nothing comes."""
+"""Image subscription: matches the QoS of the publishers and reports a missing stream."""
 
 from __future__ import annotations
 
@@ -17,36 +17,38 @@ from autocalib_ros.config import NodeOptions
 from autocalib_ros.ros.watchdog import NoImageDiagnosis, PublisherOffer, diagnose, other_transport_topic
 
 QUEUE_DEPTH = 10
-"""Images that DDS keeps while this process has no processor: a third of a second at 30 Hz.
+"""Images that DDS keeps while this process gets no CPU time: a third of a second at 30 Hz.
 
-One is usual, so that a slow callback sees no old image; this one takes a tenth of a millisecond, and evidence goes by
-stamps, so that age costs nothing. Side by side on a machine with four times more to do than it can, of 900 images of
-1280x720 at 30 Hz a queue of 1 got 23, of 5 180 and of 10 348, which were 50, 180 and 340 ms old at the median.
+A depth of 1 is usual, so that a slow callback gets no old image. Here the callback takes 0.1 ms, and evidence uses the
+time stamps, so old images do no harm. Measured on a machine with four times its load, 900 images of 1280x720 at 30 Hz:
+a depth of 1 received 23, of 5 180 and of 10 348 images, with a median latency of 50, 180 and 340 ms.
 """
 PUBLISHER_POLL_S = 1.0
+"""Real seconds between two checks of the publishers."""
 NO_IMAGE_TIMEOUT_S = 5.0
+"""Real seconds without an image before a warning."""
 NO_IMAGE_REMINDER_S = 60.0
-"""Real seconds between two looks at the publishers, without an image before that is told, and told again."""
+"""Real seconds before the same warning is repeated."""
 RELIABILITY = {'reliable': ReliabilityPolicy.RELIABLE, 'best_effort': ReliabilityPolicy.BEST_EFFORT}
 
 
 class ImageInput:
-    """Subscribes `image`, or `<image>/compressed`; what it knows of the stream is for diagnostics."""
+    """Subscribes to `image`, or `<image>/compressed`; its attributes describe the stream for /diagnostics."""
 
     def __init__(self, node: Node, options: NodeOptions, on_image: Callable[[Any], None]) -> None:
         self._node, self._on_image = node, on_image
         compressed = options.image_transport == 'compressed'
         self._type = CompressedImage if compressed else Image
-        # The image topic is resolved first: a remapping of `image` has to move its compressed form along.
+        # Resolve `image` first, so that a remapping of it also applies to its compressed topic.
         self.topic = node.resolve_topic_name('image') + ('/compressed' if compressed else '')
-        self.silence: NoImageDiagnosis | None = None
-        """Why no image has come for `NO_IMAGE_TIMEOUT_S`; None while images come."""
+        self.no_image: NoImageDiagnosis | None = None
+        """Why no image has arrived for `NO_IMAGE_TIMEOUT_S`; None while images arrive."""
         self.offers: list[PublisherOffer] = []
-        """What publishers offered at the last look."""
+        """Publishers at the last check."""
         self.lost = 0
-        """Images that DDS says it lost before they came here."""
+        """Images that DDS reported as lost."""
         self.encoding = ''
-        """What the newest image says it is."""
+        """Encoding of the newest image, for compressed images its format."""
         self._subscription: Subscription | None = None
         self._reliability: ReliabilityPolicy | None = None
         self._last_image = time.monotonic()
@@ -59,20 +61,18 @@ class ImageInput:
 
     @property
     def age_s(self) -> float | None:
-        """Seconds since the newest image came; None before the first."""
+        """Seconds since the newest image; None before the first."""
         return time.monotonic() - self._last_image if self._any_image else None
 
     @property
     def several_publishers(self) -> str:
-        """Say that several publishers share the topic, '' where they do not: nothing tells their images apart."""
+        """Return a warning if several publishers share the topic, since their images cannot be separated; '' if not."""
         names = sorted(offer.node for offer in self.offers if offer.type_name == self._type_name())
+        if len(names) < 2:
+            return ''
         return (
-            ''
-            if len(names) < 2
-            else (
-                f'{len(names)} publishers share {self.topic} ({", ".join(names)}): images of '
-                'two cameras cannot be told apart'
-            )
+            f'{len(names)} publishers share {self.topic} ({", ".join(names)}): their images cannot be separated, '
+            'use one topic per camera'
         )
 
     def _check_publishers(self) -> None:
@@ -84,10 +84,10 @@ class ImageInput:
         self._warn_no_image()
 
     def _compatible_reliability(self, offers: list[PublisherOffer]) -> ReliabilityPolicy | None:
-        """Return what connects to all publishers; None while there is none.
+        """Return the reliability that connects to all publishers; None without publishers.
 
-        Best effort connects to everything but loses half of the large images, and
-        BEST_AVAILABLE is decided once, before a camera that starts later is known.
+        Best effort connects to all but loses half of the large images. BEST_AVAILABLE is resolved only once, before
+        a camera that starts later is known.
         """
         reliable = {offer.reliable for offer in offers if offer.type_name == self._type_name()}
         if not reliable:
@@ -106,44 +106,44 @@ class ImageInput:
         self._node.get_logger().info(f'subscribed to {self.topic} ({self._type_name()}, {reliability.name.lower()})')
 
     def _on_incompatible(self, event: Any) -> None:
-        """Tell it: with image_reliability auto the next look at the publishers mends it, else a person has to."""
+        """Log it: with image_reliability auto the next check resubscribes, otherwise the user has to act."""
         policy = qos_policy_name_from_kind(event.last_policy_kind)
         if self._requested is None:
             self._node.get_logger().info(
-                f'a publisher of {self.topic} offers another {policy}: it is matched within {PUBLISHER_POLL_S:g} s'
+                f'a publisher of {self.topic} offers another {policy}: resubscribing within {PUBLISHER_POLL_S:g} s'
             )
         else:
             self._node.get_logger().warning(
-                f'a publisher of {self.topic} offers less {policy} than this node asks '
-                'for, and nothing comes from it: set image_reliability:=auto'
+                f'incompatible QoS ({policy}): no images will be received from a publisher of {self.topic}; '
+                'set image_reliability:=auto'
             )
 
     def _on_lost(self, event: Any) -> None:
         self.lost += event.total_count_change
 
     def _take(self, message: Any) -> None:
-        self._last_image, self._any_image, self._last_warning, self.silence = time.monotonic(), True, None, None
+        self._last_image, self._any_image, self._last_warning, self.no_image = time.monotonic(), True, None, None
         self.encoding = message.encoding if self._type is Image else message.format
         self._on_image(message)
 
     def _warn_no_image(self) -> None:
-        """Find out why nothing comes; log it, and again when the reason changes or much time has gone."""
+        """Diagnose a missing stream and log it, again when the reason changes or after `NO_IMAGE_REMINDER_S`."""
         now = time.monotonic()
         if now - self._last_image < NO_IMAGE_TIMEOUT_S:
             return
         other_offers = self._node.get_publishers_info_by_topic(other_transport_topic(self.topic, self._type_name()))
-        self.silence = diagnose(
+        self.no_image = diagnose(
             self.topic,
             self._type_name(),
             self.offers,
-            asks_reliable=self._reliability == ReliabilityPolicy.RELIABLE,
+            requests_reliable=self._reliability == ReliabilityPolicy.RELIABLE,
             other_offers=[_offer(publisher) for publisher in other_offers],
         )
-        words, warned_at = self._last_warning or ('', -NO_IMAGE_REMINDER_S)
-        if words == self.silence.words and now - warned_at < NO_IMAGE_REMINDER_S:
+        text, warned_at = self._last_warning or ('', -NO_IMAGE_REMINDER_S)
+        if text == self.no_image.text and now - warned_at < NO_IMAGE_REMINDER_S:
             return
-        self._last_warning = self.silence.words, now
-        self._node.get_logger().warning(f'no image for {now - self._last_image:.0f} s: {self.silence.words}')
+        self._last_warning = self.no_image.text, now
+        self._node.get_logger().warning(f'no image for {now - self._last_image:.0f} s: {self.no_image.text}')
 
     def _type_name(self) -> str:
         return f'sensor_msgs/msg/{self._type.__name__}'

@@ -1,4 +1,4 @@
-"""Parameters that change while the node runs: what is refused, with the reason, and what follows from the rest."""
+"""Parameter changes of a running node: validation, and the options that result."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Changed = Callable[[Options, NodeOptions], None]
 
 
 class LiveParameters:
-    """The options in force; `changed` is called with the new ones, `image_size` tells that of the images so far."""
+    """The present options. `changed` is called with new ones; `image_size` returns the size of the images, or None."""
 
     def __init__(
         self,
@@ -33,7 +33,7 @@ class LiveParameters:
         node.add_post_set_parameters_callback(self._take)
 
     def refusal(self, parameters: list[Parameter]) -> SetParametersResult | None:
-        """Return why these cannot be set, all at once; None where they can."""
+        """Return why these parameters cannot be set together; None if they can."""
         foreign = [parameter.name for parameter in parameters if not self._node.has_parameter(parameter.name)]
         if foreign:
             return SetParametersResult(successful=False, reason=unknown_parameter(foreign[0]))
@@ -60,9 +60,9 @@ class LiveParameters:
 def changed_options(
     options: Options, node_options: NodeOptions, values: Mapping[str, Any]
 ) -> tuple[Options, NodeOptions]:
-    """Return the options with other values by full name; names that are no options are left to ROS.
+    """Return the options with other values by full name; parameters of ROS itself are ignored.
 
-    UsageError for what cannot change while the node runs, or cannot be used.
+    UsageError for a value that is invalid or read-only while the node runs.
     """
     core, of_node = ({item.name: item for item in walk_options(group)} for group in (options, node_options))
     for name, value in values.items():
@@ -72,8 +72,8 @@ def changed_options(
         require_float(item, value)
         if not is_reconfigurable(name) and value != item.default:
             raise UsageError(
-                f"'{name}' cannot change while the node runs, what it holds rests on it: start the node "
-                f'with -p {name}:={value}'
+                f"'{name}' is read-only while the node runs: the evidence so far depends on it; restart the node with "
+                f'-p {name}:={value}'
             )
     return (
         with_overrides(options, {name: value for name, value in values.items() if name in core}),

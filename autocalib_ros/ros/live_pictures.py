@@ -1,9 +1,9 @@
-"""Pictures for people to look at: `~/debug_image`, `~/top_view` and `~/image_rect`, drawn only while somebody looks.
+"""`~/debug_image`, `~/top_view` and `~/image_rect`, drawn only while subscribed.
 
-    perception thread -> the newest image that is due -> drawing thread -> publishers
+    perception thread -> newest image that is due -> drawing thread -> publishers
 
-Without a subscriber nothing is kept nor drawn, and neither perception nor the executor waits for a picture: what
-comes while one is drawn, or sooner than `debug_rate_hz` allows, is not shown.
+Without a subscriber nothing is stored or drawn. Neither perception nor the executor waits for a picture: images that
+arrive while one is drawn, or faster than `debug_rate_hz`, are not shown.
 """
 
 from __future__ import annotations
@@ -36,24 +36,24 @@ from autocalib_ros.ros.log_text import describe_numbers
 from autocalib_ros.ros.publication import CalibrationPublisher, Published
 
 VERIFIED_COLOUR, WAITING_COLOUR = '#7ee08a', '#ffd166'
-"""Colours of the state, where a calibration is vouched for and where it is not."""
+"""Caption colours: calibration verified by traffic, and not."""
 
 
 @dataclass(frozen=True)
 class _PendingImage:
-    """An image to be shown, with what was followed in it, if somebody asked for that."""
+    """An image to show, with the tracked points if debug_image is subscribed."""
 
     header: Header
-    """With the frame that camera_info has."""
+    """Its frame is that of camera_info."""
     image: np.ndarray
     followed_px: np.ndarray | None
 
 
 class LivePictures:
-    """Publishes the pictures; safe in any thread.
+    """Publishes the pictures; thread-safe.
 
-    What is `ignored` is black in them. `progress` tells how the evidence comes on; `failed` is told of faults of the
-    program.
+    Polygons in `ignored` are blacked out. `progress` returns the present progress; `failed` is called with faults of
+    the program.
     """
 
     def __init__(
@@ -84,7 +84,7 @@ class LivePictures:
         self._thread.start()
 
     def image_used(self, message: Any, image: np.ndarray, followed: Callable[[], np.ndarray]) -> None:
-        """Take an image, grey or BGR, where somebody looks and it is time; it is not changed, nor copied here."""
+        """Take an image, grey or BGR, if it is subscribed and due; it is neither changed nor copied here."""
         debug = self._debug_image.get_subscription_count() > 0
         views = self._publication.published is not None and (
             self._top_view.get_subscription_count() > 0 or self._image_rect.get_subscription_count() > 0
@@ -92,7 +92,7 @@ class LivePictures:
         now = time.monotonic()
         if not (debug or views) or now < self._due_s:
             return
-        # in step with the images, whatever their rate, and at once after a pause
+        # keep pace with the images at any rate, without delay after a pause
         self._due_s = max(self._due_s, now - 0.5 / self.rate_hz) + 1 / self.rate_hz
         image_header = messages.header(message.header.stamp, self._headers.frame_id(message.header.frame_id))
         pending = _PendingImage(image_header, image, followed() if debug else None)
@@ -101,14 +101,14 @@ class LivePictures:
             self._changed.notify_all()
 
     def solution_found(self, result: Calibration | Refusal, evidence: Evidence) -> None:
-        """Show from now on what became of the tracks in a solution; a refusal says nothing of them."""
+        """Show the tracks as labelled by this solution; a refusal labels none."""
         if isinstance(result, Calibration):
             self._labelled_tracks = LabelledTracks(
                 evidence.image_size, evidence.points_px, evidence.track_starts, result.figures.track_labels
             )
 
     def forget(self) -> None:
-        """Show nothing of an earlier solution, nor an image from before."""
+        """Drop the track labels of earlier solutions and the pending image."""
         with self._changed:
             self._labelled_tracks = self._pending = None
 
@@ -123,18 +123,18 @@ class LivePictures:
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._closed or self._pending is not None)
-                if self._closed:
+                if self._closed or self._pending is None:
                     return
                 pending, self._pending = self._pending, None
             try:
                 self._show(pending)
-            except Exception as error:  # pictures are the least of what the node does
+            except Exception as error:  # a fault in drawing does not stop the node
                 if not self._closed:
                     self._failed(error)
 
     def _show(self, pending: _PendingImage) -> None:
-        """Draw what somebody looks at."""
-        image = black_out(pending.image, self._ignored)  # all pictures begin here, and nowhere else
+        """Draw the subscribed pictures."""
+        image = black_out(pending.image, self._ignored)  # the only source of all pictures
         height, width = image.shape[:2]
         published, state = self._publication.published, self._publication.state
         if published is not None and published.result.evidence.image_size != (width, height):
@@ -144,10 +144,10 @@ class LivePictures:
             picture = self._debug.of((width, height), result, self._labelled_tracks)
             caption = caption_of(state, result, self._progress())
             self._publish(self._debug_image, picture.draw(image, pending.followed_px, caption), pending.header)
-        if result is None:
+        if published is None:
             return
         if self._image_rect.get_subscription_count():
-            self._publish(self._image_rect, self._rectified.of(result).draw(image), pending.header)
+            self._publish(self._image_rect, self._rectified.of(published.result).draw(image), pending.header)
         if self._top_view.get_subscription_count() and published.transform is not None:
             self._draw_top_view(published, image, pending.header)
 
@@ -162,7 +162,7 @@ class LivePictures:
 
 
 class _Cached:
-    """Makes something of values, and keeps it until they are others; values are told apart by identity."""
+    """Caches the result of a function until its arguments change; arguments are compared by identity."""
 
     def __init__(self, make: Callable[..., Any]) -> None:
         self._make = make
@@ -170,18 +170,18 @@ class _Cached:
         self._made: Any = None
 
     def of(self, *values: Any) -> Any:
-        """Return what is made of values."""
+        """Return the result for these arguments."""
         same = self._of is not None and all(
             new is old or (isinstance(new, tuple) and new == old) for new, old in zip(values, self._of, strict=True)
         )
         if not same:
-            self._made, self._of = None, None  # not both at a time: tables are large
+            self._made, self._of = None, None  # free the old result first: tables are large
             self._made, self._of = self._make(*values), values
         return self._made
 
 
 def caption_of(state: CalibrationState, result: Calibration | None, progress: CalibrationProgress | None) -> Caption:
-    """Return the state in words: what is in force, or how far the evidence has come and what is missing."""
+    """Return the caption: the published calibration, or the progress with the missing evidence."""
     if result is None or state is CalibrationState.NONE:
         return Caption(*_collecting(progress), WAITING_COLOUR)
     numbers = ', '.join(describe_numbers(result))
@@ -194,17 +194,17 @@ def caption_of(state: CalibrationState, result: Calibration | None, progress: Ca
 
 
 def _collecting(progress: CalibrationProgress | None) -> tuple[str, str]:
-    """Return how far the evidence has come, and what is missing."""
+    """Return progress and missing evidence."""
     if progress is None:
         return 'COLLECTING', ''
     return f'COLLECTING {progress.percent:.0f} %', '; '.join([*progress.missing, *filter(None, [progress.outlook])])
 
 
 def image_message(picture: np.ndarray, image_header: Header) -> Image:
-    """Return a picture, grey (H, W) or BGR (H, W, 3) uint8, as a message."""
+    """Return a picture, grey (H, W) or BGR (H, W, 3) uint8, as an Image message."""
     height, width = picture.shape[:2]
     data = array('B')
-    data.frombytes(memoryview(np.ascontiguousarray(picture)).cast('B'))
+    data.frombytes(np.ascontiguousarray(picture).data.cast('B'))
     return Image(
         header=image_header,
         height=height,
@@ -217,9 +217,9 @@ def image_message(picture: np.ndarray, image_header: Header) -> Image:
 
 
 def _picture_publisher(node: Node, topic: str) -> Publisher:
-    """Publish reliably, as RViz asks by default and best-effort subscribers take too: best effort loses large images.
+    """Create a reliable publisher: RViz requests that by default, and best effort loses large images.
 
-    A subscriber that is too slow gets the newest only, and nobody waits for it but the drawing thread.
+    A slow subscriber gets only the newest picture and delays nothing but the drawing thread.
     """
     profile = QoSProfile(depth=1, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE)
     overriding = QoSOverridingOptions.with_default_policies()

@@ -1,4 +1,4 @@
-"""Results and states in one line each, for the log and the answers of services."""
+"""Results and states as one line of text, for the log and the responses of services."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ from autocalib_ros.results.calibration import Calibration, Refusal
 
 
 def describe(result: Calibration | Refusal) -> str:
-    """Return a result in one line."""
+    """Return a result as one line."""
     return describe_refusal(result) if isinstance(result, Refusal) else describe_calibration(result)
 
 
 def describe_refusal(refusal: Refusal) -> str:
-    """Return why there is no calibration, and what helps."""
+    """Return code, reason and remedy of a refusal as one line."""
     return _one_line(f'refused ({refusal.code}): {refusal.message} Remedy: {refusal.remedy}')
 
 
 def describe_calibration(result: Calibration) -> str:
-    """Return focal length, tilt and height with their sigma, the grade and what was assumed."""
+    """Return focal length, tilt, height, grade and assumptions as one line."""
     assumptions = '; '.join(map(str, result.assumptions)) or 'none'
     numbers = ', '.join(describe_numbers(result))
     return _one_line(f'calibrated, grade {result.grade}: {numbers}; assumptions: {assumptions}')
 
 
 def describe_numbers(result: Calibration) -> list[str]:
-    """Return focal length, tilt and height with their sigma, or why there is no plane."""
+    """Return focal length, tilt and height with their sigma, or why there is no ground plane."""
     sigma = result.stddev
     parts = [f'focal length {result.camera.focal_px:.2f} px{_sigma_text(sigma.focal_px)}']
     if result.ground is not None:
@@ -40,17 +40,17 @@ def describe_numbers(result: Calibration) -> list[str]:
         parts.append(f'no ground plane ({result.ground_refusal.code}): {result.ground_refusal.message}')
     info = result.camera_info
     if info.distortion_model != 'equidistant':
-        parts.append(f'camera_info {info.distortion_model}, off by at most {info.error_px:.2g} px')
+        parts.append(f'camera_info {info.distortion_model}, error at most {info.error_px:.2g} px')
     return parts
 
 
 def describe_progress(progress: CalibrationProgress | None) -> str:
-    """Return how far the evidence has come, what is missing and how long that will take."""
+    """Return progress, missing evidence and expected time as one line."""
     return 'collecting' if progress is None else _one_line(f'collecting: {progress}')
 
 
 def tilt_deg(ground: GroundPlane) -> float:
-    """Return the angle of the optical axis below the horizon, degrees."""
+    """Return the angle of the optical axis below the horizon in degrees."""
     return math.degrees(math.asin(max(-1.0, min(1.0, -float(ground.normal_in_camera[2])))))
 
 

@@ -1,4 +1,4 @@
-"""A calibration in three dimensions: `~/markers` for RViz and Foxglove, in the ground frame."""
+"""`~/markers`: ground grid, field of view and uncertainty in the ground frame, for RViz and Foxglove."""
 
 from __future__ import annotations
 
@@ -9,16 +9,18 @@ from geometry_msgs.msg import Point
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
+from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.pictures.road import ErrorEllipse, GroundGrid, enlargement, error_ellipses, view_frustum
 from autocalib_ros.pictures.views import format_length
 from autocalib_ros.results.calibration import Calibration
 from autocalib_ros.ros.log_text import describe_numbers
 
 LINE_WIDTH_HEIGHTS = 0.005
+"""Line width in camera heights."""
 LETTER_HEIGHT_HEIGHTS = 0.06
-"""Width of lines and height of letters, units of the camera's height."""
+"""Letter height in camera heights."""
 LIFT_HEIGHTS = 0.003
-"""Ellipses are drawn so far above the grid, units of the camera's height, or both would flicker."""
+"""Height of the ellipses above the grid in camera heights: in one plane both would flicker."""
 GRID_COLOUR, FIELD_OF_VIEW_COLOUR, UNCERTAINTY_COLOUR, TEXT_COLOUR = (
     (0.8, 0.8, 0.8, 0.6),
     (1.0, 0.88, 0.3, 1.0),
@@ -29,16 +31,18 @@ GRID_COLOUR, FIELD_OF_VIEW_COLOUR, UNCERTAINTY_COLOUR, TEXT_COLOUR = (
 
 
 def no_markers() -> MarkerArray:
-    """Return the message that takes all markers away."""
+    """Return the message that deletes all markers."""
     return MarkerArray(markers=[Marker(action=Marker.DELETEALL)])
 
 
 def markers(result: Calibration, ground_frame: str) -> MarkerArray:
-    """Return the markers of a calibration with a plane, in place of all before.
+    """Return the markers of a calibration, which replace all earlier ones; without a ground plane none.
 
-    They carry no stamp, which RViz takes for "now": they hold until they are replaced.
+    Their stamp is zero, which RViz takes as "now", so they stay until replaced.
     """
     camera, ground = result.camera, result.ground
+    if ground is None:
+        return no_markers()
     shown, unit_m = error_ellipses(result), ground.height_m
     grid = GroundGrid.of(camera, ground)
     made = (
@@ -50,7 +54,8 @@ def markers(result: Calibration, ground_frame: str) -> MarkerArray:
         _lines('field_of_view', view_frustum(camera, ground), FIELD_OF_VIEW_COLOUR, LINE_WIDTH_HEIGHTS * unit_m)
     )
     made += _uncertainty(shown, unit_m)
-    made.append(_text('state', 0, _words(result, grid, shown), ground.translation_m + [0, 0, 0.5 * unit_m], unit_m))
+    place = ground.translation_m + np.array([0, 0, 0.5 * unit_m])
+    made.append(_text('state', 0, _words(result, ground, grid, shown), place, unit_m))
     for marker in made:
         marker.header = Header(frame_id=ground_frame)
         marker.frame_locked = True
@@ -58,7 +63,7 @@ def markers(result: Calibration, ground_frame: str) -> MarkerArray:
 
 
 def _uncertainty(shown: Sequence[ErrorEllipse], unit_m: float) -> Iterator[Marker]:
-    """Yield an ellipse and its words for each distance."""
+    """Yield an ellipse with its text for each distance."""
     factor = enlargement(list(shown))
     for number, ellipse in enumerate(shown):
         outline = np.pad(ellipse.outline(factor), ((0, 0), (0, 1)), constant_values=LIFT_HEIGHTS * unit_m)
@@ -72,10 +77,10 @@ def _uncertainty(shown: Sequence[ErrorEllipse], unit_m: float) -> Iterator[Marke
         )
 
 
-def _words(result: Calibration, grid: GroundGrid | None, shown: Sequence[ErrorEllipse]) -> str:
+def _words(result: Calibration, ground: GroundPlane, grid: GroundGrid | None, shown: Sequence[ErrorEllipse]) -> str:
     lines = [f'grade {result.grade}', *describe_numbers(result)]
     if grid is not None:
-        lines.append(f'squares of {format_length(grid.step_m, result.ground)}')
+        lines.append(f'squares of {format_length(grid.step_m, ground)}')
     factor = enlargement(list(shown))
     if shown:
         lines.append('ellipses: one sigma of a road point' + (f', enlarged {factor} times' if factor > 1 else ''))

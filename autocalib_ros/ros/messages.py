@@ -1,7 +1,7 @@
-"""Results as ROS messages, and the one check that every outgoing message passes.
+"""Results as ROS messages, and the validation of every outgoing message.
 
-rclpy does not check fields by default: an int in a float64 is published as 5e-324, a short list reads
-memory out of bounds. So every value is converted here, and `validated` looks at each once more.
+rclpy does not check fields by default: an int in a float64 field is published as 5e-324, a short list reads beyond its
+memory. So every value is converted here, and `validated` checks each message before it is published.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from autocalib_ros.lens.camera_info import CameraInfo as CameraInfoFields
 from autocalib_ros.lens.camera_info import Readout, to_full_resolution
 
 COEFFICIENT_COUNT = {'plumb_bob': 5, 'rational_polynomial': 8, 'equidistant': 4}
-"""Length of D for each distortion model that consumers know (sensor_msgs/distortion_models.hpp)."""
+"""Length of D for each distortion model known to consumers (sensor_msgs/distortion_models.hpp)."""
 INTEGER_BITS = {'int8': 8, 'uint8': 8, 'int16': 16, 'uint16': 16, 'int32': 32, 'uint32': 32, 'int64': 64, 'uint64': 64}
 TF2_QUATERNION_TOLERANCE = 1e-6
-"""tf2 refuses quaternions whose length is farther from 1 than this."""
+"""tf2 rejects quaternions whose length differs from 1 by more than this."""
 Message = TypeVar('Message')
 
 
 class InvalidMessage(AutocalibError):
-    """A message that must not leave the node."""
+    """A message that must not be published."""
 
 
 def time_message(stamp_ns: int) -> Time:
@@ -45,7 +45,7 @@ def stamp_ns(time: Time) -> int:
 
 
 def header(stamp: Time, frame_id: str) -> Header:
-    """Return a header of its own: an incoming one is shared and never changed."""
+    """Return a new header: an incoming one is shared and must not change."""
     return Header(stamp=Time(sec=stamp.sec, nanosec=stamp.nanosec), frame_id=frame_id)
 
 
@@ -54,8 +54,8 @@ def camera_info_message(
 ) -> CameraInfo:
     """Return the CameraInfo of an image with that stamp and frame.
 
-    With the driver's own message its binning and region of interest are copied, and all else is in the full
-    resolution (REP-104). InputError where that is not of these images.
+    With the driver's message, its binning and region of interest are copied, and all other fields are in full
+    resolution (REP-104); InputError if they do not fit the images.
     """
     operation: dict[str, Any] = {}
     if driver is not None:
@@ -86,7 +86,7 @@ def camera_info_message(
 
 
 def readout(driver: CameraInfo) -> Readout:
-    """Return what a driver says about the pixels that it sends."""
+    """Return size, binning and region of interest of a driver's CameraInfo."""
     return Readout(
         driver.width,
         driver.height,
@@ -99,7 +99,7 @@ def readout(driver: CameraInfo) -> Readout:
 def ground_transform_message(
     ground: GroundPlane, stamp: Time, ground_frame: str, camera_frame: str, tf_parent: str = 'ground'
 ) -> TransformStamped:
-    """Return the pose between camera and ground: a point in the child's frame goes to the parent's."""
+    """Return the transform between camera and ground: it takes points from the child to the parent frame."""
     pose = ground.transform(ground_frame, camera_frame, tf_parent)
     x, y, z = (float(value) for value in pose.translation_m)
     qx, qy, qz, qw = (float(value) for value in pose.rotation_xyzw)
@@ -111,7 +111,7 @@ def ground_transform_message(
 
 
 def validated(message: Message) -> Message:
-    """Return the message unchanged, or raise InvalidMessage naming the field that must not be published."""
+    """Return the message unchanged; raise InvalidMessage with the name of an invalid field."""
     name = type(message).__name__
     _check_fields(message, name)
     check = SEMANTIC_CHECKS.get(name)
@@ -127,7 +127,7 @@ def _check_fields(message: Any, path: str) -> None:
 
 def _check_value(value: Any, kind: str, path: str) -> None:
     if kind == 'sequence<uint8>' and isinstance(value, array) and value.typecode == 'B':
-        return  # it cannot hold anything else, and may be long
+        return  # can hold nothing else, and may be long
     if kind.startswith('sequence<'):
         for item in _listed(value, path):
             _check_value(item, kind[len('sequence<') : -1].partition(',')[0], path)
@@ -161,7 +161,7 @@ def _check_scalar(value: Any, kind: str, path: str) -> None:
 
 
 def _listed(value: Any, path: str) -> list[Any]:
-    """Return a list, array or one-dimensional numpy array as a list of Python's own numbers."""
+    """Return a list, array or one-dimensional numpy array as a list of Python numbers."""
     _require(getattr(value, 'ndim', 1) == 1, path, 'has more than one dimension')
     return value.tolist() if hasattr(value, 'tolist') else list(value)
 
@@ -173,7 +173,7 @@ def _check_camera_info(info: CameraInfo) -> None:
     length = COEFFICIENT_COUNT.get(info.distortion_model)
     _require(length is not None, f'{path}.distortion_model', f'is {info.distortion_model!r}')
     _require(len(info.d) == length, f'{path}.d', f'holds {len(info.d)} numbers, not {length}')
-    # image_proc passes an image through unrectified when D is all zero, whatever the model.
+    # image_proc does not rectify at all if D is all zero, whatever the model
     _require(info.distortion_model != 'equidistant' or any(info.d), f'{path}.d', 'is all zero')
     for field, matrix, columns in (('k', info.k, 3), ('p', info.p, 4)):
         _require(matrix[0] > 0 and matrix[columns + 1] > 0, f'{path}.{field}', 'has no positive focal length')
@@ -216,4 +216,4 @@ SEMANTIC_CHECKS: dict[str, Callable[[Any], None]] = {
     'TransformStamped': _check_transform,
     'TFMessage': _check_transforms,
 }
-"""What a message has to mean beyond the types of its fields."""
+"""Checks of message types beyond the types of their fields."""

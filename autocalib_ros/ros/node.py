@@ -1,8 +1,8 @@
-"""The executable `autocalib_node`: starts the node, ends it cleanly, and says in one line what was wrong.
+"""The executable `autocalib_node`: starts and stops the node, and reports wrong usage in one line.
 
     autocalib_node --ros-args -p camera_height:=8.0 -r image:=/cam1/image_raw
 
-Importing this module needs no ROS, so that its absence can be explained.
+Importing this module needs no ROS, so that a missing ROS can be reported.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 USAGE = 'usage: autocalib_node --ros-args -p camera_height:=METRES -r image:=IMAGE_TOPIC [--params-file FILE]'
 NO_ROS = (
-    "autocalib_node: ROS 2 is not there ({}): pip install 'autocalib_ros[ros]', "
+    "autocalib_node: ROS 2 is not installed ({}): pip install 'autocalib_ros[ros]', "
     'or apt install ros-jazzy-ros-base and source /opt/ros/jazzy/setup.bash'
 )
 WRONG_USAGE = 2
@@ -46,7 +46,7 @@ def main(args: list[str] | None = None) -> int:
 
 
 def _run(args: list[str]) -> None:
-    """Run the node until a signal; rclpy's own handlers would take the logger and publishers away first."""
+    """Run the node until a signal; rclpy's own handlers would shut down logger and publishers first."""
     import rclpy
 
     from autocalib_ros.ros.autocalib_node import AutocalibNode
@@ -67,7 +67,7 @@ def _run(args: list[str]) -> None:
 
 
 def _init(args: list[str]) -> None:
-    """Start ROS, or raise UsageError at arguments that are not understood."""
+    """Initialise ROS; raise UsageError at unknown arguments."""
     import rclpy
     from rclpy.signals import SignalHandlerOptions
     from rclpy.utilities import remove_ros_args
@@ -82,7 +82,7 @@ def _init(args: list[str]) -> None:
 
 
 def _create(node_type: type[AutocalibNode]) -> AutocalibNode:
-    """Create the node, or raise UsageError at a parameter that rclpy itself refuses."""
+    """Create the node; raise UsageError at a parameter that rclpy itself rejects."""
     from rclpy.exceptions import ParameterException
 
     try:
@@ -92,10 +92,10 @@ def _create(node_type: type[AutocalibNode]) -> AutocalibNode:
 
 
 def _spin(node: AutocalibNode, stop: threading.Event) -> None:
-    """Serve the node in a thread of its own until `stop`; raise what a callback raised.
+    """Spin the node in its own thread until `stop`; raise what a callback raised.
 
-    One thread is enough, as no callback waits. rclpy's MultiThreadedExecutor would lose images: it queues a
-    ready callback again and again until a thread takes it up, and stalls for seconds (ros2/rclpy#1452).
+    One thread is enough, since no callback waits. rclpy's MultiThreadedExecutor would lose images: it queues a ready
+    callback again and again until a thread takes it, and stalls for seconds (ros2/rclpy#1452).
     """
     from rclpy.executors import SingleThreadedExecutor
     from rclpy.task import Future
@@ -107,7 +107,7 @@ def _spin(node: AutocalibNode, stop: threading.Event) -> None:
         spinning.add_done_callback(lambda _: stop.set())
         stop.wait()
         finished.set_result(None)
-    executor.shutdown()  # only now: it takes away what a thread that still spins waits for
+    executor.shutdown()  # only now: it destroys what a spinning thread waits for
     spinning.result()
 
 

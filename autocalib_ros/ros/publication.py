@@ -1,4 +1,4 @@
-"""The calibration in force: what is published of it, and what a new solution or other images make of it."""
+"""Publication of the current calibration: latched topics, one CameraInfo per image, and its replacement."""
 
 from __future__ import annotations
 
@@ -28,22 +28,23 @@ from autocalib_ros.ros.transforms import GroundTransformPublisher
 
 @dataclass(frozen=True)
 class Published:
-    """A calibration with the messages that are made of it."""
+    """A calibration with the messages made from it."""
 
     result: Calibration
     fields: CameraInfoFields
     image_frame: str
     transform: TransformStamped | None
-    """The ground plane; None where there is none that may be published."""
+    """Ground plane; None if there is none, or none in metres and `allow_unit_scale` is off."""
     markers: MarkerArray
-    """The same for people to look at."""
+    """Grid, field of view and uncertainty for RViz and Foxglove."""
 
 
 class CalibrationPublisher:
-    """Publishes one calibration at a time, latched and image by image; safe in any thread.
+    """Publishes one calibration at a time, latched and per image; thread-safe.
 
-    `taken(published, save)` is told of each calibration that the traffic of this run vouches for, and whether it is
-    new; `withdrawn()` that there is none any more. Both are called with the lock held, in the order of events.
+    `on_accepted(published, new)` is called with each calibration that the traffic of this run has confirmed, and
+    whether it is new; `on_withdrawn()` when none is published any more. Both are called with the lock held, in the
+    order of events.
     """
 
     def __init__(
@@ -54,19 +55,20 @@ class CalibrationPublisher:
         headers: Headers,
         *,
         driver: DriverInfo,
-        taken: Callable[[Published, bool], None],
-        withdrawn: Callable[[], None],
+        on_accepted: Callable[[Published, bool], None],
+        on_withdrawn: Callable[[], None],
     ) -> None:
         self.options, self._headers = options, headers
-        self._node, self._driver, self._taken, self._withdrawn = node, driver, taken, withdrawn
+        self._node, self._driver = node, driver
+        self._on_accepted, self._on_withdrawn = on_accepted, on_withdrawn
         self._per_image = node_options.camera_info_mode == 'per_image'
         self._lock = threading.RLock()
         self.published: Published | None = None
         self.state = CalibrationState.NONE
         self.image_frame = ''
-        """Of the newest image; '' before the first."""
+        """Frame of the newest image; '' before the first."""
         self.image_size: tuple[int, int] | None = None
-        """Of the newest image that was decoded."""
+        """Size of the newest decoded image."""
         self._camera_info = latched_publisher(node, CameraInfo, '~/camera_info')
         self._markers = latched_publisher(node, MarkerArray, '~/markers')
         self._transforms = GroundTransformPublisher(
@@ -74,23 +76,23 @@ class CalibrationPublisher:
         )
 
     def change(self, options: Options, node_options: NodeOptions) -> None:
-        """Publish by other options from now on."""
+        """Use other options from now on."""
         self.options, self._per_image = options, node_options.camera_info_mode == 'per_image'
 
     @property
     def topic(self) -> str:
-        """Name of the topic of camera_info."""
+        """Name of the camera_info topic."""
         return self._camera_info.topic_name
 
     @property
     def conflict(self) -> str:
-        """Why nothing is on /tf_static, '' where nothing stands in the way."""
+        """Reason why nothing is published on /tf_static; '' if there is none."""
         return self._transforms.conflict
 
     def on_image(self, message: Any, image_frame: str) -> Published | None:
-        """Give an image its camera_info; return a restored calibration that is withdrawn because it is of other frames.
+        """Publish the CameraInfo of an image; return a restored calibration withdrawn because its frame differs.
 
-        Of compressed images the first has to be decoded before their size is known.
+        The size of compressed images is unknown until the first is decoded.
         """
         with self._lock:
             foreign = self._on_new_frame(image_frame) if image_frame != self.image_frame else None
@@ -106,13 +108,13 @@ class CalibrationPublisher:
             self._headers.ground_frame(image_frame), self._headers.camera_frame(image_frame)
         )
         published = self.published
-        if self.state is not CalibrationState.RESTORED or published.image_frame == image_frame:
+        if self.state is not CalibrationState.RESTORED or published is None or published.image_frame == image_frame:
             return None
         self.withdraw()
         return published
 
     def on_image_size(self, width: int, height: int) -> tuple[CalibrationState, Published] | None:
-        """Take the size of an image; return what is withdrawn because its lens was calibrated in other pixels."""
+        """Take the size of a decoded image; return a calibration withdrawn because its image size differs."""
         with self._lock:
             self.image_size = (width, height)
             state, published = self.state, self.published
@@ -122,18 +124,18 @@ class CalibrationPublisher:
         return state, published
 
     def on_evidence_reset(self) -> None:
-        """Keep what is in force until a solution of the new evidence is as sure, or contradicts it."""
+        """Mark the calibration as verified only: it stays until new evidence gives one as precise or contradicts it."""
         with self._lock:
             if self.state is CalibrationState.CALIBRATED:
                 self.state = CalibrationState.VERIFIED
 
     def solved(self, result: Calibration) -> Decision | None:
-        """Let a new solution confirm or replace what is in force; None where images have another size by now."""
+        """Let a new solution confirm or replace the calibration; None if the image size has changed since."""
         while True:
             before, state = self.published, self.state
             decision = reconcile(state, before.result if before else None, result)
             new = decision.calibration is result
-            # this may take a while, and images do not wait for it
+            # outside the lock: this may take a while, and images do not wait for it
             published = (
                 self._make_messages(result, self.image_frame or DEFAULT_FRAME) if new or before is None else before
             )
@@ -150,41 +152,41 @@ class CalibrationPublisher:
             self._publish(decision.state, published)
         self.state = decision.state
         if new or confirmed:
-            self._taken(published, new)
+            self._on_accepted(published, new)
         if decision.contradicted:
             self._clear_latched()
 
     def restore(self, result: Calibration, image_frame: str) -> None:
-        """Publish a calibration of an earlier run; AutocalibError where it is not of these images."""
+        """Publish a calibration of an earlier run; AutocalibError if it does not fit the present images."""
         restored = self._make_messages(result, image_frame)
         with self._lock:
             if self.state is not CalibrationState.NONE:
-                raise InputError(f'there is a {self.state.value} one already')
+                raise InputError(f'a {self.state.value} calibration is already published')
             if self.image_frame not in ('', image_frame):
-                raise InputError(f"it is of the frame '{image_frame}', and images are of '{self.image_frame}'")
-            if self.image_size not in (None, result.evidence.image_size):
+                raise InputError(f"its frame is '{image_frame}', that of the images '{self.image_frame}'")
+            if self.image_size is not None and self.image_size != result.evidence.image_size:
                 raise InputError(
-                    'it is of images of {}x{}, and these have {}x{}'.format(
+                    'its images have {}x{} pixels, the present ones {}x{}'.format(
                         *result.evidence.image_size, *self.image_size
                     )
                 )
             self._publish(CalibrationState.RESTORED, restored)
 
     def withdraw(self) -> CalibrationState:
-        """Publish nothing any more; return what was in force."""
+        """Stop publishing; return the state before."""
         with self._lock:
             was, self.state, self.published = self.state, CalibrationState.NONE, None
             if was is not CalibrationState.NONE:
                 self._markers.publish(no_markers())
-            self._withdrawn()
+            self._on_withdrawn()
             self._clear_latched()
         return was
 
     def camera_info(self, published: Published, stamp: Time | None = None, image_frame: str = '') -> CameraInfo:
-        """Return the message of an image, or of the newest one that a calibration rests on.
+        """Return the CameraInfo of an image, or of the newest image in the evidence of the calibration.
 
-        The driver's binning and region of interest are in it where they are of these images; where they are not,
-        diagnostics say so.
+        It contains binning and region of interest of the driver if they fit the images; if not, /diagnostics reports
+        the mismatch.
         """
         fields, frame = published.fields, image_frame or published.image_frame
         stamp = stamp or messages.time_message(published.result.newest_stamp_ns)
@@ -199,7 +201,7 @@ class CalibrationPublisher:
         return Published(result, result.camera_info, image_frame, transform, shown)
 
     def _make_markers(self, result: Calibration, image_frame: str) -> MarkerArray:
-        """Return the markers of a ground plane; nothing that is only looked at stops a calibration."""
+        """Return the markers of a ground plane; a fault in these drawings does not stop the calibration."""
         try:
             return messages.validated(markers(result, self._headers.ground_frame(image_frame)))
         except Exception as error:
@@ -207,7 +209,7 @@ class CalibrationPublisher:
             return no_markers()
 
     def _make_transform(self, result: Calibration, image_frame: str) -> TransformStamped | None:
-        """Return the message of the ground plane, unless its scale is made up and nobody allowed that."""
+        """Return the ground transform, unless its scale is unknown and `allow_unit_scale` is off."""
         ground = result.ground
         if ground is None or not (ground.metric or self.options.allow_unit_scale):
             return None
@@ -227,9 +229,9 @@ class CalibrationPublisher:
         self.published, self.state = published, state
 
     def _clear_latched(self) -> None:
-        """Let late joiners no longer have what is not in force: a latched message goes with its publisher.
+        """Remove obsolete latched messages by renewing their publishers, so that late joiners do not get them.
 
-        Publishers change in the executor's thread, which may be waiting for their events.
+        Publishers are renewed in the executor's thread, which may be waiting for their events.
         """
         if self._node.executor is not None:
             self._node.executor.create_task(self._renew_publishers)

@@ -1,4 +1,4 @@
-"""Qualities of service that several publishers share."""
+"""QoS profiles shared by several publishers."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 
 
 def latched() -> QoSProfile:
-    """One publisher serves late joiners and, message by message, everybody else."""
+    """Return a QoS profile of depth 1 whose last message also reaches late joiners."""
     return QoSProfile(
         depth=1,
         history=HistoryPolicy.KEEP_LAST,
@@ -22,8 +22,8 @@ LATCHED = latched()
 
 
 def latched_publisher(node: Node, kind: type[Any], topic: str) -> Publisher:
-    """Publish latched, unless parameters `qos_overrides.<topic>.publisher.*` say otherwise."""
-    # overrides are written into the profile, so it is one of its own
+    """Create a latched publisher; parameters `qos_overrides.<topic>.publisher.*` can change its QoS."""
+    # a profile of its own, since overrides are written into it
     return node.create_publisher(
         kind, topic, latched(), qos_overriding_options=QoSOverridingOptions.with_default_policies()
     )

@@ -1,4 +1,4 @@
-"""Reports of a live node, written by a process of their own: drawing takes seconds, and would hold Python's lock."""
+"""Reports of the live node, written in a child process: drawing takes seconds and would hold the GIL."""
 
 from __future__ import annotations
 
@@ -18,28 +18,26 @@ from autocalib_ros.evidence.buffer import EvidenceBuffer
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.report.scene import ReportScene, SolutionSnapshot, append_snapshot
 from autocalib_ros.results.calibration import Calibration, Refusal
-from autocalib_ros.ros.solver_process import NICENESS
+from autocalib_ros.ros.solver_process import NICENESS, PROCESS_EXIT_S
 from autocalib_ros.util.threads import limit_blas_threads
-
-PROCESS_EXIT_S = 1.0
 
 
 @dataclass(frozen=True)
 class ReportPaths:
-    """Where a report goes."""
+    """Output paths of a report: the page and the folder of its figures."""
 
     page: Path
     figures: Path
 
 
 class ReportWriter:
-    """Remembers what a report shows of the solutions, and writes one after the other; of those that wait, the newest.
+    """Collects the solutions that a report shows, and writes reports one at a time, of those pending the newest.
 
-    Callable from any thread. `tell(text, good)` hears from a thread what became of each.
+    Thread-safe. `log(text, good=)` is called from its thread with the outcome of each report.
     """
 
-    def __init__(self, tell: Callable[[str, bool], None]) -> None:
-        self._tell = tell
+    def __init__(self, log: Callable[[str, bool], None]) -> None:
+        self._log = log
         self._changed = threading.Condition()
         self._moments: tuple[SolutionSnapshot, ...] = ()
         self._accepted: tuple[Calibration, Evidence] | None = None
@@ -49,24 +47,24 @@ class ReportWriter:
         self._closed = False
 
     def solved(self, result: Calibration | Refusal) -> None:
-        """Take down what a solution says."""
+        """Append a result to the history of solutions."""
         with self._changed:
             self._moments = append_snapshot(self._moments, result)
 
     def set_evidence(self, result: Calibration, evidence: Evidence | None) -> None:
-        """Keep the evidence of the calibration that is in force from now on."""
+        """Keep the evidence of a newly accepted calibration."""
         with self._changed:
             self._accepted = None if evidence is None else (result, evidence)
 
     def forget(self) -> None:
-        """Forget what solutions said, and what they rest on."""
+        """Drop the history and the evidence."""
         with self._changed:
             self._moments, self._accepted = (), None
 
     def scene(
         self, result: Calibration, seen: tuple[Evidence | None, np.ndarray | None], options: Options, source: str
     ) -> ReportScene:
-        """Put together what a report of a calibration shows, with what is `seen` now."""
+        """Return the contents of a report: `seen` is the present evidence and background image."""
         evidence, background = seen
         with self._changed:
             if self._accepted is not None and self._accepted[0] is result:
@@ -78,19 +76,19 @@ class ReportWriter:
             result=result, evidence=evidence, background=background, options=options, source=source, moments=moments
         )
 
-    def write(self, place: ReportPaths, scene: ReportScene) -> None:
-        """Write a report soon."""
+    def write(self, paths: ReportPaths, scene: ReportScene) -> None:
+        """Start to write a report; a newer one replaces it while it waits."""
         with self._changed:
             if self._closed:
                 return
-            self._next = (place, scene)
+            self._next = (paths, scene)
             if self._thread is None:
                 self._thread = threading.Thread(target=self._run, name='reports', daemon=True)
                 self._thread.start()
             self._changed.notify_all()
 
     def close(self) -> None:
-        """Write no more, and give up what is being written; what was there before stays."""
+        """Abort the report that is being written and drop the pending one; the previous report stays."""
         with self._changed:
             self._closed, self._next = True, None
             process = self._process
@@ -104,51 +102,50 @@ class ReportWriter:
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._closed or self._next)
-                if self._closed:
+                if self._closed or self._next is None:
                     return
-                (place, scene), self._next = self._next, None
-                # Not forked: a fork would share the locks of the parent's threads and its middleware.
+                (paths, scene), self._next = self._next, None
+                # spawn, not fork: a fork would copy locks held by the parent's threads and its middleware
                 context = multiprocessing.get_context('spawn')
                 ours, theirs = context.Pipe(duplex=False)
                 process = self._process = context.Process(
-                    target=_write, args=(theirs, place, scene), name='autocalib report', daemon=True
+                    target=_write, args=(theirs, paths, scene), name='autocalib report', daemon=True
                 )
                 process.start()
             theirs.close()
             fault = self._wait_for(process, ours)
             if not self._closed:
-                self._tell(
-                    f'the report was not written: {fault}' if fault else f'the report is written: {place.page}',
-                    not fault,
+                self._log(
+                    f'the report was not written: {fault}' if fault else f'report written to {paths.page}', not fault
                 )
 
     @staticmethod
     def _wait_for(process: BaseProcess, ours: Connection) -> str:
-        """Wait for a process that writes a report; return why that failed, '' where it did not."""
+        """Wait for the child process; return why it failed, '' if it succeeded."""
         try:
             fault = ours.recv()
         except (EOFError, OSError):
-            fault = 'the process that draws it ended before it was done: is there enough memory?'
+            fault = 'the process that draws it ended early, possibly out of memory'
         ours.close()
         process.join(PROCESS_EXIT_S)
         return fault
 
 
-def _write(pipe: Connection, place: ReportPaths, scene: ReportScene) -> None:
-    """Draw and write, behind everything else on the machine, and say what failed."""
+def _write(pipe: Connection, paths: ReportPaths, scene: ReportScene) -> None:
+    """Draw and write a report at low priority; send '' or the error."""
     os.nice(NICENESS)
     limit_blas_threads()
     try:
         from autocalib_ros.report.page import write_report
 
-        write_report(place.page, scene, place.figures)
+        write_report(paths.page, scene, paths.figures)
         pipe.send('')
-    except Exception as error:  # whatever it is, the node lives on without a report
+    except Exception as error:  # the node works without a report
         pipe.send(f'{type(error).__name__}: {error}')
 
 
 def _empty_evidence(result: Calibration, options: Options) -> Evidence:
-    """Return evidence without traffic, for a calibration of an earlier run."""
+    """Return evidence without traffic, for a calibration restored from an earlier run."""
     return EvidenceBuffer(options.buffer).snapshot(
         image_size=result.evidence.image_size,
         first_stamp_ns=result.newest_stamp_ns,

@@ -1,7 +1,7 @@
-"""Solutions in a process of their own: a solver in a thread would hold Python's lock and cost images.
+"""Solver in a child process: in a thread it would hold the GIL and cost images.
 
-The child takes a pickled problem from its pipe, and sends the result or the exception back. It steps back behind
-everything else on the machine, and ends when its parent does.
+The child receives a pickled problem through a pipe and sends back the result or the exception. It runs at low
+priority and ends with its parent.
 """
 
 from __future__ import annotations
@@ -22,29 +22,30 @@ from autocalib_ros.results.calibration import Calibration, Refusal
 
 Result = Calibration | Refusal
 NICENESS = 10
-"""A solution has minutes, an image has milliseconds."""
+"""Nice value of the child: a solution has minutes, an image milliseconds."""
 PROCESS_EXIT_S = 1.0
+"""Real seconds to wait for the end of a killed process."""
 
 
 class SolverDied(AutocalibError):
-    """The process that solves ended before it gave a result."""
+    """The solver process ended before it returned a result."""
 
 
 class _ChildTraceback(Exception):
-    """The traceback of the child, to stand above that of the parent."""
+    """Traceback of the child process, printed above that of the parent."""
 
 
 class SolverProcess:
-    """Solves like `calibrator.solve`; one problem at a time, from one thread; `close` may come from any.
+    """Callable like `calibrator.solve`, for one thread and one problem at a time; `close` is thread-safe.
 
-    The process is started by the first problem.
+    The first call starts the process.
     """
 
     def __init__(self) -> None:
         self._process: BaseProcess | None = None
 
     def _start(self) -> BaseProcess:
-        # Not forked: a fork would share the locks of the parent's threads and its middleware.
+        # spawn, not fork: a fork would copy locks held by the parent's threads and its middleware
         context = multiprocessing.get_context('spawn')
         self._pipe, child_pipe = context.Pipe()
         process = context.Process(target=_run_child, args=(child_pipe,), name='autocalib solver', daemon=True)
@@ -53,24 +54,24 @@ class SolverProcess:
         return process
 
     def __call__(self, evidence: Evidence, options: Options, /, *, lens: Camera | None) -> Result:
-        """Return the result; raise what the solver raised, or SolverEnded, after which the next call starts anew."""
+        """Return the result. Raise what the solver raised, or SolverDied; the next call then starts a new process."""
         self._process = process = self._process or self._start()
         try:
             self._pipe.send((evidence, options, lens))
-            result, error, told = self._pipe.recv()
+            result, error, child_traceback = self._pipe.recv()
         except (EOFError, OSError) as lost:
             process.join(PROCESS_EXIT_S)
             self._process = None
             raise SolverDied(
-                f'the process that solves ended with status {process.exitcode} before it gave a result; '
-                'the next solution starts another: is there enough memory?'
+                f'the solver process ended with status {process.exitcode} before it returned a result, possibly out '
+                'of memory; the next solution starts a new process'
             ) from lost
         if error is not None:
-            raise error from _ChildTraceback(told)
+            raise error from _ChildTraceback(child_traceback)
         return result
 
     def close(self) -> None:
-        """End the process, even in the middle of a solution."""
+        """Kill the process, also during a solution."""
         process, self._process = self._process, None
         if process is not None:
             process.kill()
@@ -78,8 +79,8 @@ class SolverProcess:
 
 
 def _run_child(pipe: Connection) -> None:
-    """Solve what comes until the parent is gone."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt from the keyboard is the parent's to answer
+    """Solve the problems that arrive until the parent closes the pipe."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is handled by the parent
     os.nice(NICENESS)
     while True:
         try:
@@ -88,5 +89,5 @@ def _run_child(pipe: Connection) -> None:
             return
         try:
             pipe.send((solve(evidence, options, lens=lens), None, ''))
-        except Exception as error:  # the parent raises it where the problem came from
+        except Exception as error:  # raised again in the parent, at the call
             pipe.send((None, error, traceback.format_exc()))

@@ -1,4 +1,4 @@
-"""What /diagnostics says, as one pure function of what the node knows. Needs no ROS."""
+"""Content of /diagnostics as a pure function of the state of the node. Needs no ROS."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from dataclasses import dataclass
 from enum import Enum
 
 from autocalib_ros.calibrator import CalibrationProgress
-from autocalib_ros.results.calibration import Calibration
+from autocalib_ros.results.calibration import Calibration, StandardDeviations
 from autocalib_ros.ros.log_text import tilt_deg
 from autocalib_ros.ros.watchdog import NoImageDiagnosis
 
 OK, WARN, ERROR = 0, 1, 2
-"""Levels of diagnostic_msgs/DiagnosticStatus; STALE is the aggregator's to say."""
+"""Levels of diagnostic_msgs/DiagnosticStatus; STALE is set by the aggregator."""
 RATE_WINDOW_S = 5.0
-"""Real seconds over which rates are counted."""
+"""Real seconds over which rates are averaged."""
 MAX_DROPPED_FRACTION = 0.1
-"""Images dropped, as a share of those received, from which the machine is too slow for the camera."""
+"""Fraction of the received images above which dropping is reported: the machine is too slow for the camera."""
 
 
 class NodeState(str, Enum):
-    """What the node is doing."""
+    """State of the node."""
 
     WAITING_FOR_IMAGES = 'WAITING_FOR_IMAGES'
     COLLECTING = 'COLLECTING'
@@ -39,7 +39,7 @@ LEVELS = {
 
 @dataclass(frozen=True)
 class Counts:
-    """Images so far, or per second: how many came, and what became of them."""
+    """Number of images by outcome, in total or per second."""
 
     received: float = 0
     used: float = 0
@@ -47,17 +47,17 @@ class Counts:
     unreadable: float = 0
     late: float = 0
     lost: float = 0
-    """Lost by the middleware before they came here."""
+    """Lost by the middleware."""
 
 
 class RateCounter:
-    """Counts of the last `RATE_WINDOW_S`."""
+    """Image rates over the last `RATE_WINDOW_S`."""
 
     def __init__(self) -> None:
         self._seen: deque[tuple[float, Counts]] = deque()
 
     def rates_hz(self, now_s: float, counts: Counts) -> Counts | None:
-        """Take what was counted until now; return it per second, None at the first call."""
+        """Append the counts at a time; return them per second, None at the first call."""
         self._seen.append((now_s, counts))
         while now_s - self._seen[0][0] > RATE_WINDOW_S and len(self._seen) > 2:
             self._seen.popleft()
@@ -74,29 +74,30 @@ class RateCounter:
 
 @dataclass(frozen=True, kw_only=True)
 class Situation:
-    """What the node knows at one moment."""
+    """State of the node at one moment."""
 
     topic: str
     counts: Counts
     rates_hz: Counts | None = None
     result: Calibration | None = None
-    """The calibration in force."""
+    """The published calibration."""
     restored: bool = False
-    """It was stored by an earlier run and is not yet confirmed by traffic."""
+    """The calibration was stored by an earlier run and is not yet verified by traffic."""
     progress: CalibrationProgress | None = None
     image_age_s: float | None = None
     encoding: str = ''
-    silence: NoImageDiagnosis | None = None
+    no_image: NoImageDiagnosis | None = None
     unreadable: str = ''
-    """Why the newest image could not be used."""
+    """Why the newest image cannot be used."""
     errors: tuple[str, ...] = ()
+    """Other faults that keep the node from working."""
     warnings: tuple[str, ...] = ()
-    """What else is wrong, in words: nothing works before errors are mended."""
+    """Other faults that the node can work with."""
 
 
 @dataclass(frozen=True)
 class Status:
-    """The content of a diagnostic_msgs/DiagnosticStatus."""
+    """Content of a diagnostic_msgs/DiagnosticStatus."""
 
     level: int
     message: str
@@ -104,17 +105,17 @@ class Status:
 
 
 def state_of(situation: Situation) -> NodeState:
-    """Return what the node is doing."""
+    """Return the state of the node."""
     if situation.result is not None:
         return NodeState.RESTORED if situation.restored else NodeState.CALIBRATED
     return NodeState.COLLECTING if situation.counts.used else NodeState.WAITING_FOR_IMAGES
 
 
 def status(situation: Situation) -> Status:
-    """Return the level, one line for people, and every number."""
+    """Return level, one-line message and values; the message names the gravest problems first."""
     state, problems = state_of(situation), sorted(_problems(situation), key=lambda problem: -problem[0])
     level = max([LEVELS[state], *(level for level, _ in problems)])
-    message = '; '.join([_headline(state, situation), *(words for _, words in problems)])
+    message = '; '.join([_headline(state, situation), *(text for _, text in problems)])
     return Status(level, message, tuple(_values(state, situation)))
 
 
@@ -129,23 +130,23 @@ def _headline(state: NodeState, situation: Situation) -> str:
 
 
 def _problems(situation: Situation) -> Iterator[tuple[int, str]]:
-    yield from ((ERROR, words) for words in situation.errors)
+    yield from ((ERROR, text) for text in situation.errors)
     if situation.unreadable:
         yield ERROR, f'images cannot be used: {situation.unreadable}'
-    if situation.silence is not None:
-        yield ERROR if situation.silence.lasting else WARN, situation.silence.words
-    yield from ((WARN, words) for words in situation.warnings)
+    if situation.no_image is not None:
+        yield ERROR if situation.no_image.persistent else WARN, situation.no_image.text
+    yield from ((WARN, text) for text in situation.warnings)
     rates = situation.rates_hz
     if rates is not None and rates.dropped > MAX_DROPPED_FRACTION * rates.received:
         yield (
             WARN,
             (
-                f'{rates.dropped:.1f} of {rates.received:.1f} images a second are dropped: lower the rate or size '
-                'of the images, max_image_width or tracking.max_points'
+                f'{rates.dropped:.1f} of {rates.received:.1f} images per second are dropped: reduce the image rate or '
+                'size, max_image_width or tracking.max_points'
             ),
         )
     if rates is not None and rates.received > 0 and rates.late >= rates.received:
-        yield WARN, 'no image is newer than those before: the time stamps of the images do not advance'
+        yield WARN, 'the time stamps of the images do not increase, so no image is used'
 
 
 def _values(state: NodeState, situation: Situation) -> Iterator[tuple[str, str]]:
@@ -165,19 +166,19 @@ def _values(state: NodeState, situation: Situation) -> Iterator[tuple[str, str]]
 
 
 def _result_values(result: Calibration | None) -> Iterator[tuple[str, str]]:
-    """Yield the numbers of the calibration in force, all of them '' while there is none."""
-    sigma = None if result is None else result.stddev
+    """Yield the values of the published calibration, '' without one."""
     ground = None if result is None else result.ground
+    refusal = None if result is None else result.ground_refusal
+    sigma = StandardDeviations() if result is None else result.stddev
     yield 'grade', '' if result is None else result.grade
     yield 'focal_px', _number(None if result is None else result.camera.focal_px, '.2f')
-    yield 'focal_sigma_px', _number(sigma and sigma.focal_px, '.3g')
+    yield 'focal_sigma_px', _number(sigma.focal_px, '.3g')
     yield 'tilt_deg', _number(None if ground is None else tilt_deg(ground), '.2f')
-    yield 'tilt_sigma_deg', _number(sigma and sigma.tilt_deg, '.3g')
-    yield 'roll_sigma_deg', _number(sigma and sigma.roll_deg, '.3g')
+    yield 'tilt_sigma_deg', _number(sigma.tilt_deg, '.3g')
+    yield 'roll_sigma_deg', _number(sigma.roll_deg, '.3g')
     yield 'height_m', _number(ground.height_m if ground is not None and ground.metric else None, '.3f')
-    yield 'height_sigma_m', _number(sigma and sigma.height_m, '.3g')
+    yield 'height_sigma_m', _number(sigma.height_m, '.3g')
     yield 'assumptions', '' if result is None else '; '.join(map(str, result.assumptions))
-    refusal = None if result is None else result.ground_refusal
     yield 'no_ground_plane', '' if refusal is None else refusal.message
     yield 'newest_stamp_s', _number(None if result is None else result.newest_stamp_ns * 1e-9, '.3f')
 

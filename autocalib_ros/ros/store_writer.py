@@ -1,4 +1,4 @@
-"""A thread that writes calibrations to the store, so that nobody waits for a disk who does not want to."""
+"""Background thread that writes calibrations to the store."""
 
 from __future__ import annotations
 
@@ -12,41 +12,41 @@ from autocalib_ros.errors import AutocalibError
 from autocalib_ros.results.store import Store, StoredCalibration
 
 SAVE_PERIOD_S = 60.0
-"""Real seconds between two files that nobody asked for: solutions may follow each other by seconds, for months, and
+"""Minimum real seconds between two automatic writes: solutions can follow each other within seconds, for months, and
 flash memory wears."""
 
 
 class StoreWriter:
-    """Writes one calibration after the other; of those that wait, the newest. Callable from any thread.
+    """Writes calibrations one at a time, of those pending only the newest. Thread-safe.
 
-    `tell` hears from the thread why an offer could not be written, once until that changes; it is tried again.
+    `warn(text)` is called from the thread when a write fails, once per reason; the write is repeated.
     """
 
-    def __init__(self, tell: Callable[[str], None], period_s: float = SAVE_PERIOD_S) -> None:
-        self._tell, self._period_s = tell, period_s
+    def __init__(self, warn: Callable[[str], None], period_s: float = SAVE_PERIOD_S) -> None:
+        self._warn, self._period_s = warn, period_s
         self._changed = threading.Condition()
         self._steps: list[tuple[Callable[[], Any], Future]] = []
         self._pending: Callable[[], None] | None = None
         self._due = time.monotonic()
         self._closed = False
         self.fault = ''
-        """Why the last offer could not be written; '' when it was."""
-        self._thread = threading.Thread(target=self._run, name='keeper', daemon=True)
+        """Reason why the last automatic write failed; '' if it succeeded."""
+        self._thread = threading.Thread(target=self._run, name='store writer', daemon=True)
         self._thread.start()
 
     def offer(self, store: Store, stored: StoredCalibration) -> None:
-        """Write soon: at once when nothing was written for `period_s`; a newer offer takes this one's place."""
+        """Write this at once, or `period_s` after the last write; a newer offer replaces it."""
         with self._changed:
             self._pending = lambda: store.save(stored)
             self._changed.notify_all()
 
     def withdraw(self) -> None:
-        """Leave out what was offered and has not been written yet."""
+        """Drop the pending write."""
         with self._changed:
             self._pending = None
 
     def run(self, step: Callable[[], Any]) -> Future:
-        """Run a step at once; the future holds what it returns, or the AutocalibError that it raised."""
+        """Run a step in the thread at once; the future holds its result, or its AutocalibError as a value."""
         future: Future = Future()
         with self._changed:
             if self._closed:
@@ -57,7 +57,7 @@ class StoreWriter:
         return future
 
     def close(self, timeout_s: float) -> bool:
-        """Write what waits, stop, and say whether that was done in time."""
+        """Write what is pending and stop; return whether that finished in time."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
@@ -83,18 +83,18 @@ class StoreWriter:
         result = self._guarded(pending)
         fault = str(result) if isinstance(result, Exception) else ''
         if fault:
-            with self._changed:  # a disk may have room again
+            with self._changed:  # retry: the disk may have space again
                 self._pending = self._pending or pending
         if fault and fault != self.fault:
-            self._tell(fault)
+            self._warn(fault)
         self.fault = fault
 
     def _seconds_until_due(self) -> float | None:
-        """Return the seconds until the offer is written; None while there is none."""
+        """Return the seconds until the pending write is due; None without one."""
         return None if self._pending is None else max(0.0, self._due - time.monotonic())
 
     def _take_pending(self) -> Callable[[], None] | None:
-        """Return the offer when its time has come, or no other will."""
+        """Return the pending write if it is due or the thread is closing."""
         if self._pending is None or not (self._closed or self._seconds_until_due() == 0.0):
             return None
         pending, self._pending = self._pending, None
@@ -103,10 +103,10 @@ class StoreWriter:
 
     @staticmethod
     def _guarded(step: Callable[[], Any]) -> Any:
-        """Return what a step returns, or the error that it raised: the thread has to live."""
+        """Return the result of a step, or its error as a value, so that the thread survives."""
         try:
             return step()
         except AutocalibError as error:
             return error
-        except Exception as error:  # a fault of the program: told as what it is, but not the end of saving
+        except Exception as error:  # a fault of the program: reported as such, but later writes go on
             return AutocalibError(f'fault in the store: {type(error).__name__}: {error}')

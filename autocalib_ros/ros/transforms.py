@@ -1,9 +1,8 @@
-"""The ground transform on its own topic and on /tf_static, unless somebody else has a say about these frames.
+"""The ground transform on its own topic and, unless other publishers own these frames, on /tf_static.
 
-tf2 takes a tree: a frame with two parents, or a loop, breaks it for everybody. So what others publish on /tf and
-/tf_static is looked at before and after our own transform is broadcast. tf2_msgs may be missing (no wheel of it
-exists); tf2_ros is not used: its Python broadcaster has dropped a second transform with the same child, which is what a
-new calibration is.
+tf2 needs a tree: a frame with two parents, or a loop, breaks it for all consumers. So /tf and /tf_static are checked
+for conflicts before and after the broadcast. tf2_msgs is optional (there is no wheel of it). tf2_ros is not used: its
+Python broadcaster has dropped a second transform with the same child, which every new calibration is.
 """
 
 from __future__ import annotations
@@ -27,22 +26,22 @@ except ImportError:
     TFMessage = None
 
 LISTEN_S = 2.0
-"""Real seconds of listening before the first broadcast: a transform that tf2 has taken in cannot be taken back."""
+"""Real seconds of listening before the first broadcast: tf2 consumers never drop a static transform."""
 TF_QUEUE = 100
-"""Messages of /tf and /tf_static that may wait: each static publisher latches one."""
+"""Queue of /tf and /tf_static messages: each static publisher latches one."""
 TF_STATIC_QOS = QoSProfile(
     depth=TF_QUEUE, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
 TF_QOS = QoSProfile(depth=TF_QUEUE, reliability=ReliabilityPolicy.BEST_EFFORT)
-"""Best effort connects to every publisher of /tf, and what is lost there comes again."""
+"""Best effort connects to every publisher of /tf; lost messages are repeated there."""
 TF2_MISSING = (
-    'tf2_msgs is not there: the ground transform is published on {} but not on /tf_static '
-    '(apt install ros-jazzy-tf2-msgs, or see the README for ROS from pip; publish_tf:=false hides this line)'
+    'tf2_msgs is not installed: the ground transform is published on {} but not on /tf_static '
+    '(apt install ros-jazzy-tf2-msgs; publish_tf:=false hides this line)'
 )
 
 
 class GroundTransformPublisher:
-    """Publishes `~/ground_transform`, and the same on /tf_static where that leaves tf a tree; safe in any thread."""
+    """Publishes `~/ground_transform`, and the same on /tf_static if tf stays a tree; thread-safe."""
 
     def __init__(self, node: Node, *, tf_parent: str, publish_tf: bool) -> None:
         self._node, self._tf_parent = node, tf_parent
@@ -55,7 +54,7 @@ class GroundTransformPublisher:
         self._ours: set[tuple[str, str]] = set()
         self._foreign: set[tuple[str, str]] = set()
         self.conflict = ''
-        """Why nothing is broadcast, '' where nothing stands in the way."""
+        """Reason why nothing is broadcast; '' if there is none."""
         if self._may_broadcast:
             self._tf_static = node.create_publisher(TFMessage, '/tf_static', LATCHED)
             node.create_subscription(TFMessage, '/tf_static', self._on_tf, TF_STATIC_QOS)
@@ -67,13 +66,13 @@ class GroundTransformPublisher:
             node.get_logger().warning(TF2_MISSING.format(self._ground_transform.topic_name))
 
     def announce_frames(self, ground_frame: str, camera_frame: str) -> None:
-        """Name the frames of a transform that is to come, so that a conflict is told now and not after an hour."""
+        """Name the frames of a future transform, so that a conflict is reported before the first calibration."""
         with self._lock:
             below = self._tf_parent == 'ground'
             self._set_edge(*((ground_frame, camera_frame) if below else (camera_frame, ground_frame)))
 
     def publish(self, message: TransformStamped) -> None:
-        """Publish the transform between camera and ground in place of the one before."""
+        """Publish the transform between camera and ground; it replaces the previous one."""
         with self._lock:
             self._ground_transform.publish(validated(message))
             self._latest = message
@@ -81,9 +80,9 @@ class GroundTransformPublisher:
             self._broadcast()
 
     def forget(self) -> None:
-        """Leave nothing for those who come late; who has the transform keeps it. In the executor's thread.
+        """Remove the latched transform by renewing its publisher. Call this in the executor's thread.
 
-        A latched message goes with its publisher.
+        Consumers that have received the transform keep it.
         """
         with self._lock:
             self._latest = None
@@ -98,13 +97,13 @@ class GroundTransformPublisher:
             self._broadcast()
 
     def _on_moving_tf(self, serialized: bytes) -> None:
-        """Read only what names one of our frames: a robot's whole tree at 100 Hz would cost a tenth of a core."""
+        """Parse only messages that name our frames: a robot's tree at 100 Hz would cost a tenth of a core."""
         edge = self._edge
         if edge is None or any(frame.encode() in serialized for frame in edge):
             self._on_tf(deserialize_message(serialized, TFMessage))
 
     def _on_tf(self, message: Any) -> None:
-        """Note who hangs where; our own transforms come back too."""
+        """Record the parents that others publish; our own transforms arrive here too."""
         edges = {
             (transform.header.frame_id.lstrip('/'), transform.child_frame_id.lstrip('/'))
             for transform in message.transforms
@@ -121,7 +120,7 @@ class GroundTransformPublisher:
             self._check_conflict()
 
     def _check_conflict(self) -> None:
-        """Look for a conflict; once there is one, take back what can be."""
+        """Check for a conflict; on a new one, withdraw our broadcast."""
         if not self._may_broadcast or self._edge is None:
             return
         before, self.conflict = self.conflict, conflict(*self._edge, self._foreign, tf_parent=self._tf_parent)
@@ -131,7 +130,9 @@ class GroundTransformPublisher:
             self._clear()
 
     def _broadcast(self) -> None:
-        if self._may_broadcast and self._listened and self._latest is not None and not self.conflict:
+        if not (self._may_broadcast and self._listened) or self._edge is None or self._latest is None:
+            return
+        if not self.conflict:
             self._ours.add(self._edge)
             self._tf_static.publish(validated(TFMessage(transforms=[self._latest])))
             self._broadcasting = True
@@ -143,29 +144,29 @@ class GroundTransformPublisher:
 
 
 def conflict(parent: str, child: str, foreign: Set[tuple[str, str]], *, tf_parent: str) -> str:
-    """Say why a transform would break the tree that others publish, and which parameter to set; '' if it would not.
+    """Return why a transform would break the tf tree of others, and the parameter to set; '' if it would not.
 
-    `foreign` holds the parent and child of each of their transforms. The same two frames as ours are no conflict: a
-    recording that is played back, or this node before it was started anew, says the same.
+    `foreign` holds (parent, child) of their transforms. The same parent and child as ours are no conflict: they come
+    from a recording, or from this node before a restart.
     """
     others = sorted(above for above, below in foreign if below == child and above != parent)
-    own_name = 'set ground_frame to a name of its own'
+    unique_name = 'set ground_frame to a unique name'
     if others:
         remedy = (
-            f"set tf_parent to 'camera', so that the ground hangs from '{child}'"
+            f"set tf_parent to 'camera', which makes '{child}' the parent of the ground frame"
             if tf_parent == 'ground'
-            else f"{own_name}, or tf_parent to 'ground'"
+            else f"{unique_name}, or tf_parent to 'ground'"
         )
-        broken = f"publishes '{others[0]}' as the parent of '{child}', and a second parent would break tf"
+        problem = f"publishes '{others[0]}' as the parent of '{child}', and tf allows one parent"
     elif child in _ancestors(parent, foreign):
-        remedy, broken = own_name, f"hangs '{parent}' from '{child}', and the way back would be a loop in tf"
+        remedy, problem = unique_name, f"publishes '{parent}' below '{child}', and ours would close a loop in tf"
     else:
         return ''
-    return f'/tf_static is left alone: somebody else {broken}; {remedy}, and start the node again'
+    return f'nothing is published on /tf_static: another node {problem}; {remedy}, and restart the node'
 
 
 def _ancestors(frame: str, edges: Set[tuple[str, str]]) -> set[str]:
-    """Return all frames that a frame hangs from."""
+    """Return all ancestors of a frame."""
     found: set[str] = set()
     waiting = {frame}
     while waiting:

@@ -1,4 +1,4 @@
-"""Why no image arrives, in one line, from what the publishers of the image topic offer. Needs no ROS."""
+"""Diagnosis of a missing image stream from what the publishers of the topic offer. Needs no ROS."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ SUFFIX = '/compressed'
 
 @dataclass(frozen=True)
 class PublisherOffer:
-    """What one publisher offers: the name of its node, the type of its messages, reliable or best effort."""
+    """One publisher: name of its node, message type, and whether its QoS is reliable."""
 
     node: str
     type_name: str
@@ -21,10 +21,10 @@ class PublisherOffer:
 
 @dataclass(frozen=True)
 class NoImageDiagnosis:
-    """Why no image arrives; `lasting` when waiting alone does not mend it."""
+    """Why no image arrives; `persistent` if only a change of configuration helps."""
 
-    words: str
-    lasting: bool
+    text: str
+    persistent: bool
 
 
 def diagnose(
@@ -32,32 +32,32 @@ def diagnose(
     type_name: str,
     offers: Sequence[PublisherOffer],
     *,
-    asks_reliable: bool,
+    requests_reliable: bool,
     other_offers: Sequence[PublisherOffer] = (),
 ) -> NoImageDiagnosis:
-    """Say why no image arrives on `topic`, whose messages should be `type_name`.
+    """Return why no image of type `type_name` arrives on `topic`.
 
-    `other_offers` is what is offered on the topic of the other transport, see `other_transport_topic`.
+    `other_offers` are the publishers on the topic of the other transport, see `other_transport_topic`.
     """
     if not offers:
         return _no_publisher(topic, type_name, other_offers)
     matching = [offer for offer in offers if offer.type_name == type_name]
     if not matching:
         return _wrong_type(topic, type_name, offers)
-    if asks_reliable and not any(offer.reliable for offer in matching):
+    if requests_reliable and not any(offer.reliable for offer in matching):
         return NoImageDiagnosis(
-            f'{_names(matching)} publishes {topic} as best effort, and this node asks for reliable '
-            '(incompatible QoS): set image_reliability:=auto',
+            f'incompatible QoS: {_names(matching)} publishes {topic} as best effort, this node requests reliable: '
+            'set image_reliability:=auto',
             True,
         )
-    lossy = '' if any(offer.reliable for offer in matching) else '; best effort loses large images, see the README'
+    lossy = '' if any(offer.reliable for offer in matching) else '; best effort loses large images'
     return NoImageDiagnosis(
-        f'{_names(matching)} publishes {topic}, and nothing arrives: is the camera running?{lossy}', False
+        f'{_names(matching)} publishes {topic}, but no image arrives: is the camera running?{lossy}', False
     )
 
 
 def other_transport_topic(topic: str, type_name: str) -> str:
-    """Return where the same camera publishes by the other transport: beside raw images the compressed ones."""
+    """Return the topic of the same camera in the other transport, raw or compressed."""
     return topic.removesuffix(SUFFIX) if type_name == COMPRESSED else topic + SUFFIX
 
 
@@ -66,24 +66,24 @@ def _no_publisher(topic: str, type_name: str, other_offers: Sequence[PublisherOf
     sent = {offer.type_name for offer in other_offers}
     if type_name == COMPRESSED and COMPRESSED in sent:
         return NoImageDiagnosis(
-            f"nobody publishes {topic}, but {other} holds compressed images: '{SUFFIX}' is added here, "
-            f'so remap without it, -r image:={other.removesuffix(SUFFIX)}',
+            f"no publisher on {topic}, but {other} carries compressed images: '{SUFFIX}' is appended here, "
+            f'so remap without it: -r image:={other.removesuffix(SUFFIX)}',
             True,
         )
     transport = {IMAGE: 'compressed', COMPRESSED: 'raw'}[type_name]
     if any(TRANSPORT.get(name) == transport for name in sent):
         return NoImageDiagnosis(
-            f'nobody publishes {topic}, but {_names(other_offers)} publishes {other}: set image_transport:={transport}',
+            f'no publisher on {topic}, but {_names(other_offers)} publishes {other}: set image_transport:={transport}',
             True,
         )
     return NoImageDiagnosis(
-        f'nobody publishes {topic}: start the camera, or remap with -r image:=/your/image_topic', False
+        f'no publisher on {topic}: start the camera, or remap with -r image:=/your/image_topic', False
     )
 
 
 def _wrong_type(topic: str, type_name: str, offers: Sequence[PublisherOffer]) -> NoImageDiagnosis:
     sent = sorted({offer.type_name for offer in offers})
-    what = f'{_names(offers)} publishes {topic} as {", ".join(sent)}, and this node takes {type_name}'
+    what = f'{_names(offers)} publishes {topic} as {", ".join(sent)}, but this node subscribes to {type_name}'
     if type_name == IMAGE and sent == [COMPRESSED]:
         base = topic.removesuffix(SUFFIX)
         advice = (

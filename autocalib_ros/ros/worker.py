@@ -1,10 +1,11 @@
-"""Two threads between the image callback and the calibration, so that nothing in ROS waits for either.
+"""Perception and solver threads between the image callback and the published calibration.
 
-    image callback -> a few newest images -> perception thread -> newest snapshot -> solver thread -> listener
+    image callback -> image queue -> perception thread -> newest snapshot -> solver thread -> listener
 
-Both hand-overs keep the newest: what is late is dropped and counted. A few images may wait, because the loss of
-one costs tracks and its lateness costs nothing. Snapshots are taken and solved in order, so a result never
-follows one that rests on newer evidence.
+Neither the executor nor the perception thread waits for a solution. The image queue holds a few images, because a
+lost image costs tracks while a late one costs nothing; when it is full the oldest image is dropped and counted. Only
+the newest snapshot waits for the solver. Snapshots are solved in order, so a result is never followed by one from
+older evidence.
 """
 
 from __future__ import annotations
@@ -29,61 +30,61 @@ from autocalib_ros.perception.detector.detector import VehicleDetector
 from autocalib_ros.results.calibration import Calibration, Refusal
 
 IMAGE_QUEUE_SIZE = 8
-"""Images that may wait for the perception thread: half a second of a hiccup at 15 Hz, 22 MB at 1280x720."""
-REST = 4.0
-"""Time without a solution after one, in units of what that took: solutions take a fifth of a core at the most."""
+"""Images waiting for the perception thread: bridges half a second at 15 Hz, 22 MB at 1280x720."""
+REST_FACTOR = 4.0
+"""Pause after a solution, in units of its duration: solving takes at most a fifth of a core."""
 MAX_REFUSED_PERCENT = 99.0
-"""The most that is told while the last solution was refused."""
+"""Upper limit of the progress while the last solution was refused."""
 PROGRESS_PERIOD_S = 1.0
-"""Real time between two looks at the progress."""
+"""Real seconds between two progress updates."""
 Result = Calibration | Refusal
 
 
 class Solve(Protocol):
-    """A solver: with a known lens only the pose."""
+    """Solver of a snapshot; with a known lens it estimates the pose only."""
 
     def __call__(self, evidence: Evidence, options: Options, /, *, lens: Camera | None) -> Result:
         """Return a calibration or a refusal."""
 
 
 class Viewer(Protocol):
-    """Who shows what is going on; called from the threads, and takes no time there."""
+    """Draws what the threads do. Called from these threads, so its methods must return at once."""
 
     def image_used(self, message: Any, image: np.ndarray, followed: Callable[[], np.ndarray]) -> None:
-        """An image has become evidence; `followed` tells at once where points went of late."""
+        """Take an image that became evidence; `followed` returns the recent positions of the tracked points."""
 
     def solution_found(self, result: Result, evidence: Evidence) -> None:
-        """A snapshot has been solved."""
+        """Take the result of a snapshot."""
 
 
 class Listener(Protocol):
-    """Who is told what the threads find; called from the threads."""
+    """Receives the results of the threads; called from these threads."""
 
     def image_accepted(self, width: int, height: int) -> None:
-        """An image of this size has been decoded."""
+        """Take the size of a decoded image."""
 
     def on_evidence_reset(self, why: str) -> None:
-        """The evidence so far was dropped."""
+        """Note that all evidence so far was dropped."""
 
     def image_unreadable(self, error: AutocalibError) -> None:
-        """An image could not be used."""
+        """Take the error of an image that could not be used."""
 
     def solved(self, result: Result) -> None:
-        """A snapshot has been solved."""
+        """Take the result of a snapshot."""
 
     def failed(self, error: Exception) -> None:
-        """The program itself is at fault; both threads go on."""
+        """Take a fault of the program; both threads keep running."""
 
 
 @dataclass
 class Counters:
-    """What became of the images so far."""
+    """Number of images so far, by outcome."""
 
     received: int = 0
     dropped: int = 0
     unreadable: int = 0
     late: int = 0
-    """Left out, because their time stamps were not newer than those before."""
+    """Skipped: the time stamp was not newer than that of an earlier image."""
     used: int = 0
 
     def __str__(self) -> str:
@@ -97,15 +98,16 @@ class Counters:
 class _Job:
     evidence: Evidence
     generation: int
-    """Number of resets before the evidence was gathered."""
+    """Generation of the evidence: the number of resets before it was collected."""
     waiting: list[Future] = field(default_factory=list)
-    """Callers of the service, who get the result of this snapshot or of a newer one that replaced it."""
+    """Futures of service calls, resolved with the result of this snapshot or of a newer one that replaced it."""
 
 
 class CalibrationWorker:
-    """Owns the calibrator and the two threads; `offer` and `solve_now` may be called from any thread.
+    """Owns the calibrator and the two threads; `offer` and `solve_now` are thread-safe.
 
-    `stop_solving` ends a solution that runs, when the pipeline is closed.
+    Each reset starts a new generation of evidence; snapshots and results of an older generation are dropped.
+    `stop_solving` aborts a running solution when the worker is closed.
     """
 
     def __init__(
@@ -140,7 +142,7 @@ class CalibrationWorker:
         self.counters = Counters()
         self.progress: CalibrationProgress | None = None
         self.reported_evidence: Evidence | None = None
-        """What the solution rests on that the listener is told of at the moment."""
+        """Evidence of the result that the listener is handling; None otherwise."""
         self._refused = ''
         self._threads = [
             threading.Thread(target=run, name=name, daemon=True)
@@ -150,7 +152,7 @@ class CalibrationWorker:
             thread.start()
 
     def offer(self, stamp_ns: int, message: Any) -> None:
-        """Leave an image for the perception thread; when too many wait, the oldest is dropped."""
+        """Queue an image for the perception thread; a full queue drops its oldest image."""
         with self._changed:
             self.counters.received += 1
             self.counters.dropped += len(self._images) == IMAGE_QUEUE_SIZE
@@ -159,7 +161,7 @@ class CalibrationWorker:
             self._changed.notify_all()
 
     def solve_now(self) -> Future:
-        """Ask for a solution of what is there now; the future holds None when there is nothing yet."""
+        """Request a solution of the evidence so far; the future holds None if there is none yet."""
         future: Future = Future()
         with self._changed:
             if self._closed:
@@ -170,7 +172,7 @@ class CalibrationWorker:
         return future
 
     def request_snapshot(self) -> Future:
-        """Ask for what is seen: the future holds the evidence and the road without traffic, None each before that."""
+        """Request evidence and background image without solving; the future holds (None, None) before any image."""
         future: Future = Future()
         with self._changed:
             if self._closed:
@@ -181,10 +183,10 @@ class CalibrationWorker:
         return future
 
     def reset(self) -> None:
-        """Forget all evidence; once this returns the listener hears of no solution that rests on any of it.
+        """Drop all evidence; once this returns, the listener gets no result that rests on it.
 
-        Not to be called by the listener. A solution that runs cannot be interrupted; its result is dropped, and
-        its callers get None.
+        The listener must not call this: it holds the same lock. A running solution is not interrupted; its result is
+        dropped, and its callers get None.
         """
         with self._listener_lock, self._changed:
             self._generation += 1
@@ -196,13 +198,13 @@ class CalibrationWorker:
         self._resolve(waiting, None)
 
     def change(self, options: Options, idle_solve_s: float) -> None:
-        """Solve by other options from now on, which may differ in what `config.is_reconfigurable` says."""
+        """Use other options from the next solution on; only those of `config.is_reconfigurable` may differ."""
         with self._changed:
             self._options, self._idle_solve_s, self._changing = options, idle_solve_s, True
             self._changed.notify_all()
 
     def close(self, timeout_s: float) -> bool:
-        """Stop both threads and say whether they ended in time: not every solver can be interrupted."""
+        """Stop both threads; return whether they ended in time, since not every solver can be interrupted."""
         with self._changed:
             self._closed = True
             waiting = self._drop_waiting()
@@ -217,7 +219,7 @@ class CalibrationWorker:
         return not any(thread.is_alive() for thread in self._threads)
 
     def _drop_waiting(self) -> list[Future]:
-        """Drop what waits to be solved, and return who waits for that or for the solution that runs."""
+        """Drop requests and waiting snapshot; return their futures and those of the running solution."""
         waiting = self._requests
         for job in (self._job, self._running):
             waiting += job.waiting if job else []
@@ -225,7 +227,7 @@ class CalibrationWorker:
         return waiting
 
     def _run_perception(self) -> None:
-        """Run the perception thread: the only one that touches the calibrator."""
+        """Run the perception thread, the only one that uses the calibrator."""
         while True:
             with self._changed:
                 self._changed.wait_for(
@@ -239,7 +241,7 @@ class CalibrationWorker:
                 snapshot_requests, self._snapshot_requests = self._snapshot_requests, []
                 image = self._images.popleft() if self._images else None
                 requests: list[Future] = []
-                # a caller means all that has come so far, but does not wait for a queue that never empties
+                # a request covers all images so far, but does not wait for a queue that never empties
                 if len(self._images) in (0, IMAGE_QUEUE_SIZE - 1):
                     requests, self._requests = self._requests, []
             if generation != self._calibrator_generation:
@@ -249,7 +251,7 @@ class CalibrationWorker:
                 )
             if changing:
                 self._calibrator.change(self._options)
-                self._unsolved_images += 1  # so that it takes effect even when no image comes any more
+                self._unsolved_images += 1  # solve again even if no further image arrives
             if image is not None:
                 self._process_image(*image)
             if snapshot_requests:
@@ -261,31 +263,31 @@ class CalibrationWorker:
                 self._submit(self._guarded(self._calibrator.snapshot), requests)
 
     def _until_idle(self) -> float | None:
-        """Return the seconds until what is left counts as all there is; None when nothing is left to solve."""
+        """Return the seconds until the stream counts as idle; None if all images are solved."""
         if not self._unsolved_images:
             return None
         return max(0.0, self._last_arrival + self._idle_solve_s - time.monotonic())
 
     def _process_image(self, stamp_ns: int, message: Any) -> None:
-        """Turn one image into evidence; submit a snapshot when one is due."""
+        """Add one image to the evidence; submit a snapshot if one is due."""
         try:
             image = self._decode(message)
             height, width = image.shape[:2]
-            self._lens_for((width, height))  # an image of another shape than the lens's is left out
-            frame_status = self._calibrator.add_image(stamp_ns, image)
+            self._lens_for((width, height))  # skips an image whose shape is not that of the lens
+            intake = self._calibrator.add_image(stamp_ns, image)
         except AutocalibError as error:
             self.counters.unreadable += 1
             self._listener.image_unreadable(error)
             return
-        except Exception as error:  # an unattended camera must survive one bad frame
+        except Exception as error:  # an unattended camera has to survive a bad frame
             self._listener.failed(error)
             return
-        if frame_status is ImageIntake.LATE:
+        if intake is ImageIntake.LATE:
             self.counters.late += 1
             return
-        if frame_status in (ImageIntake.TIME_JUMPED, ImageIntake.RESIZED):
+        if intake in (ImageIntake.TIME_JUMPED, ImageIntake.RESIZED):
             self._refused = ''
-            self._listener.on_evidence_reset(frame_status.value)
+            self._listener.on_evidence_reset(intake.value)
         self.counters.used += 1
         with self._changed:
             self._unsolved_images += self._generation == self._calibrator_generation
@@ -302,7 +304,7 @@ class CalibrationWorker:
                 self.progress = progress if self._generation == self._calibrator_generation else None
 
     def _submit(self, evidence: Evidence | None, requests: list[Future]) -> None:
-        """Leave a snapshot for the solver thread; it takes the place, and the callers, of one still waiting."""
+        """Hand a snapshot to the solver thread; it replaces a waiting one and takes over its callers."""
         with self._changed:
             self._unsolved_images = 0
             if evidence is not None and not self._closed and self._generation == self._calibrator_generation:
@@ -324,11 +326,11 @@ class CalibrationWorker:
                 self.reported_evidence = job.evidence
                 result = self._notify(result, job)
                 self.reported_evidence = None
-            self._rest_until = time.monotonic() + REST * (time.monotonic() - began)
+            self._rest_until = time.monotonic() + REST_FACTOR * (time.monotonic() - began)
             self._resolve(job.waiting, result)
 
     def _next_job(self) -> _Job | None:
-        """Wait for a snapshot, and for the end of the rest unless somebody waits for it; None at the end."""
+        """Wait for a snapshot, and for the end of the pause unless a caller waits; return None when closed."""
         with self._changed:
             while not self._closed:
                 job = self._job
@@ -343,7 +345,7 @@ class CalibrationWorker:
         return self._solve(evidence, self._options, lens=self._lens_for(evidence.image_size))
 
     def _notify(self, result: Result, job: _Job) -> Result | None:
-        """Tell the listener and the viewer, unless a reset came before."""
+        """Pass a result to listener and viewer; return None if a reset made it obsolete."""
         with self._listener_lock:
             if job.generation != self._generation:
                 return None
@@ -354,7 +356,7 @@ class CalibrationWorker:
             return result
 
     def _add_refusal(self, progress: CalibrationProgress | None) -> CalibrationProgress | None:
-        """Add why the last solution was refused: evidence may be enough to try and not to succeed."""
+        """Append the reason of the last refusal: evidence can pass the readiness check and still be refused."""
         if progress is None or not self._refused:
             return progress
         return replace(
@@ -364,21 +366,21 @@ class CalibrationWorker:
         )
 
     def _lens_for(self, image_size: tuple[int, int]) -> Camera | None:
-        """Return the known lens for images of that size; UsageError when they have another shape."""
+        """Return the known lens scaled to images of that size; UsageError if their shape differs."""
         return None if self._lens is None else self._lens.scaled_to(*image_size)
 
     def _resolve(self, futures: list[Future], result: Any) -> None:
-        """Give callers their result; `close` may have sent them away in the meantime."""
+        """Set the result of futures; `close` may have resolved some before."""
         with self._changed:
             for future in futures:
                 if not future.done():
                     future.set_result(result)
 
     def _guarded(self, step: Callable[[], Any]) -> Any:
-        """Return what a step of the core gives, or None when it fails: a thread that dies would fail silently."""
+        """Return the result of `step`, or None if it raises: an exception would end the thread without a trace."""
         try:
             return step()
         except Exception as error:  # reported with its traceback by the listener
-            if not self._closed:  # what is broken off at the end is no fault
+            if not self._closed:  # an aborted solution at shutdown is no fault
                 self._listener.failed(error)
             return None

@@ -1,4 +1,4 @@
-"""Files that are never half written."""
+"""Atomic file operations."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from autocalib_ros.errors import InputError
 
 
 def write_atomically(path: Path, text: str) -> None:
-    """Replace the file in one step: a reader sees the old text or the new, never a part, a power cut or not."""
+    """Replace a file atomically, also across a power cut: readers see the old text or the new, never a part."""
     path = Path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -33,9 +33,9 @@ def write_atomically(path: Path, text: str) -> None:
 
 
 def keep_copy(path: Path, kept: Path) -> None:
-    """Give the file a second name in one step, in place of what had that name; InputError where that fails.
+    """Give a file a second name atomically, replacing what had that name; InputError if that fails.
 
-    Replacing one of the two leaves the other as it is.
+    Replacing either file later leaves the other unchanged.
     """
     link = path.with_name(f'{_prefix(kept)}{os.getpid()}')
     try:
@@ -44,7 +44,7 @@ def keep_copy(path: Path, kept: Path) -> None:
         os.replace(link, kept)
         return
     except OSError:
-        pass  # the file system of a memory card may know no links
+        pass  # file systems of memory cards may not support links
     try:
         text = path.read_text(encoding='utf-8')
     except (OSError, UnicodeDecodeError) as error:
@@ -53,7 +53,7 @@ def keep_copy(path: Path, kept: Path) -> None:
 
 
 def remove_temporaries(path: Path) -> None:
-    """Remove what writers of this file left behind that were killed."""
+    """Remove temporary files that killed writers of this file left behind."""
     for left in path.parent.glob(f'{glob.escape(_prefix(path))}*'):
         with contextlib.suppress(OSError):
             left.unlink()
@@ -64,7 +64,7 @@ def _prefix(path: Path) -> str:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Make a renaming last; some network file systems know no such thing, and then it is theirs to keep."""
+    """Make a rename durable; file systems that cannot sync a folder are left to their own guarantees."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         with contextlib.suppress(OSError):

@@ -1,4 +1,4 @@
-"""How many threads the libraries below may start; for programs to call before numpy is imported."""
+"""Thread limits of the numerical libraries, to be set before numpy is imported."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import os
 
 
 def limit_blas_threads() -> None:
-    """Keep BLAS to one thread, unless the environment says otherwise.
+    """Limit BLAS to one thread, unless the environment sets another number.
 
-    The matrices here are small: threads that wait for each other doubled the processor time of a solution and
-    took it from the cameras beside this one. Takes effect only before the first import of numpy.
+    The matrices here are small: waiting threads doubled the CPU time of a solution and slowed down other cameras on
+    the machine. Takes effect only before the first import of numpy.
     """
     for variable in ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS'):
         os.environ.setdefault(variable, '1')

@@ -1,4 +1,4 @@
-"""Kill a process in the middle of its saves, again and again, and look at what it leaves: FOLDER KILLS [SEED].
+"""Kill a process in the middle of its saves, repeatedly, and check the files it leaves: FOLDER KILLS [SEED].
 
 Prints how often each kind of leaving was found. Ends with an error as soon as a file cannot be read, a calibration is
 none that was saved, or an older one than was there before comes back.
@@ -17,11 +17,11 @@ from autocalib_ros.results.store import Store, StoreState, stored_json
 from stored_results import calibration, stored
 
 LONGEST_LIFE_S = 0.08
-"""Several saves long."""
+"""Long enough for several saves."""
 
 
 def numbered(number: int):
-    """Return a calibration that tells its number, with a lens of its own."""
+    """Return a calibration with a number and a lens of its own."""
     return stored(calibration(300.0 + 0.01 * number, number=number))
 
 
@@ -32,7 +32,7 @@ def save_until_killed(store: Store, number: int) -> None:
 
 
 def check(store: Store, last: int) -> tuple[StoreState, int]:
-    """Return what is there now, after any driver could read the YAML."""
+    """Return state and number of the stored calibration; fail if a file is unreadable or too old."""
     read_camera_info(store.path)
     store.remove_leftovers()
     found = store.load()
@@ -42,12 +42,12 @@ def check(store: Store, last: int) -> tuple[StoreState, int]:
     assert stored_json(found.stored) == stored_json(numbered(number)), 'not what was saved'
     left = [path.name for path in store.path.parent.iterdir() if path.name.startswith('.')]
     assert not left, left
-    return found.kind, number
+    return found.state, number
 
 
 def main(folder: Path, kills: int, seed: int) -> None:
-    """Fork, kill, look."""
-    lives, kinds = random.Random(seed), Counter()
+    """Fork a writer, kill it and check its files, `kills` times."""
+    lives, states = random.Random(seed), Counter()
     store, last = Store(folder / 'north.yaml'), 0
     store.save(numbered(last))
     for _ in range(kills):
@@ -57,13 +57,13 @@ def main(folder: Path, kills: int, seed: int) -> None:
         time.sleep(lives.uniform(0.0, LONGEST_LIFE_S))
         os.kill(child, signal.SIGKILL)
         os.waitpid(child, 0)
-        kind, last = check(store, last)
-        kinds[kind.value] += 1
-    # one that is cut off is followed by whole ones again
+        state, last = check(store, last)
+        states[state.value] += 1
+    # the first save after an interrupted one is intact again
     store.save(numbered(last + 1))
-    kind, last = check(store, last + 1)
-    assert kind is StoreState.INTACT
-    print(f'{kills} kills, {last} saves: {dict(sorted(kinds.items()))}')
+    state, last = check(store, last + 1)
+    assert state is StoreState.INTACT
+    print(f'{kills} kills, {last} saves: {dict(sorted(states.items()))}')
 
 
 if __name__ == '__main__':

@@ -1,4 +1,4 @@
-"""Calibrations to keep, every field of them set, and a folder to keep them in."""
+"""Calibrations with every field set, and a folder to store them in."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def stored(result: Calibration) -> StoredCalibration:
 
 @contextmanager
 def quick_folder() -> Iterator[Path]:
-    """Yield a folder in memory where there is such a thing: on a busy disk each save waits for others' data."""
+    """Yield a folder in memory if possible: on a busy disk each save waits for other data."""
     memory = Path('/dev/shm')
     with tempfile.TemporaryDirectory(dir=memory if os.access(memory, os.W_OK) else None) as folder:
         yield Path(folder)

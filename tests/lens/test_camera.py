@@ -115,6 +115,6 @@ def test_half_a_pixel_of_rounding_is_the_same_shape():
 
 
 @pytest.mark.parametrize('size', [(640, 480), (1280, 719), (720, 1280), (640, 359)])
-def test_another_shape_is_wrong_usage_and_tells_both_sizes(size):
+def test_another_shape_is_wrong_usage_and_reports_both_sizes(size):
     with pytest.raises(UsageError, match=f'images of 1280x720, and these images have {size[0]}x{size[1]}'):
         LENSES['equidistant'].scaled_to(*size)

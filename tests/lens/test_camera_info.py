@@ -1,4 +1,4 @@
-"""The lens in the terms of ROS: written and read."""
+"""CameraInfo of a lens: written and read."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ WIDTH, HEIGHT = 1280, 720
 SQUARE = [900.0, 0.0, 632.0, 0.0, 900.0, 365.0, 0.0, 0.0, 1.0]
 WIDE = [500.0, 0.0, 645.0, 0.0, 500.0, 352.0, 0.0, 0.0, 1.0]
 ALLOWED_PX = 0.5
-"""What a converted lens may be off anywhere in the image: as much as a tracked point is."""
+"""Maximum error of a converted lens anywhere in the image: the accuracy of a tracked point."""
 READ_PX = 1e-6
 """An equidistant lens is read, not converted: only double precision rounds."""
 
@@ -103,7 +103,7 @@ def lens(tmp_path: Path, model: str, matrix: list[float], coefficients: list[flo
 
 
 def seen(model: str, matrix: list[float], coefficients: list[float], field_deg: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return random bearings and their pixels in the image, by OpenCV; `field_deg` ends where the model folds back."""
+    """Return random bearings and their OpenCV pixels; the model stops being monotonic at `field_deg`."""
     generator = np.random.default_rng(0)
     theta, around = np.radians(field_deg) * np.sqrt(generator.random(20000)), 2 * np.pi * generator.random(20000)
     bearings = np.stack([np.sin(theta) * np.cos(around), np.sin(theta) * np.sin(around), np.cos(theta)], axis=1)
@@ -160,7 +160,7 @@ def test_another_lens_is_converted_within_half_a_pixel(tmp_path, model, matrix, 
 
 
 def test_a_lens_without_distortion_has_the_series_of_the_tangent(tmp_path):
-    # at 40 degrees from corner to corner the fit has no reason to leave the series of tan by more than this
+    # at 40 degrees from corner to corner the fit stays this close to the series of tan
     narrow = [2000.0, *SQUARE[1:4], 2000.0, *SQUARE[5:]]
     camera = lens(tmp_path, 'plumb_bob', narrow, [0.0] * 5)
     assert camera.k[:2] == pytest.approx((1 / 3, 2 / 15), abs=1e-3)
@@ -230,47 +230,55 @@ ODD = 'give the file of camera_info_manager'
 
 
 @pytest.mark.parametrize(
-    ('changes', 'told', 'remedy'),
+    ('changes', 'expected', 'remedy'),
     [
         (
             {'camera_matrix': {'data': [0.0] * 9}},
-            'not calibrated, its focal length is 0',
+            'not calibrated, the focal length is 0',
             'calibrate the camera, or leave',
         ),
-        ({'camera_matrix': {'data': [1.0] * 8}}, "'camera_matrix' holds 8 numbers, expected 9", ODD),
-        ({'camera_matrix': {'data': [NAN, *SQUARE[1:]]}}, "'camera_matrix' holds nan, not a finite number", ODD),
-        ({'camera_matrix': {'data': ['wide', *SQUARE[1:]]}}, "'camera_matrix' holds 'wide', not a finite number", ODD),
+        ({'camera_matrix': {'data': [1.0] * 8}}, "'camera_matrix' has 8 numbers, expected 9", ODD),
+        ({'camera_matrix': {'data': [NAN, *SQUARE[1:]]}}, "'camera_matrix' contains nan, not a finite number", ODD),
+        (
+            {'camera_matrix': {'data': ['wide', *SQUARE[1:]]}},
+            "'camera_matrix' contains 'wide', not a finite number",
+            ODD,
+        ),
         ({'camera_matrix': {'data': [-900.0, *SQUARE[1:]]}}, 'not of the form fx s cx', ODD),
         ({'camera_matrix': {'data': [*SQUARE[:8], 2.0]}}, 'not of the form fx s cx', ODD),
-        ({'camera_matrix': {'rows': 3}}, "'camera_matrix' holds no list of numbers", ODD),
-        ({'camera_matrix': 'none'}, "'camera_matrix' holds no list of numbers", ODD),
+        ({'camera_matrix': {'rows': 3}}, "'camera_matrix' is not a list of numbers", ODD),
+        ({'camera_matrix': 'none'}, "'camera_matrix' is not a list of numbers", ODD),
         ({'camera_matrix': None}, "has no 'camera_matrix' (nor 'k')", ODD),
         ({'image_width': None}, "has no 'image_width' (nor 'width')", ODD),
         ({'image_width': 0}, "'image_width' is 0, not a number of pixels", ODD),
         ({'image_height': 719.5}, "'image_height' is 719.5, not a number of pixels", ODD),
-        ({'image_height': True}, "'image_height' holds True, not a finite number", ODD),
+        ({'image_height': True}, "'image_height' contains True, not a finite number", ODD),
         ({'distortion_model': None}, "has no 'distortion_model'", ODD),
-        ({'distortion_model': 'thin_prism'}, "distortion model is 'thin_prism', and only plumb_bob", 'calibrate the'),
+        (
+            {'distortion_model': 'thin_prism'},
+            "distortion model is 'thin_prism', supported are plumb_bob",
+            'recalibrate the',
+        ),
         ({'distortion_model': ''}, "distortion model is ''", 'or leave the file out'),
-        ({'distortion_model': 'rational_polynomial'}, 'holds 5 numbers, expected 8', ODD),
-        ({'distortion_model': 'equidistant'}, 'holds 5 numbers, expected 4 at the most', ODD),
-        ({'distortion_coefficients': {'data': [0.0] * 3}}, 'holds 3 numbers, expected 4 or 5', ODD),
-        ({'distortion_coefficients': {'data': [0.0, INF, 0.0, 0.0]}}, 'holds inf, not a finite number', ODD),
+        ({'distortion_model': 'rational_polynomial'}, 'has 5 numbers, expected 8', ODD),
+        ({'distortion_model': 'equidistant'}, 'has 5 numbers, expected at most 4', ODD),
+        ({'distortion_coefficients': {'data': [0.0] * 3}}, 'has 3 numbers, expected 4 or 5', ODD),
+        ({'distortion_coefficients': {'data': [0.0, INF, 0.0, 0.0]}}, 'contains inf, not a finite number', ODD),
         ({'distortion_coefficients': None}, "has no 'distortion_coefficients' (nor 'd')", ODD),
         (
             {'distortion_coefficients': {'data': [-0.5, 0.0, 0.0, 0.0]}},
-            'folds back and leaves 33 % of the image empty',
+            'not invertible for 33 % of the image',
             'near the borders',
         ),
         (
             {'distortion_model': 'equidistant', 'distortion_coefficients': {'data': [-9.0]}},
-            'folds back and leaves',
-            'calibrate the camera anew',
+            'its distortion is not invertible',
+            'recalibrate the camera',
         ),
         (
             {'distortion_model': 'equidistant', 'distortion_coefficients': {'data': [1e9]}},
             'degrees from corner to corner',
-            'calibrate the camera anew',
+            'recalibrate the camera',
         ),
         (
             {'distortion_coefficients': {'data': [-0.3, 0.1, 0.002, 0.0]}},
@@ -303,26 +311,26 @@ ODD = 'give the file of camera_info_manager'
         ),
         (
             {'camera_matrix': {'data': [250.0, *WIDE[1:4], 250.0, *WIDE[5:]]}, 'distortion_coefficients': [0.0] * 5},
-            'its angle is too wide',
+            'its field of view is too wide',
             'with a fisheye model',
         ),
         ({'roi': {'x_offset': 10, 'width': 640, 'height': 360}}, 'region of interest', 'without roi'),
     ],
 )
-def test_an_unusable_file_is_told_with_a_remedy(tmp_path, changes, told, remedy):
+def test_an_unusable_file_is_reported_with_a_remedy(tmp_path, changes, expected, remedy):
     text = complaint(written(tmp_path, document(**changes)))
-    assert told in text
+    assert expected in text
     assert remedy in text
 
 
-def test_the_error_of_a_conversion_is_told_in_pixels(tmp_path):
+def test_the_error_of_a_conversion_is_reported_in_pixels(tmp_path):
     # keeping fx misses by 1 % of the 365 px to the upper border, keeping fy by 1 % of the 647 px to the right one
     text = complaint(
         written(tmp_path, document(camera_matrix=[*SQUARE[:4], 909.0, *SQUARE[5:]], distortion_coefficients=[0.0] * 5))
     )
-    error_px = float(text.split('misses this one by up to ')[1].split(' px')[0])
+    error_px = float(text.split('differs from this one by up to ')[1].split(' px')[0])
     assert 1.0 < error_px < 6.47
-    assert 'more than 0.5 px would spoil the pose' in text
+    assert 'more than the 0.5 px that the pose allows' in text
 
 
 BOMB = b'a: &a [x, x, x, x, x, x, x, x, x]\n' + b''.join(
@@ -360,6 +368,6 @@ def test_hostile_yaml_is_one_clear_line(tmp_path, content):
     assert 'give the file of camera_info_manager' in complaint(written(tmp_path, content))
 
 
-@pytest.mark.parametrize(('name', 'told'), [('none.yaml', 'No such file'), ('', 'Is a directory')])
-def test_a_file_that_is_not_there_is_told(tmp_path, name, told):
-    assert told in complaint(tmp_path / name)
+@pytest.mark.parametrize(('name', 'expected'), [('none.yaml', 'No such file'), ('', 'Is a directory')])
+def test_a_file_that_does_not_exist_is_reported(tmp_path, name, expected):
+    assert expected in complaint(tmp_path / name)

@@ -38,7 +38,7 @@ EXACT_PX = 1e-5
 
 
 def lens(field_deg: float, k: tuple[float, ...] = EQUIDISTANT, offset_px: tuple[float, float] = (0.0, 0.0)) -> Camera:
-    """Return a lens that sees half so many degrees from its axis to the farthest corner."""
+    """Return a lens with this diagonal field of view in degrees."""
     middle = np.array([(WIDTH - 1) / 2, (HEIGHT - 1) / 2])
     x, y = (middle + offset_px).tolist()
     in_focal_lengths = Camera(WIDTH, HEIGHT, 1.0, (x, y), k).radius(np.radians(field_deg / 2))
@@ -82,13 +82,13 @@ def worst_px(info, camera: Camera) -> float:
         ('plumb_bob', 90),
     ],
 )
-def test_the_error_that_is_told_is_that_of_opencv_over_the_whole_image(model, field_deg, k, offset_px):
+def test_the_error_that_is_reported_is_that_of_opencv_over_the_whole_image(model, field_deg, k, offset_px):
     camera = lens(field_deg, k, offset_px)
     info = camera_info(camera, model)
     assert info.distortion_model == model
-    assert info.k == camera_info(camera).k  # whoever reads K alone need not know the model
+    assert info.k == camera_info(camera).k  # consumers that read K alone need not know the model
     worst = worst_px(info, camera)
-    # neither the grid nor the fit looks exactly where the error is largest, but both look near to it
+    # neither grid nor fit samples the point of the largest error, but both sample near it
     assert worst <= 1.001 * info.error_px + EXACT_PX
     assert worst >= 0.8 * info.error_px - EXACT_PX
     assert info.error_px <= MAX_MODEL_ERROR_PX
@@ -124,12 +124,12 @@ def test_a_wide_lens_is_refused_in_plumb_bob_with_the_way_out(field_deg):
     assert camera_info(lens(field_deg), 'rational_polynomial').error_px < 0.1
 
 
-@pytest.mark.parametrize(('field_deg', 'told'), [(176, 'would be off by up to'), (185, 'ends before 89')])
+@pytest.mark.parametrize(('field_deg', 'expected'), [(176, 'would be off by up to'), (185, 'ends before 89')])
 @pytest.mark.parametrize('model', ['plumb_bob', 'rational_polynomial'])
-def test_a_lens_that_sees_half_the_world_is_equidistant_or_nothing(model, field_deg, told):
+def test_a_lens_that_sees_half_the_world_is_equidistant_or_nothing(model, field_deg, expected):
     with pytest.raises(ModelMisfit) as raised:
         camera_info(lens(field_deg), model)
-    assert told in raised.value.message
+    assert expected in raised.value.message
     assert raised.value.remedy == 'Set distortion_model to equidistant, which is exact.'
     assert camera_info(lens(field_deg), 'auto').distortion_model == 'equidistant'
 
@@ -145,7 +145,7 @@ def test_a_disc_in_the_image_is_fitted_up_to_its_edge():
 @settings(deadline=None)
 @given(st.tuples(*[st.floats(-1e-9, 1e-9)] * 4))
 def test_equidistant_coefficients_are_never_all_zero(k):
-    # image_proc takes an all-zero D for "no distortion"
+    # image_proc takes an all-zero D as "no distortion"
     assert any(abs(value) >= 1e-9 for value in camera_info(Camera(WIDTH, HEIGHT, 500.0, (639.5, 359.5), k)).d)
 
 
@@ -250,18 +250,18 @@ def test_a_message_in_full_resolution_is_the_calibration_in_the_image(readout):
 
 
 @pytest.mark.parametrize(
-    ('readout', 'told'),
+    ('readout', 'expected'),
     [
-        (Readout(1280, 720, (2, 2)), 'of images of 640x360, and these have 1280x720'),  # both scalings at once
-        (Readout(1920, 1080), 'of images of 1920x1080'),
-        (Readout(0, 0), 'of images of 0x0'),
-        (Readout(1920, 1080, (1, 1), (0, 0), (640, 480)), 'of images of 640x480'),
-        (Readout(1920, 1080, (1, 1), (641, 0), (1280, 720)), 'reaches beyond its 1920x1080 pixels'),
-        (Readout(0, 0, (1, 1), (0, 0), (1280, 720)), 'reaches beyond its 0x0 pixels'),
+        (Readout(1280, 720, (2, 2)), 'for images of 640x360, these have 1280x720'),  # both scalings at once
+        (Readout(1920, 1080), 'for images of 1920x1080'),
+        (Readout(0, 0), 'for images of 0x0'),
+        (Readout(1920, 1080, (1, 1), (0, 0), (640, 480)), 'for images of 640x480'),
+        (Readout(1920, 1080, (1, 1), (641, 0), (1280, 720)), 'exceeds its 1920x1080 pixels'),
+        (Readout(0, 0, (1, 1), (0, 0), (1280, 720)), 'exceeds its 0x0 pixels'),
     ],
 )
-def test_a_readout_of_other_images_is_told(readout, told):
-    with pytest.raises(InputError, match=told):
+def test_a_readout_of_other_images_is_reported(readout, expected):
+    with pytest.raises(InputError, match=expected):
         to_full_resolution(camera_info(lens(100)), readout)
 
 

@@ -19,7 +19,7 @@ LENSES = [
 
 @pytest.fixture
 def normalised() -> np.ndarray:
-    """Return slopes of bearings up to 40 degrees from the axis, shape (n, 2)."""
+    """Return normalised coordinates of bearings up to 40 degrees from the axis, shape (n, 2)."""
     generator = np.random.default_rng(0)
     around, length = 2 * np.pi * generator.random(500), 0.84 * np.sqrt(generator.random(500))
     return np.stack([length * np.cos(around), length * np.sin(around)], axis=1)

@@ -51,7 +51,7 @@ def test_json_of_a_refusal_keeps_code_message_and_remedy() -> None:
     assert document['refusal'] == {'code': 'no_motion', 'message': 'nothing', 'remedy': 'wait', 'values': {}}
 
 
-def test_json_says_why_a_calibrated_lens_has_no_plane() -> None:
+def test_json_gives_the_reason_a_calibrated_lens_has_no_plane() -> None:
     from dataclasses import replace
 
     result = replace(calibration(None), grade='lens', ground_refusal=Reason('no_height', 'none given', 'give it'))

@@ -1,4 +1,4 @@
-"""What is read back is what was written."""
+"""Reading returns what was written."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ POSE = broken()['ground_from_camera']
 
 
 @pytest.mark.parametrize(
-    ('document', 'told'),
+    ('document', 'expected'),
     [
         (broken(version=3), 'version is 3; versions 1 and 2 can be read'),
         (broken(assumptions=[{'kind': 'a', 'text': 'b', 'values': [1]}]), 'numbers, texts or null were expected'),
@@ -78,8 +78,8 @@ POSE = broken()['ground_from_camera']
         (broken(ground_from_camera={**POSE, 'translation_m': [0.0, 0.0, -8.0]}), 'above the road'),
     ],
 )
-def test_document_that_cannot_be_used_says_why(document, told):
-    with pytest.raises(InputError, match=told):
+def test_document_that_cannot_be_used_gives_the_reason(document, expected):
+    with pytest.raises(InputError, match=expected):
         calibration_from_json(document)
 
 
@@ -99,7 +99,7 @@ def test_refusal_is_no_calibration():
 
 
 @pytest.mark.parametrize(
-    ('text', 'told'),
+    ('text', 'expected'),
     [
         ('', 'not JSON'),
         ('{"version": 1', 'not JSON'),
@@ -110,8 +110,8 @@ def test_refusal_is_no_calibration():
         ('\x00\xff', 'not JSON'),
     ],
 )
-def test_file_that_is_no_calibration_says_why(tmp_path, text, told):
+def test_file_that_is_no_calibration_gives_the_reason(tmp_path, text, expected):
     path = tmp_path / 'c.json'
     path.write_bytes(text.encode('latin-1'))
-    with pytest.raises(InputError, match=told):
+    with pytest.raises(InputError, match=expected):
         read_json(path)

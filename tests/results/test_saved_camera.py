@@ -60,8 +60,10 @@ def test_our_own_files_give_the_same_lens(ours):
     )
     assert known.k == pytest.approx(WHOLE.camera.k, abs=1e-12)
     assert known.rectified == pytest.approx(rectified_matrix(WHOLE.camera))
-    told = ours.suffix == '.json'
-    assert (known.ground is not None, known.stddev.focal_px is not None, known.covariance is not None) == (told,) * 3
+    has_pose = ours.suffix == '.json'
+    assert (known.ground is not None, known.stddev.focal_px is not None, known.covariance is not None) == (
+        has_pose,
+    ) * 3
 
 
 def test_a_checkerboards_file_keeps_what_a_kannala_brandt_lens_has_not(tmp_path):
@@ -99,7 +101,7 @@ def test_images_of_another_shape_are_wrong_usage(ours):
 
 
 @pytest.mark.parametrize(
-    ('name', 'text', 'told'),
+    ('name', 'text', 'expected'),
     [
         ('cut.json', calibration_json(WHOLE)[:900], 'it is not JSON'),
         ('other.json', '{"a": 1}', 'its version is None'),
@@ -119,14 +121,14 @@ def test_images_of_another_shape_are_wrong_usage(ours):
         ('cut.yaml', yaml.safe_dump(CHECKERBOARD, sort_keys=False)[:200], 'it is not YAML'),
     ],
 )
-def test_a_wrong_file_is_told_by_name(name, text, told, tmp_path):
+def test_a_wrong_file_is_reported_by_name(name, text, expected, tmp_path):
     (tmp_path / name).write_text(text)
-    with pytest.raises(InputError, match=told) as error:
+    with pytest.raises(InputError, match=expected) as error:
         read_saved_camera(tmp_path / name)
     assert name in str(error.value)
 
 
-def test_a_file_that_is_not_there_is_told(tmp_path):
+def test_a_file_that_does_not_exist_is_reported(tmp_path):
     for name in ('a.json', 'a.yaml'):
         with pytest.raises(InputError, match=f'cannot read .*{name}'):
             read_saved_camera(tmp_path / name)

@@ -1,4 +1,4 @@
-"""The calibration on disk, what comes between its files, and what others put there."""
+"""The store: interrupted writes, corrupt files, and files of other programs."""
 
 from __future__ import annotations
 
@@ -55,31 +55,31 @@ def test_default_folder_is_in_the_home_without_ros_home():
 
 
 @pytest.mark.parametrize(
-    ('url', 'told'),
+    ('url', 'expected'),
     [
         ('/etc/lens.yaml', 'write file:///FOLDER/FILE.yaml'),
         ('file://lens.yaml', 'names no file'),
         ('file:///folder/', 'names no file'),
         ('http://host/x.yaml', 'names no file'),
         ('package://x', 'names no file'),
-        ('file:///${CAMERA}.yaml', r'holds \$\{CAMERA\}: only'),
+        ('file:///${CAMERA}.yaml', r'contains \$\{CAMERA\}: only'),
         ('package://no_such/x.yaml', "package 'no_such'"),
     ],
 )
-def test_url_that_names_no_file_is_wrong_usage(url, told):
-    with pytest.raises(UsageError, match=told):
+def test_url_that_names_no_file_is_wrong_usage(url, expected):
+    with pytest.raises(UsageError, match=expected):
         resolve_url(url, 'cam', {'HOME': '/home/ann'})
 
 
 def test_nothing_is_found_where_nothing_was_saved(store):
-    assert (store.load().kind, store.load().note) == (StoreState.EMPTY, '')
+    assert (store.load().state, store.load().note) == (StoreState.EMPTY, '')
 
 
 @pytest.mark.parametrize('kept', [FIRST, replace(FIRST, calibration=lens_only(FIRST.calibration))])
 def test_what_was_saved_comes_back_to_the_last_bit(store, kept):
     store.save(kept)
     found = store.load()
-    assert (found.kind, found.note) == (StoreState.INTACT, '')
+    assert (found.state, found.note) == (StoreState.INTACT, '')
     assert stored_json(found.stored) == stored_json(kept)
     assert (found.stored.camera_name, found.stored.image_frame) == ('north', 'cam_optical')
 
@@ -104,10 +104,10 @@ def test_pair_that_a_kill_tore_gives_the_calibration_before(store):
     store.save(SECOND)
     store.path.write_bytes(before)
     found = store.load()
-    assert (found.kind, number_of(found)) == (StoreState.INTERRUPTED, 0)
-    assert 'a write was cut off' in found.note
+    assert (found.state, number_of(found)) == (StoreState.INTERRUPTED, 0)
+    assert 'interrupted write' in found.note
     store.save(THIRD)
-    assert (store.load().kind, number_of(store.load())) == (StoreState.INTACT, 2)
+    assert (store.load().state, number_of(store.load())) == (StoreState.INTACT, 2)
 
 
 def test_what_killed_writers_left_is_removed(store):
@@ -137,28 +137,28 @@ def test_files_are_never_broken_whenever_the_writer_is_killed(quick_path):
 
 
 @pytest.mark.parametrize('broken', ['', 'image_width: [', 'image_width: 640\n', '\x00\x01'])
-def test_broken_yaml_gives_the_pair_before_and_is_told(store, broken):
+def test_broken_yaml_gives_the_previous_pair_and_is_reported(store, broken):
     store.save(FIRST)
     store.save(SECOND)
     store.path.write_text(broken)
     found = store.load()
-    assert (found.kind, number_of(found)) == (StoreState.CORRUPT, 0)
-    assert str(store.path) in found.note and 'the pair before' in found.note
+    assert (found.state, number_of(found)) == (StoreState.CORRUPT, 0)
+    assert str(store.path) in found.note and 'using the previous pair' in found.note
     store.save(THIRD)
     assert number_of(store.load()) == 2
 
 
 @pytest.mark.parametrize('broken', ['', '{"version": 1', '[]', '{"version": 1, "state": "calibrated"}'])
-def test_broken_json_gives_the_pair_before_and_is_told(store, broken):
+def test_broken_json_gives_the_previous_pair_and_is_reported(store, broken):
     store.save(FIRST)
     store.save(SECOND)
     store.json_path.write_text(broken)
     found = store.load()
-    assert (found.kind, number_of(found)) == (StoreState.CORRUPT, 0)
+    assert (found.state, number_of(found)) == (StoreState.CORRUPT, 0)
     assert str(store.json_path) in found.note
 
 
-def test_broken_file_without_a_pair_before_is_told(store):
+def test_broken_file_without_a_pair_before_is_reported(store):
     store.save(FIRST)
     store.json_path.write_text('{')
     assert store.load().stored is None
@@ -169,7 +169,7 @@ def test_removed_yaml_means_that_nothing_is_kept(store):
     store.save(FIRST)
     store.save(SECOND)
     store.path.unlink()
-    assert (store.load().kind, store.load().stored) == (StoreState.EMPTY, None)
+    assert (store.load().state, store.load().stored) == (StoreState.EMPTY, None)
     assert 'is missing' in store.load().note
 
 
@@ -182,25 +182,25 @@ def test_yaml_that_a_driver_wrote_of_our_numbers_with_fewer_digits_is_ours(store
     )
     assert rounded != store.path.read_text()
     store.path.write_text(rounded)
-    assert store.load().kind is StoreState.INTACT
+    assert store.load().state is StoreState.INTACT
 
 
 @pytest.mark.parametrize('ours_before', [False, True])
-def test_yaml_of_another_hand_is_not_taken_for_ours_and_left_alone(store, ours_before):
+def test_yaml_of_another_program_is_not_taken_for_ours_and_left_alone(store, ours_before):
     store.path.parent.mkdir()
     if ours_before:
         store.save(FIRST)
         store.save(SECOND)
     store.path.write_text(CHECKERBOARD)
     found = store.load()
-    assert (found.kind, found.stored) == (StoreState.FOREIGN, None)
+    assert (found.state, found.stored) == (StoreState.FOREIGN, None)
     assert 'was not written by this node, or changed since' in found.note
-    with pytest.raises(InputError, match='left alone: call ~/save'):
+    with pytest.raises(InputError, match='not overwritten: call ~/save'):
         store.save(THIRD)
     assert store.path.read_text() == CHECKERBOARD
 
 
-def test_yaml_of_another_hand_is_kept_when_it_is_replaced(store):
+def test_yaml_of_another_program_is_kept_when_it_is_replaced(store):
     store.path.parent.mkdir()
     store.path.write_text(CHECKERBOARD)
     store.save(FIRST, replace_foreign=True)
@@ -210,7 +210,7 @@ def test_yaml_of_another_hand_is_kept_when_it_is_replaced(store):
     assert number_of(store.load()) == 2
 
 
-def test_second_yaml_of_another_hand_is_not_lost(store):
+def test_second_yaml_of_another_program_is_not_lost(store):
     store.path.parent.mkdir()
     store.path.write_text(CHECKERBOARD)
     store.save(FIRST, replace_foreign=True)
@@ -219,10 +219,10 @@ def test_second_yaml_of_another_hand_is_not_lost(store):
         store.save(SECOND, replace_foreign=True)
 
 
-def test_folder_that_cannot_be_made_is_told(quick_path):
+def test_folder_that_cannot_be_made_is_reported(quick_path):
     (quick_path / 'file').touch()
     blocked = Store(quick_path / 'file' / 'north.yaml')
-    assert blocked.load().kind is StoreState.EMPTY
+    assert blocked.load().state is StoreState.EMPTY
     with pytest.raises(InputError, match=f'cannot write {quick_path}/file/north.autocalib.json'):
         blocked.save(FIRST)
 
@@ -238,5 +238,5 @@ def test_full_disk_leaves_what_was_there(store, monkeypatch):
     with pytest.raises(InputError, match='No space left on device'):
         store.save(THIRD)
     monkeypatch.undo()
-    assert (store.load().kind, number_of(store.load())) == (StoreState.INTACT, 1)
+    assert (store.load().state, number_of(store.load())) == (StoreState.INTACT, 1)
     assert len(list(store.path.parent.iterdir())) == 4

@@ -1,4 +1,4 @@
-"""A workbench for live nodes: an executor in the background, a client node, and values to feed them."""
+"""Test bench for live nodes: an executor in the background, a client node, and test data."""
 
 import threading
 import time
@@ -96,7 +96,7 @@ class Bench:
         return self.adopt(AutocalibNode(context=self.context, parameter_overrides=overrides, **more))
 
     def adopt(self, node: AutocalibNode) -> AutocalibNode:
-        """Run a node that is there already, and end it with the others."""
+        """Run an existing node, and end it with the others."""
         self.nodes.append(node)
         self.executor.add_node(node)
         return node
@@ -112,7 +112,7 @@ class Bench:
         return received
 
     def connected(self, publisher):
-        """Wait until a subscriber is there, and return the publisher."""
+        """Wait for a subscriber and return the publisher."""
         wait_for(lambda: publisher.get_subscription_count() > 0, f'a subscriber of {publisher.topic_name}')
         return publisher
 
@@ -152,7 +152,7 @@ class Bench:
         """End the executor; nothing is in a callback any more."""
         self._finished.set_result(None)
         self._thread.join(PATIENCE_S)
-        self.executor.shutdown()  # only now: it takes away what a thread that still spins waits for
+        self.executor.shutdown()  # only now: it destroys what a spinning thread waits for
 
     def close(self):
         self.halt()

@@ -16,7 +16,7 @@ INTERVAL_S = 0.05
 
 
 class Camera:
-    """Sends images once somebody takes them, and then is silent, so that the node solves what is left."""
+    """Sends images once there is a subscriber, then stops, so that the node solves the rest."""
 
     def __init__(self, node: rclpy.node.Node) -> None:
         self._publisher = node.create_publisher(Image, 'image', QoSProfile(depth=IMAGES))

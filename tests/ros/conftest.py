@@ -12,19 +12,19 @@ os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
 HAS_ROS = all(importlib.util.find_spec(name) for name in ('rclpy', 'sensor_msgs', 'std_srvs'))
 
 
-NEED_NO_ROS = ('test_cameras.py', 'test_silence.py', 'test_status.py')
-"""Tests of what is plain Python in the live shell."""
+NEED_NO_ROS = ('test_cameras.py', 'test_watchdog.py', 'test_status.py')
+"""Tests of modules of the live shell that need no ROS."""
 
 
 class WithoutRos(pytest.Module):
-    """A test module that says why it is not run."""
+    """A test module that is skipped with a reason."""
 
     def collect(self):
         pytest.skip("rclpy is not importable: pip install '.[ros]'", allow_module_level=True)
 
 
 def pytest_pycollect_makemodule(module_path, parent):
-    """Skip this folder's modules where there is no ROS."""
+    """Skip the modules of this folder without ROS."""
     return None if HAS_ROS or module_path.name in NEED_NO_ROS else WithoutRos.from_parent(parent, path=module_path)
 
 

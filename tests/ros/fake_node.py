@@ -1,4 +1,4 @@
-"""The real node with a solver that gives what it is told to, after as long as it is told to: FOCAL_PX SECONDS ..."""
+"""The real node with a solver that returns what the arguments say, after a time that they give: FOCAL_PX SECONDS ..."""
 
 import sys
 import time

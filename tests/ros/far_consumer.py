@@ -1,4 +1,4 @@
-"""A consumer on another host: prints a line of JSON for each latched message that it gets."""
+"""A consumer on another host: prints a line of JSON for each latched message."""
 
 import importlib.util
 import json

@@ -47,7 +47,7 @@ def arguments() -> argparse.Namespace:
 
 
 def drive(options: argparse.Namespace) -> dict:
-    """Publish images at the rate; tell how many, and what it cost."""
+    """Publish images at the rate; return how many, and the cost."""
     import cv2
     import rclpy
     from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -81,15 +81,15 @@ def drive(options: argparse.Namespace) -> dict:
         message = messages[number % len(messages)]
         message.header.stamp = node.get_clock().now().to_msg()
         publisher.publish(message)
-    told = {'sent': count, 'latest_s': late_s, 'cores': (cpu_s() - cpu) / (time.monotonic() - began)}
+    measured = {'sent': count, 'latest_s': late_s, 'cores': (cpu_s() - cpu) / (time.monotonic() - began)}
     time.sleep(SETTLE_S)
     node.destroy_node()
     rclpy.shutdown()
-    return told
+    return measured
 
 
 def watch(options: argparse.Namespace) -> dict:
-    """Subscribe pictures until this is interrupted; tell how many came of each, and how old they were."""
+    """Subscribe pictures until this is interrupted; return how many of each arrived, and their age."""
     import rclpy
     from rclpy.executors import ExternalShutdownException
     from rclpy.qos import QoSProfile
@@ -137,13 +137,13 @@ class Timed:
         setattr(owner, name, timed)
 
     def summary(self) -> dict:
-        told = {}
+        measured = {}
         for name, calls in self.calls.items():
             for solving in (False, True):
                 times_ms = [1e3 * took for took, during in calls if during == solving]
                 if times_ms:
-                    told[f'{name}{" while solving" if solving else ""}'] = quantiles(times_ms)
-        return told
+                    measured[f'{name}{" while solving" if solving else ""}'] = quantiles(times_ms)
+        return measured
 
 
 def quantiles(values: list[float]) -> dict:
@@ -161,9 +161,8 @@ def run_node(options: argparse.Namespace) -> dict:
     from autocalib_ros.util.threads import limit_blas_threads
 
     limit_blas_threads()
-    from autocalib_ros.ros import autocalib_node, diagnostics, image_input, node
+    from autocalib_ros.ros import autocalib_node, diagnostics, image_input, node, worker
     from autocalib_ros.ros import solver_process as solver
-    from autocalib_ros.ros import worker as pipeline
 
     timed, latencies_ms, solved_s, ends = Timed(), [], [], []
     if options.depth:
@@ -182,7 +181,7 @@ def run_node(options: argparse.Namespace) -> dict:
     timed.wrap(autocalib_node.AutocalibNode, '_on_image')
     timed.wrap(diagnostics.Diagnostics, '_publish')
     timed.wrap(image_input.ImageInput, '_check_publishers')
-    timed.wrap(pipeline.CalibrationWorker, '_process_image')
+    timed.wrap(worker.CalibrationWorker, '_process_image')
     if options.watch:
         from autocalib_ros.pictures import live_overlay as live
         from autocalib_ros.ros.live_pictures import LivePictures
@@ -196,7 +195,7 @@ def run_node(options: argparse.Namespace) -> dict:
         ):
             timed.wrap(owner, name)
     if options.bare:
-        pipeline.CalibrationWorker._process_image = lambda self, stamp_ns, message: None
+        worker.CalibrationWorker._process_image = lambda self, stamp_ns, message: None
 
     own_solve = solver.SolverProcess.__call__
 
@@ -252,7 +251,7 @@ def processor_shares() -> np.ndarray:
 
 
 def measure(options: argparse.Namespace) -> None:
-    """Start all processes, wait for the drivers, interrupt the nodes, print what each of them tells."""
+    """Start all processes, wait for the drivers, interrupt the nodes, print the results of each."""
     environment = {
         **os.environ,
         'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
@@ -276,17 +275,17 @@ def measure(options: argparse.Namespace) -> None:
     for number, watcher in enumerate(watchers, 1):
         print(f'cam{number}: pictures that came, and their age in ms: {watcher.communicate()[0].strip()}')
     for number, (node, (sent, complaint)) in enumerate(zip(nodes, outputs, strict=True), 1):
-        told, log = node.communicate()
-        if node.returncode or not sent or not told:
+        measured, log = node.communicate()
+        if node.returncode or not sent or not measured:
             sys.exit(f'{complaint}\n{log}')
-        driver, node_told = json.loads(sent), json.loads(told)
+        driver, node_output = json.loads(sent), json.loads(measured)
         print(
-            f'cam{number}: sent {driver["sent"]}, lost on the way {driver["sent"] - node_told["received"]}, '
-            f'dropped by the node {node_told["dropped"]}, node {node_told["cores"]:.2f} cores and '
-            f'{node_told["cores_solving"]:.2f} for solutions, '
+            f'cam{number}: sent {driver["sent"]}, lost on the way {driver["sent"] - node_output["received"]}, '
+            f'dropped by the node {node_output["dropped"]}, node {node_output["cores"]:.2f} cores and '
+            f'{node_output["cores_solving"]:.2f} for solutions, '
             f'driver {driver["cores"]:.2f} cores, at most {driver["latest_s"] * 1e3:.0f} ms late'
         )
-        for key, value in node_told.items():
+        for key, value in node_output.items():
             print(f'  {key}: {json.dumps(value) if key != "ms" else ""}')
             for name, times in value.items() if key == 'ms' else ():
                 print(f'    {name}: {json.dumps(times)}')

@@ -24,7 +24,7 @@ def wait_for_subscriber(publisher: Publisher) -> None:
 
 
 def play(bag: Path, topic: str, interval_s: float) -> int:
-    """Send the messages as they stand in the recording, each after the one before has arrived."""
+    """Send the messages of the recording unchanged, each after the previous one has arrived."""
     rclpy.init()
     node = rclpy.create_node('player')
     publisher = node.create_publisher(Image, topic, QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE))

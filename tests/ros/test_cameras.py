@@ -53,7 +53,7 @@ def test_defaults_hold_where_a_camera_says_nothing():
 
 
 @pytest.mark.parametrize(
-    ('cameras', 'told'),
+    ('cameras', 'expected'),
     [
         ([{'namespace': 'a'}, {'namespace': '/a'}], "share the namespace 'a'"),
         ([{'namespace': 'site/a'}, {'namespace': 'site_a'}], "share the name for frames and files 'site_a'"),
@@ -67,7 +67,7 @@ def test_defaults_hold_where_a_camera_says_nothing():
             [{'namespace': 'a', 'camera_info': '/i'}, {'namespace': 'b', 'camera_info': '/i'}],
             "the camera_info topic '/i'",
         ),
-        ([{'image': 'image'}], "camera 1 has the namespace None: give it one of its own, 'cam1' say"),
+        ([{'image': 'image'}], "camera 1 has the namespace None: give it a unique name, such as 'cam1'"),
         ([{'namespace': '1 pole'}], "namespace '1 pole'"),
         ([{'namespace': 'a', 'camera_hight': 8.0}], "unknown entry 'camera_hight': did you mean 'camera_height'?"),
         ([{'namespace': 'a', 'parameters': [1]}], "'parameters' of camera 1"),
@@ -75,16 +75,16 @@ def test_defaults_hold_where_a_camera_says_nothing():
         ([], 'at least one camera'),
     ],
 )
-def test_file_that_cannot_be_used_is_refused_with_the_reason(cameras, told):
-    with pytest.raises(UsageError, match=told):
+def test_file_that_cannot_be_used_is_refused_with_the_reason(cameras, expected):
+    with pytest.raises(UsageError, match=expected):
         nodes(*cameras)
 
 
-@pytest.mark.parametrize(('content', 'told'), [(None, 'cannot read'), ('a: [', 'is not YAML')])
-def test_file_that_cannot_be_read_is_told(tmp_path, content, told):
+@pytest.mark.parametrize(('content', 'expected'), [(None, 'cannot read'), ('a: [', 'is not YAML')])
+def test_file_that_cannot_be_read_is_reported(tmp_path, content, expected):
     if content is not None:
         (tmp_path / 'cameras.yaml').write_text(content)
-    with pytest.raises(InputError, match=told):
+    with pytest.raises(InputError, match=expected):
         read_cameras(tmp_path / 'cameras.yaml')
 
 
@@ -97,7 +97,7 @@ def test_example_file_gives_its_cameras(request):
 
 
 class Kept:
-    """Stands in for a class of launch, which plain pip does not bring: keeps what it is given."""
+    """Stand-in for a class of launch, which is not on PyPI: keeps its arguments."""
 
     def __init__(self, *given, **named):
         self.given, self.named = given, named

@@ -1,4 +1,4 @@
-"""The calibration goes to the driver, where that is wanted."""
+"""Upload of the calibration to the driver."""
 
 import threading
 
@@ -11,20 +11,20 @@ from autocalib_ros.ros import driver_upload
 from bench import calibration, wait_for
 from test_node import calibrated, publish_until
 
-TOLD = 'autocalib_ros.ros.autocalib_node.AutocalibNode._say'
+LOG_METHOD = 'autocalib_ros.ros.autocalib_node.AutocalibNode._log'
 
 
 @pytest.fixture
-def told(monkeypatch) -> list[str]:
-    """Return the lines that the node says."""
+def log_lines(monkeypatch) -> list[str]:
+    """Return the log lines of the node."""
     lines: list[str] = []
-    monkeypatch.setattr(TOLD, lambda self, text, *, good: lines.append(text))
+    monkeypatch.setattr(LOG_METHOD, lambda self, text, *, good: lines.append(text))
     return lines
 
 
 @pytest.fixture
 def driver(bench):
-    """Serve set_camera_info as a driver does; return what it was sent and its next answers."""
+    """Serve set_camera_info as a driver does; return the requests and its next answers."""
 
     class Driver:
         received: list = []
@@ -42,9 +42,9 @@ def driver(bench):
     return state
 
 
-def test_calibration_is_sent_once(bench, driver, told):
+def test_calibration_is_sent_once(bench, driver, log_lines):
     node, publisher = calibrated(bench, upload_to_driver=True)
-    wait_for(lambda: any('took the calibration' in line for line in told), 'the line of the log')
+    wait_for(lambda: any('accepted the calibration' in line for line in log_lines), 'the line of the log')
     fields = camera_info(node.publication.published.result.camera)
     (sent,) = driver.received
     assert (list(sent.k), list(sent.d), sent.width) == (fields.k, fields.d, fields.width)
@@ -54,7 +54,7 @@ def test_calibration_is_sent_once(bench, driver, told):
     assert len(driver.received) == 1
 
 
-def test_newest_of_several_calibrations_is_sent_after_a_while(bench, driver, told, monkeypatch):
+def test_newest_of_several_calibrations_is_sent_after_a_while(bench, driver, log_lines, monkeypatch):
     monkeypatch.setattr(driver_upload, 'UPLOAD_PERIOD_S', 1.0)
     focals = iter((300.0, 310.0, 320.0))
     calibrated(bench, lambda evidence, options, lens: calibration(evidence, next(focals)), upload_to_driver=True)
@@ -69,7 +69,7 @@ def test_nothing_is_sent_unless_asked_for(bench, driver):
     assert not driver.received
 
 
-def test_restored_calibration_is_sent_only_when_the_traffic_confirms_it(bench, driver, told, ros_home):
+def test_restored_calibration_is_sent_only_when_the_traffic_confirms_it(bench, driver, log_lines, ros_home):
     node, publisher = calibrated(bench, camera_name='north')
     wait_for((ros_home / 'camera_info' / 'north.yaml').exists, 'the file')
     bench.stop(node)
@@ -87,24 +87,28 @@ def test_restored_calibration_is_sent_only_when_the_traffic_confirms_it(bench, d
     wait_for(lambda: driver.received, 'the call')
 
 
-def test_refusal_of_the_driver_is_told(bench, driver, told):
+def test_refusal_of_the_driver_is_reported(bench, driver, log_lines):
     driver.answers.append((False, 'read-only lens'))
     calibrated(bench, upload_to_driver=True)
-    wait_for(lambda: any('refused the calibration: read-only lens' in line for line in told), 'the line of the log')
+    wait_for(
+        lambda: any('rejected the calibration: read-only lens' in line for line in log_lines), 'the line of the log'
+    )
 
 
-def test_missing_driver_is_told_and_found_when_it_comes(bench, told, request):
+def test_missing_driver_is_reported_and_found_when_it_comes(bench, log_lines, request):
     calibrated(bench, upload_to_driver=True)
-    wait_for(lambda: any('no driver serves /set_camera_info: remap it' in line for line in told), 'the line of the log')
+    wait_for(
+        lambda: any('no driver serves /set_camera_info: remap it' in line for line in log_lines), 'the line of the log'
+    )
     driver = request.getfixturevalue('driver')
     wait_for(lambda: driver.received, 'the call')
 
 
-def test_driver_that_does_not_answer_is_given_up(bench, told, monkeypatch):
+def test_driver_that_does_not_answer_is_given_up(bench, log_lines, monkeypatch):
     monkeypatch.setattr(driver_upload, 'DRIVER_TIMEOUT_S', 0.5)
     monkeypatch.setattr('autocalib_ros.ros.driver_upload.DriverUpload._answered', lambda self, call: None)
     silent = bench.client.create_service(SetCameraInfo, '/set_camera_info', lambda request, response: response)
     assert silent
     node, _ = calibrated(bench, upload_to_driver=True)
-    wait_for(lambda: any('did not answer within' in line for line in told), 'the line of the log')
+    wait_for(lambda: any('no answer from the driver within' in line for line in log_lines), 'the line of the log')
     wait_for(lambda: bench.calibrate().success, 'the node, which goes on')

@@ -1,4 +1,4 @@
-"""The promise of two shells around one core: a live run gives what a replay of the same images gives."""
+"""A live run and a replay of the same images give the same calibration."""
 
 import json
 import re

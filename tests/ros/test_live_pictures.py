@@ -1,4 +1,4 @@
-"""Pictures of a running node over DDS: drawn while somebody looks, and only then."""
+"""Pictures of a running node over DDS: drawn only while subscribed."""
 
 import threading
 from dataclasses import replace
@@ -28,7 +28,7 @@ DRAWERS = (live.DebugPicture, live.TopPicture, live.RectifiedPicture)
 
 
 class Stream:
-    """A node that calibrates at once, and the images that it is sent."""
+    """A node that calibrates at once, and its images."""
 
     def __init__(self, bench, solve=None, **parameters):
         self.bench, self._sent = bench, 0
@@ -78,7 +78,7 @@ class Stream:
 
 @pytest.fixture
 def drawn(monkeypatch) -> list[str]:
-    """Count what is drawn, made for drawing, or asked of the tracker."""
+    """Count pictures drawn, drawers made, and requests to the tracker."""
     calls: list[str] = []
 
     def counted(owner, name):
@@ -215,10 +215,10 @@ def test_perception_and_executor_do_not_wait_for_a_picture(bench, monkeypatch):
     release.set()
 
 
-def test_a_fault_in_drawing_is_told_and_the_next_picture_comes(bench, monkeypatch):
+def test_a_fault_in_drawing_is_reported_and_the_next_picture_comes(bench, monkeypatch):
     faults = [ValueError('torn')]
     own = live.DebugPicture.draw
-    told: list[Exception] = []
+    reported: list[Exception] = []
 
     def draw(self, *given):
         if faults:
@@ -227,9 +227,9 @@ def test_a_fault_in_drawing_is_told_and_the_next_picture_comes(bench, monkeypatc
 
     monkeypatch.setattr(live.DebugPicture, 'draw', draw)
     stream = Stream(bench)
-    stream.node._pictures._failed = told.append
+    stream.node._pictures._failed = reported.append
     stream.seen('debug_image')
-    assert [str(error) for error in told] == ['torn']
+    assert [str(error) for error in reported] == ['torn']
 
 
 def test_an_ignored_region_is_black_in_pictures_of_the_image(bench):
@@ -298,6 +298,6 @@ def test_restored_is_not_yet_verified_and_says_what_the_traffic_still_lacks():
     assert 'focal length 300.00 px' in caption.text and 'COLLECTING 42 %: 17 of 40 tracks' in caption.text
 
 
-def test_a_lens_alone_says_why_there_is_no_plane():
+def test_a_lens_alone_gives_the_reason_there_is_no_plane():
     lens = replace(result(height_m=None), ground_refusal=Reason('one_direction', '3 of 10 tracks', 'wait'))
     assert 'no ground plane (one_direction): 3 of 10 tracks' in caption_of(CalibrationState.CALIBRATED, lens, None).text

@@ -94,7 +94,7 @@ def test_without_a_covariance_there_are_no_ellipses(result):
     assert 'ellipses' not in found['state'][0].text
 
 
-def test_in_units_of_the_height_no_metres_are_told(result):
+def test_in_units_of_the_height_no_metres_are_reported(result):
     unit = replace(result, ground=GroundPlane(result.ground.rotation, 1.0, metric=False), covariance=None)
     (state,) = by_namespace(validated(markers(unit, 'g')))['state']
     assert 'squares of 0.5 camera heights' in state.text

@@ -1,4 +1,4 @@
-"""Outgoing messages hold what their consumers take for granted."""
+"""Outgoing messages meet the assumptions of their consumers."""
 
 import copy
 
@@ -99,7 +99,7 @@ def test_ground_transform_takes_points_of_the_child_to_the_parent(tf_parent):
 
 
 def driver_message(width: int, height: int, binning: int, roi: RegionOfInterest | None = None) -> CameraInfo:
-    """Return what a driver publishes that was never calibrated."""
+    """Return the CameraInfo of an uncalibrated driver."""
     return CameraInfo(width=width, height=height, binning_x=binning, binning_y=binning, roi=roi or RegionOfInterest())
 
 
@@ -120,8 +120,8 @@ def test_without_a_driver_binning_and_region_are_those_of_the_whole_image():
     assert (message.binning_x, message.binning_y, message.roi) == (0, 0, RegionOfInterest())
 
 
-def test_a_driver_that_speaks_of_other_images_is_told():
-    with pytest.raises(InputError, match='of images of 320x180, and these have 640x360'):
+def test_a_driver_that_speaks_of_other_images_is_reported():
+    with pytest.raises(InputError, match='for images of 320x180, these have 640x360'):
         camera_info_message(camera_info(Camera.equidistant(640, 360, 300.0)), STAMP, 'cam', driver_message(640, 360, 2))
 
 
@@ -137,7 +137,7 @@ def test_stamp_keeps_every_nanosecond():
 
 
 @pytest.mark.parametrize(
-    ('field', 'value', 'told'),
+    ('field', 'value', 'expected'),
     [
         ('k', [1.0] * 8, 'CameraInfo.k holds 8 numbers, not 9'),
         ('k', np.eye(3), 'CameraInfo.k has more than one dimension'),
@@ -155,8 +155,8 @@ def test_stamp_keeps_every_nanosecond():
         ('distortion_model', 'fisheye', "CameraInfo.distortion_model is 'fisheye'"),
     ],
 )
-def test_broken_camera_info_is_refused_by_name(field, value, told):
-    with pytest.raises(InvalidMessage, match=told.replace('.', r'\.')):
+def test_broken_camera_info_is_refused_by_name(field, value, expected):
+    with pytest.raises(InvalidMessage, match=expected.replace('.', r'\.')):
         validated(unchecked(info_message(), field, value))
 
 
@@ -176,17 +176,17 @@ def test_camera_info_with_a_frame_that_tf2_rejects_is_refused(frame):
 
 
 @pytest.mark.parametrize(
-    ('field', 'value', 'told'),
+    ('field', 'value', 'expected'),
     [
         ('x', 1, 'rotation.x is a int, not a float'),
         ('x', np.float32(1), 'rotation.x is a float32, not a float'),
         ('w', 2.0, 'rotation has the length'),
     ],
 )
-def test_broken_rotation_is_refused(field, value, told):
+def test_broken_rotation_is_refused(field, value, expected):
     message = transform_message(GroundPlane(ROTATION, 8.0))
     unchecked(message.transform.rotation, field, value)
-    with pytest.raises(InvalidMessage, match=told):
+    with pytest.raises(InvalidMessage, match=expected):
         validated(message)
 
 

@@ -1,4 +1,4 @@
-"""A real node in this process, heard and asked over DDS."""
+"""A node in this process, with clients over DDS."""
 
 import threading
 import time
@@ -169,7 +169,7 @@ def test_a_lens_without_plane_does_not_replace_one_with_its_plane(bench):
         bench.collect(kind, topic, latched=True) for kind, topic in ((CameraInfo, INFO), (TransformStamped, GROUND))
     )
     wait_for(lambda: infos and transforms, 'lens and plane')
-    assert 'focal length 310' in bench.calibrate().message  # what was found is told, and not published
+    assert 'focal length 310' in bench.calibrate().message  # the solution is reported, but not published
     assert bench.calibrate().success
     wait_for(lambda: infos[-1].k[0] == 320.0 and transforms[-1].transform.translation.z == 9.0, 'lens and plane anew')
     assert 310.0 not in [info.k[0] for info in infos]
@@ -183,10 +183,10 @@ def test_calibrate_answers_with_the_refusal(bench):
     assert 'too_few_tracks' in answer.message and '12 tracks of the 40 needed.' in answer.message
 
 
-def test_calibrate_before_the_first_image_says_so(bench):
+def test_calibrate_before_the_first_image_reports_it(bench):
     bench.start(instantly)
     answer = bench.calibrate()
-    assert (answer.success, answer.message) == (False, 'no image yet on /image')
+    assert (answer.success, answer.message) == (False, 'no image received yet on /image')
 
 
 def test_refusal_keeps_the_calibration_before(bench):
@@ -293,9 +293,9 @@ def test_known_lens_is_read_and_given_to_the_solver_in_the_size_of_the_images(be
 
 
 def test_solver_gets_no_lens_unless_one_is_given(bench):
-    told = []
-    calibrated(bench, lambda evidence, options, lens: told.append(lens) or calibration(evidence))
-    assert told and set(told) == {None}
+    lenses = []
+    calibrated(bench, lambda evidence, options, lens: lenses.append(lens) or calibration(evidence))
+    assert lenses and set(lenses) == {None}
 
 
 def test_known_lens_in_a_distortion_model_that_cannot_say_it_is_wrong_usage(bench, tmp_path):
@@ -304,7 +304,7 @@ def test_known_lens_in_a_distortion_model_that_cannot_say_it_is_wrong_usage(benc
         bench.start(instantly, camera_info_file=str(tmp_path / 'lens.yaml'), distortion_model='plumb_bob')
 
 
-def test_answer_of_calibrate_tells_the_error_of_a_fitted_distortion_model(bench):
+def test_answer_of_calibrate_reports_the_error_of_a_fitted_distortion_model(bench):
     def solve(evidence, options, lens):
         return with_requested_model(calibration(evidence), options)
 
@@ -313,7 +313,7 @@ def test_answer_of_calibrate_tells_the_error_of_a_fitted_distortion_model(bench)
     infos = bench.collect(CameraInfo, INFO, latched=True)
     answer = bench.calibrate()
     assert answer.success
-    assert 'camera_info rational_polynomial, off by at most' in answer.message
+    assert 'camera_info rational_polynomial, error at most' in answer.message
     info = wait_for(lambda: infos, 'camera_info')[0]
     assert (info.distortion_model, len(info.d)) == ('rational_polynomial', 8)
 

@@ -1,4 +1,4 @@
-"""What the node makes of its stream, its driver and its parameters, heard over DDS."""
+"""Response of the node to its image stream, driver and parameters, over DDS."""
 
 from dataclasses import replace
 
@@ -21,16 +21,16 @@ INFO = '/autocalib/camera_info'
 
 
 @pytest.fixture
-def told(bench: Bench) -> list:
+def statuses(bench: Bench) -> list:
     return bench.collect(DiagnosticArray, '/diagnostics')
 
 
-def message(told: list) -> str:
-    return told[-1].status[0].message if told else ''
+def message(statuses: list) -> str:
+    return statuses[-1].status[0].message if statuses else ''
 
 
-def values(told: list) -> dict[str, str]:
-    return {item.key: item.value for item in told[-1].status[0].values} if told else {}
+def values(statuses: list) -> dict[str, str]:
+    return {item.key: item.value for item in statuses[-1].status[0].values} if statuses else {}
 
 
 def fed(bench: Bench, count: int = 3, **parameters):
@@ -50,46 +50,50 @@ def fed(bench: Bench, count: int = 3, **parameters):
     return node, publisher
 
 
-def test_calibrated_node_says_so_in_diagnostics(bench, told):
+def test_calibrated_node_reports_it_in_diagnostics(bench, statuses):
     fed(bench, camera_height=8.0)
-    wait_for(lambda: values(told).get('state') == 'CALIBRATED', 'the calibration')
-    assert (told[-1].status[0].level, told[-1].status[0].name) == (b'\x00', 'autocalib: calibration')
-    assert (values(told)['grade'], values(told)['focal_px'], values(told)['focal_sigma_px']) == ('full', '300.00', '1')
-    assert stamp_ns(told[-1].header.stamp) > START_NS
+    wait_for(lambda: values(statuses).get('state') == 'CALIBRATED', 'the calibration')
+    assert (statuses[-1].status[0].level, statuses[-1].status[0].name) == (b'\x00', 'autocalib: calibration')
+    assert (values(statuses)['grade'], values(statuses)['focal_px'], values(statuses)['focal_sigma_px']) == (
+        'full',
+        '300.00',
+        '1',
+    )
+    assert stamp_ns(statuses[-1].header.stamp) > START_NS
 
 
-def test_image_that_cannot_be_decoded_is_an_error_until_one_can(bench, told):
+def test_image_that_cannot_be_decoded_is_an_error_until_one_can(bench, statuses):
     node, publisher = fed(bench)
     publisher.publish(image(START_NS + 10 * FRAME_NS, encoding='no_such_encoding'))
-    wait_for(lambda: "'no_such_encoding' is not supported" in message(told), 'the complaint')
-    assert (told[-1].status[0].level, values(told)['unreadable']) == (b'\x02', '1')
+    wait_for(lambda: "'no_such_encoding' is not supported" in message(statuses), 'the complaint')
+    assert (statuses[-1].status[0].level, values(statuses)['unreadable']) == (b'\x02', '1')
     publisher.publish(image(START_NS + 11 * FRAME_NS))
-    wait_for(lambda: 'no_such_encoding' not in message(told), 'the end of the complaint')
+    wait_for(lambda: 'no_such_encoding' not in message(statuses), 'the end of the complaint')
 
 
-def test_size_that_changes_is_an_error_until_there_is_a_new_calibration(bench, told):
+def test_size_that_changes_is_an_error_until_there_is_a_new_calibration(bench, statuses):
     node, publisher = fed(bench, camera_height=8.0)
     wait_for(lambda: node.publication.published, 'the calibration')
     node._worker.change(node.options, 1000.0)  # no solution for now
     publisher.publish(image(START_NS + 10 * FRAME_NS, size=(160, 120)))
-    wait_for(lambda: 'these have 160x120: it is withdrawn' in message(told), 'the error')
-    assert (told[-1].status[0].level, values(told)['state']) == (b'\x02', 'COLLECTING')
+    wait_for(lambda: 'the present ones 160x120' in message(statuses), 'the error')
+    assert (statuses[-1].status[0].level, values(statuses)['state']) == (b'\x02', 'COLLECTING')
     node._worker.change(node.options, 0.1)
-    wait_for(lambda: values(told)['state'] == 'CALIBRATED', 'a calibration of the new size')
-    assert told[-1].status[0].level == b'\x00'
+    wait_for(lambda: values(statuses)['state'] == 'CALIBRATED', 'a calibration of the new size')
+    assert statuses[-1].status[0].level == b'\x00'
 
 
-def test_second_publisher_of_our_camera_info_is_told(bench, told):
+def test_second_publisher_of_our_camera_info_is_reported(bench, statuses):
     bench.client.create_publisher(CameraInfo, INFO, QoSProfile(depth=1))
     bench.start()
-    wait_for(lambda: f'/client publishes {INFO} too: remap one of them' in message(told), 'the warning')
-    assert told[-1].status[0].level == b'\x01'
+    wait_for(lambda: f'/client also publishes {INFO}: remap one of the two' in message(statuses), 'the warning')
+    assert statuses[-1].status[0].level == b'\x01'
 
 
-def test_two_cameras_on_one_topic_are_told(bench, told):
+def test_two_cameras_on_one_topic_are_reported(bench, statuses):
     bench.publisher(), bench.publisher()
     bench.start()
-    wait_for(lambda: '2 publishers share /image' in message(told), 'the warning')
+    wait_for(lambda: '2 publishers share /image' in message(statuses), 'the warning')
 
 
 @pytest.mark.parametrize('wanted', [True, False])
@@ -99,12 +103,12 @@ def test_newest_message_of_the_driver_is_kept_where_that_is_wanted(bench, wanted
     if not wanted:
         assert (node._driver.newest, node._driver.check(SIZE), driver.get_subscription_count()) == (None, '', 0)
         return
-    assert 'no CameraInfo comes on /camera_info_in' in node._driver.check(SIZE)
+    assert 'no CameraInfo on /camera_info_in' in node._driver.check(SIZE)
     bench.connected(driver)
     driver.publish(CameraInfo(width=2 * SIZE[0], height=2 * SIZE[1], binning_x=2, binning_y=2))
     wait_for(lambda: node._driver.newest, 'the message')
     assert (node._driver.newest.binning_x, node._driver.check(SIZE)) == (2, '')
-    assert '320x240, and these have 640x480' in node._driver.check((640, 480))
+    assert '320x240, these have 640x480' in node._driver.check((640, 480))
 
 
 def test_binning_and_region_of_the_driver_are_published_where_they_are_of_these_images(bench):
@@ -119,13 +123,13 @@ def test_binning_and_region_of_the_driver_are_published_where_they_are_of_these_
         CameraInfo(width=7, height=7),
     )
     wait_for(lambda: node.publication.published, 'the calibration')
-    for number, told_by_driver in enumerate(readouts, 10):
-        driver.publish(told_by_driver)
-        wait_for(lambda width=told_by_driver.width: node._driver.newest and node._driver.newest.width == width, 'it')
+    for number, driver_info in enumerate(readouts, 10):
+        driver.publish(driver_info)
+        wait_for(lambda width=driver_info.width: node._driver.newest and node._driver.newest.width == width, 'it')
         sent = image(START_NS + number * FRAME_NS)
         publisher.publish(sent)
         wait_for(lambda sent=sent: infos and infos[-1].header == sent.header, 'camera_info of the image')
-        if told_by_driver.width == 1920:
+        if driver_info.width == 1920:
             binned = infos[-1]
         else:
             assert (infos[-1].width, infos[-1].binning_x) == (SIZE[0], 0)
@@ -171,7 +175,7 @@ def test_pixel_outside_the_images_is_refused_once_their_size_is_known(bench):
     assert not refused.successful and 'lies outside the images' in refused.reason
 
 
-def test_recording_that_loops_begins_the_evidence_anew_and_keeps_the_calibration(bench):
+def test_recording_that_loops_restarts_the_evidence_and_keeps_the_calibration(bench):
     infos = bench.collect(CameraInfo, INFO)
     node, publisher = fed(bench, count=20, camera_height=8.0)
     wait_for(lambda: (now := node.publication.published) and now.result.evidence.frames == 20, 'the calibration')
@@ -183,9 +187,11 @@ def test_recording_that_loops_begins_the_evidence_anew_and_keeps_the_calibration
 
 
 @pytest.mark.parametrize(
-    ('focal_px', 'state', 'in_force_px'), [(305.0, 'VERIFIED', 300.0), (400.0, 'CALIBRATED', 400.0)]
+    ('focal_px', 'state', 'published_px'), [(305.0, 'VERIFIED', 300.0), (400.0, 'CALIBRATED', 400.0)]
 )
-def test_after_a_loop_a_surer_calibration_stays_unless_the_traffic_contradicts_it(bench, focal_px, state, in_force_px):
+def test_after_a_loop_a_more_precise_calibration_stays_unless_the_traffic_contradicts_it(
+    bench, focal_px, state, published_px
+):
     def solve(evidence, options, lens):
         if evidence.frames > 3:
             return calibration(evidence)
@@ -199,10 +205,10 @@ def test_after_a_loop_a_surer_calibration_stays_unless_the_traffic_contradicts_i
     wait_for(lambda: (now := node.publication.published) and now.result.evidence.frames == 20, 'the calibration')
     publisher.publish(image(START_NS))
     wait_for(lambda: counters.used == 21 and node.publication.state.name == state, 'the first after the loop')
-    wait_for(lambda: node.publication.published.result.camera.focal_px == in_force_px, 'what is in force')
+    wait_for(lambda: node.publication.published.result.camera.focal_px == published_px, 'the published calibration')
 
 
-def test_images_twice_and_out_of_order_are_left_out_of_the_evidence_but_get_camera_info(bench, told):
+def test_images_twice_and_out_of_order_are_left_out_of_the_evidence_but_get_camera_info(bench, statuses):
     infos = bench.collect(CameraInfo, INFO)
     node, publisher = fed(bench, count=10, camera_height=8.0)
     wait_for(lambda: node.publication.published, 'the calibration')
@@ -211,8 +217,8 @@ def test_images_twice_and_out_of_order_are_left_out_of_the_evidence_but_get_came
     for sent in late:
         publisher.publish(sent)
     wait_for(lambda: [info.header for info in infos[-2:]] == [sent.header for sent in late], 'their camera_info')
-    wait_for(lambda: values(told)['late'] == '2', 'the count')
-    assert values(told)['used'] == '10'
+    wait_for(lambda: values(statuses)['late'] == '2', 'the count')
+    assert values(statuses)['used'] == '10'
 
 
 def test_images_without_stamps_take_their_time_from_the_clock_of_the_recording(bench):

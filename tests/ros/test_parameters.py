@@ -86,7 +86,7 @@ def test_what_is_read_at_each_solution_may_change_and_what_shapes_the_evidence_m
 
 
 @pytest.mark.parametrize(
-    ('given', 'told'),
+    ('given', 'expected'),
     [
         ({'camera_height': 9}, 'write camera_height:=9.0, not 9'),
         ({'camera_height': -1.0}, "'camera_height' lies between 0 and 500"),
@@ -94,12 +94,12 @@ def test_what_is_read_at_each_solution_may_change_and_what_shapes_the_evidence_m
         ({'gate.min_tracks': 3.5}, "'min_tracks' takes a int"),
         ({'camera_info_mode': 'never'}, 'one of per_image, latched_only'),
         ({'scale_from': 'speed'}, "needs 'scale.speed_km_h'"),
-        ({'tracking.max_points': 100}, "'tracking.max_points' cannot change while the node runs"),
+        ({'tracking.max_points': 100}, "'tracking.max_points' is read-only while the node runs"),
         ({'image_transport': 'compressed'}, 'start the node with -p image_transport:=compressed'),
     ],
 )
-def test_change_that_cannot_be_is_refused_with_the_reason(given, told):
-    with pytest.raises(UsageError, match=told):
+def test_change_that_is_not_possible_is_refused_with_the_reason(given, expected):
+    with pytest.raises(UsageError, match=expected):
         changed_options(Options(), NodeOptions(), given)
 
 
@@ -129,19 +129,19 @@ def set_remotely(bench: Bench, *parameters: Parameter, atomically: bool = False)
 
 
 @pytest.mark.parametrize(
-    ('name', 'value', 'told'),
+    ('name', 'value', 'expected'),
     [
         ('camera_height', 9, 'write camera_height:=9.0, not 9'),
         ('camera_height', 900.0, 'lies between 0 and 500'),
-        ('buffer.seconds', 60.0, 'cannot change while the node runs'),
+        ('buffer.seconds', 60.0, 'is read-only while the node runs'),
         ('camera_hight', 9.0, "unknown parameter 'camera_hight': did you mean 'camera_height'?"),
     ],
 )
-def test_ros_param_set_is_refused_in_words_that_help(bench: Bench, name, value, told):
+def test_ros_param_set_is_refused_with_a_helpful_message(bench: Bench, name, value, expected):
     bench.start(camera_height=7.5)
     (result,) = set_remotely(bench, Parameter(name, value=value))
     assert not result.successful
-    assert told in result.reason
+    assert expected in result.reason
 
 
 def test_source_of_the_scale_changes_at_once_or_not_at_all(bench: Bench):
@@ -173,7 +173,7 @@ def test_example_file_holds_only_options_that_differ_and_can_be_used(request, na
 
 
 @pytest.mark.parametrize('name', ['thermal', 'low_power'])
-def test_every_line_of_an_example_file_says_why(request, name):
+def test_every_line_of_an_example_file_gives_the_reason(request, name):
     lines = (request.config.rootpath / 'config' / f'{name}.yaml').read_text().splitlines()
     options = [number for number, line in enumerate(lines) if re.match(r' *\w+: \S', line)]
     assert options and all(lines[number - 1].lstrip().startswith('#') for number in options)
@@ -186,7 +186,7 @@ def test_node_reads_an_example_file(request, name):
 
 
 @pytest.mark.parametrize(
-    ('given', 'told'),
+    ('given', 'expected'),
     [
         ({'camera_height': 8}, 'camera_height:=8.0, not 8'),
         ({'camera_hight': 8.0}, "unknown parameter 'camera_hight': did you mean 'camera_height'"),
@@ -201,13 +201,13 @@ def test_node_reads_an_example_file(request, name):
         ({'scale.distance_m': 12}, 'scale.distance_m:=12.0, not 12'),
     ],
 )
-def test_unusable_parameter_is_refused_with_what_would_be_accepted(given, told):
-    with pytest.raises(UsageError, match=told):
+def test_unusable_parameter_is_refused_with_what_would_be_accepted(given, expected):
+    with pytest.raises(UsageError, match=expected):
         read(given)
 
 
 @pytest.mark.parametrize(
-    ('argument', 'told'),
+    ('argument', 'expected'),
     [
         ('camera_height:=8', 'write camera_height:=8.0, not 8'),
         ('camera_height:=501.0', 'lies between 0 and 500'),
@@ -216,31 +216,31 @@ def test_unusable_parameter_is_refused_with_what_would_be_accepted(given, told):
         ('scale.distance_px:=[412.0, 530.0, 888.0, 530.0]', 'four numbers in one text'),
     ],
 )
-def test_node_ends_with_status_2_and_one_line_at_an_unusable_parameter(argument, told):
+def test_node_ends_with_status_2_and_one_line_at_an_unusable_parameter(argument, expected):
     done = run_node('-p', argument)
     assert done.returncode == 2
-    assert told in done.stderr
+    assert expected in done.stderr
     assert len(done.stderr.splitlines()) == 1
 
 
 @pytest.mark.parametrize(
-    ('content', 'told'),
+    ('content', 'expected'),
     [
         (None, 'No such file or directory'),
         ('image_width: 640', "it has no 'image_height'"),
     ],
 )
-def test_node_ends_with_status_2_and_one_line_at_an_unusable_camera_info_file(tmp_path, content, told):
+def test_node_ends_with_status_2_and_one_line_at_an_unusable_camera_info_file(tmp_path, content, expected):
     path = tmp_path / 'lens.yaml'
     if content is not None:
         path.write_text(content)
     done = run_node('-p', f'camera_info_file:={path}')
     assert done.returncode == 2
-    assert str(path) in done.stderr and told in done.stderr
+    assert str(path) in done.stderr and expected in done.stderr
     assert len(done.stderr.splitlines()) == 1
 
 
-def test_node_ends_with_status_2_and_one_line_at_a_detector_that_is_not_there():
+def test_node_ends_with_status_2_and_one_line_at_a_detector_that_does_not_exist():
     done = run_node('-p', 'detector.model:=/nowhere/model.onnx')
     assert done.returncode == 2
     assert "'detector.model' is /nowhere/model.onnx, which is not a file" in done.stderr

@@ -1,4 +1,4 @@
-"""A calibration that outlives its node, and the services that keep and forget it."""
+"""Storing and restoring a calibration across nodes, and the services for it."""
 
 import os
 import signal
@@ -127,7 +127,7 @@ def test_height_that_is_given_now_wins(bench, kept):
     assert wait_for(lambda: transforms, 'the transform')[0].transform.translation.z == 6.5
 
 
-def test_calibration_that_agrees_but_is_less_sure_verifies_the_restored_one(bench, kept, evidence):
+def test_calibration_that_agrees_but_is_less_precise_verifies_the_restored_one(bench, kept, evidence):
     from dataclasses import replace
 
     def vague(evidence, options, lens):
@@ -206,7 +206,7 @@ def test_restored_calibration_can_be_saved(bench, kept, store):
     assert store.load().stored.calibration.ground.height_m == 6.5
 
 
-def test_save_without_a_calibration_says_why_not(bench, store):
+def test_save_without_a_calibration_gives_the_reason(bench, store):
     bench.start(never, camera_name='north')
     answer = bench.ask('save')
     assert not answer.success and 'no calibration yet' in answer.message
@@ -230,18 +230,18 @@ def test_node_starts_over_a_broken_file(bench, kept, store, text):
     store.json_path.unlink()
     node, _ = calibrated(bench, camera_name='north')
     assert node.publication.state is CALIBRATED
-    wait_for(lambda: 'left alone' in node.store_writer.fault, 'what is told of the file')
+    wait_for(lambda: 'not overwritten' in node.store_writer.fault, 'the report about the file')
     assert store.path.read_text() == text
     assert bench.ask('save').success
     assert store.path.with_name('north.yaml.orig').read_text() == text
-    assert store.load().kind is StoreState.INTACT
+    assert store.load().state is StoreState.INTACT
 
 
 def test_reset_withdraws_what_is_published_and_leaves_what_is_stored(bench, store):
     node, publisher = calibrated(bench, focal(311.0), camera_name='north')
     wait_for(store.path.exists, 'the file')
     answer = bench.ask('reset')
-    assert answer.success and 'the calibrated calibration is withdrawn' in answer.message
+    assert answer.success and 'calibrated calibration withdrawn' in answer.message
     assert node.publication.state is NONE
     wait_for(lambda: nothing_latched(bench), 'the end of the latched messages', 5.0)
     assert store.load().stored.calibration.camera.focal_px == 311.0
@@ -266,7 +266,7 @@ def test_solution_that_runs_during_a_reset_is_not_published(bench, store):
     assert running.wait(PATIENCE_S)
     assert bench.ask('reset').success
     wait_for(answer.done, 'the caller who is sent away')
-    assert not answer.result().success and 'a reset came in between' in answer.result().message
+    assert not answer.result().success and 'the evidence was reset meanwhile' in answer.result().message
     release.set()
     assert not bench.calibrate().success
     assert node.publication.state is NONE and not store.path.exists()
@@ -309,7 +309,9 @@ def process(log: Path, focal_px: float, seconds: float = 0.0, **parameters):
             run.kill()
 
 
-def test_killed_node_leaves_its_calibration_to_the_next_which_tells_that_it_is_not_verified(bench, tmp_path, ros_home):
+def test_killed_node_leaves_its_calibration_to_the_next_which_reports_that_it_is_not_verified(
+    bench, tmp_path, ros_home
+):
     store, publisher = Store(ros_home / 'camera_info' / 'cam1.yaml'), bench.publisher()
     info, ground = '/cam1/autocalib/camera_info', '/cam1/autocalib/ground_transform'
     with process(tmp_path / 'first', 311.0) as first:
@@ -319,7 +321,7 @@ def test_killed_node_leaves_its_calibration_to_the_next_which_tells_that_it_is_n
         wait_for(store.path.exists, 'the file')
         first.send_signal(signal.SIGKILL)
         first.wait(PATIENCE_S)
-    assert store.load().kind is StoreState.INTACT
+    assert store.load().state is StoreState.INTACT
     with process(tmp_path / 'second', 350.0) as second:
         infos = bench.collect(CameraInfo, info, latched=True)
         transforms = bench.collect(TransformStamped, ground, latched=True)
@@ -336,7 +338,9 @@ def test_killed_node_leaves_its_calibration_to_the_next_which_tells_that_it_is_n
         assert infos[-1].k[0] == 311.0
         wait_for(lambda: bench.ask('calibrate', '/cam1/autocalib').success, 'a calibration')
         wait_for(lambda: infos[-1].k[0] == 350.0, 'the new calibration')
-        wait_for(lambda: 'does not hold any more' in (tmp_path / 'second').read_text(), 'the line of the log')
+        wait_for(
+            lambda: 'is inconsistent with current traffic' in (tmp_path / 'second').read_text(), 'the line of the log'
+        )
         second.send_signal(signal.SIGINT)
         assert second.wait(PATIENCE_S) == 0, (tmp_path / 'second').read_text()
     assert store.load().stored.calibration.camera.focal_px == 350.0

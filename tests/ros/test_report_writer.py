@@ -1,4 +1,4 @@
-"""The report of a live node: written beside the calibration by a process of its own."""
+"""The report of a live node: written next to the calibration by a child process."""
 
 import subprocess
 import sys
@@ -19,13 +19,13 @@ OPTIONS = Options(camera_height=8.0)
 
 
 @pytest.fixture
-def told():
+def log_lines():
     return []
 
 
 @pytest.fixture
-def reports(told):
-    made = ReportWriter(lambda text, good: told.append((text, good)))
+def reports(log_lines):
+    made = ReportWriter(lambda text, good: log_lines.append((text, good)))
     yield made
     made.close()
 
@@ -66,20 +66,20 @@ def test_images_of_another_size_are_not_shown(reports):
     assert reports.scene(result, (evidence, grey_road()), OPTIONS, '').background is None
 
 
-def test_a_report_that_cannot_be_written_is_told(reports, told, tmp_path):
+def test_a_report_that_cannot_be_written_is_reported(reports, log_lines, tmp_path):
     (tmp_path / 'file').touch()
     scene = reports.scene(full_result(junction_evidence()), (None, None), OPTIONS, '')
     reports.write(ReportPaths(tmp_path / 'file' / 'page.html', tmp_path / 'file' / 'figures'), scene)
-    wait_for(lambda: told, 'the complaint', 120.0)
-    ((text, good),) = told
+    wait_for(lambda: log_lines, 'the complaint', 120.0)
+    ((text, good),) = log_lines
     assert text.startswith('the report was not written: InputError: cannot write') and not good
 
 
-def test_a_node_that_ends_gives_the_report_up(reports, told, tmp_path):
+def test_a_node_that_ends_gives_the_report_up(reports, log_lines, tmp_path):
     scene = reports.scene(full_result(junction_evidence()), (None, np.zeros((180, 320), np.uint8)), OPTIONS, '')
     reports.write(ReportPaths(tmp_path / 'page.html', tmp_path / 'figures'), scene)
     reports.close()
-    assert not told and not (tmp_path / 'page.html').exists()
+    assert not log_lines and not (tmp_path / 'page.html').exists()
 
 
 def test_the_node_starts_without_what_only_the_report_needs():

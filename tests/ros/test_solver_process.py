@@ -1,4 +1,4 @@
-"""Solutions in a process of their own."""
+"""The solver in a child process."""
 
 import os
 import signal
@@ -52,7 +52,7 @@ def test_exception_of_the_solver_is_raised_here_with_its_traceback(solver):
     assert 'require_inside' in str(raised.value.__cause__)
 
 
-def test_process_that_dies_is_told_and_the_next_solution_starts_another(solver):
+def test_process_that_dies_is_reported_and_the_next_solution_starts_another(solver):
     assert not solver(snapshot(), OPTIONS, lens=None)
     os.kill(solver._process.pid, signal.SIGKILL)
     with pytest.raises(SolverDied, match='ended with status -9'):

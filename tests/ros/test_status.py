@@ -1,4 +1,4 @@
-"""What /diagnostics says of what the node knows."""
+"""Content of /diagnostics for each state of the node."""
 
 from dataclasses import replace
 
@@ -68,34 +68,34 @@ CALIBRATED = replace(COLLECTING, result=RESULT, progress=CalibrationProgress(100
 )
 def test_state_and_its_level(situation, state, level):
     assert state_of(situation) is state
-    told = status(situation)
-    assert (told.level, told.message.startswith(state.value)) == (level, True)
-    assert dict(told.values)['state'] == state.value
+    current = status(situation)
+    assert (current.level, current.message.startswith(state.value)) == (level, True)
+    assert dict(current.values)['state'] == state.value
 
 
 @pytest.mark.parametrize(
-    ('changes', 'level', 'told'),
+    ('changes', 'level', 'expected'),
     [
-        ({'silence': NoImageDiagnosis('nobody publishes', False)}, WARN, 'nobody publishes'),
-        ({'silence': NoImageDiagnosis('another type', True)}, ERROR, 'another type'),
+        ({'no_image': NoImageDiagnosis('no publisher', False)}, WARN, 'no publisher'),
+        ({'no_image': NoImageDiagnosis('another type', True)}, ERROR, 'another type'),
         ({'unreadable': "image encoding 'x' is not supported"}, ERROR, "images cannot be used: image encoding 'x'"),
         ({'errors': ('the image size changed',)}, ERROR, 'the image size changed'),
         ({'warnings': ('two publishers',)}, WARN, 'two publishers'),
         (
             {'rates_hz': Counts(received=30.0, used=20.0, dropped=10.0)},
             WARN,
-            '10.0 of 30.0 images a second are dropped',
+            '10.0 of 30.0 images per second are dropped',
         ),
-        ({'rates_hz': Counts(received=30.0, late=30.0)}, WARN, 'time stamps of the images do not advance'),
+        ({'rates_hz': Counts(received=30.0, late=30.0)}, WARN, 'time stamps of the images do not increase'),
     ],
 )
-def test_trouble_raises_the_level_of_a_calibrated_node_and_is_told(changes, level, told):
+def test_trouble_raises_the_level_of_a_calibrated_node_and_is_reported(changes, level, expected):
     trouble = status(replace(CALIBRATED, **changes))
     assert trouble.level == level
-    assert trouble.message.startswith('CALIBRATED') and told in trouble.message
+    assert trouble.message.startswith('CALIBRATED') and expected in trouble.message
 
 
-def test_worst_trouble_is_told_first():
+def test_worst_trouble_is_reported_first():
     message = status(replace(CALIBRATED, warnings=('small',), errors=('great',))).message
     assert message.index('great') < message.index('small')
 
@@ -104,10 +104,10 @@ def test_stream_that_stops_brings_no_complaint_about_stamps():
     assert status(replace(CALIBRATED, rates_hz=Counts())).level == OK
 
 
-def test_progress_is_told_in_the_message_and_in_values():
-    told = status(COLLECTING)
-    assert '42 %: 17 of 40 tracks; another, about 6 min more' in told.message
-    values = dict(told.values)
+def test_progress_is_reported_in_the_message_and_in_values():
+    current = status(COLLECTING)
+    assert '42 %: 17 of 40 tracks; another, about 6 min more' in current.message
+    values = dict(current.values)
     assert (values['evidence_percent'], values['missing'], values['outlook']) == (
         '42',
         '17 of 40 tracks; another',
@@ -115,7 +115,7 @@ def test_progress_is_told_in_the_message_and_in_values():
     )
 
 
-def test_numbers_of_the_stream_are_told():
+def test_numbers_of_the_stream_are_reported():
     values = dict(status(COLLECTING).values)
     expected = {
         'image_topic': '/cam1/image',
@@ -132,7 +132,7 @@ def test_numbers_of_the_stream_are_told():
     assert {name: values[name] for name in expected} == expected
 
 
-def test_numbers_of_the_calibration_are_told():
+def test_numbers_of_the_calibration_are_reported():
     values = dict(status(CALIBRATED).values)
     expected = {
         'grade': 'full',
@@ -150,7 +150,7 @@ def test_numbers_of_the_calibration_are_told():
     assert {name: values[name] for name in expected} == expected
 
 
-def test_lens_alone_says_why_there_is_no_plane():
+def test_lens_alone_gives_the_reason_there_is_no_plane():
     lens = replace(
         RESULT,
         grade='lens',

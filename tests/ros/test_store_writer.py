@@ -1,4 +1,4 @@
-"""The thread that writes."""
+"""The thread that writes calibrations."""
 
 import threading
 
@@ -19,16 +19,16 @@ def store(quick_path) -> Store:
 
 
 @pytest.fixture
-def told() -> list[str]:
+def warnings() -> list[str]:
     return []
 
 
 @pytest.fixture
-def start(told):
+def start(warnings):
     started = []
 
     def make(period_s: float = NEVER_S) -> StoreWriter:
-        started.append(StoreWriter(told.append, period_s))
+        started.append(StoreWriter(warnings.append, period_s))
         return started[-1]
 
     yield make
@@ -78,19 +78,19 @@ def test_step_runs_at_once_and_gives_its_result_or_error(start, store):
     assert store_writer.run(lambda: 5).result(PATIENCE_S) == 5
 
 
-def test_fault_is_told_once_and_the_offer_is_tried_again(start, store, told, quick_path):
+def test_fault_is_reported_once_and_the_offer_is_tried_again(start, store, warnings, quick_path):
     (quick_path / 'camera_info').touch()
     store_writer = start(0.02)
     store_writer.offer(store, FIRST)
-    wait_for(lambda: told, 'the fault')
+    wait_for(lambda: warnings, 'the fault')
     assert not threading.Event().wait(0.2)  # ten more tries
-    assert len(told) == 1 and 'cannot write' in told[0] and store_writer.fault == told[0]
+    assert len(warnings) == 1 and 'cannot write' in warnings[0] and store_writer.fault == warnings[0]
     (quick_path / 'camera_info').unlink()
     wait_for(lambda: kept(store) == 0, 'the calibration')
     wait_for(lambda: not store_writer.fault, 'the end of the fault')
 
 
-def test_closed_keeper_takes_no_more_steps(start):
+def test_closed_writer_takes_no_more_steps(start):
     store_writer = start()
     store_writer.close(PATIENCE_S)
     assert 'shutting down' in str(store_writer.run(lambda: 5).result(PATIENCE_S))

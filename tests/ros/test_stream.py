@@ -1,4 +1,4 @@
-"""Streams as cameras really send them: a node and a camera in processes of their own, seen by /diagnostics."""
+"""Image streams as real cameras send them: a node and a camera in processes of their own, seen by /diagnostics."""
 
 import json
 import signal
@@ -19,8 +19,8 @@ PATIENCE_S = 90.0
 RAW, COMPRESSED, LOSSY = {}, {'compressed': True}, {'reliable': False}
 
 
-class Told(list):
-    """What /diagnostics told; newest last."""
+class DiagnosticsLog(list):
+    """Messages of /diagnostics, newest last."""
 
     def newest(self) -> dict[str, str]:
         return {} if not self else {item.key: item.value for item in self[-1].status[0].values}
@@ -57,52 +57,52 @@ def running_camera(topic: str, *phases: dict):
 
 
 @pytest.fixture
-def told(bench: Bench) -> Told:
-    seen = Told()
+def diagnostics(bench: Bench) -> DiagnosticsLog:
+    seen = DiagnosticsLog()
     bench.client.create_subscription(DiagnosticArray, '/diagnostics', seen.append, 10)
     return seen
 
 
-def test_camera_that_starts_late_and_changes_its_reliability_twice_is_heard(told, tmp_path):
+def test_camera_that_starts_late_and_changes_its_reliability_twice_is_heard(diagnostics, tmp_path):
     with running_node(tmp_path / 'log'):
-        wait_for(lambda: told.newest().get('state') == 'WAITING_FOR_IMAGES', 'the node', PATIENCE_S)
+        wait_for(lambda: diagnostics.newest().get('state') == 'WAITING_FOR_IMAGES', 'the node', PATIENCE_S)
         with running_camera('/camera/image', RAW, LOSSY, RAW) as go_on:
-            wait_for(lambda: told.used() > 3, 'images', PATIENCE_S)
+            wait_for(lambda: diagnostics.used() > 3, 'images', PATIENCE_S)
             go_on()
-            reliably = told.used()
-            wait_for(lambda: told.used() > reliably + 10, 'images of best effort', PATIENCE_S)
+            reliably = diagnostics.used()
+            wait_for(lambda: diagnostics.used() > reliably + 10, 'images of best effort', PATIENCE_S)
             go_on()
-            lossily = told.used()
-            wait_for(lambda: told.used() > lossily + 10, 'reliable images', PATIENCE_S)
+            lossily = diagnostics.used()
+            wait_for(lambda: diagnostics.used() > lossily + 10, 'reliable images', PATIENCE_S)
     subscriptions = [line for line in (tmp_path / 'log').read_text().splitlines() if 'subscribed to' in line]
     assert [line.rpartition(' ')[2] for line in subscriptions] == ['reliable)', 'best_effort)', 'reliable)']
-    newest = told.newest()
+    newest = diagnostics.newest()
     assert (newest['state'], newest['encoding'], newest['image_topic']) == ('COLLECTING', 'mono8', '/camera/image')
     assert float(newest['received_hz']) > 0
-    status = told[-1].status[0]
+    status = diagnostics[-1].status[0]
     assert (status.level, status.name, status.hardware_id) == (b'\x01', 'site/autocalib: calibration', 'site')
 
 
-def test_compressed_images_are_heard(told, tmp_path):
+def test_compressed_images_are_heard(diagnostics, tmp_path):
     with (
         running_node(tmp_path / 'log', '-p', 'image_transport:=compressed'),
         running_camera('/camera/image/compressed', COMPRESSED),
     ):
-        wait_for(lambda: told.used() > 3, 'images', PATIENCE_S)
-    assert told.newest()['encoding'] == 'jpeg'
+        wait_for(lambda: diagnostics.used() > 3, 'images', PATIENCE_S)
+    assert diagnostics.newest()['encoding'] == 'jpeg'
 
 
-def test_resolution_that_changes_in_mid_stream_begins_the_evidence_anew(told, tmp_path):
+def test_resolution_that_changes_in_mid_stream_restarts_the_evidence(diagnostics, tmp_path):
     with running_node(tmp_path / 'log'), running_camera('/camera/image', RAW, {'width': 160, 'height': 120}) as go_on:
-        wait_for(lambda: told.used() > 3, 'images', PATIENCE_S)
+        wait_for(lambda: diagnostics.used() > 3, 'images', PATIENCE_S)
         go_on()
         wait_for(
-            lambda: 'the image size changed: the evidence is collected anew' in (tmp_path / 'log').read_text(),
+            lambda: 'the image size changed: collecting new evidence' in (tmp_path / 'log').read_text(),
             'the news',
             PATIENCE_S,
         )
-        before = told.used()
-        wait_for(lambda: told.used() > before + 3, 'images of the other size', PATIENCE_S)
+        before = diagnostics.used()
+        wait_for(lambda: diagnostics.used() > before + 3, 'images of the other size', PATIENCE_S)
 
 
 @pytest.mark.parametrize(
@@ -113,8 +113,8 @@ def test_resolution_that_changes_in_mid_stream_begins_the_evidence_anew(told, tm
     ],
     ids=['type', 'reliability'],
 )
-def test_stream_that_cannot_be_heard_is_told_as_an_error(told, tmp_path, arguments, topic, phase, words):
+def test_stream_that_cannot_be_heard_is_reported_as_an_error(diagnostics, tmp_path, arguments, topic, phase, words):
     with running_node(tmp_path / 'log', *arguments), running_camera(topic, phase):
-        wait_for(lambda: told and words in told[-1].status[0].message, 'the reason', PATIENCE_S)
-        assert told[-1].status[0].level == b'\x02'
+        wait_for(lambda: diagnostics and words in diagnostics[-1].status[0].message, 'the reason', PATIENCE_S)
+        assert diagnostics[-1].status[0].level == b'\x02'
         assert words in (tmp_path / 'log').read_text()

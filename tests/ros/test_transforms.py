@@ -58,29 +58,34 @@ def test_a_ground_under_the_camera_leaves_a_tree(foreign):
 
 
 @pytest.mark.parametrize(
-    ('foreign', 'tf_parent', 'told', 'remedy'),
+    ('foreign', 'tf_parent', 'expected', 'remedy'),
     [
         ({('base', 'cam1')}, 'ground', "'base' as the parent of 'cam1'", "set tf_parent to 'camera'"),
         (
             {('map', 'cam1_ground')},
             'camera',
             "'map' as the parent of 'cam1_ground'",
-            "set ground_frame to a name of its own, or tf_parent to 'ground'",
+            "set ground_frame to a unique name, or tf_parent to 'ground'",
         ),
-        ({('cam1', 'cam1_ground')}, 'ground', "hangs 'cam1_ground' from 'cam1'", 'set ground_frame'),
+        ({('cam1', 'cam1_ground')}, 'ground', "publishes 'cam1_ground' below 'cam1'", 'set ground_frame'),
         (
             {('cam1', 'a'), ('a', 'b'), ('b', 'cam1_ground')},
             'ground',
-            "hangs 'cam1_ground' from 'cam1'",
+            "publishes 'cam1_ground' below 'cam1'",
             'set ground_frame',
         ),
-        ({('cam1_ground', 'mast'), ('mast', 'cam1')}, 'camera', "hangs 'cam1' from 'cam1_ground'", 'set ground_frame'),
+        (
+            {('cam1_ground', 'mast'), ('mast', 'cam1')},
+            'camera',
+            "publishes 'cam1' below 'cam1_ground'",
+            'set ground_frame',
+        ),
     ],
 )
-def test_a_second_parent_and_a_loop_are_told_with_the_parameter_to_set(foreign, tf_parent, told, remedy):
+def test_a_second_parent_and_a_loop_are_reported_with_the_parameter_to_set(foreign, tf_parent, expected, remedy):
     edge = ('cam1_ground', 'cam1') if tf_parent == 'ground' else ('cam1', 'cam1_ground')
     text = conflict(*edge, foreign, tf_parent=tf_parent)
-    assert told in text and remedy in text
+    assert expected in text and remedy in text
     assert '\n' not in text
 
 
@@ -132,20 +137,20 @@ def test_a_list_that_gives_a_frame_two_parents_is_refused():
 
 @with_tf2
 @pytest.mark.parametrize(
-    ('name', 'value', 'told'),
+    ('name', 'value', 'expected'),
     [
         ('x', float('nan'), r'TFMessage\.transforms.*translation\.x is nan'),
         ('x', 1, r'TFMessage\.transforms.*translation\.x is a int, not a float'),
     ],
 )
-def test_a_list_with_a_broken_transform_is_refused(name, value, told):
+def test_a_list_with_a_broken_transform_is_refused(name, value, expected):
     from tf2_msgs.msg import TFMessage
 
     message = TFMessage(
         transforms=[ground_transform_message(GroundPlane(ROTATION, 8.0), time_message(1), 'ground', 'cam')]
     )
     object.__setattr__(message.transforms[0].transform.translation, f'_{name}', value)
-    with pytest.raises(InvalidMessage, match=told):
+    with pytest.raises(InvalidMessage, match=expected):
         validated(message)
 
 
@@ -280,4 +285,4 @@ def test_without_tf2_msgs_the_transform_has_its_own_topic_and_one_warning(bench,
     cameras.calibrate()
     wait_for(lambda: [message.transform.translation.z for message in received][-1:] == [9.0], 'the transform')
     assert bench.client.count_publishers('/tf_static') == 0
-    assert capfd.readouterr().err.count('tf2_msgs is not there') == 1
+    assert capfd.readouterr().err.count('tf2_msgs is not installed') == 1

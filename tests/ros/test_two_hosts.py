@@ -25,7 +25,7 @@ NEEDED = {'focal_px', 'height_m'} | ({'tf_static_m'} if importlib.util.find_spec
 
 
 def ip(*words: str) -> None:
-    """Run ip; an error tells what it said."""
+    """Run ip; an error includes its output."""
     done = subprocess.run(['ip', *words], capture_output=True, text=True, timeout=20, check=False)
     if done.returncode:
         raise OSError(f'ip {" ".join(words)}: {done.stderr.strip()}')
@@ -45,7 +45,7 @@ def connect(hosts: tuple[str, str]) -> None:
 
 @pytest.fixture
 def hosts() -> Iterator[tuple[str, str]]:
-    """Yield the names of two hosts; they are gone afterwards, whatever happens."""
+    """Yield the names of two hosts; they are removed afterwards in any case."""
     if os.geteuid() != 0 or shutil.which('ip') is None:
         pytest.skip('two hosts take root and iproute2: run as root with `ip` installed')
     names = (f'autocalib{os.getpid()}a', f'autocalib{os.getpid()}b')
@@ -73,18 +73,18 @@ class Process:
             stdout=subprocess.PIPE,
             text=True,
         )
-        self.told: list[list] = []
+        self.received: list[list] = []
         self._reader = threading.Thread(target=self._read)
         self._reader.start()
 
     def _read(self) -> None:
         for line in self._process.stdout:
-            self.told.append(json.loads(line))
+            self.received.append(json.loads(line))
 
     @property
     def newest(self) -> dict[str, float]:
         """The newest value of each kind."""
-        return dict(tuple(item) for item in self.told)
+        return dict(tuple(item) for item in self.received)
 
     def kill(self) -> None:
         self._process.kill()
@@ -109,7 +109,7 @@ def test_a_consumer_on_another_host_gets_the_calibration_late_and_again_after_a_
             with running(hosts[1], 'far_consumer.py') as late:
                 wait_for(lambda: late.newest.keys() >= NEEDED, 'the calibration, latched')
                 assert late.newest == consumer.newest == dict.fromkeys(NEEDED, 8.0) | {'focal_px': 300.0}
-        before = len(consumer.told)
+        before = len(consumer.received)
         with running(hosts[0], 'camera_host.py', '310.0'):
-            wait_for(lambda: {what for what, _ in consumer.told[before:]} >= NEEDED, 'what the new node restores')
+            wait_for(lambda: {what for what, _ in consumer.received[before:]} >= NEEDED, 'what the new node restores')
             wait_for(lambda: consumer.newest == dict.fromkeys(NEEDED, 8.0) | {'focal_px': 310.0}, 'what it solves')

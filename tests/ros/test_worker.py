@@ -18,7 +18,7 @@ NEVER_S = 1e6
 
 
 class Heard:
-    """A listener that writes down what it is told."""
+    """A listener that records what it receives."""
 
     def __init__(self):
         self.sizes, self.unreadable, self.results, self.faults, self.anew = [], [], [], [], []
@@ -64,7 +64,7 @@ def heard() -> Heard:
 
 @pytest.fixture
 def start(heard):
-    """Start a pipeline around a solver; closed at the end."""
+    """Start a worker around a solver; closed at the end."""
     started = []
 
     def make(solve, idle_solve_s: float = NEVER_S, **more) -> CalibrationWorker:
@@ -81,25 +81,25 @@ def start(heard):
         return started[-1]
 
     yield make
-    for pipeline in started:
-        pipeline.close(PATIENCE_S)
+    for worker in started:
+        worker.close(PATIENCE_S)
 
 
-def feed(pipeline: CalibrationWorker, heard: Heard, count: int, first: int = 0) -> None:
+def feed(worker: CalibrationWorker, heard: Heard, count: int, first: int = 0) -> None:
     """Offer images one by one, each after the one before has been used."""
     for number in range(first, first + count):
-        pipeline.offer(number * FRAME_NS, PIXELS)
+        worker.offer(number * FRAME_NS, PIXELS)
         wait_for(lambda wanted=number + 1: len(heard.sizes) >= wanted, f'image {number}')
 
 
-def offer_while_held_up(pipeline: CalibrationWorker, count: int) -> None:
+def offer_while_held_up(worker: CalibrationWorker, count: int) -> None:
     """Offer `count` images, all but the first while the first one is being decoded."""
     entered, release = threading.Event(), threading.Event()
-    pipeline._decode = lambda message: (entered.set(), release.wait(PATIENCE_S), message)[2]
-    pipeline.offer(0, PIXELS)
+    worker._decode = lambda message: (entered.set(), release.wait(PATIENCE_S), message)[2]
+    worker.offer(0, PIXELS)
     assert entered.wait(PATIENCE_S)
     for number in range(1, count):
-        pipeline.offer(number * FRAME_NS, PIXELS)
+        worker.offer(number * FRAME_NS, PIXELS)
     release.set()
 
 
@@ -108,8 +108,8 @@ def result_of(future: Future):
 
 
 def test_what_is_left_is_solved_once_when_no_image_comes(start, heard):
-    pipeline = start(calibration, idle_solve_s=0.1)
-    feed(pipeline, heard, 3)
+    worker = start(calibration, idle_solve_s=0.1)
+    feed(worker, heard, 3)
     wait_for(lambda: heard.results and heard.results[-1].evidence.frames == 3, 'the idle solution')
     solved = len(heard.results)
     assert not threading.Event().wait(0.5)  # five times the idle time: long enough for a second solution to show
@@ -118,11 +118,11 @@ def test_what_is_left_is_solved_once_when_no_image_comes(start, heard):
 
 def test_images_keep_flowing_while_a_solution_runs(start, heard):
     slow = Slow()
-    pipeline = start(slow)
-    feed(pipeline, heard, 2)
-    answer = pipeline.solve_now()
+    worker = start(slow)
+    feed(worker, heard, 2)
+    answer = worker.solve_now()
     assert slow.running.wait(PATIENCE_S)
-    feed(pipeline, heard, 20, first=2)
+    feed(worker, heard, 20, first=2)
     assert not answer.done()
     slow.release.set()
     assert result_of(answer).evidence.frames == 2
@@ -130,80 +130,80 @@ def test_images_keep_flowing_while_a_solution_runs(start, heard):
 
 def test_newest_snapshot_takes_the_place_and_the_callers_of_one_that_waits(start, heard):
     slow = Slow()
-    pipeline = start(slow)
-    feed(pipeline, heard, 1)
-    answers = [pipeline.solve_now()]
+    worker = start(slow)
+    feed(worker, heard, 1)
+    answers = [worker.solve_now()]
     assert slow.running.wait(PATIENCE_S)
     for number in (1, 2):
-        feed(pipeline, heard, 1, first=number)
-        answers.append(pipeline.solve_now())
-        wait_for(lambda: not pipeline._requests, 'the snapshot')
+        feed(worker, heard, 1, first=number)
+        answers.append(worker.solve_now())
+        wait_for(lambda: not worker._requests, 'the snapshot')
     slow.release.set()
     assert [result_of(answer).evidence.frames for answer in answers] == [1, 3, 3]
     assert [result.evidence.frames for result in heard.results] == [1, 3]
 
 
 def test_late_images_are_dropped_and_counted(start, heard):
-    pipeline = start(calibration)
-    offer_while_held_up(pipeline, IMAGE_QUEUE_SIZE + 4)
-    wait_for(lambda: pipeline.counters.used == IMAGE_QUEUE_SIZE + 1, 'the first and the newest images')
-    assert (pipeline.counters.received, pipeline.counters.dropped) == (IMAGE_QUEUE_SIZE + 4, 3)
+    worker = start(calibration)
+    offer_while_held_up(worker, IMAGE_QUEUE_SIZE + 4)
+    wait_for(lambda: worker.counters.used == IMAGE_QUEUE_SIZE + 1, 'the first and the newest images')
+    assert (worker.counters.received, worker.counters.dropped) == (IMAGE_QUEUE_SIZE + 4, 3)
 
 
 def test_a_hiccup_loses_no_image(start, heard):
-    pipeline = start(calibration)
-    offer_while_held_up(pipeline, IMAGE_QUEUE_SIZE + 1)
-    wait_for(lambda: pipeline.counters.used == IMAGE_QUEUE_SIZE + 1, 'all images')
-    assert pipeline.counters.dropped == 0
+    worker = start(calibration)
+    offer_while_held_up(worker, IMAGE_QUEUE_SIZE + 1)
+    wait_for(lambda: worker.counters.used == IMAGE_QUEUE_SIZE + 1, 'all images')
+    assert worker.counters.dropped == 0
 
 
-def test_unreadable_image_is_told_and_the_stream_goes_on(start, heard):
-    pipeline = start(calibration)
-    pipeline.offer(0, None)
+def test_unreadable_image_is_reported_and_the_stream_goes_on(start, heard):
+    worker = start(calibration)
+    worker.offer(0, None)
     wait_for(lambda: heard.unreadable == ['torn image'], 'the complaint')
-    feed(pipeline, heard, 1)
-    assert (pipeline.counters.unreadable, pipeline.counters.used) == (1, 1)
+    feed(worker, heard, 1)
+    assert (worker.counters.unreadable, worker.counters.used) == (1, 1)
 
 
 def test_late_images_are_counted_and_not_used(start, heard):
-    pipeline = start(calibration)
-    feed(pipeline, heard, 10)
+    worker = start(calibration)
+    feed(worker, heard, 10)
     for number in (9, 5):  # a stamp twice, and one out of order
-        pipeline.offer(number * FRAME_NS, PIXELS)
-    feed(pipeline, heard, 1, first=10)
-    assert (pipeline.counters.late, pipeline.counters.used, heard.anew) == (2, 11, [])
-    assert result_of(pipeline.solve_now()).evidence.frames == 11
+        worker.offer(number * FRAME_NS, PIXELS)
+    feed(worker, heard, 1, first=10)
+    assert (worker.counters.late, worker.counters.used, heard.anew) == (2, 11, [])
+    assert result_of(worker.solve_now()).evidence.frames == 11
 
 
-def test_recording_that_begins_again_is_told_and_its_evidence_begins_anew(start, heard):
-    pipeline = start(calibration)
-    feed(pipeline, heard, 20)
-    pipeline.offer(0, PIXELS)
+def test_recording_that_begins_again_is_reported_and_its_evidence_restarts_the_evidence(start, heard):
+    worker = start(calibration)
+    feed(worker, heard, 20)
+    worker.offer(0, PIXELS)
     wait_for(lambda: heard.anew, 'the news')
-    assert heard.anew == ['the time stamps stepped']
-    assert result_of(pipeline.solve_now()).evidence.frames == 1
+    assert heard.anew == ['the time stamps jumped']
+    assert result_of(worker.solve_now()).evidence.frames == 1
 
 
 def test_other_options_are_solved_with_though_no_image_comes(start, heard):
-    told = []
-    pipeline = start(calibration, idle_solve_s=0.1)
-    pipeline._solve = lambda evidence, options, lens: told.append(options.camera_height) or calibration(evidence)
-    feed(pipeline, heard, 1)
-    wait_for(lambda: told == [0.0], 'the first solution')
-    pipeline.change(Options(camera_height=9.0), 0.1)
-    wait_for(lambda: told == [0.0, 9.0], 'a solution by the new options')
+    heights = []
+    worker = start(calibration, idle_solve_s=0.1)
+    worker._solve = lambda evidence, options, lens: heights.append(options.camera_height) or calibration(evidence)
+    feed(worker, heard, 1)
+    wait_for(lambda: heights == [0.0], 'the first solution')
+    worker.change(Options(camera_height=9.0), 0.1)
+    wait_for(lambda: heights == [0.0, 9.0], 'a solution by the new options')
 
 
 def test_solver_rests_unless_somebody_waits(start, heard, monkeypatch):
-    monkeypatch.setattr('autocalib_ros.ros.worker.REST', 1e6)
-    pipeline = start(lambda evidence: threading.Event().wait(0.01) or calibration(evidence))
-    feed(pipeline, heard, 1)
-    assert result_of(pipeline.solve_now())
-    feed(pipeline, heard, 1, first=1)
-    pipeline._submit(pipeline._calibrator.snapshot(), [])
+    monkeypatch.setattr('autocalib_ros.ros.worker.REST_FACTOR', 1e6)
+    worker = start(lambda evidence: threading.Event().wait(0.01) or calibration(evidence))
+    feed(worker, heard, 1)
+    assert result_of(worker.solve_now())
+    feed(worker, heard, 1, first=1)
+    worker._submit(worker._calibrator.snapshot(), [])
     assert not threading.Event().wait(0.3)  # long enough for a solution that does not wait to show
     assert len(heard.results) == 1
-    assert result_of(pipeline.solve_now()).evidence.frames == 2
+    assert result_of(worker.solve_now()).evidence.frames == 2
 
 
 def test_close_stops_a_solver_that_can_be_stopped_and_reports_no_fault(start, heard):
@@ -214,15 +214,15 @@ def test_close_stops_a_solver_that_can_be_stopped_and_reports_no_fault(start, he
         assert stopped.wait(PATIENCE_S)
         raise RuntimeError('stopped')
 
-    pipeline = start(slow, stop_solving=stopped.set)
-    feed(pipeline, heard, 1)
-    pipeline.solve_now()
+    worker = start(slow, stop_solving=stopped.set)
+    feed(worker, heard, 1)
+    worker.solve_now()
     assert running.wait(PATIENCE_S)
-    assert pipeline.close(PATIENCE_S)
+    assert worker.close(PATIENCE_S)
     assert not heard.faults
 
 
-def test_fault_of_a_solver_is_told_and_the_next_solution_works(start, heard):
+def test_fault_of_a_solver_is_reported_and_the_next_solution_works(start, heard):
     faults = [ZeroDivisionError('a bug')]
 
     def faulty(evidence):
@@ -230,43 +230,43 @@ def test_fault_of_a_solver_is_told_and_the_next_solution_works(start, heard):
             raise faults.pop()
         return refusal(evidence)
 
-    pipeline = start(faulty)
-    feed(pipeline, heard, 1)
-    assert result_of(pipeline.solve_now()) is None
+    worker = start(faulty)
+    feed(worker, heard, 1)
+    assert result_of(worker.solve_now()) is None
     assert isinstance(heard.faults[0], ZeroDivisionError)
-    assert result_of(pipeline.solve_now()).code == 'too_few_tracks'
+    assert result_of(worker.solve_now()).code == 'too_few_tracks'
 
 
 def test_known_lens_is_given_to_the_solver_in_the_size_of_the_images(start, heard):
     height, width = PIXELS.shape
     lens = replace(Camera.equidistant(2 * width, 2 * height, 500.0), k=(0.01, 0.0, 0.0, 0.0))
-    pipeline = start(lambda evidence, lens: replace(calibration(evidence), camera=lens), lens=lens)
-    feed(pipeline, heard, 1)
-    camera = result_of(pipeline.solve_now()).camera
+    worker = start(lambda evidence, lens: replace(calibration(evidence), camera=lens), lens=lens)
+    feed(worker, heard, 1)
+    camera = result_of(worker.solve_now()).camera
     assert camera == replace(Camera.equidistant(width, height, 250.0), k=(0.01, 0.0, 0.0, 0.0))
 
 
-def test_image_of_another_shape_than_the_known_lens_is_left_out_and_told(start, heard):
+def test_image_of_another_shape_than_the_known_lens_is_left_out_and_reported(start, heard):
     height, width = PIXELS.shape
-    pipeline = start(lambda evidence, lens: calibration(evidence), lens=Camera.equidistant(width, height, 250.0))
-    pipeline.offer(0, np.zeros((height, 2 * width), np.uint8))
+    worker = start(lambda evidence, lens: calibration(evidence), lens=Camera.equidistant(width, height, 250.0))
+    worker.offer(0, np.zeros((height, 2 * width), np.uint8))
     wait_for(lambda: heard.unreadable, 'the complaint')
     assert heard.unreadable == [
         f'the lens was calibrated in images of {width}x{height}, and these images have '
         f'{2 * width}x{height}, another shape: give a calibration of their size'
     ]
-    feed(pipeline, heard, 1)
+    feed(worker, heard, 1)
     assert (heard.sizes, heard.faults) == ([(width, height)], [])
 
 
-def test_progress_says_why_the_last_solution_was_refused(start, heard, monkeypatch):
+def test_progress_gives_the_reason_the_last_solution_was_refused(start, heard, monkeypatch):
     monkeypatch.setattr('autocalib_ros.ros.worker.PROGRESS_PERIOD_S', 0.0)
-    pipeline = start(refusal)
-    pipeline.offer(0, PIXELS)
-    pipeline.solve_now().result(PATIENCE_S)
-    pipeline.offer(FRAME_NS, PIXELS)
-    wait_for(lambda: pipeline.progress and '12 tracks of the 40 needed.' in pipeline.progress.missing, 'the reason')
-    assert pipeline.progress.percent <= 99.0
+    worker = start(refusal)
+    worker.offer(0, PIXELS)
+    worker.solve_now().result(PATIENCE_S)
+    worker.offer(FRAME_NS, PIXELS)
+    wait_for(lambda: worker.progress and '12 tracks of the 40 needed.' in worker.progress.missing, 'the reason')
+    assert worker.progress.percent <= 99.0
 
 
 def test_nothing_to_solve_before_the_first_image(start):
@@ -275,69 +275,69 @@ def test_nothing_to_solve_before_the_first_image(start):
 
 def test_close_sends_callers_away_and_says_that_a_solution_still_runs(start, heard):
     slow = Slow()
-    pipeline = start(slow)
-    feed(pipeline, heard, 1)
-    answer = pipeline.solve_now()
+    worker = start(slow)
+    feed(worker, heard, 1)
+    answer = worker.solve_now()
     assert slow.running.wait(PATIENCE_S)
-    assert not pipeline.close(timeout_s=0.1)
+    assert not worker.close(timeout_s=0.1)
     assert result_of(answer) is None
     slow.release.set()
-    assert pipeline.close(PATIENCE_S)
+    assert worker.close(PATIENCE_S)
 
 
 def test_close_ends_idle_threads(start):
     assert start(calibration).close(PATIENCE_S)
 
 
-def test_reset_starts_the_evidence_anew(start, heard):
-    pipeline = start(calibration)
-    feed(pipeline, heard, 5)
-    pipeline.reset()
-    assert result_of(pipeline.solve_now()) is None
-    feed(pipeline, heard, 2, first=5)
-    assert result_of(pipeline.solve_now()).evidence.frames == 2
+def test_reset_drops_the_evidence(start, heard):
+    worker = start(calibration)
+    feed(worker, heard, 5)
+    worker.reset()
+    assert result_of(worker.solve_now()) is None
+    feed(worker, heard, 2, first=5)
+    assert result_of(worker.solve_now()).evidence.frames == 2
 
 
-def test_solution_that_runs_during_a_reset_is_not_told_and_its_callers_do_not_wait(start, heard):
+def test_solution_that_runs_during_a_reset_is_not_reported_and_its_callers_do_not_wait(start, heard):
     slow = Slow()
-    pipeline = start(slow)
-    feed(pipeline, heard, 3)
-    answer = pipeline.solve_now()
+    worker = start(slow)
+    feed(worker, heard, 3)
+    answer = worker.solve_now()
     assert slow.running.wait(PATIENCE_S)
-    pipeline.reset()
+    worker.reset()
     assert result_of(answer) is None
-    feed(pipeline, heard, 1, first=3)
+    feed(worker, heard, 1, first=3)
     slow.release.set()
-    assert result_of(pipeline.solve_now()).evidence.frames == 1
+    assert result_of(worker.solve_now()).evidence.frames == 1
     assert [result.evidence.frames for result in heard.results] == [1]
 
 
 def test_image_that_is_looked_at_during_a_reset_is_no_evidence_after_it(start, heard):
-    pipeline = start(calibration, idle_solve_s=0.1)
+    worker = start(calibration, idle_solve_s=0.1)
     entered, release = threading.Event(), threading.Event()
-    pipeline._decode = lambda message: (entered.set(), release.wait(PATIENCE_S), message)[2]
-    pipeline.offer(0, PIXELS)
+    worker._decode = lambda message: (entered.set(), release.wait(PATIENCE_S), message)[2]
+    worker.offer(0, PIXELS)
     assert entered.wait(PATIENCE_S)
-    pipeline.offer(FRAME_NS, PIXELS)
-    pipeline.reset()
+    worker.offer(FRAME_NS, PIXELS)
+    worker.reset()
     release.set()
     wait_for(lambda: heard.sizes, 'the image')
-    assert result_of(pipeline.solve_now()) is None
-    feed(pipeline, heard, 1, first=1)
-    assert result_of(pipeline.solve_now()).evidence.frames == 1
+    assert result_of(worker.solve_now()) is None
+    feed(worker, heard, 1, first=1)
+    assert result_of(worker.solve_now()).evidence.frames == 1
     assert [result.evidence.frames for result in heard.results] == [1]
 
 
-def test_reset_returns_when_nothing_is_told_any_more(start, heard, monkeypatch):
+def test_reset_returns_when_nothing_is_reported_any_more(start, heard, monkeypatch):
     telling, release = threading.Event(), threading.Event()
     monkeypatch.setattr(
         heard, 'solved', lambda result: (telling.set(), release.wait(PATIENCE_S), heard.results.append(result))
     )
-    pipeline = start(calibration)
-    feed(pipeline, heard, 1)
-    pipeline.solve_now()
+    worker = start(calibration)
+    feed(worker, heard, 1)
+    worker.solve_now()
     assert telling.wait(PATIENCE_S)
-    resetting = threading.Thread(target=pipeline.reset)
+    resetting = threading.Thread(target=worker.reset)
     resetting.start()
     assert not threading.Event().wait(0.1) and resetting.is_alive()
     release.set()
@@ -347,12 +347,12 @@ def test_reset_returns_when_nothing_is_told_any_more(start, heard, monkeypatch):
 
 def test_progress_of_before_a_reset_is_forgotten(start, heard, monkeypatch):
     monkeypatch.setattr('autocalib_ros.ros.worker.PROGRESS_PERIOD_S', 0.0)
-    pipeline = start(refusal)
-    feed(pipeline, heard, 1)
-    result_of(pipeline.solve_now())
-    wait_for(lambda: pipeline.progress, 'the progress')
-    pipeline.reset()
-    assert pipeline.progress is None
-    feed(pipeline, heard, 1, first=1)
-    wait_for(lambda: pipeline.progress, 'the progress')
-    assert '12 tracks of the 40 needed.' not in pipeline.progress.missing
+    worker = start(refusal)
+    feed(worker, heard, 1)
+    result_of(worker.solve_now())
+    wait_for(lambda: worker.progress, 'the progress')
+    worker.reset()
+    assert worker.progress is None
+    feed(worker, heard, 1, first=1)
+    wait_for(lambda: worker.progress, 'the progress')
+    assert '12 tracks of the 40 needed.' not in worker.progress.missing

@@ -1,4 +1,4 @@
-"""Write config/autocalib.yaml anew from the options: python tests/tools/write_params_file.py."""
+"""Regenerate config/autocalib.yaml from the options: python tests/tools/write_params_file.py."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ from typing import Any
 from autocalib_ros.config import RECONFIGURABLE, NodeOptions, Options
 
 HEAD = """\
-# Every option of autocalib_ros with its default: what it does, and what it may be.
+# All options of autocalib_ros with default, meaning, unit and range.
 #
 #   autocalib_node --ros-args --params-file autocalib.yaml -p camera_height:=8.0
 #   autocalib replay BAG --params-file autocalib.yaml --camera-height 8.0
 #
-# Copy the file and keep only the lines that you change. An unknown name is an error. A number with a point
-# stays one with a point: ROS refuses 8 where 8.0 is meant. The file has to stand before every -p that is to win.
+# Copy the file and keep only the lines that you change. An unknown name is an error. Write floats with a decimal
+# point: ROS rejects 8 for 8.0. Put --params-file before any -p that overrides it.
 #
 {changes}
 
 /**:
   ros__parameters:"""
-CHANGES = 'While a node runs, `ros2 param set` changes these options and groups, and a solution follows at once:'
-FIXED = 'All else shapes the evidence from the first image on, or names what others rely on, and is read-only.'
+CHANGES = 'A running node accepts these options and groups by `ros2 param set` and solves again at once:'
+FIXED = 'All others are read-only: they shape the evidence from the first image on, or name topics, frames and files.'
 WIDTH = 118
 
 
 def lines_of(options: Any, indent: str) -> Iterator[str]:
-    """Yield the lines of an option dataclass, each option under what it does and may be."""
+    """Yield the lines of an option dataclass, each option below its description and range."""
     for item in dataclasses.fields(options):
         value = getattr(options, item.name)
         if dataclasses.is_dataclass(value):
@@ -45,7 +45,7 @@ def lines_of(options: Any, indent: str) -> Iterator[str]:
 
 
 def permitted(meta: Any) -> str:
-    """Say which values an option takes."""
+    """Return the permitted values of an option as text."""
     low, high = meta['low'], meta['high']
     if meta['choices']:
         return f' One of: {", ".join(meta["choices"])}.'
@@ -57,7 +57,7 @@ def permitted(meta: Any) -> str:
 
 
 def as_yaml(value: Any) -> str:
-    """Write a value so that YAML and ROS read the same type back."""
+    """Return a value as YAML of the same type in ROS."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, float):
@@ -67,7 +67,7 @@ def as_yaml(value: Any) -> str:
 
 
 def first_line(options: Any) -> str:
-    """Return what an option dataclass is about."""
+    """Return the first docstring line of an option dataclass."""
     return (type(options).__doc__ or '').splitlines()[0]
 
 

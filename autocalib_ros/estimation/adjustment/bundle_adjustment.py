@@ -177,7 +177,7 @@ def adjust(
 
 
 def _enough_rows(labels: np.ndarray, config: AdjustmentConfig) -> bool:
-    turning = len(config.windows) + (0 if config.bundle is None else len(config.bundle.lives))
+    turning = len(config.windows) + (0 if config.bundle is None else len(config.bundle.tracklets))
     return np.count_nonzero(labels >= 0) + turning >= MIN_RESIDUAL_ROWS
 
 

@@ -45,13 +45,13 @@ class LinearisedRows:
     """Weight from evidence outside the row's residuals (corroboration by other tracks), shape (rows,)."""
 
     @classmethod
-    def of(cls, residuals: np.ndarray, slopes: np.ndarray, dof: np.ndarray, influence: np.ndarray) -> LinearisedRows:
-        """Sum residuals (rows, samples) and Jacobians `slopes` (rows, samples, parameters) over the samples."""
-        transposed = slopes.transpose(0, 2, 1)
+    def of(cls, residuals: np.ndarray, jacobian: np.ndarray, dof: np.ndarray, influence: np.ndarray) -> LinearisedRows:
+        """Sum residuals (rows, samples) and Jacobians `jacobian` (rows, samples, parameters) over the samples."""
+        transposed = jacobian.transpose(0, 2, 1)
         return cls(
             (residuals**2).sum(axis=1) / dof,
             (transposed @ residuals[..., None])[..., 0],
-            transposed @ slopes,
+            transposed @ jacobian,
             influence,
         )
 
@@ -134,12 +134,14 @@ class StraightTrackBlock:
             (pull @ (-dot(self._normals, turn)[:, None] * self._directions)[..., None])[..., 0]
             for turn in self._turns()
         ]
-        slopes = self.whiten @ np.stack([free, *columns], axis=-1)
-        free, slopes = slopes[..., :1], slopes[..., 1:]
-        along = (free * slopes).sum(axis=1, keepdims=True) / np.maximum((free * free).sum(axis=1, keepdims=True), 1e-12)
+        jacobian = self.whiten @ np.stack([free, *columns], axis=-1)
+        free, jacobian = jacobian[..., :1], jacobian[..., 1:]
+        along = (free * jacobian).sum(axis=1, keepdims=True) / np.maximum(
+            (free * free).sum(axis=1, keepdims=True), 1e-12
+        )
         return LinearisedRows.of(
             (self.whiten @ distance[..., None])[..., 0],
-            slopes - free * along,
+            jacobian - free * along,
             self.dof,
             self._lane_keeping_weights(distance),
         )
@@ -177,7 +179,7 @@ class PlanarMotionBlock:
         self._base = view = self._view(parameters.base)
         self.warm_start = initial_motion(view) if motion is None else refined(view, motion)
         self._distances = view.distances(self.warm_start)
-        self._slopes = view.slopes(self.warm_start, self._distances)
+        self._slopes = view.jacobian(self.warm_start, self._distances)
         self._root = np.sqrt(robust_weight(self._distances))
         self.dof = np.maximum(view.mask.sum(axis=1) - 2, 1)
 
@@ -196,11 +198,11 @@ class PlanarMotionBlock:
         columns = [
             (self._distances_at(unit) - self._distances) / DIFFERENTIATION_STEP for unit in np.eye(parameters.size)
         ]
-        slopes = self._root[..., None] * np.stack(columns, axis=-1)
+        jacobian = self._root[..., None] * np.stack(columns, axis=-1)
         own = self._root[..., None] * self._slopes
         matrix = own.transpose(0, 2, 1) @ own + 1e-9 * np.eye(2)
-        slopes = slopes - own @ np.linalg.solve(matrix, own.transpose(0, 2, 1) @ slopes)
-        return LinearisedRows.of(self._root * self._distances, slopes, self.dof, np.ones(len(self.dof)))
+        jacobian = jacobian - own @ np.linalg.solve(matrix, own.transpose(0, 2, 1) @ jacobian)
+        return LinearisedRows.of(self._root * self._distances, jacobian, self.dof, np.ones(len(self.dof)))
 
     def distances_px(self) -> tuple[np.ndarray, np.ndarray]:
         """Return observed pixels (n, 2) and their distances (n,) from the motions of their windows, at the base."""
@@ -224,16 +226,22 @@ class PlanarMotionBlock:
 class RigidBodyBlock:
     """Tracklets of rigid bodies, one a row: reprojection errors of the best shape and motion of each tracklet.
 
-    `shapes` is the warm start, None where there is none.
+    `unknowns` is the warm start, None where there is none.
     """
 
-    def __init__(self, parameters: Parameterisation, bundle: TrackletBundle, shapes: StructureAndMotion | None) -> None:
+    def __init__(
+        self, parameters: Parameterisation, bundle: TrackletBundle, unknowns: StructureAndMotion | None
+    ) -> None:
         self._parameters, self._bundle, base = parameters, bundle, parameters.base
-        self.vehicle_ids, self.vehicle_weight, self.dof = bundle.lives.bodies, bundle.lives.body_weights, bundle.dof
+        self.vehicle_ids, self.vehicle_weight, self.dof = (
+            bundle.tracklets.bodies,
+            bundle.tracklets.body_weights,
+            bundle.dof,
+        )
         self.warm_start = (
             bundle.initialised(base.camera, base.rotation)
-            if shapes is None
-            else bundle.refined(base.camera, base.rotation, shapes)
+            if unknowns is None
+            else bundle.refined(base.camera, base.rotation, unknowns)
         )
         self._residuals = bundle.residuals(base.camera, base.rotation, self.warm_start)
         self._root = np.sqrt(bundle.robust_weight(self._residuals))[:, :, None, None]
@@ -244,14 +252,14 @@ class RigidBodyBlock:
         """Return the shapes and the mean squared residuals (tracklets,) at a parameter step."""
         state = self._parameters.state(step)
         near = self.warm_start if self._follow is None else self.warm_start.stepped(-(self._follow @ step))
-        shapes = self._bundle.refined(state.camera, state.rotation, near)
-        residuals = self._root * self._bundle.residuals(state.camera, state.rotation, shapes)
-        return shapes, (residuals**2).sum(axis=(1, 2, 3)) / self.dof
+        unknowns = self._bundle.refined(state.camera, state.rotation, near)
+        residuals = self._root * self._bundle.residuals(state.camera, state.rotation, unknowns)
+        return unknowns, (residuals**2).sum(axis=(1, 2, 3)) / self.dof
 
     def linearise(self) -> LinearisedRows:
         """Return the rows at the base; shape and motion of each tracklet are projected out."""
         parameters, bundle, base = self._parameters, self._bundle, self._parameters.base
-        slopes, by_place = bundle.slopes(base.camera, base.rotation, self.warm_start)
+        jacobian, by_place = bundle.jacobian(base.camera, base.rotation, self.warm_start)
         lenses = [parameters.camera(DIFFERENTIATION_STEP * unit) for unit in np.eye(parameters.lens)]
         columns = [
             change / DIFFERENTIATION_STEP
@@ -259,7 +267,7 @@ class RigidBodyBlock:
         ]
         columns += [bundle.rotation_jacobian(axis, by_place, self.warm_start) for axis in parameters.axes]
         columns += [np.zeros(self._residuals.shape)] * len(parameters.free_angles)
-        own, residuals = bundle.weighted_system(slopes, self._residuals)
+        own, residuals = bundle.weighted_system(jacobian, self._residuals)
         shared = (self._root[..., None] * np.stack(columns, axis=-1)).reshape(len(own), -1, parameters.size)
         matrix = damped(own.transpose(0, 2, 1) @ own, np.zeros(len(own)))
         self._follow = np.linalg.solve(matrix, own.transpose(0, 2, 1) @ shared)
@@ -267,6 +275,6 @@ class RigidBodyBlock:
 
     def distances_px(self) -> tuple[np.ndarray, np.ndarray]:
         """Return observed pixels (n, 2) and their reprojection errors (n,), at the base."""
-        base, lives = self._parameters.base, self._bundle.lives
+        base, tracklets = self._parameters.base, self._bundle.tracklets
         away = self._bundle.reprojection_errors_px(base.camera, base.rotation, self.warm_start)
-        return lives.pixels[lives.mask], np.hypot(*away[lives.mask].T)
+        return tracklets.pixels[tracklets.mask], np.hypot(*away[tracklets.mask].T)

@@ -117,7 +117,7 @@ class WindowRays:
         epipolar_error = u * line[..., 0] + v * line[..., 1] + w * line[..., 2]
         return self.mask * epipolar_error / (np.sqrt(np.maximum(gradient2, 1e-18)) * self.sigma_px)
 
-    def slopes(self, motion: PlanarMotion, here: np.ndarray) -> np.ndarray:
+    def jacobian(self, motion: PlanarMotion, here: np.ndarray) -> np.ndarray:
         """Derivatives of the distances `here` by turn and heading, shape (windows, points, 2)."""
         return (
             np.stack(
@@ -134,13 +134,13 @@ class WindowRays:
 def turn_sigma(view: WindowRays, motion: PlanarMotion) -> np.ndarray:
     """Standard deviation of each window's turn in radians, shape (windows,)."""
     here = view.distances(motion)
-    a, b, d = _normal_matrix(view.slopes(motion, here), robust_weight(here))
+    a, b, d = _normal_matrix(view.jacobian(motion, here), robust_weight(here))
     return np.sqrt(d / np.maximum(a * d - b * b, 1e-12))
 
 
-def _normal_matrix(slopes: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, ...]:
+def _normal_matrix(jacobian: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, ...]:
     """Entries (windows,) of the weighted J^T J, of Jacobians (windows, points, 2) and weights (windows, points)."""
-    return tuple((weight * slopes[..., i] * slopes[..., j]).sum(axis=1) for i, j in ((0, 0), (0, 1), (1, 1)))
+    return tuple((weight * jacobian[..., i] * jacobian[..., j]).sum(axis=1) for i, j in ((0, 0), (0, 1), (1, 1)))
 
 
 def without_side_slip(
@@ -284,9 +284,9 @@ def refined(view: WindowRays, motion: PlanarMotion, rounds: int = WARM_START_ROU
     here = view.distances(motion)
     cost = point_cost(here)
     for _ in range(rounds):
-        slopes, weight = view.slopes(motion, here), robust_weight(here)
-        a, b, d = _normal_matrix(slopes, weight)
-        p, q = ((weight * slopes[..., i] * here).sum(axis=1) for i in (0, 1))
+        jacobian, weight = view.jacobian(motion, here), robust_weight(here)
+        a, b, d = _normal_matrix(jacobian, weight)
+        p, q = ((weight * jacobian[..., i] * here).sum(axis=1) for i in (0, 1))
         lift = damping * (a + d) + 1e-9
         a, d = a + lift, d + lift
         determinant = a * d - b * b

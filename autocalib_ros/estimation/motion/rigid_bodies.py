@@ -47,10 +47,10 @@ class StructureAndMotion:
 
     def stepped(self, step: np.ndarray) -> StructureAndMotion:
         """Return the unknowns after a step (tracklets, 3 points + 3 instants)."""
-        lives, points, _ = self.points.shape
-        poses = step[:, 3 * points :].reshape(lives, -1, 3)
+        tracklets, points, _ = self.points.shape
+        poses = step[:, 3 * points :].reshape(tracklets, -1, 3)
         return StructureAndMotion(
-            self.points + step[:, : 3 * points].reshape(lives, points, 3),
+            self.points + step[:, : 3 * points].reshape(tracklets, points, 3),
             self.translations + poses[..., :2],
             self.turns_rad + poses[..., 2],
         )
@@ -71,9 +71,9 @@ class StructureAndMotion:
 class TrackletBundle:
     """Tracklets with everything their residuals need that does not depend on lens and plane."""
 
-    def __init__(self, lives: Tracklets, noise_px: float, drift_px: float) -> None:
-        self.lives, self.mask, self._noise_px, self.drift_px = lives, lives.mask, noise_px, drift_px
-        covariance = drift_covariance(tracked_path_px(lives.pixels, self.mask), drift_px)
+    def __init__(self, tracklets: Tracklets, noise_px: float, drift_px: float) -> None:
+        self.tracklets, self.mask, self._noise_px, self.drift_px = tracklets, tracklets.mask, noise_px, drift_px
+        covariance = drift_covariance(tracked_path_px(tracklets.pixels, self.mask), drift_px)
         covariance *= self.mask[..., :, None] & self.mask[..., None, :]
         diagonal = np.arange(self.mask.shape[2])
         covariance[..., diagonal, diagonal] += np.where(self.mask, noise_px**2, 1.0)
@@ -90,27 +90,27 @@ class TrackletBundle:
 
     def subset(self, keep: np.ndarray) -> TrackletBundle | None:
         """Return the tracklets that `keep` selects, None if it selects none."""
-        lives = self.lives.subset(keep)
-        return TrackletBundle(lives, self._noise_px, self.drift_px) if len(lives) else None
+        tracklets = self.tracklets.subset(keep)
+        return TrackletBundle(tracklets, self._noise_px, self.drift_px) if len(tracklets) else None
 
     def without_drift(self) -> TrackletBundle:
         """Return the same tracklets with points that do not drift."""
-        return TrackletBundle(self.lives, self._noise_px, 0.0)
+        return TrackletBundle(self.tracklets, self._noise_px, 0.0)
 
-    def noise_cost(self, camera: Camera, camera_from_plane: np.ndarray, shapes: StructureAndMotion) -> float:
+    def noise_cost(self, camera: Camera, camera_from_plane: np.ndarray, unknowns: StructureAndMotion) -> float:
         """Return twice the negative log-likelihood of the residuals near the best fit.
 
         The likelihood is restricted (Patterson & Thompson 1971) and its scale is fitted: the unknowns absorb part of
         the noise, and more of it if the noise is correlated.
         """
-        shapes = self.refined(camera, camera_from_plane, shapes)
-        residuals = self.residuals(camera, camera_from_plane, shapes)
+        unknowns = self.refined(camera, camera_from_plane, unknowns)
+        residuals = self.residuals(camera, camera_from_plane, unknowns)
         scale = float(np.median((residuals**2).sum(axis=(1, 2, 3)) / self.dof))
         diagonal = np.diagonal(self.whiten, axis1=-2, axis2=-1)
         density = 2.0 * np.log(np.where(self.mask, diagonal, 1.0)).sum(axis=(1, 2))
-        slopes, _ = self.slopes(camera, camera_from_plane, shapes)
-        slopes = slopes.reshape(len(self.lives), -1, slopes.shape[-1])
-        eigenvalues = np.linalg.eigvalsh(slopes.transpose(0, 2, 1) @ slopes)
+        jacobian, _ = self.jacobian(camera, camera_from_plane, unknowns)
+        jacobian = jacobian.reshape(len(self.tracklets), -1, jacobian.shape[-1])
+        eigenvalues = np.linalg.eigvalsh(jacobian.transpose(0, 2, 1) @ jacobian)
         volume = np.log(np.where(eigenvalues > MIN_EIGENVALUE_FRACTION * eigenvalues[:, -1:], eigenvalues, 1.0)).sum(
             axis=1
         )
@@ -118,14 +118,14 @@ class TrackletBundle:
 
     def initial_guess(self, camera: Camera, camera_from_plane: np.ndarray) -> StructureAndMotion:
         """Guess the unknowns: points on the ground at first sight, moved as a rigid body from instant to instant."""
-        bearings = unproject_rays(camera, self.lives.pixels).bearings @ camera_from_plane
+        bearings = unproject_rays(camera, self.tracklets.pixels).bearings @ camera_from_plane
         side = float(np.sign(np.median(bearings[..., 2][self.mask]))) if self.mask.any() else 1.0
         ground = bearings[..., :2] / np.maximum(side * bearings[..., 2:], START_MIN_DEPRESSION_RAD)
         count, points, instants = self.mask.shape
-        shapes = StructureAndMotion(
+        unknowns = StructureAndMotion(
             np.zeros((count, points, 3)), np.zeros((count, instants, 2)), np.zeros((count, instants))
         )
-        shapes.points[..., 2] = side
+        unknowns.points[..., 2] = side
         for tracklet in range(count):
             placed = np.full((points, 2), np.nan)
             seen_instants = np.flatnonzero(self.mask[tracklet].any(axis=0))
@@ -134,28 +134,28 @@ class TrackletBundle:
                 here, seen = ground[tracklet, :, instant], self.mask[tracklet, :, instant]
                 known = seen & np.isfinite(placed[:, 0])
                 turn, move = _rigid_transform(placed[known], here[known]) if known.sum() >= 2 else (0.0, np.zeros(2))
-                shapes.turns_rad[tracklet, instant], shapes.translations[tracklet, instant] = turn, move
+                unknowns.turns_rad[tracklet, instant], unknowns.translations[tracklet, instant] = turn, move
                 new = seen & ~known
                 placed[new] = (here[new] - move) @ _rotation(turn)
-            shapes.points[tracklet, :, :2] = np.nan_to_num(placed)
-        return shapes
+            unknowns.points[tracklet, :, :2] = np.nan_to_num(placed)
+        return unknowns
 
-    def residuals(self, camera: Camera, camera_from_plane: np.ndarray, shapes: StructureAndMotion) -> np.ndarray:
+    def residuals(self, camera: Camera, camera_from_plane: np.ndarray, unknowns: StructureAndMotion) -> np.ndarray:
         """Whitened residuals (tracklets, points, instants, 2)."""
-        return self.whiten @ self.reprojection_errors_px(camera, camera_from_plane, shapes)
+        return self.whiten @ self.reprojection_errors_px(camera, camera_from_plane, unknowns)
 
     def reprojection_errors_px(
-        self, camera: Camera, camera_from_plane: np.ndarray, shapes: StructureAndMotion
+        self, camera: Camera, camera_from_plane: np.ndarray, unknowns: StructureAndMotion
     ) -> np.ndarray:
         """Projected minus observed pixels, shape (tracklets, points, instants, 2)."""
-        pixels, _ = camera.project(self._positions(shapes) @ camera_from_plane.T)
-        return (pixels - self.lives.pixels) * self.mask[..., None]
+        pixels, _ = camera.project(self._positions(unknowns) @ camera_from_plane.T)
+        return (pixels - self.tracklets.pixels) * self.mask[..., None]
 
-    def _positions(self, shapes: StructureAndMotion) -> np.ndarray:
+    def _positions(self, unknowns: StructureAndMotion) -> np.ndarray:
         """Positions of the points (tracklets, points, instants, 3) in the frame of the plane."""
-        cosine, sine = np.cos(shapes.turns_rad)[:, None], np.sin(shapes.turns_rad)[:, None]
-        x, y, z = (shapes.points[:, :, None, axis] for axis in range(3))
-        right, ahead = (shapes.translations[:, None, :, axis] for axis in range(2))
+        cosine, sine = np.cos(unknowns.turns_rad)[:, None], np.sin(unknowns.turns_rad)[:, None]
+        x, y, z = (unknowns.points[:, :, None, axis] for axis in range(3))
+        right, ahead = (unknowns.translations[:, None, :, axis] for axis in range(2))
         return np.stack(
             [cosine * x - sine * y + right, sine * x + cosine * y + ahead, np.broadcast_to(z, self.mask.shape)], axis=-1
         )
@@ -174,14 +174,14 @@ class TrackletBundle:
         """Mean squared residual of each point over the squared scale, shape (tracklets, points)."""
         return (residuals**2).sum(axis=(2, 3)) / self._point_dof / cauchy_scale**2
 
-    def slopes(
-        self, camera: Camera, camera_from_plane: np.ndarray, shapes: StructureAndMotion
+    def jacobian(
+        self, camera: Camera, camera_from_plane: np.ndarray, unknowns: StructureAndMotion
     ) -> tuple[np.ndarray, np.ndarray]:
         """Derivatives of the residuals by the unknowns of each tracklet, and of the pixels by the positions.
 
         Shapes (tracklets, points, instants, 2, 3 points + 3 instants) and (tracklets, points, instants, 2, 3).
         """
-        placed = self._positions(shapes)
+        placed = self._positions(unknowns)
         in_camera = placed @ camera_from_plane.T
         here, _ = camera.project(in_camera)
         # lengths are in camera heights, so one step suits bodies of any size
@@ -192,82 +192,85 @@ class TrackletBundle:
             / DERIVATIVE_STEP
             * self.mask[..., None, None]
         )
-        cosine, sine = (part[:, None, :, None] for part in (np.cos(shapes.turns_rad), np.sin(shapes.turns_rad)))
+        cosine, sine = (part[:, None, :, None] for part in (np.cos(unknowns.turns_rad), np.sin(unknowns.turns_rad)))
         x, y, z = np.moveaxis(by_place, -1, 0)
         by_point = self._whitened(np.stack([x * cosine + y * sine, y * cosine - x * sine, z], axis=-1))
-        about = placed[..., :2] - shapes.translations[:, None]
+        about = placed[..., :2] - unknowns.translations[:, None]
         by_pose = np.stack([x, y, y * about[..., :1] - x * about[..., 1:]], axis=-1)
-        lives, points, instants = self.mask.shape
-        slopes = np.zeros((lives, points, instants, 2, 3 * points + 3 * instants))
+        tracklets, points, instants = self.mask.shape
+        jacobian = np.zeros((tracklets, points, instants, 2, 3 * points + 3 * instants))
         for point in range(points):
-            slopes[:, point, ..., 3 * point : 3 * point + 3] = by_point[:, point]
+            jacobian[:, point, ..., 3 * point : 3 * point + 3] = by_point[:, point]
         poses = self.whiten[..., None, None] * by_pose[:, :, None]
         # the pose at the reference instant is fixed
-        poses[np.arange(lives), :, :, self.reference] = 0.0
-        slopes[..., 3 * points :] = np.moveaxis(poses, 3, 4).reshape(lives, points, instants, 2, -1)
-        return slopes, by_place
+        poses[np.arange(tracklets), :, :, self.reference] = 0.0
+        jacobian[..., 3 * points :] = np.moveaxis(poses, 3, 4).reshape(tracklets, points, instants, 2, -1)
+        return jacobian, by_place
 
-    def _whitened(self, slopes: np.ndarray) -> np.ndarray:
+    def _whitened(self, jacobian: np.ndarray) -> np.ndarray:
         """Whiten derivatives (tracklets, points, instants, 2, n) along the instants."""
-        lives, points, instants = self.mask.shape
-        return (self.whiten @ slopes.reshape(lives, points, instants, -1)).reshape(slopes.shape)
+        tracklets, points, instants = self.mask.shape
+        return (self.whiten @ jacobian.reshape(tracklets, points, instants, -1)).reshape(jacobian.shape)
 
     def residual_changes(
-        self, cameras: list[Camera], camera: Camera, camera_from_plane: np.ndarray, shapes: StructureAndMotion
+        self, cameras: list[Camera], camera: Camera, camera_from_plane: np.ndarray, unknowns: StructureAndMotion
     ) -> list[np.ndarray]:
         """Whitened changes (tracklets, points, instants, 2) of the residuals from one camera to each of the others."""
-        in_camera = self._positions(shapes) @ camera_from_plane.T
+        in_camera = self._positions(unknowns) @ camera_from_plane.T
         here, _ = camera.project(in_camera)
         return [self.whiten @ ((other.project(in_camera)[0] - here) * self.mask[..., None]) for other in cameras]
 
-    def rotation_jacobian(self, axis: np.ndarray, by_place: np.ndarray, shapes: StructureAndMotion) -> np.ndarray:
+    def rotation_jacobian(self, axis: np.ndarray, by_place: np.ndarray, unknowns: StructureAndMotion) -> np.ndarray:
         """Whitened derivative (tracklets, points, instants, 2) by rotation of the plane about its axis (3,)."""
-        lever = np.cross(axis, self._positions(shapes))
+        lever = np.cross(axis, self._positions(unknowns))
         return self.whiten @ (by_place @ lever[..., None])[..., 0]
 
     def initialised(self, camera: Camera, camera_from_plane: np.ndarray) -> StructureAndMotion:
         """Solve from an initial guess; outliers are down-weighted only once point heights are estimated."""
-        shapes = self.initial_guess(camera, camera_from_plane)
+        unknowns = self.initial_guess(camera, camera_from_plane)
         for cauchy_scale in (START_CAUCHY_SCALE, CAUCHY_SCALE):
-            shapes = self.refined(camera, camera_from_plane, shapes, COLD_START_ROUNDS, cauchy_scale)
-        return shapes
+            unknowns = self.refined(camera, camera_from_plane, unknowns, COLD_START_ROUNDS, cauchy_scale)
+        return unknowns
 
     def refined(
         self,
         camera: Camera,
         camera_from_plane: np.ndarray,
-        shapes: StructureAndMotion,
+        unknowns: StructureAndMotion,
         rounds: int = WARM_START_ROUNDS,
         cauchy_scale: float = CAUCHY_SCALE,
     ) -> StructureAndMotion:
         """Refine the unknowns by Levenberg-Marquardt iterations, each tracklet on its own."""
-        damping = np.full(len(self.lives), START_DAMPING)
-        here = self.residuals(camera, camera_from_plane, shapes)
+        damping = np.full(len(self.tracklets), START_DAMPING)
+        here = self.residuals(camera, camera_from_plane, unknowns)
         cost = self.cost(here, cauchy_scale)
         for _ in range(rounds):
-            slopes, _ = self.slopes(camera, camera_from_plane, shapes)
-            own, weighted = self.weighted_system(slopes, here, cauchy_scale)
+            jacobian, _ = self.jacobian(camera, camera_from_plane, unknowns)
+            own, weighted = self.weighted_system(jacobian, here, cauchy_scale)
             matrix, gradient = own.transpose(0, 2, 1) @ own, own.transpose(0, 2, 1) @ weighted[..., None]
-            trial = shapes.stepped(-np.linalg.solve(damped(matrix, damping), gradient)[..., 0])
+            trial = unknowns.stepped(-np.linalg.solve(damped(matrix, damping), gradient)[..., 0])
             there = self.residuals(camera, camera_from_plane, trial)
             cost_there = self.cost(there, cauchy_scale)
             better = cost_there <= cost
             gain = np.max(cost - cost_there, initial=0.0, where=better)
-            shapes = shapes.where(better, trial)
+            unknowns = unknowns.where(better, trial)
             here = np.where(better[:, None, None, None], there, here)
             cost = np.where(better, cost_there, cost)
             damping = np.where(better, np.maximum(damping / 3, 1e-7), np.minimum(damping * 6, 1e4))
             if better.all() and gain < 1e-3:
                 break
-        return shapes
+        return unknowns
 
     def weighted_system(
-        self, slopes: np.ndarray, residuals: np.ndarray, cauchy_scale: float = CAUCHY_SCALE
+        self, jacobian: np.ndarray, residuals: np.ndarray, cauchy_scale: float = CAUCHY_SCALE
     ) -> tuple[np.ndarray, np.ndarray]:
         """Jacobian (tracklets, residuals, n) and residuals (tracklets, residuals), times root weights."""
         root = np.sqrt(self.robust_weight(residuals, cauchy_scale))[:, :, None, None]
-        count = len(self.lives)
-        return ((slopes * root[..., None]).reshape(count, -1, slopes.shape[-1]), (residuals * root).reshape(count, -1))
+        count = len(self.tracklets)
+        return (
+            (jacobian * root[..., None]).reshape(count, -1, jacobian.shape[-1]),
+            (residuals * root).reshape(count, -1),
+        )
 
 
 def damped(matrix: np.ndarray, damping: np.ndarray) -> np.ndarray:

@@ -110,11 +110,11 @@ def refine_with_tracklets(
 def _adjust_with_tracklets(fit: Adjustment, tracks: TrackSet, config: AdjustmentConfig) -> Adjustment:
     """Adjust with tracklets, with or without point drift, whichever has the higher likelihood."""
     solved = adjust(fit.state, tracks, config, refine=True)
-    drifting, (_, _, shapes) = solved.problem.config.bundle, solved.problem.warm_start
-    if drifting is None or shapes is None:
+    drifting, (_, _, unknowns) = solved.problem.config.bundle, solved.problem.warm_start
+    if drifting is None or unknowns is None:
         return solved
     without_drift, camera, plane = drifting.without_drift(), solved.state.camera, solved.state.rotation
-    if without_drift.noise_cost(camera, plane, shapes) < drifting.noise_cost(camera, plane, shapes):
+    if without_drift.noise_cost(camera, plane, unknowns) < drifting.noise_cost(camera, plane, unknowns):
         solved = adjust(
             solved.state,
             tracks,
@@ -132,13 +132,13 @@ def restart_tracklets(fit: Adjustment, tracks: TrackSet) -> Adjustment:
     solution and is stuck in a wrong minimum shifts the solution by degrees.
     """
     for _ in range(MAX_RESTARTS):
-        bundle, (_, motion, shapes) = fit.problem.config.bundle, fit.problem.warm_start
-        if bundle is None or shapes is None:
+        bundle, (_, motion, unknowns) = fit.problem.config.bundle, fit.problem.warm_start
+        if bundle is None or unknowns is None:
             return fit
         camera, plane = fit.state.camera, fit.state.rotation
         restarted = bundle.initialised(camera, plane)
         current_cost, restarted_cost = (
-            bundle.cost(bundle.residuals(camera, plane, each)) for each in (shapes, restarted)
+            bundle.cost(bundle.residuals(camera, plane, each)) for each in (unknowns, restarted)
         )
         better = restarted_cost < current_cost - MIN_RESTART_GAIN
         if not better.any():
@@ -148,7 +148,7 @@ def restart_tracklets(fit: Adjustment, tracks: TrackSet) -> Adjustment:
             tracks,
             fit.problem.config,
             refine=True,
-            warm_start=(None, motion, shapes.where(better, restarted)),
+            warm_start=(None, motion, unknowns.where(better, restarted)),
         )
     return fit
 

@@ -189,10 +189,10 @@ def check_plane(plane: PlaneEstimate, gate: GateOptions, *, assumed: bool = Fals
 def check_halves(fit: Adjustment, tracks: TrackSet, gate: GateOptions) -> Reason | Statement:
     """Solve the earlier and the later half of the vehicles; they have to agree within what they know."""
     config = replace(fit.problem.config, vehicle_correlation=fit.vehicle_correlation)
-    lives = no_tracklets() if config.bundle is None else config.bundle.lives
+    tracklets = no_tracklets() if config.bundle is None else config.bundle.tracklets
     early, lived, windows = _earlier_half(
         (tracks.vehicles, tracks.times_s),
-        (lives.bodies, lives.times_s),
+        (tracklets.bodies, tracklets.times_s),
         (config.windows.bodies, config.windows.times_s),
     )
     fits = []

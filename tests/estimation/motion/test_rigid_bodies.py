@@ -51,27 +51,27 @@ def test_perfect_motion_leaves_no_residual() -> None:
     bundle = TrackletBundle(
         lives_of(np.stack([life(generator, turn) for turn in (-60.0, -10.0, 0.0, 25.0, 80.0)])), 0.3, 0.05
     )
-    shapes = bundle.refined(CAMERA, POSE, bundle.initialised(CAMERA, POSE), 60)
-    assert np.abs(bundle.residuals(CAMERA, POSE, shapes)).max() < 0.05
+    unknowns = bundle.refined(CAMERA, POSE, bundle.initialised(CAMERA, POSE), 60)
+    assert np.abs(bundle.residuals(CAMERA, POSE, unknowns)).max() < 0.05
     reference = bundle.reference[0]
-    assert not shapes.translations[0, reference].any() and shapes.turns_rad[0, reference] == 0.0
-    assert np.degrees(np.ptp(shapes.turns_rad, axis=1)) == pytest.approx([60.0, 10.0, 0.0, 25.0, 80.0], abs=0.5)
+    assert not unknowns.translations[0, reference].any() and unknowns.turns_rad[0, reference] == 0.0
+    assert np.degrees(np.ptp(unknowns.turns_rad, axis=1)) == pytest.approx([60.0, 10.0, 0.0, 25.0, 80.0], abs=0.5)
 
 
 def test_whitened_residuals_have_unit_variance() -> None:
     bundle = TrackletBundle(noisy(np.random.default_rng(2)), NOISE_PX, 0.0)
-    shapes = bundle.initialised(CAMERA, POSE)
-    squared = (bundle.residuals(CAMERA, POSE, shapes) ** 2).sum(axis=(1, 2, 3)) / bundle.dof
+    unknowns = bundle.initialised(CAMERA, POSE)
+    squared = (bundle.residuals(CAMERA, POSE, unknowns) ** 2).sum(axis=(1, 2, 3)) / bundle.dof
     assert squared.mean() == pytest.approx(1.0, abs=0.25)
 
 
 def test_an_outlier_on_the_body_is_down_weighted() -> None:
     generator = np.random.default_rng(3)
-    lives = noisy(generator, 4)
-    lives.pixels[0, 0] += np.linspace(0, 60, MAX_INSTANTS)[:, None]
-    bundle = TrackletBundle(lives, NOISE_PX, 0.0)
-    shapes = bundle.initialised(CAMERA, POSE)
-    robust_weight = bundle.robust_weight(bundle.residuals(CAMERA, POSE, shapes))
+    tracklets = noisy(generator, 4)
+    tracklets.pixels[0, 0] += np.linspace(0, 60, MAX_INSTANTS)[:, None]
+    bundle = TrackletBundle(tracklets, NOISE_PX, 0.0)
+    unknowns = bundle.initialised(CAMERA, POSE)
+    robust_weight = bundle.robust_weight(bundle.residuals(CAMERA, POSE, unknowns))
     assert robust_weight[0, 0] < 0.1 < 0.5 < np.median(robust_weight)
 
 
@@ -81,8 +81,8 @@ def test_derivatives_match_finite_differences() -> None:
     steps = Parameterisation(
         AdjustmentState(CAMERA, POSE, np.zeros(0)), AdjustmentConfig(prior, JointOptions(), bundle=bundle)
     )
-    shapes = bundle.initialised(CAMERA, POSE)
-    rows = RigidBodyBlock(steps, bundle, shapes)
+    unknowns = bundle.initialised(CAMERA, POSE)
+    rows = RigidBodyBlock(steps, bundle, unknowns)
     here = rows.linearise()
     for index in range(steps.size):
         step = np.zeros(steps.size)
@@ -98,11 +98,11 @@ def test_the_likelihood_shows_whether_points_drift() -> None:
     without_drift = noisy(generator, 20)
     walk = np.cumsum(generator.normal(scale=0.5, size=without_drift.pixels.shape), axis=2)
     drifting = lives_of(without_drift.pixels + walk)
-    for lives, drifts in ((without_drift, False), (drifting, True)):
-        bundle = TrackletBundle(lives, NOISE_PX, 0.05)
-        shapes = bundle.initialised(CAMERA, POSE)
-        more_probable = bundle.noise_cost(CAMERA, POSE, shapes) < bundle.without_drift().noise_cost(
-            CAMERA, POSE, shapes
+    for tracklets, drifts in ((without_drift, False), (drifting, True)):
+        bundle = TrackletBundle(tracklets, NOISE_PX, 0.05)
+        unknowns = bundle.initialised(CAMERA, POSE)
+        more_probable = bundle.noise_cost(CAMERA, POSE, unknowns) < bundle.without_drift().noise_cost(
+            CAMERA, POSE, unknowns
         )
         assert more_probable == drifts
 
@@ -111,11 +111,11 @@ def test_tracklets_follow_the_tracks_of_a_body_and_take_bodies_in_turn() -> None
     _, evidence = draw_evidence('turning', 0, 0)
     instants = ResampledTracks(evidence)
     windows = find_windows(evidence, instants)
-    lives = find_tracklets(windows, instants, 1000)
-    assert len(np.unique(lives.bodies)) > 15
-    assert (lives.mask.sum(axis=(1, 2)) >= 15).all()
+    tracklets = find_tracklets(windows, instants, 1000)
+    assert len(np.unique(tracklets.bodies)) > 15
+    assert (tracklets.mask.sum(axis=(1, 2)) >= 15).all()
     times = evidence.times_s[evidence.track_starts[0] : evidence.track_starts[1]]
-    assert times.min() - 1 < lives.times_s.min()
+    assert times.min() - 1 < tracklets.times_s.min()
     few = find_tracklets(windows, instants, 10)
     assert len(np.unique(few.bodies)) == 10
     assert not len(find_tracklets(windows.subset(np.zeros(0, int)), instants, 10))

@@ -67,11 +67,11 @@ def test_few_vehicles_with_slipping_points_do_not_mislead(seed: int) -> None:
 
 def turned_lives(windows: TwoFrameWindows, instants: ResampledTracks, limit: int, *, by_deg: float) -> Tracklets:
     """Find tracklets as a slightly rotated camera would see them: bodies that move in another plane."""
-    lives = find_tracklets(windows, instants, limit)
-    bearings, _ = TURNING.camera.unproject(lives.pixels)
+    tracklets = find_tracklets(windows, instants, limit)
+    bearings, _ = TURNING.camera.unproject(tracklets.pixels)
     turn = Rotation.from_rotvec(np.radians([by_deg, 0.0, 0.0])).as_matrix()
     pixels, _ = TURNING.camera.project(bearings @ turn.T)
-    return replace(lives, pixels=np.where(lives.mask[..., None], pixels, 0.0))
+    return replace(tracklets, pixels=np.where(tracklets.mask[..., None], pixels, 0.0))
 
 
 def test_tracklets_that_contradict_windows_are_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -104,15 +104,15 @@ def by_windows(evidence: Evidence) -> tuple[TwoFrameWindows, Adjustment, TrackSe
 def test_a_tracklet_in_a_wrong_minimum_is_restarted() -> None:
     evidence = evidence_of(3)
     windows, fit, nothing = by_windows(evidence)
-    lives = find_tracklets(windows, ResampledTracks(evidence), 100)
-    bundle = TrackletBundle(lives, 0.3, 0.0)
+    tracklets = find_tracklets(windows, ResampledTracks(evidence), 100)
+    bundle = TrackletBundle(tracklets, 0.3, 0.0)
     config = replace(fit.problem.config, windows=windows.subset(np.zeros(0, int)), bundle=bundle)
     good = adjust(TRUTH, nothing, config, refine=True)
-    shapes = good.problem.warm_start[2]
-    assert shapes is not None
+    unknowns = good.problem.warm_start[2]
+    assert unknowns is not None
     # a body that turns the other way: no small step leads to its true motion
-    turns_rad = np.where(np.arange(len(lives))[:, None] < 3, -shapes.turns_rad, shapes.turns_rad)
-    stuck = replace(shapes, turns_rad=turns_rad)
+    turns_rad = np.where(np.arange(len(tracklets))[:, None] < 3, -unknowns.turns_rad, unknowns.turns_rad)
+    stuck = replace(unknowns, turns_rad=turns_rad)
     bad = adjust(TRUTH, nothing, config, refine=True, warm_start=(None, None, stuck))
     mended = turning.restart_tracklets(bad, nothing)
     assert (bad.turning2[:3] > 1.5 * good.turning2[:3]).any()
