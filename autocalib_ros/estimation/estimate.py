@@ -131,5 +131,6 @@ def find_solution(
     markings = estimate_from_lane_markings(observations, config)
     if is_better(markings, found):
         return markings
-    informative = isinstance(markings, Reason) and markings.code != 'no_markings'
-    return append_reason(found, markings) if informative else found
+    if isinstance(markings, Reason) and markings.code != 'no_markings':
+        return append_reason(found, markings)
+    return found

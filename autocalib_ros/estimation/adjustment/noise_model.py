@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from autocalib_ros.config import JointOptions
+from autocalib_ros.estimation.observations.point_drift import tracked_path_px
 from autocalib_ros.geometry.great_circles import Rays
 from autocalib_ros.geometry.ground_plane import depression_sine
 from autocalib_ros.geometry.small_matrices import cross, dot, inverse_cholesky_factors
@@ -65,15 +66,9 @@ def whitening_matrices(
     if drifting:
         lever = along_m - (along_m * mask).sum(axis=0) / np.maximum(mask.sum(axis=0), 1)
         heading = np.radians(options.heading_deg) * lever * px_per_m
-        followed = _tracked_distance_px(pixels, mask)
+        followed = tracked_path_px(pixels, mask.T).T
         covariance += heading[:, None] * heading + options.drift_px**2 * np.minimum(followed[:, None], followed)
     covariance *= mask[:, None] & mask
     diagonal = np.arange(len(mask))
     covariance[diagonal, diagonal] += np.where(mask, options.noise_px**2, 1.0)
     return np.ascontiguousarray((inverse_cholesky_factors(covariance) * mask).transpose(2, 0, 1))
-
-
-def _tracked_distance_px(pixels: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Return the path length in pixels of tracks (tracks, samples, 2) up to each sample, shape (samples, tracks)."""
-    steps = np.hypot(*np.diff(pixels, axis=1).T) * (mask[1:] & mask[:-1])
-    return np.concatenate([np.zeros((1, len(pixels))), np.cumsum(steps, axis=0)])

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from autocalib_ros.geometry.ground_plane import ahead_direction
 from autocalib_ros.lens.camera import Camera
 
 
@@ -31,8 +32,7 @@ def measure_silhouettes(
 ) -> SilhouetteSizes:
     """Measure silhouettes (n, OUTLINE_COLUMNS), as in `Outlines.ends_px`, of objects that stand on the road."""
     bearings = camera.unproject(silhouettes_px[:, :-1].astype(float).reshape(-1, 2))[0].reshape(-1, 8, 3)
-    ahead = np.array([0.0, 0.0, 1.0]) - normal[2] * normal
-    ahead /= np.linalg.norm(ahead)
+    ahead = ahead_direction(normal)
     x, y, z = bearings @ ahead, bearings @ np.cross(normal, ahead), bearings @ normal
     middle = np.arctan2(y.sum(axis=1), x.sum(axis=1))
     turned = np.arctan2(y, x) - middle[:, None]

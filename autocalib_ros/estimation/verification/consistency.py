@@ -1,4 +1,4 @@
-"""How far two solutions are apart in focal length and ground normal, and how far they should be."""
+"""Consistency of two solutions: their differences in focal length and ground normal, and the expected differences."""
 
 from __future__ import annotations
 
@@ -13,35 +13,37 @@ from autocalib_ros.estimation.adjustment.parameters import AdjustmentState
 from autocalib_ros.geometry.ground_plane import unsigned_angle_deg
 
 REGULARISING_INFORMATION = 1e-9
-"""Information that is added along every parameter, so that what nothing tells has a large variance and not none."""
+"""Information added along every parameter, so that an undetermined parameter has a large variance and the inverse
+exists."""
 
 
 @dataclass(frozen=True)
 class SolutionDifference:
-    """Of two solutions."""
+    """Differences between two solutions."""
 
     focal: float
-    """Of the focal lengths, relative."""
+    """Relative difference of the focal lengths."""
     normal_deg: float
-    """Angle between the ground normals, degrees, whichever side they point to."""
+    """Angle between the ground normals without regard to their sign, degrees."""
     sigmas_of_each: np.ndarray
-    """Standard deviations of what is compared by either solution, shape (solutions, 2)."""
+    """Standard deviations of focal length and normal in either solution, shape (solutions, 2)."""
 
     @property
     def sigmas(self) -> np.ndarray:
-        """Standard deviations (2,) of the two differences, were the solutions independent."""
+        """Standard deviations (2,) of the two differences between independent solutions."""
         return np.hypot(*self.sigmas_of_each)
 
     def exceeds(self, sigmas: float) -> bool:
-        """Whether either is larger than so many standard deviations of the less sure solution.
+        """Whether either difference exceeds this many standard deviations of the less certain solution.
 
-        Two solutions by the same evidence, the one using it better, differ by less than that (Hausman 1978).
+        Two estimates from the same evidence, one of them efficient, differ by less than that: the variance of the
+        difference is the difference of the variances (Hausman 1978, "Specification tests in econometrics").
         """
         return bool((np.array([self.focal, self.normal_deg]) > sigmas * self.sigmas_of_each.max(axis=0)).any())
 
 
 def compare_solutions(first: Adjustment, second: Adjustment) -> SolutionDifference:
-    """Compare two solutions."""
+    """Return the differences between two solutions."""
     focal = abs(float(np.log(first.state.camera.focal_px / second.state.camera.focal_px)))
     return SolutionDifference(
         focal,
@@ -51,38 +53,37 @@ def compare_solutions(first: Adjustment, second: Adjustment) -> SolutionDifferen
 
 
 def expected_half_differences(whole: Adjustment, *halves: Adjustment) -> np.ndarray:
-    """Standard deviations (2,) of the differences between halves by what the whole says of itself.
+    """Return the standard deviations (2,) of the differences between halves that the sigma of the whole implies.
 
-    Two halves that tell alike differ by twice the whole's deviation, unequal ones by more; how unequal they are, the
-    curvature of their costs tells, which rests on more than the few vehicles of a half.
+    Two equally informative halves differ by twice the standard deviation of the whole, unequal ones by more. How
+    informative each half is follows from the curvature of its cost, which is more stable than a jackknife over the
+    few vehicles of a half.
     """
-    in_whole, *in_halves = (
-        _focal_and_normal_sigma(
-            propagate_sigma(
-                lambda step, fit=fit: _change_from(fit)(fit.problem.parameters.state(step)),
-                fit.problem.parameters.size,
-                _curvature_covariance(fit),
-            )
-        )
-        for fit in (whole, *halves)
-    )
+    in_whole, *in_halves = (_curvature_sigma(fit) for fit in (whole, *halves))
     return (
         _focal_and_normal_sigma(whole.sigma(_change_from(whole))) * np.hypot(*in_halves) / np.maximum(in_whole, 1e-12)
     )
 
 
+def _curvature_sigma(fit: Adjustment) -> np.ndarray:
+    """Standard deviations (2,) of focal length and normal from the curvature of the cost."""
+    change, parameters = _change_from(fit), fit.problem.parameters
+    sigma = propagate_sigma(lambda step: change(parameters.state(step)), parameters.size, _curvature_covariance(fit))
+    return _focal_and_normal_sigma(sigma)
+
+
 def _change_from(fit: Adjustment) -> Callable[[AdjustmentState], np.ndarray]:
-    """Log focal length, and how the normal has moved from that of a fit in degrees, shape (4,)."""
+    """Function of a state: log focal length, and the rotation of the normal from that of a fit, degrees, (4,)."""
     normal = fit.state.rotation[:, 2]
     return lambda state: np.array([np.log(state.camera.focal_px), *np.degrees(np.cross(normal, state.rotation[:, 2]))])
 
 
 def _focal_and_normal_sigma(sigmas: np.ndarray) -> np.ndarray:
-    """Standard deviations (2,) of focal length and normal out of those of `_change_from` (4,)."""
+    """Standard deviations (2,) of focal length and normal from those of `_change_from` (4,)."""
     return np.array([sigmas[0], np.linalg.norm(sigmas[1:])])
 
 
 def _curvature_covariance(fit: Adjustment) -> np.ndarray:
-    """Covariance (parameters, parameters) that the curvature of the cost alone would give."""
+    """Covariance (parameters, parameters) from the curvature of the cost: the inverse of the information."""
     _, prior = fit.problem.parameters.prior_gradient(fit.state.camera)
     return np.linalg.inv(fit.information + np.diag(prior) + REGULARISING_INFORMATION * np.eye(len(prior)))

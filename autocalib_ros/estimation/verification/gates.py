@@ -26,46 +26,49 @@ from autocalib_ros.results.refusals import Reason, reason
 from autocalib_ros.results.statements import Statement, check
 
 MIN_STRAIGHT_FRACTION = 0.25
-"""Share of vehicles that follow the roads; below it the traffic turns, and what it agrees on is a turn."""
+"""Fraction of the vehicles that have to follow the roads. Below it the traffic turns, and the common direction is that
+of a turn. Judgement."""
 MIN_ONE_ROAD_FRACTION, MIN_KEPT_ROAD_FRACTION = 0.75, 0.5
-"""The same where one road alone is found: on a ring or a bend some arc always passes for a road. Half of the vehicles
-are enough when those that follow the road keep to it: on a ring they drive on round it."""
+"""The same for a single road: on a ring or a bend some arc always resembles a road. Half of the vehicles are enough if
+those that follow the road stay on it, since on a ring they drive on round it: at most 64 % do in 60 simulated rings,
+at least 85 % on simulated roads."""
 LANE_KEEPING_PATH_FRACTION = 0.9
 MIN_LANE_KEEPING_FRACTION = 0.8
-"""A vehicle keeps to a road that it follows for so much of its way; so many, of all that follow it anywhere, have to.
-"""
+"""A vehicle is lane-keeping if it follows the road for the first fraction of its path; the second fraction of all
+vehicles that follow the road anywhere have to be."""
 MIN_TRACKS_PER_VEHICLE = 3
-"""Tracks of a vehicle that tell whether it keeps to a road: a single one is on it or not."""
+"""Tracks of a vehicle that show whether it is lane-keeping: a single track is on the road or not."""
 MIN_FOCAL_CONTRAST = 1.3
-"""Agreement at the best trial focal length over that at the median one: wrong lenses bend straight paths apart."""
+"""Support at the best trial focal length over that at the median one: a wrong lens bends straight paths. Judgement."""
 MAX_FOCAL_DIAGONALS = 1.5
-"""Focal length, in image diagonals, beyond which no lens curvature can be seen."""
+"""Focal length, in image diagonals, above which lens curvature is invisible. Judgement."""
 MAX_K1_SIGMAS = 3.5
+"""Deviation of k1 from the mean of its family, in sigmas of the prior: 0.05 % of the lenses of the family exceed it."""
 MAX_TURNING_FOCAL_SIGMA = 0.03
-"""Largest relative standard deviation of a focal length that was found by traffic that turns: there noise biases, and
-the bias grows faster than the deviation."""
+"""Largest relative sigma of a focal length from turning traffic: noise biases it, and the bias grows faster than the
+sigma."""
 MAX_MOTION_FOCAL_SIGMA = 0.1
-"""Vehicles that turn vouch for a lens when their motion alone tells the focal length to this share, one sigma: turns
-that were taken for roads are off by more."""
+"""Relative sigma of the focal length from the motion of turning vehicles alone, below which that motion confirms the
+lens: turns mistaken for roads have larger errors. Judgement."""
 ASSUMED_PLANE_SIGMA_FACTOR = 3.0
-"""A plane that rests on an assumption may be so many times less sure than one that was measured."""
+"""Factor by which the sigma of a plane that rests on an assumption may exceed that of a measured one. Judgement."""
 MAX_HALVES_SIGMAS, MAX_WHOLE_SIGMAS = 3.5, 3.0
-"""Two halves of the evidence may differ by so many standard deviations: of their own, and of what the whole lets them.
-"""
+"""Allowed difference between two halves of the evidence: in their own sigmas, and in the sigmas that follow from the
+whole."""
 HALVES_FOCAL_TOLERANCE = 0.03
 HALVES_NORMAL_TOLERANCE_DEG = 1.5
-"""Two halves of the evidence may always differ by so much: it is within what the program promises."""
+"""Difference between two halves that is always allowed: the promised accuracy."""
 
 
 def check_straight_traffic(fit: Adjustment, contrast: float, tracks: TrackSet) -> Reason | None:
-    """Say why the straight traffic that a solution started from tells nothing, if so.
+    """Check the straight traffic behind an initial solution.
 
-    `contrast` is how sharply it agreed on the focal length.
+    `contrast` is the support at the best trial focal length over that at the median one.
     """
     prior = fit.problem.config.prior
-    share = _straight_fraction(fit, tracks)
-    if share < MIN_STRAIGHT_FRACTION:
-        return _turning_traffic_reason(fit, share, MIN_STRAIGHT_FRACTION)
+    fraction = _straight_fraction(fit, tracks)
+    if fraction < MIN_STRAIGHT_FRACTION:
+        return _turning_traffic_reason(fit, fraction, MIN_STRAIGHT_FRACTION)
     if contrast < MIN_FOCAL_CONTRAST and not (prior.family == 'distortion_free' and len(fit.state.angles_rad) > 1):
         return reason('no_agreement', contrast=contrast, limit=MIN_FOCAL_CONTRAST)
     return _check_horizon(fit, tracks)
@@ -80,10 +83,10 @@ def check_lens(
     turned: bool,
     driving: np.ndarray | None = None,
 ) -> Reason | None:
-    """Say why the lens cannot be trusted, if so; `turned` where the solution started from traffic that turns.
+    """Check the lens; `turned` marks a solution that was initialised by turning traffic.
 
-    `tracks` are those that were chosen out of the evidence; where `driving`, a mask (tracks,), is given, the others are
-    of people, who need not keep to a road.
+    `tracks` are those selected from the evidence. `driving` is a mask (tracks,) of the tracks of vehicles: pedestrians
+    need not follow a road.
     """
     failed_check = (
         _check_horizon(fit, tracks) or _check_focal_length(fit, gate, turned=turned) or _check_lens_model(fit)
@@ -91,17 +94,17 @@ def check_lens(
     if failed_check or turned and motion_constrains_focal(fit):
         return failed_check
     needed = MIN_STRAIGHT_FRACTION if len(fit.state.angles_rad) > 1 else MIN_ONE_ROAD_FRACTION
-    share = _straight_fraction(fit, tracks, driving)
+    fraction = _straight_fraction(fit, tracks, driving)
     if (
-        needed == MIN_ONE_ROAD_FRACTION > share > MIN_KEPT_ROAD_FRACTION
+        needed == MIN_ONE_ROAD_FRACTION > fraction > MIN_KEPT_ROAD_FRACTION
         and lane_keeping_fraction(fit, evidence) > MIN_LANE_KEEPING_FRACTION
     ):
         return None
-    return _turning_traffic_reason(fit, share, needed) if share < needed else None
+    return _turning_traffic_reason(fit, fraction, needed) if fraction < needed else None
 
 
 def check_markings_view(fit: Adjustment, tracks: TrackSet) -> Reason | None:
-    """Say why what was found without the traffic cannot be how it is seen, if so."""
+    """Check a markings-only solution against the traffic: horizon and lens model."""
     return _check_horizon(fit, tracks) or _check_lens_model(fit)
 
 
@@ -117,7 +120,7 @@ def _above_horizon_reason(fraction_below_horizon: float) -> Reason:
 
 
 def motion_constrains_focal(fit: Adjustment) -> bool:
-    """Whether the motion of vehicles that turn tells the focal length by itself, or need not."""
+    """Whether the motion of turning vehicles determines the focal length by itself, or the focal length is known."""
     if not fit.problem.config.turning or 0 not in fit.problem.config.prior.free:
         return fit.problem.config.turning
     _, known = fit.problem.parameters.prior_gradient(fit.state.camera)
@@ -125,19 +128,19 @@ def motion_constrains_focal(fit: Adjustment) -> bool:
 
 
 def _straight_fraction(fit: Adjustment, tracks: TrackSet, driving: np.ndarray | None = None) -> float:
-    share = tracks.vehicle_weight if driving is None else tracks.vehicle_weight * driving
-    return float((share * fit.inliers()).sum() / max(share.sum(), 1e-9))
+    weight = tracks.vehicle_weight if driving is None else tracks.vehicle_weight * driving
+    return float((weight * fit.inliers()).sum() / max(weight.sum(), 1e-9))
 
 
 def lane_keeping_fraction(fit: Adjustment, evidence: Evidence) -> float:
-    """Share of the vehicles that follow a road anywhere that do so all along, 0 where too few tell."""
+    """Return the fraction of lane-keeping vehicles among those that follow a road anywhere, 0 if too few do."""
     every = long_tracks(evidence)
     labels, _ = assign_roads(fit.state, UnprojectedTracks.through(fit.state.camera, every))
     lengths = np.hypot(*np.moveaxis(np.diff(every.pixels, axis=1), -1, 0)).sum(axis=1)
     _, vehicle_ids = np.unique(every.vehicles, return_inverse=True)
-    share = np.bincount(vehicle_ids, lengths * (labels >= 0)) / np.maximum(np.bincount(vehicle_ids, lengths), 1e-9)
-    following = (share > 1.0 - LANE_KEEPING_PATH_FRACTION) & (np.bincount(vehicle_ids) >= MIN_TRACKS_PER_VEHICLE)
-    kept = following & (share > LANE_KEEPING_PATH_FRACTION)
+    on_road = np.bincount(vehicle_ids, lengths * (labels >= 0)) / np.maximum(np.bincount(vehicle_ids, lengths), 1e-9)
+    following = (on_road > 1.0 - LANE_KEEPING_PATH_FRACTION) & (np.bincount(vehicle_ids) >= MIN_TRACKS_PER_VEHICLE)
+    kept = following & (on_road > LANE_KEEPING_PATH_FRACTION)
     return float(kept.sum() / following.sum()) if following.sum() >= MIN_VEHICLES_PER_ROAD else 0.0
 
 
@@ -151,8 +154,8 @@ def _check_focal_length(fit: Adjustment, gate: GateOptions, *, turned: bool) -> 
     sigma = fit.focal_sigma
     diagonals = camera.focal_px / np.hypot(camera.width, camera.height)
     too_long = diagonals > MAX_FOCAL_DIAGONALS and not prior.focal_known
-    # without distortion only an angle between roads tells the focal length, and one that was found by that focal
-    # length proves nothing
+    # without distortion only an angle between roads determines the focal length, and an angle that was measured with
+    # that focal length proves nothing
     circular = prior.family == 'distortion_free' and not (
         prior.focal_known or fit.problem.config.options.crossing_deg is not None
     )
@@ -174,7 +177,7 @@ def _check_lens_model(fit: Adjustment) -> Reason | None:
 
 
 def check_plane(plane: PlaneEstimate, gate: GateOptions, *, assumed: bool = False) -> Reason | None:
-    """Say why the ground plane cannot be trusted, if so; one that is `assumed` may be less sure."""
+    """Check the ground plane; one that is `assumed` may be less certain."""
     sigma = plane.worst_sigma_deg
     if isinstance(plane.assumed, LevelCamera) and not plane.assumed.constrains_plane(plane.fit.state):
         return reason('plane_uncertain', 'level_road')
@@ -187,7 +190,7 @@ def check_plane(plane: PlaneEstimate, gate: GateOptions, *, assumed: bool = Fals
 
 
 def check_halves(fit: Adjustment, tracks: TrackSet, gate: GateOptions) -> Reason | Statement:
-    """Solve the earlier and the later half of the vehicles; they have to agree within what they know."""
+    """Cross-validate in time: solve the earlier and the later half of the vehicles, and compare."""
     config = replace(fit.problem.config, vehicle_correlation=fit.vehicle_correlation)
     tracklets = no_tracklets() if config.bundle is None else config.bundle.tracklets
     early, lived, windows = _earlier_half(
@@ -207,8 +210,8 @@ def check_halves(fit: Adjustment, tracks: TrackSet, gate: GateOptions) -> Reason
         if any(mask.sum() < gate.min_tracks_per_road // 2 for mask in road_support(fits[-1], part)):
             return check('halves_not_compared')
     apart = compare_solutions(*fits)
-    focal, turn = apart.focal, apart.normal_deg if fit.plane_known else 0.0  # one road leaves the normal free
-    # what either half says of itself is no excuse where the whole claims to know better
+    focal, turn = apart.focal, apart.normal_deg if fit.plane_known else 0.0  # one road does not determine the normal
+    # a large sigma of one half excuses no difference that the sigma of the whole rules out
     focal_limit, turn_limit = np.maximum(
         (HALVES_FOCAL_TOLERANCE, HALVES_NORMAL_TOLERANCE_DEG),
         np.minimum(MAX_HALVES_SIGMAS * apart.sigmas, MAX_WHOLE_SIGMAS * expected_half_differences(fit, *fits)),
@@ -221,9 +224,9 @@ def check_halves(fit: Adjustment, tracks: TrackSet, gate: GateOptions) -> Reason
 
 
 def _earlier_half(*seen: tuple[np.ndarray, np.ndarray]) -> list[np.ndarray]:
-    """Masks of the earlier half of owners (n,) and times (n,), by each owner's mean time: no vehicle is in both halves.
+    """Masks of the earlier half of pairs of vehicles (n,) and times (n,), by mean time: no vehicle is in both halves.
 
-    The middle is that of all that are seen, each as often as it has owners.
+    The median is that of all vehicles, one value for each kind of observation that they have.
     """
     means = [_mean_times(vehicle_ids, times_s) for vehicle_ids, times_s in seen]
     each = [

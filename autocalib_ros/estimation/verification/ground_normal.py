@@ -1,4 +1,4 @@
-"""The ground plane of a solution: from its roads and turning vehicles, or from one road and an assumption."""
+"""The ground normal of a solution: from its roads and turning vehicles, or from one road and an assumption."""
 
 from __future__ import annotations
 
@@ -18,18 +18,19 @@ from autocalib_ros.lens.camera import Camera
 from autocalib_ros.results.statements import Statement, assumption
 
 STEP_RAD = 1e-5
+"""Step of the numerical derivative by the assumption, radians."""
 AGREEMENT_SIGMAS = 3.0
-"""Two assumptions that differ by more contradict each other."""
+"""Two estimates that differ by more combined standard deviations contradict each other (0.3 % of consistent pairs)."""
 
 
 def orient_above_traffic(normal: np.ndarray, camera: Camera, tracks: TrackSet) -> tuple[np.ndarray, float]:
-    """Turn a plane normal (3,) away from the traffic; and the share of the tracked points below the horizon."""
+    """Orient a plane normal (3,) away from the traffic; and the fraction of tracked points below the horizon."""
     return orient_upward(normal, unproject_rays(camera, tracks.pixels[tracks.weights > 0]).bearings)
 
 
 @dataclass(frozen=True)
 class LevelCamera:
-    """The direction across the road under a camera whose roll is taken for zero."""
+    """Direction across the road for a camera without roll."""
 
     sigma_deg: float
 
@@ -39,11 +40,11 @@ class LevelCamera:
         return float(np.radians(self.sigma_deg))
 
     def across(self, _: AdjustmentState, step_rad: float = 0.0) -> np.ndarray:
-        """Direction (3,) in the plane, at a roll by a step: what is level in the image."""
+        """Direction (3,) in the plane: the horizontal of the image, rolled by a step."""
         return np.array([np.cos(step_rad), np.sin(step_rad), 0.0])
 
     def constrains_plane(self, state: AdjustmentState) -> bool:
-        """Whether the road leads across the level, so that the roll tells the plane."""
+        """Whether the road is far enough from the horizontal of the image for the roll to determine the plane."""
         along = state.directions[0]
         return float(np.hypot(along[1], along[2])) > MIN_SINE_TO_X_AXIS
 
@@ -56,9 +57,10 @@ class LevelCamera:
 def combine_assumptions(
     level: LevelCamera, square: TransverseDirection, state: AdjustmentState
 ) -> tuple[TransverseDirection | None, float]:
-    """Join two assumptions by their variances, None where they contradict each other; and their difference in degrees.
+    """Combine two assumptions weighted by inverse variance; and their difference in degrees.
 
-    The difference is a rotation about the road, nan where the roll does not tell the plane.
+    None instead of the combination if they contradict each other. The difference is a rotation about the road, nan if
+    the roll does not determine the plane.
     """
     if not level.constrains_plane(state):
         return square, np.nan
@@ -83,28 +85,28 @@ def combine_assumptions(
 
 @dataclass(frozen=True)
 class PlaneEstimate:
-    """The upward ground normal as a function of a state, and how sure it is."""
+    """The upward ground normal as a function of a state, with its uncertainty."""
 
     fit: Adjustment
     side: float
-    """1 or -1: which side of the state's plane is up."""
+    """1 or -1: the side of the state's plane that is up."""
     assumed: LevelCamera | TransverseDirection | None = None
-    """What tells the direction across the road where the traffic does not."""
+    """Assumption on the direction across the road, if the traffic does not determine it."""
     fraction_below_horizon: float = 1.0
-    """Share of the tracked points below the horizon."""
+    """Fraction of the tracked points below the horizon."""
 
     @classmethod
     def of(
         cls, fit: Adjustment, tracks: TrackSet, assumed: LevelCamera | TransverseDirection | None = None
     ) -> PlaneEstimate:
-        """Return the plane of a solution, the side of the traffic below."""
+        """Return the plane of a solution, oriented so that the traffic is below the horizon."""
         plane = cls(fit, 1.0, assumed)
         normal = plane.normal(fit.state)
         up, fraction_below_horizon = orient_above_traffic(normal, fit.state.camera, tracks)
         return replace(plane, side=float(np.sign(normal @ up)), fraction_below_horizon=fraction_below_horizon)
 
     def normal(self, state: AdjustmentState, step_rad: float = 0.0) -> np.ndarray:
-        """Upward normal (3,) in the camera frame at a state; a step of what is assumed counts where it is."""
+        """Return the upward normal (3,) in the camera frame at a state, with the assumption changed by a step."""
         if self.assumed is None:
             return self.side * state.rotation[:, 2]
         normal = np.cross(state.directions[0], self.assumed.across(state, step_rad))
@@ -112,25 +114,27 @@ class PlaneEstimate:
 
     @property
     def lens_and_normal(self) -> tuple[Camera, np.ndarray]:
-        """Lens and upward normal (3,) of the solution."""
+        """Lens, and upward normal (3,), of the solution."""
         return self.fit.state.camera, self.normal(self.fit.state)
 
     def sigma(self, function: Callable[[Camera, np.ndarray], np.ndarray]) -> np.ndarray:
-        """Standard deviations of a function of lens and normal, shape of its result; with those of the assumption."""
-        told = self.fit.sigma(lambda state: function(state.camera, self.normal(state)))
-        return told if self.assumed is None else np.hypot(told, self._by_assumption(function))
+        """Return the standard deviations of a function of lens and normal, in the shape of its result."""
+        of_fit = self.fit.sigma(lambda state: function(state.camera, self.normal(state)))
+        return of_fit if self.assumed is None else np.hypot(of_fit, self._change_by_assumption(function, self.assumed))
 
     def covariance(self, function: Callable[[Camera, np.ndarray], np.ndarray]) -> np.ndarray:
-        """Covariance (n, n) of a function of lens and normal with n results; with that of the assumption."""
-        told = self.fit.covariance_of(lambda state: function(state.camera, self.normal(state)))
+        """Return the covariance (n, n) of a function of lens and normal with n results."""
+        of_fit = self.fit.covariance_of(lambda state: function(state.camera, self.normal(state)))
         if self.assumed is None:
-            return told
-        moved = self._by_assumption(function)
-        return told + np.outer(moved, moved)
+            return of_fit
+        change = self._change_by_assumption(function, self.assumed)
+        return of_fit + np.outer(change, change)
 
-    def _by_assumption(self, function: Callable[[Camera, np.ndarray], np.ndarray]) -> np.ndarray:
-        """How far a standard deviation of what is assumed moves the results of a function, (n,)."""
-        state, sigma_rad = self.fit.state, self.assumed.step_sigma_rad
+    def _change_by_assumption(
+        self, function: Callable[[Camera, np.ndarray], np.ndarray], assumed: LevelCamera | TransverseDirection
+    ) -> np.ndarray:
+        """Change (n,) of the results of a function by one standard deviation of the assumption."""
+        state, sigma_rad = self.fit.state, assumed.step_sigma_rad
         ends = [np.atleast_1d(function(state.camera, self.normal(state, step))) for step in (-STEP_RAD, STEP_RAD)]
         return sigma_rad * (ends[1] - ends[0]) / (2 * STEP_RAD)
 

@@ -14,22 +14,22 @@ from autocalib_ros.results.statements import Statement, assumption
 
 
 def release_k2(fit: Adjustment, tracks: TrackSet) -> Adjustment:
-    """Set k2 free where that makes the traffic clearly more probable; one road cannot tell."""
+    """Release k2 if that makes the traffic clearly more probable; a single road does not determine it."""
     config = fit.problem.config
     if config.prior.family != 'equidistant' or config.prior.sigma[3] <= 0 or not fit.plane_known:
         return fit
-    bent = adjust(
+    released = adjust(
         fit.state,
         tracks,
         replace(config, prior=config.prior.with_free_k2()),
         refine=True,
         warm_start=fit.problem.warm_start,
     )
-    return select_model([fit, bent], tracks, MODEL_SELECTION_MARGIN)
+    return select_model([fit, released], tracks, MODEL_SELECTION_MARGIN)
 
 
 def fix_unidentifiable(fit: Adjustment, tracks: TrackSet) -> tuple[Adjustment, tuple[str, ...]]:
-    """Hold what the evidence cannot tell; the names of what is held."""
+    """Fix the lens parameters that the evidence does not determine at their prior; and their names."""
     config, fixed = fit.problem.config, _unidentifiable(fit)
     if not fixed:
         return fit, ()
@@ -48,25 +48,25 @@ def fix_unidentifiable(fit: Adjustment, tracks: TrackSet) -> tuple[Adjustment, t
 
 
 def _unidentifiable(fit: Adjustment) -> tuple[str, ...]:
-    """Names of the lens's parameters that the evidence alone leaves wider than their prior."""
+    """Names of the lens parameters whose sigma from the evidence alone exceeds that of the prior."""
     prior = fit.problem.config.prior
     _, known = fit.problem.parameters.prior_gradient(fit.state.camera)
-    left = sigma_without_prior(fit.information, known)
+    sigmas = sigma_without_prior(fit.information, known)
     names = [LENS_PARAMETERS[parameter] for parameter in prior.free]
-    return tuple(name for name, sigma, is_known in zip(names, left, known, strict=False) if is_known and sigma > 1.0)
+    return tuple(name for name, sigma, is_known in zip(names, sigmas, known, strict=False) if is_known and sigma > 1.0)
 
 
 def _restored(camera: Camera, prior: Camera, name: str) -> Camera:
-    """Return the camera with one parameter at the prior's value."""
+    """Return the camera with one parameter at its prior mean."""
     (cx, cy), (k1, k2, *rest) = camera.principal_point_px, camera.k
-    values = {
-        'focal length': {'focal_px': prior.focal_px},
-        'principal point x': {'principal_point_px': (prior.principal_point_px[0], cy)},
-        'principal point y': {'principal_point_px': (cx, prior.principal_point_px[1])},
-        'k1': {'k': (prior.k[0], k2, *rest)},
-        'k2': {'k': (k1, prior.k[1], *rest)},
-    }
-    return replace(camera, **values[name])
+    if name == 'focal length':
+        return replace(camera, focal_px=prior.focal_px)
+    if name == 'principal point x':
+        return replace(camera, principal_point_px=(prior.principal_point_px[0], cy))
+    if name == 'principal point y':
+        return replace(camera, principal_point_px=(cx, prior.principal_point_px[1]))
+    k3, k4 = rest
+    return replace(camera, k=(prior.k[0], k2, k3, k4) if name == 'k1' else (k1, prior.k[1], k3, k4))
 
 
 def lens_assumptions(fit: Adjustment, fixed: tuple[str, ...]) -> tuple[Statement, ...]:

@@ -11,14 +11,14 @@ from autocalib_ros.results.refusals import Reason, reason
 REFERENCE_WIDTH_PX = 1280
 """Image width for which `max_drift_px` is given; it scales with the width."""
 MIN_RATE_TIME_S = 30.0
-"""What is seen in a shorter time is one vehicle or two, and no rate."""
+"""A shorter time shows one or two vehicles, and no rate."""
 NO_TRAFFIC_S = 300.0
-"""After so long without traffic the rate of before says nothing of what comes."""
+"""After this time without traffic the earlier rate predicts nothing."""
 
 
 @dataclass(frozen=True)
 class Requirement:
-    """How much there is of what a first solution needs, and how much is needed."""
+    """One requirement of a first solution: how much there is, and how much is needed."""
 
     have: float
     need: float
@@ -26,17 +26,17 @@ class Requirement:
 
     @property
     def fraction(self) -> float:
-        """Part of the need that is there, 1 where it is met."""
+        """Fraction of the need that is there, 1 if it is met."""
         return min(1.0, self.have / self.need) if self.need > 0 else 1.0
 
 
 def drift_limit_px(image_width: int, gate: GateOptions) -> float:
-    """Return the background's drift up to which a camera stands still."""
+    """Return the background drift, in pixels, up to which a camera counts as stationary."""
     return gate.max_drift_px * image_width / REFERENCE_WIDTH_PX
 
 
 def check_steady(evidence: Evidence, gate: GateOptions) -> Reason | None:
-    """Say how far the camera moved, where that is too far."""
+    """Check that the camera is stationary."""
     limit = drift_limit_px(evidence.image_size[0], gate)
     if evidence.drift_px <= limit:
         return None
@@ -44,7 +44,7 @@ def check_steady(evidence: Evidence, gate: GateOptions) -> Reason | None:
 
 
 def check_readiness(evidence: Evidence, gate: GateOptions) -> Reason | None:
-    """Return the first reason why nothing can be estimated from the evidence, or None."""
+    """Return the first reason against estimating from the evidence, or None."""
     moving = check_steady(evidence, gate)
     if moving:
         return moving
@@ -58,23 +58,23 @@ def check_readiness(evidence: Evidence, gate: GateOptions) -> Reason | None:
 
 
 def requirements(evidence: Evidence, gate: GateOptions, first_solve_s: float) -> list[Requirement]:
-    """Return what a first solution needs."""
+    """Return the requirements of a first solution."""
     tracks, coverage, seconds = evidence.track_count, evidence.coverage, evidence.seconds
     return [
         Requirement(tracks, gate.min_tracks, f'{tracks} of {gate.min_tracks} tracks'),
         Requirement(
             coverage,
             gate.min_coverage,
-            f'traffic crossed {coverage:.0%} of the image, {gate.min_coverage:.0%} is needed',
+            f'traffic crossed {coverage:.0%} of the image, {gate.min_coverage:.0%} needed',
         ),
         Requirement(seconds, first_solve_s, f'{seconds:.0f} s of the first {first_solve_s:g} s watched'),
     ]
 
 
 def outlook(evidence: Evidence, fraction: float) -> str:
-    """Say how long it takes until `fraction` of what is needed has become all, at the rate since the start.
+    """Return the time until `fraction` of the requirements has grown to all of them, at the rate so far, as text.
 
-    '' in the first moments, before anything is seen, and when nothing is missing; without traffic it says that instead.
+    '' at the start, before any traffic, and if nothing is missing; without traffic the text says so.
     """
     if fraction >= 1.0:
         return ''
@@ -87,7 +87,7 @@ def outlook(evidence: Evidence, fraction: float) -> str:
 
 
 def coarse_duration(seconds: float) -> str:
-    """Return a time as coarsely as an estimate deserves."""
+    """Return a duration as text, rounded as an estimate should be."""
     for unit, length_s, most_s in (('s', 10.0, 90.0), ('min', 60.0, 5400.0), ('h', 3600.0, 172800.0)):
         if seconds < most_s:
             count = max(1, round(seconds / length_s))

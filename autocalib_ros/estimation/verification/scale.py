@@ -1,7 +1,8 @@
-"""The scale of the ground plane: the camera's height from what is given, as a function of lens and plane.
+"""The scale of the ground plane: the camera height from the given measure, as a function of lens and plane.
 
-The traffic tells lens and plane without any metre. A length on the road, or how fast its traffic goes, is a number of
-heights in the solved lens and plane, and so tells the height; it is then as sure as that number, and as what is given.
+The traffic determines lens and plane up to scale. In the estimated lens and plane, a length on the road or the speed
+of the traffic is a multiple of the camera height; the given length or speed then gives the height. Its sigma combines
+that of the multiple and that of the given measure.
 """
 
 from __future__ import annotations
@@ -20,18 +21,20 @@ from autocalib_ros.results.refusals import Reason, reason
 from autocalib_ros.results.statements import Statement, Value, assumption
 
 SIMILAR_HEIGHT_FACTOR = 1.25
-"""A height within this factor of the usual one weighs near against far as that one did: nothing is solved again."""
+"""Heights within this factor of the default weigh near and far points alike, so that nothing is estimated again."""
 MIN_DEPRESSION_SCALE_SINE = 0.03
-"""Least sine of the angle below the horizon of a pixel whose place on the road is believed: 33 heights away."""
+"""Least sine of the depression angle of a pixel whose position on the road is used: 33 camera heights away."""
 MIN_SPEED_VEHICLES = 10
-"""Fewer vehicles tell neither how fast the traffic goes nor how much that varies."""
+"""Fewer vehicles determine neither the mean speed nor its variation. Judgement."""
 MIN_FLOW_SPEED_FRACTION = 0.4
-"""Slower than this share of the median speed is who walks or waits; vehicles that flow vary by a fifth or so."""
+"""Vehicles slower than this fraction of the median speed are pedestrians or waiting; flowing traffic varies by about a
+fifth."""
 TRIM_FRACTION = 0.25
-"""Share of the vehicles, slowest and fastest each, that does not count in the mean speed."""
+"""Fraction of the slowest and of the fastest vehicles that is trimmed from the mean speed."""
 STEP_PX = 1e-3
+"""Step of the numerical derivative by the given pixels."""
 MAD_TO_SIGMA = 1.4826
-"""Standard deviation over median absolute deviation, of normal errors."""
+"""Standard deviation over median absolute deviation of a normal distribution."""
 M_S_PER_KM_H = 1 / 3.6
 
 HeightFunction = Callable[[Camera, np.ndarray], float]
@@ -40,11 +43,11 @@ HeightFunction = Callable[[Camera, np.ndarray], float]
 
 @dataclass(frozen=True)
 class Scale:
-    """Where the scale comes from, and how sure the height is where lens and plane are exact."""
+    """Source of the scale, with the sigma of the height for exact lens and plane."""
 
     height: HeightFunction
     sigma: float
-    """Standard deviation of the height, without that of lens and plane."""
+    """Standard deviation of the height without the part from lens and plane."""
     metric: bool
     """Whether the height is in metres."""
     kind: str = ''
@@ -65,7 +68,7 @@ class Scale:
 def known_scale(options: Options, camera: Camera, normal: np.ndarray, flow: TrackSet | None = None) -> Scale | Reason:
     """Return the scale that the options ask for, or why there is none.
 
-    `flow` are straight tracks along the busiest road, for the scale by their speed.
+    `flow` holds straight tracks along the busiest road, for the scale from their speed.
     """
     if options.scale_from == 'distance':
         return _scale_from_distance(options.scale, camera, normal)
@@ -81,19 +84,19 @@ def known_scale(options: Options, camera: Camera, normal: np.ndarray, flow: Trac
 
 
 def check_scale(height: float, sigma: float, gate: GateOptions) -> Reason | None:
-    """Say why a height with its whole standard deviation cannot be trusted, if so."""
+    """Check a height against its total standard deviation."""
     if sigma <= gate.max_sigma_height_rel * height:
         return None
     return reason('scale_uncertain', height_m=height, sigma=min(sigma / height, 9.99), limit=gate.max_sigma_height_rel)
 
 
 def is_unusual(height_m: float) -> bool:
-    """Whether a height is so far from the one that an unknown height is taken for that solving again is worth it."""
+    """Whether a height differs enough from the default for an unknown height to estimate again with it."""
     return abs(np.log(height_m / DEFAULT_CAMERA_HEIGHT_M)) > np.log(SIMILAR_HEIGHT_FACTOR)
 
 
 def _scale_from_distance(given: ScaleOptions, camera: Camera, normal: np.ndarray) -> Scale | Reason:
-    """Two pixels on the road and the metres between them."""
+    """Return the scale from two pixels on the road and the metres between them."""
     pixels = np.array(given.pixels)
     bearings, valid = camera.unproject(pixels)
     below = -(bearings @ normal)
@@ -132,12 +135,12 @@ def _scale_from_distance(given: ScaleOptions, camera: Camera, normal: np.ndarray
 
 
 def _scale_from_speed(given: ScaleOptions, camera: Camera, normal: np.ndarray, flow: TrackSet) -> Scale | Reason:
-    """The mean speed of the traffic.
+    """Return the scale from the mean speed of the traffic.
 
-    A point h above the road seems to be where its ray meets the road, H / (H - h) times as far and as fast: v metres a
-    second look like v / (H - h) heights a second. The speed of the evidence is so H - h, and h is added. The mean over
-    those who pass a spot and that over those on the road differ by variance over mean (Wardrop 1952): where traffic
-    stops and goes a mean speed tells less, and it is doubted by that.
+    A point at h above the road appears where its ray meets the road, H / (H - h) times as far and as fast: v m/s look
+    like v / (H - h) heights a second. So the speed of the evidence gives H - h, and h is added. The mean over vehicles
+    that pass a spot and the mean over vehicles on a road differ by variance over mean (Wardrop 1952); the sigma
+    includes this difference, which is large in stop-and-go traffic.
     """
     tracks = _flowing(camera, normal, flow)
     vehicles = len(np.unique(tracks.vehicles))
@@ -168,7 +171,7 @@ def _scale_from_speed(given: ScaleOptions, camera: Camera, normal: np.ndarray, f
 
 
 def _flowing(camera: Camera, normal: np.ndarray, flow: TrackSet) -> TrackSet:
-    """Tracks of the vehicles that go with the traffic."""
+    """Tracks of the vehicles that flow with the traffic."""
     if not len(flow):
         return flow
     speeds = _vehicle_speeds(camera, normal, flow)
@@ -179,11 +182,11 @@ def _flowing(camera: Camera, normal: np.ndarray, flow: TrackSet) -> TrackSet:
 def _vehicle_speeds(camera: Camera, normal: np.ndarray, tracks: TrackSet) -> np.ndarray:
     """Speed of each vehicle as if its points were on the road, heights a second, shape (vehicles,).
 
-    The median of its tracks. Points weigh by how surely a pixel tells their place along the road, and so do not
-    count far away, where the plane tells it least.
+    The median of its tracks. Points are weighted by the inverse variance of their position along the road for a given
+    pixel noise, so that far points hardly count.
     """
     places = ground_points(camera, normal, 1.0, tracks.pixels.reshape(-1, 2)).reshape(tracks.pixels.shape)
-    # a pixel covers a way on the road that grows with the square of the distance from the camera
+    # the length of road that a pixel covers grows with the square of the distance from the camera
     weights = (tracks.weights > 0) / (1.0 + (places * places).sum(axis=-1)) ** 2
     weights /= weights.sum(axis=1, keepdims=True)
     times = tracks.sample_times_s - (weights * tracks.sample_times_s).sum(axis=1, keepdims=True)
@@ -195,7 +198,7 @@ def _vehicle_speeds(camera: Camera, normal: np.ndarray, tracks: TrackSet) -> np.
 
 
 def trimmed_mean(values: np.ndarray) -> tuple[float, float]:
-    """Mean of the middle of values (n,), and its standard deviation (Tukey & McLaughlin 1963)."""
+    """Return the trimmed mean of values (n,) and its standard deviation (Tukey & McLaughlin 1963)."""
     cut = int(TRIM_FRACTION * len(values))
     ordered = np.sort(values)
     low, high = ordered[cut], ordered[len(values) - 1 - cut]
