@@ -1,4 +1,4 @@
-"""The results as values, and their files."""
+"""Results as values: a calibration or a refusal, with its evidence, uncertainty and figures."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from autocalib_ros.results.refusals import Reason
 from autocalib_ros.results.statements import Statement, Value
 
 GROUND_DISTANCES_M = (10.0, 20.0, 40.0)
-"""Distances from the camera's foot at which the accuracy on the road is told."""
+"""Distances from the camera's foot point at which the sigma of a road point is given."""
 COVARIANCE_PARAMETERS = (
     'focal_px',
     'principal_point_x_px',
@@ -33,7 +33,7 @@ COVARIANCE_PARAMETERS = (
 
 @dataclass(frozen=True, kw_only=True)
 class EvidenceSummary:
-    """What a result rests on."""
+    """Size of the evidence behind a result."""
 
     image_size: tuple[int, int]
     seconds: float
@@ -43,12 +43,12 @@ class EvidenceSummary:
     vehicles: int
     coverage: float
     people: int = 0
-    """Of those that moved, who walks, not counted in `vehicles`: as far as a detector, or else lens and plane tell."""
+    """Pedestrians and cyclists, not counted in `vehicles`: classified by a detector, or by size and speed."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class StandardDeviations:
-    """One sigma of what is published; None where it is not estimated."""
+    """One standard deviation of each published number; None if it is not estimated."""
 
     focal_px: float | None = None
     principal_point_px: tuple[float, float] | None = None
@@ -58,12 +58,12 @@ class StandardDeviations:
     height_m: float | None = None
     k2: float | None = None
     ground_point_m: tuple[float | None, ...] = ()
-    """Of where a pixel meets the road straight ahead, `GROUND_DISTANCES_M` away; None outside the image."""
+    """Of the road point of a pixel straight ahead, at each of `GROUND_DISTANCES_M`; None outside the image."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PaperReport:
-    """Quantities of the published method, reported whichever method gave the result."""
+    """Quantities of the published method (Jain & Saunier 2020), reported with the result of either method."""
 
     focal_px: float
     polynomial_k: tuple[float, float, float]
@@ -77,19 +77,19 @@ class PaperReport:
 
 @dataclass(frozen=True)
 class Residuals:
-    """How far what a solution rests on lies from where the solution has it, in observed pixels."""
+    """Residuals of a solution in observed pixels."""
 
     points_px: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), np.float32))
     """Observed pixels, shape (n, 2)."""
     distance_px: np.ndarray = field(default_factory=lambda: np.zeros(0, np.float32))
-    """From the path along a road, or from the place on a vehicle that turns, shape (n,)."""
+    """Distance from the path along a road, or from the position on a turning vehicle, shape (n,)."""
     roads: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int8))
-    """Index of the road direction, -1 for a vehicle that turns, shape (n,)."""
+    """Index of the road direction, -1 for a turning vehicle, shape (n,)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Figures:
-    """What a report draws; not part of a result's identity and not written to calibration.json."""
+    """Data of the report's figures; not compared, and not written to calibration.json."""
 
     focal_sweep_px: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
     """Trial focal length and its error, shape (n, 2)."""
@@ -101,7 +101,7 @@ class Figures:
     paper_tracks: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
     """Indices of the tracks that the published method keeps."""
     residuals: Residuals = field(default_factory=Residuals)
-    """Of the robust method; none for the published one."""
+    """Of method joint; empty for the published method."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,34 +137,34 @@ class Refusal:
 
 @dataclass(frozen=True, kw_only=True)
 class Calibration:
-    """A lens, and the ground plane where the evidence and the height give one."""
+    """A lens, and the ground plane if evidence and scale give one."""
 
     method: str
     grade: str
-    """'full': lens and metric ground plane; 'assumed': the same, where the plane rests on an assumption that was
-    allowed; 'unit_scale': the plane in units of the height; 'lens': no plane."""
+    """'full': lens and metric ground plane; 'assumed': the same, but the plane rests on an assumption; 'unit_scale':
+    the plane in units of the camera height; 'lens': no plane."""
     assumptions: tuple[Statement, ...]
-    """What was assumed, of `statements.ASSUMPTIONS`."""
+    """What was assumed: kinds of `statements.ASSUMPTIONS`."""
     checks: tuple[Statement, ...] = ()
-    """What was measured or cross-checked, of `statements.CHECKS`."""
+    """What was measured or cross-checked: kinds of `statements.CHECKS`."""
     camera: Camera
     ground: GroundPlane | None
     ground_refusal: Reason | None
-    """Why there is no ground plane, where there is none."""
+    """Why there is no ground plane; None if there is one."""
     road_directions: np.ndarray
     """Unit vectors in the camera optical frame, shape (n, 3)."""
     stddev: StandardDeviations
     covariance: np.ndarray | None = field(default=None, compare=False, repr=False)
-    """Of `COVARIANCE_PARAMETERS`, shape (10, 10), where there is a ground plane in metres and it is estimated."""
+    """Of `COVARIANCE_PARAMETERS`, shape (10, 10); None without a metric ground plane or an estimate."""
     paper: PaperReport | None
     evidence: EvidenceSummary
     newest_stamp_ns: int
-    """Stamp of the newest image that the result rests on."""
+    """Stamp of the newest image in the evidence."""
     distortion_model: str = 'auto'
     rectified_balance: float = 0.0
     figures: Figures = field(default_factory=Figures, compare=False, repr=False)
 
     @cached_property
     def camera_info(self) -> CameraInfo:
-        """The lens as ROS knows it; ModelMisfit where the distortion model cannot say it."""
+        """The lens as CameraInfo; raises ModelMisfit if the distortion model cannot represent it."""
         return camera_info(self.camera, self.distortion_model, self.rectified_balance)
