@@ -7,6 +7,8 @@ import sys
 from collections import Counter
 from pathlib import Path
 
+import pytest
+
 import autocalib_ros
 
 PACKAGE = Path(autocalib_ros.__file__).parent
@@ -177,12 +179,14 @@ def test_constants_of_one_name_have_one_value() -> None:
     assert not {name: found for name, found in values.items() if len(found) > 1 and name not in PER_COMMAND}
 
 
+@pytest.mark.dds
 def test_all_but_the_live_shell_imports_without_ros():
     modules = [name for name in MODULES if room_of(name) not in ('ros', '__main__')]
     done = run_without_ros(modules)
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.dds
 def test_node_without_ros_says_in_one_line_how_to_install_it():
     done = run_without_ros(['autocalib_ros.ros.node'], 'sys.exit(sys.modules["autocalib_ros.ros.node"].main())')
     assert done.returncode == 2, done.stderr

@@ -150,7 +150,7 @@ def test_progress_says_what_is_missing() -> None:
 
 
 def watched(seconds: float, moved_at_s: float = np.inf, gone_at_s: float = np.inf) -> AutoCalibrator:
-    """Feed one vehicle in the first minute, and then a road without traffic, at 2 images/s.
+    """Feed one vehicle in the first minute, and then a road without traffic, at one image/s.
 
     The camera is bumped at one time, or turned to another scene.
     """
@@ -160,14 +160,14 @@ def watched(seconds: float, moved_at_s: float = np.inf, gone_at_s: float = np.in
     block = np.random.default_rng(2).integers(0, 255, (30, 40)).astype(np.uint8)
     block = cv2.resize(block, (60, 45), interpolation=cv2.INTER_CUBIC)
     noise = np.random.default_rng(3).integers(0, 9, (2, 180, 320)).astype(np.uint8)  # else pictures are repeated ones
-    for index in range(int(2 * seconds)):
-        picture = road if index < 2 * gone_at_s else road[::-1, ::-1]
-        if index >= 2 * moved_at_s:
+    for index in range(int(seconds)):
+        picture = road if index < gone_at_s else road[::-1, ::-1]
+        if index >= moved_at_s:
             picture = np.roll(picture, (4, 7), axis=(0, 1))
         picture = picture.copy()
-        if 60 <= index < 100:
-            picture[60:105, 6 * (index - 60) : 6 * (index - 60) + 60] = block
-        calibrator.add_image(index * 500_000_000, cv2.add(picture, noise[index % 2]))
+        if 20 <= index < 60:
+            picture[60:105, 6 * (index - 20) : 6 * (index - 20) + 60] = block
+        calibrator.add_image(index * 1_000_000_000, cv2.add(picture, noise[index % 2]))
     return calibrator
 
 
@@ -177,12 +177,14 @@ def held(calibrator: AutoCalibrator) -> int:
     return evidence.track_count
 
 
+@pytest.mark.render
 def test_a_lone_vehicle_is_kept_as_long_as_nothing_replaces_it() -> None:
     calibrator = watched(400.0)
     assert held(calibrator) > 0
     assert calibrator.progress().outlook == 'no traffic in the last 6 min'
 
 
+@pytest.mark.render
 def test_evidence_from_before_a_bump_is_forgotten() -> None:
     calibrator = watched(400.0, moved_at_s=150.0)
     assert held(calibrator) == 0
@@ -190,11 +192,13 @@ def test_evidence_from_before_a_bump_is_forgotten() -> None:
     assert evidence is not None and evidence.drift_px < 0.5  # and with it what it was compared with
 
 
+@pytest.mark.render
 def test_a_bump_is_reported_while_evidence_from_before_is_held() -> None:
     progress = watched(200.0, moved_at_s=150.0).progress()
     assert 'the camera moves' in str(progress) and not progress.outlook
 
 
+@pytest.mark.render
 def test_evidence_is_forgotten_when_the_camera_may_look_elsewhere() -> None:
     assert held(watched(400.0, gone_at_s=150.0)) == 0
 

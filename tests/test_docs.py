@@ -146,6 +146,7 @@ def test_generated_pages_are_those_of_the_code():
     assert outdated(DOCS) == [], 'run `autocalib docs`'
 
 
+@pytest.mark.render
 def test_docs_command_writes_and_checks(tmp_path, capsys):
     assert main(['docs', '--check', str(tmp_path)]) == 3
     assert not list(tmp_path.iterdir())
@@ -176,6 +177,7 @@ def test_relative_links_lead_somewhere():
     assert broken == []
 
 
+@pytest.mark.render
 def test_figures_of_the_method_are_drawn(tmp_path):
     spec = importlib.util.spec_from_file_location('draw_figures', DOCS / 'explanation' / 'draw_figures.py')
     module = importlib.util.module_from_spec(spec)
@@ -362,8 +364,14 @@ def test_constants_that_are_explained_exist():
 # Generated pages say what the code has
 
 
-def test_every_option_has_a_row_with_its_default():
-    page = reference_pages()['reference/parameters.md']
+@pytest.fixture(scope='module')
+def pages() -> dict[str, str]:
+    """Return the generated pages, made once."""
+    return reference_pages()
+
+
+def test_every_option_has_a_row_with_its_default(pages):
+    page = pages['reference/parameters.md']
     for item in [*walk_options(Options()), *walk_options(NodeOptions())]:
         (row,) = re.findall(rf'^\| `{re.escape(item.name)}` .*$', page, re.MULTILINE)
         default = str(item.default).lower() if isinstance(item.default, bool) else str(item.default) or "''"
@@ -372,8 +380,8 @@ def test_every_option_has_a_row_with_its_default():
         assert ' '.join(item.doc.split())[1:20].replace('<', '&lt;').replace('>', '&gt;') in row
 
 
-def test_every_argument_of_every_command_has_a_row():
-    page = reference_pages()['reference/cli.md']
+def test_every_argument_of_every_command_has_a_row(pages):
+    page = pages['reference/cli.md']
     for name, parser in command_parsers().items():
         assert f'\n## autocalib {name}\n' in page
         for action in parser._actions:

@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 
 from autocalib_ros.config import JointOptions, Options, ScaleOptions
 from autocalib_ros.errors import InputError
-from autocalib_ros.estimation.estimate import solve
 from autocalib_ros.geometry.ground_plane import GroundPlane, pixels_ahead
 from autocalib_ros.ground import Ground
 from autocalib_ros.lens.camera import Camera
@@ -28,6 +27,7 @@ from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_e
 from autocalib_ros.results.calibration import GROUND_DISTANCES_M, Calibration, EvidenceSummary, StandardDeviations
 from autocalib_ros.results.calibration_json import to_json
 from autocalib_ros.results.refusals import Reason
+from solved_once import solve_once
 
 TYPES = get_typestore(Stores.ROS2_JAZZY).types
 DATA = Path(os.environ.get('AUTOCALIB_TEST_DATA', '')) / 'data'
@@ -402,6 +402,7 @@ def worst_px(truth: dict[str, Any]) -> float:
     return float(max(np.abs(pixels - rows[:, 2:]).max(), np.abs(again - rows[:, 2:]).max()))
 
 
+@pytest.mark.render
 def test_the_truth_of_the_simulator_is_met():
     options = SimulationOptions(duration_s=1.0, width_px=640, height_px=360, k=(0.02, -0.004, 0.0, 0.0))
     assert worst_px(truth_of(Simulation(options))) < 1e-4  # its pixels are rounded to 4 digits, half of it
@@ -483,10 +484,11 @@ ONE_ROAD = Junction(
 )
 
 
+@pytest.mark.solve
 @pytest.mark.parametrize('scale', SCALES)
 def test_the_covariance_of_a_calibration_agrees_with_its_deviations(scale):
     junction = ONE_ROAD if scale == 'assumed' else Junction()
-    result = solve(synthetic_evidence(junction, np.random.default_rng(0)), SCALES[scale])
+    result = solve_once(synthetic_evidence(junction, np.random.default_rng(0)), SCALES[scale])
     assert isinstance(result, Calibration) and result.ground is not None and result.covariance is not None
     sigma, (cx, cy) = result.stddev, result.stddev.principal_point_px
     np.testing.assert_allclose(

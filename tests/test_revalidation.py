@@ -101,6 +101,7 @@ def test_without_deviations_the_newer_is_taken():
     assert 'without standard deviations' in decision.text
 
 
+@pytest.mark.solve
 def test_solutions_of_one_camera_agree_and_of_a_turned_one_do_not():
     options = Options(camera_height=8.0, joint=JointOptions(lens_prior='equidistant'))
 

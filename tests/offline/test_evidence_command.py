@@ -16,7 +16,12 @@ from autocalib_ros.lens.camera import Camera
 from autocalib_ros.lens.camera_info_yaml import read_camera_info, write_camera_info_yaml
 from autocalib_ros.offline.synthetic.junction import Junction, synthetic_evidence
 
-JUNCTION = Junction(noise_px=0.2, turning_fraction=0.0)
+pytestmark = pytest.mark.solve
+
+JUNCTION = Junction(noise_px=0.2, turning_fraction=0.0, vehicles=40, points_per_vehicle=2)
+"""Little evidence is solved quickly; the command is what is tested here."""
+ONE_FAMILY = ('-p', 'joint.lens_prior=equidistant')
+"""Of lenses: the others take as long again."""
 SMALL_LENS = Camera(640, 360, 280.0, (319.5, 179.5))
 """The junction's lens, in images of half the size."""
 REFUSE = ('-p', 'gate.min_tracks=100000')
@@ -41,7 +46,7 @@ def without_height(saved, capsys):
     """Return a function that runs the command: status, stdout and stderr."""
 
     def run(*arguments: object) -> tuple[int, str, str]:
-        status = main(['evidence', str(saved), *map(str, arguments)])
+        status = main(['evidence', str(saved), *ONE_FAMILY, *map(str, arguments)])
         return status, *capsys.readouterr()
 
     return run
@@ -88,8 +93,8 @@ def test_json_is_the_file_and_nothing_is_written_unless_asked(evidence, tmp_path
     assert stdout == (tmp_path / 'here' / 'out' / 'calibration.json').read_text()
 
 
-def test_ten_runs_on_one_evidence_give_the_same_bytes(evidence):
-    assert len({evidence('--json')[1] for _ in range(10)}) == 1
+def test_runs_on_one_evidence_give_the_same_bytes(evidence):
+    assert len({evidence('--json')[1] for _ in range(3)}) == 1
 
 
 def test_a_refusal_is_status_3_with_the_reason_on_stderr(evidence, tmp_path):

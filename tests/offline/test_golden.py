@@ -224,6 +224,7 @@ def test_evidence_that_is_missing_is_wrong_input(folder: Path, capsys: pytest.Ca
     assert 'bend.npz' in capsys.readouterr().err
 
 
+@pytest.mark.solve
 def test_nothing_moved_is_status_0(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = (folder / golden.EXPECTED).read_text()
     assert main(['benchmark', 'golden', str(folder), '--only', 'bend', '--update']) == 0
@@ -231,6 +232,7 @@ def test_nothing_moved_is_status_0(folder: Path, capsys: pytest.CaptureFixture[s
     assert (folder / golden.EXPECTED).read_text() == before
 
 
+@pytest.mark.solve
 def test_changes_are_printed_with_status_3_until_they_are_expected(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

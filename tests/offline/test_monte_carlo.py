@@ -135,6 +135,7 @@ def test_a_refusal_keeps_its_code() -> None:
     assert (found.accepted, found.code, found.cpu_s) == (False, 'no_motion', 2.0)
 
 
+@pytest.mark.solve
 def test_a_solver_that_fails_does_not_end_the_benchmark() -> None:
     found = run_method(TASK, 'unheard_of', *draw_evidence('few', 0, 0))
     assert (found.accepted, found.code) == (False, 'crash:UsageError')
@@ -154,6 +155,7 @@ def test_a_plane_tilted_by_a_degree_falsifies_distances_by_some_per_cent() -> No
     assert distance_error(JUNCTION.camera, plane(tilt_deg=-80.0), JUNCTION) == np.inf  # the road is above the horizon
 
 
+@pytest.mark.solve
 @pytest.mark.parametrize('family', ['highway', 'long_bend', 'roundabout_arms', 'skew_turning', 'tee', 'sparse'])
 def test_families_of_scenes_are_solved_without_a_crash(family: str) -> None:
     results = run_task(Task(family, 0, 0, ('paper', *(['joint'] if family == 'sparse' else []))))  # the quickest
@@ -309,6 +311,7 @@ def test_an_unwritable_csv_is_reported_before_the_work(tmp_path: Path) -> None:
         run_monte_carlo(['many'], ['joint'], 1000, out=tmp_path, quiet=True)
 
 
+@pytest.mark.solve
 def test_benchmark_runs_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / 'runs.csv'
     assert main(['benchmark', 'accuracy', '--runs', '2', '--family', 'standard', '--out', str(out)]) == 0
@@ -321,6 +324,7 @@ def test_benchmark_runs_from_the_command_line(tmp_path: Path, capsys: pytest.Cap
     assert '2 of 2 draws' in printed.err
 
 
+@pytest.mark.solve
 def test_processes_do_not_change_the_result() -> None:
     alone, shared = (run_monte_carlo(['pedestrians'], ['paper'], 2, jobs=jobs, quiet=True) for jobs in (1, 2))
     assert [str(replace(item, cpu_s=0.0)) for item in alone] == [str(replace(item, cpu_s=0.0)) for item in shared]
@@ -349,6 +353,7 @@ def test_the_cost_benchmark_is_still_there(capsys: pytest.CaptureFixture[str]) -
     assert 'nowhere.mp4 does not exist' in capsys.readouterr().err
 
 
+@pytest.mark.dds
 def test_module_runs_the_benchmark_too() -> None:
     done = subprocess.run(
         [sys.executable, '-m', 'autocalib_ros.benchmark', 'accuracy', '--help'],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shutil
 
 import cv2
 import numpy as np
@@ -18,8 +19,19 @@ from autocalib_ros.offline.simulate.options import SCENES, SimulationOptions
 from autocalib_ros.offline.simulate.simulation import Simulation
 from autocalib_ros.offline.simulate.truth import truth_of
 
+pytestmark = pytest.mark.render
+
 # One road is quickest to draw.
 TINY = {'width_px': 160, 'height_px': 90, 'focal_px': 70.0, 'rate_hz': 5.0, 'duration_s': 0.6, 'one_way': True}
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory):
+    """Return a bag of TINY and the calls of its progress, for tests that only read."""
+    calls = []
+    path = tmp_path_factory.mktemp('simulated') / 'bag'
+    write_bag(path, SimulationOptions(**TINY), workers=1, progress=lambda *done: calls.append(done))
+    return path, calls
 
 
 def _messages(path, topic):
@@ -74,27 +86,23 @@ def test_bag_does_not_depend_on_the_number_of_workers(tmp_path):
     assert frames[0] == frames[1]
 
 
-def test_true_camera_info_comes_with_every_frame(tmp_path):
+def test_true_camera_info_comes_with_every_frame(bag):
     options = SimulationOptions(**TINY)
-    infos = _messages(write_bag(tmp_path / 'bag', options, workers=1), options.truth_topic)
+    infos = _messages(bag[0], options.truth_topic)
     assert len(infos) == options.frame_count
     assert infos[0].distortion_model == 'equidistant'
     assert infos[0].d == pytest.approx(options.k)
     assert infos[0].k.reshape(3, 3)[:2, 2] == pytest.approx(options.lens.centre_px)
 
 
-def test_truth_is_written_beside_the_images(tmp_path):
+def test_truth_is_written_beside_the_images(bag):
     options = SimulationOptions(**TINY)
-    path = write_bag(tmp_path / 'bag', options, workers=1)
-    written = json.loads((path / 'truth.json').read_text())
+    written = json.loads((bag[0] / 'truth.json').read_text())
     assert written == json.loads(json.dumps(truth_of(Simulation(options))))
 
 
-def test_progress_counts_every_frame(tmp_path):
-    calls = []
-    options = SimulationOptions(**TINY)
-    write_bag(tmp_path / 'bag', options, workers=1, progress=lambda *done: calls.append(done))
-    assert calls == [(1, 3), (2, 3), (3, 3)]
+def test_progress_counts_every_frame(bag):
+    assert bag[1] == [(1, 3), (2, 3), (3, 3)]
 
 
 def test_existing_folder_is_not_overwritten(tmp_path):
@@ -110,8 +118,8 @@ def test_folder_that_is_no_bag_is_never_overwritten(tmp_path):
     assert (tmp_path / 'note.txt').read_text() == 'mine'
 
 
-def test_bag_is_overwritten_on_request(tmp_path):
-    write_bag(tmp_path / 'bag', SimulationOptions(**TINY), workers=1)
+def test_bag_is_overwritten_on_request(tmp_path, bag):
+    shutil.copytree(bag[0], tmp_path / 'bag')
     options = SimulationOptions(**{**TINY, 'duration_s': 0.2})
     path = write_bag(tmp_path / 'bag', options, workers=1, overwrite=True)
     assert len(_messages(path, options.topic)) == 1

@@ -93,6 +93,7 @@ def truth() -> dict:
     return truth_of(Simulation(SimulationOptions(**SMALL, bump_at_s=1.0)))
 
 
+@pytest.mark.render
 def test_truth_has_the_keys_of_the_scenes(truth):
     assert {
         'case',

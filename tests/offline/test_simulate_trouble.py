@@ -15,6 +15,8 @@ from autocalib_ros.offline.simulate.options import SimulationOptions
 from autocalib_ros.offline.simulate.simulation import Simulation
 from autocalib_ros.offline.simulate.weather import GroundBuffer, box_corners
 
+pytestmark = pytest.mark.render
+
 SMALL = {
     'width_px': 320,
     'height_px': 180,

@@ -75,6 +75,7 @@ def circles(junction: Junction, evidence: Evidence) -> tuple[np.ndarray, np.ndar
     return np.array(normals), np.array(worst)
 
 
+@pytest.mark.render
 @pytest.mark.parametrize('name', FAMILIES)
 def test_every_family_records_as_many_tracks_as_asked_for(name: str) -> None:
     junction, evidence = drawn(name)
@@ -86,6 +87,7 @@ def test_every_family_records_as_many_tracks_as_asked_for(name: str) -> None:
         assert evidence.track_count == TRACKS.get(name, junction.tracks)
 
 
+@pytest.mark.render
 @pytest.mark.parametrize('name', FAMILIES)
 def test_every_point_lies_in_the_image(name: str) -> None:
     junction, evidence = drawn(name)
@@ -94,6 +96,7 @@ def test_every_point_lies_in_the_image(name: str) -> None:
     assert (evidence.points_px < np.array(evidence.image_size) + margin).all()
 
 
+@pytest.mark.render
 @pytest.mark.parametrize('name', FAMILIES)
 def test_a_seed_gives_the_same_evidence_again(name: str) -> None:
     _, first = drawn(name)

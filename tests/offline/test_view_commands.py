@@ -316,6 +316,7 @@ def test_a_bag_is_a_source_too(tmp_path, write_bag, images):
     assert cv2.imread(str(tmp_path / 'r.png')).shape == (24, 32, 3)
 
 
+@pytest.mark.dds
 def test_help_of_the_new_commands_imports_nothing_heavy():
     for name in ('compare', 'rectify', 'topview', 'picture'):
         code = (

@@ -15,6 +15,8 @@ from autocalib_ros.perception.klt_tracker import PointTracker
 from autocalib_ros.perception.motion_mask import Region
 from autocalib_ros.perception.observer import Observer
 
+pytestmark = pytest.mark.render
+
 SIZE = (360, 640)
 RATE_HZ = 10.0
 CAR = (50, 80)

@@ -8,6 +8,8 @@ import pytest
 
 from autocalib_ros.perception.drift_monitor import DriftMonitor
 
+pytestmark = pytest.mark.render
+
 WIDTH, HEIGHT = 640, 360
 LIMIT_PX = 1.5
 """What passes for standing still at this width."""

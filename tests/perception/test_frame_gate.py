@@ -15,6 +15,8 @@ from autocalib_ros.perception.images import ImageDecoder
 from autocalib_ros.perception.klt_tracker import PointTracker, _near_prediction
 from autocalib_ros.perception.observer import Observer
 
+pytestmark = pytest.mark.render
+
 HEIGHT, WIDTH = 240, 480
 RATE_HZ = 10.0
 SHUT = (40, 46)

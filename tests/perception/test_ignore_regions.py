@@ -16,6 +16,8 @@ from autocalib_ros.perception.images import ImageDecoder
 from autocalib_ros.perception.masked_messages import mask_message, require_maskable
 from autocalib_ros.perception.observer import Observer
 
+pytestmark = pytest.mark.render
+
 HEIGHT, WIDTH = 200, 400
 UPPER = '-10 -10 405 -10 405 99.5 -10 99.5'
 """The upper half of the image and some more."""

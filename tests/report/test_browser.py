@@ -10,7 +10,10 @@ import pytest
 
 from browser import Browser, browser, chromium
 
-pytestmark = pytest.mark.skipif(chromium() is None, reason='no Chromium: apt-get install chromium')
+pytestmark = [
+    pytest.mark.render,
+    pytest.mark.skipif(chromium() is None, reason='no Chromium: apt-get install chromium'),
+]
 WIDTHS = {'desktop': 1280, 'telephone': 390}
 UNDECODED = '[...document.images].filter(image => !(image.complete && image.naturalWidth)).length'
 TOO_WIDE = (

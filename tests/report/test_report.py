@@ -26,6 +26,8 @@ from autocalib_ros.report.traffic_figures import kept_tracks
 from autocalib_ros.results.calibration import Refusal, Residuals
 from synthetic_results import SPEED_M_S, junction_evidence
 
+pytestmark = pytest.mark.render
+
 ALL = {entry.name for entry in ENTRIES}
 ON_THE_ROAD = {'ground_grid', 'top_view', 'speeds', 'speed_histogram'}
 OF_TRAFFIC = {'all_tracks', 'coverage'}

@@ -6,13 +6,15 @@ import numpy as np
 import pytest
 
 from autocalib_ros.config import Options
-from autocalib_ros.estimation.estimate import solve
 from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.offline.synthetic.junction import Junction, synthetic_evidence
 from autocalib_ros.pictures.views import TopView, grid_lines, grid_step, ground_to_image, image_to_ground
 from autocalib_ros.report.road_figures import position_sigma_m, tracked_road_points
 from autocalib_ros.report.scene import ReportScene
 from autocalib_ros.results.calibration import Calibration
+from solved_once import solve_once
+
+pytestmark = pytest.mark.solve
 
 JUNCTION = Junction()
 TRUTH = GroundPlane(JUNCTION.camera_from_ground.T, JUNCTION.height_m)
@@ -24,7 +26,7 @@ SIGMAS = 3.0
 def scene(request) -> ReportScene:
     """Return what a report is about, solved from traffic whose truth is known."""
     evidence, options = synthetic_evidence(JUNCTION, np.random.default_rng(request.param)), Options(camera_height=8.0)
-    result = solve(evidence, options)
+    result = solve_once(evidence, options)
     assert isinstance(result, Calibration) and result.grade == 'full'
     return ReportScene(result=result, evidence=evidence, background=None, options=options, source='made up')
 

@@ -120,6 +120,7 @@ def test_what_killed_writers_left_is_removed(store):
     assert not left.exists() and another.exists()
 
 
+@pytest.mark.dds
 def test_files_are_never_broken_whenever_the_writer_is_killed(quick_path):
     script = Path(__file__).parents[1] / 'helpers' / 'kill_saves.py'
     done = subprocess.run(
@@ -136,8 +137,8 @@ def test_files_are_never_broken_whenever_the_writer_is_killed(quick_path):
     assert saves > 10, 'hardly a save in all those lives: the kills hit nothing'
 
 
-@pytest.mark.parametrize('broken', ['', 'image_width: [', 'image_width: 640\n', '\x00\x01'])
-def test_broken_yaml_gives_the_previous_pair_and_is_reported(store, broken):
+@pytest.mark.parametrize('broken', ['', 'image_width: [', 'image_width: 640\n', 'camera_name: north\n', '\x00\x01'])
+def test_broken_yaml_gives_the_pair_before_and_is_told(store, broken):
     store.save(FIRST)
     store.save(SECOND)
     store.path.write_text(broken)

@@ -19,6 +19,8 @@ from autocalib_ros.ros.ground_points_node import GroundPointsNode
 from autocalib_ros.ros.qos import LATCHED
 from bench import wait_for
 
+pytestmark = pytest.mark.dds
+
 CAMERA = Camera(1280, 720, 560.0, (630.0, 371.0), (0.015, 0.0, 0.0, 0.0))
 PIXELS = [(640.0, 500.0, 0.0), (200.0, 10.0, 0.0), (900.0, 400.0, 1.5)]
 """The second lies above the horizon."""

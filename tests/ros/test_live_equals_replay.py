@@ -38,13 +38,13 @@ def bag(tmp_path_factory) -> Path:
     write_bag(
         path,
         SimulationOptions(
-            width_px=640,
-            height_px=360,
-            focal_px=280.0,
+            width_px=480,
+            height_px=270,
+            focal_px=210.0,
             principal_point_offset_px=(3.0, -2.0),
             camera_height_m=HEIGHT_M,
             duration_s=30.0,
-            rate_hz=10.0,
+            rate_hz=8.0,
             topic=TOPIC,
         ),
     )

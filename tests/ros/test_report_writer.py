@@ -82,6 +82,7 @@ def test_a_node_that_ends_gives_the_report_up(reports, log_lines, tmp_path):
     assert not log_lines and not (tmp_path / 'page.html').exists()
 
 
+@pytest.mark.dds
 def test_the_node_starts_without_what_only_the_report_needs():
     program = (
         'import sys, autocalib_ros.ros.autocalib_node\n'

@@ -16,6 +16,8 @@ from autocalib_ros.results.calibration import Refusal
 from autocalib_ros.ros.solver_process import SolverDied, SolverProcess
 from bench import PATIENCE_S, PIXELS
 
+pytestmark = pytest.mark.dds
+
 OPTIONS = Options(camera_height=8.0)
 
 

@@ -12,6 +12,8 @@ from diagnostic_msgs.msg import DiagnosticArray
 
 from bench import Bench, wait_for
 
+pytestmark = pytest.mark.dds
+
 NODE = [sys.executable, '-m', 'autocalib_ros.ros.node', '--ros-args', '-r', '__ns:=/site', '-r', 'image:=/camera/image']
 CAMERA = [sys.executable, str(Path(__file__).with_name('camera.py'))]
 PATIENCE_S = 90.0
@@ -66,7 +68,7 @@ def diagnostics(bench: Bench) -> DiagnosticsLog:
 def test_camera_that_starts_late_and_changes_its_reliability_twice_is_heard(diagnostics, tmp_path):
     with running_node(tmp_path / 'log'):
         wait_for(lambda: diagnostics.newest().get('state') == 'WAITING_FOR_IMAGES', 'the node', PATIENCE_S)
-        with running_camera('/camera/image', RAW, LOSSY, RAW) as go_on:
+        with running_camera('/camera/image', RAW, LOSSY, RAW, {'width': 160, 'height': 120}) as go_on:
             wait_for(lambda: diagnostics.used() > 3, 'images', PATIENCE_S)
             go_on()
             reliably = diagnostics.used()
@@ -74,12 +76,19 @@ def test_camera_that_starts_late_and_changes_its_reliability_twice_is_heard(diag
             go_on()
             lossily = diagnostics.used()
             wait_for(lambda: diagnostics.used() > lossily + 10, 'reliable images', PATIENCE_S)
+            newest, status = diagnostics.newest(), diagnostics[-1].status[0]
+            go_on()
+            wait_for(
+                lambda: 'the image size changed: collecting new evidence' in (tmp_path / 'log').read_text(),
+                'the news',
+                PATIENCE_S,
+            )
+            before = diagnostics.used()
+            wait_for(lambda: diagnostics.used() > before + 3, 'images of the other size', PATIENCE_S)
     subscriptions = [line for line in (tmp_path / 'log').read_text().splitlines() if 'subscribed to' in line]
     assert [line.rpartition(' ')[2] for line in subscriptions] == ['reliable)', 'best_effort)', 'reliable)']
-    newest = diagnostics.newest()
     assert (newest['state'], newest['encoding'], newest['image_topic']) == ('COLLECTING', 'mono8', '/camera/image')
     assert float(newest['received_hz']) > 0
-    status = diagnostics[-1].status[0]
     assert (status.level, status.name, status.hardware_id) == (b'\x01', 'site/autocalib: calibration', 'site')
 
 
@@ -90,19 +99,6 @@ def test_compressed_images_are_heard(diagnostics, tmp_path):
     ):
         wait_for(lambda: diagnostics.used() > 3, 'images', PATIENCE_S)
     assert diagnostics.newest()['encoding'] == 'jpeg'
-
-
-def test_resolution_that_changes_in_mid_stream_restarts_the_evidence(diagnostics, tmp_path):
-    with running_node(tmp_path / 'log'), running_camera('/camera/image', RAW, {'width': 160, 'height': 120}) as go_on:
-        wait_for(lambda: diagnostics.used() > 3, 'images', PATIENCE_S)
-        go_on()
-        wait_for(
-            lambda: 'the image size changed: collecting new evidence' in (tmp_path / 'log').read_text(),
-            'the news',
-            PATIENCE_S,
-        )
-        before = diagnostics.used()
-        wait_for(lambda: diagnostics.used() > before + 3, 'images of the other size', PATIENCE_S)
 
 
 @pytest.mark.parametrize(

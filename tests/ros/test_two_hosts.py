@@ -18,6 +18,8 @@ import pytest
 
 from bench import wait_for
 
+pytestmark = pytest.mark.dds
+
 HERE = Path(__file__).parent
 CABLE = 'cable'
 NEEDED = {'focal_px', 'height_m'} | ({'tf_static_m'} if importlib.util.find_spec('tf2_msgs') else set())

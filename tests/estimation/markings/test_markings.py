@@ -32,6 +32,9 @@ from autocalib_ros.results.calibration import Calibration
 from autocalib_ros.results.calibration_json import to_json
 from autocalib_ros.results.refusals import Reason
 from road_lines import Paint, painted_lines, post_lines, random_lines
+from solved_once import evidence_once, solve_once
+
+pytestmark = pytest.mark.solve
 
 WIDTH, HEIGHT = 1280, 720
 CENTRE = (639.5, 359.5)
@@ -50,7 +53,7 @@ OPTIONS = Options(camera_height=8.0, joint=NEAR_EQUIDISTANT)
 
 
 def driven(junction: Junction) -> Evidence:
-    return synthetic_evidence(junction, np.random.default_rng(0))
+    return evidence_once(junction)
 
 
 def seen(junction: Junction, lines: np.ndarray) -> Evidence:
@@ -269,7 +272,7 @@ def test_lines_that_no_traffic_confirms_are_refused() -> None:
 def test_traffic_that_contradicts_keeps_its_own_result(alone: Calibration) -> None:
     elsewhere = replace(LONE_ROAD, camera_from_ground=pose(40.0, 1.0, 35.0))
     lines = painted_lines(elsewhere, np.random.default_rng(1))
-    result = solve(seen(LONE_ROAD, lines), OPTIONS)
+    result = solve_once(seen(LONE_ROAD, lines), OPTIONS)
     assert (result.camera, result.grade, result.ground) == (alone.camera, alone.grade, alone.ground)
     # the refusal reports both attempts
     assert result.ground_refusal.message.startswith(alone.ground_refusal.message)
@@ -278,15 +281,15 @@ def test_traffic_that_contradicts_keeps_its_own_result(alone: Calibration) -> No
 
 @pytest.fixture(scope='module')
 def alone() -> Calibration:
-    """Calibrate without lines."""
-    result = solve(driven(LONE_ROAD), OPTIONS)
+    """The result without lines."""
+    result = solve_once(driven(LONE_ROAD), OPTIONS)
     assert isinstance(result, Calibration)
     return result
 
 
 @pytest.fixture(scope='module')
 def assumed() -> Calibration:
-    result = solve(painted(LONE_ROAD), OPTIONS)
+    result = solve_once(painted(LONE_ROAD), OPTIONS)
     assert isinstance(result, Calibration)
     return result
 
@@ -327,7 +330,7 @@ def test_the_same_lines_give_the_same_numbers(assumed: Calibration) -> None:
 
 def test_lines_are_not_used_if_switched_off(alone: Calibration) -> None:
     options = replace(OPTIONS, joint=replace(OPTIONS.joint, road_markings=False))
-    assert to_json(solve(painted(LONE_ROAD), options)) == to_json(alone)
+    assert to_json(solve_once(painted(LONE_ROAD), options)) == to_json(alone)
 
 
 BUSY = Junction(vehicles=30, points_per_vehicle=3)
@@ -338,13 +341,13 @@ HELD = replace(OPTIONS, joint=replace(NEAR_EQUIDISTANT, k1_sigma=0.0))
 
 @pytest.fixture(scope='module')
 def by_busy_traffic() -> Calibration:
-    result = solve(driven(BUSY), HELD)
+    result = solve_once(driven(BUSY), HELD)
     assert isinstance(result, Calibration) and result.grade == 'full'
     return result
 
 
 def test_lines_refine_the_solution_from_traffic(by_busy_traffic: Calibration) -> None:
-    result = solve(painted(BUSY, FINE), HELD)
+    result = solve_once(painted(BUSY, FINE), HELD)
     assert isinstance(result, Calibration) and result.grade == 'full'
     assert result.stddev.focal_px < 0.7 * by_busy_traffic.stddev.focal_px
     assert abs(result.camera.focal_px - 560.0) < 3.0 * result.stddev.focal_px
@@ -359,7 +362,7 @@ def test_lines_refine_the_solution_from_traffic(by_busy_traffic: Calibration) ->
 
 def test_lines_that_contradict_sufficient_traffic_are_not_used(by_busy_traffic: Calibration) -> None:
     elsewhere = replace(BUSY, camera_from_ground=pose(36.0, 4.0, 35.0))
-    result = solve(seen(BUSY, painted_lines(elsewhere, np.random.default_rng(1))), HELD)
+    result = solve_once(seen(BUSY, painted_lines(elsewhere, np.random.default_rng(1))), HELD)
     assert isinstance(result, Calibration) and result.grade == 'full'
     assert result.camera == by_busy_traffic.camera and result.assumptions == by_busy_traffic.assumptions
     assert result.checks[: len(by_busy_traffic.checks)] == by_busy_traffic.checks
@@ -367,7 +370,7 @@ def test_lines_that_contradict_sufficient_traffic_are_not_used(by_busy_traffic: 
 
 
 def test_lines_suffice_where_all_traffic_turns_about_one_point() -> None:
-    result = solve(painted(RING), OPTIONS)
+    result = solve_once(painted(RING), OPTIONS)
     assert isinstance(result, Calibration) and result.grade == 'assumed'
     assert abs(result.camera.focal_px - 560.0) < min(3.0 * result.stddev.focal_px, 0.03 * 560.0)
     error, sigmas = ground_errors(result, RING)
@@ -377,7 +380,7 @@ def test_lines_suffice_where_all_traffic_turns_about_one_point() -> None:
 
 def test_lines_complete_a_known_lens() -> None:
     alone, result = (
-        solve(evidence, OPTIONS, lens=LONE_ROAD.camera) for evidence in (driven(LONE_ROAD), painted(LONE_ROAD))
+        solve_once(evidence, OPTIONS, lens=LONE_ROAD.camera) for evidence in (driven(LONE_ROAD), painted(LONE_ROAD))
     )
     assert not isinstance(alone, Calibration) or alone.ground is None
     assert isinstance(result, Calibration) and result.grade == 'assumed'
@@ -409,14 +412,14 @@ def test_a_second_focal_length_that_fits_as_well_is_refused() -> None:
 def test_errors_are_covered_by_their_standard_deviations(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(markings, 'MAX_GRID_STARTS', 1)  # more starts only find ambiguities: with one, less is refused
     ratios = []
-    for seed in range(8):
+    for seed in range(5):
         junction, evidence = drawn(seed)
         found = told(evidence)
         if isinstance(found, Reason):
             continue
         fit, tracks, _ = found
         ratios.append([abs(focal_error(fit, junction)) / fit.focal_sigma, *tilt_and_roll_sigmas(fit, tracks, junction)])
-    assert len(ratios) >= 8
+    assert len(ratios) >= 5
     assert np.max(ratios) < 3.5
     # nor may the standard deviations be far too large
     assert 0.5 < np.sqrt(np.mean(np.square(ratios))) < 1.5

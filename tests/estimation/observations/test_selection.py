@@ -5,13 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from autocalib_ros.config import Options
-from autocalib_ros.estimation.estimate import solve
 from autocalib_ros.estimation.observations.selection import drop_pedestrians
 from autocalib_ros.evidence.snapshot import Evidence, TrackKind
 from autocalib_ros.offline.synthetic.junction import Junction, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration, Refusal
+from solved_once import solve_once
 
 
 def with_people(evidence: Evidence, count: int, generator: np.random.Generator) -> Evidence:
@@ -32,10 +33,11 @@ def with_people(evidence: Evidence, count: int, generator: np.random.Generator) 
     )
 
 
+@pytest.mark.solve
 def test_pedestrians_change_neither_lens_nor_plane_nor_the_labels_of_vehicles() -> None:
     evidence = synthetic_evidence(Junction(), np.random.default_rng(3))
     crowd = with_people(evidence, 80, np.random.default_rng(4))
-    alone, among = (solve(one, Options(camera_height=8.0)) for one in (evidence, crowd))
+    alone, among = (solve_once(one, Options(camera_height=8.0)) for one in (evidence, crowd))
     assert isinstance(alone, Calibration) and isinstance(among, Calibration)
     assert among.camera == alone.camera
     np.testing.assert_array_equal(among.ground.normal_in_camera, alone.ground.normal_in_camera)
@@ -46,7 +48,7 @@ def test_pedestrians_change_neither_lens_nor_plane_nor_the_labels_of_vehicles() 
 def test_vehicle_tracks_are_too_few_if_most_are_of_pedestrians() -> None:
     evidence = synthetic_evidence(Junction(), np.random.default_rng(3))
     kinds = np.where(np.arange(evidence.track_count) < 10, TrackKind.VEHICLE, TrackKind.PERSON).astype(np.uint8)
-    refused = solve(replace(evidence, track_kinds=kinds), Options(camera_height=8.0))
+    refused = solve_once(replace(evidence, track_kinds=kinds), Options(camera_height=8.0))
     assert isinstance(refused, Refusal) and refused.code == 'too_few_tracks'
     assert refused.message.startswith('10 tracks of the 40 needed')
     assert len(refused.figures.paper_tracks)  # the published method uses all tracks

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from autocalib_ros.config import Options, PaperOptions
-from autocalib_ros.estimation.estimate import solve
 from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration, Refusal
+from solved_once import solve_once
+
+pytestmark = pytest.mark.solve
 
 OPTIONS = Options(camera_height=8.0, method='paper', paper=PaperOptions(window_s=3.0, vote_sigmas=0.0))
 CLEAN = Junction(turning_fraction=0.0, wander_m=0.0, noise_px=0.2, camera_from_ground=pose(32.0, 1.0, 40.0))
@@ -16,7 +18,7 @@ CLEAN = Junction(turning_fraction=0.0, wander_m=0.0, noise_px=0.2, camera_from_g
 
 @pytest.fixture(scope='module')
 def result() -> Calibration:
-    found = solve(synthetic_evidence(CLEAN, np.random.default_rng(0)), OPTIONS)
+    found = solve_once(synthetic_evidence(CLEAN, np.random.default_rng(0)), OPTIONS)
     assert isinstance(found, Calibration)
     return found
 
@@ -46,6 +48,5 @@ def test_no_uncertainty_is_given(result: Calibration) -> None:
 
 def test_without_long_tracks_it_refuses() -> None:
     options = Options(camera_height=8.0, method='paper', paper=PaperOptions(window_s=300.0))
-    found = solve(synthetic_evidence(CLEAN, np.random.default_rng(0)), options)
-    assert isinstance(found, Refusal)
-    assert found.code == 'too_few_tracks'
+    found = solve_once(synthetic_evidence(CLEAN, np.random.default_rng(0)), options)
+    assert isinstance(found, Refusal) and found.code == 'too_few_tracks'

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from autocalib_ros.config import Options
-from autocalib_ros.estimation.estimate import solve
 from autocalib_ros.estimation.people.cyclists import find_cyclists
 from autocalib_ros.evidence.snapshot import Evidence, Outlines, Track
 from autocalib_ros.offline.synthetic.junction import Junction, evidence_from_tracks, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration
 from silhouette_evidence import CAR_M, RIDER_M, driven, with_outlines
+from solved_once import solve_once
 
 JUNCTION = Junction(vehicles=30)
 FIRST_RIDER, FIRST_CAR = 1000, 2000
@@ -114,8 +114,9 @@ def street() -> tuple[Evidence, Evidence]:
     return vehicles, with_outlines(evidence_from_tracks(both, JUNCTION.image_size, 100.0), outlines)
 
 
+@pytest.mark.solve
 def test_lens_and_plane_come_from_vehicles_alone(street: tuple[Evidence, Evidence]) -> None:
-    alone, among = (solve(each, Options(camera_height=JUNCTION.height_m)) for each in street)
+    alone, among = (solve_once(each, Options(camera_height=JUNCTION.height_m)) for each in street)
     assert isinstance(alone, Calibration) and isinstance(among, Calibration)
     found = among.evidence.people
     assert 17 <= found <= 21
@@ -127,6 +128,7 @@ def test_lens_and_plane_come_from_vehicles_alone(street: tuple[Evidence, Evidenc
     assert off_deg < 3.0 * np.hypot(among.stddev.tilt_deg, among.stddev.roll_deg)
 
 
+@pytest.mark.solve
 def test_with_too_few_vehicles_left_cyclists_stay_in_the_plane_and_are_reported(
     street: tuple[Evidence, Evidence],
 ) -> None:
@@ -134,7 +136,7 @@ def test_with_too_few_vehicles_left_cyclists_stay_in_the_plane_and_are_reported(
     _, among = street
     least = int((among.track_vehicles < FIRST_RIDER).sum()) + 20
     demanding = replace(options, gate=replace(options.gate, min_tracks=least))
-    result = solve(among, demanding)
+    result = solve_once(among, demanding)
     assert isinstance(result, Calibration), result
     [check] = [check for check in result.checks if check.kind == 'pedestrians_kept']
     assert f'at least {least} needed' in check.text

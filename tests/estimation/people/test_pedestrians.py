@@ -99,6 +99,7 @@ def test_cars_in_a_jam_are_not_pedestrians():
     assert len(told) <= 3
 
 
+@pytest.mark.solve
 def test_a_calibration_counts_pedestrians_apart_from_vehicles_and_is_no_worse(street):
     junction, evidence = street
     result = solve(evidence, replace(Options(), camera_height=junction.height_m))
@@ -109,6 +110,7 @@ def test_a_calibration_counts_pedestrians_apart_from_vehicles_and_is_no_worse(st
     assert off_deg < 3.0 * np.hypot(result.stddev.tilt_deg, result.stddev.roll_deg)
 
 
+@pytest.mark.solve
 def test_pedestrians_beside_a_single_road_are_not_turning_traffic():
     generator = np.random.default_rng(7)
     junction = Junction(road_angles_deg=(0.0,), turning_fraction=0.0, vehicles=25, points_per_vehicle=6)

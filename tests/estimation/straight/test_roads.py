@@ -21,6 +21,9 @@ from autocalib_ros.offline.benchmark.monte_carlo import draw_evidence
 from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration, Refusal
 from autocalib_ros.results.statements import check
+from solved_once import solved_junction
+
+pytestmark = pytest.mark.solve
 
 OPTIONS = Options(camera_height=8.0)
 ONE_ROAD = Junction(
@@ -35,7 +38,7 @@ ONE_ROAD = Junction(
 def solved(
     junction: Junction, seed: int = 0, options: Options = OPTIONS, lens: Camera | None = None
 ) -> Calibration | Refusal:
-    return solve(synthetic_evidence(junction, np.random.default_rng(seed)), options, lens=lens)
+    return solved_junction(junction, options, seed, lens)
 
 
 def normal_error_deg(result: Calibration, junction: Junction) -> float:
@@ -177,7 +180,7 @@ def test_one_road_gives_a_lens_and_the_refusal_of_a_plane() -> None:
     assert result.ground_refusal.code == 'one_direction'
 
 
-@pytest.mark.parametrize('roll_deg', [-1.5, 0.0, 2.0])
+@pytest.mark.parametrize('roll_deg', [-1.5, 2.0])
 def test_one_road_and_a_level_camera_give_an_assumed_plane_where_allowed(roll_deg: float) -> None:
     junction = replace(ONE_ROAD, camera_from_ground=pose(35.0, roll_deg, 60.0))
     options = replace(OPTIONS, joint=JointOptions(roll_prior_deg=2.0))
@@ -205,16 +208,16 @@ def test_traffic_that_only_turns_is_refused() -> None:
     assert result.code in ('turning_traffic', 'halves_disagree', 'no_direction')
 
 
-@pytest.mark.parametrize('changing_share', [0.3, 0.4])
-def test_frequent_lane_changes_still_give_the_lens(changing_share: float) -> None:
-    junction = replace(ONE_ROAD, lane_change_fraction=changing_share)
+def test_a_road_on_which_many_change_lanes_still_gives_the_lens() -> None:
+    junction = replace(ONE_ROAD, lane_change_fraction=0.4)
     result = solved(junction)
     assert isinstance(result, Calibration)
     assert abs(result.camera.focal_px - 560.0) < 3 * result.stddev.focal_px
 
 
-@pytest.mark.parametrize('points', [1, 3, 4])
+@pytest.mark.parametrize('points', [3, 4])
 def test_a_ring_of_which_an_arc_passes_for_a_road_is_refused(points: int) -> None:
+    """With one point a vehicle: the golden case `roundabout`."""
     generator = np.random.default_rng([5, 1])
     ring = replace(families()['roundabout'](generator)[0], tracks=None, vehicles=60, points_per_vehicle=points)
     assert isinstance(solved(ring), Refusal)
@@ -257,22 +260,22 @@ def test_unit_scale_needs_its_option() -> None:
 
 
 def test_the_same_evidence_gives_the_same_answer_to_the_last_bit() -> None:
-    first, second = solved(Junction()), solved(Junction())
-    assert isinstance(first, Calibration)
-    assert isinstance(second, Calibration)
+    first, second = (solve(synthetic_evidence(Junction(), np.random.default_rng(0)), OPTIONS), solved(Junction()))
+    assert isinstance(first, Calibration) and isinstance(second, Calibration)
     assert first.camera == second.camera
     np.testing.assert_array_equal(first.ground.rotation, second.ground.rotation)  # type: ignore[union-attr]
 
 
 def test_standard_deviations_have_the_size_of_the_errors() -> None:
-    results = [solved(Junction(), seed) for seed in range(8)]
+    """Five draws; `autocalib benchmark accuracy` has forty of this family."""
+    results = [solved(Junction(), seed) for seed in range(5)]
     errors = [
         (result.camera.focal_px - 560.0) / result.stddev.focal_px
         for result in results
         if isinstance(result, Calibration) and result.stddev.focal_px
     ]
-    assert len(errors) == 8
-    assert 0.2 < np.sqrt(np.mean(np.square(errors))) < 2.0  # eight runs tell a factor of two, no more
+    assert len(errors) == 5
+    assert 0.2 < np.sqrt(np.mean(np.square(errors))) < 2.0  # five runs tell a factor of two, no more
 
 
 def test_a_half_without_tracks_is_reported_as_not_cross_checked() -> None:

@@ -14,6 +14,8 @@ from autocalib_ros.offline.benchmark.families import motorway
 from autocalib_ros.offline.synthetic.junction import Junction, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration
 
+pytestmark = pytest.mark.solve
+
 SEED = 4
 
 

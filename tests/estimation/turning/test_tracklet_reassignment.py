@@ -29,6 +29,8 @@ from autocalib_ros.offline.synthetic.junction import Junction, synthetic_evidenc
 from autocalib_ros.results.calibration import Calibration
 from autocalib_ros.results.refusals import Reason
 
+pytestmark = pytest.mark.solve
+
 TURNING = Junction(drive=partial(drive_arc, radii_m=(12.0, 60.0)), vehicles=14, points_per_vehicle=8, noise_px=0.3)
 TRUTH = AdjustmentState(TURNING.camera, TURNING.camera_from_ground, np.zeros(0))
 
@@ -56,8 +58,8 @@ def sigmas_off(result: Calibration) -> float:
     return float((np.abs(off_deg) / sigma).max())
 
 
-@pytest.mark.parametrize('seed', range(4))
-def test_few_vehicles_with_slipping_points_do_not_mislead(seed: int) -> None:
+@pytest.mark.parametrize('seed', range(2))
+def test_few_vehicles_whose_points_slide_do_not_mislead(seed: int) -> None:
     generator = np.random.default_rng(seed)
     evidence = slid(synthetic_evidence(TURNING, generator), generator, 1.0)
     result = solve(evidence, Options(camera_height=8.0), lens=TURNING.camera)

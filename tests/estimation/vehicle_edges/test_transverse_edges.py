@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from autocalib_ros.config import GateOptions, JointOptions, Options
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentState
-from autocalib_ros.estimation.estimate import find_solution, solve
+from autocalib_ros.estimation.estimate import find_solution
 from autocalib_ros.estimation.observations.track_set import select_tracks
 from autocalib_ros.estimation.solution import Solution
 from autocalib_ros.estimation.vehicle_edges.transverse_edges import (
@@ -25,6 +25,7 @@ from autocalib_ros.geometry.robust_kernels import wrap_undirected
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration
+from solved_once import solve_once
 
 CAMERA = Camera(1280, 720, 560.0, (639.5, 359.5))
 HEIGHT_M = 8.0
@@ -243,8 +244,9 @@ def with_boxes(junction: Junction, clutter: float = 0.5) -> Evidence:
 ROLLED = replace(ONE_ROAD, camera_from_ground=pose(35.0, 5.0, 60.0))
 
 
+@pytest.mark.solve
 def test_one_road_and_edges_give_an_assumed_plane_of_a_rolled_camera() -> None:
-    result = solve(with_boxes(ROLLED), Options(camera_height=HEIGHT_M))
+    result = solve_once(with_boxes(ROLLED), Options(camera_height=HEIGHT_M))
     assert isinstance(result, Calibration) and result.ground is not None
     assert result.grade == 'assumed'
     assert 'transverse_edges' in [statement.kind for statement in result.assumptions]
@@ -253,16 +255,18 @@ def test_one_road_and_edges_give_an_assumed_plane_of_a_rolled_camera() -> None:
     assert error < 1.5 and error < 2.5 * np.hypot(result.stddev.roll_deg, result.stddev.tilt_deg)
 
 
+@pytest.mark.solve
 def test_edges_are_not_used_if_switched_off() -> None:
     options = Options(camera_height=HEIGHT_M, joint=JointOptions(transverse_edges=False))
-    result = solve(with_boxes(ROLLED), options)
+    result = solve_once(with_boxes(ROLLED), options)
     assert isinstance(result, Calibration) and result.ground_refusal is not None
     assert result.ground_refusal.code == 'one_direction'
 
 
+@pytest.mark.solve
 def test_edges_that_contradict_a_level_camera_are_refused_with_a_reason() -> None:
     junction = replace(ONE_ROAD, camera_from_ground=pose(35.0, 9.0, 60.0))
-    result = solve(with_boxes(junction), Options(camera_height=HEIGHT_M, joint=JointOptions(roll_prior_deg=1.0)))
+    result = solve_once(with_boxes(junction), Options(camera_height=HEIGHT_M, joint=JointOptions(roll_prior_deg=1.0)))
     assert isinstance(result, Calibration) and result.ground is None and result.ground_refusal is not None
     assert result.ground_refusal.code == 'plane_uncertain'
     assert 'edges of vehicles and a level camera disagree' in result.ground_refusal.message
@@ -281,12 +285,14 @@ def assumed() -> Solution:
     return solution
 
 
+@pytest.mark.solve
 def test_a_plane_through_the_traffic_is_refused(assumed: Solution) -> None:
     assert assumed.plane.fraction_below_horizon > 0.99 and check_plane(assumed.plane, GateOptions()) is None
     doubt = check_plane(replace(assumed.plane, fraction_below_horizon=0.8), GateOptions())
     assert doubt is not None and doubt.code == 'horizon'
 
 
+@pytest.mark.solve
 def test_the_plane_is_no_more_certain_about_its_road_than_the_edges(assumed: Solution) -> None:
     plane, along = assumed.plane, assumed.fit.state.directions[0]
     across = np.cross(along, plane.normal(plane.fit.state))

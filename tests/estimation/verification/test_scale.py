@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from autocalib_ros.calibrator import AutoCalibrator
-from autocalib_ros.config import Options, ScaleOptions
+from autocalib_ros.config import JointOptions, Options, ScaleOptions
 from autocalib_ros.errors import UsageError
 from autocalib_ros.estimation.estimate import find_solution, solve
 from autocalib_ros.estimation.observations.track_set import SAMPLES_PER_TRACK, TrackSet, select_tracks
@@ -19,8 +19,11 @@ from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration
 from autocalib_ros.results.refusals import Reason
+from solved_once import solve_once, solved_junction
 
-JUNCTION = Junction()
+JUNCTION = Junction(points_per_vehicle=2)
+ONE_FAMILY = JointOptions(lens_prior='equidistant')
+"""The height does not depend on how the family of the lens is chosen, and the others take as long again."""
 NEAR_M, FAR_M = ((10.0, -8.0), (18.0, -2.0)), ((25.0, -15.0), (38.0, -16.0))
 """Two pairs of points on the road in view, metres from the camera's foot; the first 10 m apart."""
 MEAN_KM_H = 9.5 * 3.6
@@ -39,11 +42,13 @@ def pixels_of(points_m: tuple[tuple[float, float], ...], junction: Junction = JU
 
 def by_distance(pixels: np.ndarray, metres: float, **more: float) -> Options:
     text = ' '.join(f'{value:.6f}' for value in pixels.ravel())
-    return Options(scale_from='distance', scale=ScaleOptions(distance_px=text, distance_m=metres, **more))
+    return Options(
+        joint=ONE_FAMILY, scale_from='distance', scale=ScaleOptions(distance_px=text, distance_m=metres, **more)
+    )
 
 
 def by_speed(km_h: float, **more: float) -> Options:
-    return Options(scale_from='speed', scale=ScaleOptions(speed_km_h=km_h, **more))
+    return Options(joint=ONE_FAMILY, scale_from='speed', scale=ScaleOptions(speed_km_h=km_h, **more))
 
 
 def flow_of(speeds_m_s: np.ndarray, above_m: float = 0.0, junction: Junction = JUNCTION) -> TrackSet:
@@ -78,10 +83,10 @@ def test_the_deviation_by_distance_is_that_of_clicks_and_tape() -> None:
         height_at_truth(
             by_distance(pixels + generator.normal(scale=2.0, size=(2, 2)), metres + generator.normal(scale=0.2))
         )
-        for _ in range(2000)
+        for _ in range(1000)
     ]
     scale = at_truth(by_distance(pixels, metres, distance_sigma_m=0.2, pixel_sigma_px=2.0))
-    # a spread of 2000 draws is known to 1.6 %, one sigma; the slope changes over two pixels so far away
+    # a spread of 1000 draws is known to 2.2 %, one sigma; the slope changes over two pixels so far away
     assert isinstance(scale, Scale) and scale.sigma == pytest.approx(np.std(heights), rel=0.06)
 
 
@@ -128,7 +133,7 @@ def test_the_deviation_of_the_trimmed_mean_is_its_spread() -> None:
 
 
 def solved(junction: Junction, options: Options, seed: int = 0) -> Calibration:
-    result = solve(synthetic_evidence(junction, np.random.default_rng(seed)), options)
+    result = solved_junction(junction, options, seed)
     assert isinstance(result, Calibration)
     return result
 
@@ -141,11 +146,12 @@ def evidence() -> Evidence:
 @pytest.fixture(scope='module')
 def result(evidence: Evidence) -> Calibration:
     """Return a calibration by distance."""
-    result = solve(evidence, by_distance(pixels_of(NEAR_M), 10.0, distance_sigma_m=0.4))
+    result = solve_once(evidence, by_distance(pixels_of(NEAR_M), 10.0, distance_sigma_m=0.4))
     assert isinstance(result, Calibration)
     return result
 
 
+@pytest.mark.solve
 def test_a_distance_gives_a_metric_ground_plane(result: Calibration) -> None:
     assert result.grade == 'full' and result.ground is not None and result.ground.metric
     assert result.stddev.height_m is not None
@@ -153,6 +159,7 @@ def test_a_distance_gives_a_metric_ground_plane(result: Calibration) -> None:
     assert 0.04 * 8.0 < result.stddev.height_m < 0.06 * 8.0  # the tape alone is 4 %
 
 
+@pytest.mark.solve
 def test_the_source_of_the_scale_stands_among_the_assumptions(result: Calibration) -> None:
     source = result.assumptions[-1]
     assert source.kind == 'scale_distance'
@@ -162,9 +169,12 @@ def test_the_source_of_the_scale_stands_among_the_assumptions(result: Calibratio
     assert f'camera height {result.ground.height_m:.3f} +- {result.stddev.height_m:.2g} m' in source.text
 
 
+@pytest.mark.solve
 def test_road_points_are_as_unsure_as_the_scale(evidence: Evidence, result: Calibration) -> None:
-    exact = solve(evidence, Options(camera_height=result.ground.height_m))
-    given = solve(evidence, Options(camera_height=result.ground.height_m, camera_height_sigma=0.4))
+    exact = solve_once(evidence, Options(joint=ONE_FAMILY, camera_height=result.ground.height_m))
+    given = solve_once(
+        evidence, Options(joint=ONE_FAMILY, camera_height=result.ground.height_m, camera_height_sigma=0.4)
+    )
     assert exact.stddev.height_m is None and given.stddev.height_m == 0.4
     assert '+- 0.4 m (given)' in given.assumptions[-1].text and '+-' not in exact.assumptions[-1].text
     for distance, without, with_sigma, by_tape in zip(
@@ -178,6 +188,7 @@ def test_road_points_are_as_unsure_as_the_scale(evidence: Evidence, result: Cali
         assert by_tape > distance * 0.04  # the tape's share; the rest of it correlates with lens and plane
 
 
+@pytest.mark.solve
 def test_a_speed_gives_the_height_of_the_evidence() -> None:
     found = solved(replace(JUNCTION, vehicles=120), by_speed(MEAN_KM_H, speed_sigma_km_h=1.0))
     assert found.ground is not None and found.stddev.height_m is not None
@@ -188,6 +199,7 @@ def test_a_speed_gives_the_height_of_the_evidence() -> None:
     )
 
 
+@pytest.mark.solve
 def test_an_unusual_height_is_solved_with_once_more() -> None:
     junction = replace(JUNCTION, height_m=14.0, centre_m=(24.0, -14.0))
     points = ((18.0, -8.0), (26.0, -2.0))
@@ -198,21 +210,23 @@ def test_an_unusual_height_is_solved_with_once_more() -> None:
     scale = known_scale(options, *first.plane.lens_and_normal)
     assert isinstance(scale, Scale)
     found, given = (
-        solve(evidence, options),
-        solve(evidence, Options(camera_height=scale.height(*first.plane.lens_and_normal))),
+        solve_once(evidence, options),
+        solve_once(evidence, Options(joint=ONE_FAMILY, camera_height=scale.height(*first.plane.lens_and_normal))),
     )
     assert found.camera == given.camera != first.fit.state.camera
     assert found.ground.height_m == pytest.approx(14.0, abs=3 * found.stddev.height_m)
 
 
+@pytest.mark.solve
 def test_the_same_evidence_gives_the_same_height_to_the_last_bit(evidence: Evidence, result: Calibration) -> None:
     again = solve(evidence, by_distance(pixels_of(NEAR_M), 10.0, distance_sigma_m=0.4))
     assert again.ground.height_m == result.ground.height_m and again.stddev == result.stddev
 
 
+@pytest.mark.solve
 def test_the_published_method_takes_a_distance(evidence: Evidence) -> None:
     options = replace(by_distance(pixels_of(NEAR_M), 10.0), method='paper')
-    found = solve(evidence, options)
+    found = solve_once(evidence, options)
     assert found.ground is not None
     places = [
         bearing / -(bearing @ found.ground.normal_in_camera) for bearing in found.camera.unproject(pixels_of(NEAR_M))[0]
@@ -223,14 +237,14 @@ def test_the_published_method_takes_a_distance(evidence: Evidence) -> None:
 
 # Seeds of their own: Monte Carlo of what is clicked, taped and driven.
 
-SEEDS = range(20)
+SEEDS = range(12)
 
 
 def draws() -> Iterator[tuple[np.random.Generator, Solution]]:
     for seed in SEEDS:
         generator = np.random.default_rng([seed, 7])
         evidence = synthetic_evidence(JUNCTION, generator)
-        options = Options()
+        options = Options(joint=ONE_FAMILY)
         solution = find_solution(
             evidence,
             select_tracks(evidence, options.joint.max_tracks),
@@ -250,7 +264,7 @@ def score(options: Options, solution: Solution) -> float:
 
 
 @pytest.mark.slow
-def test_heights_lie_within_their_deviations_over_twenty_draws() -> None:
+def test_heights_lie_within_their_deviations_over_twelve_draws() -> None:
     exact, clicked, driven = [], [], []
     near, far = pixels_of(NEAR_M), pixels_of(FAR_M)
     metres = float(np.hypot(*np.subtract(*FAR_M)))
@@ -279,17 +293,18 @@ def test_heights_lie_within_their_deviations_over_twenty_draws() -> None:
             )
         )
     for scores in (exact, clicked, driven):
-        # twenty tell a root mean square to 16 % and a mean to 0.22, one sigma
+        # twelve tell a root mean square to 20 % and a mean to 0.29, one sigma
         assert 0.5 < np.sqrt(np.mean(np.square(scores))) < 1.5
         assert abs(np.mean(scores)) < 0.7
-        assert np.abs(scores).max() < 4.0  # sixty normal draws exceed it once in 250 times
+        assert np.abs(scores).max() < 4.0  # 36 normal draws exceed it once in 400 times
 
 
 # What gives no scale.
 
 
+@pytest.mark.solve
 def test_a_pixel_above_the_horizon_leaves_the_lens(evidence: Evidence) -> None:
-    found = solve(evidence, by_distance(np.array([[600.0, 20.0], [600.0, 500.0]]), 10.0))
+    found = solve_once(evidence, by_distance(np.array([[600.0, 20.0], [600.0, 500.0]]), 10.0))
     assert isinstance(found, Calibration) and found.grade == 'lens' and found.ground is None
     reason = found.ground_refusal
     assert reason is not None and reason.code == 'scale_off_road'
@@ -300,22 +315,23 @@ def test_a_pixel_above_the_horizon_leaves_the_lens(evidence: Evidence) -> None:
 def test_a_pixel_outside_the_image_is_wrong_usage_from_the_first_image_on(evidence: Evidence) -> None:
     options = by_distance(np.array([[600.0, 400.0], [1300.0, 500.0]]), 10.0)
     with pytest.raises(UsageError, match=r'pixel \(1300, 500\).* outside the images, which have 1280x720'):
-        solve(evidence, options)
+        solve_once(evidence, options)
     with pytest.raises(UsageError, match='outside the images, which have 320x180'):
         AutoCalibrator(options).add_image(0, np.zeros((180, 320), np.uint8))
 
 
+@pytest.mark.solve
 @pytest.mark.parametrize(
     'options',
     [
         by_distance(pixels_of(NEAR_M), 10.0, distance_sigma_m=3.0),
         by_speed(MEAN_KM_H, speed_sigma_km_h=10.0),
-        Options(camera_height=8.0, camera_height_sigma=2.0),
+        Options(joint=ONE_FAMILY, camera_height=8.0, camera_height_sigma=2.0),
     ],
     ids=['distance', 'speed', 'height'],
 )
 def test_a_scale_less_sure_than_the_gate_is_refused_with_numbers(evidence: Evidence, options: Options) -> None:
-    found = solve(evidence, options)
+    found = solve_once(evidence, options)
     assert isinstance(found, Calibration) and found.ground is None and found.grade == 'lens'
     reason = found.ground_refusal
     assert reason is not None and reason.code == 'scale_uncertain'
@@ -329,6 +345,7 @@ def test_too_few_vehicles_tell_no_speed(count: int) -> None:
     assert reason.values == {'vehicles': count, 'limit': MIN_SPEED_VEHICLES} and f'{count} vehicles' in reason.message
 
 
+@pytest.mark.solve
 def test_without_a_plane_there_is_no_scale() -> None:
     one_road = Junction(
         road_angles_deg=(0.0,),
