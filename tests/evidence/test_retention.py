@@ -12,6 +12,8 @@ from autocalib_ros.evidence.buffer import EvidenceBuffer
 from autocalib_ros.evidence.retention import REPLACING_VEHICLES, cell_heading_bins, headings, novelty
 from autocalib_ros.evidence.snapshot import Evidence, Segments, Track
 
+pytestmark = pytest.mark.render
+
 HOUR_S = 3600.0
 MAIN = ((40.0, 300.0), (1200.0, 0.0))
 SIDE = ((620.0, 700.0), (0.0, -500.0))

@@ -17,6 +17,8 @@ from autocalib_ros.offline import outputs
 from autocalib_ros.offline.recordings.open import open_source
 from autocalib_ros.offline.recordings.write_bag import camera_info_topic, write_bag
 
+pytestmark = pytest.mark.render
+
 SECOND = 1_000_000_000
 
 
@@ -41,7 +43,6 @@ def source(tmp_path, write_bag, images):
     return open_source(write_bag(tmp_path / 'recording', images(4)))
 
 
-@pytest.mark.render
 def test_a_calibration_gives_all_files(tmp_path, lens_only, source):
     result = replace(lens_only.result, distortion_model='rational_polynomial', rectified_balance=1.0)
     lens_only = replace(lens_only, background=None, result=result)  # no background saves the time of some figures
@@ -56,7 +57,6 @@ def test_a_calibration_gives_all_files(tmp_path, lens_only, source):
     assert Evidence.load(tmp_path / 'evidence.npz').track_count == lens_only.evidence.track_count
 
 
-@pytest.mark.render
 def test_a_refusal_removes_the_camera_info_of_an_earlier_run(tmp_path, refused, source):
     (tmp_path / 'camera_info.yaml').write_text('from an earlier run')
     assert outputs.write_outputs(tmp_path, refused, source) == ['calibration.json', 'report.html', 'evidence.npz']

@@ -43,6 +43,8 @@ from autocalib_ros.offline.synthetic.drives import (
 )
 from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_evidence
 
+pytestmark = pytest.mark.render
+
 FAMILIES = tuple(families())
 TRACKS = {'standard': 60, 'few': 40, 'many': 400}
 CLEAN = Junction(turning_fraction=0.0, wander_m=0.0, noise_px=0.0)
@@ -75,7 +77,6 @@ def circles(junction: Junction, evidence: Evidence) -> tuple[np.ndarray, np.ndar
     return np.array(normals), np.array(worst)
 
 
-@pytest.mark.render
 @pytest.mark.parametrize('name', FAMILIES)
 def test_every_family_records_as_many_tracks_as_asked_for(name: str) -> None:
     junction, evidence = drawn(name)
@@ -87,7 +88,6 @@ def test_every_family_records_as_many_tracks_as_asked_for(name: str) -> None:
         assert evidence.track_count == TRACKS.get(name, junction.tracks)
 
 
-@pytest.mark.render
 @pytest.mark.parametrize('name', FAMILIES)
 def test_every_point_lies_in_the_image(name: str) -> None:
     junction, evidence = drawn(name)
@@ -96,7 +96,6 @@ def test_every_point_lies_in_the_image(name: str) -> None:
     assert (evidence.points_px < np.array(evidence.image_size) + margin).all()
 
 
-@pytest.mark.render
 @pytest.mark.parametrize('name', FAMILIES)
 def test_a_seed_gives_the_same_evidence_again(name: str) -> None:
     _, first = drawn(name)

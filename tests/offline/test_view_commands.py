@@ -22,6 +22,8 @@ from autocalib_ros.pictures.views import EMPTY_GREY, ground_to_image, image_to_g
 from autocalib_ros.results.calibration_json import write_calibration_json
 from stored_results import LOOKS_ALONG, calibration, lens_only
 
+pytestmark = pytest.mark.render
+
 DIP = np.radians(28.0)
 DOWN = np.array([[1.0, 0, 0], [0, np.cos(DIP), np.sin(DIP)], [0, -np.sin(DIP), np.cos(DIP)]])
 LENS = Camera(640, 360, 300.0, (322.0, 178.0), (0.01, 0.0, 0.0, 0.0))
@@ -316,7 +318,6 @@ def test_a_bag_is_a_source_too(tmp_path, write_bag, images):
     assert cv2.imread(str(tmp_path / 'r.png')).shape == (24, 32, 3)
 
 
-@pytest.mark.dds
 def test_help_of_the_new_commands_imports_nothing_heavy():
     for name in ('compare', 'rectify', 'topview', 'picture'):
         code = (

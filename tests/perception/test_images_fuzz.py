@@ -46,7 +46,7 @@ def mutations(draw) -> SimpleNamespace:
     return SimpleNamespace(**whole, data=PIXELS[: whole['length']])
 
 
-@settings(max_examples=1_000, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=500, deadline=None, suppress_health_check=list(HealthCheck))
 @given(message=mutations())
 def test_any_header_gives_an_image_of_its_size_or_an_error(message):
     try:
@@ -60,7 +60,7 @@ def test_any_header_gives_an_image_of_its_size_or_an_error(message):
     )
 
 
-@settings(max_examples=400, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=200, deadline=None, suppress_health_check=list(HealthCheck))
 @given(
     file=st.sampled_from(FILES),
     cut=st.integers(0, 3000),

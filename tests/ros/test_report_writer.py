@@ -66,6 +66,7 @@ def test_images_of_another_size_are_not_shown(reports):
     assert reports.scene(result, (evidence, grey_road()), OPTIONS, '').background is None
 
 
+@pytest.mark.dds
 def test_a_report_that_cannot_be_written_is_reported(reports, log_lines, tmp_path):
     (tmp_path / 'file').touch()
     scene = reports.scene(full_result(junction_evidence()), (None, None), OPTIONS, '')
