@@ -12,6 +12,8 @@ from autocalib_ros.calibrator import CLOCK_JUMP_NS, AutoCalibrator, CalibrationP
 from autocalib_ros.config import BufferOptions, GateOptions, Options
 from autocalib_ros.errors import InputError
 
+pytestmark = pytest.mark.render
+
 OPTIONS = Options(first_solve_s=2.0, solve_interval_s=1.0, gate=GateOptions(min_tracks=4))
 
 
@@ -177,14 +179,12 @@ def held(calibrator: AutoCalibrator) -> int:
     return evidence.track_count
 
 
-@pytest.mark.render
 def test_a_lone_vehicle_is_kept_as_long_as_nothing_replaces_it() -> None:
     calibrator = watched(400.0)
     assert held(calibrator) > 0
     assert calibrator.progress().outlook == 'no traffic in the last 6 min'
 
 
-@pytest.mark.render
 def test_evidence_from_before_a_bump_is_forgotten() -> None:
     calibrator = watched(400.0, moved_at_s=150.0)
     assert held(calibrator) == 0
@@ -198,7 +198,6 @@ def test_a_bump_is_reported_while_evidence_from_before_is_held() -> None:
     assert 'the camera moves' in str(progress) and not progress.outlook
 
 
-@pytest.mark.render
 def test_evidence_is_forgotten_when_the_camera_may_look_elsewhere() -> None:
     assert held(watched(400.0, gone_at_s=150.0)) == 0
 

@@ -142,6 +142,7 @@ def test_readme_fits_on_a_few_screens():
     assert len(text_of(ROOT / 'README.md').splitlines()) <= 150
 
 
+@pytest.mark.render
 def test_generated_pages_are_those_of_the_code():
     assert outdated(DOCS) == [], 'run `autocalib docs`'
 
@@ -370,6 +371,7 @@ def pages() -> dict[str, str]:
     return reference_pages()
 
 
+@pytest.mark.render
 def test_every_option_has_a_row_with_its_default(pages):
     page = pages['reference/parameters.md']
     for item in [*walk_options(Options()), *walk_options(NodeOptions())]:
@@ -380,6 +382,7 @@ def test_every_option_has_a_row_with_its_default(pages):
         assert ' '.join(item.doc.split())[1:20].replace('<', '&lt;').replace('>', '&gt;') in row
 
 
+@pytest.mark.render
 def test_every_argument_of_every_command_has_a_row(pages):
     page = pages['reference/cli.md']
     for name, parser in command_parsers().items():

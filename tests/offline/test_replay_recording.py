@@ -16,6 +16,8 @@ from autocalib_ros.offline.recordings.sources import Frame
 from autocalib_ros.offline.replay_recording import replay, solve_evidence
 from autocalib_ros.results.calibration import Refusal
 
+pytestmark = pytest.mark.render
+
 
 class Drive:
     """A minimal `Source` of generated images."""

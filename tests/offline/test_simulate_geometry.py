@@ -15,6 +15,8 @@ from autocalib_ros.offline.simulate.options import SimulationOptions
 from autocalib_ros.offline.simulate.simulation import Simulation
 from autocalib_ros.offline.simulate.truth import truth_of
 
+pytestmark = pytest.mark.render
+
 SMALL = {'width_px': 320, 'height_px': 180, 'focal_px': 140.0, 'rate_hz': 5.0, 'duration_s': 2.0}
 
 
@@ -93,7 +95,6 @@ def truth() -> dict:
     return truth_of(Simulation(SimulationOptions(**SMALL, bump_at_s=1.0)))
 
 
-@pytest.mark.render
 def test_truth_has_the_keys_of_the_scenes(truth):
     assert {
         'case',

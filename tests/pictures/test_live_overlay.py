@@ -18,6 +18,8 @@ from autocalib_ros.pictures.live_overlay import (
 from autocalib_ros.pictures.road import GroundGrid
 from autocalib_ros.pictures.views import ground_to_image, image_to_ground
 
+pytestmark = pytest.mark.render
+
 SIZE = (640, 480)
 BLACK = np.zeros((480, 640, 3), np.uint8)
 NOTHING = np.zeros((0, 16, 2))

@@ -14,6 +14,8 @@ from autocalib_ros.estimation.paper.intrinsics import (
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.synthetic.junction import Junction, synthetic_evidence
 
+pytestmark = pytest.mark.solve
+
 STRAIGHT = Junction(turning_fraction=0.0, wander_m=0.0, noise_px=0.2)
 WINDOW = PaperOptions(window_s=3.0)  # synthetic vehicles cross the image in three to eight seconds
 

@@ -15,6 +15,8 @@ from autocalib_ros.results.calibration import Calibration
 from silhouette_evidence import CAR_M, RIDER_M, driven, with_outlines
 from solved_once import solve_once
 
+pytestmark = pytest.mark.solve
+
 JUNCTION = Junction(vehicles=30)
 FIRST_RIDER, FIRST_CAR = 1000, 2000
 

@@ -10,6 +10,8 @@ from autocalib_ros.estimation.straight.consensus import consensus_directions
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.synthetic.junction import Junction, synthetic_evidence
 
+pytestmark = pytest.mark.solve
+
 
 def angle_deg(first: np.ndarray, second: np.ndarray) -> float:
     return float(np.degrees(np.arccos(np.clip(abs(first @ second), 0, 1))))

@@ -27,6 +27,8 @@ from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_e
 from autocalib_ros.results.calibration import Calibration
 from solved_once import solve_once
 
+pytestmark = pytest.mark.solve
+
 CAMERA = Camera(1280, 720, 560.0, (639.5, 359.5))
 HEIGHT_M = 8.0
 ONE_ROAD = Junction(
@@ -244,7 +246,6 @@ def with_boxes(junction: Junction, clutter: float = 0.5) -> Evidence:
 ROLLED = replace(ONE_ROAD, camera_from_ground=pose(35.0, 5.0, 60.0))
 
 
-@pytest.mark.solve
 def test_one_road_and_edges_give_an_assumed_plane_of_a_rolled_camera() -> None:
     result = solve_once(with_boxes(ROLLED), Options(camera_height=HEIGHT_M))
     assert isinstance(result, Calibration) and result.ground is not None
