@@ -87,6 +87,7 @@ SHELL_WORDS = {
     '.venv/bin/pip',
     '.venv/bin/python',
     '.venv/bin/ruff',
+    '.venv/bin/mypy',
     '.venv/bin/autocalib',
 }
 NAMES = {item.name for options in (Options(), NodeOptions()) for item in walk_options(options)}

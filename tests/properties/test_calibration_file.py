@@ -18,12 +18,16 @@ from autocalib_ros.results.calibration import (
 )
 from autocalib_ros.results.calibration_json import calibration_from_json, calibration_json
 from autocalib_ros.results.refusals import Reason
+from autocalib_ros.results.statements import Statement
 from random_geometry import SIZE, between, ground_planes, lenses, reproducible
 
 COUNTS = st.integers(0, 10**6)
 NUMBERS = st.floats(-1e6, 1e6, allow_nan=False)
 SIGMAS = st.none() | between(0.0, 1e3)
 WORDS = st.text(max_size=20)
+NUMBERS = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False)
+VALUES = st.dictionaries(WORDS, NUMBERS | WORDS, max_size=3)
+STATEMENTS = st.builds(Statement, WORDS, WORDS, VALUES)
 ARRAYS = ('ground', 'road_directions', 'covariance')
 
 
@@ -80,11 +84,11 @@ def calibrations(draw: st.DrawFn) -> Calibration:
     return Calibration(
         method=draw(st.sampled_from(['joint', 'paper'])),
         grade=draw(st.sampled_from(['full', 'assumed'])) if metric else 'unit_scale' if ground else 'lens',
-        assumptions=tuple(draw(st.lists(WORDS, max_size=3))),
-        checks=tuple(draw(st.lists(WORDS, max_size=3))),
+        assumptions=tuple(draw(st.lists(STATEMENTS, max_size=3))),
+        checks=tuple(draw(st.lists(STATEMENTS, max_size=3))),
         camera=draw(lenses()),
         ground=ground,
-        ground_refusal=None if ground else draw(st.builds(Reason, WORDS, WORDS, WORDS)),
+        ground_refusal=None if ground else draw(st.builds(Reason, WORDS, WORDS, WORDS, VALUES)),
         road_directions=roads / np.linalg.norm(roads, axis=1, keepdims=True),
         stddev=draw(deviations()),
         covariance=spread @ spread.T if metric and draw(st.booleans()) else None,

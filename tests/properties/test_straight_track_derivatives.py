@@ -75,9 +75,9 @@ def test_gradients_of_straight_tracks_are_those_of_their_residuals(
     here = block.linearise()
     step = 1e-5
     differences = np.column_stack(
-        [block.dof * (block.at(unit)[1] - block.at(-unit)[1]) / (2 * step) for unit in step * np.eye(parameters.size)]
+        [block.dof * (block.at(unit) - block.at(-unit)) / (2 * step) for unit in step * np.eye(parameters.size)]
     )
-    _, squared = block.at(np.zeros(parameters.size))
+    squared = block.at(np.zeros(parameters.size))
     np.testing.assert_allclose(here.squared, squared, rtol=1e-9, atol=1e-12)
     # a part in a thousand of the steepest: circles minimise distances that are weighted once, so nearly the residuals
     largest = np.abs(differences).max(axis=1, keepdims=True)
@@ -92,6 +92,6 @@ def test_curvature_foretells_how_residuals_change(drawn: tuple[StraightTrackBloc
     for index in range(parameters.size):
         step = np.zeros(parameters.size)
         step[index] = 1e-3  # of a sigma, a radian or log f: small against what bends the residuals
-        changed = (block.dof * (block.at(step)[1] - here.squared)).sum()
+        changed = (block.dof * (block.at(step) - here.squared)).sum()
         foretold = (2 * here.gradient @ step + np.einsum('p,rpq,q->r', step, here.curvature, step)).sum()
         assert changed == pytest.approx(foretold, rel=0.05, abs=1e-2), index

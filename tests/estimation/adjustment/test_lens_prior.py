@@ -54,7 +54,7 @@ def test_a_known_lens_has_no_free_parameters() -> None:
 
 @pytest.mark.parametrize('angle', ['right', '5', '-90', ''])
 def test_an_invalid_angle_is_refused_with_the_accepted_values(angle: str) -> None:
-    with pytest.raises(UsageError, match='degrees between 10 and 170'):
+    with pytest.raises(UsageError, match='between 10 and 170 degrees'):
         JointOptions(road_angle=angle)
 
 

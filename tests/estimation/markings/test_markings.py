@@ -139,9 +139,9 @@ LENSES = {
 @pytest.mark.parametrize('lens', LENSES)
 def test_lines_determine_lens_and_plane(lens: str) -> None:
     junction = replace(JUNCTION, camera=LENSES[lens])
-    fit, tracks, words = fit_of(painted(junction))
+    fit, tracks, statement = fit_of(painted(junction))
     require_true(fit, tracks, junction, focal=0.025)
-    assert 'taken as parallel or square to each other: 90 +- 1 degrees' in words
+    assert (statement.kind, statement.values['sigma_deg']) == ('lane_markings', pytest.approx(1.0))
     # the true principal point is far from the centre, which the prior does not know
     assert abs(fit.state.camera.principal_point_px[0] - LENSES[lens].principal_point_px[0]) < 0.03 * WIDTH
 
@@ -182,7 +182,7 @@ def test_posts_are_distinguished_from_lines_across_the_road() -> None:
 
 
 def test_without_lines_there_is_no_solution() -> None:
-    assert refused(seen(JUNCTION, np.zeros((0, 4)))).endswith('there are 0')
+    assert refused(seen(JUNCTION, np.zeros((0, 4)))).endswith(': 0 lines')
 
 
 def test_lines_away_from_traffic_are_not_on_the_road() -> None:
@@ -191,19 +191,19 @@ def test_lines_away_from_traffic_are_not_on_the_road() -> None:
     lines = painted_lines(lone, np.random.default_rng(1))
     away = np.hypot(*(0.5 * (lines[:, None, :2] + lines[:, None, 2:]) - places).transpose(2, 0, 1)).min(axis=1)
     assert (away > 0.1 * WIDTH).sum() > 15
-    assert refused(seen(lone, lines[away > 0.1 * WIDTH])).endswith('there are 0')
+    assert refused(seen(lone, lines[away > 0.1 * WIDTH])).endswith(': 0 lines')
 
 
 def test_lines_of_one_direction_give_no_plane() -> None:
     lines = painted_lines(JUNCTION, np.random.default_rng(1), Paint(angles_deg=(0.0,), across=False))
     assert len(lines) > 40
     message = refused(seen(JUNCTION, lines))
-    assert 'they suit two planes' in message or 'are along the second of two directions' in message
+    assert 'they fit two planes' in message or 'along the second of two directions' in message
 
 
 def test_random_lines_give_no_solution() -> None:
     message = refused(seen(JUNCTION, random_lines(JUNCTION, np.random.default_rng(0), 150)))
-    assert 'they suit two planes' in message or 'of two directions' in message or 'focal length' in message
+    assert 'they fit two planes' in message or 'of two directions' in message or 'focal length' in message
 
 
 def test_distant_lines_alone_give_no_solution() -> None:
@@ -249,7 +249,7 @@ def test_traffic_that_shows_another_plane_contradicts_lines() -> None:
     plane = by_traffic(driven(LONE_ROAD), tracks, fit.state.camera).plane
     doubt = verify_with_traffic(fit, [plane])
     assert isinstance(doubt, Reason) and doubt.code == 'markings_contradicted'
-    assert 'the road of the traffic and the lines along it are ' in doubt.message
+    assert 'the road of the traffic and the markings along it differ by ' in doubt.message
     assert 'joint.road_markings' in doubt.remedy
     # one contradiction outweighs an agreement
     own, own_tracks, _ = fit_of(painted(LONE_ROAD))
@@ -262,11 +262,11 @@ def test_lines_that_no_traffic_confirms_are_refused() -> None:
     fit, tracks, _ = fit_of(painted(JUNCTION))
     doubt = verify_with_traffic(fit, [])
     assert isinstance(doubt, Reason) and doubt.code == 'markings_unconfirmed'
-    assert 'the traffic tells nothing' in doubt.message
+    assert 'no traffic confirms them' in doubt.message
     vague = PlaneEstimate.of(replace(fit, covariance=fit.covariance + np.eye(len(fit.covariance))), tracks)
     doubt = verify_with_traffic(fit, [vague])
     assert isinstance(doubt, Reason) and doubt.code == 'markings_unconfirmed'
-    assert 'degrees, 4.5 are needed' in doubt.message
+    assert 'degrees (at most 4.5 allowed)' in doubt.message
 
 
 def test_traffic_that_contradicts_keeps_its_own_result(alone: Calibration) -> None:
@@ -276,7 +276,7 @@ def test_traffic_that_contradicts_keeps_its_own_result(alone: Calibration) -> No
     assert (result.camera, result.grade, result.ground) == (alone.camera, alone.grade, alone.ground)
     # the refusal reports both attempts
     assert result.ground_refusal.message.startswith(alone.ground_refusal.message)
-    assert 'the road of the traffic and the lines along it are ' in result.ground_refusal.message
+    assert 'the road of the traffic and the markings along it differ by ' in result.ground_refusal.message
 
 
 @pytest.fixture(scope='module')
@@ -406,7 +406,7 @@ def drawn(seed: int) -> tuple[Junction, Evidence]:
 def test_a_second_focal_length_that_fits_as_well_is_refused() -> None:
     # the first initial value leads to a focal length 9 % too short, and another one is hardly better
     _, evidence = drawn(14)
-    assert 'they suit two focal lengths, ' in refused(evidence)
+    assert 'they fit two focal lengths, ' in refused(evidence)
 
 
 def test_errors_are_covered_by_their_standard_deviations(monkeypatch: pytest.MonkeyPatch) -> None:

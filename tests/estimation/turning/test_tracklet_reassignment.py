@@ -28,6 +28,7 @@ from autocalib_ros.offline.synthetic.drives import drive_arc
 from autocalib_ros.offline.synthetic.junction import Junction, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration
 from autocalib_ros.results.refusals import Reason
+from autocalib_ros.results.statements import Statement
 
 pytestmark = pytest.mark.solve
 
@@ -124,7 +125,7 @@ def test_a_tracklet_in_a_wrong_minimum_is_restarted() -> None:
 def test_halves_bound_the_standard_deviation_of_the_whole() -> None:
     generator = np.random.default_rng(1)
     _, fit, nothing = by_windows(slid(synthetic_evidence(TURNING, generator), generator, 8.0))
-    assert isinstance(check_halves(fit, nothing, GateOptions()), str)
+    assert isinstance(check_halves(fit, nothing, GateOptions()), Statement)
     boasting = replace(fit, covariance=1e-4 * fit.covariance)
     doubt = check_halves(boasting, nothing, GateOptions())
     assert isinstance(doubt, Reason) and doubt.code == 'halves_disagree'
