@@ -77,7 +77,7 @@ class DriverUpload:
         self._call.add_done_callback(self._answered)
 
     def _answered(self, call: Future) -> None:
-        if call is not self._call:
+        if self._call is None or call is not self._call:
             return  # timed out before
         self._call = None
         answer = call.result()

@@ -8,6 +8,7 @@ point heights are not needed. Residuals are Sampson distances (Sampson 1982) in 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -15,7 +16,6 @@ from autocalib_ros.config import JointOptions
 from autocalib_ros.estimation.observations.two_frame_windows import TwoFrameWindows
 from autocalib_ros.geometry.great_circles import Rays, unproject_rays
 from autocalib_ros.geometry.robust_kernels import cauchy_loss, cauchy_weight
-from autocalib_ros.geometry.small_matrices import dot
 from autocalib_ros.lens.camera import Camera
 
 START_TURNS_DEG = (0.0, 2.0, 4.5, 7.5, 11.0, 15.0, 20.0, 26.0, 33.0, 42.0, 52.0, 65.0, 80.0, 100.0)
@@ -90,31 +90,36 @@ class WindowRays:
         )
         return replace(self, first=first, second=second)
 
+    @cached_property
+    def _components(self) -> tuple[np.ndarray, ...]:
+        """Bearing, radial and tangential of both ends, each by component, shape (3, windows, points)."""
+        return tuple(
+            np.ascontiguousarray(np.moveaxis(vectors, -1, 0))
+            for rays in (self.first, self.second)
+            for vectors in (rays.bearings, rays.radial, rays.tangential)
+        )
+
     def distances(self, motion: PlanarMotion) -> np.ndarray:
         """Signed Sampson distances in standard deviations, shape (windows, points); 0 outside the mask."""
         cosine, sine = np.cos(motion.turn_rad)[:, None], np.sin(motion.turn_rad)[:, None]
         along, across = np.cos(motion.heading_rad)[:, None], np.sin(motion.heading_rad)[:, None]
-        x, y, z = np.moveaxis(self.first.bearings, -1, 0)
-        u, v, w = np.moveaxis(self.second.bearings, -1, 0)
+        (x, y, z), radial, tangential, (u, v, w), radial_second, tangential_second = self._components
         turned = (cosine * x - sine * y, sine * x + cosine * y)
         # the epipolar line of the first point, t x R a, and that of the second, R^T (b x t)
-        line = np.stack([across * z, -along * z, along * turned[1] - across * turned[0]], axis=-1)
+        line = (across * z, -along * z, along * turned[1] - across * turned[0])
         line_back_xy = (-w * across, w * along)
-        line_back = np.stack(
-            [
-                cosine * line_back_xy[0] + sine * line_back_xy[1],
-                cosine * line_back_xy[1] - sine * line_back_xy[0],
-                u * across - v * along,
-            ],
-            axis=-1,
+        line_back = (
+            cosine * line_back_xy[0] + sine * line_back_xy[1],
+            cosine * line_back_xy[1] - sine * line_back_xy[0],
+            u * across - v * along,
         )
         gradient2 = (
-            dot(self.second.radial, line) ** 2
-            + dot(self.second.tangential, line) ** 2
-            + dot(self.first.radial, line_back) ** 2
-            + dot(self.first.tangential, line_back) ** 2
+            _dot_components(radial_second, line) ** 2
+            + _dot_components(tangential_second, line) ** 2
+            + _dot_components(radial, line_back) ** 2
+            + _dot_components(tangential, line_back) ** 2
         )
-        epipolar_error = u * line[..., 0] + v * line[..., 1] + w * line[..., 2]
+        epipolar_error = u * line[0] + v * line[1] + w * line[2]
         return self.mask * epipolar_error / (np.sqrt(np.maximum(gradient2, 1e-18)) * self.sigma_px)
 
     def jacobian(self, motion: PlanarMotion, here: np.ndarray) -> np.ndarray:
@@ -129,6 +134,11 @@ class WindowRays:
             )
             / DERIVATIVE_STEP
         )
+
+
+def _dot_components(vectors: np.ndarray, other: tuple[np.ndarray, ...]) -> np.ndarray:
+    """Scalar product of vectors that are given by component, (3, ...)."""
+    return vectors[0] * other[0] + vectors[1] * other[1] + vectors[2] * other[2]
 
 
 def turn_sigma(view: WindowRays, motion: PlanarMotion) -> np.ndarray:
