@@ -285,9 +285,10 @@ def test_expected_results_agree_with_the_ground_truth(case: Case) -> None:
             assert abs(numbers[name] - case.truth[name]) <= 3 * sigmas[name] + 1e-9, name
 
 
-@pytest.mark.slow
-def test_nothing_moved() -> None:
-    golden_run = run_cases(STORED, jobs=2, quiet=True)
+@pytest.mark.solve
+def test_quick_cases_have_not_moved() -> None:
+    """The whole set is solved by `autocalib benchmark golden`, which .ci/run calls."""
+    golden_run = run_cases(STORED, ['bend', 'one_road', 'pedestrians', 'two_roads', 'two_roads_paper'], quiet=True)
     assert not golden_run.moved, '\n'.join(format_report(golden_run))
 
 
