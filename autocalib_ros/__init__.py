@@ -15,7 +15,7 @@ PUBLIC = {
     'replay': 'autocalib_ros.offline.replay_recording',
 }
 """Public names and the modules that define them."""
-__all__ = ['Ground', 'Options', 'replay']  # noqa: F822  defined by __getattr__
+__all__ = ['Ground', 'Options', 'replay']
 
 
 def __getattr__(name: str) -> Any:

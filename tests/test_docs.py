@@ -4,6 +4,7 @@ import argparse
 import ast
 import importlib.util
 import inspect
+import itertools
 import json
 import pkgutil
 import re
@@ -233,7 +234,7 @@ def test_autocalib_commands_parse_and_their_options_are_valid(monkeypatch):
 def test_ros_parameters_in_commands_are_valid():
     for _, words in shell_lines():
         if '--ros-args' in words:
-            values = parse_assignments([value for flag, value in zip(words, words[1:], strict=False) if flag == '-p'])
+            values = parse_assignments([value for flag, value in itertools.pairwise(words) if flag == '-p'])
             core = {item.name for item in walk_options(Options())}
             with_overrides(Options(), {name: value for name, value in values.items() if name in core})
             with_overrides(NodeOptions(), {name: value for name, value in values.items() if name not in core})

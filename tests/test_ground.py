@@ -267,7 +267,7 @@ def horizon_row(column: float) -> float:
     """The row of the horizon in a column, by bisection of OpenCV's bearings."""
 
     def depression(row: float) -> float:
-        model, k, d = LENSES['equidistant']
+        _model, k, d = LENSES['equidistant']
         slope = cv2.fisheye.undistortPoints(np.array([[[column, row]]]), np.reshape(k, (3, 3)), np.array(d))[0, 0]
         return float(-(CAMERA_FROM_GROUND.T @ [*slope, 1.0])[2])
 

@@ -213,6 +213,6 @@ def test_topics_and_names_follow_the_image_topic(source, topic, kind, sibling, n
 
 
 def test_a_damaged_calibration_is_not_half_written(tmp_path, full, source):
-    with pytest.raises(Exception):  # noqa: B017  whatever it is, nothing may be left
+    with pytest.raises(Exception):  # noqa: B017, PT011  whatever it is, nothing may be left
         write_bag(tmp_path / 'new', replace(full.result, newest_stamp_ns=None), source)
     assert not (tmp_path / 'new').exists()

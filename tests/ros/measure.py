@@ -10,6 +10,7 @@ A driver plays the first seconds of the video forwards and backwards, so that th
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
 import resource
@@ -105,10 +106,8 @@ def watch(options: argparse.Namespace) -> dict:
             ages.append(1e3 * (time.time() - stamp.sec - stamp.nanosec * 1e-9))
 
         node.create_subscription(Image, f'autocalib/{topic}', take, QoSProfile(depth=1))
-    try:
+    with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
         rclpy.spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
     return {topic: quantiles(ages or [0.0]) for topic, ages in ages_ms.items()}
 
 
@@ -156,7 +155,7 @@ def quantiles(values: list[float]) -> dict:
     }
 
 
-def run_node(options: argparse.Namespace) -> dict:
+def run_node(options: argparse.Namespace) -> dict:  # noqa: C901  one clock after the other
     """Run a node with clocks in it until it is interrupted."""
     from autocalib_ros.util.threads import limit_blas_threads
 

@@ -4,6 +4,7 @@ neighbour.py listen                     prints a line of JSON for each message o
 neighbour.py hang CHILD PARENT TOPIC    publishes a transform that hangs CHILD from PARENT
 """
 
+import contextlib
 import json
 import sys
 import threading
@@ -48,10 +49,8 @@ def main() -> None:
     node = rclpy.create_node('neighbour')
     {'listen': listen, 'hang': hang}[sys.argv[1]](node, *sys.argv[2:])
     threading.Thread(target=lambda: (sys.stdin.read(), rclpy.try_shutdown()), daemon=True).start()
-    try:
+    with contextlib.suppress(rclpy.executors.ExternalShutdownException):
         rclpy.spin(node)
-    except rclpy.executors.ExternalShutdownException:
-        pass
 
 
 if __name__ == '__main__':

@@ -1,6 +1,7 @@
 """Upload of the calibration to the driver."""
 
 import threading
+from types import SimpleNamespace
 
 import pytest
 from sensor_msgs.srv import SetCameraInfo
@@ -26,11 +27,7 @@ def log_lines(monkeypatch) -> list[str]:
 def driver(bench):
     """Serve set_camera_info as a driver does; return the requests and its next answers."""
 
-    class Driver:
-        received: list = []
-        answers: list = []
-
-    state = Driver()
+    state = SimpleNamespace(received=[], answers=[])
     state.received, state.answers = [], []
 
     def answer(request, response):
@@ -109,6 +106,6 @@ def test_driver_that_does_not_answer_is_given_up(bench, log_lines, monkeypatch):
     monkeypatch.setattr('autocalib_ros.ros.driver_upload.DriverUpload._answered', lambda self, call: None)
     silent = bench.client.create_service(SetCameraInfo, '/set_camera_info', lambda request, response: response)
     assert silent
-    node, _ = calibrated(bench, upload_to_driver=True)
+    _node, _ = calibrated(bench, upload_to_driver=True)
     wait_for(lambda: any('no answer from the driver within' in line for line in log_lines), 'the line of the log')
     wait_for(lambda: bench.calibrate().success, 'the node, which goes on')

@@ -108,7 +108,7 @@ def test_a_camera_that_sees_no_road_has_markers_without_a_grid(result):
 def test_numbers_that_are_none_are_found(result):
     array = markers(result, 'g')
     array.markers[1].points[3].y = math.nan
-    with pytest.raises(InvalidMessage, match='points.y is nan'):
+    with pytest.raises(InvalidMessage, match=r'points\.y is nan'):
         validated(array)
 
 

@@ -164,7 +164,7 @@ def test_a_lens_without_plane_does_not_replace_one_with_its_plane(bench):
     def solve(evidence, options, lens):
         return calibration(evidence, **(found.pop(0) if len(found) > 1 else found[0]))
 
-    node, _ = calibrated(bench, solve)
+    _node, _ = calibrated(bench, solve)
     infos, transforms = (
         bench.collect(kind, topic, latched=True) for kind, topic in ((CameraInfo, INFO), (TransformStamped, GROUND))
     )
@@ -300,7 +300,7 @@ def test_solver_gets_no_lens_unless_one_is_given(bench):
 
 def test_known_lens_in_a_distortion_model_that_cannot_say_it_is_wrong_usage(bench, tmp_path):
     write_camera_info_yaml(tmp_path / 'lens.yaml', Camera.equidistant(1280, 720, 500.0), 'cam')
-    with pytest.raises(UsageError, match='plumb_bob would be off by up to .* Set distortion_model to rational'):
+    with pytest.raises(UsageError, match=r'plumb_bob would be off by up to .* Set distortion_model to rational'):
         bench.start(instantly, camera_info_file=str(tmp_path / 'lens.yaml'), distortion_model='plumb_bob')
 
 

@@ -63,7 +63,7 @@ def test_calibrated_node_reports_it_in_diagnostics(bench, statuses):
 
 
 def test_image_that_cannot_be_decoded_is_an_error_until_one_can(bench, statuses):
-    node, publisher = fed(bench)
+    _node, publisher = fed(bench)
     publisher.publish(image(START_NS + 10 * FRAME_NS, encoding='no_such_encoding'))
     wait_for(lambda: "'no_such_encoding' is not supported" in message(statuses), 'the complaint')
     assert (statuses[-1].status[0].level, values(statuses)['unreadable']) == (b'\x02', '1')

@@ -131,7 +131,7 @@ def test_a_list_that_gives_a_frame_two_parents_is_refused():
         ground_transform_message(GroundPlane(ROTATION, 8.0), time_message(1), ground, 'cam')
         for ground in ('north', 'south')
     ]
-    with pytest.raises(InvalidMessage, match='TFMessage.transforms give a frame two parents'):
+    with pytest.raises(InvalidMessage, match=r'TFMessage\.transforms give a frame two parents'):
         validated(TFMessage(transforms=both))
 
 

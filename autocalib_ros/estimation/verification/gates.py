@@ -91,7 +91,7 @@ def check_lens(
     failed_check = (
         _check_horizon(fit, tracks) or _check_focal_length(fit, gate, turned=turned) or _check_lens_model(fit)
     )
-    if failed_check or turned and motion_constrains_focal(fit):
+    if failed_check or (turned and motion_constrains_focal(fit)):
         return failed_check
     needed = MIN_STRAIGHT_FRACTION if len(fit.state.angles_rad) > 1 else MIN_ONE_ROAD_FRACTION
     fraction = _straight_fraction(fit, tracks, driving)
@@ -202,7 +202,7 @@ def check_halves(fit: Adjustment, tracks: TrackSet, gate: GateOptions) -> Reason
     for half, seen, living in ((early, windows, lived), (~early, ~windows, ~lived)):
         part, bundle = tracks.subset(half), config.bundle and config.bundle.subset(living)
         part_setting = replace(config, windows=config.windows.subset(seen), bundle=bundle)
-        if half.sum() + seen.sum() + living.sum() < MIN_RESIDUAL_ROWS or config.turning and not part_setting.turning:
+        if half.sum() + seen.sum() + living.sum() < MIN_RESIDUAL_ROWS or (config.turning and not part_setting.turning):
             return check('halves_not_compared')
         _, motion, shapes = fit.problem.warm_start
         warm_start = None, motion.subset(seen) if motion else None, shapes.subset(living) if bundle and shapes else None
