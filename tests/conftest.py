@@ -1,6 +1,7 @@
 """Tests run as the programs do: with one thread for linear algebra; those that cost nothing are marked `unit`."""
 
 import os
+from collections import defaultdict
 
 import pytest
 
@@ -10,20 +11,27 @@ from stored_results import quick_folder
 limit_blas_threads()
 os.environ.pop('FORCE_COLOR', None)  # some test machines set it, and messages are compared as they are
 
-COSTLY = ('solve', 'dds', 'render', 'slow')
-"""Markers of tests that take seconds, see pytest.ini; a test with none of them is a `unit` test."""
+COSTS_S = {'slow': 60.0, 'solve': 2.0, 'dds': 1.5, 'render': 1.5, 'unit': 0.02}
+"""Markers and about how many seconds one of their tests takes, see pytest.ini; without another it is a `unit` test."""
 FIXTURE_COSTS = {'bench': 'dds', 'written': 'render', 'still_video': 'render', 'video': 'render'}
 """Markers of all tests that ask for a fixture: a workbench of nodes, a report, videos."""
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """Mark tests by what they cost, and those that cost little `unit`."""
+    """Mark tests by what they cost, and those that cost little `unit`; the dearest modules come first.
+
+    With several processes, the last module then keeps one of them busy for seconds and not for minutes.
+    """
+    module_s: dict[str, float] = defaultdict(float)
     for item in items:
         for fixture in FIXTURE_COSTS.keys() & set(item.fixturenames):
             item.add_marker(FIXTURE_COSTS[fixture])
-        if not any(item.get_closest_marker(name) for name in COSTLY):
+        costs_s = [cost_s for name, cost_s in COSTS_S.items() if item.get_closest_marker(name)]
+        if not costs_s:
             item.add_marker('unit')
+        module_s[item.nodeid.partition('::')[0]] += max(costs_s, default=COSTS_S['unit'])
+    items.sort(key=lambda item: -module_s[item.nodeid.partition('::')[0]])
 
 
 def pytest_configure(config):
