@@ -45,6 +45,11 @@ class LinearisedRows:
     """Weight from evidence outside the row's residuals (corroboration by other tracks), shape (rows,)."""
 
     @classmethod
+    def none(cls, parameters: int) -> LinearisedRows:
+        """Return no rows."""
+        return cls(np.zeros(0), np.zeros((0, parameters)), np.zeros((0, parameters, parameters)), np.zeros(0))
+
+    @classmethod
     def of(cls, residuals: np.ndarray, jacobian: np.ndarray, dof: np.ndarray, influence: np.ndarray) -> LinearisedRows:
         """Sum residuals (rows, samples) and Jacobians `jacobian` (rows, samples, parameters) over the samples."""
         transposed = jacobian.transpose(0, 2, 1)
@@ -188,6 +193,8 @@ class PlanarMotionBlock:
 
     def at(self, step: np.ndarray) -> tuple[PlanarMotion, np.ndarray]:
         """Return the motions and the mean squared distances (windows,) at a parameter step."""
+        if not len(self.dof):
+            return self.warm_start, np.zeros(0)
         view = self._view(self._parameters.state(step))
         motion = refined(view, self.warm_start)
         return motion, ((self._root * view.distances(motion)) ** 2).sum(axis=1) / self.dof
@@ -195,6 +202,8 @@ class PlanarMotionBlock:
     def linearise(self) -> LinearisedRows:
         """Return the rows at the base, by forward differences; the motion of each window is projected out."""
         parameters = self._parameters
+        if not len(self.dof):  # most adjustments have no windows, and empty arrays cost as much as small ones
+            return LinearisedRows.none(parameters.size)
         columns = [
             (self._distances_at(unit) - self._distances) / DIFFERENTIATION_STEP for unit in np.eye(parameters.size)
         ]
