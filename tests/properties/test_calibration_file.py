@@ -25,8 +25,8 @@ COUNTS = st.integers(0, 10**6)
 NUMBERS = st.floats(-1e6, 1e6, allow_nan=False)
 SIGMAS = st.none() | between(0.0, 1e3)
 WORDS = st.text(max_size=20)
-NUMBERS = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False)
-VALUES = st.dictionaries(WORDS, NUMBERS | WORDS, max_size=3)
+ITEMS = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | WORDS
+VALUES = st.dictionaries(WORDS, ITEMS, max_size=3)
 STATEMENTS = st.builds(Statement, WORDS, WORDS, VALUES)
 ARRAYS = ('ground', 'road_directions', 'covariance')
 
