@@ -356,7 +356,7 @@ def test_the_cost_benchmark_is_still_there(capsys: pytest.CaptureFixture[str]) -
 @pytest.mark.dds
 def test_module_runs_the_benchmark_too() -> None:
     done = subprocess.run(
-        [sys.executable, '-m', 'autocalib_ros.benchmark', 'accuracy', '--help'],
+        [sys.executable, '-m', 'autocalib_ros', 'benchmark', 'accuracy', '--help'],
         capture_output=True,
         cwd=Path(autocalib_ros.__file__).parents[1],
         text=True,
