@@ -1,4 +1,4 @@
-"""ament_python package, installable by pip and by colcon; all metadata is in setup.cfg."""
+"""ament_python package, installable by pip and by colcon; the metadata is in setup.cfg."""
 
 from glob import glob
 
@@ -8,6 +8,7 @@ NAME = 'autocalib_ros'
 
 setup(
     name=NAME,
+    python_requires='>=3.10',  # colcon cannot read it from setup.cfg
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
