@@ -232,7 +232,7 @@ def test_a_camera_that_hangs_elsewhere_gets_no_second_parent(bench, capfd, topic
         wait_for(lambda: cameras.node.publication.conflict, 'the conflict, before any calibration')
         cameras.calibrate()
         wait_for(lambda: heights(heard, 'ground_transform') == [8.0], 'the transform on its own topic')
-        wait_for(lambda: cameras.node.publication._transforms._settled, 'the time when it would be broadcast')
+        wait_for(lambda: cameras.node.publication._transforms._listened, 'the time when it would be broadcast')
         assert not any(
             child == 'cam_optical' and parent != 'mast'
             for name, found in heard
