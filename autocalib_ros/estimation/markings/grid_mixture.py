@@ -28,8 +28,8 @@ POST_SIGMA_RAD = np.radians(1.0)
 MIN_NOISE_SCALE, MAX_NOISE_SCALE = 0.15, 2.0
 """Limits of the noise scale."""
 MIN_DEPRESSION_SINE = 0.1
-"""Sine of the smallest angle below the horizon for segments on the road, ten camera heights away. Farther ones are too
-foreshortened to be told from what stands there."""
+"""Sine of the smallest angle below the horizon for segments on the road, ten camera heights away. Farther ones are
+too foreshortened to be distinguished from upright structures."""
 ANNEALING_ROUNDS, FINAL_ROUNDS, MAX_DAMPING_TRIALS = 8, 40, 8
 """Iterations at each width of the annealing, iterations at the end, and trials of the damping in one iteration."""
 CONVERGED_STEP = 1e-5
