@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 import rclpy
 from geometry_msgs.msg import PolygonStamped, TransformStamped
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
+from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import CameraInfo, PointCloud2, PointField
 from std_msgs.msg import Header
 
@@ -27,6 +27,7 @@ from autocalib_ros.errors import InputError
 from autocalib_ros.ground import Ground
 from autocalib_ros.ros.messages import header, validated
 from autocalib_ros.ros.qos import LATCHED
+from autocalib_ros.ros.spinning import spin_until, stop_on_signals
 
 WARN_PERIOD_S = 10.0
 """Real seconds between two warnings."""
@@ -100,11 +101,14 @@ def cloud(points_m: np.ndarray, cloud_header: Header) -> PointCloud2:
 
 def main(args: list[str] | None = None) -> int:
     """Run the node until it is interrupted."""
+    stop = stop_on_signals()
+    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     try:
-        rclpy.init(args=args)
-        rclpy.spin(GroundPointsNode())
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
+        node = GroundPointsNode()
+        try:
+            spin_until(node, stop)
+        finally:
+            node.destroy_node()
     finally:
         rclpy.try_shutdown()
     return 0

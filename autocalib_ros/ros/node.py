@@ -7,10 +7,7 @@ Importing this module needs no ROS, so that a missing ROS can be reported.
 
 from __future__ import annotations
 
-import signal
 import sys
-import threading
-from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
 from autocalib_ros.errors import AutocalibError, UsageError
@@ -46,19 +43,18 @@ def main(args: list[str] | None = None) -> int:
 
 
 def _run(args: list[str]) -> None:
-    """Run the node until a signal; rclpy's own handlers would shut down logger and publishers first."""
+    """Run the node until a signal."""
     import rclpy
 
     from autocalib_ros.ros.autocalib_node import AutocalibNode
+    from autocalib_ros.ros.spinning import spin_until, stop_on_signals
 
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+    stop = stop_on_signals()
     _init(args)
     try:
         node = _create(AutocalibNode)
         try:
-            _spin(node, stop)
+            spin_until(node, stop)
         finally:
             node.close()
             node.destroy_node()
@@ -89,26 +85,6 @@ def _create(node_type: type[AutocalibNode]) -> AutocalibNode:
         return node_type()
     except ParameterException as error:
         raise UsageError(str(error)) from error
-
-
-def _spin(node: AutocalibNode, stop: threading.Event) -> None:
-    """Spin the node in its own thread until `stop`; raise what a callback raised.
-
-    One thread is enough, since no callback waits. rclpy's MultiThreadedExecutor would lose images: it queues a ready
-    callback again and again until a thread takes it, and stalls for seconds (ros2/rclpy#1452).
-    """
-    from rclpy.executors import SingleThreadedExecutor
-    from rclpy.task import Future
-
-    executor, finished = SingleThreadedExecutor(), Future()
-    executor.add_node(node)
-    with ThreadPoolExecutor(max_workers=1) as pool:
-        spinning = pool.submit(executor.spin_until_future_complete, finished)
-        spinning.add_done_callback(lambda _: stop.set())
-        stop.wait()
-        finished.set_result(None)
-    executor.shutdown()  # only now: it destroys what a spinning thread waits for
-    spinning.result()
 
 
 if __name__ == '__main__':

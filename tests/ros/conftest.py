@@ -36,10 +36,12 @@ def ros_home(quick_path, monkeypatch):
 
 
 @pytest.fixture
-def bench():
-    """Yield a running executor to put nodes on, with a client node beside them."""
+def bench(monkeypatch):
+    """Yield a running executor to put nodes on, with a client node beside them; nodes find a camera at once."""
+    from autocalib_ros.ros import image_input
     from bench import Bench
 
+    monkeypatch.setattr(image_input, 'PUBLISHER_POLL_S', 0.05)
     running = Bench()
     yield running
     running.close()
