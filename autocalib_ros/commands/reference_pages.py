@@ -13,6 +13,7 @@ import pkgutil
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import fields, is_dataclass
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,7 @@ LONGEST_VALUE = 60
 """Characters of a constant's value above which the page shows its kind only."""
 
 
+@cache
 def reference_pages() -> dict[str, str]:
     """Return the text of each generated page by its path below docs/."""
     return {

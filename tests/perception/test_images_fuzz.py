@@ -46,7 +46,7 @@ def mutations(draw) -> SimpleNamespace:
     return SimpleNamespace(**whole, data=PIXELS[: whole['length']])
 
 
-@settings(max_examples=500, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=250, deadline=None, suppress_health_check=list(HealthCheck))
 @given(message=mutations())
 def test_any_header_gives_an_image_of_its_size_or_an_error(message):
     try:

@@ -17,7 +17,7 @@ from autocalib_ros.lens.camera_info_yaml import camera_info_yaml, read_camera_in
 from autocalib_ros.results.store import Store, StoreState, resolve_url, stored_json
 from stored_results import calibration, lens_only, stored
 
-KILLS = 60
+KILLS = 30
 FIRST, SECOND, THIRD = (stored(calibration(focal, number=number)) for number, focal in enumerate((300.0, 310.0, 320.0)))
 CHECKERBOARD = camera_info_yaml(stored(calibration(444.0)).info, 'north')
 

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.parameter import Parameter
-from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import CameraInfo, RegionOfInterest
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, RegionOfInterest
 
 from autocalib_ros.results.calibration import StandardDeviations
+from autocalib_ros.ros import image_input
 from autocalib_ros.ros.driver_info import check_size
 from autocalib_ros.ros.messages import stamp_ns, time_message
 from bench import SIZE, Bench, calibration, image, wait_for
@@ -60,6 +61,25 @@ def test_calibrated_node_reports_it_in_diagnostics(bench, statuses):
         '1',
     )
     assert stamp_ns(statuses[-1].header.stamp) > START_NS
+
+
+@pytest.mark.parametrize(
+    ('kind', 'reliability', 'parameters', 'words'),
+    [
+        (CompressedImage, ReliabilityPolicy.RELIABLE, {}, 'publishes /image as sensor_msgs/msg/CompressedImage'),
+        (Image, ReliabilityPolicy.BEST_EFFORT, {'image_reliability': 'reliable'}, 'set image_reliability:=auto'),
+    ],
+    ids=['type', 'reliability'],
+)
+def test_stream_that_cannot_be_heard_is_reported_as_an_error(
+    bench, statuses, capfd, monkeypatch, kind, reliability, parameters, words
+):
+    monkeypatch.setattr(image_input, 'NO_IMAGE_TIMEOUT_S', 0.3)
+    bench.publisher(kind, reliability=reliability)
+    bench.start(**parameters)
+    wait_for(lambda: words in message(statuses), 'the reason')
+    assert statuses[-1].status[0].level == b'\x02'
+    assert words in capfd.readouterr().err
 
 
 def test_image_that_cannot_be_decoded_is_an_error_until_one_can(bench, statuses):

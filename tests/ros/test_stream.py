@@ -99,18 +99,3 @@ def test_compressed_images_are_heard(diagnostics, tmp_path):
     ):
         wait_for(lambda: diagnostics.used() > 3, 'images', PATIENCE_S)
     assert diagnostics.newest()['encoding'] == 'jpeg'
-
-
-@pytest.mark.parametrize(
-    ('arguments', 'topic', 'phase', 'words'),
-    [
-        ((), '/camera/image', COMPRESSED, 'publishes /camera/image as sensor_msgs/msg/CompressedImage'),
-        (('-p', 'image_reliability:=reliable'), '/camera/image', LOSSY, 'set image_reliability:=auto'),
-    ],
-    ids=['type', 'reliability'],
-)
-def test_stream_that_cannot_be_heard_is_reported_as_an_error(diagnostics, tmp_path, arguments, topic, phase, words):
-    with running_node(tmp_path / 'log', *arguments), running_camera(topic, phase):
-        wait_for(lambda: diagnostics and words in diagnostics[-1].status[0].message, 'the reason', PATIENCE_S)
-        assert diagnostics[-1].status[0].level == b'\x02'
-        assert words in (tmp_path / 'log').read_text()
