@@ -325,11 +325,6 @@ def test_benchmark_runs_from_the_command_line(tmp_path: Path, capsys: pytest.Cap
 
 
 @pytest.mark.solve
-def test_processes_do_not_change_the_result() -> None:
-    alone, shared = (run_monte_carlo(['few'], ['paper'], 2, jobs=jobs, quiet=True) for jobs in (1, 2))
-    assert [str(replace(item, cpu_s=0.0)) for item in alone] == [str(replace(item, cpu_s=0.0)) for item in shared]
-
-
 @pytest.mark.parametrize(
     ('arguments', 'message'),
     [

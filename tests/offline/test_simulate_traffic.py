@@ -138,7 +138,9 @@ def test_another_seed_gives_other_traffic(network, traffic):
 
 
 def test_cyclists_ride_along_their_road_and_are_in_the_truth():
-    options = SimulationOptions(cyclists=8, pedestrians=4, duration_s=10.0, rate_hz=5.0)
+    options = SimulationOptions(
+        cyclists=8, pedestrians=4, duration_s=10.0, rate_hz=5.0, width_px=320, height_px=180, focal_px=140.0
+    )
     truth = truth_of(Simulation(options))
     cyclists = [track for track in truth['people']['tracks'] if track['type'] == 'cyclist']
     assert len(cyclists) >= 6
