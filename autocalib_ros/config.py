@@ -380,7 +380,10 @@ class GateOptions(_Validated):
         0.2, 'maximum standard deviation of the camera height, fraction of it', low=0, high=1
     )
     max_drift_px: float = option(
-        3.0, 'maximum background drift of a fixed camera, pixels at an image width of 1280', low=0.1
+        3.0,
+        'maximum lasting displacement of the background of a fixed camera, pixels at an image width of 1280; at least '
+        '1.5 px of the image',
+        low=0.1,
     )
 
 

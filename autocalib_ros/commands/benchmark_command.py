@@ -58,6 +58,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--update', action='store_true', help='store the new values of the cases that moved as the expected ones'
     )
     golden.add_argument('--jobs', type=int, default=1, metavar='J', help='number of processes (default: %(default)s)')
+    streams = what.add_parser(
+        'streams',
+        help='uneven time stamps and repeated images, applied to recordings',
+        description='Apply faults of time stamps and repeated images to recordings while they are read, and compare '
+        'the results with those of the recordings as they are. Exit status: 0 if each verdict is the same, each focal '
+        'length within its standard deviation and at least 80 %% of the tracks are left, 3 otherwise.',
+    )
+    streams.add_argument('recordings', metavar='RECORDING', nargs='+', type=Path, help='recordings to replay')
+    streams.add_argument(
+        '--kinds',
+        nargs='+',
+        default=[],
+        metavar='KIND',
+        help='faults by name; stamps and repeats are all of one sort (default: both)',
+    )
+    streams.add_argument('--start', type=float, default=0.0, metavar='S', help='seconds to skip at the start')
+    streams.add_argument('--duration', type=float, metavar='S', help='seconds of each recording to use')
+    streams.add_argument(
+        '--camera-height', type=float, default=8.0, metavar='H', help='height in metres (default: %(default)s)'
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -77,6 +97,8 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.update:
             golden.update(arguments.folder, golden_run)
         return MOVED if golden_run.moved else DONE
+    if arguments.what == 'streams':
+        return _run_streams(arguments)
     from autocalib_ros.offline.benchmark.monte_carlo import run_monte_carlo
     from autocalib_ros.offline.benchmark.table import format_tables
 
@@ -93,3 +115,20 @@ def run(arguments: argparse.Namespace) -> int:
         )
     )
     return DONE
+
+
+def _run_streams(arguments: argparse.Namespace) -> int:
+    from autocalib_ros.config import Options
+    from autocalib_ros.offline.benchmark.streams import measure_streams
+
+    failed = False
+    for line, is_failure in measure_streams(
+        arguments.recordings,
+        arguments.kinds,
+        Options(camera_height=arguments.camera_height),
+        start_s=arguments.start,
+        duration_s=arguments.duration,
+    ):
+        print(line, flush=True)
+        failed |= is_failure
+    return MOVED if failed else DONE

@@ -39,6 +39,10 @@ def replay_and_report(
         warn_missing_scale(options, lens)
     with progress_bar(source.total, 'images', 'replay', quiet=quiet) as progress:
         replayed = replay(source, options, progress.update_to, lens=lens, detector=detector)
+    if replayed.repeated and not quiet:
+        print_stderr(f'{replayed.repeated} of {replayed.frames} images repeat an earlier one and are left out.')
+    if not quiet and not replayed.evidence.picture.fills_image:
+        print_stderr(replayed.evidence.picture.description)
     print_result(replayed, out, write_outputs(out, replayed, source), quiet=quiet, json=json)
     return replayed
 

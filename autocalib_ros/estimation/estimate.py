@@ -112,7 +112,7 @@ def find_solution(
     gate, joint = options.gate, options.joint
     if len(tracks) < gate.min_tracks:
         return reason('too_few_tracks', 'short', tracks=len(tracks), limit=gate.min_tracks)
-    priors = lens_priors(evidence.image_size, joint) if lens is None else [known_lens(lens)]
+    priors = lens_priors(evidence.image_size, joint, evidence.picture) if lens is None else [known_lens(lens)]
     crossing_rad = None if joint.crossing_deg is None else float(np.radians(joint.crossing_deg))
     instants, generator = ResampledTracks(evidence), np.random.default_rng(options.random_seed)
     windows = find_windows(evidence, instants)

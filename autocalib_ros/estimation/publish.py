@@ -14,6 +14,7 @@ from autocalib_ros.estimation.paper.vanishing_point_voting import segment_orient
 from autocalib_ros.estimation.people.pedestrians import people
 from autocalib_ros.estimation.solution import Solution
 from autocalib_ros.estimation.verification.ground_normal import PlaneEstimate
+from autocalib_ros.estimation.verification.readiness import stillness_checks
 from autocalib_ros.estimation.verification.scale import Scale, check_scale, known_scale
 from autocalib_ros.evidence.snapshot import Evidence, TrackKind
 from autocalib_ros.geometry.ground_plane import ground_plane, ground_points, pixels_ahead, tilt_and_roll_deg
@@ -60,7 +61,7 @@ class ResultDraft:
             method=self.options.method,
             grade='lens',
             assumptions=solution.assumptions,
-            checks=solution.checks,
+            checks=(*stillness_checks(self.evidence), *solution.checks),
             camera=solution.fit.state.camera,
             ground=None,
             ground_refusal=solution.plane_refusal,

@@ -7,8 +7,10 @@ from collections.abc import Iterable
 import numpy as np
 
 from autocalib_ros.config import BufferOptions
+from autocalib_ros.evidence.picture import Picture
 from autocalib_ros.evidence.retention import RetentionIndex
 from autocalib_ros.evidence.snapshot import Edges, Evidence, Outlines, Segments, Track, track_arrays
+from autocalib_ros.evidence.stillness import Stillness
 from autocalib_ros.evidence.tables import EDGES, OUTLINES, SEGMENTS, ObservationTable, merged
 
 
@@ -101,12 +103,6 @@ class EvidenceBuffer:
         for lines in self._line_tables:
             lines.keep(lines.retention.rows_not_replaced(time_s))
 
-    def forget_before(self, time_s: float) -> None:
-        """Drop all observations that ended before `time_s`: the camera may have moved since."""
-        self._keep_tracks(self._track_retention.rows_since(time_s))
-        for lines in self._line_tables:
-            lines.keep(lines.retention.rows_since(time_s))
-
     def _keep_tracks(self, rows: np.ndarray) -> None:
         if len(rows) < len(self._tracks):
             self._track_retention.keep(rows)
@@ -134,6 +130,8 @@ class EvidenceBuffer:
         frames: int,
         drift_px: float,
         unfinished: list[Track],
+        picture: Picture | None = None,
+        stillness: Stillness | None = None,
     ) -> Evidence:
         """Return the observations so far, with the tracks that are still being followed."""
         return Evidence(
@@ -142,6 +140,8 @@ class EvidenceBuffer:
             newest_stamp_ns=newest_stamp_ns,
             frames=frames,
             drift_px=drift_px,
+            picture=picture or Picture.whole(image_size),
+            stillness=stillness or Stillness(),
             **merged([lines.arrays() for lines in self._line_tables]),
             **track_arrays([*self._tracks, *unfinished]),
         )

@@ -102,10 +102,6 @@ class RetentionIndex:
         vehicles, newest_s, added = self._novelty()
         return np.flatnonzero(((newest_s >= time_s) | (added > 1.0 / (1.0 + REPLACING_VEHICLES)))[vehicles])
 
-    def rows_since(self, time_s: float) -> np.ndarray:
-        """Return the rows not older than `time_s`."""
-        return np.flatnonzero(self._times_s[: self.count] >= time_s)
-
     def _novelty(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the vehicle index of each row (n,), and the last time and novelty of each vehicle."""
         held = slice(self.count)

@@ -11,14 +11,20 @@ from typing import Any
 import numpy as np
 
 from autocalib_ros.evidence.npz import evidence_file, write_evidence_file
+from autocalib_ros.evidence.picture import Picture
+from autocalib_ros.evidence.stillness import Stillness
 from autocalib_ros.evidence.tables import OUTLINE_COLUMNS, TABLES, merged, require_array
 from autocalib_ros.results.calibration import EvidenceSummary
 
 COVERAGE_CELLS = (16, 9)
 """Columns and rows of the grid of image cells over which coverage is counted."""
 TRACK_ARRAYS = ('track_starts', 'points_px', 'times_s', 'track_vehicles')
+STILLNESS = 'stillness'
+"""Saved only if there was sway, or another view."""
 TRACK_KINDS = 'track_kinds'
 """Saved only if a detector classified the tracks."""
+PICTURE = 'picture'
+"""Saved only if the picture does not fill the images."""
 
 
 class TrackKind(IntEnum):
@@ -99,7 +105,7 @@ class Evidence:
     segment_times_s: np.ndarray
     """Shape (segments,)."""
     drift_px: float
-    """Largest displacement of the background, pixels of the full image; 0 for a fixed camera."""
+    """Largest lasting displacement of the background, pixels of the full image; 0 for a fixed camera."""
     edges_px: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))
     """As `Edges.ends_px`, shape (edges, 4)."""
     edge_vehicles: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
@@ -116,10 +122,21 @@ class Evidence:
     """Line segments of the static scene, x0, y0, x1, y1, shape (lines, 4)."""
     track_kinds: np.ndarray = field(default_factory=lambda: np.zeros(0, np.uint8))
     """`TrackKind` of each track, uint8, shape (tracks,); all unknown by default."""
+    picture: Picture = None  # type: ignore[assignment]  # never None after construction
+    """The picture inside the images; by default it fills them. It is scaled with `image_size`."""
+
+    stillness: Stillness = field(default_factory=Stillness)
+    """Sway, which is compensated, and the still part of the recording that the evidence is from."""
 
     def __post_init__(self) -> None:
         if not len(self.track_kinds):
             object.__setattr__(self, 'track_kinds', np.zeros(len(self.track_vehicles), np.uint8))
+        if min(self.image_size) < 1:
+            return  # `require_consistent` says so
+        if self.picture is None:
+            object.__setattr__(self, 'picture', Picture.whole(self.image_size))
+        elif self.picture.image_size != self.image_size:
+            object.__setattr__(self, 'picture', self.picture.in_images_of(self.image_size))
 
     @property
     def track_count(self) -> int:
@@ -130,6 +147,11 @@ class Evidence:
     def seconds(self) -> float:
         """Time between the first and the newest image."""
         return (self.newest_stamp_ns - self.first_stamp_ns) * 1e-9
+
+    @property
+    def sway_px(self) -> float:
+        """Compensated sway about the rest position: 95 % of the images lie within it, pixels; 0: none."""
+        return self.stillness.sway_px
 
     def track(self, index: int) -> Track:
         """Return one track."""
@@ -147,10 +169,11 @@ class Evidence:
 
     @property
     def coverage(self) -> float:
-        """Fraction of the image cells that tracks cross, 0 to 1."""
+        """Fraction of the cells of the picture that tracks cross, 0 to 1."""
         if not len(self.points_px):
             return 0.0
-        cells = np.floor(self.points_px / self.image_size * COVERAGE_CELLS).astype(int)
+        from_corner = self.points_px - self.picture.rectangle[:2]
+        cells = np.floor(from_corner / self.picture.size * COVERAGE_CELLS).astype(int)
         cells = np.clip(cells, 0, np.array(COVERAGE_CELLS) - 1)
         return len(np.unique(cells @ [1, COVERAGE_CELLS[0]])) / (COVERAGE_CELLS[0] * COVERAGE_CELLS[1])
 
@@ -168,6 +191,14 @@ class Evidence:
             people=len(np.unique(self.track_vehicles[people])),
         )
 
+    def since(self, start_s: float) -> Evidence:
+        """Return the evidence with times that count from `start_s`, before which there is none."""
+        if start_s <= 0.0:
+            return self
+        names = ('times_s', *(table.times for table in TABLES if table.times))
+        times = {name: getattr(self, name) - start_s for name in names}
+        return replace(self, first_stamp_ns=self.first_stamp_ns + round(start_s * 1e9), **times)
+
     def select_tracks(self, keep: np.ndarray) -> Evidence:
         """Return the evidence with only the tracks of indices `keep` (n,); the other observations are unchanged."""
         return replace(self, **track_arrays([self.track(index) for index in keep]))
@@ -184,6 +215,10 @@ class Evidence:
         arrays |= merged([table.arrays(self) for table in TABLES if table.is_saved(self)])
         if self.track_kinds.any():
             arrays[TRACK_KINDS] = self.track_kinds
+        if not self.picture.fills_image:
+            arrays[PICTURE] = self.picture.numbers
+        if self.stillness.is_notable:
+            arrays[STILLNESS] = self.stillness.as_array()
         write_evidence_file(
             path,
             arrays,
@@ -197,8 +232,17 @@ class Evidence:
     def load(cls, path: Path) -> Evidence:
         """Read a file that `save` wrote, also with an earlier version; InputError if it is unreadable."""
         required = (*TRACK_ARRAYS, *(name for table in TABLES if table.required for name in table.names))
-        optional = (*(name for table in TABLES if not table.required for name in table.names), TRACK_KINDS)
+        optional = (
+            *(name for table in TABLES if not table.required for name in table.names),
+            TRACK_KINDS,
+            PICTURE,
+            STILLNESS,
+        )
         with evidence_file(path, required, optional) as fields:
+            if PICTURE in fields:
+                fields[PICTURE] = Picture.of_numbers(fields['image_size'], fields[PICTURE])
+            if STILLNESS in fields:
+                fields[STILLNESS] = Stillness.from_array(fields[STILLNESS])
             evidence = cls(**fields)
             evidence.require_consistent()
         return evidence

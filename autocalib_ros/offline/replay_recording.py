@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,8 +18,11 @@ from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.recordings.open import open_source
 from autocalib_ros.offline.recordings.sources import Source
 from autocalib_ros.perception.detector.detector import VehicleDetector
+from autocalib_ros.perception.frame_clock import ClockSummary
 from autocalib_ros.report.scene import SolutionSnapshot, append_snapshot
 from autocalib_ros.results.calibration import Calibration, Refusal
+
+LOG = logging.getLogger(__name__)
 
 SOLVE_AGAIN_GROWTH = 2.0
 """Growth of the recording after which an accepted calibration is solved again, for the convergence plot of the report.
@@ -39,9 +43,13 @@ class ReplayResult:
     background: np.ndarray | None
     """Background image without traffic, BGR uint8; None if unknown."""
     frames: int
+    repeated: int = 0
+    """How many of the frames repeat an earlier one, exactly or through a codec."""
     options: Options = field(default_factory=Options)
     moments: tuple[SolutionSnapshot, ...] = ()
     """Intermediate solutions and the last one, for the convergence plot of the report."""
+    clock: ClockSummary = field(default_factory=ClockSummary)
+    """What the frame clock made of the stamps."""
 
 
 def replay(
@@ -53,6 +61,7 @@ def replay(
 ) -> ReplayResult:
     """Collect evidence from a recording, given as a path or an open source, and solve at its end.
 
+    If the view changes (cuts, zooms, a camera that is turned), the longest part in which it stands still is solved.
     `on_progress` receives the number of frames and a short note, whose first word is the state: collecting, solving,
     calibrated or refused. With a known `lens` only the pose is estimated; UsageError if its aspect ratio differs from
     that of the images. `detector` is an open detector; None opens the one of the options. InputError without an image.
@@ -62,11 +71,14 @@ def replay(
     calibrator, accepted_at_s, count, note, scaled_lens = AutoCalibrator(options, detector), None, 0, '', None
     latest: Calibration | Refusal | None = None
     moments: tuple[SolutionSnapshot, ...] = ()
-    next_solve_s = 0.0
+    next_solve_s, part_start_s = 0.0, 0.0
     for count, frame in enumerate(source.frames(), start=1):
         scaled_lens = _scaled_lens(lens, (frame.image.shape[1], frame.image.shape[0]))
         calibrator.add_image(frame.stamp_ns, frame.image)
         due = calibrator.snapshot_if_due()
+        if due is not None and due.stillness.start_s != part_start_s:  # another still part of the recording
+            part_start_s = due.stillness.start_s
+            accepted_at_s, moments, latest, next_solve_s = None, (), None, 0.0
         if due is not None and due.seconds >= next_solve_s:
             report_progress(count, 'solving')
             tried = solve(due, options, lens=scaled_lens)
@@ -78,9 +90,13 @@ def replay(
         if on_progress is not None and count % PROGRESS_EVERY_FRAMES == 1:
             note = _progress_note(calibrator, latest, accepted_at_s)
         report_progress(count, note)
-    evidence = calibrator.snapshot()
+    evidence = calibrator.snapshot(longest_part=True)
     if evidence is None:
         raise InputError(f'{source.name} has no images')
+    if evidence.stillness.start_s != part_start_s:
+        accepted_at_s, moments = None, ()
+    if calibrator.clock().is_uneven:
+        LOG.warning('%s: uneven time stamps, regularised: %s', source.name, calibrator.clock())
     report_progress(count, 'solving')
     result = solve(evidence, options, lens=scaled_lens)
     report_progress(count, 'calibrated' if result else 'refused')
@@ -90,10 +106,12 @@ def replay(
         result=result,
         evidence=evidence,
         accepted_at_s=accepted_at_s,
-        background=calibrator.background(),
+        background=calibrator.background(longest_part=True),
         frames=count,
+        repeated=calibrator.repeated,
         options=options,
         moments=append_snapshot(moments, result),
+        clock=calibrator.clock(),
     )
 
 

@@ -7,12 +7,20 @@ import numpy as np
 
 MAX_SAMPLES = 9
 """Images in memory; bounds memory and the cost of the median."""
-FIRST_INTERVAL_S = 1.0
-"""First sampling interval, seconds."""
+FIRST_INTERVAL_S = 0.5
+"""First sampling interval, seconds: a background two seconds after the first image."""
 MAX_INTERVAL_S = 600.0
 """Longest sampling interval: images older than `MAX_SAMPLES` of these show other light, dirt and road paint."""
 MIN_SAMPLES = 5
 """The median of fewer images still shows passing vehicles. Judgement."""
+
+REDUCED_FLAGS = (
+    cv2.IMREAD_COLOR,
+    cv2.IMREAD_REDUCED_COLOR_2,
+    cv2.IMREAD_REDUCED_COLOR_4,
+    cv2.IMREAD_REDUCED_COLOR_8,
+)
+"""Decoding of a JPEG in whole, half, quarter and eighth size, each cheaper than the one before."""
 
 
 class Background:
@@ -25,16 +33,18 @@ class Background:
         self._samples: list[tuple[float, np.ndarray]] = []
         self._interval_s = FIRST_INTERVAL_S
         self._next_s = 0.0
+        self._width = 0
 
     def update(self, image: np.ndarray, time_s: float) -> None:
         """Add a grey or BGR uint8 image if the sampling interval has passed."""
-        if time_s < self._next_s:
+        if not self.is_due(time_s):
             return
         if len(self._samples) == MAX_SAMPLES:
             self._thin()
         ok, encoded = cv2.imencode('.jpg', image, [cv2.IMWRITE_JPEG_QUALITY, 92])
         if ok:
             self._samples.append((time_s, encoded))
+            self._width = image.shape[1]
         self._next_s = time_s + self._interval_s
 
     def _thin(self) -> None:
@@ -44,12 +54,9 @@ class Background:
         self._samples = self._samples[::2]
         self._interval_s *= 2
 
-    def forget_before(self, time_s: float) -> None:
-        """Drop images taken before `time_s`, when the camera pose was different; keep at least the newest one."""
-        newer = [sample for sample in self._samples if sample[0] >= time_s]
-        if len(newer) < len(self._samples):
-            self._samples = newer or self._samples[-1:]
-            self._interval_s, self._next_s = FIRST_INTERVAL_S, self._samples[-1][0] + FIRST_INTERVAL_S
+    def is_due(self, time_s: float) -> bool:
+        """Whether an image of this time would be added."""
+        return time_s >= self._next_s
 
     @property
     def times_s(self) -> tuple[float, ...]:
@@ -62,11 +69,25 @@ class Background:
 
     def grey(self) -> np.ndarray | None:
         """Return the median image in grey, uint8 (H, W); None while there are fewer than `MIN_SAMPLES`."""
-        return self._median(cv2.IMREAD_GRAYSCALE) if len(self._samples) >= MIN_SAMPLES else None
+        return median(samples) if (samples := self.grey_samples()) else None
+
+    def grey_samples(self) -> list[np.ndarray]:
+        """Return the images in grey, uint8 (H, W), oldest first; none while there are fewer than `MIN_SAMPLES`."""
+        return self._decoded(cv2.IMREAD_GRAYSCALE) if len(self._samples) >= MIN_SAMPLES else []
+
+    def samples(self, max_width: int) -> list[np.ndarray]:
+        """Return the images, BGR uint8 (h, w, 3), oldest first, halved until they are at most `max_width` wide."""
+        halvings = 0
+        while self._width > max_width << halvings and halvings + 1 < len(REDUCED_FLAGS):
+            halvings += 1
+        return self._decoded(REDUCED_FLAGS[halvings])
 
     def _median(self, flags: int) -> np.ndarray:
+        return median(self._decoded(flags))
+
+    def _decoded(self, flags: int) -> list[np.ndarray]:
         images = [cv2.imdecode(encoded, flags) for _, encoded in self._samples]
-        return median([image for image in images if image is not None])
+        return [image for image in images if image is not None]
 
 
 def median(images: list[np.ndarray]) -> np.ndarray:

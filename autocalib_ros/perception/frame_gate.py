@@ -11,6 +11,8 @@ from enum import Enum
 import cv2
 import numpy as np
 
+from autocalib_ros.perception.repeats import RepeatDetector
+
 COMPARISON_WIDTH_PX = 64
 """Width in pixels at which views are compared: resolves lorries, averages noise."""
 MIN_VIEW_CORRELATION = 0.3
@@ -40,15 +42,18 @@ class FrameStatus(Enum):
 
 
 class FrameGate:
-    """Classifies the frames of one stream; frames that are `REPEATED` or `HIDDEN` must not be used."""
+    """Classifies the frames of one stream; frames that are `REPEATED` or `HIDDEN` must not be used.
+
+    Without a detector of repeats, only identical frames are repeated.
+    """
 
     def __init__(
         self,
-        max_repeat_difference: float,
+        repeats: RepeatDetector | None = None,
         level_shift_threshold: float = np.inf,
         min_spread_levels: float = MIN_SPREAD_LEVELS,
     ) -> None:
-        self._max_repeat_difference = max_repeat_difference
+        self._repeats = repeats
         self._level_shift_threshold = level_shift_threshold
         self._min_spread_levels = min_spread_levels
         self._last: np.ndarray | None = None
@@ -56,17 +61,35 @@ class FrameGate:
         self._last_s = 0.0
 
     def classify(self, image: np.ndarray, time_s: float) -> FrameStatus:
-        """Compare a reduced grey image (h, w) of any type with the last accepted one."""
+        """Compare a reduced grey image (h, w), uint8 with a detector of repeats, with the last accepted one."""
         current = _downsampled(image)
         status = FrameStatus.NEW if self._last is None else self._compare(self._last, image, current, time_s)
         if status is not FrameStatus.HIDDEN:
             self._last_s = time_s
         if status in (FrameStatus.NEW, FrameStatus.LEVEL_SHIFT):
             self._last, self._before = image, current
+            self._learn_from(status, time_s)
         return status
 
+    def revoke(self) -> None:
+        """Take back that the frame accepted last is new: it is repeated."""
+        if self._repeats is not None:
+            self._repeats.revoke()
+
+    def _learn_from(self, status: FrameStatus, time_s: float) -> None:
+        if self._repeats is None:
+            return
+        if status is FrameStatus.LEVEL_SHIFT:
+            self._repeats.restart()
+        self._repeats.accept(time_s)
+
+    def _is_repeated(self, last: np.ndarray, image: np.ndarray, time_s: float) -> bool:
+        if self._repeats is None:
+            return np.array_equal(last, image)
+        return self._repeats.is_repeat(last, image, time_s)
+
     def _compare(self, last: np.ndarray, image: np.ndarray, current: np.ndarray, time_s: float) -> FrameStatus:
-        if cv2.absdiff(last, image).max() <= self._max_repeat_difference:
+        if self._is_repeated(last, image, time_s):
             return FrameStatus.REPEATED
         before, change = self._before, current - self._before
         spread = _robust_spread(before)

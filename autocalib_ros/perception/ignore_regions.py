@@ -55,6 +55,13 @@ def require_polygons_inside(polygons: Polygons, size: tuple[int, int]) -> None:
             )
 
 
+def union(one: np.ndarray | None, other: np.ndarray | None) -> np.ndarray | None:
+    """Return the union of two masks uint8 (h, w), each of which may be None: nothing."""
+    if one is None or other is None:
+        return one if other is None else other
+    return cv2.bitwise_or(one, other)
+
+
 class IgnoreMask:
     """The ignored regions in pixels of the tracked image, for feature detection."""
 

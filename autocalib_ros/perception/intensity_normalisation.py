@@ -21,6 +21,9 @@ CLIPPED_FRACTION, CLIPPED_S = 0.25, 2.0
 """Fraction of clipped pixels, and seconds after which the limits are then reset. Judgement."""
 HISTOGRAM_SAMPLES = 128
 """Samples along each side of the image for the percentiles."""
+MAX_STEP_S = 2.0
+"""Longest interval between two images that counts, seconds: one odd stamp must not move the limits, and after a real
+pause `CLIPPED_S` resets them if need be."""
 DEFAULT_INTERVAL_S = 0.1
 """Frame interval assumed if the stamps are unusable, seconds."""
 
@@ -70,9 +73,7 @@ class IntensityNormaliser:
             self._reset()
         step_s = self._step_s(stamp_s)
         self._encoding, self._stamp_s, self._time_s = encoding, stamp_s, self._time_s + step_s
-        self._frame_gate = self._frame_gate or FrameGate(
-            max_repeat_difference=0.0, min_spread_levels=self._min_span / 4
-        )
+        self._frame_gate = self._frame_gate or FrameGate(min_spread_levels=self._min_span / 4)
         status = self._frame_gate.classify(samples, self._time_s)
         if status in (FrameStatus.REPEATED, FrameStatus.HIDDEN):
             self._last_within_limits_s += step_s
@@ -90,7 +91,7 @@ class IntensityNormaliser:
 
     def _step_s(self, stamp_s: float | None) -> float:
         step_s = 0.0 if stamp_s is None or self._stamp_s is None else stamp_s - self._stamp_s
-        return step_s if step_s > 0 else DEFAULT_INTERVAL_S
+        return min(step_s, MAX_STEP_S) if step_s > 0 else DEFAULT_INTERVAL_S
 
     def _clipped_too_long(self, samples: np.ndarray) -> bool:
         """Whether more than `CLIPPED_FRACTION` of the samples has been outside the limits for `CLIPPED_S`."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import deque
+
 import cv2
 import numpy as np
 
@@ -22,7 +24,15 @@ STATIONARY_PX = 1.5
 MAX_GAP_S = 1.0
 """Longest interval between two images, seconds; a longer one ends all tracks."""
 GAP_INTERVALS = 2.3
-"""Ratio to the previous frame interval above which an interval is a gap, across which velocity predicts."""
+"""Ratio to the usual interval between images above which an interval is a gap, across which velocity predicts."""
+USUAL_INTERVALS, USUAL_QUANTILE = 31, 0.75
+"""Intervals whose upper quartile is the usual one: a second or two, so that a change of the rate is followed within a
+second. The upper quartile, because up to half of the images are repeats or lost at random without being gaps."""
+SHORTEST_INTERVAL = 0.5
+"""Fraction of the usual interval below which a stamp is in doubt, and the usual one is taken for velocities."""
+SAME_INTERVAL = 0.05
+"""Relative difference up to which the ratio of two intervals is one of whole frames: less than the velocity of a
+vehicle changes."""
 GAP_TOLERANCE = 0.25
 """Largest distance from the predicted position after a gap, fraction of the displacement, at least `MAX_TURN_PX`: a
 vehicle at 10 m/s that brakes hard for a second misses the prediction by a fifth.
@@ -34,6 +44,17 @@ MIN_STEP_RATIO, MAX_STEP_RATIO = 0.3, 2.3
 `MAX_TURN_PX` or `MAX_TURN_FRACTION` of the step, and its length ratio lies within these limits, which a late or lost
 image can cause. A point that stops dead has stuck to an occluder; one that jumps has found another object. Judgement.
 """
+MIN_FAST_POINTS = 5
+"""Least number of points faster than `MAX_TURN_PX` per image that tell a repeated image."""
+UNCHANGED, UNCHANGED_FRACTION = 0.5, 2 / 3
+"""Largest change of the surroundings of a point that stands still, fraction of their contrast (where a fast point was,
+they change by all of it), and the fraction of the fast points that stand still in a repeated image. Vehicles do not
+stop together from one image to the next; points stick to an occluder one by one.
+"""
+MIN_SCALED_STEP_PX = 1.0
+"""Least step, pixels per image, of a point that tells how far points moved across repeated images: noise is a fifth."""
+MAX_SCALED_POINTS = 60
+"""Most points that tell it; their median is then known to a few percent."""
 
 
 class PointTracker:
@@ -46,46 +67,132 @@ class PointTracker:
         self._options, self._excluded = options, excluded
         self._grey: np.ndarray | None = None
         self._time_s = self._interval_s = 0.0
+        self._repeats = 0
+        self._intervals_s: deque[float] = deque(maxlen=USUAL_INTERVALS)
         slots = options.max_points
         self._history = np.zeros((slots, MAX_TRACK_SAMPLES, 3))
         self._count = np.zeros(slots, int)
         self._vehicle = np.zeros(slots, int)
         self._step = np.zeros((slots, 2))
 
+    def is_repeat(self, grey: np.ndarray, time_s: float) -> bool:
+        """Return whether the fast points all stand still in a grey image (H, W): it repeats the last one."""
+        if self._grey is None or not 0 < time_s - self._time_s <= MAX_GAP_S:
+            return False
+        fast = np.flatnonzero((self._count > 1) & (np.hypot(*self._step.T) > MAX_TURN_PX))
+        if len(fast) < MIN_FAST_POINTS:
+            return False
+        before, after = (self._patches(image, self._current_positions(fast)) for image in (self._grey, grey))
+        change = np.abs(after - before).mean(axis=1)
+        contrast = np.abs(before - before.mean(axis=1, keepdims=True)).mean(axis=1)
+        return bool((change < UNCHANGED * contrast).mean() > UNCHANGED_FRACTION)
+
+    def _patches(self, grey: np.ndarray, points_px: np.ndarray) -> np.ndarray:
+        """Return the pixels of a grey image (H, W) around points (n, 2), float32 (n, window_px squared)."""
+        reach = np.arange(self._options.window_px) - self._options.window_px // 2
+        columns, rows = np.round(points_px).astype(int).T[..., None] + reach
+        rows, columns = np.clip(rows, 0, grey.shape[0] - 1), np.clip(columns, 0, grey.shape[1] - 1)
+        return grey[rows[:, :, None], columns[:, None, :]].reshape(len(points_px), -1).astype(np.float32)
+
+    def skip_repeat(self) -> None:
+        """Count a repeated image that is left out: the next step is over one more frame interval."""
+        self._repeats += 1
+
+    def exclude(self, excluded: np.ndarray | None) -> None:
+        """Replace the mask `excluded` (H, W) at which tracks end."""
+        self._excluded = excluded
+
     def follow(self, grey: np.ndarray, time_s: float) -> list[Track]:
-        """Track all points into a new grey image (H, W); return the tracks that ended."""
+        """Track all points into a new grey image (H, W); return the tracks that ended.
+
+        A repeat of the last image is left out.
+        """
+        if self.is_repeat(grey, time_s):
+            self.skip_repeat()
+            return []
         finished: list[Track] = []
+        intervals, self._repeats = self._repeats + 1, 0
         if self._grey is not None:
             interval_s = time_s - self._time_s
-            gap = interval_s > GAP_INTERVALS * self._interval_s > 0
             if not 0 < interval_s <= MAX_GAP_S:
                 finished = self.finish_all()
             else:
+                self._intervals_s.append(interval_s / intervals)  # repeats are images too
+                usual_s = float(np.quantile(self._intervals_s, USUAL_QUANTILE))
+                gap = interval_s > GAP_INTERVALS * usual_s
                 before = match_grey_levels(self._grey, grey) if gap else self._grey
-                finished = self._follow(before, grey, time_s, interval_s / self._interval_s if gap else 1.0)
-            self._interval_s = self._interval_s if gap else interval_s
+                interval_s = usual_s if interval_s < SHORTEST_INTERVAL * usual_s else interval_s
+                finished = self._follow(before, grey, time_s, interval_s, gap, after_repeats=intervals > 1)
+                if intervals == 1 or not self._interval_s:
+                    self._interval_s = interval_s
         self._grey, self._time_s = grey, time_s
         return finished
 
-    def _follow(self, before: np.ndarray, after: np.ndarray, time_s: float, steps: float) -> list[Track]:
-        """Track all points, predicted `steps` times their last step ahead: 1, or more across a gap."""
+    def _follow(
+        self, before: np.ndarray, after: np.ndarray, time_s: float, interval_s: float, gap: bool, after_repeats: bool
+    ) -> list[Track]:
+        """Track all points, predicted by their velocity over the interval; across a gap they must end near there.
+
+        After repeats the points tell how many of their steps they moved; the steps stay those of one interval.
+        """
         active = np.flatnonzero(self._count)
         if not len(active):
             return []
-        start, predicted = self._current_positions(active), steps * self._step[active]
+        steps = _whole(interval_s / self._interval_s if self._interval_s > 0 else 1.0)
+        if after_repeats:
+            steps = self._measured_steps(before, after, active, max(steps, 1.0))
+        start = self._current_positions(active)
+        predicted = self._step[active] * steps
+        known = self._count[active] > 1
+        if gap:
+            known |= self._predict_new(active, known, predicted)
         found, followed = self._flow(before, after, start, start + predicted)
         step = found - start
-        known = self._count[active] > 1
-        followed &= (
-            known & _near_prediction(predicted, step) if steps > 1 else ~(known & _is_discontinuous(predicted, step))
-        )
+        near = gap and not after_repeats
+        followed &= known & _near_prediction(predicted, step) if near else ~(known & _is_discontinuous(predicted, step))
         kept = active[followed]
         self._history[kept, self._count[kept]] = np.column_stack([np.full(len(kept), time_s), found[followed]])
         self._count[kept] += 1
-        self._step[kept] = step[followed] / steps
+        self._step[kept] = step[followed] / (steps if after_repeats else 1.0)
         ended = np.concatenate([active[~followed], kept[self._is_stationary(kept, time_s)]])
         finished = self._finish(ended)
         return finished + self._restart_full(np.flatnonzero(self._count == MAX_TRACK_SAMPLES))
+
+    def _measured_steps(self, before: np.ndarray, after: np.ndarray, active: np.ndarray, most: float) -> float:
+        """Return how many of their last steps the points moved across repeats: `most` if nothing moves.
+
+        The stamps do not tell: of a camera of 25 images per second that is recorded with 30, the image after a repeat
+        is one step on; after a stall, as many as intervals passed.
+        """
+        speed = np.hypot(*self._step[active].T) * (self._count[active] > 1)
+        fastest = active[np.argsort(-speed, kind='stable')[:MAX_SCALED_POINTS]]
+        fastest = fastest[np.hypot(*self._step[fastest].T) >= MIN_SCALED_STEP_PX]
+        measured, support = most, 0
+        if not len(fastest):
+            return measured
+        start, step = self._current_positions(fastest), self._step[fastest]
+        for guess in (*2.0 ** np.arange(np.ceil(np.log2(most))), most):
+            found, good = self._flow(before, after, start, start + guess * step)
+            ratio = ((found - start) * step).sum(axis=1) / (step**2).sum(axis=1)
+            good &= (ratio >= MIN_STEP_RATIO) & (ratio <= MAX_STEP_RATIO * most)
+            if not good.any():
+                continue
+            middle = float(np.median(ratio[good]))
+            agreeing = int((good & (np.abs(ratio - middle) <= GAP_TOLERANCE * middle)).sum())
+            if agreeing > support:
+                measured, support = middle, agreeing
+        return measured
+
+    def _predict_new(self, active: np.ndarray, known: np.ndarray, predicted: np.ndarray) -> np.ndarray:
+        """Predict new points (not `known`) by the median of their vehicle, in place; return the mask (n,) of these."""
+        vehicles = self._vehicle[active]
+        found = np.zeros(len(active), bool)
+        for vehicle in np.unique(vehicles[~known]):
+            same = vehicles == vehicle
+            if (same & known).any():
+                predicted[same & ~known] = np.median(predicted[same & known], axis=0)
+                found |= same & ~known
+        return found
 
     def _flow(
         self, before: np.ndarray, after: np.ndarray, start: np.ndarray, guess: np.ndarray
@@ -212,6 +319,13 @@ class PointTracker:
         if len(chosen) < MIN_TRACK_SAMPLES:
             return None
         return Track(int(self._vehicle[slot]), path[chosen, 0].copy(), path[chosen, 1:].copy())
+
+
+def _whole(ratio: float) -> float:
+    """Return a ratio of two intervals, as one of whole numbers of frames where it is near one to them."""
+    frames = round(max(ratio, 1.0 / ratio))
+    nearest = float(frames) if ratio >= 1.0 else 1.0 / frames
+    return nearest if abs(ratio - nearest) <= SAME_INTERVAL * nearest else ratio
 
 
 def _near_prediction(predicted: np.ndarray, step: np.ndarray) -> np.ndarray:

@@ -7,20 +7,25 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from autocalib_ros.config import Options
+from autocalib_ros.config import GateOptions, Options
+from autocalib_ros.evidence.picture import Picture
 from autocalib_ros.evidence.snapshot import Edges, Outlines, Segments, Track, TrackKind
-from autocalib_ros.perception.background import Background
+from autocalib_ros.evidence.stillness import MIN_TOLD_SWAY_PX, Stillness, drift_limit_px, sway_limit_px
+from autocalib_ros.perception.background import Background, median
 from autocalib_ros.perception.detector.detector import VehicleDetector
 from autocalib_ros.perception.detector_tracks import DetectorTracks
-from autocalib_ros.perception.drift_monitor import DriftMonitor
+from autocalib_ros.perception.drift_monitor import DriftLimits, DriftMonitor, ImagePose
 from autocalib_ros.perception.edges import EdgeFinder
 from autocalib_ros.perception.frame_gate import LEVEL_SHIFT_THRESHOLD, FrameGate, FrameStatus
-from autocalib_ros.perception.ignore_regions import IgnoreMask, black_out, require_polygons_inside
+from autocalib_ros.perception.ignore_regions import IgnoreMask, black_out, require_polygons_inside, union
 from autocalib_ros.perception.klt_tracker import PointTracker
 from autocalib_ros.perception.line_segments import LineSegmentDetector
 from autocalib_ros.perception.motion_mask import MotionMask, Region, exclude_pixels
+from autocalib_ros.perception.picture_area import PictureArea
+from autocalib_ros.perception.repeats import RepeatDetector
 from autocalib_ros.perception.segments import Keypoints, find_keypoints, match_segments
 from autocalib_ros.perception.silhouettes import outlines_of
+from autocalib_ros.perception.still_view import warped
 
 MOTION_MASK_PERIOD = 2
 """Frames between updates of the motion mask: traffic needs no finer time step."""
@@ -28,8 +33,6 @@ EDGE_SEARCH_PERIOD = 2
 """Keypoint detections between edge searches, which cost as much; edges change little in between."""
 
 
-MAX_REPEAT_DIFFERENCE = 4
-"""Largest pixel difference, grey levels, between a reduced frame and its repetition."""
 GATE_WIDTH_PX = 320
 """Width at which frames are compared with the frame gate."""
 
@@ -42,6 +45,17 @@ class FrameObservations:
     segments: Segments | None
     edges: Edges | None
     outlines: Outlines | None = None
+    view: int = 0
+    """Number of the still view that they belong to; observations of different views are never mixed."""
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """What a still view of the camera shows besides its traffic."""
+
+    background: Background
+    lines: LineSegmentDetector
+    picture_area: PictureArea
 
 
 class Observer:
@@ -58,16 +72,18 @@ class Observer:
         require_polygons_inside(self._polygons, image_size)
         ignored = IgnoreMask(self._polygons, image_size, self._tracked_size)
         self._ignored = ignored.near(0)
-        self._excluded = ignored.near(options.tracking.window_px)
+        self._excluded_by_options = self._excluded = ignored.near(options.tracking.window_px)
         self._motion = MotionMask(options.motion)
         self._detector_tracks = None if detector is None else DetectorTracks(detector, options.detector)
         self._tracker = PointTracker(options.tracking, self._excluded)
-        self._drift_monitor = DriftMonitor(options.buffer.seconds, self._ignored)
-        self._background = Background()
-        self._line_detector = LineSegmentDetector(self._excluded)
+        self._drift_monitor = DriftMonitor(self._drift_limits(options.gate), self._ignored)
+        self._scenes = {0: self._new_scene()}
+        self._view = 0
         self._sift = cv2.SIFT_create(contrastThreshold=0.03)  # type: ignore[attr-defined]  # for OpenCV 4.5
         self._keypoints: Keypoints | None = None
-        self._frame_gate = FrameGate(MAX_REPEAT_DIFFERENCE, LEVEL_SHIFT_THRESHOLD)
+        self._frame_gate = FrameGate(RepeatDetector(), LEVEL_SHIFT_THRESHOLD)
+        self.repeated = 0
+        """Number of images so far that repeat an earlier one."""
         self._frames = 0
         self._vehicles = 0
         self._edge_finder = EdgeFinder()
@@ -78,10 +94,20 @@ class Observer:
         image = black_out(image, self._polygons)
         grey = self._tracked_image(image)
         status = self._frame_gate.classify(_downsampled(grey, self._ignored), time_s)
-        if status in (FrameStatus.REPEATED, FrameStatus.HIDDEN):
-            return FrameObservations([], None, None)
+        if status is FrameStatus.REPEATED:
+            return self._leave_out(status)
+        pose = self._drift_monitor.update(grey, time_s)
+        if pose.view != self._view:
+            return self._change_view(pose.view)
+        if status is FrameStatus.HIDDEN or not pose.is_usable:
+            return FrameObservations([], None, None, view=self._view)
+        image, grey = self._in_rest_position(image, grey, pose, time_s)
+        if self._tracker.is_repeat(grey, time_s):
+            return self._leave_out(status)
         ended = self._reset_appearance() if status is FrameStatus.LEVEL_SHIFT else []
-        self._background.update(image, time_s)
+        self._scene.background.update(image, time_s)
+        if self._scene.picture_area.update(self._scene.background):
+            self._exclude_no_picture()
         tracks = [self._to_full_size(track) for track in (*ended, *self._tracker.follow(grey, time_s))]
         detect = self._frames % self._options.tracking.detect_every == 0
         if detect or self._frames % MOTION_MASK_PERIOD == 0:
@@ -89,9 +115,64 @@ class Observer:
         if self._detector_tracks is not None:
             self._detector_tracks.follow(image, time_s, self._tracker, self._reduction)
         segments, edges, outlines = self._detect(grey, time_s) if detect else (None, None, None)
-        self._drift_monitor.update(grey, time_s)
         self._frames += 1
-        return FrameObservations(tracks, segments, edges, outlines)
+        return FrameObservations(tracks, segments, edges, outlines, self._view)
+
+    def change_gate(self, gate: GateOptions) -> None:
+        """Take another limit of the drift, which may change while running."""
+        self._drift_monitor.change_limits(self._drift_limits(gate))
+
+    def _drift_limits(self, gate: GateOptions) -> DriftLimits:
+        """Return what counts as standing still, in pixels of the tracked image."""
+        width = self._image_size[0]
+        limits = (drift_limit_px(width, gate), sway_limit_px(width, gate), MIN_TOLD_SWAY_PX)
+        return DriftLimits(*(limit / self._reduction for limit in limits))
+
+    def _new_scene(self) -> _Scene:
+        return _Scene(
+            Background(),
+            LineSegmentDetector(self._excluded_by_options),
+            PictureArea(self._image_size, self._tracked_size, self._polygons),
+        )
+
+    @property
+    def _scene(self) -> _Scene:
+        return self._scenes[self._view]
+
+    def _change_view(self, view: int) -> FrameObservations:
+        """Begin with another view, or go on with an earlier one; return the tracks that end with the one before."""
+        ended = [self._to_full_size(track) for track in self._reset_appearance()]
+        before, self._view = self._view, view
+        self._scenes = {number: self._scenes.get(number) or self._new_scene() for number in self._drift_monitor.views}
+        self._exclude_no_picture()
+        return FrameObservations(ended, None, None, view=before)
+
+    def _in_rest_position(
+        self, image: np.ndarray, grey: np.ndarray, pose: ImagePose, time_s: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Undo the sway of an image, in full size only if the background takes it, and of the tracked image."""
+        if not pose.is_compensated:
+            return image, grey
+        if self._scene.background.is_due(time_s):
+            image = warped(image, pose.motion.enlarged(self._reduction))
+        return image, warped(grey, pose.motion)
+
+    def _leave_out(self, status: FrameStatus) -> FrameObservations:
+        """Count a repeated image, which shows nothing."""
+        if status is not FrameStatus.REPEATED:  # only the tracker noticed
+            self._frame_gate.revoke()
+        self.repeated += 1
+        self._tracker.skip_repeat()
+        return FrameObservations([], None, None, view=self._view)
+
+    def _exclude_no_picture(self) -> None:
+        """Leave out what is no picture in all that follows: tracks, moving regions and corners of the background."""
+        mask = self._scene.picture_area.mask
+        margin = 2 * self._options.tracking.window_px + 1
+        near = None if mask is None else cv2.dilate(mask, np.ones((margin, margin), np.uint8))
+        self._excluded = union(self._excluded_by_options, near)
+        self._tracker.exclude(self._excluded)
+        self._drift_monitor.exclude(union(self._ignored, mask))
 
     def _reset_appearance(self) -> list[Track]:
         """Reset all state that depends on earlier grey levels; return the tracks that end."""
@@ -188,33 +269,42 @@ class Observer:
 
     @property
     def drift_px(self) -> float:
-        """Largest displacement of the background, pixels of the full image."""
+        """Largest lasting displacement of the background of the present view, pixels of the full image."""
         return self._drift_monitor.drift_px * self._reduction
 
     @property
-    def lost_s(self) -> float:
-        """Time at which the background was last lost; minus infinity if never."""
-        return self._drift_monitor.lost_s
+    def view(self) -> int:
+        """Number of the present still view."""
+        return self._view
 
-    def compare_since(self, time_s: float) -> None:
-        """Compute `drift_px` since `time_s`, that of the oldest evidence, if that is older than `buffer.seconds`."""
-        self._drift_monitor.compare_since(time_s)
+    @property
+    def views(self) -> dict[int, float]:
+        """Numbers of the still views in memory, at most two, and the seconds that each was seen and still."""
+        return {number: still_s for number, still_s in self._drift_monitor.views.items() if number in self._scenes}
 
-    def forget_view_before(self, time_s: float) -> None:
-        """Drop background images from before `time_s`, when the camera pose was different."""
-        self._background.forget_before(time_s)
+    def stillness(self, view: int) -> tuple[float, Stillness]:
+        """Return the drift of a view in memory in pixels of the full image, and how still the camera stood."""
+        drift_px, stillness = self._drift_monitor.stillness(view)
+        return drift_px * self._reduction, stillness.enlarged(self._reduction)
 
-    def still_lines(self) -> np.ndarray:
+    def still_lines(self, view: int | None = None) -> np.ndarray:
         """Return the line segments of the background, x0, y0, x1, y1 in pixels of the full image, shape (n, 4)."""
-        times = self._background.times_s
-        if not self._line_detector.is_current(times):
-            grey = self._background.grey()
-            self._line_detector.find(None if grey is None else self._tracked_image(grey), times)
-        return self._to_full_pixels(self._line_detector.lines_px.reshape(-1, 2)).reshape(-1, 4)
+        scene = self._scenes[self._view if view is None else view]
+        times = scene.background.times_s
+        if not scene.lines.is_current(times):
+            samples = scene.background.grey_samples()
+            grey = self._tracked_image(median(samples)) if samples else None
+            tracked = [self._tracked_image(sample) for sample in samples]
+            scene.lines.find(grey, times, scene.picture_area.mask, tracked)
+        return self._to_full_pixels(scene.lines.lines_px.reshape(-1, 2)).reshape(-1, 4)
 
-    def background(self) -> np.ndarray | None:
+    def picture(self, view: int) -> Picture:
+        """Return the picture inside the images of a view in memory, pixels of the full image."""
+        return self._scenes[view].picture_area.picture
+
+    def background(self, view: int | None = None) -> np.ndarray | None:
         """Return the background image, BGR uint8 (H, W, 3); None before the first image."""
-        image = self._background.image()
+        image = self._scenes[self._view if view is None else view].background.image()
         return (
             None if image is None else black_out(image, self._polygons)
         )  # JPEG ringing at the borders of the polygons

@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import AbstractPathEffect, withStroke
 
+from autocalib_ros.evidence.picture import Picture
 from autocalib_ros.pictures.drawing import ROAD_COLOURS
 from autocalib_ros.report.scene import NOT_USED, REJECTED, ReportScene
 
@@ -96,7 +97,21 @@ def image_axes(
         aspect='equal',
     )
     axes.set_axis_off()
+    _outline_picture(axes, scene.evidence.picture)
     return figure, axes
+
+
+def _outline_picture(axes: Axes, picture: Picture) -> None:
+    """Outline the picture inside the images, unless it fills them."""
+    if picture.fills_image:
+        return
+    x0, y0, x1, y1 = picture.rectangle
+    outline = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]])
+    if picture.circle is not None:
+        x, y, radius = picture.circle
+        angles = np.linspace(0.0, 2 * np.pi, 181)
+        outline = np.column_stack([x + radius * np.cos(angles), y + radius * np.sin(angles)])
+    axes.plot(*outline.T - 0.5, color=MUTED_COLOUR, linewidth=1, linestyle='--')
 
 
 def faded_rgb(picture: np.ndarray, fade: float) -> np.ndarray:

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from autocalib_ros.config import GateOptions
-from autocalib_ros.estimation.verification.readiness import drift_limit_px
 from autocalib_ros.evidence.snapshot import Evidence
+from autocalib_ros.evidence.stillness import drift_limit_px
 from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
 from autocalib_ros.lens.camera import field_of_view_deg
 from autocalib_ros.results.calibration import GROUND_DISTANCES_M, Calibration, Refusal
@@ -120,10 +120,25 @@ def _paper_rows(result: Calibration) -> list[TableRow]:
 
 def file_rows(result: Calibration | Refusal, evidence: Evidence) -> list[TableRow]:
     """Return the table rows of the values in the output files, and of the method."""
+    stillness = evidence.stillness
     rows = [
-        TableRow('background motion', f'{evidence.drift_px:.2f} px', note='maximum'),
+        TableRow('background motion', f'{evidence.drift_px:.2f} px', note='largest lasting displacement'),
+        *([TableRow('sway', f'{stillness.sway_px:.1f} px', note='95 %, compensated')] if stillness.sway_px else []),
+        *(
+            [
+                TableRow(
+                    'still part used',
+                    f'{stillness.start_s:.1f} to {stillness.end_s:.1f} s',
+                    note=f'of {stillness.recorded_s:.1f} s; the view changed {len(stillness.changes)} times',
+                )
+            ]
+            if stillness.changes
+            else []
+        ),
         TableRow('method', result.method),
     ]
+    if not evidence.picture.fills_image:
+        rows.insert(0, TableRow('picture', str(evidence.picture), note='the rest of the images is not used'))
     if isinstance(result, Refusal):
         return rows
     rows.append(TableRow('grade', result.grade))
@@ -245,7 +260,7 @@ def needs(result: Calibration | Refusal, evidence: Evidence, gate: GateOptions) 
                 'stationary camera',
                 f'background motion {evidence.drift_px:.1f} px',
                 f'at most {limit:.1f} px',
-                evidence.drift_px <= limit,
+                refusal.code != 'camera_moving' and evidence.drift_px <= limit,
             ),
         ),
         (

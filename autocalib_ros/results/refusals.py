@@ -51,11 +51,36 @@ WAIT = 'wait for more traffic, or record for longer'
 REFUSALS = (
     RefusalCode(
         code='camera_moving',
-        cause='The camera moves: the background has drifted in the image.',
-        limit='gate.max_drift_px, 3 px at an image width of 1280 px (scaled with the width)',
+        cause='The camera moves: the background is displaced in the image for good. Or the view changes, by cuts, '
+        'zooms or motion, and no part of the recording stands still for long enough. Sway about a rest position is '
+        'compensated up to 4.5 px, or 0.35 % of the image width if that is more.',
+        limit='gate.max_drift_px, 3 px at an image width of 1280 px (scaled with the width, at least 1.5 px); a still '
+        'part of at least 10 s where the view changes',
         remedy='fix the camera to a rigid mount and record again',
         missing='a camera that stands still',
         message='the camera moves: the background drifted by {drift_px:.1f} px (limit {limit_px:.1f} px)',
+        variants={
+            'always': (
+                'the camera moves all the time: the picture moved by {travel_px:.0f} px in {seconds:.0f} s; its '
+                'longest still part lasts {part_s:.1f} s (at least {limit_s:.0f} s needed)',
+                '',
+            ),
+            'turned': (
+                'the camera was moved at {time_s:.1f} s: the picture was displaced by {moved_px:.1f} px; the still '
+                'part lasts {part_s:.1f} s (at least {limit_s:.0f} s needed)',
+                'record for longer while the camera stands, on a rigid mount',
+            ),
+            'zoom': (
+                'the picture was zoomed by {factor:.2f} between {from_s:.1f} and {to_s:.1f} s (zooms in all: {count}); '
+                'the still part lasts {part_s:.1f} s (at least {limit_s:.0f} s needed)',
+                'record for longer without a zoom, and switch off an automatic zoom',
+            ),
+            'cut': (
+                'the view was cut at {time_s:.1f} s (cuts, title cards or other cameras in all: {count}); the still '
+                'part lasts {part_s:.1f} s (at least {limit_s:.0f} s needed)',
+                'record one view of the road for longer',
+            ),
+        },
     ),
     RefusalCode(
         code='no_motion',

@@ -76,8 +76,15 @@ def _lens_family(family: str, k1_sigma: float) -> str:
     return f'{name}: k1 = {k1} +- {k1_sigma:.3g}'
 
 
-def _principal_point(sigma_px: float) -> str:
-    return 'principal point at the image centre' + (f' +- {sigma_px:.0f} px' if sigma_px > 0 else '')
+def _principal_point(
+    sigma_px: float, sigma_down_px: float | None = None, picture: str | None = None, covered: bool = False
+) -> str:
+    where = 'the image centre' if picture is None or covered else f'the centre of the picture ({picture})'
+    if covered:
+        where += f', of which bars cover a part (seen: {picture}),'
+    if sigma_down_px is not None:
+        return f'principal point at {where} +- {sigma_px:.0f} px across and {sigma_down_px:.0f} px down'
+    return f'principal point at {where}' + (f' +- {sigma_px:.0f} px' if sigma_px > 0 else '')
 
 
 def _focal_given(focal_px: float, sigma_px: float) -> str:
@@ -147,6 +154,15 @@ def _scale_speed(
     )
 
 
+def _still_part(start_s: float, end_s: float, recorded_s: float, cuts: int, zooms: int, moves: int) -> str:
+    counts = ((cuts, 'cuts to another view'), (zooms, 'zooms'), (moves, 'motions of the camera'))
+    changes = ', '.join(f'{what}: {count}' for count, what in counts if count)
+    return (
+        f'only the part from {start_s:.1f} to {end_s:.1f} s of {recorded_s:.1f} s was used, in which the view stands '
+        f'still; left out: the rest' + (f' ({changes})' if changes else '')
+    )
+
+
 ASSUMPTIONS: dict[str, Wording] = {
     'lens_given': 'the lens is given: only the pose was estimated',
     'lens_family': _lens_family,
@@ -163,7 +179,7 @@ ASSUMPTIONS: dict[str, Wording] = {
     'scale_height': _scale_height,
     'scale_distance': _scale_distance,
     'scale_speed': _scale_speed,
-    'paper_lens': 'equidistant lens with the principal point at the image centre',
+    'paper_lens': 'equidistant lens with the principal point at the centre of the picture',
     'paper_roads': 'the two roads are perpendicular',
     'paper_uncertainty': 'the published method gives no uncertainty',
 }
@@ -173,6 +189,8 @@ SCALE_KINDS = ('scale_height', 'scale_distance', 'scale_speed')
 """Kinds that say where the scale comes from; at most one stands in a calibration."""
 
 CHECKS: dict[str, Wording] = {
+    'sway': 'the camera sways by {sway_px:.1f} px about its rest position (95 % of the images): compensated',
+    'still_part': _still_part,
     'crossing_angle': _crossing_angle,
     'turning_vehicles': '{vehicles} turning vehicles move as rigid bodies in the plane',
     'halves': _halves,

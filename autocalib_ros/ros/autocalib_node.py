@@ -152,7 +152,7 @@ class AutocalibNode(Node):
         if not self._worker.close(deadline - time.monotonic()):
             self.get_logger().warning('shutdown: a solution was still running and is lost')
         self._pictures.close(max(0.0, deadline - time.monotonic()))
-        self.get_logger().info(f'shutdown: {self._worker.counters}')
+        self.get_logger().info(f'shutdown: {self._worker.counters}; time stamps: {self._worker.clock}')
 
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
         """Reject parameters with a helpful reason: rclpy rejects a wrong type before any callback."""
@@ -264,6 +264,7 @@ class AutocalibNode(Node):
             result=None if published is None else published.result,
             restored=self.publication.state is CalibrationState.RESTORED,
             progress=self._worker.progress,
+            clock=self._worker.clock,
             image_age_s=self._input.age_s,
             encoding=self._input.encoding,
             no_image=self._input.no_image,

@@ -8,11 +8,9 @@ from builtin_interfaces.msg import Time
 
 from autocalib_ros.config import NodeOptions
 from autocalib_ros.lens.camera_info_yaml import sanitised_name
-from autocalib_ros.ros.messages import stamp_ns
+from autocalib_ros.perception.header_stamps import HeaderStamps
 
 DEFAULT_FRAME = 'camera_optical_frame'
-MAX_REPEATED_STAMPS = 30
-"""Images in a row with one time stamp after which the clock counts as stopped, or as one of whole seconds."""
 
 
 class Headers:
@@ -23,27 +21,11 @@ class Headers:
     ) -> None:
         self._options, self._namespace, self._warn, self._now_ns = options, namespace.strip('/'), warn, now_ns
         self._warned: set[str] = set()
-        self._given_ns, self._repeats = -1, 0
+        self._stamps = HeaderStamps(warn)
 
     def stamp_ns(self, stamp: Time) -> int:
-        """Return the time of an image in nanoseconds.
-
-        It is the time of receipt if the driver sets none, and from then on once `MAX_REPEATED_STAMPS` images in a row
-        had the same stamp.
-        """
-        given_ns = stamp_ns(stamp)
-        if not given_ns:
-            self._warn_once('images have no time stamp: using the time of receipt')
-            return self._now_ns()
-        if self._repeats < MAX_REPEATED_STAMPS:
-            self._repeats = self._repeats + 1 if given_ns == self._given_ns else 1
-            self._given_ns = given_ns
-        if self._repeats < MAX_REPEATED_STAMPS:
-            return given_ns
-        self._warn_once(
-            f'{MAX_REPEATED_STAMPS} images in a row have the same time stamp: using the time of receipt from now on'
-        )
-        return self._now_ns()
+        """Return the time of the next image in nanoseconds: its stamp, or if that is no use its time of receipt."""
+        return self._stamps.choose(stamp.sec, stamp.nanosec, self._now_ns())
 
     def frame_id(self, given: str) -> str:
         """Return the frame of an image in tf2: as given without a leading '/', never empty."""

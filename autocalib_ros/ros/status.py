@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 
 from autocalib_ros.calibrator import CalibrationProgress
+from autocalib_ros.perception.frame_clock import ClockSummary
 from autocalib_ros.results.calibration import Calibration, StandardDeviations
 from autocalib_ros.ros.log_text import tilt_deg
 from autocalib_ros.ros.watchdog import NoImageDiagnosis
@@ -46,6 +47,8 @@ class Counts:
     dropped: float = 0
     unreadable: float = 0
     late: float = 0
+    repeated: float = 0
+    """Of the used ones, repeats of an earlier image."""
     lost: float = 0
     """Lost by the middleware."""
 
@@ -84,6 +87,8 @@ class Situation:
     restored: bool = False
     """The calibration was stored by an earlier run and is not yet verified by traffic."""
     progress: CalibrationProgress | None = None
+    clock: ClockSummary = field(default_factory=ClockSummary)
+    """What the frame clock made of the stamps."""
     image_age_s: float | None = None
     encoding: str = ''
     no_image: NoImageDiagnosis | None = None
@@ -162,7 +167,18 @@ def _values(state: NodeState, situation: Situation) -> Iterator[tuple[str, str]]
     yield 'used_hz', _number(None if rates is None else rates.used, '.1f')
     for name in Counts.__dataclass_fields__:
         yield name, f'{getattr(counts, name):.0f}'
+    yield from _clock_values(situation.clock)
     yield from _result_values(situation.result)
+
+
+def _clock_values(clock: ClockSummary) -> Iterator[tuple[str, str]]:
+    """Yield what the frame clock made of the stamps."""
+    yield 'frame_period_s', _number(clock.period_s, '.5f')
+    yield 'stamp_jitter_s', _number(clock.jitter_s, '.5f')
+    yield 'missing_frames', str(clock.lost)
+    yield 'queued', str(clock.queued)
+    yield 'odd_stamps', str(clock.odd)
+    yield 'clock_steps', str(clock.steps)
 
 
 def _result_values(result: Calibration | None) -> Iterator[tuple[str, str]]:

@@ -27,6 +27,7 @@ from autocalib_ros.errors import AutocalibError
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.perception.detector.detector import VehicleDetector
+from autocalib_ros.perception.frame_clock import ClockSummary
 from autocalib_ros.results.calibration import Calibration, Refusal
 
 IMAGE_QUEUE_SIZE = 8
@@ -86,11 +87,13 @@ class Counters:
     late: int = 0
     """Skipped: the time stamp was not newer than that of an earlier image."""
     used: int = 0
+    repeated: int = 0
+    """Of the used ones, repeats of an earlier image, which show nothing new."""
 
     def __str__(self) -> str:
         return (
             f'images received {self.received}, used {self.used}, dropped {self.dropped}, '
-            f'unreadable {self.unreadable}, late {self.late}'
+            f'unreadable {self.unreadable}, late {self.late}, repeated {self.repeated}'
         )
 
 
@@ -141,6 +144,8 @@ class CalibrationWorker:
         self._progress_at = -PROGRESS_PERIOD_S
         self.counters = Counters()
         self.progress: CalibrationProgress | None = None
+        self.clock = ClockSummary()
+        """What the frame clock made of the stamps so far."""
         self.reported_evidence: Evidence | None = None
         """Evidence of the result that the listener is handling; None otherwise."""
         self._refused = ''
@@ -274,7 +279,9 @@ class CalibrationWorker:
             image = self._decode(message)
             height, width = image.shape[:2]
             self._lens_for((width, height))  # skips an image whose shape is not that of the lens
+            repeated = self._calibrator.repeated
             intake = self._calibrator.add_image(stamp_ns, image)
+            self.counters.repeated += max(0, self._calibrator.repeated - repeated)
         except AutocalibError as error:
             self.counters.unreadable += 1
             self._listener.image_unreadable(error)
@@ -300,6 +307,7 @@ class CalibrationWorker:
         if time.monotonic() >= self._progress_at + PROGRESS_PERIOD_S:
             self._progress_at = time.monotonic()
             progress = self._add_refusal(self._guarded(self._calibrator.progress))
+            self.clock = self._calibrator.clock()
             with self._changed:
                 self.progress = progress if self._generation == self._calibrator_generation else None
 

@@ -135,14 +135,6 @@ def test_recent_vehicles_stay_however_many_there_are() -> None:
     assert snapshot(buffer).track_count == before == 60 * 4 * POINTS
 
 
-def test_all_from_before_a_bump_is_forgotten_needed_or_not() -> None:
-    buffer = filled(EvidenceBuffer(BufferOptions()), [drive(0, 0.0, SIDE), drive(1, 100.0, MAIN)], 8000)
-    buffer.forget_before(50.0)
-    evidence = snapshot(buffer)
-    assert set(evidence.track_vehicles) == set(evidence.segment_vehicles) == {1}
-    assert buffer.oldest_s >= 100.0
-
-
 def test_the_same_traffic_leaves_the_same_evidence_to_the_last_bit() -> None:
     generator = np.random.default_rng(0)
     traffic = [

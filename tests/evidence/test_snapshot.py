@@ -131,15 +131,12 @@ def test_outlines_that_are_not_all_there_are_an_input_error(tmp_path: Path, miss
         Evidence.load(path)
 
 
-def test_the_buffer_keeps_no_more_outlines_than_allowed_and_forgets_old_ones() -> None:
+def test_the_buffer_keeps_no_more_outlines_than_allowed() -> None:
     buffer = EvidenceBuffer(BufferOptions(max_outlines=100))
     for index in range(50):
         buffer.add_outlines(outlines(float(index), list(range(3 * index, 3 * index + 7))))
         assert len(snapshot(buffer).outlines_px) <= 100
     assert len(snapshot(buffer).outlines_px) > 50
-    assert buffer.oldest_s < 48.0
-    buffer.forget_before(48.0)
-    assert snapshot(buffer).outline_times_s.tolist() == [48.0] * 7 + [49.0] * 7
 
 
 def test_evidence_without_a_vehicle_has_nothing_of_it() -> None:
@@ -215,15 +212,6 @@ def test_the_buffer_keeps_no_more_segments_than_allowed() -> None:
         assert len(snapshot(buffer).segments_px) <= 100
     buffer.add_segments(segments(50.0, 130))
     assert len(snapshot(buffer).segments_px) == 100
-
-
-def test_old_evidence_is_forgotten() -> None:
-    buffer = EvidenceBuffer(BufferOptions())
-    for end in (1.0, 10.0, 20.0):
-        buffer.add_track(track(0, end))
-        buffer.add_segments(segments(end, 2))
-    buffer.forget_before(15.0)
-    assert snapshot(buffer).track_count == 1 and len(snapshot(buffer).segments_px) == 2
 
 
 def test_coverage_counts_crossed_cells() -> None:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
 from autocalib_ros.config import GateOptions, Options
 from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.estimation.estimate import solve
+from autocalib_ros.evidence.snapshot import Evidence
+from autocalib_ros.evidence.stillness import ViewChangeKind
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.recordings.open import open_source
 from autocalib_ros.offline.recordings.sources import Frame
@@ -117,3 +120,35 @@ def test_a_refused_solution_is_what_is_missing_and_then_since_when_it_is_calibra
     assert any(note.startswith('calibrated since ') and note.endswith('focal length 100 px') for note in reports)
     assert reports.index('solving') < reports.index('collecting 100 %: the halves disagree')
     assert reports[-1] == 'calibrated'
+
+
+class TwoViews:
+    """A title card for three seconds, then a road with a box that crosses it, by `Frame`."""
+
+    name, topic, image_type, camera_frame, duration_s = 'two views', '', '', '', None
+
+    def frames(self):
+        noise = np.random.default_rng(1)
+        texture = [np.random.default_rng(seed).integers(40, 200, (30, 40)).astype(np.uint8) for seed in range(3)]
+        title, road, box = (cv2.resize(one, (320, 240), interpolation=cv2.INTER_CUBIC) for one in texture)
+        for index in range(160):
+            image = title.copy() if index < 30 else road.copy()
+            if index >= 60:
+                left = 4 * (index - 60) % 260
+                image[100:140, left : left + 60] = box[:40, :60]
+            yield Frame(index * 100_000_000, cv2.add(image, noise.integers(0, 6, image.shape).astype(np.uint8)))
+
+
+def test_the_longest_still_part_of_a_recording_is_solved_and_the_rest_is_named():
+    replayed = replay(TwoViews(), Options())
+    stillness = replayed.evidence.stillness
+    assert [change.kind for change in stillness.changes] == [ViewChangeKind.CUT]
+    assert stillness.start_s == pytest.approx(3.0, abs=0.3) and stillness.recorded_s == pytest.approx(15.9)
+    assert replayed.evidence.track_count > 5 and replayed.evidence.times_s.min() >= 0.0
+    assert replayed.result.code == 'too_few_tracks'  # a part of ten seconds, so that the cut is no reason
+
+
+def test_stillness_survives_the_file(tmp_path):
+    evidence = replay(TwoViews(), Options()).evidence
+    evidence.save(tmp_path / 'evidence.npz')
+    assert Evidence.load(tmp_path / 'evidence.npz').stillness == evidence.stillness

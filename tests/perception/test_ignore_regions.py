@@ -11,6 +11,7 @@ import pytest
 from autocalib_ros.calibrator import AutoCalibrator
 from autocalib_ros.config import Options
 from autocalib_ros.errors import InputError, UsageError
+from autocalib_ros.evidence.stillness import ViewChangeKind
 from autocalib_ros.perception.ignore_regions import black_out, ignored_mask
 from autocalib_ros.perception.images import ImageDecoder
 from autocalib_ros.perception.masked_messages import mask_message, require_maskable
@@ -84,7 +85,8 @@ def test_the_border_of_a_region_does_not_hide_that_the_camera_moved() -> None:
     observer = Observer(Options(ignore_regions='60 40 340 40 340 160 60 160'), (WIDTH, HEIGHT))
     for index in range(40):
         observer.observe(scene(0.5 * index, (), shift=0.0 if index < 20 else 6.0), 0.5 * index)
-    assert observer.drift_px == pytest.approx(6.0, abs=0.5)
+    (change,) = observer.stillness(observer.view)[1].changes
+    assert change.kind is ViewChangeKind.TURN and change.amount == pytest.approx(6.0, abs=0.5)
 
 
 def test_a_shutter_is_detected_although_most_of_the_image_is_black() -> None:
@@ -94,7 +96,7 @@ def test_a_shutter_is_detected_although_most_of_the_image_is_black() -> None:
         if 20 <= index < 25:
             image = np.full_like(image, 120)
         tracks += observer.observe(image, 0.1 * index).tracks
-    assert observer.lost_s == -np.inf
+    assert list(observer.views) == [0]
     assert not any(2.0 <= time < 2.5 for track in [*tracks, *observer.unfinished()] for time in track.times_s)
 
 

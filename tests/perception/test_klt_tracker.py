@@ -110,6 +110,90 @@ def test_uneven_steps_along_one_line_are_followed() -> None:
     assert not finished and len(tracker.unfinished()) == 3
 
 
+GRID = np.stack(np.meshgrid(np.arange(9.0, 55.0, 11.0), np.arange(9.0, 35.0, 11.0)), -1).reshape(-1, 2)
+"""Fifteen points on the car."""
+
+
+def follow_all(steps: list[float], *, told: bool) -> PointTracker:
+    """Follow 15 points through steps along the road; a step of zero is a repeat through a codec."""
+    tracker, place = PointTracker(TrackingOptions()), 20.0
+    for index, step in enumerate([0.0, *steps]):
+        place += step
+        image = scene((place, 40.0))
+        if step == 0:
+            image = cv2.imdecode(cv2.imencode('.jpg', image, [cv2.IMWRITE_JPEG_QUALITY, 60])[1], cv2.IMREAD_GRAYSCALE)
+        if told and step == 0 and index:
+            tracker.skip_repeat()
+        else:
+            assert not tracker.follow(image, 0.04 * index)
+        if index == 0:
+            tracker.add_points(GRID + (place, 40.0), np.zeros(len(GRID), int))
+    return tracker
+
+
+@pytest.mark.parametrize('told', [True, False])
+@pytest.mark.parametrize(
+    'steps',
+    [
+        [5, 5, 5, 0, 5, 5, 5, 0, 5, 5, 5, 0, 5, 5],  # a camera slower than its recorder
+        [5, 5, 5, 0, 10, 5, 5, 0, 10, 5, 5, 0, 10, 5],  # stalls
+        [5, 5, 5, 0, 0, 0, 10, 5, 5, 0, 0, 0, 10, 5, 5],  # as recorded by a network camera
+        [5, 0, 5, 0, 5, 0, 5, 0, 5, 0, 5, 0, 5],
+        [*(8 * [5, 5, 0, 5, 0]), 5],  # the usual interval is that of the images, repeats among them
+    ],
+)
+def test_a_step_of_zero_ends_no_point(steps: list[float], told: bool) -> None:
+    tracks = follow_all(steps, told=told).unfinished()
+    assert len(tracks) == len(GRID)
+    for track in tracks:
+        place = 20.0 + np.cumsum([0.0, *steps])
+        expected = place[np.round(track.times_s / 0.04).astype(int)]
+        np.testing.assert_allclose(track.points_px[:, 0] - track.points_px[0, 0], expected - 20.0, atol=0.5)
+        assert (np.diff(expected) > 0).all()  # repeats give no sample
+
+
+def test_a_point_that_sticks_while_others_go_on_ends() -> None:
+    tracker = PointTracker(TrackingOptions())
+    post = scene(None)[40:120, 140:152]
+    for index in range(20):
+        image = scene((20.0 + 5 * index, 40.0))
+        image[40:120, 140:152] = post  # in front of the car
+        ended = tracker.follow(image, 0.04 * index)
+        if index == 0:
+            tracker.add_points(GRID + (20.0, 40.0), np.zeros(len(GRID), int))
+        if ended:
+            assert 100 < ended[0].points_px[-1, 0] < 152
+            return
+    pytest.fail('no point has ended at the post')
+
+
+@pytest.mark.parametrize('lost', [(8,), (8, 9), (8, 9, 10, 11), (4, 6, 7, 9, 10, 11, 13)])
+def test_lost_images_end_no_track(lost: tuple[int, ...]) -> None:
+    tracker, finished = PointTracker(TrackingOptions()), []
+    for index in range(20):
+        if index in lost:
+            continue
+        offset = (20.0 + 6.0 * index, 40.0)
+        finished += tracker.follow(scene(offset), 0.1 * index)
+        if index == 0:
+            tracker.add_points(np.array([(40.0, 60.0), (55.0, 55.0), (65.0, 68.0)]), np.array([7, 7, 7]))
+    assert not finished
+    for track in tracker.unfinished():
+        np.testing.assert_allclose(np.diff(track.points_px[:, 0]) / np.diff(track.times_s), 60.0, atol=3.0)
+
+
+def test_one_short_interval_ends_no_track() -> None:
+    # the stamp of one image 1 ms after the one before: the interval after it is no gap, nor is any later one
+    tracker, finished = PointTracker(TrackingOptions()), []
+    for index in range(20):
+        finished += tracker.follow(scene((20.0 + 6.0 * index, 40.0)), 0.1 * index - (0.099 if index == 8 else 0.0))
+        if index == 0:
+            tracker.add_points(np.array([(40.0, 60.0), (55.0, 55.0), (65.0, 68.0)]), np.array([7, 7, 7]))
+        if index == 12:  # a new one is taken as before
+            tracker.add_points(np.array([(20.0 + 6.0 * index + 8.0, 70.0)]), np.array([8]))
+    assert not finished and len(tracker.unfinished()) == 4
+
+
 def test_a_point_thrown_off_its_line_is_given_up() -> None:
     before = np.array([[10.0, 0.0]] * 6)
     now = np.array([[12.0, 1.0], [5.0, 0.0], [20.0, 1.0], [0.0, 0.0], [8.0, 9.0], [-8.0, 0.0]])

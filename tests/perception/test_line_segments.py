@@ -191,3 +191,45 @@ def test_the_snapshot_brings_the_lines() -> None:
     lines = calibrator.snapshot().still_lines_px
     assert lines.dtype == float and misses(lines, edges()).max() < WITHIN_PX
     np.testing.assert_array_equal(calibrator.snapshot().still_lines_px, lines)
+
+
+def test_lines_are_there_two_seconds_after_the_first_image() -> None:
+    observer = Observer(Options(), (WIDTH, HEIGHT))
+    for index in range(22):  # 10 images a second
+        observer.observe(picture(car_x=-80.0 + 30 * index, seed=index), 0.1 * index)
+    lines = observer.still_lines()
+    assert len(lines) >= 12 and misses(lines, edges()).max() < WITHIN_PX
+
+
+def test_lines_along_a_bar_are_dropped_and_those_that_end_at_it_are_kept() -> None:
+    bar = 300  # ends within the stripes
+    observer = Observer(Options(), (WIDTH, HEIGHT))
+    for index in range(MIN_SAMPLES):
+        image = picture(seed=index)
+        image[bar:] = 0
+        observer.observe(image, float(index))
+    lines = observer.still_lines()
+    assert observer.picture(observer.view).rectangle == (0.0, 0.0, WIDTH, bar)
+    assert (lines[:, 1::2].min(axis=1) < bar - 10).all()  # none along the border
+    long = misses(lines, edges()[1::2])
+    assert (long < WITHIN_PX).sum() >= 8  # the sides of the stripes, which the bar cuts
+
+
+def test_lines_along_the_image_border_are_dropped() -> None:
+    image = picture()
+    image[-1], image[:, 0] = 30, 30
+    finder = LineSegmentDetector(None)
+    finder.find(image, (0.0,))
+    assert len(finder.lines_px) and misses(finder.lines_px, edges()).max() < WITHIN_PX
+
+
+def test_edges_that_half_of_the_samples_do_not_show_are_dropped() -> None:
+    # the median of rectangles that each cover a part of the road in three images of five has edges of its own
+    samples = [picture(car_x=x, seed=seed) for seed, x in enumerate((100.0, 130.0, 160.0, 400.0, 430.0))]
+    median = np.median(np.stack(samples), axis=0).astype(np.uint8)
+    finder = LineSegmentDetector(None)
+    finder.find(median, (0.0,))
+    assert (finder.lines_px[:, 1::2].max(axis=1) < CAR_ROWS[1] + 5).any()
+    finder.find(median, (1.0,), samples=samples)
+    upright = np.abs(np.diff(finder.lines_px[:, ::2])) < 3
+    assert not ((finder.lines_px[:, 1::2].max(axis=1) < CAR_ROWS[1] + 5) & upright[:, 0]).any()

@@ -20,13 +20,14 @@ from autocalib_ros.estimation.verification.gates import (
     MIN_STRAIGHT_FRACTION,
 )
 from autocalib_ros.estimation.verification.scale import MIN_SPEED_VEHICLES
+from autocalib_ros.evidence.stillness import MIN_DRIFT_LIMIT_PX, MIN_STILL_PART_S
 from autocalib_ros.geometry.ground_plane import MIN_FRACTION_BELOW_HORIZON
 from autocalib_ros.lens.opencv_lens import MAX_MODEL_ERROR_PX
 from autocalib_ros.results.refusals import BY_CODE, REFUSALS, reason
 
 GATE, JOINT, PAPER = GateOptions(), JointOptions(), PaperOptions()
 LIMITS = {
-    'camera_moving': [f'{GATE.max_drift_px:g} px'],
+    'camera_moving': [f'{GATE.max_drift_px:g} px', f'{MIN_DRIFT_LIMIT_PX:g} px', f'{MIN_STILL_PART_S:g} s'],
     'too_few_tracks': [f'{GATE.min_tracks}', f'{100 * PAPER.min_lifetime:g} %', f'{PAPER.window_s:g} s'],
     'poor_coverage': [f'{100 * GATE.min_coverage:g} %'],
     'no_agreement': [f'{MIN_FOCAL_CONTRAST:g} times'],

@@ -4,7 +4,7 @@ import pytest
 from builtin_interfaces.msg import Time
 
 from autocalib_ros.config import NodeOptions
-from autocalib_ros.ros.headers import MAX_REPEATED_STAMPS, Headers
+from autocalib_ros.ros.headers import Headers
 
 
 @pytest.fixture
@@ -27,23 +27,6 @@ def test_zero_stamp_becomes_the_time_of_receipt_with_one_warning(warnings):
     read = headers(warnings)
     assert [read.stamp_ns(Time()), read.stamp_ns(Time())] == [42, 42]
     assert len(warnings) == 1
-
-
-def test_stamp_that_stands_still_becomes_the_time_of_receipt_for_good_with_one_warning(warnings):
-    read = headers(warnings)
-    assert [read.stamp_ns(Time(sec=7)) for _ in range(MAX_REPEATED_STAMPS - 1)] == [7_000_000_000] * (
-        MAX_REPEATED_STAMPS - 1
-    )
-    assert not warnings
-    assert [read.stamp_ns(Time(sec=7)), read.stamp_ns(Time(sec=8))] == [42, 42]
-    assert len(warnings) == 1
-
-
-def test_stamps_that_repeat_and_go_on_are_kept(warnings):
-    read = headers(warnings)
-    given = [Time(sec=1 + number // 2) for number in range(4 * MAX_REPEATED_STAMPS)]
-    assert [read.stamp_ns(stamp) for stamp in given] == [stamp.sec * 1_000_000_000 for stamp in given]
-    assert not warnings
 
 
 def test_empty_frame_becomes_the_default_with_one_warning(warnings):

@@ -200,10 +200,11 @@ def test_recording_that_loops_restarts_the_evidence_and_keeps_the_calibration(be
     node, publisher = fed(bench, count=20, camera_height=8.0)
     wait_for(lambda: (now := node.publication.published) and now.result.evidence.frames == 20, 'the calibration')
     bench.listening(INFO)
-    again = image(START_NS)
-    publisher.publish(again)
-    wait_for(lambda: infos and infos[-1].header == again.header, 'camera_info of the first image again')
-    wait_for(lambda: node.publication.published.result.evidence.frames == 1, 'the evidence of the second time')
+    again = [image(START_NS), image(START_NS + FRAME_NS)]  # the second tells the loop from one odd stamp
+    for sent in again:
+        publisher.publish(sent)
+    wait_for(lambda: [info.header for info in infos[-2:]] == [sent.header for sent in again], 'their camera_info')
+    wait_for(lambda: node.publication.published.result.evidence.frames == 2, 'the evidence of the second time')
 
 
 @pytest.mark.parametrize(
@@ -223,7 +224,8 @@ def test_after_a_loop_a_more_precise_calibration_stays_unless_the_traffic_contra
         publisher.publish(image(START_NS + number * FRAME_NS))
         wait_for(lambda wanted=number + 1: counters.used >= wanted, 'an image')
     wait_for(lambda: (now := node.publication.published) and now.result.evidence.frames == 20, 'the calibration')
-    publisher.publish(image(START_NS))
+    for number in range(2):
+        publisher.publish(image(START_NS + number * FRAME_NS))
     wait_for(lambda: counters.used == 21 and node.publication.state.name == state, 'the first after the loop')
     wait_for(lambda: node.publication.published.result.camera.focal_px == published_px, 'the published calibration')
 
@@ -247,11 +249,11 @@ def test_images_without_stamps_take_their_time_from_the_clock_of_the_recording(b
     node = bench.start(lambda evidence, options, lens: calibration(evidence), use_sim_time=True, idle_solve_s=0.3)
     publisher = bench.connected(bench.publisher())
     counters = node._worker.counters
-    for second in (5000, 5001, 20):  # the clock steps back, as where a recording is played in a loop
+    for second in (5000, 5001, 5002, 20, 21):  # the clock steps back, as where a recording is played in a loop
         clock.publish(Clock(clock=time_message(second * 10**9)))
         wait_for(lambda now=second: node.get_clock().now().nanoseconds == now * 10**9, 'the clock')
-        before = counters.used
+        before = counters.used + counters.late
         publisher.publish(image(0))
-        wait_for(lambda before=before: counters.used == before + 1, 'an image')
-    wait_for(lambda: (now := node.publication.published) and now.result.newest_stamp_ns == 20 * 10**9, 'the solution')
-    assert node.publication.published.result.evidence.frames == 1
+        wait_for(lambda before=before: counters.used + counters.late == before + 1, 'an image')
+    wait_for(lambda: (now := node.publication.published) and now.result.newest_stamp_ns == 21 * 10**9, 'the solution')
+    assert node.publication.published.result.evidence.frames == 2

@@ -179,9 +179,10 @@ def test_recording_that_begins_again_is_reported_and_its_evidence_restarts_the_e
     worker = start(calibration)
     feed(worker, heard, 20)
     worker.offer(0, PIXELS)
+    worker.offer(100_000_000, PIXELS)  # the second tells a recording that begins again from one odd stamp
     wait_for(lambda: heard.anew, 'the news')
     assert heard.anew == ['the time stamps jumped']
-    assert result_of(worker.solve_now()).evidence.frames == 1
+    assert result_of(worker.solve_now()).evidence.frames == 2
 
 
 def test_other_options_are_solved_with_though_no_image_comes(start, heard):

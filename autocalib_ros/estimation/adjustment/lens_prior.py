@@ -13,7 +13,8 @@ from functools import cached_property
 import numpy as np
 
 from autocalib_ros.config import JointOptions
-from autocalib_ros.lens.camera import Camera, image_centre
+from autocalib_ros.evidence.picture import Picture
+from autocalib_ros.lens.camera import Camera
 
 EQUIDISTANT = (0.0, 0.0, 0.0, 0.0)
 """Coefficients k1 to k4 of r = f theta."""
@@ -26,7 +27,8 @@ K2_SIGMA = 0.02
 """Standard deviation of k2 about its family: it moves an image point at one radian by 2 %, as the default sigma of k1
 moves it by 3 %."""
 PRINCIPAL_POINT_SIGMA_FRACTION = 0.01
-"""Standard deviation of the principal point, fraction of the image width, unless the option gives pixels. Judgement."""
+"""Standard deviation of the principal point about the centre of the picture, fraction of the width of the picture,
+unless the option gives pixels. Judgement."""
 LOOSE_PRINCIPAL_POINT_SIGMA_FRACTION = 0.1
 """Standard deviation of the principal point, fraction of the image width, where the evidence identifies it: an image
 may be cropped or digitally zoomed. Judgement."""
@@ -43,6 +45,8 @@ class LensPrior:
     """Mean; its focal length is used only where `focal_known`."""
     sigma: np.ndarray
     """Of log f (inf: unknown), cx and cy in pixels, k1, k2; 0: fixed, shape (5,)."""
+    picture: Picture | None = None
+    """The picture whose centre is the mean of the principal point; None if the lens is known."""
 
     @property
     def focal_known(self) -> bool:
@@ -99,9 +103,15 @@ class LensPrior:
         return replace(self, sigma=np.where(fixed, 0.0, self.sigma))
 
     def with_loose_principal_point(self) -> LensPrior:
-        """Return the prior with a loose principal point and free k2, unless these are fixed by an option."""
+        """Return the prior with a loose principal point and free k2, unless these are fixed by an option.
+
+        The image circle of a fisheye shows its centre: there the principal point stays as it is.
+        """
         sigma = self.sigma.copy()
-        sigma[1:3] = np.where(sigma[1:3] > 0, LOOSE_PRINCIPAL_POINT_SIGMA_FRACTION * self.centre.width, 0.0)
+        whole_circle = self.picture is not None and self.picture.circle is not None  # neither cropped nor zoomed
+        loose_px = 0.0 if whole_circle else LOOSE_PRINCIPAL_POINT_SIGMA_FRACTION * self.centre.width
+        loose = np.maximum(loose_px, sigma[1:3])
+        sigma[1:3] = np.where(sigma[1:3] > 0, loose, 0.0)
         sigma[4] = max(sigma[4], K2_SIGMA) if sigma[3] > 0 else sigma[4]
         return replace(self, sigma=sigma)
 
@@ -117,11 +127,13 @@ def known_lens(lens: Camera) -> LensPrior:
     return LensPrior('known', lens, np.zeros(5))
 
 
-def lens_priors(image_size: tuple[int, int], options: JointOptions) -> list[LensPrior]:
-    """Return the priors of the lens families to choose from, the most common one first."""
-    width, _ = image_size
-    point = options.principal_point_sigma_px
-    point = PRINCIPAL_POINT_SIGMA_FRACTION * width if point < 0 else point
+def lens_priors(image_size: tuple[int, int], options: JointOptions, picture: Picture | None = None) -> list[LensPrior]:
+    """Return the priors of the lens families to choose from, the most common one first.
+
+    The principal point is that of the picture inside the images, which by default fills them.
+    """
+    picture = picture or Picture.whole(image_size)
+    point_x, point_y = _principal_point_sigma_px(picture, options.principal_point_sigma_px)
     focal = options.focal_prior_px
     log_focal = options.focal_sigma_px / focal if focal > 0 else np.inf
     families = {
@@ -130,8 +142,25 @@ def lens_priors(image_size: tuple[int, int], options: JointOptions) -> list[Lens
         'kannala_brandt': (KANNALA_BRANDT, KANNALA_BRANDT_SIGMA),
     }
     names = list(families) if options.lens_prior == 'auto' else [options.lens_prior]
-    centre = Camera(*image_size, focal if focal > 0 else float(width), image_centre(*image_size))
+    centre = Camera(*image_size, focal if focal > 0 else float(image_size[0]), picture.lens_centre_px)
     return [
-        LensPrior(name, replace(centre, k=families[name][0]), np.array([log_focal, point, point, *families[name][1]]))
+        LensPrior(
+            name,
+            replace(centre, k=families[name][0]),
+            np.array([log_focal, point_x, point_y, *families[name][1]]),
+            picture,
+        )
         for name in names
     ]
+
+
+def _principal_point_sigma_px(picture: Picture, given_px: float) -> tuple[float, float]:
+    """Return the standard deviations x and y of the principal point; one that is given (not negative) holds as it is.
+
+    A picture that looks cut adds the distance that its centre may have from that of the lens.
+    """
+    if given_px >= 0:
+        return given_px, given_px
+    own = PRINCIPAL_POINT_SIGMA_FRACTION * (picture.size[0] if picture.circle is None else picture.image_size[0])
+    across, down = picture.centre_sigma_px
+    return float(np.hypot(own, across)), float(np.hypot(own, down))

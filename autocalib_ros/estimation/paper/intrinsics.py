@@ -9,7 +9,7 @@ import numpy as np
 from autocalib_ros.config import PaperOptions
 from autocalib_ros.estimation.observations.track_set import path_lengths
 from autocalib_ros.evidence.snapshot import Evidence
-from autocalib_ros.lens.camera import Camera, image_centre
+from autocalib_ros.lens.camera import Camera
 from autocalib_ros.results.calibration import PaperReport
 
 RIM_MARGIN = 1.02
@@ -89,13 +89,14 @@ def paper_intrinsics(evidence: Evidence, options: PaperOptions) -> PaperIntrinsi
     intervals = paper_intervals(evidence, options)
     if not intervals:
         return None
-    sweeps = [_sweep(interval, evidence.image_size, options) for interval in intervals]
+    centre = np.asarray(evidence.picture.lens_centre_px)
+    sweeps = [_sweep(interval, centre, evidence.image_size, options) for interval in intervals]
     minima = [int(np.argmin(sweep[:, 1])) for sweep in sweeps]
     inside = [index for index, minimum in enumerate(minima) if 0 < minimum < options.focal_steps - 1]
     candidates = sorted(inside or range(len(sweeps)), key=lambda index: sweeps[index][minima[index], 0])
     median = candidates[(len(candidates) - 1) // 2]
     focal, paths = float(sweeps[median][minima[median], 0]), intervals[median].paths
-    camera = Camera.equidistant(*evidence.image_size, focal)
+    camera = Camera(*evidence.image_size, focal, evidence.picture.lens_centre_px)
     before = np.mean([_line_fit_errors(path) / len(path) for path in paths])
     after = np.mean([_line_fit_errors(camera.undistort(path)) / len(path) for path in paths])
     report = PaperReport(
@@ -106,9 +107,13 @@ def paper_intrinsics(evidence: Evidence, options: PaperOptions) -> PaperIntrinsi
     return PaperIntrinsics(report, sweeps[median], np.array(intervals[median].tracks, int))
 
 
-def _sweep(interval: ObservedInterval, image_size: tuple[int, int], options: PaperOptions) -> np.ndarray:
-    """Return trial focal lengths up to the image diagonal and their summed squared line errors, shape (n, 2)."""
-    centre = np.asarray(image_centre(*image_size))
+def _sweep(
+    interval: ObservedInterval, centre: np.ndarray, image_size: tuple[int, int], options: PaperOptions
+) -> np.ndarray:
+    """Return trial focal lengths up to the image diagonal and their summed squared line errors, shape (n, 2).
+
+    `centre` (2,) is the principal point.
+    """
     radii = [np.hypot(*(path - centre).T) for path in interval.paths]
     lowest = RIM_MARGIN * max(radius.max() for radius in radii) / (np.pi / 2)
     diagonal = float(np.hypot(*image_size))

@@ -47,7 +47,7 @@ def solve_paper(
             window_s=paper.window_s,
             path_ratio=paper.max_path_ratio,
         )
-    camera = Camera.equidistant(*evidence.image_size, intrinsics.report.focal_px)
+    camera = Camera(*evidence.image_size, intrinsics.report.focal_px, evidence.picture.lens_centre_px)
     found = segment_orientations(camera, evidence.segments_px, options.paper)
     figures = replace(figures, orientation_histogram=found.histogram, orientation_peaks_deg=found.peaks_deg)
     result = Calibration(

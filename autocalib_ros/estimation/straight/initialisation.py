@@ -12,7 +12,6 @@ from autocalib_ros.estimation.adjustment.model_selection import MODEL_SELECTION_
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig, RoadDirections, initial_state
 from autocalib_ros.estimation.observations.track_set import TrackSet
 from autocalib_ros.estimation.straight.consensus import CONSENSUS_INLIER_PX, consensus_directions
-from autocalib_ros.lens.camera import Camera
 
 FOCAL_TRIALS = 14
 """Trial focal lengths: steps of about 17 %, within the basin of convergence of the bundle adjustment."""
@@ -53,7 +52,8 @@ def _from_trials(
     """Return adjusted solutions of the best trials, and the consensus scores of all trials, shape (trials,)."""
     prior = config.prior
     size = (prior.centre.width, prior.centre.height)
-    trials = [prior.centre.focal_px] if prior.focal_known else focal_trials(subsample, size, FOCAL_TRIALS)
+    centre = prior.centre.principal_point_px
+    trials = [prior.centre.focal_px] if prior.focal_known else focal_trials(subsample, size, centre, FOCAL_TRIALS)
     found = [consensus_directions(prior.start(trial), subsample, generator, inlier_px=inlier_px) for trial in trials]
     starts = [initial_state(prior.start(trials[index]), found[index]) for index in _peaks(found)[:MAX_STARTS]]
     fits = [adjust(start, subsample, config) for start in starts]
@@ -98,11 +98,10 @@ def _peaks(found: list[RoadDirections]) -> list[int]:
     return sorted((int(index) for index in peaks), key=lambda index: -scores[index])
 
 
-def focal_trials(tracks: TrackSet, image_size: tuple[int, int], count: int) -> np.ndarray:
-    """Return `count` trial focal lengths in geometric progression.
+def focal_trials(tracks: TrackSet, image_size: tuple[int, int], centre: tuple[float, float], count: int) -> np.ndarray:
+    """Return `count` trial focal lengths in geometric progression for the principal point `centre`.
 
     From all tracked points within 120 degrees of the axis to twice the image diagonal.
     """
-    centre = Camera.equidistant(*image_size, 1.0).principal_point_px
     farthest = np.hypot(*(tracks.pixels.reshape(-1, 2) - centre).T).max()
     return np.geomspace(farthest / np.radians(120.0), 2.0 * np.hypot(*image_size), count)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment, adjust, evaluate_with
 from autocalib_ros.estimation.adjustment.covariance import sigma_without_prior
-from autocalib_ros.estimation.adjustment.lens_prior import LENS_PARAMETERS
+from autocalib_ros.estimation.adjustment.lens_prior import LENS_PARAMETERS, LensPrior
 from autocalib_ros.estimation.adjustment.model_selection import MODEL_SELECTION_MARGIN, select_model
 from autocalib_ros.estimation.observations.track_set import TrackSet
 from autocalib_ros.lens.camera import Camera
@@ -69,6 +69,17 @@ def _restored(camera: Camera, prior: Camera, name: str) -> Camera:
     return replace(camera, k=(prior.k[0], k2, k3, k4) if name == 'k1' else (k1, prior.k[1], k3, k4))
 
 
+def _principal_point_assumption(prior: LensPrior) -> Statement:
+    """Return where the principal point was assumed; a picture that does not fill the images is named."""
+    sigma_px, down_px = prior.sigma[1:3]
+    more: dict[str, object] = {}
+    if prior.picture is not None and not prior.picture.fills_image:
+        more |= {'picture': str(prior.picture), 'covered': prior.picture.is_covered}
+    if down_px != sigma_px:
+        more['sigma_down_px'] = down_px
+    return assumption('principal_point', sigma_px=sigma_px, **more)
+
+
 def lens_assumptions(fit: Adjustment, fixed: tuple[str, ...]) -> tuple[Statement, ...]:
     """Return what was assumed of the lens, with the parameters that were fixed at their prior."""
     prior = fit.problem.config.prior
@@ -76,7 +87,7 @@ def lens_assumptions(fit: Adjustment, fixed: tuple[str, ...]) -> tuple[Statement
         return (assumption('lens_given'),)
     statements = [
         assumption('lens_family', family=prior.family, k1_sigma=prior.sigma[3]),
-        assumption('principal_point', sigma_px=prior.sigma[1]),
+        _principal_point_assumption(prior),
     ]
     if prior.focal_known:
         focal_px = prior.centre.focal_px

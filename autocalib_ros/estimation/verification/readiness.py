@@ -6,10 +6,23 @@ from dataclasses import dataclass
 
 from autocalib_ros.config import GateOptions
 from autocalib_ros.evidence.snapshot import Evidence
+from autocalib_ros.evidence.stillness import (
+    MIN_STILL_PART_S,
+    MIN_TOLD_SWAY_PX,
+    Stillness,
+    ViewChange,
+    ViewChangeKind,
+    drift_limit_px,
+)
 from autocalib_ros.results.refusals import Reason, reason
+from autocalib_ros.results.statements import Statement, check
 
-REFERENCE_WIDTH_PX = 1280
-"""Image width for which `max_drift_px` is given; it scales with the width."""
+MOVES = (ViewChangeKind.TURN, ViewChangeKind.DRIFT, ViewChangeKind.MOTION)
+"""Changes of the view that are motions of the camera."""
+MIN_MOVES, MOVES_S = 3, 60.0
+"""Motions within so many seconds of a still part that show a camera without a mount: a fixed one is bumped once. It
+counts as moving unless it stood for half of that time."""
+
 MIN_RATE_TIME_S = 30.0
 """A shorter time shows one or two vehicles, and no rate."""
 NO_TRAFFIC_S = 300.0
@@ -30,17 +43,68 @@ class Requirement:
         return min(1.0, self.have / self.need) if self.need > 0 else 1.0
 
 
-def drift_limit_px(image_width: int, gate: GateOptions) -> float:
-    """Return the background drift, in pixels, up to which a camera counts as stationary."""
-    return gate.max_drift_px * image_width / REFERENCE_WIDTH_PX
-
-
 def check_steady(evidence: Evidence, gate: GateOptions) -> Reason | None:
-    """Check that the camera is stationary."""
+    """Check that the camera is stationary, and that the still part of the recording is long enough."""
     limit = drift_limit_px(evidence.image_size[0], gate)
-    if evidence.drift_px <= limit:
+    if evidence.drift_px > limit:
+        return reason('camera_moving', drift_px=evidence.drift_px, limit_px=limit)
+    return _check_still_part(evidence.stillness, limit)
+
+
+def _check_still_part(stillness: Stillness, limit_px: float) -> Reason | None:
+    """Return why the still part of a recording with several views is no evidence, by what most of them are."""
+    changes = stillness.changes
+    by_kind = {kind: [change for change in changes if change.kind is kind] for kind in ViewChangeKind}
+    zooms, cuts = by_kind[ViewChangeKind.ZOOM], by_kind[ViewChangeKind.CUT]
+    moves = [change for change in changes if change.kind in MOVES]
+    paused = sum(_is_near(change, stillness) for change in moves) >= MIN_MOVES
+    limit_s = max(MIN_STILL_PART_S, 0.5 * _watched_s(stillness) if paused else 0.0)
+    if not changes or stillness.part_s >= limit_s:
         return None
-    return reason('camera_moving', drift_px=evidence.drift_px, limit_px=limit)
+    common = {'part_s': stillness.part_s, 'limit_s': limit_s}
+    if zooms and len(zooms) > len(moves) and len(zooms) >= len(cuts):
+        times = {'factor': zooms[-1].amount, 'from_s': zooms[-1].start_s, 'to_s': zooms[-1].end_s}
+        return reason('camera_moving', 'zoom', count=len(zooms), **times, **common)
+    if len(cuts) > len(moves):
+        return reason('camera_moving', 'cut', count=len(cuts), time_s=cuts[-1].start_s, **common)
+    last = moves[-1]
+    settled = last.start_s > 0.0 and last.end_s < stillness.recorded_s and stillness.sway_px <= limit_px
+    if len(moves) == 1 and last.kind is ViewChangeKind.TURN and settled:
+        return reason('camera_moving', 'turned', moved_px=last.amount, time_s=last.start_s, **common)
+    travel_px = max([stillness.travel_px, *(change.amount for change in moves)])
+    return reason('camera_moving', 'always', travel_px=travel_px, seconds=stillness.recorded_s, **common)
+
+
+def _is_near(change: ViewChange, stillness: Stillness) -> bool:
+    """Whether a change lies within `MOVES_S` of the still part: a bump a month ago says nothing about the mount."""
+    return change.end_s >= stillness.start_s - MOVES_S and change.start_s <= stillness.end_s + MOVES_S
+
+
+def _watched_s(stillness: Stillness) -> float:
+    """Return the length of the recording within `MOVES_S` of the still part, seconds."""
+    return min(stillness.recorded_s, stillness.end_s + MOVES_S) - max(0.0, stillness.start_s - MOVES_S)
+
+
+def stillness_checks(evidence: Evidence) -> tuple[Statement, ...]:
+    """Return what is told about sway, and about the parts of the recording that were left out."""
+    stillness = evidence.stillness
+    checks: list[Statement] = []
+    if stillness.sway_px >= MIN_TOLD_SWAY_PX:
+        checks.append(check('sway', sway_px=stillness.sway_px))
+    if stillness.changes or stillness.start_s > 0:
+        kinds = [change.kind for change in stillness.changes]
+        checks.append(
+            check(
+                'still_part',
+                start_s=stillness.start_s,
+                end_s=stillness.end_s,
+                recorded_s=stillness.recorded_s,
+                cuts=kinds.count(ViewChangeKind.CUT),
+                zooms=kinds.count(ViewChangeKind.ZOOM),
+                moves=sum(kind in MOVES for kind in kinds),
+            )
+        )
+    return tuple(checks)
 
 
 def check_readiness(evidence: Evidence, gate: GateOptions) -> Reason | None:

@@ -15,17 +15,15 @@ from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag2 import Reader as Reader2
 from rosbags.typesys import Stores, get_typestore
 
-from autocalib_ros.calibrator import MAX_REORDERING_NS
 from autocalib_ros.errors import AutocalibError, InputError, UsageError
 from autocalib_ros.offline.recordings.sources import Frame, StoredImage, TimeWindow, no_image_error
 from autocalib_ros.offline.recordings.truncated_mcap import is_truncated, readable_path
+from autocalib_ros.perception.header_stamps import HeaderStamps
 from autocalib_ros.perception.images import ImageDecoder
 
 LOG = logging.getLogger(__name__)
 
 IMAGE_TYPES = ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage')
-PEEK_IMAGES = 5
-"""Images inspected at opening to decide whether the header stamps are usable."""
 ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 
 
@@ -60,29 +58,34 @@ class BagSource:
         self.total = count if window.is_whole_recording else round(count * duration_s / max(recording_s, 1e-9))
 
     def frames(self) -> Iterator[Frame]:
-        """Yield the decoded images of the window in order of time; InputError without an image."""
-        decoder, order = ImageDecoder(), _StampFilter()
+        """Yield the decoded images of the window in the order of recording; InputError without an image."""
+        decoder = ImageDecoder()
+        stamps = HeaderStamps(lambda text: LOG.warning('%s: %s', self.topic, text), self._second_stamp_ns())
         decoded, broken, reason = 0, 0, ''
         for stored in self._messages():
             try:
                 if stored.message is None:
                     raise InputError('the message is damaged')
+                stamp = stored.message.header.stamp
+                stamp_ns = stamps.choose(stamp.sec, stamp.nanosec, stored.recorded_ns)
                 image = decoder.decode(stored.message)
             except InputError as error:
                 broken, reason = broken + 1, reason or str(error)
                 continue
             decoded += 1
-            stamp_ns = self._stamp_ns(stored)
-            if order.accepts(stamp_ns):
-                yield Frame(stamp_ns, image)
+            yield Frame(stamp_ns, image)
         if broken and not decoded:
             raise InputError(f'none of the {broken} images on {self.topic} of {self.name} can be decoded: {reason}')
         if broken:
             LOG.warning(
                 '%d of %d images could not be decoded and were skipped; the first: %s', broken, broken + decoded, reason
             )
-        if order.late:
-            LOG.warning('%d images came late or twice and were skipped', order.late)
+
+    def _second_stamp_ns(self) -> int | None:
+        """Return the header stamp of the second image of the window that is not damaged; None without one."""
+        whole = (stored.message.header for stored in self._messages() if stored.message is not None)
+        headers = list(islice(whole, 2))
+        return _header_ns(headers[1]) if len(headers) > 1 else None
 
     def stored(self) -> Iterator[StoredImage]:
         """Yield the messages of the window as CDR."""
@@ -130,21 +133,12 @@ class BagSource:
             return None
 
     def _peek(self, readers: list[Any]) -> Any:
-        """Inspect the first images: start time, and whether the header stamps are usable."""
-        first = list(islice(self._read(readers, None, None), PEEK_IMAGES))
-        if not first:
+        """Note the time of the first image; return its message, None if it is damaged."""
+        first = next(self._read(readers, None, None), None)
+        if first is None:
             raise InputError(f'{self.name} has no images on {self.topic}')
-        self._first_ns = first[0].recorded_ns
-        messages = [stored.message for stored in first if stored.message is not None]
-        stamps = [_header_ns(message.header) for message in messages]
-        self._use_headers = bool(stamps) and stamps[0] > 0 and (len(stamps) == 1 or len(set(stamps)) > 1)
-        if stamps and not self._use_headers:
-            what = 'zero' if stamps[0] <= 0 else 'always the same'
-            LOG.warning('header stamps on %s are %s; receive times are used', self.topic, what)
-        return messages[0] if messages else None
-
-    def _stamp_ns(self, stored: _BagMessage) -> int:
-        return _header_ns(stored.message.header) if self._use_headers else stored.recorded_ns
+        self._first_ns = first.recorded_ns
+        return first.message
 
     def _to_ros2_cdr(self, message: Any) -> memoryview:
         """Return a ROS 1 message as CDR, without the `seq` of its header."""
@@ -194,23 +188,6 @@ class _Topics:
 
     def _describe(self, topics: Any) -> str:
         return ', '.join(f'{topic} ({self._types[topic]}, {self.counts[topic]} messages)' for topic in sorted(topics))
-
-
-class _StampFilter:
-    """Accepts stamps that increase, or that jump back so far that the clock must have been reset."""
-
-    def __init__(self) -> None:
-        self._newest_ns: int | None = None
-        self.late = 0
-
-    def accepts(self, stamp_ns: int) -> bool:
-        """Return whether to use an image with this stamp; count the late ones."""
-        newest = self._newest_ns
-        if newest is not None and newest - MAX_REORDERING_NS < stamp_ns <= newest:
-            self.late += 1
-            return False
-        self._newest_ns = stamp_ns
-        return True
 
 
 @contextmanager

@@ -14,7 +14,7 @@ SWAY_STEP_S = 0.5
 SWAY_DURATION_S = 3000.0
 """Length of the simulated sway; synthetic recordings are shorter."""
 DRIFT_QUANTILES = (0.05, 0.95)
-"""Quantiles of the background offsets, as used by `perception.drift_monitor`."""
+"""Quantiles of the background offsets whose span is the drift of synthetic evidence."""
 
 Sway = Callable[[np.ndarray], np.ndarray]
 """Rotations (n, 3, 3) of the camera about its mean pose at times (n,) in seconds."""
@@ -85,7 +85,7 @@ def random_sway(generator: np.random.Generator) -> Sway:
 
 
 def background_drift_px(camera: Camera, sway: Sway, seconds: float) -> float:
-    """Return the drift in pixels that the drift monitor reports for a camera that sways for `seconds`."""
+    """Return the drift in pixels of evidence from a camera that sways for `seconds` and is not compensated."""
     corners = np.stack(
         np.meshgrid(np.linspace(0.1, 0.9, 8) * camera.width, np.linspace(0.1, 0.9, 5) * camera.height), axis=-1
     ).reshape(-1, 2)

@@ -10,6 +10,8 @@ import pytest
 
 from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.offline.recordings.open import open_source
+from autocalib_ros.offline.simulate.stamp_faults import STAMP_FAULTS
+from autocalib_ros.perception.header_stamps import HeaderStamps
 
 SECOND = 1_000_000_000
 KINDS = [
@@ -125,7 +127,9 @@ def test_an_empty_bag_is_said_to_be_empty(tmp_path, write_bag, mcap):
         open_source(path)
 
 
-@pytest.mark.parametrize(('stamps', 'what'), [(lambda _: 0, 'zero'), (lambda _: 7 * SECOND, 'always the same')])
+@pytest.mark.parametrize(
+    ('stamps', 'what'), [(lambda _: 0, 'no time stamp'), (lambda _: 7 * SECOND, 'the same time stamp')]
+)
 def test_useless_header_stamps_give_way_to_the_time_of_recording(
     tmp_path, write_bag, images, a_header_at, caplog, stamps, what
 ):
@@ -138,13 +142,51 @@ def test_useless_header_stamps_give_way_to_the_time_of_recording(
     assert what in caplog.text
 
 
-def test_late_images_are_skipped_and_a_set_clock_is_not(tmp_path, write_bag, images, a_header_at, caplog):
-    messages = images(6)
-    for (_, _, message), tenth in zip(messages, [0, 1, 3, 2, 4, -500], strict=True):
+def test_images_come_in_the_order_of_recording_with_their_stamps(tmp_path, write_bag, images, a_header_at, caplog):
+    messages, tenths = images(6), [0, 1, 3, 2, 4, -500]
+    for (_, _, message), tenth in zip(messages, tenths, strict=True):
         message.header = a_header_at(100 * SECOND + tenth * SECOND // 10)
     frames = open_source(write_bag(tmp_path / 'bag', messages)).frames()
-    assert [(frame.stamp_ns - 100 * SECOND) * 10 // SECOND for frame in frames] == [0, 1, 3, 4, -500]
-    assert '1 images came late' in caplog.text
+    assert [(frame.stamp_ns - 100 * SECOND) * 10 // SECOND for frame in frames] == tenths  # the frame clock judges them
+    assert not caplog.records
+
+
+def test_stamps_of_whole_seconds_lose_no_image(tmp_path, write_bag, images, a_header_at, caplog):
+    messages = images(60)
+    for _, recorded_ns, message in messages:
+        message.header = a_header_at((recorded_ns + 8 * SECOND // 10) // SECOND * SECOND)
+    frames = list(open_source(write_bag(tmp_path / 'bag', messages)).frames())
+    assert len(frames) == 60
+    assert np.diff([frame.stamp_ns for frame in frames[12:]]) == pytest.approx(np.diff([m[1] for m in messages[12:]]))
+    assert len(caplog.records) == 1
+
+
+@pytest.mark.parametrize('fault', ['even', 'seconds', 'stopped', 'zeros', 'wrapped_in_seconds', 'one_ahead_10_min'])
+def test_a_replay_chooses_the_stamps_of_the_live_node(tmp_path, write_bag, images, a_header_at, fault):
+    messages = images(90)
+    recorded_ns = np.array([recorded for _, recorded, _ in messages])
+    if fault == 'zeros':
+        given = np.where(np.arange(90) % 20 == 10, 0, recorded_ns - SECOND // 30)
+    else:
+        given = STAMP_FAULTS[fault](recorded_ns - SECOND // 30, np.random.default_rng(0)).stamps_ns
+    live, expected = HeaderStamps(lambda _: None), []
+    for (_, received_ns, message), stamp_ns in zip(messages, given.tolist(), strict=True):
+        message.header = a_header_at(stamp_ns)
+        if fault == 'wrapped_in_seconds':
+            true_ns = received_ns - SECOND // 30
+            message.header.stamp.sec, message.header.stamp.nanosec = true_ns // SECOND, true_ns % 2**32
+        expected.append(live.choose(message.header.stamp.sec, message.header.stamp.nanosec, received_ns))
+    frames = open_source(write_bag(tmp_path / 'bag', messages)).frames()
+    assert [frame.stamp_ns for frame in frames][1:] == expected[1:]  # a recording knows the second at the first
+
+
+def test_simulated_time_begins_at_zero(tmp_path, write_bag, images, a_header_at, caplog):
+    messages = images(6)
+    for index, (_, _, message) in enumerate(messages):
+        message.header = a_header_at(index * SECOND // 30)
+    frames = open_source(write_bag(tmp_path / 'bag', messages)).frames()
+    assert [frame.stamp_ns for frame in frames] == [index * SECOND // 30 for index in range(6)]
+    assert not caplog.records
 
 
 def test_an_image_that_cannot_be_decoded_is_skipped_and_counted(tmp_path, write_bag, images, caplog):

@@ -1,0 +1,179 @@
+"""Repeated images made on purpose, and the benchmark that applies faults to recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from autocalib_ros.cli import main
+from autocalib_ros.config import Options
+from autocalib_ros.errors import UsageError
+from autocalib_ros.offline.benchmark import streams
+from autocalib_ros.offline.benchmark.repeating_source import RepeatingSource
+from autocalib_ros.offline.benchmark.streams import StreamRun, expand_kinds, format_run, run_stream, run_streams
+from autocalib_ros.offline.recordings.sources import Frame, StoredImage
+from autocalib_ros.offline.simulate.repeat_faults import REPEAT_FAULTS, jpeg, skipping
+from synthetic_results import refusal
+
+pytestmark = pytest.mark.render
+
+INTERVAL_NS = 50_000_000
+SIZE = (180, 320)
+
+
+def texture(seed: int, shape: tuple[int, int]) -> np.ndarray:
+    noise = cv2.GaussianBlur(np.random.default_rng(seed).normal(0, 1, shape), (0, 0), 1.5)
+    return np.clip(110 + 45 * noise / noise.std(), 0, 255)
+
+
+class Road:
+    """A minimal `Source`: three cars on a still road, one fast and near, one small and slow."""
+
+    name, topic, image_type, camera_frame = 'road', '', '', ''
+
+    def __init__(self, total: int) -> None:
+        self.total, self.duration_s = total, total * INTERVAL_NS * 1e-9
+        self._road = texture(0, SIZE) * 0.4 + 60
+        self._cars = [(texture(1, (40, 60)), 125, 4.5), (texture(2, (24, 36)), 80, -2.5), (texture(3, (14, 20)), 40, 1)]
+
+    def frames(self):
+        noise = np.random.default_rng(0)
+        for index in range(self.total):
+            image = self._road.copy()
+            for number, (car, row, step) in enumerate(self._cars):
+                column = (step * index + 150 * number) % (SIZE[1] + 70) - 65
+                place = np.array([[1.0, 0, column], [0, 1.0, row]])
+                inside = cv2.warpAffine(np.ones_like(car), place, SIZE[::-1])
+                image = image * (1 - inside) + cv2.warpAffine(car, place, SIZE[::-1]) * inside
+            image += noise.normal(0, 1.5, SIZE)
+            yield Frame(index * INTERVAL_NS, np.clip(image, 0, 255).astype(np.uint8))
+
+    def stored(self):
+        return (StoredImage(index * INTERVAL_NS, index * INTERVAL_NS, '') for index in range(self.total))
+
+
+@pytest.mark.parametrize('kind', REPEAT_FAULTS)
+def test_a_fault_repeats_images_in_order_at_an_even_rate(kind: str) -> None:
+    source = RepeatingSource(Road(40), REPEAT_FAULTS[kind])
+    stamps = [frame.stamp_ns for frame in source.frames()]
+    assert stamps == [stored.stamp_ns for stored in source.stored()]
+    assert len(stamps) == source.total == len(source.order)
+    assert (np.diff(stamps) > 0).all() and stamps[-1] <= 40 * INTERVAL_NS
+    assert set(np.diff(source.order).tolist()) <= {0, 1, 2} and source.order[0] == 0
+    assert source.order.max() <= 39
+    if kind != 'frozen_jpeg':  # the first freeze comes later
+        assert 0.1 < np.mean(np.diff(source.order) == 0) < 0.7
+
+
+def test_a_recorder_of_30_shows_every_fifth_image_of_25_twice() -> None:
+    source = RepeatingSource(Road(25), REPEAT_FAULTS['repeated_25_in_30'])
+    assert source.order.tolist()[:12] == [0, 0, 1, 2, 3, 4, 5, 5, 6, 7, 8, 9]
+    assert [frame.stamp_ns for frame in source.frames()][12] == 10 * INTERVAL_NS
+
+
+@pytest.mark.parametrize('new_codec', [jpeg, skipping])
+def test_a_repeat_through_a_codec_differs_somewhere_and_hardly_on_average(new_codec) -> None:
+    code, (first, second) = new_codec(), [frame.image for frame in Road(62).frames()][60:]
+    once, twice, new = code(first), code(first), code(second)
+    moving = (slice(125, 165), slice(200, 280))  # where the fast car is
+    assert cv2.absdiff(once, twice)[moving].mean() < 0.5 * cv2.absdiff(twice, new)[moving].mean()
+    if new_codec is jpeg:
+        assert cv2.absdiff(once, twice).max() > 4
+
+
+@pytest.fixture(scope='module')
+def unsolved() -> Iterator[None]:
+    """Let every solution be a refusal, which takes no time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(streams, 'solve', lambda evidence, options: refusal(evidence))
+        yield
+
+
+@pytest.fixture(scope='module')
+def even(unsolved: None) -> StreamRun:
+    return run_stream('even', Road(100), Options())
+
+
+TRACKED = ['repeated_in_bursts', 'repeated_25_in_30_jpeg', 'repeated_15_in_30_skipping', 'repeated_at_random']
+
+
+@pytest.mark.parametrize('kind', TRACKED)
+def test_repeats_are_left_out_and_cost_few_tracks(kind: str, even: StreamRun) -> None:
+    source = RepeatingSource(Road(100), REPEAT_FAULTS[kind])
+    run = run_stream(kind, source, Options())
+    repeats = int((np.diff(source.order) == 0).sum())
+    assert even.repeated == 0 and even.tracks > 15
+    assert 0.9 * repeats - 2 <= run.repeated <= repeats
+    assert run.tracks >= 0.8 * even.tracks
+
+
+EVEN = StreamRun('even', 'full', 100, 300, 0, 500.0, 10.0)
+
+
+@pytest.mark.parametrize(
+    ('run', 'faults'),
+    [
+        (StreamRun('x', 'full', 80, 300, 0, 509.0, 10.0), []),
+        (StreamRun('x', 'full', 79, 300, 0, 511.0, 10.0), ['focal length', 'tracks']),
+        (StreamRun('x', 'assumed', 200, 300, 0, 500.0, 10.0), ['verdict']),
+        (StreamRun('x', 'no_motion', 100, 300, 0), ['verdict']),
+    ],
+)
+def test_faults_are_another_verdict_a_far_focal_length_and_few_tracks(run: StreamRun, faults: list[str]) -> None:
+    assert run.faults(EVEN) == faults
+
+
+def test_two_refusals_are_one_verdict() -> None:
+    refused = [StreamRun('x', code, 90, 300, 0) for code in ('no_agreement', 'too_little_curvature')]
+    assert refused[0].faults(refused[1]) == []
+
+
+def test_a_row_names_focal_length_sigmas_and_tracks() -> None:
+    row = format_run(StreamRun('jitter_30', 'full', 90, 300, 7, 505.0, 11.0), EVEN)
+    assert row.split() == ['jitter_30', 'full', '505.0', '11.0', '+0.50', '90', '90', '7', 'ok']
+    refused = format_run(StreamRun('jitter_30', 'no_motion', 3, 300, 0), EVEN)
+    assert refused.split() == ['jitter_30', 'no_motion', '-', '-', '-', '3', '3', '0', 'verdict,', 'tracks']
+
+
+def test_kinds_are_names_or_groups() -> None:
+    assert expand_kinds(['repeats', 'jitter_20', 'jitter_20']) == (*REPEAT_FAULTS, 'jitter_20')
+    assert 'constant' not in expand_kinds([]) and {'jitter_30', 'frozen_jpeg'} <= set(expand_kinds([]))
+    with pytest.raises(UsageError, match=r'no such fault: jiter; there are stamps, repeats, even, jitter_20'):
+        expand_kinds(['jiter'])
+
+
+def test_a_stream_through_a_codec_is_compared_with_the_codec_alone(monkeypatch) -> None:
+    monkeypatch.setattr(streams, 'run_stream', lambda kind, source, options: StreamRun(kind, 'full', 9, 30, 0))
+    kinds = ['repeated_25_in_30', 'repeated_25_in_30_jpeg', 'frozen_jpeg', 'jitter_30']
+    pairs = [(run.kind, even.kind) for run, even in run_streams(Road(9), kinds, Options())]
+    assert pairs == [
+        ('even', 'even'),
+        ('repeated_25_in_30', 'even'),
+        ('even_jpeg', 'even_jpeg'),
+        ('repeated_25_in_30_jpeg', 'even_jpeg'),
+        ('frozen_jpeg', 'even_jpeg'),
+        ('jitter_30', 'even'),
+    ]
+
+
+@pytest.mark.parametrize(('verdict', 'status'), [('full', 0), ('no_motion', 3)])
+def test_the_command_prints_a_row_a_kind_and_fails_by_its_exit_status(verdict, status, monkeypatch, capsys, tmp_path):
+    asked = []
+
+    def runs(source, kinds, options):
+        asked.append((source, kinds, options.camera_height))
+        faulty = StreamRun('frozen_jpeg', verdict, 90, 300, 30, *([500.0, 10.0] if status == 0 else []))
+        return [(EVEN, EVEN), (faulty, EVEN)]
+
+    monkeypatch.setattr(streams, 'run_streams', runs)
+    monkeypatch.setattr(streams, 'open_source', lambda path, **window: (path, window))
+    arguments = ['a', 'b', '--kinds', 'frozen_jpeg', '--duration', '30', '--camera-height', '7.5']
+    assert main(['benchmark', 'streams', *arguments]) == status
+    window = {'start_s': 0.0, 'duration_s': 30.0}
+    assert asked == [((Path(name), window), ('frozen_jpeg',), 7.5) for name in 'ab']
+    rows = capsys.readouterr().out.splitlines()
+    assert [row.split()[0] for row in rows] == ['a', 'kind', 'even', 'frozen_jpeg', 'b', 'kind', 'even', 'frozen_jpeg']
