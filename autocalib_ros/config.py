@@ -221,6 +221,19 @@ class PaperOptions(_Validated):
 
 
 @dataclass(frozen=True, kw_only=True)
+class LensOptions(_Validated):
+    """What is known of the lens and its images besides the camera_info file."""
+
+    pixel_aspect: float = option(
+        0.0,
+        'width of a pixel over its height (sample aspect ratio), for images that a recorder squeezed: 1.4222 for '
+        '720x576 of a 16:9 picture, 2 for 960x1080; 1: square; 0: as the video file says, else tested by the traffic',
+        low=0,
+        high=10,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
 class JointOptions(_Validated):
     """Robust method: joint bundle adjustment of lens, roads and ground plane."""
 
@@ -442,6 +455,7 @@ class Options(_Validated):
     detector: DetectorOptions = field(default_factory=DetectorOptions)
     buffer: BufferOptions = field(default_factory=BufferOptions)
     paper: PaperOptions = field(default_factory=PaperOptions)
+    lens: LensOptions = field(default_factory=LensOptions)
     joint: JointOptions = field(default_factory=JointOptions)
     scale: ScaleOptions = field(default_factory=ScaleOptions)
     gate: GateOptions = field(default_factory=GateOptions)
@@ -570,6 +584,7 @@ RECONFIGURABLE = (
     'solve_growth',
     'solve_interval_s',
     'paper',
+    'lens',
     'joint',
     'scale',
     'gate',

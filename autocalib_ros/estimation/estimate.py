@@ -5,13 +5,17 @@ from __future__ import annotations
 import numpy as np
 
 from autocalib_ros.config import Options
-from autocalib_ros.estimation.adjustment.lens_prior import known_lens, lens_priors
+from autocalib_ros.estimation.adjustment.lens_prior import LensPrior, known_lens, lens_priors
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig
+from autocalib_ros.estimation.given_lens import check_principal_point, verify_given_lens
 from autocalib_ros.estimation.observations.selection import drop_pedestrians
 from autocalib_ros.estimation.observations.track_set import TrackSet, select_tracks
 from autocalib_ros.estimation.observations.two_frame_windows import ResampledTracks, find_windows
 from autocalib_ros.estimation.paper.intrinsics import paper_intrinsics
 from autocalib_ros.estimation.paper.published_method import solve_paper
+from autocalib_ros.estimation.pixels.aspect_hypotheses import AspectHypotheses
+from autocalib_ros.estimation.pixels.aspect_test import choose_aspect, with_told_aspect
+from autocalib_ros.estimation.pixels.square_pixels import with_square_pixels
 from autocalib_ros.estimation.publish import (
     ResultDraft,
     choose_solution,
@@ -43,7 +47,12 @@ def solve(evidence: Evidence, options: Options, *, lens: Camera | None = None) -
     """
     options.scale.require_inside(*evidence.image_size)
     # The published intrinsic stage: part of method paper, a comparison for method joint.
-    draft = ResultDraft.begin(evidence, options, paper_intrinsics(evidence, options.paper))
+    aspect = options.lens.pixel_aspect or evidence.pixel_aspect or 1.0
+    draft = ResultDraft.begin(evidence, options, paper_intrinsics(with_square_pixels(evidence, aspect), options.paper))
+    # A given lens that cannot be of these images is not tried.
+    impossible = None if lens is None or options.method == 'paper' else check_principal_point(lens)
+    if impossible:
+        return draft.refusal(impossible)
     # Pedestrians that a detector saw are left out.
     traffic, kept = drop_pedestrians(evidence)
     # Without enough evidence nothing is estimated.
@@ -112,12 +121,37 @@ def find_solution(
     gate, joint = options.gate, options.joint
     if len(tracks) < gate.min_tracks:
         return reason('too_few_tracks', 'short', tracks=len(tracks), limit=gate.min_tracks)
-    priors = lens_priors(evidence.image_size, joint, evidence.picture) if lens is None else [known_lens(lens)]
     crossing_rad = None if joint.crossing_deg is None else float(np.radians(joint.crossing_deg))
-    instants, generator = ResampledTracks(evidence), np.random.default_rng(options.random_seed)
+    instants = ResampledTracks(evidence)
     windows = find_windows(evidence, instants)
-    observations = Observations(tracks, windows, instants, priors, gate, evidence, generator)
-    config = AdjustmentConfig(priors[0], joint, height_m, crossing_rad)
+
+    def estimate_under(priors: list[LensPrior]) -> Solution | Reason:
+        generator = np.random.default_rng(options.random_seed)
+        observations = Observations(tracks, windows, instants, priors, gate, evidence, generator)
+        return _estimate(observations, AdjustmentConfig(priors[0], joint, height_m, crossing_rad))
+
+    families = lens_priors(evidence.image_size, joint, evidence.picture)
+
+    def estimate_with_aspect(aspect: float, sigma: float) -> Solution | Reason:
+        return estimate_under([prior.with_pixel_aspect(aspect, sigma) for prior in families])
+
+    if lens is not None:
+        return verify_given_lens(
+            lens, estimate_under([known_lens(lens)]), tracks, lambda: estimate_with_aspect(lens.pixel_aspect, 0.0)
+        )
+    given = options.lens.pixel_aspect
+    if given > 0.0:
+        return with_told_aspect(estimate_with_aspect(given, 0.0), given, 'given')
+    hypotheses = AspectHypotheses.of(evidence.image_size)
+    if evidence.pixel_aspect > 0.0:
+        hypotheses = hypotheses.told(evidence.pixel_aspect)
+    found = choose_aspect(hypotheses, estimate_with_aspect, tracks, gate)
+    return with_told_aspect(found, evidence.pixel_aspect, 'recording')
+
+
+def _estimate(observations: Observations, config: AdjustmentConfig) -> Solution | Reason:
+    """Estimate lens, plane and roads under the priors of the observations, by one strategy after the other."""
+    joint = config.options
     # Traffic: straight first; turning alone if that leaves anything open.
     found = estimate_from_straight_traffic(observations, config)
     if not (isinstance(found, Solution) and found.full):

@@ -8,6 +8,7 @@ import numpy as np
 
 from autocalib_ros.config import Options
 from autocalib_ros.estimation.adjustment.noise_model import DEFAULT_CAMERA_HEIGHT_M
+from autocalib_ros.estimation.adjustment.parameters import AdjustmentState
 from autocalib_ros.estimation.adjustment.residuals import collect_residuals
 from autocalib_ros.estimation.paper.intrinsics import PaperIntrinsics
 from autocalib_ros.estimation.paper.vanishing_point_voting import segment_orientations
@@ -174,11 +175,17 @@ def _with_ground(lens: Calibration, solution: Solution, options: Options) -> Cal
 
 
 def _lens_stddev(solution: Solution) -> StandardDeviations:
-    focal, cx, cy, k1, k2 = solution.fit.sigma(
-        lambda state: np.array([state.camera.focal_px, *state.camera.principal_point_px, *state.camera.k[:2]])
-    )
+    aspect = solution.fit.state.camera.pixel_aspect
+
+    def published(state: AdjustmentState) -> np.ndarray:
+        camera = state.camera
+        focal_x = camera.focal_px / camera.pixel_aspect * aspect
+        return np.array([camera.focal_px, focal_x, *camera.principal_point_px, *camera.k[:2]])
+
+    # of the less certain of the two focal lengths: they differ where the pixel aspect is uncertain
+    down, across, cx, cy, k1, k2 = solution.fit.sigma(published)
     return StandardDeviations(
-        focal_px=float(focal), principal_point_px=(float(cx), float(cy)), k1=float(k1), k2=float(k2)
+        focal_px=float(max(down, across)), principal_point_px=(float(cx), float(cy)), k1=float(k1), k2=float(k2)
     )
 
 

@@ -57,6 +57,8 @@ class Solution:
     """Whether the plane rests on less than crossing roads or turning vehicles, without an assumption in `plane`."""
     from_markings: bool = False
     """Whether lens and plane come from the lane markings."""
+    of_traffic: Adjustment | None = None
+    """The adjustment of the traffic that lane markings replaced; None if `fit` is it, or there is none."""
 
     @property
     def assumed(self) -> bool:

@@ -125,6 +125,7 @@ def sharpen_with_lane_markings(found: Solution, observations: Observations) -> S
         checks=checks,
         assumptions=(*lens_assumptions(fit, ()), statement),
         from_markings=True,
+        of_traffic=found.fit,
     )
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-SENSOR_SHAPES = (1.0, 11 / 9, 5 / 4, 4 / 3, 22 / 15, 3 / 2, 16 / 10, 16 / 9, 17 / 9)
+PICTURE_SHAPES = (1.0, 11 / 9, 5 / 4, 4 / 3, 22 / 15, 3 / 2, 16 / 10, 16 / 9, 17 / 9)
 """Long over short side of whole pictures: square fisheye modes, CIF, SXGA, VGA and its multiples, SIF, 3:2 sensors,
 16:10, HD, DCI."""
 SHAPE_TOLERANCE = 0.01
@@ -172,9 +172,9 @@ def _missing(width: float, height: float) -> tuple[float, float]:
     """Return the columns and rows that a picture lacks to the smallest sensor shape around it; 0 if it has one."""
     upright = height > width
     long, short = max(width, height), min(width, height)
-    if any(abs(long / short / shape - 1) <= SHAPE_TOLERANCE for shape in SENSOR_SHAPES):
+    if any(abs(long / short / shape - 1) <= SHAPE_TOLERANCE for shape in PICTURE_SHAPES):
         return 0.0, 0.0
-    around = [(max(long, short * shape), max(short, long / shape)) for shape in SENSOR_SHAPES]
+    around = [(max(long, short * shape), max(short, long / shape)) for shape in PICTURE_SHAPES]
     whole_long, whole_short = min(around, key=lambda sides: sides[0] * sides[1])
     missing = (whole_long - long, whole_short - short)
     return (missing[1], missing[0]) if upright else missing

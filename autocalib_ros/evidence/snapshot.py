@@ -25,6 +25,8 @@ TRACK_KINDS = 'track_kinds'
 """Saved only if a detector classified the tracks."""
 PICTURE = 'picture'
 """Saved only if the picture does not fill the images."""
+PIXEL_ASPECT = 'pixel_aspect'
+"""Saved only if the recording says it."""
 
 
 class TrackKind(IntEnum):
@@ -127,6 +129,8 @@ class Evidence:
 
     stillness: Stillness = field(default_factory=Stillness)
     """Sway, which is compensated, and the still part of the recording that the evidence is from."""
+    pixel_aspect: float = 0.0
+    """Width of a pixel over its height as the recording says; 0 if it says nothing."""
 
     def __post_init__(self) -> None:
         if not len(self.track_kinds):
@@ -219,6 +223,8 @@ class Evidence:
             arrays[PICTURE] = self.picture.numbers
         if self.stillness.is_notable:
             arrays[STILLNESS] = self.stillness.as_array()
+        if self.pixel_aspect:
+            arrays[PIXEL_ASPECT] = np.array(self.pixel_aspect)
         write_evidence_file(
             path,
             arrays,
@@ -237,13 +243,14 @@ class Evidence:
             TRACK_KINDS,
             PICTURE,
             STILLNESS,
+            PIXEL_ASPECT,
         )
         with evidence_file(path, required, optional) as fields:
             if PICTURE in fields:
                 fields[PICTURE] = Picture.of_numbers(fields['image_size'], fields[PICTURE])
             if STILLNESS in fields:
                 fields[STILLNESS] = Stillness.from_array(fields[STILLNESS])
-            evidence = cls(**fields)
+            evidence = cls(**{**fields, PIXEL_ASPECT: float(fields.get(PIXEL_ASPECT, 0.0))})
             evidence.require_consistent()
         return evidence
 
@@ -268,6 +275,8 @@ class Evidence:
             raise ValueError(f'an image size of {self.image_size}, {self.frames} frames in {self.seconds} s')
         if not self.drift_px >= 0:
             raise ValueError(f'a drift of {self.drift_px} px')
+        if not 0.0 <= self.pixel_aspect < np.inf:
+            raise ValueError(f'a pixel aspect of {self.pixel_aspect}')
 
 
 def track_arrays(tracks: list[Track]) -> dict[str, Any]:

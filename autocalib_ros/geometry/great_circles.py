@@ -25,7 +25,9 @@ class Rays:
     radial: np.ndarray
     """Derivative of the bearing by the image radius, per pixel, shape (..., 3)."""
     tangential: np.ndarray
-    """Derivative of the bearing along the circle around the principal point, per pixel, shape (..., 3)."""
+    """Derivative of the bearing along the circle around the principal point, per pixel, shape (..., 3).
+
+    Of pixels that are not square, the two are the derivatives by u and v: at right angles in the image too."""
 
     def pixel_scale(self, normals: np.ndarray) -> np.ndarray:
         """Return pixels per unit of n.b, shape (...), for circle normals (..., 3) that broadcast to the bearings."""
@@ -43,6 +45,8 @@ def unproject_rays(camera: Camera, pixels: np.ndarray) -> Rays:
     Beyond the largest image radius of the lens model, a pixel gets the outermost bearing of the model.
     """
     x, y = pixels[..., 0] - camera.principal_point_px[0], pixels[..., 1] - camera.principal_point_px[1]
+    if not camera.has_square_pixels:
+        x = camera.pixel_aspect * x - camera.skew * y
     radius = np.maximum(np.sqrt(x * x + y * y), 1e-9)
     theta, _ = camera.angle(radius)
     # half-angle formulas: one tangent is cheaper than a sine and a cosine
@@ -57,11 +61,19 @@ def unproject_rays(camera: Camera, pixels: np.ndarray) -> Rays:
     along = cosine * outward
     rays.radial[..., 0], rays.radial[..., 1], rays.radial[..., 2] = along * x, along * y, -sine * outward
     rays.tangential[..., 0], rays.tangential[..., 1], rays.tangential[..., 2] = -y * around, x * around, 0.0
-    return rays
+    return rays if camera.has_square_pixels else _along_pixel_axes(rays, camera, x[..., None], y[..., None])
+
+
+def _along_pixel_axes(rays: Rays, camera: Camera, x: np.ndarray, y: np.ndarray) -> Rays:
+    """Return the rays with derivatives by u and v; (x, y), shape (..., 1), is the unit vector along the radius."""
+    by_x, by_y = x * rays.radial - y * rays.tangential, y * rays.radial + x * rays.tangential
+    return Rays(rays.bearings, camera.pixel_aspect * by_x, by_y - camera.skew * by_x)
 
 
 def bearing_change(rays: Rays, camera: Camera, pixels: np.ndarray, way_px: np.ndarray) -> np.ndarray:
     """Return the change (n, 3) of the bearings of pixels (n, 2) for image displacements `way_px` (n, 2)."""
+    if not camera.has_square_pixels:
+        return rays.radial * way_px[:, :1] + rays.tangential * way_px[:, 1:]
     outward = pixels - camera.principal_point_px
     outward = outward / np.maximum(np.hypot(*outward.T), 1e-9)[:, None]
     return (

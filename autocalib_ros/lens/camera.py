@@ -7,6 +7,11 @@ A bearing at the angle theta from the optical axis is imaged at the distance
 from the principal point (Kannala & Brandt 2006, equation 6). k = 0 is the equidistant lens; k1 = 1/3, k2 = 2/15 is
 the series of the distortion-free one, tan(theta). Pixel (0, 0) is the centre of the top-left pixel. Camera optical
 frame: x right, y down, z forward (REP-103).
+
+Distances are in pixel heights. Where pixels are not square, or their axes are skewed, a point (x, y) of the image
+plane, in pixel heights from the principal point, lies at the pixel
+
+    u = (x + skew y) / pixel_aspect + cx,    v = y + cy
 """
 
 from __future__ import annotations
@@ -46,18 +51,26 @@ class Lens(Protocol):
 
 @dataclass(frozen=True)
 class Camera:
-    """Kannala-Brandt camera with square pixels and no skew; lengths in pixels, angles in radians."""
+    """Kannala-Brandt camera; lengths in pixels, angles in radians."""
 
     width: int
     height: int
     focal_px: float
+    """In pixel heights: fy of K."""
     principal_point_px: tuple[float, float]
     k: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    pixel_aspect: float = 1.0
+    """Width of a pixel over its height, the sample aspect ratio of video: fy / fx of K."""
+    skew: float = 0.0
+    """Cotangent of the angle between the pixel axes, K[0, 1] / fx: `alpha` of OpenCV's fisheye model."""
 
     def __post_init__(self) -> None:
-        numbers = (self.focal_px, *self.principal_point_px, *self.k)
-        if not np.isfinite(numbers).all() or self.focal_px <= 0 or min(self.width, self.height) < 1:
-            raise UsageError(f'a camera needs a positive focal length, a size and finite numbers, got {self}')
+        numbers = (self.focal_px, *self.principal_point_px, *self.k, self.pixel_aspect, self.skew)
+        positive = min(self.focal_px, self.pixel_aspect) > 0
+        if not np.isfinite(numbers).all() or not positive or min(self.width, self.height) < 1:
+            raise UsageError(
+                f'a camera needs a positive focal length and pixel aspect, a size and finite numbers, got {self}'
+            )
 
     @classmethod
     def equidistant(cls, width: int, height: int, focal_px: float) -> Camera:
@@ -84,11 +97,37 @@ class Camera:
     @property
     def matrix(self) -> np.ndarray:
         """K, shape (3, 3), in pixels."""
-        cx, cy = self.principal_point_px
-        return np.array([[self.focal_px, 0.0, cx], [0.0, self.focal_px, cy], [0.0, 0.0, 1.0]])
+        (cx, cy), focal_x_px = self.principal_point_px, self.focal_px / self.pixel_aspect
+        return np.array([[focal_x_px, self.skew * focal_x_px, cx], [0.0, self.focal_px, cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def diagonal_px(self) -> float:
+        """Diagonal of the image in pixel heights."""
+        return float(np.hypot(self.width * self.pixel_aspect, self.height))
+
+    @property
+    def has_square_pixels(self) -> bool:
+        """Whether pixels are square and not skewed."""
+        return self.pixel_aspect == 1.0 and self.skew == 0.0
+
+    def offsets(self, pixels: np.ndarray) -> np.ndarray:
+        """Return the offsets (..., 2) of pixels (..., 2) from the principal point, in pixel heights."""
+        offset = np.asarray(pixels, float) - self.principal_point_px
+        return offset if self.has_square_pixels else offset @ self._offset_from_pixel.T
+
+    @cached_property
+    def _offset_from_pixel(self) -> np.ndarray:
+        """Derivative of `offsets` by the pixel, shape (2, 2)."""
+        return np.array([[self.pixel_aspect, -self.skew], [0.0, 1.0]])
+
+    def pixels_at(self, offsets: np.ndarray) -> np.ndarray:
+        """Return the pixels (..., 2) at offsets (..., 2) from the principal point, in pixel heights."""
+        if not self.has_square_pixels:
+            offsets = offsets @ np.linalg.inv(self._offset_from_pixel).T
+        return offsets + self.principal_point_px
 
     def radius(self, theta_rad: np.ndarray) -> np.ndarray:
-        """Return the image radius in pixels for angles from the optical axis."""
+        """Return the image radius in pixel heights for angles from the optical axis."""
         return self.focal_px * theta_rad * _power_series(self.k, theta_rad * theta_rad)
 
     def radius_derivative(self, theta_rad: np.ndarray) -> np.ndarray:
@@ -116,12 +155,11 @@ class Camera:
         theta = np.arctan2(across, bearings[..., 2])
         on_axis = across < 1e-12
         scale = np.where(on_axis, 0.0, self.radius(theta) / np.where(on_axis, 1.0, across))
-        pixels = scale[..., None] * bearings[..., :2] + self.principal_point_px
-        return pixels, theta <= self.max_angle_rad
+        return self.pixels_at(scale[..., None] * bearings[..., :2]), theta <= self.max_angle_rad
 
     def unproject(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return unit bearings (..., 3) of pixels (..., 2), and which are inside the range of the lens model (...)."""
-        offset = np.asarray(pixels, float) - self.principal_point_px
+        offset = self.offsets(pixels)
         r = np.hypot(offset[..., 0], offset[..., 1])
         theta, valid = self.angle(r)
         on_axis = r < 1e-12
@@ -129,7 +167,7 @@ class Camera:
         return np.concatenate([scale[..., None] * offset, np.cos(theta)[..., None]], axis=-1), valid
 
     def angle(self, radius_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the angles in radians of image radii, by Newton's method, and where it converged."""
+        """Return the angles in radians of image radii in pixel heights, by Newton's method, and where it converged."""
         radius = np.asarray(radius_px, float) / self.focal_px
         limit = self.max_angle_rad
         theta = np.clip(radius, 0.0, limit)
@@ -145,7 +183,7 @@ class Camera:
         return theta, np.abs(theta * _power_series(self.k, theta * theta) - radius) < 1e-6
 
     def undistort(self, pixels: np.ndarray, focal_px: float | None = None) -> np.ndarray:
-        """Return pixels (..., 2) of a distortion-free camera with the same principal point.
+        """Return pixels (..., 2) of a distortion-free camera with the same principal point and pixel shape.
 
         Generalises `x_u = x_d tan(theta) / theta_d` of Jain & Saunier (arXiv 2001.07243) to all lenses of the model.
         Pixels at 90 degrees from the optical axis or more give nan.
@@ -153,7 +191,7 @@ class Camera:
         bearings, valid = self.unproject(pixels)
         ahead = valid & (bearings[..., 2] > 1e-6)
         scale = np.where(ahead, (focal_px or self.focal_px) / np.where(ahead, bearings[..., 2], 1.0), np.nan)
-        return scale[..., None] * bearings[..., :2] + self.principal_point_px
+        return self.pixels_at(scale[..., None] * bearings[..., :2])
 
 
 def scale_factors(calibrated: tuple[int, int], images: tuple[int, int]) -> tuple[float, float]:

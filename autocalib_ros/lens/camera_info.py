@@ -83,7 +83,7 @@ def camera_info(camera: Camera, distortion_model: str = 'auto', rectified_balanc
     coefficients, error_px = _coefficients(camera, model)
     if not error_px <= MAX_MODEL_ERROR_PX:
         raise _model_misfit(camera, model, error_px)
-    rectified = rectified_matrix(camera, rectified_balance)
+    rectified = rectified_matrix(camera, rectified_balance, camera.pixel_aspect)
     return CameraInfo(
         width=camera.width,
         height=camera.height,
@@ -170,16 +170,16 @@ def _model_misfit(camera: Camera, model: str, error_px: float) -> ModelMisfit:
     return ModelMisfit(message, f'Set distortion_model to {others}.')
 
 
-def rectified_matrix(camera: Lens, balance: float = 0.0) -> np.ndarray:
-    """Return K, shape (3, 3), of a distortion-free image of the same size.
+def rectified_matrix(camera: Lens, balance: float = 0.0, pixel_aspect: float = 1.0) -> np.ndarray:
+    """Return K, shape (3, 3), of a distortion-free image of the same size, with pixels of an aspect.
 
     `balance` 0: only valid pixels, the largest axis-parallel rectangle about the axis inside the undistorted border.
     1: the whole field of view, the smallest rectangle around that border. Values between interpolate the matrix, as in
     OpenCV. Border points beyond `RECTIFIED_LIMIT_DEG` are clipped to it.
     """
     left, right, top, bottom = _normalised_borders(camera)
-    filled = _matrix_for_rectangle(camera, left.max(), right.min(), top.max(), bottom.min(), max)
-    whole = _matrix_for_rectangle(camera, left.min(), right.max(), top.min(), bottom.max(), min)
+    filled = _matrix_for_rectangle(camera, left.max(), right.min(), top.max(), bottom.min(), max, pixel_aspect)
+    whole = _matrix_for_rectangle(camera, left.min(), right.max(), top.min(), bottom.max(), min, pixel_aspect)
     return (1.0 - balance) * filled + balance * whole
 
 
@@ -204,14 +204,21 @@ def _normalised_borders(camera: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarra
 
 
 def _matrix_for_rectangle(
-    camera: Lens, left: float, right: float, top: float, bottom: float, choose: Callable[[float, float], float]
+    camera: Lens,
+    left: float,
+    right: float,
+    top: float,
+    bottom: float,
+    choose: Callable[[float, float], float],
+    aspect: float,
 ) -> np.ndarray:
-    """Return K with square pixels that centres a rectangle of normalised coordinates and fits one of its sides."""
+    """Return K that centres a rectangle of normalised coordinates and fits one of its sides."""
     width, height = camera.width, camera.height
-    focal = choose((width - 1) / max(right - left, 1e-6), (height - 1) / max(bottom - top, 1e-6))
+    focal = choose((width - 1) * aspect / max(right - left, 1e-6), (height - 1) / max(bottom - top, 1e-6))
+    focal_x = focal / aspect
     return np.array(
         [
-            [focal, 0, (width - 1) / 2 - focal * (right + left) / 2],
+            [focal_x, 0, (width - 1) / 2 - focal_x * (right + left) / 2],
             [0, focal, (height - 1) / 2 - focal * (bottom + top) / 2],
             [0, 0, 1],
         ]

@@ -6,7 +6,7 @@ A bearing with normalised coordinates (x, y) = (X / Z, Y / Z) and r^2 = x^2 + y^
     y' = y (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y
 
 in the model 'rational_polynomial' and, without k4 to k6, in 'plumb_bob'. Without distortion all are zero.
-'equidistant' is the polynomial of camera.py with separate focal lengths for x and y.
+'equidistant' is the polynomial of camera.py.
 """
 
 from __future__ import annotations
@@ -54,9 +54,14 @@ class OpencvLens:
     """k1 to k4 of an equidistant lens, otherwise k1, k2, p1, p2, k3, k4, k5, k6, as in D."""
 
     @property
-    def has_square_pixels(self) -> bool:
-        """Whether pixels are square and not skewed, as in a Camera."""
-        return self.matrix[0, 0] == self.matrix[1, 1] and self.matrix[0, 1] == 0.0
+    def pixel_aspect(self) -> float:
+        """Width of a pixel over its height."""
+        return float(self.matrix[1, 1] / self.matrix[0, 0])
+
+    @property
+    def skew(self) -> float:
+        """Cotangent of the angle between the pixel axes."""
+        return float(self.matrix[0, 1] / self.matrix[0, 0])
 
     def grid(self) -> np.ndarray:
         """Return pixels evenly over the image, shape (n, 2)."""
@@ -70,7 +75,7 @@ class OpencvLens:
         """Return bearings (n, 3), their reprojection (n, 2), and whether that is at `pixels` (n, 2)."""
         ideal = np.linalg.solve(self.matrix, np.column_stack([pixels, np.ones(len(pixels))]).T).T[:, :2]
         if self.equidistant:
-            bearings, valid = _camera(self, 1.0, np.zeros(2), self.coefficients).unproject(ideal)
+            bearings, valid = _unit_camera(self).unproject(ideal)
             return bearings, pixels, valid
         normalised = undistort(ideal, self.coefficients)
         imaged = distort(normalised, self.coefficients) @ self.matrix[:2, :2].T + self.matrix[:2, 2]
@@ -79,16 +84,16 @@ class OpencvLens:
 
 
 def fit_kannala_brandt(lens: OpencvLens) -> Camera:
-    """Return the Kannala-Brandt camera closest to the lens over its image.
+    """Return the Kannala-Brandt camera closest to the lens over its image, with pixels of the same shape.
 
-    An equidistant lens with square pixels converts exactly, others by a fit. InputError if the lens leaves part of
+    An equidistant lens converts exactly, others by a fit. InputError if the lens leaves part of
     the image without a bearing, or if the error of the fit exceeds `MAX_MODEL_ERROR_PX`.
     """
     bearings, imaged, invertible = lens.unproject_and_reproject(lens.grid())
     _require_coverage(lens, float(invertible.mean()))
     _require_field_of_view(bearings[invertible])
-    if lens.equidistant and lens.has_square_pixels:
-        return _camera(lens, lens.matrix[0, 0], lens.matrix[:2, 2], lens.coefficients)
+    if lens.equidistant:
+        return _camera(lens, lens.matrix[1, 1], lens.matrix[:2, 2], lens.coefficients)
     camera = _fit_camera(lens, bearings[invertible], imaged[invertible])
     pixels, valid = camera.project(bearings[invertible])
     error_px = np.where(valid, np.hypot(*(pixels - imaged[invertible]).T), np.inf).max()
@@ -122,26 +127,32 @@ def _require_field_of_view(bearings: np.ndarray) -> None:
 
 def _misfit_cause(lens: OpencvLens) -> str:
     """Return what a Camera cannot represent, and how to calibrate without it."""
-    (fx, skew, _), (_, fy, _), _ = lens.matrix
-    causes = {
-        f'two focal lengths, {fx:.1f} and {fy:.1f} px (--fix-aspect-ratio)': fx != fy,
-        'skewed axes': skew != 0.0,
-        'tangential distortion (--zero-tangent-dist)': not lens.equidistant and any(lens.coefficients[2:4]),
-    }
-    found = [cause for cause, there in causes.items() if there]
-    if not found:
-        return 'its field of view is too wide: recalibrate the camera with a fisheye model'
-    return f'it has {" and ".join(found)}: recalibrate the camera without, by the options of camera_calibration'
+    if any(lens.coefficients[2:4]):
+        return (
+            'it has tangential distortion: recalibrate the camera without, by --zero-tangent-dist of camera_calibration'
+        )
+    return 'its field of view is too wide: recalibrate the camera with a fisheye model'
 
 
 def _camera(lens: OpencvLens, focal_px: float, principal_point_px: np.ndarray, k: Sequence[float]) -> Camera:
     k1, k2, k3, k4 = (float(value) for value in k)
     cx, cy = (float(value) for value in principal_point_px)
-    return Camera(lens.width, lens.height, float(focal_px), (cx, cy), (k1, k2, k3, k4))
+    return Camera(lens.width, lens.height, float(focal_px), (cx, cy), (k1, k2, k3, k4), lens.pixel_aspect, lens.skew)
+
+
+def _unit_camera(lens: OpencvLens) -> Camera:
+    """Return the camera of an equidistant lens for normalised coordinates: focal length 1, principal point (0, 0)."""
+    k1, k2, k3, k4 = (float(value) for value in lens.coefficients)
+    return Camera(lens.width, lens.height, 1.0, (0.0, 0.0), (k1, k2, k3, k4))
 
 
 def _fit_camera(lens: OpencvLens, bearings: np.ndarray, imaged: np.ndarray) -> Camera:
-    """Solve for principal point, f and f k1 to f k4 by linear least squares: the pixels are linear in them."""
+    """Solve for principal point, f and f k1 to f k4 by linear least squares: the pixels are linear in them.
+
+    Pixels are in pixel heights from the first one, which is what `Camera.offsets` gives of a camera with its principal
+    point there.
+    """
+    unit = Camera(lens.width, lens.height, 1.0, (0.0, 0.0), pixel_aspect=lens.pixel_aspect, skew=lens.skew)
     across = np.hypot(bearings[:, 0], bearings[:, 1])
     powers = np.arctan2(across, bearings[:, 2])[:, None] ** [1, 3, 5, 7, 9]
     outwards = bearings[:, :2] / np.maximum(across, 1e-12)[:, None]
@@ -152,8 +163,8 @@ def _fit_camera(lens: OpencvLens, bearings: np.ndarray, imaged: np.ndarray) -> C
             np.column_stack([zeros, ones, powers * outwards[:, 1:]]),
         ]
     )
-    solution = np.linalg.lstsq(rows, imaged.T.ravel(), rcond=None)[0]
-    return _camera(lens, solution[2], solution[:2], solution[3:] / solution[2])
+    solution = np.linalg.lstsq(rows, unit.offsets(imaged).T.ravel(), rcond=None)[0]
+    return _camera(lens, solution[2], unit.pixels_at(solution[:2]), solution[3:] / solution[2])
 
 
 def fit_opencv_coefficients(camera: Camera, *, rational: bool) -> tuple[tuple[float, ...], float]:
@@ -172,7 +183,7 @@ def fit_opencv_coefficients(camera: Camera, *, rational: bool) -> tuple[tuple[fl
     least_px = np.inf
     for _ in range(MAX_LAWSON_ITERATIONS):
         coefficients = _radial_fit(normalised, radii, np.sqrt(weights) / denominator, rational=rational)
-        error_px = camera.focal_px * _radial_error(*checked, coefficients).max()
+        error_px = camera.focal_px / min(camera.pixel_aspect, 1.0) * _radial_error(*checked, coefficients).max()
         if error_px < least_px:
             best, least_px = coefficients, float(error_px)
         denominator = _denominator(normalised * normalised, coefficients)
@@ -187,7 +198,7 @@ def fit_opencv_coefficients(camera: Camera, *, rational: bool) -> tuple[tuple[fl
 def max_visible_angle_rad(camera: Camera) -> float:
     """Return the largest visible angle from the axis: of a corner, or of the edge of a fisheye's disc."""
     corners = np.array([(x, y) for x in (0, camera.width - 1) for y in (0, camera.height - 1)], float)
-    return float(camera.angle(np.hypot(*(corners - camera.principal_point_px).T).max())[0])
+    return float(camera.angle(np.hypot(*camera.offsets(corners).T).max())[0])
 
 
 def _radial_samples(camera: Camera, field_rad: float, steps: int) -> tuple[np.ndarray, np.ndarray]:

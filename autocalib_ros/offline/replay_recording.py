@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -75,7 +75,7 @@ def replay(
     for count, frame in enumerate(source.frames(), start=1):
         scaled_lens = _scaled_lens(lens, (frame.image.shape[1], frame.image.shape[0]))
         calibrator.add_image(frame.stamp_ns, frame.image)
-        due = calibrator.snapshot_if_due()
+        due = _as_recorded(calibrator.snapshot_if_due(), source)
         if due is not None and due.stillness.start_s != part_start_s:  # another still part of the recording
             part_start_s = due.stillness.start_s
             accepted_at_s, moments, latest, next_solve_s = None, (), None, 0.0
@@ -90,7 +90,7 @@ def replay(
         if on_progress is not None and count % PROGRESS_EVERY_FRAMES == 1:
             note = _progress_note(calibrator, latest, accepted_at_s)
         report_progress(count, note)
-    evidence = calibrator.snapshot(longest_part=True)
+    evidence = _as_recorded(calibrator.snapshot(longest_part=True), source)
     if evidence is None:
         raise InputError(f'{source.name} has no images')
     if evidence.stillness.start_s != part_start_s:
@@ -113,6 +113,11 @@ def replay(
         moments=append_snapshot(moments, result),
         clock=calibrator.clock(),
     )
+
+
+def _as_recorded(evidence: Evidence | None, source: Source) -> Evidence | None:
+    """Return evidence with the pixel aspect that its recording says."""
+    return evidence and replace(evidence, pixel_aspect=source.pixel_aspect)
 
 
 def _progress_note(

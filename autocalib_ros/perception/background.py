@@ -7,8 +7,11 @@ import numpy as np
 
 MAX_SAMPLES = 9
 """Images in memory; bounds memory and the cost of the median."""
-FIRST_INTERVAL_S = 0.5
-"""First sampling interval, seconds: a background two seconds after the first image."""
+FIRST_INTERVAL_S = 1.0
+"""First sampling interval, seconds: in less a vehicle nearby covers much of the same pixels again."""
+EARLY_INTERVAL_S = 0.5
+"""Sampling interval until there are `MIN_SAMPLES` at `FIRST_INTERVAL_S`, seconds: a background after two seconds, which
+the better one replaces."""
 MAX_INTERVAL_S = 600.0
 """Longest sampling interval: images older than `MAX_SAMPLES` of these show other light, dirt and road paint."""
 MIN_SAMPLES = 5
@@ -30,33 +33,46 @@ class Background:
     """
 
     def __init__(self) -> None:
-        self._samples: list[tuple[float, np.ndarray]] = []
+        self._regular: list[tuple[float, np.ndarray]] = []
+        self._early: list[tuple[float, np.ndarray]] = []
         self._interval_s = FIRST_INTERVAL_S
-        self._next_s = 0.0
+        self._next_s = self._next_early_s = 0.0
         self._width = 0
 
     def update(self, image: np.ndarray, time_s: float) -> None:
         """Add a grey or BGR uint8 image if the sampling interval has passed."""
         if not self.is_due(time_s):
             return
-        if len(self._samples) == MAX_SAMPLES:
-            self._thin()
         ok, encoded = cv2.imencode('.jpg', image, [cv2.IMWRITE_JPEG_QUALITY, 92])
-        if ok:
-            self._samples.append((time_s, encoded))
-            self._width = image.shape[1]
-        self._next_s = time_s + self._interval_s
+        self._width = image.shape[1]
+        if time_s >= self._next_s:
+            if len(self._regular) == MAX_SAMPLES:
+                self._thin()
+            self._regular += [(time_s, encoded)] if ok else []
+            self._next_s = time_s + self._interval_s
+            self._early = self._early if self._is_early else []
+        else:
+            self._early += [(time_s, encoded)] if ok else []
+        self._next_early_s = time_s + EARLY_INTERVAL_S
+
+    @property
+    def _is_early(self) -> bool:
+        return len(self._regular) < MIN_SAMPLES
+
+    @property
+    def _samples(self) -> list[tuple[float, np.ndarray]]:
+        return sorted([*self._regular, *self._early], key=lambda sample: sample[0])
 
     def _thin(self) -> None:
         if 2 * self._interval_s > MAX_INTERVAL_S:
-            self._samples = self._samples[1:]
+            self._regular = self._regular[1:]
             return
-        self._samples = self._samples[::2]
+        self._regular = self._regular[::2]
         self._interval_s *= 2
 
     def is_due(self, time_s: float) -> bool:
         """Whether an image of this time would be added."""
-        return time_s >= self._next_s
+        return time_s >= (min(self._next_s, self._next_early_s) if self._is_early else self._next_s)
 
     @property
     def times_s(self) -> tuple[float, ...]:

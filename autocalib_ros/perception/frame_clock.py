@@ -66,6 +66,8 @@ empty, the nearer any times lie to one."""
 SURE_SIGMA = 0.08
 """Frames: if half of the last `PHASE_RUN` errors exceed three times this and three standard deviations, the rate has
 changed."""
+SEARCH_IMAGES = 8
+"""Images between two searches for a grid where the last `MAX_IMAGES` show none: a search takes milliseconds."""
 REFIT = 8
 """Images between two fits while the stamps are even."""
 PHASE_RUN, PHASE_SHIFT = 8, 0.1
@@ -167,6 +169,7 @@ class FrameClock:
 
     def _leave_grid(self) -> None:
         self._grid: FrameGrid | None = None
+        self._unsearched = 0
         self._slot = 0
         self._window: deque[tuple[int, int, bool]] = deque(maxlen=MAX_IMAGES)
         self._misfits: deque[bool] = deque(maxlen=CHECKED)
@@ -497,6 +500,10 @@ class FrameClock:
             self._look_for_grid()
 
     def _look_for_grid(self) -> None:
+        self._unsearched += 1
+        if len(self._raw) == MAX_IMAGES and self._unsearched < SEARCH_IMAGES:
+            return
+        self._unsearched = 0
         stamps = np.array(self._raw, np.int64)
         found = find_grid(stamps, exact=self._distrusted)
         if found is None:

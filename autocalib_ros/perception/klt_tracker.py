@@ -48,7 +48,8 @@ MIN_FAST_POINTS = 5
 """Least number of points faster than `MAX_TURN_PX` per image that tell a repeated image."""
 UNCHANGED, UNCHANGED_FRACTION = 0.5, 2 / 3
 """Largest change of the surroundings of a point that stands still, fraction of their contrast (where a fast point was,
-they change by all of it), and the fraction of the fast points that stand still in a repeated image. Vehicles do not
+they change by all of it) and of the change at the place where it should be (an edge along its path looks the same at
+both), and the fraction of the fast points that stand still in a repeated image. Vehicles do not
 stop together from one image to the next; points stick to an occluder one by one.
 """
 MIN_SCALED_STEP_PX = 1.0
@@ -82,10 +83,13 @@ class PointTracker:
         fast = np.flatnonzero((self._count > 1) & (np.hypot(*self._step.T) > MAX_TURN_PX))
         if len(fast) < MIN_FAST_POINTS:
             return False
-        before, after = (self._patches(image, self._current_positions(fast)) for image in (self._grey, grey))
-        change = np.abs(after - before).mean(axis=1)
+        positions = self._current_positions(fast)
+        before, after = (self._patches(image, positions) for image in (self._grey, grey))
+        moved = self._patches(grey, positions + self._step[fast])
+        change, change_if_moved = (np.abs(image - before).mean(axis=1) for image in (after, moved))
         contrast = np.abs(before - before.mean(axis=1, keepdims=True)).mean(axis=1)
-        return bool((change < UNCHANGED * contrast).mean() > UNCHANGED_FRACTION)
+        unchanged = change < UNCHANGED * np.minimum(contrast, change_if_moved)
+        return bool(unchanged.mean() > UNCHANGED_FRACTION)
 
     def _patches(self, grey: np.ndarray, points_px: np.ndarray) -> np.ndarray:
         """Return the pixels of a grey image (H, W) around points (n, 2), float32 (n, window_px squared)."""

@@ -32,7 +32,7 @@ def rectified_renderer(known: SavedCamera, balance: float | None) -> Callable[[n
         )
     matrix = known.rectified if balance is None else None
     if matrix is None:
-        matrix = rectified_matrix(known, balance or 0.0)
+        matrix = rectified_matrix(known, balance or 0.0, float(known.matrix[1, 1] / known.matrix[0, 0]))
     if not np.isfinite(matrix).all():
         raise InputError(
             'the distortion folds back before the border of the image, so the undistorted view has no size:'

@@ -51,9 +51,10 @@ def clusters(scene: ReportScene) -> Figure | None:
     from autocalib_ros.report.lens_figures import undistorted_axes
 
     found = segment_orientations(calibration.camera, scene.evidence.segments_px, scene.options.paper)
-    matrix = rectified_matrix(calibration.camera)
+    camera = calibration.camera
+    matrix = rectified_matrix(camera, pixel_aspect=camera.pixel_aspect)
     # the segments refer to a camera with the same focal length and principal point (0, 0)
-    ends = found.ends_px * (matrix[[0, 1], [0, 1]] / calibration.camera.focal_px) + matrix[:2, 2]
+    ends = found.ends_px * (matrix[[0, 1], [0, 1]] / camera.focal_px) + matrix[:2, 2]
     figure, axes = undistorted_axes(scene)
     for index, peak in enumerate(peaks):
         near = ends[orientation_difference_deg(found.orientation_deg, peak) <= scene.options.paper.cluster_deg]

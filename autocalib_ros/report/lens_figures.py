@@ -31,7 +31,7 @@ def undistorted(scene: ReportScene) -> Figure | None:
     if scene.calibration is None or (scene.background is None and not scene.groups()):
         return None
     camera = scene.calibration.camera
-    matrix = rectified_matrix(camera)
+    matrix = rectified_matrix(camera, pixel_aspect=camera.pixel_aspect)
     figure, axes = undistorted_axes(scene)
     for name, label, tracks in scene.groups():
         paths = [in_undistorted(camera, matrix, path) for path in tracks]
@@ -44,7 +44,9 @@ def undistorted_axes(scene: ReportScene) -> tuple[Figure, Axes]:
     """Return a figure with axes in pixel coordinates over the undistorted background."""
     camera, picture = scene.calibrated.camera, scene.background
     if picture is not None:
-        picture = resample(picture, rectification_map(camera, rectified_matrix(camera)))
+        picture = resample(
+            picture, rectification_map(camera, rectified_matrix(camera, pixel_aspect=camera.pixel_aspect))
+        )
     return image_axes(scene, picture=picture)
 
 

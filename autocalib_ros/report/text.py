@@ -11,7 +11,7 @@ from autocalib_ros.config import GateOptions
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.evidence.stillness import drift_limit_px
 from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
-from autocalib_ros.lens.camera import field_of_view_deg
+from autocalib_ros.lens.camera import Camera, field_of_view_deg
 from autocalib_ros.results.calibration import GROUND_DISTANCES_M, Calibration, Refusal
 from autocalib_ros.results.refusals import BY_CODE
 from autocalib_ros.results.statements import SCALE_KINDS
@@ -79,10 +79,19 @@ def _lens_rows(result: Calibration) -> list[TableRow]:
     ]
     return [
         TableRow('focal length', f'{camera.focal_px:.2f} px', _number(sigma.focal_px, 2)),
+        *_pixel_rows(camera),
         TableRow('principal point', f'{cx:.2f}, {cy:.2f} px', point),
         *[row for row, value in zip(coefficients, camera.k, strict=True) if value or row.name == 'k1'],
         TableRow('field of view', f'{across:.1f} x {down:.1f} degrees', note='between the centres of opposite borders'),
     ]
+
+
+def _pixel_rows(camera: Camera) -> list[TableRow]:
+    """Return the row of pixels that are not square."""
+    if camera.pixel_aspect == 1.0:
+        return []
+    note = f'focal length {camera.focal_px:.2f} px down the image, {camera.matrix[0, 0]:.2f} px across it'
+    return [TableRow('pixel aspect', f'{camera.pixel_aspect:.4f}', note=note)]
 
 
 def _ground_rows(result: Calibration) -> list[TableRow]:

@@ -86,6 +86,8 @@ def _parse_calibration(document: Mapping[str, Any]) -> Calibration:
         float(lens['focal_px']),
         _numbers(lens['principal_point_px'], float, 2),
         _numbers(lens['k'], float, 4),
+        float(lens.get('pixel_aspect', 1.0)),
+        float(lens.get('skew', 0.0)),
     )
     grade, pose, reason = str(document['grade']), document['ground_from_camera'], document['refusal']
     return Calibration(
@@ -253,6 +255,8 @@ def _calibration_json(result: Calibration) -> dict[str, Any]:
             'focal_px': camera.focal_px,
             'principal_point_px': list(camera.principal_point_px),
             'k': list(camera.k),
+            'pixel_aspect': camera.pixel_aspect,
+            'skew': camera.skew,
         },
         'camera_info': {'distortion_model': info.distortion_model, 'k': info.k, 'd': info.d, 'r': info.r, 'p': info.p},
         'ground_from_camera': None

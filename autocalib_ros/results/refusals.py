@@ -207,6 +207,58 @@ REFUSALS = (
         '{focal_limit:.1%}), ground normal by {normal_deg:.1f} degrees (limit {normal_limit_deg:.1f})',
     ),
     RefusalCode(
+        code='given_lens',
+        cause='The given lens does not belong to these images: the traffic contradicts it, or its principal point lies '
+        'outside them.',
+        limit='3 % of the focal length, or of the image width for the principal point, or 3 sigma if that is larger',
+        remedy='give the camera_info file of this camera in this resolution, mode and zoom, and check that K belongs '
+        'to the size in the file; or leave the file out',
+        missing='a lens that belongs to the images',
+        message='the traffic contradicts the given lens: its focal length is {given_px:.1f} px, the traffic gives '
+        '{traffic_px:.1f} +- {sigma_px:.1f} px',
+        variants={
+            'outside': (
+                'the principal point of the given lens, ({x_px:.1f}, {y_px:.1f}), lies outside the images of '
+                '{width}x{height}',
+                '',
+            ),
+            'principal_point': (
+                'the traffic contradicts the given lens: its principal point is ({x_px:.1f}, {y_px:.1f}), the traffic '
+                'gives ({traffic_x_px:.1f}, {traffic_y_px:.1f}) +- {sigma_px:.1f} px',
+                '',
+            ),
+            'pixel_aspect': (
+                'the traffic contradicts the given lens: its pixels are {aspect:.3f} times as wide as high, the '
+                'traffic gives {traffic_aspect:.3f} +- {sigma:.3f}',
+                '',
+            ),
+            'angle': (
+                'the traffic contradicts the given lens: it images {given_deg:.1f} degrees from its axis at '
+                '{radius_px:.0f} px, the traffic gives {traffic_deg:.1f} +- {sigma_deg:.1f} degrees there',
+                '',
+            ),
+        },
+    ),
+    RefusalCode(
+        code='pixel_aspect',
+        cause='The pixels may not be square: the traffic cannot tell, or it contradicts square pixels and every usual '
+        'squeeze.',
+        limit='gate.max_sigma_focal_rel, 5 % (one sigma), with the difference that the pixel aspect makes',
+        remedy='set lens.pixel_aspect, the width of a pixel over its height: 1 if the images are not squeezed, else '
+        'the shape of the picture over that of the image (720x576 of a 16:9 picture: 1.422); or wait for traffic '
+        'nearer the borders of the image',
+        missing='the shape of the pixels',
+        message='pixels may be {aspect:.3g} times as wide as high: the traffic measures {measured:.2f} +- '
+        '{sigma:.2f}, and the focal length is +- {focal:.0%} with it (at most {limit:.0%} allowed)',
+        variants={
+            'undecided': (
+                'pixels of these images of {width}x{height} may be {aspect:.3g} times as wide as high: the traffic '
+                'measures {measured:.2f} +- {sigma:.2f}, which does not exclude {other:.3g}',
+                '',
+            )
+        },
+    ),
+    RefusalCode(
         code='one_direction',
         cause='No ground plane: a single road direction leaves the rotation about that road free. Method paper: the '
         'orientation histogram has fewer than two peaks.',

@@ -75,8 +75,8 @@ class SavedCamera:
 
     @property
     def focal_px(self) -> float:
-        """Focal length, the geometric mean of x and y if the pixels are not square."""
-        return float(np.sqrt(self.matrix[0, 0] * self.matrix[1, 1]))
+        """Focal length in pixel heights, as of a `Camera`."""
+        return float(self.matrix[1, 1])
 
     @property
     def principal_point_px(self) -> tuple[float, float]:

@@ -163,11 +163,20 @@ def _still_part(start_s: float, end_s: float, recorded_s: float, cuts: int, zoom
     )
 
 
+def _pixel_aspect(aspect: float, source: str) -> str:
+    return f'pixels {aspect:.4g} times as wide as high ({"given" if source == "given" else "the recording says so"})'
+
+
 ASSUMPTIONS: dict[str, Wording] = {
     'lens_given': 'the lens is given: only the pose was estimated',
     'lens_family': _lens_family,
     'principal_point': _principal_point,
     'focal_given': _focal_given,
+    'pixel_aspect': _pixel_aspect,
+    'squeezed_pixels': 'pixels {aspect:.4g} times as wide as high, a picture of {shape}: the traffic measures '
+    '{measured:.3f} +- {sigma:.3f} (log odds {log_odds:.0f} against square pixels)',
+    'nearly_square_pixels': 'pixels {aspect:.4f} +- {sigma:.4f} times as wide as high: {width}x{height} may be a '
+    'picture of another size, squeezed',
     'parameter_fixed': '{parameter} fixed at its prior: the traffic does not determine it',
     'crossing_angle': _crossing_angle,
     'level_camera': 'plane across one road from a level camera: roll = 0 +- {sigma_deg:g} degrees',
@@ -203,6 +212,10 @@ CHECKS: dict[str, Wording] = {
     'degrees ({sigma_deg:.1f} expected)',
     'markings_and_traffic_road': 'road of the traffic and the markings along it differ by {difference_deg:.1f} degrees '
     '({sigma_deg:.1f} expected)',
+    'given_lens': 'traffic gives a focal length of {traffic_px:.1f} +- {sigma_px:.1f} px, the given lens has '
+    '{given_px:.1f} px',
+    'pixel_aspect': 'traffic measures pixels {measured:.3f} +- {sigma:.3f} times as wide as high, '
+    '{sigmas:.1f} sigma from square: standard deviations cover {aspect:.3g}',
     'pedestrians_kept': 'pedestrian tracks kept in the plane estimate; without them: {without}',
     'distortion_model': 'camera_info uses {model}: at most {error_px:.2g} px off anywhere in the image',
 }

@@ -72,6 +72,16 @@ def test_without_a_detector_a_file_has_no_track_kinds(tmp_path: Path) -> None:
     assert Evidence.load(tmp_path / 'evidence.npz').track_kinds.tolist() == [TrackKind.UNKNOWN] * 2
 
 
+def test_the_shape_of_the_pixels_survives_its_file(tmp_path: Path) -> None:
+    plain = of_kinds(TrackKind.UNKNOWN)
+    squeezed = replace(plain, pixel_aspect=64 / 45)
+    for evidence in (squeezed, plain):
+        evidence.save(tmp_path / 'e.npz')
+        assert Evidence.load(tmp_path / 'e.npz').pixel_aspect == evidence.pixel_aspect
+    with np.load(tmp_path / 'e.npz') as arrays:
+        assert 'pixel_aspect' not in arrays  # as in files of earlier versions
+
+
 @pytest.mark.parametrize('kinds', [[1], [1, 3], [1.0, 2.0]])
 def test_kinds_that_do_not_fit_are_an_input_error(tmp_path: Path, kinds: list) -> None:
     path = tmp_path / 'evidence.npz'

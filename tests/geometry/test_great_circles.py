@@ -8,6 +8,7 @@ import pytest
 from autocalib_ros.estimation.observations.track_set import select_tracks
 from autocalib_ros.geometry.great_circles import (
     Rays,
+    bearing_change,
     fit_circles,
     fit_circles_through,
     orthonormal_basis,
@@ -76,6 +77,25 @@ def test_ray_derivatives_match_finite_differences() -> None:
 
     np.testing.assert_allclose(rays.radial, slope(outward), atol=1e-8)
     np.testing.assert_allclose(rays.tangential, slope(around), atol=1e-8)
+
+
+def test_ray_derivatives_of_other_pixels_are_those_by_u_and_v() -> None:
+    camera = Camera(720, 576, 448.0, (359.5, 287.5), (0.02, 0.0, 0.0, 0.0), pixel_aspect=64 / 45, skew=0.01)
+    place, step = np.array([500.0, 150.0]), 1e-4
+    rays = unproject_rays(camera, place)
+    for found, along in ((rays.radial, [1.0, 0.0]), (rays.tangential, [0.0, 1.0])):
+        ahead, behind = (unproject_rays(camera, place + sign * step * np.array(along)).bearings for sign in (1, -1))
+        np.testing.assert_allclose(found, (ahead - behind) / (2 * step), atol=1e-8)
+    np.testing.assert_allclose(rays.bearings, camera.unproject(place)[0], atol=1e-9)
+    change = bearing_change(
+        Rays(rays.bearings[None], rays.radial[None], rays.tangential[None]),
+        camera,
+        place[None],
+        np.array([[0.01, -0.02]]),
+    )
+    np.testing.assert_allclose(
+        change[0], camera.unproject(place + [0.01, -0.02])[0] - camera.unproject(place)[0], atol=1e-8
+    )
 
 
 def test_rays_stay_finite_at_the_principal_point() -> None:

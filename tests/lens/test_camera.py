@@ -13,6 +13,7 @@ LENSES = {
     'equidistant': Camera(1280, 720, 560.0, (639.5, 359.5)),
     'kannala_brandt': Camera(1280, 720, 560.0, (630.0, 371.0), (0.015, -0.003, 0.001, -0.0002)),
     'narrow': Camera(640, 480, 900.0, (320.0, 240.0), (0.05, 0.0, 0.0, 0.0)),
+    'squeezed': Camera(720, 576, 448.0, (359.5, 287.5), (0.015, -0.003, 0.0, 0.0), pixel_aspect=64 / 45),
     'nearly distortion-free': Camera(1280, 720, 700.0, (640.0, 360.0), (1 / 3, 2 / 15, 17 / 315, 62 / 2835)),
 }
 
@@ -46,6 +47,41 @@ def test_projection_agrees_with_opencv(camera: Camera) -> None:
         points[:, None], np.zeros(3), np.zeros(3), camera.matrix, np.array(camera.k)
     )
     np.testing.assert_allclose(camera.project(points)[0], expected[:, 0], atol=1e-8)
+
+
+def test_skewed_axes_agree_with_opencv() -> None:
+    camera = Camera(1280, 720, 502.5, (640.0, 365.0), (0.01, -0.004, 0.002, 0.0), pixel_aspect=1.005, skew=0.003)
+    points = np.random.default_rng(1).uniform((-2, -1, 1), (2, 1, 3), (100, 3))
+    expected, _ = cv2.fisheye.projectPoints(
+        points[:, None], np.zeros(3), np.zeros(3), camera.matrix, np.array(camera.k), alpha=camera.skew
+    )
+    pixels, _ = camera.project(points)
+    np.testing.assert_allclose(pixels, expected[:, 0], atol=1e-8)
+    seen, _ = camera.unproject(pixels)
+    np.testing.assert_allclose(seen, points / np.linalg.norm(points, axis=1)[:, None], atol=1e-7)
+
+
+def test_a_squeezed_image_of_a_lens_has_its_pixel_aspect() -> None:
+    wide = Camera(1024, 576, 448.0, (511.5, 287.5), (0.015, -0.003, 0.0, 0.0))
+    squeezed, bearings = LENSES['squeezed'], wide.unproject(np.random.default_rng(2).uniform(0, 576, (50, 2)))[0]
+    pixels = wide.project(bearings)[0]
+    columns = (pixels[:, 0] + 0.5) * 720 / 1024 - 0.5  # the border lies half a pixel outside the first column
+    np.testing.assert_allclose(squeezed.project(bearings)[0], np.column_stack([columns, pixels[:, 1]]), atol=1e-9)
+    assert squeezed.matrix[0, 0] == pytest.approx(315.0)
+    assert squeezed.scaled_to(360, 288).matrix[:2, :2] == pytest.approx(np.diag([157.5, 224.0]))
+
+
+def test_undistorted_paths_of_a_squeezed_lens_are_straight() -> None:
+    line = np.array([-1.0, 0.4, 1.0]) + np.linspace(0, 1, 20)[:, None] * [2.0, -0.3, 0.5]
+    flat = LENSES['squeezed'].undistort(LENSES['squeezed'].project(line)[0])
+    steps = flat - flat[0]
+    assert np.abs(steps[:, 0] * steps[-1, 1] - steps[:, 1] * steps[-1, 0]).max() < 1e-5 * np.hypot(*steps[-1]) ** 2
+
+
+@pytest.mark.parametrize('aspect', [0.0, -1.0, np.nan])
+def test_an_impossible_pixel_aspect_is_refused(aspect: float) -> None:
+    with pytest.raises(UsageError, match='pixel aspect'):
+        Camera(1280, 720, 560.0, (639.5, 359.5), pixel_aspect=aspect)
 
 
 def test_projection_is_valid_behind_the_image_plane() -> None:
@@ -95,7 +131,7 @@ def test_an_impossible_focal_length_is_refused(focal: float) -> None:
 
 @pytest.mark.parametrize('size', [(640, 360), (2560, 1440), (1920, 1080)])
 def test_a_scaled_lens_sees_the_same_through_the_same_part_of_the_image(camera, pixels, size):
-    width, height = size if camera.height == 720 else (size[0], size[0] * 3 // 4)
+    width, height = size if camera.height == 720 else (size[0], size[0] * camera.height // camera.width)
     scale = width / camera.width
     before, _ = camera.unproject(pixels)
     # the border of the first pixel, at -0.5, is the border in every size

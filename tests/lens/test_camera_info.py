@@ -13,7 +13,8 @@ import yaml
 from autocalib_ros.errors import InputError
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.lens.camera_info import camera_info, rectified_matrix
-from autocalib_ros.lens.camera_info_yaml import read_camera_info, write_camera_info_yaml
+from autocalib_ros.lens.camera_info_lens import CameraInfoLens
+from autocalib_ros.lens.camera_info_yaml import read_camera_info, read_exact_lens, write_camera_info_yaml
 
 CAMERA = Camera(1280, 720, 560.0, (639.5, 359.5))
 WIDTH, HEIGHT = 1280, 720
@@ -286,30 +287,6 @@ ODD = 'give the file of camera_info_manager'
             '--zero-tangent-dist',
         ),
         (
-            {'camera_matrix': {'data': [*SQUARE[:4], 910.0, *SQUARE[5:]]}},
-            'two focal lengths, 900.0 and 910.0 px',
-            '--fix-aspect-ratio',
-        ),
-        ({'camera_matrix': {'data': [900.0, 5.0, *SQUARE[2:]]}}, 'skewed axes', 'or leave the file out'),
-        (
-            {
-                'camera_matrix': {'data': [*WIDE[:4], 505.0, *WIDE[5:]]},
-                'distortion_model': 'equidistant',
-                'distortion_coefficients': [0.01],
-            },
-            'two focal lengths, 500.0 and 505.0 px',
-            '--fix-aspect-ratio',
-        ),
-        (
-            {
-                'camera_matrix': {'data': [500.0, 5.0, *WIDE[2:]]},
-                'distortion_model': 'equidistant',
-                'distortion_coefficients': [0.01],
-            },
-            'skewed axes',
-            'or leave the file out',
-        ),
-        (
             {'camera_matrix': {'data': [250.0, *WIDE[1:4], 250.0, *WIDE[5:]]}, 'distortion_coefficients': [0.0] * 5},
             'its field of view is too wide',
             'with a fisheye model',
@@ -324,13 +301,45 @@ def test_an_unusable_file_is_reported_with_a_remedy(tmp_path, changes, expected,
 
 
 def test_the_error_of_a_conversion_is_reported_in_pixels(tmp_path):
-    # keeping fx misses by 1 % of the 365 px to the upper border, keeping fy by 1 % of the 647 px to the right one
-    text = complaint(
-        written(tmp_path, document(camera_matrix=[*SQUARE[:4], 909.0, *SQUARE[5:]], distortion_coefficients=[0.0] * 5))
-    )
+    # p1 = 0.005 moves a corner at (x, y) = (0.72, 0.41) by 900 p1 (2 x y, r^2 + 2 y^2) px, of which a shift of the
+    # principal point and the radial terms take up a part
+    text = complaint(written(tmp_path, document(distortion_coefficients=[0.0, 0.0, 0.005, 0.0, 0.0])))
     error_px = float(text.split('differs from this one by up to ')[1].split(' px')[0])
-    assert 1.0 < error_px < 6.47
+    assert 0.5 < error_px < 0.005 * 900 * np.hypot(2 * 0.72 * 0.41, 0.83**2 + 2 * 0.41**2)
     assert 'more than the 0.5 px that the pose allows' in text
+
+
+CALIBRATOR_FISHEYE = {
+    'camera_matrix': {'data': [500.0, 1.5, 640.0, 0.0, 502.5, 365.0, 0.0, 0.0, 1.0]},
+    'distortion_model': 'equidistant',
+    'distortion_coefficients': {'data': [0.01, -0.004, 0.002, -0.0005]},
+}
+"""As the fisheye calibrator of camera_calibration writes it: fx != fy by 0.5 %, and skew."""
+
+
+@pytest.mark.parametrize(
+    'matrix',
+    [CALIBRATOR_FISHEYE['camera_matrix']['data'], [450.0, 0.0, 640.0, 0.0, 640.0, 365.0, 0.0, 0.0, 1.0]],
+    ids=['calibrator', 'squeezed'],
+)
+def test_a_fisheye_file_is_read_and_published_as_it_is(tmp_path, matrix):
+    given = document(**{**CALIBRATOR_FISHEYE, 'camera_matrix': {'data': matrix}})
+    lens = read_camera_info(written(tmp_path, given))
+    published = camera_info(lens)
+    assert published.k == pytest.approx(matrix, rel=1e-15)
+    assert published.d == given['distortion_coefficients']['data']
+    exact, _ = read_exact_lens(written(tmp_path, given))
+    pixels = exact.grid()
+    there, reached = CameraInfoLens(exact).unproject(pixels)
+    np.testing.assert_allclose(lens.unproject(pixels)[0][reached], there[reached], atol=1e-9)
+
+
+def test_a_pinhole_file_with_two_focal_lengths_is_converted_with_its_pixels(tmp_path):
+    given = document(camera_matrix={'data': [*SQUARE[:4], 910.0, *SQUARE[5:]]}, distortion_coefficients=[0.0] * 5)
+    lens = read_camera_info(written(tmp_path, given))
+    assert lens.pixel_aspect == pytest.approx(910 / 900)
+    pixels, _ = lens.project(np.array([[0.3, -0.2, 1.0]]))
+    assert np.hypot(*(pixels[0] - (SQUARE[2] + 270.0, SQUARE[5] - 182.0))) < 0.5  # the error that a conversion may have
 
 
 BOMB = b'a: &a [x, x, x, x, x, x, x, x, x]\n' + b''.join(

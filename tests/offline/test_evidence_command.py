@@ -132,6 +132,8 @@ def test_a_known_lens_is_kept_and_the_pose_is_found(evidence, lens_file):
         'focal_px': 560.0,
         'principal_point_px': [639.5, 359.5],
         'k': [0.0, 0.0, 0.0, 0.0],
+        'pixel_aspect': 1.0,
+        'skew': 0.0,
     }
     x, y, z, w = found['ground_from_camera']['rotation_xyzw']
     up_in_camera = np.array([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)])

@@ -26,6 +26,7 @@ class Drive:
     """A minimal `Source` of generated images."""
 
     name, topic, image_type, camera_frame, duration_s = 'drive', '', '', '', None
+    pixel_aspect = 0.0
 
     def __init__(self, total: int) -> None:
         self.total = total
@@ -56,6 +57,12 @@ def test_one_box_is_no_calibration_and_nothing_was_accepted():
     assert not replayed.result
     assert replayed.accepted_at_s is None
     assert replayed.result.evidence.seconds == pytest.approx(3.9)
+
+
+def test_the_evidence_keeps_what_the_recording_says_of_its_pixels():
+    drive = Drive(5)
+    drive.pixel_aspect = 64 / 45
+    assert replay(drive, Options()).evidence.pixel_aspect == 64 / 45
 
 
 def test_the_same_recording_gives_the_same_evidence():
@@ -126,6 +133,7 @@ class TwoViews:
     """A title card for three seconds, then a road with a box that crosses it, by `Frame`."""
 
     name, topic, image_type, camera_frame, duration_s = 'two views', '', '', '', None
+    pixel_aspect = 0.0
 
     def frames(self):
         noise = np.random.default_rng(1)

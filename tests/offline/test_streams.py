@@ -34,6 +34,7 @@ class Road:
     """A minimal `Source`: three cars on a still road, one fast and near, one small and slow."""
 
     name, topic, image_type, camera_frame = 'road', '', '', ''
+    pixel_aspect = 0.0
 
     def __init__(self, total: int) -> None:
         self.total, self.duration_s = total, total * INTERVAL_NS * 1e-9

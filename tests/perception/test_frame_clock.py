@@ -126,10 +126,10 @@ def test_what_happened_is_told():
 @pytest.mark.parametrize('spread', [0.5, 0.8])
 def test_irregular_intervals_keep_their_stamps(spread):
     random = np.random.default_rng(3)
-    stamps = START_NS + np.cumsum(random.uniform(1 - spread, 1 + spread, 450) * SECOND / 15).astype(np.int64)
+    stamps = START_NS + np.cumsum(random.uniform(1 - spread, 1 + spread, 250) * SECOND / 15).astype(np.int64)
     result = clocked(stamps)
     assert (result.times_ns == stamps[result.images]).mean() > 0.97
-    assert len(result.images) >= 445
+    assert len(result.images) >= 245
 
 
 def test_intervals_that_wander_keep_their_stamps_nearly():

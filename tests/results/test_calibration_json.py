@@ -20,6 +20,7 @@ CASES = {
     'whole': WHOLE,
     'lens only': replace(lens_only(WHOLE), ground_refusal=Reason('no_height', 'none given', 'give it'), paper=None),
     'unit scale': replace(WHOLE, grade='unit_scale', ground=replace(WHOLE.ground, height_m=1.0, metric=False)),
+    'squeezed pixels': replace(WHOLE, camera=replace(WHOLE.camera, pixel_aspect=64 / 45, skew=0.001)),
     'no roads, no deviations': replace(
         lens_only(WHOLE),
         road_directions=np.zeros((0, 3)),
@@ -53,6 +54,12 @@ def test_every_field_survives_to_the_last_bit(name):
         np.testing.assert_array_equal(again.ground.rotation, CASES[name].ground.rotation)
         assert again.ground.rotation_xyzw.tolist() == CASES[name].ground.rotation_xyzw.tolist()
         assert (again.ground.height_m, again.ground.metric) == (CASES[name].ground.height_m, CASES[name].ground.metric)
+
+
+def test_a_file_from_before_pixels_had_a_shape_has_square_ones():
+    document = json.loads(calibration_json(WHOLE))
+    lens = {name: value for name, value in document['camera'].items() if name not in ('pixel_aspect', 'skew')}
+    assert calibration_from_json({**document, 'camera': lens}).camera == WHOLE.camera
 
 
 def broken(**changes) -> dict:

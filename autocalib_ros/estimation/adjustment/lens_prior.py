@@ -32,19 +32,19 @@ unless the option gives pixels. Judgement."""
 LOOSE_PRINCIPAL_POINT_SIGMA_FRACTION = 0.1
 """Standard deviation of the principal point, fraction of the image width, where the evidence identifies it: an image
 may be cropped or digitally zoomed. Judgement."""
-LENS_PARAMETERS = ('focal length', 'principal point x', 'principal point y', 'k1', 'k2')
+LENS_PARAMETERS = ('focal length', 'principal point x', 'principal point y', 'k1', 'k2', 'pixel aspect')
 """Names of the lens parameters, in the order of `LensPrior.sigma`."""
 
 
 @dataclass(frozen=True)
 class LensPrior:
-    """Gaussian prior of a lens family: mean and standard deviations of focal length, principal point, k1 and k2."""
+    """Gaussian prior of a lens family: mean and standard deviations of the `LENS_PARAMETERS`."""
 
     family: str
     centre: Camera
     """Mean; its focal length is used only where `focal_known`."""
     sigma: np.ndarray
-    """Of log f (inf: unknown), cx and cy in pixels, k1, k2; 0: fixed, shape (5,)."""
+    """Of log f (inf: unknown), cx and cy in pixels, k1, k2, log pixel aspect (inf: unknown); 0: fixed, shape (6,)."""
     picture: Picture | None = None
     """The picture whose centre is the mean of the principal point; None if the lens is known."""
 
@@ -60,12 +60,12 @@ class LensPrior:
 
     @cached_property
     def units(self) -> np.ndarray:
-        """Unit of each free parameter: its sigma, or 1 in log f where that is unknown, shape (free,)."""
+        """Unit of each free parameter: its sigma, or 1 (of a logarithm) where that is unknown, shape (free,)."""
         return np.where(np.isfinite(self.sigma), self.sigma, 1.0)[self.free]
 
     def moved(self, camera: Camera, step: np.ndarray) -> Camera:
         """Return the camera moved by a step (free,) in units of the free parameters."""
-        change = np.zeros(5)
+        change = np.zeros(len(LENS_PARAMETERS))
         change[self.free] = step * self.units
         cx, cy = camera.principal_point_px
         k1, k2, k3, k4 = camera.k
@@ -74,13 +74,20 @@ class LensPrior:
             focal_px=camera.focal_px * float(np.exp(np.clip(change[0], -1.0, 1.0))),
             principal_point_px=(float(cx + change[1]), float(cy + change[2])),
             k=(float(k1 + change[3]), float(k2 + change[4]), k3, k4),
+            pixel_aspect=camera.pixel_aspect * float(np.exp(np.clip(change[5], -1.0, 1.0))),
         )
 
     def step(self, camera: Camera, other: Camera) -> np.ndarray:
         """Return the step (free,) by which `moved` takes a camera to another."""
         shift = np.subtract(other.principal_point_px, camera.principal_point_px)
         change = np.array(
-            [np.log(other.focal_px / camera.focal_px), *shift, other.k[0] - camera.k[0], other.k[1] - camera.k[1]]
+            [
+                np.log(other.focal_px / camera.focal_px),
+                *shift,
+                other.k[0] - camera.k[0],
+                other.k[1] - camera.k[1],
+                np.log(other.pixel_aspect / camera.pixel_aspect),
+            ]
         )
         return change[self.free] / self.units
 
@@ -110,10 +117,20 @@ class LensPrior:
         sigma = self.sigma.copy()
         whole_circle = self.picture is not None and self.picture.circle is not None  # neither cropped nor zoomed
         loose_px = 0.0 if whole_circle else LOOSE_PRINCIPAL_POINT_SIGMA_FRACTION * self.centre.width
-        loose = np.maximum(loose_px, sigma[1:3])
+        loose = np.maximum(loose_px * np.array([1.0, self.centre.pixel_aspect]), sigma[1:3])
         sigma[1:3] = np.where(sigma[1:3] > 0, loose, 0.0)
         sigma[4] = max(sigma[4], K2_SIGMA) if sigma[3] > 0 else sigma[4]
         return replace(self, sigma=sigma)
+
+    def with_pixel_aspect(self, aspect: float, sigma: float) -> LensPrior:
+        """Return the prior with another mean of the pixel aspect, and a standard deviation of its logarithm.
+
+        The principal point stays as certain across the image, and down the image in the same lengths on the sensor.
+        """
+        sigmas = self.sigma.copy()
+        sigmas[2] *= aspect / self.centre.pixel_aspect
+        sigmas[5] = sigma
+        return replace(self, centre=replace(self.centre, pixel_aspect=aspect), sigma=sigmas)
 
     def with_free_k2(self) -> LensPrior:
         """Return the prior with k2 free about its mean."""
@@ -124,7 +141,7 @@ class LensPrior:
 
 def known_lens(lens: Camera) -> LensPrior:
     """Return the prior of a known lens: all parameters fixed."""
-    return LensPrior('known', lens, np.zeros(5))
+    return LensPrior('known', lens, np.zeros(len(LENS_PARAMETERS)))
 
 
 def lens_priors(image_size: tuple[int, int], options: JointOptions, picture: Picture | None = None) -> list[LensPrior]:
@@ -147,7 +164,7 @@ def lens_priors(image_size: tuple[int, int], options: JointOptions, picture: Pic
         LensPrior(
             name,
             replace(centre, k=families[name][0]),
-            np.array([log_focal, point_x, point_y, *families[name][1]]),
+            np.array([log_focal, point_x, point_y, *families[name][1], 0.0]),
             picture,
         )
         for name in names

@@ -145,7 +145,7 @@ def _best_starts(segments: RoadSegments, prior: LensPrior) -> list[tuple[Camera,
     """Initial lenses and planes with the lowest annealed cost, distinct."""
     planes = _start_planes()
     found: list[tuple[float, Camera, np.ndarray]] = []
-    diagonal = np.hypot(prior.centre.width, prior.centre.height)
+    diagonal = prior.centre.diagonal_px
     for focal in [prior.centre.focal_px] if prior.focal_known else diagonal * GRID_FOCAL_DIAGONALS:
         camera = prior.start(focal)
         costs = annealed_costs(segments, camera, planes, ANNEALING_WIDTHS_RAD[0])

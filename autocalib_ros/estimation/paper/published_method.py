@@ -48,6 +48,7 @@ def solve_paper(
             path_ratio=paper.max_path_ratio,
         )
     camera = Camera(*evidence.image_size, intrinsics.report.focal_px, evidence.picture.lens_centre_px)
+    camera = replace(camera, pixel_aspect=options.lens.pixel_aspect or evidence.pixel_aspect or 1.0)
     found = segment_orientations(camera, evidence.segments_px, options.paper)
     figures = replace(figures, orientation_histogram=found.histogram, orientation_peaks_deg=found.peaks_deg)
     result = Calibration(

@@ -25,7 +25,7 @@ class SegmentOrientations:
     """Segments in the undistorted image and their orientations."""
 
     ends_px: np.ndarray
-    """End points relative to the principal point, shape (n, 2, 2)."""
+    """End points relative to the principal point, in pixel heights, shape (n, 2, 2)."""
     orientation_deg: np.ndarray
     """0 to 180, shape (n,)."""
     histogram: np.ndarray
@@ -36,7 +36,7 @@ class SegmentOrientations:
 
 def segment_orientations(camera: Camera, segments_px: np.ndarray, options: PaperOptions) -> SegmentOrientations:
     """Undistort segments x0, y0, x1, y1 (n, 4) and compute their orientation histogram: steps 7 and 8 of the paper."""
-    ends = camera.undistort(segments_px.reshape(-1, 2, 2)) - np.asarray(camera.principal_point_px)
+    ends = camera.offsets(camera.undistort(segments_px.reshape(-1, 2, 2)))
     ends = ends[np.isfinite(ends).all(axis=(1, 2))]
     step = ends[:, 1] - ends[:, 0]
     orientation = np.degrees(np.arctan2(step[:, 1], step[:, 0])) % 180.0

@@ -12,6 +12,7 @@ from autocalib_ros.estimation.adjustment.model_selection import MODEL_SELECTION_
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig, RoadDirections, initial_state
 from autocalib_ros.estimation.observations.track_set import TrackSet
 from autocalib_ros.estimation.straight.consensus import CONSENSUS_INLIER_PX, consensus_directions
+from autocalib_ros.lens.camera import Camera
 
 FOCAL_TRIALS = 14
 """Trial focal lengths: steps of about 17 %, within the basin of convergence of the bundle adjustment."""
@@ -51,9 +52,7 @@ def _from_trials(
 ) -> tuple[list[Adjustment], np.ndarray]:
     """Return adjusted solutions of the best trials, and the consensus scores of all trials, shape (trials,)."""
     prior = config.prior
-    size = (prior.centre.width, prior.centre.height)
-    centre = prior.centre.principal_point_px
-    trials = [prior.centre.focal_px] if prior.focal_known else focal_trials(subsample, size, centre, FOCAL_TRIALS)
+    trials = [prior.centre.focal_px] if prior.focal_known else focal_trials(subsample, prior.centre, FOCAL_TRIALS)
     found = [consensus_directions(prior.start(trial), subsample, generator, inlier_px=inlier_px) for trial in trials]
     starts = [initial_state(prior.start(trials[index]), found[index]) for index in _peaks(found)[:MAX_STARTS]]
     fits = [adjust(start, subsample, config) for start in starts]
@@ -84,7 +83,7 @@ def select_lens_family(fit: Adjustment, priors: list[LensPrior], subsample: Trac
 def _solve_in_family(fit: Adjustment, prior: LensPrior, subsample: TrackSet) -> Adjustment:
     """Adjust with the prior of another lens family, from the lens that agrees at `MATCHED_RADIUS_DIAGONALS`."""
     camera = fit.state.camera
-    angle, _ = camera.angle(np.array(MATCHED_RADIUS_DIAGONALS * np.hypot(camera.width, camera.height)))
+    angle, _ = camera.angle(np.array(MATCHED_RADIUS_DIAGONALS * camera.diagonal_px))
     focal = camera.radius(angle) / replace(prior.centre, focal_px=1.0).radius(angle)
     start = replace(fit.state, camera=prior.start(float(focal)))
     return adjust(start, subsample, replace(fit.problem.config, prior=prior))
@@ -98,10 +97,10 @@ def _peaks(found: list[RoadDirections]) -> list[int]:
     return sorted((int(index) for index in peaks), key=lambda index: -scores[index])
 
 
-def focal_trials(tracks: TrackSet, image_size: tuple[int, int], centre: tuple[float, float], count: int) -> np.ndarray:
-    """Return `count` trial focal lengths in geometric progression for the principal point `centre`.
+def focal_trials(tracks: TrackSet, centre: Camera, count: int) -> np.ndarray:
+    """Return `count` trial focal lengths in geometric progression, about the principal point of a lens.
 
     From all tracked points within 120 degrees of the axis to twice the image diagonal.
     """
-    farthest = np.hypot(*(tracks.pixels.reshape(-1, 2) - centre).T).max()
-    return np.geomspace(farthest / np.radians(120.0), 2.0 * np.hypot(*image_size), count)
+    farthest = np.hypot(*centre.offsets(tracks.pixels.reshape(-1, 2)).T).max()
+    return np.geomspace(farthest / np.radians(120.0), 2.0 * centre.diagonal_px, count)

@@ -61,8 +61,7 @@ def fit_turning_traffic(tracks: TrackSet, windows: TwoFrameWindows, config: Adju
     few = replace(config, windows=windows.balanced_subset(MAX_START_WINDOWS))
     if len(np.unique(few.windows.bodies)) < MIN_TURNING_VEHICLES:
         return None
-    centre = config.prior.centre
-    diagonal = np.hypot(centre.width, centre.height)
+    diagonal = config.prior.centre.diagonal_px
     lenses = [config.prior.start(diagonal * ratio) for ratio in START_FOCAL_DIAGONALS]
     starts = [
         AdjustmentState(lens, _level_plane(tilt), np.zeros(0))

@@ -152,7 +152,7 @@ def _turning_traffic_reason(fit: Adjustment, fraction: float, limit: float) -> R
 def _check_focal_length(fit: Adjustment, gate: GateOptions, *, turned: bool) -> Reason | None:
     camera, prior = fit.state.camera, fit.problem.config.prior
     sigma = fit.focal_sigma
-    diagonals = camera.focal_px / np.hypot(camera.width, camera.height)
+    diagonals = camera.focal_px / camera.diagonal_px
     too_long = diagonals > MAX_FOCAL_DIAGONALS and not prior.focal_known
     # without distortion only an angle between roads determines the focal length, and an angle that was measured with
     # that focal length proves nothing

@@ -92,4 +92,6 @@ def lens_assumptions(fit: Adjustment, fixed: tuple[str, ...]) -> tuple[Statement
     if prior.focal_known:
         focal_px = prior.centre.focal_px
         statements.append(assumption('focal_given', focal_px=focal_px, sigma_px=prior.sigma[0] * focal_px))
-    return (*statements, *(assumption('parameter_fixed', parameter=name) for name in fixed))
+    # what is taken of the pixels has a statement of its own
+    names = [name for name in fixed if name != 'pixel aspect']
+    return (*statements, *(assumption('parameter_fixed', parameter=name) for name in names))

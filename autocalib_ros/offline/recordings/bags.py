@@ -51,6 +51,7 @@ class BagSource:
             first = self._peek(readers)
             recording_s = (max(reader.end_time for reader in readers) - self._first_ns) * 1e-9
         self.camera_frame = first.header.frame_id.lstrip('/') if first else ''
+        self.pixel_aspect = 0.0
         duration_s = window.overlap_s(recording_s)
         self.duration_s: float | None = duration_s
         if any(is_truncated(part) for part in _recording_files(path)):

@@ -78,6 +78,8 @@ class Source(Protocol):
     """Approximate number of frames in the window; None if unknown."""
     duration_s: float | None
     """Approximate duration of the window in seconds; None if unknown."""
+    pixel_aspect: float
+    """Width of a pixel over its height, as the recording says; 0 if it says nothing."""
 
     def frames(self) -> Iterator[Frame]:
         """Yield the decoded images of the window in order of time; InputError without an image."""

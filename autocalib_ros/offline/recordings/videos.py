@@ -16,6 +16,8 @@ LOG = logging.getLogger(__name__)
 
 PLAUSIBLE_FPS = (0.01, 1000.0)
 FALLBACK_FPS = 25.0
+PLAUSIBLE_PIXEL_ASPECT = (0.2, 5.0)
+"""Width of a pixel over its height; the usual squeezes lie between 1/2 and 2, and other values come from damage."""
 MIN_DECODED_FRACTION = 0.95
 """Fraction of the frames declared in the header below which a video counts as truncated; some containers estimate
 their number only."""
@@ -33,6 +35,11 @@ class VideoSource:
             fps, declared_frames = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
             if not capture.grab():
                 raise InputError(f'{self.name} has no frame that can be decoded')
+            self.pixel_aspect = _pixel_aspect(capture)
+        if self.pixel_aspect:
+            LOG.warning(
+                '%s says that its pixels are %.4g times as wide as high, which is used', self.name, self.pixel_aspect
+            )
         if not PLAUSIBLE_FPS[0] <= fps <= PLAUSIBLE_FPS[1]:
             LOG.warning('%s has no valid frame rate; %g frames/s assumed', self.name, FALLBACK_FPS)
             fps = FALLBACK_FPS
@@ -84,6 +91,18 @@ class VideoSource:
             yield capture
         finally:
             capture.release()
+
+
+def _pixel_aspect(capture: cv2.VideoCapture) -> float:
+    """Return the sample aspect ratio that a video says; 0 if it says none.
+
+    1:1 counts as none: many recorders write it into files of squeezed pictures.
+    """
+    across, down = capture.get(cv2.CAP_PROP_SAR_NUM), capture.get(cv2.CAP_PROP_SAR_DEN)
+    if not (across > 0 and down > 0) or across == down:
+        return 0.0
+    aspect = across / down
+    return aspect if PLAUSIBLE_PIXEL_ASPECT[0] <= aspect <= PLAUSIBLE_PIXEL_ASPECT[1] else 0.0
 
 
 class _FrameClock:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
+import subprocess
+
 import numpy as np
 import pytest
 
@@ -19,6 +22,18 @@ def test_a_video_gives_its_frames_and_times(tmp_path, write_video, suffix):
     # Matroska keeps times in whole milliseconds
     assert np.allclose([frame.stamp_ns * 1e-9 for frame in frames], np.arange(30) / 10, atol=1.1e-3)
     assert source.duration_s == pytest.approx(3.0, abs=0.2)
+
+
+@pytest.mark.skipif(shutil.which('ffmpeg') is None, reason='ffmpeg writes the sample aspect ratio')
+@pytest.mark.parametrize(('ratio', 'expected'), [('64/45', 64 / 45), ('1/1', 0.0), ('10/11', 10 / 11)])
+def test_a_video_says_the_shape_of_its_pixels(tmp_path, write_video, caplog, ratio, expected):
+    plain, squeezed = write_video(tmp_path / 'plain.mp4'), tmp_path / 'squeezed.mp4'
+    filters = ['-vf', f'setsar={ratio}', '-c:v', 'mpeg4']
+    subprocess.run(['ffmpeg', '-v', 'error', '-i', plain, *filters, squeezed], check=True)
+    assert open_source(plain).pixel_aspect == 0.0
+    assert open_source(squeezed).pixel_aspect == pytest.approx(expected)
+    # 1:1 stands in many files of squeezed pictures, so it is not told
+    assert ('times as wide as high' in caplog.text) == (expected > 0)
 
 
 def test_the_window_of_a_video_counts_from_its_first_frame(tmp_path, write_video):

@@ -1,0 +1,92 @@
+"""Squeezed pixels, told or found by the traffic."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from squeezed_evidence import squeezed
+
+from autocalib_ros.config import LensOptions, Options
+from autocalib_ros.evidence.snapshot import Evidence
+from autocalib_ros.offline.synthetic.junction import Junction
+from autocalib_ros.results.calibration import Calibration, Refusal
+from solved_once import evidence_once, solve_once
+
+GOLDEN = Path(__file__).parents[2] / 'golden'
+OPTIONS = Options(camera_height=8.0)
+FOCAL_PX = 589.7
+"""Of the two roads in images of 1280x720."""
+
+
+@pytest.fixture(scope='module')
+def two_roads() -> Evidence:
+    return Evidence.load(GOLDEN / 'two_roads.npz')
+
+
+def kinds(result: Calibration | Refusal) -> set[str]:
+    assert isinstance(result, Calibration), result.message
+    return {statement.kind for statement in (*result.assumptions, *result.checks)}
+
+
+def test_square_pixels_are_not_called_squeezed(two_roads: Evidence) -> None:
+    result = solve_once(two_roads, OPTIONS)
+    assert result.camera.pixel_aspect == 1.0
+    assert not kinds(result) & {'pixel_aspect', 'squeezed_pixels', 'nearly_square_pixels'}
+
+
+def test_a_squeezed_picture_is_found_by_its_traffic_and_said() -> None:
+    junction = Junction(vehicles=120)
+    result = solve_once(squeezed(evidence_once(junction), 720, 576), OPTIONS)
+    assert 'squeezed_pixels' in kinds(result)
+    camera, sigma = result.camera, result.stddev.focal_px
+    # CameraInfo is of the images as they are delivered
+    assert abs(camera.matrix[1, 1] - 448.0) < 3 * sigma
+    assert abs(camera.matrix[0, 0] - 315.0) < 3 * sigma
+    assert camera.principal_point_px == pytest.approx((359.5, 287.5), abs=3 * max(result.stddev.principal_point_px))
+    assert result.ground.normal_in_camera == pytest.approx(junction.normal_in_camera, abs=0.01)
+
+
+@pytest.mark.parametrize('told', ['recording', 'given'])
+def test_a_told_aspect_gives_the_calibration_of_the_picture_before_it_was_squeezed(
+    two_roads: Evidence, told: str
+) -> None:
+    plain, pal = solve_once(two_roads, OPTIONS), squeezed(two_roads, 720, 576)
+    if told == 'recording':
+        result = solve_once(replace(pal, pixel_aspect=64 / 45), OPTIONS)
+    else:
+        result = solve_once(pal, replace(OPTIONS, lens=LensOptions(pixel_aspect=64 / 45)))
+    said = next(statement for statement in result.assumptions if statement.kind == 'pixel_aspect')
+    assert (said.values['aspect'], said.values['source']) == (64 / 45, told)
+    # the noise of a tracked point is taken as round in other pixels, which moves the solution by less than its sigma
+    assert result.camera.focal_px == pytest.approx(plain.camera.focal_px * 0.8, abs=0.8 * plain.stddev.focal_px)
+    assert result.ground.normal_in_camera == pytest.approx(plain.ground.normal_in_camera, abs=0.01)
+    assert result.ground.height_m == pytest.approx(8.0)
+
+
+def test_a_rounded_size_widens_the_focal_length_by_the_squeeze(two_roads: Evidence) -> None:
+    plain, rounded = solve_once(two_roads, OPTIONS), solve_once(squeezed(two_roads, 1280, 704), OPTIONS)
+    assert 'nearly_square_pixels' in kinds(rounded)
+    across, down = rounded.camera.matrix[0, 0], rounded.camera.matrix[1, 1]
+    assert rounded.stddev.focal_px > 2 * plain.stddev.focal_px
+    assert abs(across - FOCAL_PX) < 3 * rounded.stddev.focal_px
+    assert abs(down - FOCAL_PX * 704 / 720) < 3 * rounded.stddev.focal_px
+
+
+def test_an_undecided_aspect_of_a_squeezed_size_is_refused_with_the_option_to_set() -> None:
+    skew = Evidence.load(GOLDEN / 'skew.npz')
+    result = solve_once(squeezed(skew, 720, 576), OPTIONS)
+    assert isinstance(result, Refusal)
+    assert result.code == 'pixel_aspect'
+    assert 'lens.pixel_aspect' in result.remedy
+    assert '1.42' in result.message and '1.07' in result.message
+
+
+def test_the_published_method_takes_a_told_aspect(two_roads: Evidence) -> None:
+    plain = solve_once(two_roads, replace(OPTIONS, method='paper'))
+    pal = replace(squeezed(two_roads, 720, 576), pixel_aspect=64 / 45)
+    result = solve_once(pal, replace(OPTIONS, method='paper'))
+    # its focal lengths are 300 steps up to the diagonal
+    assert result.camera.matrix[1, 1] == pytest.approx(0.8 * plain.camera.focal_px, rel=0.02)
+    assert result.camera.matrix[0, 0] == pytest.approx(720 / 1280 * plain.camera.focal_px, rel=0.02)

@@ -1,0 +1,84 @@
+"""A given lens that is of these images, and such that are not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from autocalib_ros.config import Options
+from autocalib_ros.evidence.snapshot import Evidence
+from autocalib_ros.lens.camera import Camera
+from autocalib_ros.results.calibration import Calibration, Refusal
+from solved_once import solve_once
+
+GOLDEN = Path(__file__).parents[1] / 'golden'
+OPTIONS = Options(camera_height=8.0)
+
+
+@pytest.fixture(scope='module')
+def two_roads() -> Evidence:
+    return Evidence.load(GOLDEN / 'two_roads.npz')
+
+
+@pytest.fixture(scope='module')
+def right(two_roads: Evidence) -> Camera:
+    """Return the lens that the traffic itself gives."""
+    free = solve_once(two_roads, OPTIONS)
+    assert isinstance(free, Calibration)
+    return free.camera
+
+
+def refused(evidence: Evidence, lens: Camera) -> Refusal:
+    result = solve_once(evidence, OPTIONS, lens=lens)
+    assert isinstance(result, Refusal)
+    assert result.code == 'given_lens'
+    return result
+
+
+def test_the_right_lens_is_taken_with_full_grade(two_roads: Evidence, right: Camera) -> None:
+    result = solve_once(two_roads, OPTIONS, lens=right)
+    assert isinstance(result, Calibration)
+    assert (result.grade, result.camera) == ('full', right)
+
+
+def test_a_lens_with_skew_and_two_focal_lengths_is_published_as_it_is(two_roads: Evidence, right: Camera) -> None:
+    exact = replace(right, pixel_aspect=1.004, skew=0.002)
+    result = solve_once(two_roads, OPTIONS, lens=exact)
+    assert isinstance(result, Calibration)
+    assert result.camera == exact
+    assert result.camera_info.k == pytest.approx(exact.matrix.ravel().tolist())
+
+
+@pytest.mark.parametrize('factor', [0.5, 0.9, 1.1, 4 / 3, 2.0], ids=['half', 'short', 'long', 'crop', 'double'])
+def test_a_focal_length_of_another_mode_is_refused_with_both_numbers(
+    two_roads: Evidence, right: Camera, factor: float
+) -> None:
+    given = replace(right, focal_px=factor * right.focal_px)
+    found = refused(two_roads, given)
+    assert found.values['given_px'] == pytest.approx(given.focal_px)
+    assert found.values['traffic_px'] == pytest.approx(right.focal_px, rel=0.01)
+    assert f'{given.focal_px:.1f} px' in found.message and f'{right.focal_px:.1f} +-' in found.message
+
+
+def test_a_matrix_that_was_not_scaled_to_the_images_is_refused(two_roads: Evidence, right: Camera) -> None:
+    found = refused(two_roads, replace(right, focal_px=2 * right.focal_px, principal_point_px=(1279.5, 719.5)))
+    assert found.values['traffic_px'] == pytest.approx(right.focal_px, rel=0.01)
+
+
+def test_a_principal_point_outside_the_images_is_refused_at_once(two_roads: Evidence, right: Camera) -> None:
+    empty = two_roads.select_tracks(two_roads.track_vehicles[:0])
+    found = refused(empty, replace(right, principal_point_px=(1744.0, 597.0)))
+    assert '(1744.0, 597.0)' in found.message and '1280x720' in found.message
+
+
+def test_a_wrong_principal_point_is_refused_with_both_points(two_roads: Evidence, right: Camera) -> None:
+    x, y = right.principal_point_px
+    found = refused(two_roads, replace(right, principal_point_px=(x, y + 120.0)))
+    assert found.values['y_px'] == pytest.approx(y + 120.0)
+    assert found.values['traffic_y_px'] == pytest.approx(y, abs=20.0)
+
+
+def test_a_lens_of_another_family_is_refused(two_roads: Evidence, right: Camera) -> None:
+    refused(two_roads, replace(right, k=(1 / 3, 2 / 15, 17 / 315, 62 / 2835)))
