@@ -130,9 +130,8 @@ def find_solution(
         observations = Observations(tracks, windows, instants, priors, gate, evidence, generator)
         return _estimate(observations, AdjustmentConfig(priors[0], joint, height_m, crossing_rad))
 
-    families = lens_priors(evidence.image_size, joint, evidence.picture)
-
     def estimate_with_aspect(aspect: float, sigma: float) -> Solution | Reason:
+        families = lens_priors(evidence.image_size, joint, evidence.picture, aspect)
         return estimate_under([prior.with_pixel_aspect(aspect, sigma) for prior in families])
 
     if lens is not None:

@@ -144,13 +144,15 @@ def known_lens(lens: Camera) -> LensPrior:
     return LensPrior('known', lens, np.zeros(len(LENS_PARAMETERS)))
 
 
-def lens_priors(image_size: tuple[int, int], options: JointOptions, picture: Picture | None = None) -> list[LensPrior]:
+def lens_priors(
+    image_size: tuple[int, int], options: JointOptions, picture: Picture | None = None, pixel_aspect: float = 1.0
+) -> list[LensPrior]:
     """Return the priors of the lens families to choose from, the most common one first.
 
     The principal point is that of the picture inside the images, which by default fills them.
     """
     picture = picture or Picture.whole(image_size)
-    point_x, point_y = _principal_point_sigma_px(picture, options.principal_point_sigma_px)
+    point_x, point_y = _principal_point_sigma_px(picture, options.principal_point_sigma_px, pixel_aspect)
     focal = options.focal_prior_px
     log_focal = options.focal_sigma_px / focal if focal > 0 else np.inf
     families = {
@@ -159,7 +161,8 @@ def lens_priors(image_size: tuple[int, int], options: JointOptions, picture: Pic
         'kannala_brandt': (KANNALA_BRANDT, KANNALA_BRANDT_SIGMA),
     }
     names = list(families) if options.lens_prior == 'auto' else [options.lens_prior]
-    centre = Camera(*image_size, focal if focal > 0 else float(image_size[0]), picture.lens_centre_px)
+    start_px = focal if focal > 0 else float(image_size[0])
+    centre = Camera(*image_size, start_px, picture.lens_centre_px, pixel_aspect=pixel_aspect)
     return [
         LensPrior(
             name,
@@ -171,13 +174,14 @@ def lens_priors(image_size: tuple[int, int], options: JointOptions, picture: Pic
     ]
 
 
-def _principal_point_sigma_px(picture: Picture, given_px: float) -> tuple[float, float]:
+def _principal_point_sigma_px(picture: Picture, given_px: float, pixel_aspect: float) -> tuple[float, float]:
     """Return the standard deviations x and y of the principal point; one that is given (not negative) holds as it is.
 
-    A picture that looks cut adds the distance that its centre may have from that of the lens.
+    A picture that looks cut, in square pixels, adds the distance that its centre may have from that of the lens.
     """
     if given_px >= 0:
-        return given_px, given_px
+        return given_px, given_px * pixel_aspect
     own = PRINCIPAL_POINT_SIGMA_FRACTION * (picture.size[0] if picture.circle is None else picture.image_size[0])
-    across, down = picture.centre_sigma_px
-    return float(np.hypot(own, across)), float(np.hypot(own, down))
+    width, height = picture.image_size
+    across, down = picture.scaled(pixel_aspect, 1.0, (round(width * pixel_aspect), height)).centre_sigma_px
+    return float(np.hypot(own, across / pixel_aspect)), float(np.hypot(own * pixel_aspect, down))

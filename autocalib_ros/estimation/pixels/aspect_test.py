@@ -162,6 +162,8 @@ def _clear_other(
 ) -> Solution | Reason | None:
     """Return the solution with other pixels that traffic and lane markings show clearly; None if there is none.
 
+    It rests on an assumption, and has the grade of one: the shape of the picture is taken from the usual ones.
+
     A reason if there is one that they do not tell from another, in images of a size that is usually squeezed or with
     lane markings that agree with it alone. Pixels that a first measurement excludes are not tried; `confirmed`: lane
     markings agree with the expected ones.
@@ -184,7 +186,7 @@ def _clear_other(
         likeliest = min((other for other in odds if other != aspect), key=odds.__getitem__)
         if odds[likeliest] > CLEAR_NATS:
             statement = _squeezed(shape, found, measured, odds[expected])
-            shown.append(replace(found, assumptions=(*found.assumptions, statement)))
+            shown.append(replace(found, reduced=True, assumptions=(*found.assumptions, statement)))
         elif hypotheses.doubtful or (_is_confirmed(found) and not confirmed):
             undecided = _undecided(hypotheses, aspect, measured, likeliest)
     return shown[0] if len(shown) == 1 else undecided
