@@ -232,6 +232,10 @@ class LensOptions(_Validated):
         high=10,
     )
 
+    def pixel_aspect_or(self, recorded: float) -> float:
+        """Return the pixel aspect of the option, else that of the recording (0: it says nothing), else 1."""
+        return self.pixel_aspect or recorded or 1.0
+
 
 @dataclass(frozen=True, kw_only=True)
 class JointOptions(_Validated):

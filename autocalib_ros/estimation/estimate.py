@@ -14,7 +14,7 @@ from autocalib_ros.estimation.observations.two_frame_windows import ResampledTra
 from autocalib_ros.estimation.paper.intrinsics import paper_intrinsics
 from autocalib_ros.estimation.paper.published_method import solve_paper
 from autocalib_ros.estimation.pixels.aspect_hypotheses import AspectHypotheses
-from autocalib_ros.estimation.pixels.aspect_test import choose_aspect, with_told_aspect
+from autocalib_ros.estimation.pixels.aspect_test import choose_aspect, with_stated_aspect
 from autocalib_ros.estimation.pixels.square_pixels import with_square_pixels
 from autocalib_ros.estimation.publish import (
     ResultDraft,
@@ -47,7 +47,7 @@ def solve(evidence: Evidence, options: Options, *, lens: Camera | None = None) -
     """
     options.scale.require_inside(*evidence.image_size)
     # The published intrinsic stage: part of method paper, a comparison for method joint.
-    aspect = options.lens.pixel_aspect or evidence.pixel_aspect or 1.0
+    aspect = options.lens.pixel_aspect_or(evidence.pixel_aspect)
     draft = ResultDraft.begin(evidence, options, paper_intrinsics(with_square_pixels(evidence, aspect), options.paper))
     # A given lens that cannot be of these images is not tried.
     impossible = None if lens is None or options.method == 'paper' else check_principal_point(lens)
@@ -140,12 +140,12 @@ def find_solution(
         )
     given = options.lens.pixel_aspect
     if given > 0.0:
-        return with_told_aspect(estimate_with_aspect(given, 0.0), given, 'given')
+        return with_stated_aspect(estimate_with_aspect(given, 0.0), given, 'given')
     hypotheses = AspectHypotheses.of(evidence.image_size)
     if evidence.pixel_aspect > 0.0:
-        hypotheses = hypotheses.told(evidence.pixel_aspect)
+        hypotheses = hypotheses.expecting(evidence.pixel_aspect)
     found = choose_aspect(hypotheses, estimate_with_aspect, tracks, gate)
-    return with_told_aspect(found, evidence.pixel_aspect, 'recording')
+    return with_stated_aspect(found, evidence.pixel_aspect, 'recording')
 
 
 def _estimate(observations: Observations, config: AdjustmentConfig) -> Solution | Reason:

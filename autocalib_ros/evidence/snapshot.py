@@ -152,11 +152,6 @@ class Evidence:
         """Time between the first and the newest image."""
         return (self.newest_stamp_ns - self.first_stamp_ns) * 1e-9
 
-    @property
-    def sway_px(self) -> float:
-        """Compensated sway about the rest position: 95 % of the images lie within it, pixels; 0: none."""
-        return self.stillness.sway_px
-
     def track(self, index: int) -> Track:
         """Return one track."""
         part = slice(self.track_starts[index], self.track_starts[index + 1])

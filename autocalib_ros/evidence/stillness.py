@@ -22,10 +22,10 @@ MAX_SWAY_FRACTION = 0.0035
 120 degrees (focal length 1.87 to 0.29 widths), so that this is 0.1 to 0.7 degrees; masts sway by up to half a degree,
 hands by more than one."""
 MIN_STILL_PART_S = 10.0
-"""Shortest still part of a recording with other parts, seconds: two periods of the slowest sway (0.2 Hz). In a shorter
-one a camera that stands cannot be told from one that just pauses."""
-MIN_TOLD_SWAY_PX = 0.25
-"""Least sway that is told and compensated, pixels: tracked points scatter by 0.3 px."""
+"""Shortest still part of a recording with other parts, seconds: two periods of the slowest sway (0.2 Hz). A shorter
+one does not distinguish a fixed camera from one that pauses."""
+MIN_REPORTED_SWAY_PX = 0.25
+"""Least sway that is reported and compensated, pixels: tracked points scatter by 0.3 px."""
 
 
 def drift_limit_px(image_width: int, gate: GateOptions) -> float:

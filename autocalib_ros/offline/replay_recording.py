@@ -95,8 +95,9 @@ def replay(
         raise InputError(f'{source.name} has no images')
     if evidence.stillness.start_s != part_start_s:
         accepted_at_s, moments = None, ()
-    if calibrator.clock().is_uneven:
-        LOG.warning('%s: uneven time stamps, regularised: %s', source.name, calibrator.clock())
+    clock = calibrator.clock()
+    if clock.is_uneven:
+        LOG.warning('%s: uneven time stamps, regularised: %s', source.name, clock)
     report_progress(count, 'solving')
     result = solve(evidence, options, lens=scaled_lens)
     report_progress(count, 'calibrated' if result else 'refused')
@@ -111,7 +112,7 @@ def replay(
         repeated=calibrator.repeated,
         options=options,
         moments=append_snapshot(moments, result),
-        clock=calibrator.clock(),
+        clock=clock,
     )
 
 

@@ -138,10 +138,6 @@ class DriftMonitor:
         """Take other limits from the next image on."""
         self._limits = limits
 
-    def ignore(self, ignored: np.ndarray | None) -> None:
-        """Take another mask (H, W) of ignored pixels, for the references from now on."""
-        self._ignored = ignored
-
     def _reduced(self, grey: np.ndarray) -> np.ndarray:
         self._factor = max(1.0, grey.shape[1] / WIDTH_PX)
         if self._factor == 1.0:

@@ -107,13 +107,14 @@ class PointTracker:
         self._excluded = excluded
 
     def follow(self, grey: np.ndarray, time_s: float) -> list[Track]:
-        """Track all points into a new grey image (H, W); return the tracks that ended.
-
-        A repeat of the last image is left out.
-        """
+        """Track all points into a grey image (H, W) unless it is a repeat; return the tracks that ended."""
         if self.is_repeat(grey, time_s):
             self.skip_repeat()
             return []
+        return self.follow_new(grey, time_s)
+
+    def follow_new(self, grey: np.ndarray, time_s: float) -> list[Track]:
+        """Track all points into a grey image (H, W) that is no repeat; return the tracks that ended."""
         finished: list[Track] = []
         intervals, self._repeats = self._repeats + 1, 0
         if self._grey is not None:

@@ -10,7 +10,7 @@ import numpy as np
 from autocalib_ros.config import GateOptions, Options
 from autocalib_ros.evidence.picture import Picture
 from autocalib_ros.evidence.snapshot import Edges, Outlines, Segments, Track, TrackKind
-from autocalib_ros.evidence.stillness import MIN_TOLD_SWAY_PX, Stillness, drift_limit_px, sway_limit_px
+from autocalib_ros.evidence.stillness import MIN_REPORTED_SWAY_PX, Stillness, drift_limit_px, sway_limit_px
 from autocalib_ros.perception.background import Background, median
 from autocalib_ros.perception.detector.detector import VehicleDetector
 from autocalib_ros.perception.detector_tracks import DetectorTracks
@@ -108,7 +108,7 @@ class Observer:
         self._scene.background.update(image, time_s)
         if self._scene.picture_area.update(self._scene.background):
             self._exclude_no_picture()
-        tracks = [self._to_full_size(track) for track in (*ended, *self._tracker.follow(grey, time_s))]
+        tracks = [self._to_full_size(track) for track in (*ended, *self._tracker.follow_new(grey, time_s))]
         detect = self._frames % self._options.tracking.detect_every == 0
         if detect or self._frames % MOTION_MASK_PERIOD == 0:
             self._motion.update(grey, time_s)
@@ -125,7 +125,7 @@ class Observer:
     def _drift_limits(self, gate: GateOptions) -> DriftLimits:
         """Return what counts as standing still, in pixels of the tracked image."""
         width = self._image_size[0]
-        limits = (drift_limit_px(width, gate), sway_limit_px(width, gate), MIN_TOLD_SWAY_PX)
+        limits = (drift_limit_px(width, gate), sway_limit_px(width, gate), MIN_REPORTED_SWAY_PX)
         return DriftLimits(*(limit / self._reduction for limit in limits))
 
     def _new_scene(self) -> _Scene:

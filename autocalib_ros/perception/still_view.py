@@ -27,8 +27,8 @@ MIN_SWAY_SAMPLES = 8
 """Least offsets from which sway is judged: a third of a second of video."""
 SWAY_QUANTILE = 0.8
 """Share of the offsets within the amplitude of sway; a sine spends a fifth of its time beyond 95 % of its amplitude."""
-TOLD_QUANTILE = 0.95
-"""Share of the images within the sway that is told."""
+REPORTED_QUANTILE = 0.95
+"""Share of the images within the sway that is reported."""
 SWAY_ENDS = 0.7
 """Fraction of the least sway below which compensation ends: it does not flicker. Judgement."""
 SWAY_SIGMAS = 4.0
@@ -221,9 +221,9 @@ class StillView:
 
     @property
     def sway_px(self) -> float:
-        """Compensated sway about the rest position: `TOLD_QUANTILE` of the images lie within it, pixels; 0: none."""
+        """Compensated sway about the rest position: `REPORTED_QUANTILE` of the images are within, pixels; 0: none."""
         counts = np.cumsum(self._amplitudes)
-        bound = int(np.searchsorted(counts, TOLD_QUANTILE * counts[-1]))
+        bound = int(np.searchsorted(counts, REPORTED_QUANTILE * counts[-1]))
         return (bound + 0.5) * AMPLITUDE_STEP_PX if bound else 0.0
 
     def _sample(self, image: np.ndarray, motion: PictureMotion, time_s: float) -> None:

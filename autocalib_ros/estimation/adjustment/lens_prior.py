@@ -183,5 +183,5 @@ def _principal_point_sigma_px(picture: Picture, given_px: float, pixel_aspect: f
         return given_px, given_px * pixel_aspect
     own = PRINCIPAL_POINT_SIGMA_FRACTION * (picture.size[0] if picture.circle is None else picture.image_size[0])
     width, height = picture.image_size
-    across, down = picture.scaled(pixel_aspect, 1.0, (round(width * pixel_aspect), height)).centre_sigma_px
+    across, down = picture.scaled(pixel_aspect, 1.0, (max(round(width * pixel_aspect), 1), height)).centre_sigma_px
     return float(np.hypot(own, across / pixel_aspect)), float(np.hypot(own * pixel_aspect, down))

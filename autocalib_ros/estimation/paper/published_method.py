@@ -47,8 +47,8 @@ def solve_paper(
             window_s=paper.window_s,
             path_ratio=paper.max_path_ratio,
         )
-    camera = Camera(*evidence.image_size, intrinsics.report.focal_px, evidence.picture.lens_centre_px)
-    camera = replace(camera, pixel_aspect=options.lens.pixel_aspect or evidence.pixel_aspect or 1.0)
+    aspect, centre_px = options.lens.pixel_aspect_or(evidence.pixel_aspect), evidence.picture.lens_centre_px
+    camera = Camera(*evidence.image_size, intrinsics.report.focal_px, centre_px, pixel_aspect=aspect)
     found = segment_orientations(camera, evidence.segments_px, options.paper)
     figures = replace(figures, orientation_histogram=found.histogram, orientation_peaks_deg=found.peaks_deg)
     result = Calibration(

@@ -69,8 +69,8 @@ class AspectHypotheses:
         others_sigma = TELEVISION_SIGMA if television else near_sigma
         return cls(size, others, near_sigma, others_sigma, television or recorder)
 
-    def told(self, aspect: float) -> AspectHypotheses:
-        """Return the hypotheses where the recording says a pixel aspect: it is expected, and square pixels are not."""
+    def expecting(self, aspect: float) -> AspectHypotheses:
+        """Return the hypotheses for a recording that states a pixel aspect: that one is expected, not 1."""
         others = {
             name: other
             for name, other in {**self.others, 'square pixels': 1.0}.items()

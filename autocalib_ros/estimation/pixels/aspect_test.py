@@ -267,8 +267,8 @@ def _same_change(fit: Adjustment, before: AdjustmentState, after: AdjustmentStat
     return fit.problem.parameters.step_to(replace(fit.state, camera=moved, rotation=rotation))
 
 
-def with_told_aspect(found: Solution | Reason, aspect: float, source: str) -> Solution | Reason:
-    """Add to a solution what an option ('given') or the recording told of its pixels, where they are not square."""
+def with_stated_aspect(found: Solution | Reason, aspect: float, source: str) -> Solution | Reason:
+    """Add to a solution the pixel aspect that an option ('given') or the recording states, unless it is 1."""
     if (
         isinstance(found, Reason)
         or aspect in (0.0, 1.0)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from autocalib_ros.config import GateOptions
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.evidence.stillness import (
+    MIN_REPORTED_SWAY_PX,
     MIN_STILL_PART_S,
-    MIN_TOLD_SWAY_PX,
     Stillness,
     ViewChange,
     ViewChangeKind,
@@ -20,8 +20,8 @@ from autocalib_ros.results.statements import Statement, check
 MOVES = (ViewChangeKind.TURN, ViewChangeKind.DRIFT, ViewChangeKind.MOTION)
 """Changes of the view that are motions of the camera."""
 MIN_MOVES, MOVES_S = 3, 60.0
-"""Motions within so many seconds of a still part that show a camera without a mount: a fixed one is bumped once. It
-counts as moving unless it stood for half of that time."""
+"""Least number of motions of a camera without a mount, and seconds around the still part within which they are counted:
+a fixed camera is bumped once. Such a camera counts as moving unless it stood still for half of that time."""
 
 MIN_RATE_TIME_S = 30.0
 """A shorter time shows one or two vehicles, and no rate."""
@@ -86,10 +86,10 @@ def _watched_s(stillness: Stillness) -> float:
 
 
 def stillness_checks(evidence: Evidence) -> tuple[Statement, ...]:
-    """Return what is told about sway, and about the parts of the recording that were left out."""
+    """Return the checks of sway and of the parts of the recording that were left out."""
     stillness = evidence.stillness
     checks: list[Statement] = []
-    if stillness.sway_px >= MIN_TOLD_SWAY_PX:
+    if stillness.sway_px >= MIN_REPORTED_SWAY_PX:
         checks.append(check('sway', sway_px=stillness.sway_px))
     if stillness.changes or stillness.start_s > 0:
         kinds = [change.kind for change in stillness.changes]

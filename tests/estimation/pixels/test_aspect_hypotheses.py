@@ -61,7 +61,7 @@ def test_a_cropped_image_is_taken_as_square() -> None:
 
 
 def test_what_a_recording_says_is_expected_and_square_pixels_are_another_hypothesis() -> None:
-    told = AspectHypotheses.of((720, 576)).told(64 / 45)
+    told = AspectHypotheses.of((720, 576)).expecting(64 / 45)
     assert told.expected == 64 / 45
     assert not told.doubtful
     assert told.others == pytest.approx({'4:3': 16 / 15, 'square pixels': 1.0})

@@ -24,7 +24,9 @@ def test_a_video_gives_its_frames_and_times(tmp_path, write_video, suffix):
     assert source.duration_s == pytest.approx(3.0, abs=0.2)
 
 
-@pytest.mark.skipif(shutil.which('ffmpeg') is None, reason='ffmpeg writes the sample aspect ratio')
+@pytest.mark.skipif(
+    shutil.which('ffmpeg') is None, reason='no ffmpeg to write the aspect ratio: apt-get install ffmpeg'
+)
 @pytest.mark.parametrize(('ratio', 'expected'), [('64/45', 64 / 45), ('1/1', 0.0), ('10/11', 10 / 11)])
 def test_a_video_says_the_shape_of_its_pixels(tmp_path, write_video, caplog, ratio, expected):
     plain, squeezed = write_video(tmp_path / 'plain.mp4'), tmp_path / 'squeezed.mp4'
