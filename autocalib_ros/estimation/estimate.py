@@ -24,8 +24,9 @@ from autocalib_ros.estimation.publish import (
     scale_of,
     with_requested_model,
 )
-from autocalib_ros.estimation.solution import Observations, Solution, append_reason, is_better
+from autocalib_ros.estimation.solution import Observations, Solution, accepted, append_reason, is_better
 from autocalib_ros.estimation.strategies import (
+    complete_with_lane_markings,
     estimate_from_lane_markings,
     estimate_from_straight_traffic,
     estimate_from_turning_traffic,
@@ -152,18 +153,27 @@ def _estimate(observations: Observations, config: AdjustmentConfig) -> Solution 
     """Estimate lens, plane and roads under the priors of the observations, by one strategy after the other."""
     joint = config.options
     # Traffic: straight first; turning alone if that leaves anything open.
-    found = estimate_from_straight_traffic(observations, config)
+    straight, turning = estimate_from_straight_traffic(observations, config), None
+    found = accepted(straight)
     if not (isinstance(found, Solution) and found.full):
         turning = estimate_from_turning_traffic(observations, config)
-        found = turning if turning is not None and is_better(turning, found) else found
+        found = found if turning is None or not is_better(accepted(turning), found) else accepted(turning)
     if not joint.road_markings:
         return found
     # Lane markings: a sharper estimate if the traffic gives all, another strategy if it does not.
     if isinstance(found, Solution) and found.full:
         return sharpen_with_lane_markings(found, observations)
     markings = estimate_from_lane_markings(observations, config)
-    if is_better(markings, found):
-        return markings
+    completed = [
+        complete_with_lane_markings(traffic, observations)
+        for traffic in (straight, turning)
+        if isinstance(traffic, Solution) and traffic.lens_refusal
+    ]
+    best = found
+    for other in (*completed, markings):
+        best = other if is_better(other, best) else best
+    if best is not found:
+        return best
     if isinstance(markings, Reason) and markings.code != 'no_markings':
         return append_reason(found, markings)
     return found

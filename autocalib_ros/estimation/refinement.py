@@ -14,17 +14,16 @@ from autocalib_ros.estimation.one_road import CrossTraffic, complete_one_road
 from autocalib_ros.estimation.people.pedestrians import people
 from autocalib_ros.estimation.solution import Observations, Solution
 from autocalib_ros.estimation.straight.initialisation import select_lens_family
-from autocalib_ros.estimation.straight.roads import add_further_roads, fix_right_angle, main_road
+from autocalib_ros.estimation.straight.roads import add_further_roads, expect_right_angle, main_road
 from autocalib_ros.estimation.turning.turning_traffic import (
-    check_turning_centres,
     refine_with_tracklets,
     refine_with_turning,
     widen_by_point_slip,
     widen_by_tracklet_difference,
 )
-from autocalib_ros.estimation.verification.gates import check_halves, check_lens, check_plane
+from autocalib_ros.estimation.verification.gates import check_focal_length, check_halves, check_lens, check_plane
 from autocalib_ros.estimation.verification.ground_normal import LevelCamera, PlaneEstimate
-from autocalib_ros.estimation.verification.identifiability import fix_unidentifiable, lens_assumptions, release_k2
+from autocalib_ros.estimation.verification.identifiability import fix_unidentifiable, free_k2, lens_assumptions
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.results.refusals import Reason
 from autocalib_ros.results.statements import Statement, check
@@ -60,47 +59,47 @@ def refine_and_verify(
     # Turning vehicles join the adjustment as rigid bodies between two instants.
     if fit.plane_known:
         fit = refine_with_turning(fit, tracks, observations.windows) or fit
-    # Further roads; two roads near 90 degrees are fixed at a right angle.
+    # Further roads; two roads near 90 degrees are expected at a right angle.
     fit = add_further_roads(fit, tracks, gate)
-    fit, angle = fix_right_angle(fit, tracks, options)
-    # k2 is released if the evidence asks for it.
-    fit = release_k2(fit, tracks)
+    fit, angle = expect_right_angle(fit, tracks, options)
+    # k2 is free within its prior where the plane is known.
+    fit = free_k2(fit, tracks)
     # Turning vehicles as rigid bodies over several seconds.
     fit, tracklet_state = refine_with_tracklets(fit, tracks, observations.windows, observations.instants)
     # Parameters that the evidence does not determine return to their prior.
     fit, fixed = fix_unidentifiable(fit, tracks)
     # Gates on the lens; cross-validation in time.
-    failed = _check_lens(fit, tracks, observations, turned=turned) or _check_one_centre(fit, observations)
+    failed = _check_lens(fit, tracks, observations, turned=turned)
     if failed:
-        return failed
+        # a lens that the traffic does not determine bends roads: then few vehicles seem to follow one
+        return (failed.code == 'turning_traffic' and check_focal_length(fit, gate, turned=turned)) or failed
     halves = check_halves(fit, tracks, gate)
     if isinstance(halves, Reason):
         return halves
     # Errors that no residual shows widen the covariance.
     fit = widen_by_point_slip(fit, observations.windows)
     fit = widen_by_tracklet_difference(fit, tracklet_state)
+    uncertain = check_focal_length(fit, gate, turned=turned)
     assumptions = lens_assumptions(fit, fixed)
     if not fit.plane_known:
+        if uncertain:
+            return uncertain
         return complete_one_road(fit, tracks, observations, assumptions, halves, crossing)
-    if fit.crossing_fixed and angle:
+    if fit.crossing_known and angle:
         assumptions = (*assumptions, angle)
     along, flow = main_road(fit, tracks)
     plane = PlaneEstimate.of(fit, tracks)
     checks = (*_plane_checks(fit, angle), halves)
-    return Solution(fit, plane, along, flow, assumptions, checks, check_plane(plane, gate))
+    return Solution(fit, plane, along, flow, assumptions, checks, check_plane(plane, gate), lens_refusal=uncertain)
 
 
 def _check_lens(fit: Adjustment, tracks: TrackSet, observations: Observations, *, turned: bool) -> Reason | None:
     """Check the lens; if too few tracks follow the road, check again without pedestrians."""
-    evidence, gate = observations.evidence, observations.gate
-    failed = check_lens(fit, tracks, evidence, gate, turned=turned)
+    evidence = observations.evidence
+    failed = check_lens(fit, tracks, evidence, turned=turned)
     if failed is None or failed.code != 'turning_traffic':
         return failed
-    return check_lens(fit, tracks, evidence, gate, turned=turned, driving=_vehicle_tracks(fit, tracks, evidence))
-
-
-def _check_one_centre(fit: Adjustment, observations: Observations) -> Reason | None:
-    return check_turning_centres(fit, observations.windows) if len(fit.state.angles_rad) < 2 else None
+    return check_lens(fit, tracks, evidence, turned=turned, driving=_vehicle_tracks(fit, tracks, evidence))
 
 
 def _vehicle_tracks(fit: Adjustment, tracks: TrackSet, evidence: Evidence) -> np.ndarray:
@@ -116,4 +115,4 @@ def _vehicle_tracks(fit: Adjustment, tracks: TrackSet, evidence: Evidence) -> np
 def _plane_checks(fit: Adjustment, angle: Statement | None) -> tuple[Statement, ...]:
     vehicles = len(np.unique(fit.problem.vehicle_ids[fit.problem.block_of_row > 0]))
     turning = (check('turning_vehicles', vehicles=vehicles),) if vehicles else ()
-    return turning if angle is None or fit.crossing_fixed else (angle, *turning)
+    return turning if angle is None or fit.crossing_known else (angle, *turning)

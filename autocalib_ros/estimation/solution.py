@@ -53,6 +53,8 @@ class Solution:
     assumptions: tuple[Statement, ...]
     checks: tuple[Statement, ...]
     plane_refusal: Reason | None
+    lens_refusal: Reason | None = None
+    """Why the traffic alone does not determine the lens; lane markings may complete it."""
     reduced: bool = False
     """Whether the plane rests on less than crossing roads or turning vehicles, without an assumption in `plane`."""
     from_markings: bool = False
@@ -68,7 +70,12 @@ class Solution:
     @property
     def full(self) -> bool:
         """Whether crossing roads or turning vehicles determine all of it."""
-        return self.plane_refusal is None and not self.assumed
+        return self.plane_refusal is None and self.lens_refusal is None and not self.assumed
+
+
+def accepted(found: Solution | Reason) -> Solution | Reason:
+    """Return a solution that determines the lens, else the reason why it does not."""
+    return found if isinstance(found, Reason) else found.lens_refusal or found
 
 
 def is_better(other: Solution | Reason, found: Solution | Reason) -> bool:

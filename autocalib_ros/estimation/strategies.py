@@ -7,8 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from autocalib_ros.config import JointOptions
-from autocalib_ros.estimation.adjustment.bundle_adjustment import UNMODELLED_FOCAL, Adjustment, adjust, road_support
+from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment, adjust, road_support
 from autocalib_ros.estimation.adjustment.lens_prior import LensPrior, known_lens
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig
 from autocalib_ros.estimation.markings.markings_solution import (
@@ -27,7 +26,6 @@ from autocalib_ros.estimation.straight.roads import (
     main_road,
 )
 from autocalib_ros.estimation.turning.turning_traffic import fit_turning_traffic
-from autocalib_ros.estimation.verification.consistency import compare_solutions
 from autocalib_ros.estimation.verification.gates import check_plane, check_straight_traffic
 from autocalib_ros.estimation.verification.ground_normal import AGREEMENT_SIGMAS, PlaneEstimate
 from autocalib_ros.estimation.verification.identifiability import lens_assumptions
@@ -37,6 +35,14 @@ from autocalib_ros.results.statements import Statement, check
 
 MAX_CONFIRMING_SIGMA_DEG = 4.5
 """Traffic whose plane, or whose road, is less certain than this (one sigma) does not confirm lane markings."""
+
+
+MAX_NEAR_FOCAL_SIGMA = 0.1
+"""Relative standard deviation of the focal length of the traffic above which lane markings are not combined with it:
+their search about it spans some 20 % to either side, two standard deviations."""
+MIN_BOTH_RIGHT = 0.5
+"""Probability that traffic and lane markings are both right, below which they contradict each other and the grade is
+lowered."""
 
 
 def estimate_from_straight_traffic(observations: Observations, config: AdjustmentConfig) -> Solution | Reason:
@@ -68,7 +74,9 @@ def estimate_from_turning_traffic(observations: Observations, config: Adjustment
 
 def estimate_from_lane_markings(observations: Observations, config: AdjustmentConfig) -> Solution | Reason:
     """Estimate from lane markings; the traffic, seen through the lens that they give, has to confirm the plane."""
-    priors = [_prior_for_markings(prior, config.options) for prior in observations.priors]
+    priors = [_prior_for_markings(prior) for prior in observations.priors]
+    if config.options.principal_point_sigma_px < 0:
+        priors += [prior.with_loose_principal_point() for prior in priors]
     found = fit_to_markings(observations.evidence, observations.tracks, priors, config, observations.gate)
     if isinstance(found, Reason):
         return found
@@ -101,42 +109,58 @@ def _planes_of_traffic(fit: Adjustment, observations: Observations, config: Adju
 
 
 def sharpen_with_lane_markings(found: Solution, observations: Observations) -> Solution:
-    """Return the solution with lens and plane of the lane markings, if both agree and the markings are more certain."""
-    config = found.fit.problem.config
-    prior = _prior_for_markings(config.prior, config.options)
-    sharper = refine_with_markings(found.fit, observations.evidence, observations.tracks, prior, observations.gate)
+    """Return the solution combined with the lane markings; with a lower grade where they contradict each other."""
+    combined = _combined_with_lane_markings(found, observations)
+    return found if isinstance(combined, Reason) else combined
+
+
+def complete_with_lane_markings(traffic: Solution, observations: Observations) -> Solution | Reason:
+    """Complete a solution whose lens is too uncertain by traffic alone with lane markings; a reason if they fail."""
+    if not traffic.fit.focal_sigma <= MAX_NEAR_FOCAL_SIGMA and traffic.lens_refusal:
+        return traffic.lens_refusal
+    combined = _combined_with_lane_markings(traffic, observations)
+    if isinstance(combined, Reason):
+        return combined
+    uncertain = not combined.fit.focal_sigma <= observations.gate.max_sigma_focal_rel
+    if traffic.lens_refusal and (uncertain or not combined.from_markings):
+        return traffic.lens_refusal
+    return replace(combined, lens_refusal=None, reduced=True)
+
+
+def _combined_with_lane_markings(found: Solution, observations: Observations) -> Solution | Reason:
+    traffic = found.fit
+    sharper = refine_with_markings(
+        traffic, observations.evidence, observations.tracks, traffic.problem.config.prior, observations.gate
+    )
     if isinstance(sharper, Reason):
-        return found
-    fit, statement = sharper
-    plane = PlaneEstimate.of(fit, observations.tracks)
-    difference = compare_solutions(found.fit, fit)
-    agree = not difference.exceeds(AGREEMENT_SIGMAS) and check_plane(plane, observations.gate) is None
-    compared = check('lane_markings', focal=difference.focal, normal_deg=difference.normal_deg, used=agree)
-    checks = (*found.checks, compared)
-    if not agree or _uncertainty(fit, plane) > _uncertainty(found.fit, found.plane):
-        return replace(found, checks=checks)
-    along, flow = main_road(fit, observations.tracks)
+        return sharper
+    focal = abs(float(np.log(traffic.state.camera.focal_px / sharper.markings.camera.focal_px)))
+    normal_deg = unsigned_angle_deg(traffic.state.rotation[:, 2], sharper.markings.rotation[:, 2])
+    contradicted = sharper.both_right < MIN_BOTH_RIGHT
+    compared = check('lane_markings', focal=focal, normal_deg=normal_deg, used=not contradicted)
+    plane = PlaneEstimate.of(sharper.fit, observations.tracks)
+    if contradicted and not sharper.fit.focal_sigma <= observations.gate.max_sigma_focal_rel:
+        # lane markings that could not give the lens themselves lower the grade, but do not replace the traffic
+        return replace(found, checks=(*found.checks, compared), reduced=True)
+    along, flow = main_road(sharper.fit, observations.tracks)
     return replace(
         found,
-        fit=fit,
+        fit=sharper.fit,
         plane=plane,
         along=along,
         flow=flow,
-        checks=checks,
-        assumptions=(*lens_assumptions(fit, ()), statement),
-        from_markings=True,
-        of_traffic=found.fit,
+        checks=(*found.checks, compared),
+        assumptions=(*found.assumptions, sharper.assumption),
+        plane_refusal=check_plane(plane, observations.gate, assumed=contradicted),
+        reduced=contradicted,
+        from_markings=not contradicted,
+        of_traffic=traffic,
     )
 
 
-def _uncertainty(fit: Adjustment, plane: PlaneEstimate) -> float:
-    """Product of the sigmas of focal length and plane."""
-    return max(fit.focal_sigma, UNMODELLED_FOCAL) * plane.worst_sigma_deg
-
-
-def _prior_for_markings(prior: LensPrior, options: JointOptions) -> LensPrior:
-    """Return the prior for lane markings, which determine the principal point, unless that is given."""
-    return prior if options.principal_point_sigma_px >= 0 else prior.with_loose_principal_point()
+def _prior_for_markings(prior: LensPrior) -> LensPrior:
+    """Return the prior for lane markings, with k2 free unless an option fixes the lens."""
+    return prior.with_free_k2() if prior.sigma[3] > 0 and prior.sigma[4] <= 0 else prior
 
 
 def verify_with_traffic(by_markings: Adjustment, planes: Iterable[PlaneEstimate]) -> tuple[Statement, ...] | Reason:

@@ -172,22 +172,11 @@ REFUSALS = (
     RefusalCode(
         code='too_little_turning',
         cause='The focal length is uncertain: too few vehicles turn, or they turn too little.',
-        limit='3 % of the focal length (one sigma), or gate.max_sigma_focal_rel if that is smaller',
+        limit='gate.max_sigma_focal_rel (5 % of the focal length, one sigma)',
         remedy='wait for more turning vehicles, or for straight traffic',
         missing='turning traffic',
         message='turning traffic does not determine the lens: focal length {focal_px:.0f} px +- {sigma:.1%} '
         '(at most {limit:.0%} allowed)',
-    ),
-    RefusalCode(
-        code='one_centre',
-        cause='All vehicles turn about one point, as on one ring or bend, which constrains the focal length too '
-        'weakly.',
-        limit='2 % of the focal length (one sigma), if half of the turning centres lie within 50 % of the turning '
-        'radius',
-        remedy='wait for vehicles that turn elsewhere, enter or leave, or drive straight',
-        missing='traffic that turns in more than one place',
-        message='all vehicles turn about one point, as on one ring or bend (half of their turning centres lie within '
-        '{spread:.0%} of the radius): focal length +- {sigma:.1%} (at most {limit:.0%} allowed there)',
     ),
     RefusalCode(
         code='lens_model',

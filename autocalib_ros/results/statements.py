@@ -98,14 +98,19 @@ def _halves(focal: float, normal_deg: float | None) -> str:
 
 def _lane_markings_difference(focal: float, normal_deg: float, used: bool) -> str:
     difference = f'{focal:.1%} in focal length and {normal_deg:.1f} degrees in ground normal'
-    return f'lane markings differ from the traffic by {difference}' + ('' if used else ': not used')
+    contradiction = '' if used else ': a contradiction, which lowers the grade'
+    return f'lane markings differ from the traffic by {difference}{contradiction}'
 
 
 def _crossing_angle(angle_deg: float, sigma_deg: float | None, source: str) -> str:
     if source == 'given':
         return f'roads cross at {angle_deg:g} degrees (given)'
     measured = f'{angle_deg:.1f} +- {sigma_deg:.1f} degrees'
-    return f'roads cross at 90 degrees (measured: {measured})' if source == 'fixed' else f'roads cross at {measured}'
+    return (
+        f'roads cross at {measured}'
+        if source == 'measured'
+        else f'roads cross at 90 +- 1 degrees (measured: {measured})'
+    )
 
 
 def _transverse_edges(vehicles: int, sigma_deg: float, level_sigma_deg: float | None) -> str:

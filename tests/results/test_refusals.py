@@ -5,14 +5,12 @@ import pytest
 from autocalib_ros.config import GateOptions, JointOptions, PaperOptions
 from autocalib_ros.estimation.markings.markings_solution import MIN_ALIGNED_FRACTION, MIN_PLACES
 from autocalib_ros.estimation.strategies import MAX_CONFIRMING_SIGMA_DEG
-from autocalib_ros.estimation.turning.turning_traffic import MAX_SIGMA_FOCAL_ONE_CENTRE
 from autocalib_ros.estimation.verification.gates import (
     HALVES_FOCAL_TOLERANCE,
     HALVES_NORMAL_TOLERANCE_DEG,
     MAX_FOCAL_DIAGONALS,
     MAX_HALVES_SIGMAS,
     MAX_K1_SIGMAS,
-    MAX_TURNING_FOCAL_SIGMA,
     MIN_FOCAL_CONTRAST,
     MIN_KEPT_ROAD_FRACTION,
     MIN_LANE_KEEPING_FRACTION,
@@ -42,8 +40,7 @@ LIMITS = {
     ],
     'horizon': [f'{100 * MIN_FRACTION_BELOW_HORIZON:g} %'],
     'too_little_curvature': [f'{100 * GATE.max_sigma_focal_rel:g} %', f'{MAX_FOCAL_DIAGONALS:g} image diagonals'],
-    'too_little_turning': [f'{100 * MAX_TURNING_FOCAL_SIGMA:g} %'],
-    'one_centre': [f'{100 * MAX_SIGMA_FOCAL_ONE_CENTRE:g} %'],
+    'too_little_turning': [f'{100 * GATE.max_sigma_focal_rel:g} %'],
     'lens_model': [f'{MAX_K1_SIGMAS:g} times', f'({JOINT.k1_sigma:g})'],
     'halves_disagree': [
         f'{100 * HALVES_FOCAL_TOLERANCE:g} %',

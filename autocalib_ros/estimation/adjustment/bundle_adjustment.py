@@ -35,7 +35,6 @@ from autocalib_ros.estimation.observations.vehicle_grouping import group_into_bo
 from autocalib_ros.geometry.great_circles import squared_distances_through, unproject_rays
 from autocalib_ros.geometry.ground_plane import depression_sine
 from autocalib_ros.geometry.robust_kernels import geman_mcclure_loss, geman_mcclure_weight
-from autocalib_ros.lens.camera import Camera
 
 ROBUST_LIMIT_SCHEDULE = (8.0, 4.0, 2.0)
 FINAL_ROBUST_LIMIT = 1.0
@@ -65,6 +64,9 @@ INLIER_MEDIANS = 3.0
 UNMODELLED_FOCAL, UNMODELLED_RAD = 0.001, np.radians(0.03)
 """Standard deviations of model errors that residuals do not show: relative focal length (real lenses deviate from
 their family) and ground normal in radians (a road is crowned by about a degree to either side, not planar)."""
+HEADING_BIAS_RAD = np.radians(0.15)
+"""Standard deviation of the common heading error of all vehicles of one driving direction, radians: 0 to 0.25 degrees
+against the truth of rendered scenes."""
 MIN_ROAD_DISTANCE_RATIO = 5.0
 """A track discriminates between two roads when its distance from one is at least this multiple of that from the other.
 Judgement."""
@@ -107,8 +109,8 @@ class Adjustment:
         return float(self.scales[0])
 
     @property
-    def crossing_fixed(self) -> bool:
-        """Whether the angle between the first two roads was fixed."""
+    def crossing_known(self) -> bool:
+        """Whether the angle between the first two roads was given or assumed."""
         return self.problem.config.crossing_rad is not None and len(self.state.angles_rad) > 1
 
     @property
@@ -162,7 +164,7 @@ def adjust(
     With `refine` the start is near the minimum, and only the final robust limit is used. `warm_start` holds the
     eliminated unknowns of the same windows and tracklets at the start.
     """
-    state, problem = with_crossing_angle(start, config.crossing_rad), None
+    state, problem = with_crossing_angle(start, None if config.crossing_sigma_rad > 0 else config.crossing_rad), None
     for robust_limit in (() if refine else ROBUST_LIMIT_SCHEDULE) + MAX_ITERATIONS * (FINAL_ROBUST_LIMIT,):
         # at a coarse start, inliers may be farther away than any outlier limit: reject only in the final rounds
         unprojected = UnprojectedTracks.through(state.camera, tracks)
@@ -183,29 +185,26 @@ def _enough_rows(labels: np.ndarray, config: AdjustmentConfig) -> bool:
 
 def _gauss_newton_step(problem: Problem, robust_limit: float) -> tuple[np.ndarray, AdjustmentState, WarmStart]:
     """Take one Gauss-Newton step on the robust cost, halved until the cost does not increase."""
-    rows, prior = problem.linearise(), problem.config.prior
+    rows, parameters = problem.linearise(), problem.parameters
     scale = problem.scales(rows.squared)[problem.block_of_row]
     row_weight = problem.vehicle_weight * rows.influence / scale
     weight = row_weight * geman_mcclure_weight(rows.squared, robust_limit * scale)
-    gradient, prior_information = problem.parameters.prior_gradient(problem.parameters.base.camera)
+    gradient, prior_information = parameters.prior_gradient(parameters.base)
     matrix = np.tensordot(weight, rows.curvature, 1) + np.diag(prior_information)
     step = -np.linalg.lstsq(matrix, gradient + weight @ rows.gradient, rcond=1e-12)[0]
 
-    def cost(squared: np.ndarray, camera: Camera) -> float:
-        deviations = prior.deviations(camera)
-        return float(
-            (row_weight * problem.dof * geman_mcclure_loss(squared, robust_limit * scale)).sum()
-            + deviations @ deviations
-        )
+    def cost(squared: np.ndarray, state: AdjustmentState) -> float:
+        loss = geman_mcclure_loss(squared, robust_limit * scale)
+        return float((row_weight * problem.dof * loss).sum()) + parameters.prior_cost(state)
 
-    base_cost = cost(rows.squared, problem.parameters.base.camera)
+    base_cost = cost(rows.squared, parameters.base)
     for _ in range(MAX_BACKTRACKS):
-        state = problem.parameters.state(step)
+        state = parameters.state(step)
         warm_start, squared = problem.at(step)
-        if cost(squared, state.camera) <= base_cost:
+        if cost(squared, state) <= base_cost:
             return step, state, warm_start
         step = step / 2
-    return np.zeros_like(step), problem.parameters.base, problem.warm_start
+    return np.zeros_like(step), parameters.base, problem.warm_start
 
 
 def _converged(step: np.ndarray, prior: LensPrior) -> bool:
@@ -235,10 +234,11 @@ def _evaluate(last: Problem, state: AdjustmentState, warm_start: WarmStart, trac
     weight = row_weight * robust_weight
     # the Hessian also has the derivative of the robust weight: a multiple of g g^T
     second_order = -4.0 / limit / dof * row_weight / (1.0 + rows.squared / limit) ** 3
-    _, prior = problem.parameters.prior_gradient(state.camera)
+    _, prior = problem.parameters.prior_gradient(state)
     covariance = jackknife_covariance(rows.gradient, rows.curvature, weight, second_order, problem.vehicle_ids, prior)
     covariance += np.diag(_unmodelled_sigmas(problem.parameters) ** 2)
     road = problem.block_of_row == 0
+    covariance += _heading_bias_covariance(problem, rows.curvature[road], weight, rows.curvature, prior)
     whitened2 = np.full(len(tracks), np.inf)
     whitened2[problem.used] = rows.squared[road]
     information = np.tensordot(weight, rows.curvature, 1)
@@ -257,6 +257,27 @@ def _evaluate(last: Problem, state: AdjustmentState, warm_start: WarmStart, trac
         turning_information=np.tensordot(weight[~road], rows.curvature[~road], 1),
         vehicle_correlation=intraclass_correlation(problem.vehicle_ids[road], scores),
     )
+
+
+def _heading_bias_covariance(
+    problem: Problem, on_roads: np.ndarray, weight: np.ndarray, curvatures: np.ndarray, prior: np.ndarray
+) -> np.ndarray:
+    """Return the covariance (parameters, parameters) from a common heading error of the tracks of each direction.
+
+    The errors of vehicles are independent, but for this one: the view of a body changes alike for all that drive the
+    same way, and their tracked points drift alike.
+    """
+    parameters = problem.parameters
+    size, heading = parameters.size, np.flatnonzero(np.abs(parameters.axes[:, 2]) > 0.5)
+    if not len(on_roads) or not len(heading) or not np.isfinite(curvatures).all():
+        return np.zeros((size, size))
+    of_heading = on_roads[:, :, parameters.lens + int(heading[0])]  # J^T j by a turn of the track's road in the plane
+    inverse = np.linalg.pinv(np.tensordot(weight, curvatures, 1) + np.diag(prior), hermitian=True)
+    directions = problem.straight.driving_directions()
+    shifts = [
+        inverse @ ((weight[: len(on_roads)] * (directions == each)) @ of_heading) for each in np.unique(directions)
+    ]
+    return HEADING_BIAS_RAD**2 * np.array(shifts).T @ np.array(shifts)
 
 
 def _unmodelled_sigmas(parameters: Parameterisation) -> np.ndarray:

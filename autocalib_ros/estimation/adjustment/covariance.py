@@ -33,7 +33,7 @@ def jackknife_covariance(
     CR3 (Bell & McCaffrey 2002; MacKinnon & White 1985) for an M-estimate: the solution without one vehicle is one
     Newton step from the solution. Small samples widen it (`small_sample_factor`), above all where vehicles agree
     better than their noise allows; the spread of the prior is added. Infinite where the information is singular or
-    there are no more vehicles than parameters.
+    there are no more vehicles than parameters that the evidence, not the prior, determines.
 
     - `gradients` g = J^T r (rows, parameters), of whitened residuals r
     - `curvatures` J^T J (rows, parameters, parameters)
@@ -49,10 +49,13 @@ def jackknife_covariance(
     np.add.at(matrices, inverse, weight[:, None, None] * curvatures)
     information = matrices.sum(axis=0) + np.diag(prior)
     values, vectors = np.linalg.eigh(information)
-    if len(clusters) <= size or values[0] < MIN_EIGENVALUE_RATIO * values[-1]:
+    if values[0] < MIN_EIGENVALUE_RATIO * values[-1]:
         return np.full((size, size), np.inf)
     # Hessian of the redescending loss in whitened parameters, where the information is the identity
     whiten = vectors / np.sqrt(values)
+    from_evidence = size - float(prior @ (whiten**2).sum(axis=1))
+    if len(clusters) <= from_evidence:
+        return np.full((size, size), np.inf)
     hessian = np.eye(size) + whiten.T @ (gradients.T * second_order) @ gradients @ whiten
     curvature_ratios, axes = np.linalg.eigh(hessian)
     curvature_ratios = np.maximum(curvature_ratios, MIN_CURVATURE_RATIO)

@@ -23,9 +23,9 @@ DISTORTION_FREE = (1 / 3, 2 / 15, 17 / 315, 62 / 2835)
 KANNALA_BRANDT = (1 / 6, 1 / 30, 0.0, 0.0)
 KANNALA_BRANDT_SIGMA = (1 / 6, 1 / 30)
 """Mean and sigma of k1, k2 of a family that covers the range between the two above, one sigma from either."""
-K2_SIGMA = 0.02
-"""Standard deviation of k2 about its family: it moves an image point at one radian by 2 %, as the default sigma of k1
-moves it by 3 %."""
+K2_SIGMA = 0.01
+"""Standard deviation of k2 about its family: the classical projections about the equidistant one, from orthographic to
+stereographic, have k2 of 0 to 0.008."""
 PRINCIPAL_POINT_SIGMA_FRACTION = 0.01
 """Standard deviation of the principal point about the centre of the picture, fraction of the width of the picture,
 unless the option gives pixels. Judgement."""

@@ -68,7 +68,7 @@ def laplace_cost(fit: Adjustment, tracks: TrackSet, scales: np.ndarray) -> float
     )
     scale = np.concatenate([np.full(len(tracks), scales[0]), scales[problem.block_of_row[turning]]])
     squared = np.concatenate([fit.whitened2, fit.turning2])
-    deviations, prior = problem.parameters.prior_gradient(fit.state.camera)
+    _, prior = problem.parameters.prior_gradient(fit.state)
     volume = np.linalg.slogdet(fit.information + np.diag(prior) + 1e-9 * np.eye(len(prior)))[1]
     cost = (vehicle_weight / scale * dof * geman_mcclure_bounded_loss(squared, FINAL_ROBUST_LIMIT * scale)).sum()
-    return float(cost + deviations @ deviations + volume)
+    return float(cost + problem.parameters.prior_cost(fit.state) + volume)

@@ -15,6 +15,9 @@ from autocalib_ros.estimation.observations.two_frame_windows import TwoFrameWind
 from autocalib_ros.geometry.great_circles import Rays
 from autocalib_ros.lens.camera import Camera
 
+RIGHT_ANGLE_SIGMA_RAD = np.radians(1.0)
+"""Standard deviation of the angle between two roads, or two directions of lane markings, from a right angle: junctions
+are built to about that."""
 MIN_SINE_TO_X_AXIS = 0.2
 """Smallest sine of the angle between a road and the camera's x axis for which zero roll constrains the ground plane.
 Judgement."""
@@ -50,7 +53,9 @@ class AdjustmentConfig:
     height_m: float = 0.0
     """Camera height in metres, 0: unknown. It only sets the weight of near against far points."""
     crossing_rad: float | None = None
-    """Fixed angle of the second road to the first, None: free."""
+    """Angle of the second road to the first that is given or assumed, None: free."""
+    crossing_sigma_rad: float = 0.0
+    """Its standard deviation, 0: exact."""
     drifting: bool = False
     """Whether tracked points drift. A single track then hardly shows a slight turn, so the tracks of one body are
     weighted together."""
@@ -90,11 +95,16 @@ class Parameterisation:
             return every[:2]  # without roads, the heading in the plane is arbitrary
         return every if roads > 1 or self.config.turning else every[1:]  # rotation about a lone road is unobservable
 
+    @property
+    def crossing_known(self) -> bool:
+        """Whether the angle of the second road to the first is given or assumed."""
+        return self.config.crossing_rad is not None and len(self.base.angles_rad) > 1
+
     @cached_property
     def free_angles(self) -> tuple[int, ...]:
         """Indices of roads with a free angle: the first defines the frame, the second may be fixed."""
-        fixed = self.config.crossing_rad is not None and len(self.base.angles_rad) > 1
-        return tuple(range(2 if fixed else 1, len(self.base.angles_rad)))
+        exact = self.crossing_known and self.config.crossing_sigma_rad <= 0
+        return tuple(range(2 if exact else 1, len(self.base.angles_rad)))
 
     @property
     def size(self) -> int:
@@ -126,12 +136,33 @@ class Parameterisation:
         """Return the rotation matrix (3, 3) of a step (rotations,) about the axes."""
         return Rotation.from_rotvec(step @ self.axes).as_matrix()
 
-    def prior_gradient(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """Return gradient and diagonal information of the prior at a camera, (parameters,) each."""
+    def prior_gradient(self, state: AdjustmentState) -> tuple[np.ndarray, np.ndarray]:
+        """Return gradient and diagonal information of the prior at a state, (parameters,) each."""
         gradient, information = np.zeros(self.size), np.zeros(self.size)
-        gradient[: self.lens] = self.config.prior.deviations(camera)
+        gradient[: self.lens] = self.config.prior.deviations(state.camera)
         information[: self.lens] = self.config.prior.information
+        if self._crossing_uncertain:
+            crossing, sigma = self.lens + len(self.axes), self.config.crossing_sigma_rad
+            gradient[crossing] = self._crossing_deviation_rad(state) / sigma**2
+            information[crossing] = sigma**-2
         return gradient, information
+
+    def prior_cost(self, state: AdjustmentState) -> float:
+        """Return twice the negative log density of the prior at a state, up to a constant."""
+        deviations = self.config.prior.deviations(state.camera)
+        crossing = (
+            self._crossing_deviation_rad(state) / self.config.crossing_sigma_rad if self._crossing_uncertain else 0.0
+        )
+        return float(deviations @ deviations) + crossing**2
+
+    @property
+    def _crossing_uncertain(self) -> bool:
+        return self.crossing_known and self.config.crossing_sigma_rad > 0
+
+    def _crossing_deviation_rad(self, state: AdjustmentState) -> float:
+        """Return how far the second road is from its expected angle to the first, on the nearest side."""
+        expected = with_crossing_angle(state, self.config.crossing_rad).angles_rad[1]
+        return float(np.angle(np.exp(1j * (state.angles_rad[1] - expected))))
 
 
 def upward_normal(state: AdjustmentState, config: AdjustmentConfig, rays: Rays) -> np.ndarray:

@@ -103,6 +103,12 @@ class StraightTrackBlock:
         distance = rays.distance_px(self._circles(state, rays)[:, None])
         return ((self.whiten @ distance[..., None])[..., 0] ** 2).sum(axis=1) / self.dof
 
+    def driving_directions(self) -> np.ndarray:
+        """Return a number for road and sense of each track, shape (tracks,): one for each driving direction."""
+        along = np.where(self._mask, self._road.along_m, np.nan)
+        forward = np.nanmean(np.diff(along, axis=1), axis=1) > 0
+        return 2 * self._labels + forward
+
     def distances_px(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return observed pixels (n, 2), their distances from the circles (n,) and their tracks (n,), at the base."""
         track, sample = np.nonzero(self._mask)

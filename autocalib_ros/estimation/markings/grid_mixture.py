@@ -14,15 +14,14 @@ from scipy.spatial.transform import Rotation
 
 from autocalib_ros.estimation.adjustment.covariance import jackknife_covariance
 from autocalib_ros.estimation.adjustment.lens_prior import LensPrior
+from autocalib_ros.estimation.adjustment.parameters import RIGHT_ANGLE_SIGMA_RAD
 from autocalib_ros.estimation.markings.road_segments import ProjectedSegments, RoadSegments
-from autocalib_ros.geometry.robust_kernels import student_density, student_weight, wrap_undirected
+from autocalib_ros.geometry.robust_kernels import STUDENT_FREEDOM, student_density, student_weight, wrap_undirected
 from autocalib_ros.lens.camera import Camera
 
 LINE_END_SIGMA_PX, MARKING_SIGMA_RAD = 0.4, np.radians(0.5)
 """Standard deviations before scaling: of an end point of a segment, across it, in pixels; and of the direction of
 markings on the road. Judgement."""
-RIGHT_ANGLE_SIGMA_RAD = np.radians(1.0)
-"""Standard deviation of the angle between the two directions from a right angle: junctions are built to about that."""
 POST_SIGMA_RAD = np.radians(1.0)
 """Standard deviation of posts from the vertical. Judgement."""
 MIN_NOISE_SCALE, MAX_NOISE_SCALE = 0.15, 2.0
@@ -206,8 +205,11 @@ def refine_grid(
     cost, responsibilities = mixture.cost(state, sigmas)
     gradients, curvatures = mixture.linearised(state, responsibilities, sigmas)
     _, prior_information = mixture.prior_terms(state)
+    # the Hessian also has the derivatives of the robust weights and of the responsibilities: a multiple of g g^T
+    aligned = responsibilities.sum(axis=0)
+    second_order = -segments.weights * (2.0 / (STUDENT_FREEDOM + 1.0) + 1.0 - aligned) / np.maximum(aligned, 0.05)
     covariance = jackknife_covariance(
-        gradients, curvatures, segments.weights, np.zeros(len(segments)), segments.groups, prior_information
+        gradients, curvatures, segments.weights, second_order, segments.groups, prior_information
     )
     units = np.append(np.ones(len(prior_information) - 1), RIGHT_ANGLE_SIGMA_RAD)
     information = (np.tensordot(segments.weights, curvatures, 1) + np.diag(prior_information + 1e-9)) * np.outer(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -10,13 +10,17 @@ from scipy.spatial.transform import Rotation
 
 from autocalib_ros.config import GateOptions
 from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment, evaluate_at
+from autocalib_ros.estimation.adjustment.combination import Mode, combine
 from autocalib_ros.estimation.adjustment.lens_prior import LensPrior
-from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig, AdjustmentState, Parameterisation
-from autocalib_ros.estimation.markings.grid_mixture import RIGHT_ANGLE_SIGMA_RAD, MarkingGrid
+from autocalib_ros.estimation.adjustment.parameters import (
+    RIGHT_ANGLE_SIGMA_RAD,
+    AdjustmentConfig,
+    AdjustmentState,
+)
+from autocalib_ros.estimation.markings.grid_mixture import MarkingGrid
 from autocalib_ros.estimation.markings.grid_search import find_grids, find_grids_near, keep_segments_near_traffic
 from autocalib_ros.estimation.markings.road_segments import ProjectedSegments, RoadSegments, segments_on_road
 from autocalib_ros.estimation.observations.track_set import TrackSet
-from autocalib_ros.estimation.observations.two_frame_windows import no_windows
 from autocalib_ros.estimation.verification.gates import check_markings_view
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.ground_plane import unsigned_angle_deg
@@ -32,7 +36,10 @@ shadow of a lamp post, may be askew. Judgement."""
 AMBIGUITY_NATS, MAX_AMBIGUITY_DEG = 5.0, 3.0
 """A second solution contradicts the best if its log-evidence is at most this much lower, and its plane differs by more
 than this angle, or its focal length by more than the accepted uncertainty. Judgement."""
-"""Code of the refusals made here."""
+MODE_NATS = 8.0
+"""Log-evidence below the best solution beyond which another one is left out: 1 in 3000."""
+SAME_MODE_FOCAL, SAME_MODE_DEG = 0.005, 0.2
+"""Solutions that differ by less, in log focal length and in the plane, are one."""
 MIN_VARIANCE = 1e-12
 """Regularisation for segments without noise, as in tests."""
 MAX_SKEW_SIGMAS = 2.5
@@ -48,6 +55,8 @@ def fit_to_markings(
     """
     candidates = segments_on_road(evidence)
     grids = find_grids(candidates, priors)
+    # a loose principal point turns planes and lenses that a usual one tells apart into one: no ambiguity of the best
+    grids = [grid for grid in grids if grid.prior.sigma[1] == grids[0].prior.sigma[1]]
     accepted = _accepted_grid(candidates, grids, evidence, gate, MIN_PLACES)
     if isinstance(accepted, Reason):
         return accepted
@@ -59,35 +68,84 @@ def fit_to_markings(
     return check_markings_view(fit, tracks) or (fit, _describe(segments, best))
 
 
+@dataclass(frozen=True)
+class MarkingsRefinement:
+    """A solution of the traffic combined with lane markings."""
+
+    fit: Adjustment
+    """The combination."""
+    markings: AdjustmentState
+    """What the lane markings alone give, with the roads of the traffic."""
+    both_right: float
+    """Probability, 0 to 1, that traffic and lane markings are both right."""
+    assumption: Statement
+
+
 def refine_with_markings(
     fit: Adjustment, evidence: Evidence, tracks: TrackSet, prior: LensPrior, gate: GateOptions
-) -> tuple[Adjustment, Statement] | Reason:
-    """Refine lens and plane of a solution with the segments on the road; its roads are kept.
+) -> MarkingsRefinement | Reason:
+    """Combine lens and plane of a solution with those of the segments on the road.
 
-    Returns the adjustment and its assumption in words, or the reason why not.
+    Returns why not if the segments give none.
     """
-    up, state = _upward_normal(fit), fit.state
+    if not np.isfinite(fit.covariance).all():
+        return reason('no_markings', 'traffic')
+    parameters = fit.problem.parameters
     candidates = segments_on_road(evidence)
-    grids = find_grids_near(candidates, prior, state.camera, up)
-    accepted = _accepted_grid(candidates, grids, evidence, gate, MIN_PLACES_CONFIRMED)
+    grids = find_grids_near(candidates, prior, fit.state.camera, _upward_normal(fit))
+    accepted = _accepted_modes(candidates, grids, evidence)
     if isinstance(accepted, Reason):
         return accepted
-    segments, grid = accepted
-    config = replace(fit.problem.config, prior=prior, windows=no_windows(), bundle=None)
-    road, normal = state.rotation[:, 0], grid.rotation[:, 2] * np.sign(state.rotation[:, 2] @ grid.rotation[:, 2])
-    along = road - (road @ normal) * normal
-    along /= np.linalg.norm(along)
-    rotation = np.column_stack([along, np.cross(normal, along), normal])
-    refined = AdjustmentState(grid.camera, rotation, state.angles_rad)
-    parameters, lens = Parameterisation(refined, config), len(prior.free)
-    covariance, angles = np.zeros((parameters.size, parameters.size)), len(parameters.free_angles)
-    # rotations about the axes of the grid become rotations about the axes of the roads
-    to_roads = block_diag(np.eye(lens), parameters.axes @ rotation.T @ grid.rotation)
-    from_grid = parameters.size - angles
-    covariance[:from_grid, :from_grid] = to_roads @ grid.covariance[:-1, :-1] @ to_roads.T
-    if angles:
-        covariance[-angles:, -angles:] = fit.covariance[-angles:, -angles:]
-    return evaluate_at(refined, tracks, config, covariance), _describe(segments, grid)
+    tilting = np.flatnonzero(np.abs(parameters.axes[:, :2]).sum(axis=1) > 0.5)
+    shared = np.concatenate([np.arange(parameters.lens), parameters.lens + tilting])
+    modes = [_mode_of(grid, fit, parameters.axes[tilting]) for _, grid in accepted]
+    combined = combine(fit, modes, shared)
+    both = evaluate_at(parameters.state(combined.step), tracks, fit.problem.config, combined.covariance)
+    described = accepted[modes.index(combined.likeliest)]
+    return MarkingsRefinement(both, combined.likeliest.state, combined.both_right, _describe(*described))
+
+
+def _mode_of(grid: MarkingGrid, fit: Adjustment, tilting: np.ndarray) -> Mode:
+    """Return a grid as a mode of the parameters of a fit: the lens, and rotations of the plane about axes (n, 3)."""
+    state, lens = fit.state, fit.problem.parameters.lens
+    normal = grid.rotation[:, 2] * np.sign(state.rotation[:, 2] @ grid.rotation[:, 2])
+    turn, _ = Rotation.align_vectors(normal[None], state.rotation[:, 2][None])
+    seen = AdjustmentState(grid.camera, turn.as_matrix() @ state.rotation, state.angles_rad)
+    # rotations about the axes of the grid become rotations about the axes of the roads, but for the heading
+    to_roads = block_diag(np.eye(lens), tilting @ seen.rotation.T @ grid.rotation)
+    return Mode(seen, to_roads @ grid.covariance[:-1, :-1] @ to_roads.T, -grid.negative_log_evidence)
+
+
+def _accepted_modes(
+    candidates: RoadSegments, grids: list[MarkingGrid], evidence: Evidence
+) -> list[tuple[RoadSegments, MarkingGrid]] | Reason:
+    """Return the grids that fit about as well as the best, with their segments near traffic; a reason if none does."""
+    if not grids:
+        return reason('no_markings', lines=len(candidates))
+    found: list[tuple[RoadSegments, MarkingGrid]] = []
+    against: Reason | None = None
+    distinct: list[MarkingGrid] = []
+    for grid in grids:
+        if grid.negative_log_evidence > grids[0].negative_log_evidence + MODE_NATS or any(
+            _same(grid, other) for other in distinct
+        ):
+            continue
+        distinct.append(grid)
+        accepted = keep_segments_near_traffic(candidates, grid, evidence)
+        failed = reason('no_markings', 'off_road') if accepted is None else _check_axes(*accepted, MIN_PLACES_CONFIRMED)
+        against = against or failed
+        if accepted is not None and failed is None and not any(_same(accepted[1], other) for _, other in found):
+            refined = replace(accepted[1], cost=grid.cost, laplace_term=grid.laplace_term)
+            found.append((accepted[0], refined))
+    return found or against or reason('no_markings', lines=len(candidates))
+
+
+def _same(one: MarkingGrid, other: MarkingGrid) -> bool:
+    """Whether two grids are one minimum."""
+    return (
+        abs(float(np.log(one.camera.focal_px / other.camera.focal_px))) < SAME_MODE_FOCAL
+        and unsigned_angle_deg(one.rotation[:, 2], other.rotation[:, 2]) < SAME_MODE_DEG
+    )
 
 
 def _upward_normal(fit: Adjustment) -> np.ndarray:
@@ -125,10 +183,10 @@ def _accepted_grid(
     accepted = keep_segments_near_traffic(candidates, grids[0], evidence)
     if accepted is None:
         return reason('no_markings', 'off_road')
-    return _check_ambiguity(candidates, grids, gate) or _check_axes(*accepted, min_places) or accepted
+    return check_ambiguity(candidates, grids, gate) or _check_axes(*accepted, min_places) or accepted
 
 
-def _check_ambiguity(segments: RoadSegments, grids: list[MarkingGrid], gate: GateOptions) -> Reason | None:
+def check_ambiguity(segments: RoadSegments, grids: list[MarkingGrid], gate: GateOptions) -> Reason | None:
     """Return a refusal if another plane or lens fits the segments as well."""
     best = grids[0]
     for other in grids[1:]:

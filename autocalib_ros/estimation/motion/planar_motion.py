@@ -225,25 +225,6 @@ def paths(windows: TwoFrameWindows, camera: Camera, camera_from_plane: np.ndarra
     )
 
 
-def turning_centres(
-    windows: TwoFrameWindows, camera: Camera, camera_from_plane: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Turning centre (windows, 2) of each window of tracks, in camera heights, and its turning radius (windows,)."""
-    from_tracks = windows.subset(np.flatnonzero(~windows.from_segments))
-    point_weights = from_tracks.mask / np.maximum(from_tracks.mask.sum(axis=1, keepdims=True), 1)
-    first, middle, second = (
-        (point_weights[..., None] * positions).sum(axis=1)
-        for positions in paths(from_tracks, camera, camera_from_plane)
-    )
-    # the centre of the circle through three points
-    a, b = middle - first, second - first
-    across = 2.0 * (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
-    across = np.where(np.abs(across) < 1e-9, 1e-9, across)
-    a2, b2 = (a * a).sum(axis=1), (b * b).sum(axis=1)
-    from_first = np.stack([b[:, 1] * a2 - a[:, 1] * b2, a[:, 0] * b2 - b[:, 0] * a2], axis=1) / across[:, None]
-    return first + from_first, np.hypot(*from_first.T)
-
-
 def _on_plane(bearings: np.ndarray) -> np.ndarray:
     """Intersect bearings (..., 3) in the frame of the plane with it, in camera heights, shape (..., 2)."""
     depth = bearings[..., 2:] * (np.sign(np.median(bearings[..., 2])) if bearings.size else 1.0)

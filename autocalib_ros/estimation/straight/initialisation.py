@@ -12,6 +12,8 @@ from autocalib_ros.estimation.adjustment.model_selection import MODEL_SELECTION_
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig, RoadDirections, initial_state
 from autocalib_ros.estimation.observations.track_set import TrackSet
 from autocalib_ros.estimation.straight.consensus import CONSENSUS_INLIER_PX, consensus_directions
+from autocalib_ros.geometry.great_circles import unproject_rays
+from autocalib_ros.geometry.ground_plane import MIN_FRACTION_BELOW_HORIZON, orient_upward
 from autocalib_ros.lens.camera import Camera
 
 FOCAL_TRIALS = 14
@@ -23,6 +25,8 @@ MIN_INLIER_FRACTION, LOOSE_INLIER_FACTOR = 0.5, 3.0
 MATCHED_RADIUS_DIAGONALS = 0.3
 """Image radius, in diagonals, at which a start in another lens family gets the same angle: two lenses of one field of
 view agree about best there."""
+MAX_FOCAL_DIAGONALS = 1.5
+"""Focal length, in image diagonals, above which lens curvature is invisible. Judgement."""
 MIN_ROAD_SEPARATION_DEG = 15.0
 """Smallest angle between two roads: closer ones are one road with errors. Judgement."""
 
@@ -57,7 +61,22 @@ def _from_trials(
     starts = [initial_state(prior.start(trials[index]), found[index]) for index in _peaks(found)[:MAX_STARTS]]
     fits = [adjust(start, subsample, config) for start in starts]
     # two coincident roads fit the errors of one road, and so look more probable than they are
-    return [fit for fit in fits if roads_separated(fit)] or fits, np.array([item.score for item in found])
+    fits = [fit for fit in fits if roads_separated(fit)] or fits
+    # traffic is below the horizon
+    fits = [fit for fit in fits if below_horizon(fit, subsample)] or fits
+    return fits, np.array([item.score for item in found])
+
+
+def below_horizon(fit: Adjustment, tracks: TrackSet) -> bool:
+    """Return whether the traffic lies below the horizon of the plane of a solution, if it has one.
+
+    Without lens curvature the focal length is anything, and so is the plane.
+    """
+    camera = fit.state.camera
+    if not fit.plane_known or camera.focal_px > MAX_FOCAL_DIAGONALS * camera.diagonal_px:
+        return True
+    bearings = unproject_rays(camera, tracks.pixels[tracks.weights > 0]).bearings
+    return orient_upward(fit.state.rotation[:, 2], bearings)[1] >= MIN_FRACTION_BELOW_HORIZON
 
 
 def roads_separated(fit: Adjustment) -> bool:

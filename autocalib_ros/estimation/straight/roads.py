@@ -9,9 +9,14 @@ from scipy.spatial.transform import Rotation
 
 from autocalib_ros.config import GateOptions, JointOptions
 from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment, adjust, road_support
-from autocalib_ros.estimation.adjustment.parameters import AdjustmentState, RoadDirections, initial_state
+from autocalib_ros.estimation.adjustment.parameters import (
+    RIGHT_ANGLE_SIGMA_RAD,
+    AdjustmentState,
+    RoadDirections,
+    initial_state,
+)
 from autocalib_ros.estimation.observations.track_set import TrackSet, evenly_spaced
-from autocalib_ros.estimation.straight.initialisation import MIN_ROAD_SEPARATION_DEG, roads_separated
+from autocalib_ros.estimation.straight.initialisation import MIN_ROAD_SEPARATION_DEG, below_horizon, roads_separated
 from autocalib_ros.geometry.great_circles import fit_circles, unproject_rays
 from autocalib_ros.results.statements import Statement, assumption, check
 
@@ -25,10 +30,10 @@ ROAD_INLIER_DEG = 1.0
 """Angle in degrees between a track's direction and a further road within which the track supports it."""
 RIGHT_ANGLE_SIGMAS = 2.5
 RIGHT_ANGLE_FLOOR_DEG = 2.0
-"""Two roads are fixed at 90 degrees within this many standard deviations, or within this many degrees: junctions are
-built to about a degree, and tracked points drift by another degree across the driving direction. Within either limit
-90 degrees are more probable than any other angle: more than half of all junctions are square, the others spread over
-tens of degrees."""
+"""Two roads are expected at 90 degrees within this many standard deviations, or within this many degrees: junctions
+are built to about a degree, and tracked points drift by another degree across the driving direction. Within either
+limit 90 degrees are more probable than any other angle: more than half of all junctions are square, the others spread
+over tens of degrees."""
 MAX_NOISE_RATIO = 4.0
 """Largest ratio of the residual scale of tracks on roads to that of turning vehicles (both squared, whitened); above
 it the further road consists of similar turns. Judgement."""
@@ -51,8 +56,12 @@ def drop_unsupported_roads(
 
 
 def _all_supported(fit: Adjustment, support: list[np.ndarray], tracks: TrackSet, gate: GateOptions) -> bool:
-    """Return whether each road has its own support and consecutive roads are separated."""
-    return roads_separated(fit) and all(has_road_support(mask, tracks, gate) for mask in support)
+    """Return whether each road has its own support, and all lie apart in a plane below the horizon.
+
+    Similar turns look like a road, but that is not in one plane with another.
+    """
+    supported = all(has_road_support(mask, tracks, gate) for mask in support)
+    return supported and roads_separated(fit) and below_horizon(fit, tracks)
 
 
 def add_second_road(fit: Adjustment, tracks: TrackSet, gate: GateOptions) -> Adjustment:
@@ -138,11 +147,11 @@ def _angles_in_plane(state: AdjustmentState, normals: np.ndarray) -> np.ndarray:
     return np.arctan2(along[:, 1], along[:, 0])
 
 
-def fix_right_angle(fit: Adjustment, tracks: TrackSet, options: JointOptions) -> tuple[Adjustment, Statement | None]:
-    """Fix the angle of the first two roads at 90 degrees if the measured one is consistent with it.
+def expect_right_angle(fit: Adjustment, tracks: TrackSet, options: JointOptions) -> tuple[Adjustment, Statement | None]:
+    """Expect the first two roads at 90 degrees, to `RIGHT_ANGLE_SIGMA_RAD`, if the measured angle allows it.
 
     Returns the solution and the angle as an assumption or a check, None with fewer than two roads. An angle given by
-    an option stays fixed; with `road_angle` 'free' none is fixed.
+    an option is exact; with `road_angle` 'free' none is expected.
     """
     if len(fit.state.angles_rad) < 2:
         return fit, None
@@ -152,8 +161,10 @@ def fix_right_angle(fit: Adjustment, tracks: TrackSet, options: JointOptions) ->
     sigma = float(fit.sigma(lambda state: np.array([crossing_deg(state)]))[0])
     if options.road_angle == 'free' or abs(90.0 - angle) > max(RIGHT_ANGLE_SIGMAS * sigma, RIGHT_ANGLE_FLOOR_DEG):
         return fit, check('crossing_angle', angle_deg=angle, sigma_deg=min(sigma, 90.0), source='measured')
-    squared = adjust(fit.state, tracks, replace(config, crossing_rad=np.pi / 2))
-    return squared, assumption('crossing_angle', angle_deg=angle, sigma_deg=sigma, source='fixed')
+    squared = adjust(
+        fit.state, tracks, replace(config, crossing_rad=np.pi / 2, crossing_sigma_rad=RIGHT_ANGLE_SIGMA_RAD)
+    )
+    return squared, assumption('crossing_angle', angle_deg=angle, sigma_deg=sigma, source='expected')
 
 
 def main_road(fit: Adjustment, tracks: TrackSet) -> tuple[np.ndarray, TrackSet]:

@@ -14,7 +14,6 @@ from autocalib_ros.estimation.motion.planar_motion import (
     WindowRays,
     initial_motion,
     point_slip,
-    turning_centres,
     without_side_slip,
 )
 from autocalib_ros.estimation.motion.rigid_bodies import TrackletBundle
@@ -22,7 +21,6 @@ from autocalib_ros.estimation.observations.track_set import TrackSet
 from autocalib_ros.estimation.observations.tracklets import find_tracklets, no_tracklets
 from autocalib_ros.estimation.observations.two_frame_windows import ResampledTracks, TwoFrameWindows
 from autocalib_ros.estimation.verification.consistency import compare_solutions
-from autocalib_ros.results.refusals import Reason, reason
 
 START_FOCAL_DIAGONALS = (0.35, 0.55, 0.85)
 """Initial focal lengths in image diagonals: lenses of about 100, 75 and 50 degrees across the diagonal."""
@@ -32,13 +30,6 @@ MAX_START_WINDOWS = 60
 """Windows used in the multi-start."""
 MAX_TURNING_WINDOWS, MAX_TRACKLETS = 300, 100
 """Windows and tracklets in one adjustment."""
-MAX_CENTRE_SPREAD = 0.5
-"""Largest median distance of the turning centres from their common centre, in median turning radii, for which all
-vehicles count as turning about one point. Judgement."""
-MAX_SIGMA_FOCAL_ONE_CENTRE = 0.02
-"""Largest accepted relative standard deviation of the focal length if all vehicles turn about one point. The bias from
-noise grows with the variance, so faster than the standard deviation: on simulated roundabouts both are equal at 2.5 %,
-and the bias is half the standard deviation at 1.5 %."""
 MAX_TRACKLET_DIFFERENCE_SIGMAS = 3.0
 """Largest difference between the solutions from windows and from tracklets, in standard deviations of the less certain.
 Judgement."""
@@ -158,29 +149,6 @@ def widen_by_tracklet_difference(fit: Adjustment, tracklet_state: AdjustmentStat
         return fit
     step = fit.problem.parameters.step_to(tracklet_state)
     return replace(fit, covariance=fit.covariance + np.outer(step, step))
-
-
-def check_turning_centres(fit: Adjustment, windows: TwoFrameWindows) -> Reason | None:
-    """Return a refusal if all vehicles turn about one point and the focal length is too uncertain for that.
-
-    A single axis of rotation constrains lens and plane so weakly that the bias from noise exceeds the stated standard
-    deviations, unless these are small.
-    """
-    sigma = fit.focal_sigma
-    depends_on_turning = fit.problem.config.turning and sigma >= MAX_SIGMA_FOCAL_ONE_CENTRE
-    chosen = _turning_windows(fit, windows) if depends_on_turning else None
-    if chosen is None:
-        return None
-    centres, radii = turning_centres(chosen, fit.state.camera, fit.state.rotation)
-    distances = np.hypot(*(centres - np.median(centres, axis=0)).T)
-    if not len(radii) or np.median(distances) > MAX_CENTRE_SPREAD * np.median(radii):
-        return None
-    return reason(
-        'one_centre',
-        spread=np.median(distances) / np.median(radii),
-        sigma=sigma,
-        limit=MAX_SIGMA_FOCAL_ONE_CENTRE,
-    )
 
 
 def widen_by_point_slip(fit: Adjustment, windows: TwoFrameWindows) -> Adjustment:

@@ -85,5 +85,5 @@ def _focal_and_normal_sigma(sigmas: np.ndarray) -> np.ndarray:
 
 def _curvature_covariance(fit: Adjustment) -> np.ndarray:
     """Covariance (parameters, parameters) from the curvature of the cost: the inverse of the information."""
-    _, prior = fit.problem.parameters.prior_gradient(fit.state.camera)
+    _, prior = fit.problem.parameters.prior_gradient(fit.state)
     return np.linalg.inv(fit.information + np.diag(prior) + REGULARISING_INFORMATION * np.eye(len(prior)))

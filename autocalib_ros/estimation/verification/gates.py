@@ -17,6 +17,7 @@ from autocalib_ros.estimation.adjustment.bundle_adjustment import (
 from autocalib_ros.estimation.adjustment.covariance import sigma_without_prior
 from autocalib_ros.estimation.observations.track_set import TrackSet, UnprojectedTracks, long_tracks
 from autocalib_ros.estimation.observations.tracklets import no_tracklets
+from autocalib_ros.estimation.straight.initialisation import MAX_FOCAL_DIAGONALS
 from autocalib_ros.estimation.straight.roads import MIN_VEHICLES_PER_ROAD
 from autocalib_ros.estimation.verification.consistency import compare_solutions, expected_half_differences
 from autocalib_ros.estimation.verification.ground_normal import LevelCamera, PlaneEstimate, orient_above_traffic
@@ -40,13 +41,8 @@ MIN_TRACKS_PER_VEHICLE = 3
 """Tracks of a vehicle that show whether it is lane-keeping: a single track is on the road or not."""
 MIN_FOCAL_CONTRAST = 1.3
 """Support at the best trial focal length over that at the median one: a wrong lens bends straight paths. Judgement."""
-MAX_FOCAL_DIAGONALS = 1.5
-"""Focal length, in image diagonals, above which lens curvature is invisible. Judgement."""
 MAX_K1_SIGMAS = 3.5
 """Deviation of k1 from the mean of its family, in sigmas of the prior: 0.05 % of the lenses of the family exceed it."""
-MAX_TURNING_FOCAL_SIGMA = 0.03
-"""Largest relative sigma of a focal length from turning traffic: noise biases it, and the bias grows faster than the
-sigma."""
 MAX_MOTION_FOCAL_SIGMA = 0.1
 """Relative sigma of the focal length from the motion of turning vehicles alone, below which that motion confirms the
 lens: turns mistaken for roads have larger errors. Judgement."""
@@ -78,7 +74,6 @@ def check_lens(
     fit: Adjustment,
     tracks: TrackSet,
     evidence: Evidence,
-    gate: GateOptions,
     *,
     turned: bool,
     driving: np.ndarray | None = None,
@@ -88,9 +83,7 @@ def check_lens(
     `tracks` are those selected from the evidence. `driving` is a mask (tracks,) of the tracks of vehicles: pedestrians
     need not follow a road.
     """
-    failed_check = (
-        _check_horizon(fit, tracks) or _check_focal_length(fit, gate, turned=turned) or _check_lens_model(fit)
-    )
+    failed_check = _check_horizon(fit, tracks) or _check_lens_model(fit)
     if failed_check or (turned and motion_constrains_focal(fit)):
         return failed_check
     needed = MIN_STRAIGHT_FRACTION if len(fit.state.angles_rad) > 1 else MIN_ONE_ROAD_FRACTION
@@ -123,7 +116,7 @@ def motion_constrains_focal(fit: Adjustment) -> bool:
     """Whether the motion of turning vehicles determines the focal length by itself, or the focal length is known."""
     if not fit.problem.config.turning or 0 not in fit.problem.config.prior.free:
         return fit.problem.config.turning
-    _, known = fit.problem.parameters.prior_gradient(fit.state.camera)
+    _, known = fit.problem.parameters.prior_gradient(fit.state)
     return bool(sigma_without_prior(fit.turning_information, known)[0] < MAX_MOTION_FOCAL_SIGMA)
 
 
@@ -149,7 +142,8 @@ def _turning_traffic_reason(fit: Adjustment, fraction: float, limit: float) -> R
     return reason('turning_traffic', '' if roads > 1 else 'one_road', fraction=fraction, limit=limit, roads=roads)
 
 
-def _check_focal_length(fit: Adjustment, gate: GateOptions, *, turned: bool) -> Reason | None:
+def check_focal_length(fit: Adjustment, gate: GateOptions, *, turned: bool) -> Reason | None:
+    """Check whether the traffic alone determines the focal length."""
     camera, prior = fit.state.camera, fit.problem.config.prior
     sigma = fit.focal_sigma
     diagonals = camera.focal_px / camera.diagonal_px
@@ -159,7 +153,7 @@ def _check_focal_length(fit: Adjustment, gate: GateOptions, *, turned: bool) -> 
     circular = prior.family == 'distortion_free' and not (
         prior.focal_known or fit.problem.config.options.crossing_deg is not None
     )
-    needed = min(gate.max_sigma_focal_rel, MAX_TURNING_FOCAL_SIGMA) if turned else gate.max_sigma_focal_rel
+    needed = gate.max_sigma_focal_rel
     if not (too_long or circular or not sigma <= needed):
         return None
     code = 'too_little_turning' if turned else 'too_little_curvature'

@@ -7,25 +7,18 @@ from dataclasses import replace
 from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment, adjust, evaluate_with
 from autocalib_ros.estimation.adjustment.covariance import sigma_without_prior
 from autocalib_ros.estimation.adjustment.lens_prior import LENS_PARAMETERS, LensPrior
-from autocalib_ros.estimation.adjustment.model_selection import MODEL_SELECTION_MARGIN, select_model
 from autocalib_ros.estimation.observations.track_set import TrackSet
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.results.statements import Statement, assumption
 
 
-def release_k2(fit: Adjustment, tracks: TrackSet) -> Adjustment:
-    """Release k2 if that makes the traffic clearly more probable; a single road does not determine it."""
+def free_k2(fit: Adjustment, tracks: TrackSet) -> Adjustment:
+    """Free k2 within its prior: no lens follows its family exactly. A single road does not determine it."""
     config = fit.problem.config
-    if config.prior.family != 'equidistant' or config.prior.sigma[3] <= 0 or not fit.plane_known:
+    if config.prior.sigma[3] <= 0 or config.prior.sigma[4] > 0 or not fit.plane_known:
         return fit
-    released = adjust(
-        fit.state,
-        tracks,
-        replace(config, prior=config.prior.with_free_k2()),
-        refine=True,
-        warm_start=fit.problem.warm_start,
-    )
-    return select_model([fit, released], tracks, MODEL_SELECTION_MARGIN)
+    freed = replace(config, prior=config.prior.with_free_k2())
+    return adjust(fit.state, tracks, freed, refine=True, warm_start=fit.problem.warm_start)
 
 
 def fix_unidentifiable(fit: Adjustment, tracks: TrackSet) -> tuple[Adjustment, tuple[str, ...]]:
@@ -50,7 +43,7 @@ def fix_unidentifiable(fit: Adjustment, tracks: TrackSet) -> tuple[Adjustment, t
 def _unidentifiable(fit: Adjustment) -> tuple[str, ...]:
     """Names of the lens parameters whose sigma from the evidence alone exceeds that of the prior."""
     prior = fit.problem.config.prior
-    _, known = fit.problem.parameters.prior_gradient(fit.state.camera)
+    _, known = fit.problem.parameters.prior_gradient(fit.state)
     sigmas = sigma_without_prior(fit.information, known)
     names = [LENS_PARAMETERS[parameter] for parameter in prior.free]
     return tuple(name for name, sigma, is_known in zip(names, sigmas, known, strict=False) if is_known and sigma > 1.0)

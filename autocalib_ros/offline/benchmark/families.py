@@ -42,6 +42,8 @@ MAX_K1 = 0.05
 TURNING_K1 = 0.03
 MAX_CENTRE_OFFSET_PX = 20.0
 """Largest offset of the principal point from the image centre along each axis."""
+BUILT_DEG = 1.0
+"""Standard deviation of the angle at which two roads cross from a right angle: junctions are built to about that."""
 PRINCIPAL_POINT_SIGMA = 0.01
 """Standard deviation of the principal point, fraction of the image width: default joint.principal_point_sigma_px."""
 
@@ -50,14 +52,16 @@ Family = Callable[[np.random.Generator], tuple[Junction, Evidence]]
 
 
 def standard_junction(generator: np.random.Generator, heading_deg: tuple[float, float] = (25.0, 65.0)) -> Junction:
-    """Draw the standard junction: 60 tracks, one per vehicle, on two perpendicular roads that cross ahead."""
+    """Draw the standard junction: 60 tracks, one per vehicle, on two roads that cross ahead at about a right angle."""
     tilt, roll, heading, height = generator.uniform([26, -2, heading_deg[0], 6], [38, 2, heading_deg[1], 10])
     reach = generator.uniform(1.1, 1.7) * height / np.tan(np.radians(tilt))
     bearing = np.radians(generator.uniform(-8, 8) - heading)
+    crossing = 90.0 + generator.normal(scale=BUILT_DEG)
     return Junction(
         camera=draw_lens(generator),
         camera_from_ground=pose(tilt, roll, heading),
         height_m=float(height),
+        road_angles_deg=(0.0, float(crossing)),
         centre_m=(float(reach * np.cos(bearing)), float(reach * np.sin(bearing))),
         tracks=60,
         points_per_vehicle=1,

@@ -69,7 +69,7 @@ def test_a_rounded_size_widens_the_focal_length_by_the_squeeze(two_roads: Eviden
     plain, rounded = solve_once(two_roads, OPTIONS), solve_once(squeezed(two_roads, 1280, 704), OPTIONS)
     assert 'nearly_square_pixels' in kinds(rounded)
     across, down = rounded.camera.matrix[0, 0], rounded.camera.matrix[1, 1]
-    assert rounded.stddev.focal_px > 2 * plain.stddev.focal_px
+    assert rounded.stddev.focal_px > 1.3 * plain.stddev.focal_px
     assert abs(across - FOCAL_PX) < 3 * rounded.stddev.focal_px
     assert abs(down - FOCAL_PX * 704 / 720) < 3 * rounded.stddev.focal_px
 
@@ -80,7 +80,7 @@ def test_an_undecided_aspect_of_a_squeezed_size_is_refused_with_the_option_to_se
     assert isinstance(result, Refusal)
     assert result.code == 'pixel_aspect'
     assert 'lens.pixel_aspect' in result.remedy
-    assert '1.42' in result.message and '1.07' in result.message
+    assert '1.42 times as wide as high' in result.message
 
 
 def test_the_published_method_takes_a_told_aspect(two_roads: Evidence) -> None:

@@ -10,7 +10,7 @@ import pytest
 from autocalib_ros.config import GateOptions, JointOptions, Options
 from autocalib_ros.estimation.adjustment.bundle_adjustment import adjust
 from autocalib_ros.estimation.adjustment.lens_prior import lens_priors
-from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig, AdjustmentState
+from autocalib_ros.estimation.adjustment.parameters import RIGHT_ANGLE_SIGMA_RAD, AdjustmentConfig, AdjustmentState
 from autocalib_ros.estimation.estimate import solve
 from autocalib_ros.estimation.observations.track_set import select_tracks
 from autocalib_ros.estimation.verification.gates import check_halves
@@ -92,7 +92,7 @@ def test_skewed_roads_are_measured_not_squared() -> None:
 def test_perpendicularity_is_tested_before_it_is_used() -> None:
     result = solved(Junction())
     assert isinstance(result, Calibration)
-    assert [item.values['source'] for item in result.assumptions if item.kind == 'crossing_angle'] == ['fixed']
+    assert [item.values['source'] for item in result.assumptions if item.kind == 'crossing_angle'] == ['expected']
 
 
 def test_perpendicularity_can_be_asserted() -> None:
@@ -268,7 +268,8 @@ def test_the_same_evidence_gives_the_same_answer_to_the_last_bit() -> None:
 
 def test_standard_deviations_have_the_size_of_the_errors() -> None:
     """Five draws; `autocalib benchmark accuracy` has forty of this family."""
-    results = [solved(Junction(), seed) for seed in range(5)]
+    crossings = 90.0 + np.random.default_rng(1).normal(scale=np.degrees(RIGHT_ANGLE_SIGMA_RAD), size=5)
+    results = [solved(Junction(road_angles_deg=(0.0, float(angle))), seed) for seed, angle in enumerate(crossings)]
     errors = [
         (result.camera.focal_px - 560.0) / result.stddev.focal_px
         for result in results

@@ -101,9 +101,9 @@ def test_turning_traffic_completes_a_single_road() -> None:
 def test_a_ring_alone_is_refused_unless_it_tells_the_lens() -> None:
     result = solved(replace(TURNING, drive=partial(drive_ring, radius_m=20.0), vehicles=25, points_per_vehicle=6))
     if isinstance(result, Refusal):
-        assert result.code in ('one_centre', 'turning_traffic', 'too_little_turning')
+        assert result.code in ('turning_traffic', 'too_little_turning')
     else:
-        assert result.stddev.focal_px is not None and result.stddev.focal_px < 0.02 * 560.0
+        assert result.stddev.focal_px is not None and result.stddev.focal_px < 0.05 * 560.0
         assert abs(result.camera.focal_px - 560.0) < 3.0 * result.stddev.focal_px
 
 
