@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from drawn_pictures import noisy, paste
 
 from autocalib_ros.cli import main
 from autocalib_ros.config import Options
@@ -42,16 +43,12 @@ class Road:
         self._cars = [(texture(1, (40, 60)), 125, 4.5), (texture(2, (24, 36)), 80, -2.5), (texture(3, (14, 20)), 40, 1)]
 
     def frames(self):
-        noise = np.random.default_rng(0)
         for index in range(self.total):
             image = self._road.copy()
             for number, (car, row, step) in enumerate(self._cars):
                 column = (step * index + 150 * number) % (SIZE[1] + 70) - 65
-                place = np.array([[1.0, 0, column], [0, 1.0, row]])
-                inside = cv2.warpAffine(np.ones_like(car), place, SIZE[::-1])
-                image = image * (1 - inside) + cv2.warpAffine(car, place, SIZE[::-1]) * inside
-            image += noise.normal(0, 1.5, SIZE)
-            yield Frame(index * INTERVAL_NS, np.clip(image, 0, 255).astype(np.uint8))
+                paste(image, car, column, row)
+            yield Frame(index * INTERVAL_NS, noisy(image, 1.5, index))
 
     def stored(self):
         return (StoredImage(index * INTERVAL_NS, index * INTERVAL_NS, '') for index in range(self.total))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from drawn_pictures import noisy, paste
 
 from autocalib_ros.calibrator import AutoCalibrator
 from autocalib_ros.config import DetectorOptions, Options
@@ -29,13 +30,7 @@ def texture(seed: int, shape: tuple[int, int], sigma: float = 1.5) -> np.ndarray
 
 
 ROAD = texture(0, SIZE) * 0.5 + 40
-NOISE = np.random.default_rng(9).normal(0, 1.5, SIZE)
 LOOKS = [texture(seed, CAR) for seed in range(1, 5)]
-
-
-def noisy(image: np.ndarray, seed: int) -> np.ndarray:
-    """Add noise, another one for each seed, uint8."""
-    return np.clip(image + np.roll(NOISE, 7919 * seed), 0, 255).astype(np.uint8)
 
 
 class World:
@@ -60,10 +55,8 @@ class World:
         self.time_s = time_s
         image = ROAD.copy()
         for look, (x, y) in zip(LOOKS, self.at(time_s), strict=False):
-            shift = np.array([[1.0, 0, x], [0, 1.0, y]])
-            mask = cv2.warpAffine(np.ones(CAR), shift, SIZE[::-1])
-            image = image * (1 - mask) + cv2.warpAffine(look, shift, SIZE[::-1]) * mask
-        return noisy(image, int(time_s * 1000))
+            paste(image, look, x, y)
+        return noisy(image, 1.5, int(time_s * 1000))
 
     def detect(self, image: np.ndarray) -> Detections:
         """Return all boxes, in pixels of the image given."""
@@ -87,7 +80,7 @@ def watched(
     tracks, segments, edges = [], [], []
     for index in range(int(RATE_HZ * (2 + seconds))):
         time_s = index / RATE_HZ
-        image = world.image(time_s - 2.0) if time_s >= 2 else noisy(ROAD, index)
+        image = world.image(time_s - 2.0) if time_s >= 2 else noisy(ROAD, 1.5, index)
         world.missed = (0,) if missed_between[0] <= time_s - 2 < missed_between[1] else ()
         if scale > 1:
             image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_LINEAR)
@@ -186,7 +179,7 @@ def test_evidence_of_a_detector_has_track_kinds_and_the_result_reports_them() ->
     world = World([(20, 100), (500, 250)], [40.0, -40.0], people=(1,))
     calibrator = AutoCalibrator(Options(), detector=world)
     for index in range(70):
-        image = world.image(0.1 * (index - 20)) if index >= 20 else noisy(ROAD, index)
+        image = world.image(0.1 * (index - 20)) if index >= 20 else noisy(ROAD, 1.5, index)
         calibrator.add_image(index * 100_000_000, image)
     evidence = calibrator.snapshot()
     assert evidence is not None

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 import pytest
+from drawn_pictures import noisy
 
 from autocalib_ros.evidence.stillness import Stillness, ViewChangeKind
 from autocalib_ros.perception.drift_monitor import DriftLimits, DriftMonitor, ImagePose
@@ -42,10 +43,9 @@ def moved(image: np.ndarray, x: float = 0.0, y: float = 0.0, zoom: float = 1.0, 
 
 
 def watched(scene: Scene, seconds: float, noise: float = 2.0) -> tuple[list[ImagePose], DriftMonitor]:
-    generator, monitor, poses = np.random.default_rng(5), DriftMonitor(LIMITS), []
-    for time_s in np.arange(0.0, seconds, 1 / RATE_HZ):
-        image = scene(float(time_s)) + generator.normal(0, noise, (HEIGHT, WIDTH))
-        poses.append(monitor.update(np.clip(image, 0, 255).astype(np.uint8), float(time_s)))
+    monitor, poses = DriftMonitor(LIMITS), []
+    for index, time_s in enumerate(np.arange(0.0, seconds, 1 / RATE_HZ)):
+        poses.append(monitor.update(noisy(scene(float(time_s)), noise, index), float(time_s)))
     return poses, monitor
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from drawn_pictures import noisy
 
 from autocalib_ros.config import BufferOptions, Options
 from autocalib_ros.evidence.buffer import EvidenceBuffer
@@ -29,8 +30,7 @@ def scene(index: int) -> np.ndarray:
     lean = round(40 * np.tan(np.radians(LEAN_DEG)))
     glass = np.array([[x + 30, y + 10], [x + 60, y + 10], [x + 60 + lean, y + 50], [x + 30 + lean, y + 50]])
     cv2.fillPoly(image, [glass.astype(np.int32)], 20)
-    noise = np.random.default_rng(index).normal(0, 1.5, SIZE)
-    return np.clip(cv2.GaussianBlur(image, (0, 0), 0.7) + noise, 0, 255).astype(np.uint8)
+    return noisy(cv2.GaussianBlur(image, (0, 0), 0.7), 1.5, index)
 
 
 def region(index: int, margin: int = 12) -> Region:

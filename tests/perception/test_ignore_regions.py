@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
+from drawn_pictures import noisy, paste
 
 from autocalib_ros.calibrator import AutoCalibrator
 from autocalib_ros.config import Options
@@ -40,11 +41,8 @@ def scene(
         ROAD, np.array([[1.0, 0, shift], [0, 1.0, 0]]), (WIDTH, HEIGHT), borderMode=cv2.BORDER_REFLECT
     )
     for x, y in places:
-        place = np.array([[1.0, 0, x + speed[0] * time_s + shift], [0, 1.0, y + speed[1] * time_s]])
-        mask = cv2.warpAffine(np.ones_like(CAR), place, (WIDTH, HEIGHT))
-        image = image * (1 - mask) + cv2.warpAffine(CAR, place, (WIDTH, HEIGHT)) * mask
-    noise = np.random.default_rng(int(1000 * time_s)).normal(0, 1.5, image.shape)
-    return np.clip(image + noise, 0, 255).astype(np.uint8)
+        paste(image, CAR, x + speed[0] * time_s + shift, y + speed[1] * time_s)
+    return noisy(image, 1.5, int(1000 * time_s))
 
 
 def watch(options: Options, places: tuple[tuple[float, float], ...], speed: tuple[float, float] = (45.0, 0.0)) -> tuple:

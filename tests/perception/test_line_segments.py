@@ -7,6 +7,7 @@ from functools import cache
 import cv2
 import numpy as np
 import pytest
+from drawn_pictures import noisy
 
 from autocalib_ros.calibrator import AutoCalibrator
 from autocalib_ros.config import Options
@@ -47,8 +48,7 @@ def picture(shift: float = 0.0, car_x: float | None = None, seed: int = 0, facto
     if car_x is not None:
         left, right = (int(np.clip(x, 0, WIDTH)) * factor for x in (car_x, car_x + 90))
         image[CAR_ROWS[0] * factor : CAR_ROWS[1] * factor, left:right] = 240
-    noise = np.random.default_rng(seed).normal(0.0, 2.0, image.shape)
-    return np.clip(image + noise, 0, 255).astype(np.uint8)
+    return noisy(image, 2.0, seed)
 
 
 def edges(shift: float = 0.0) -> np.ndarray:

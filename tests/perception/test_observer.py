@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from drawn_pictures import noisy, paste
 
 from autocalib_ros.config import MotionOptions, Options
 from autocalib_ros.perception.background import Background
@@ -31,11 +32,8 @@ def scene(time_s: float, cars: int = 2) -> np.ndarray:
     image = ROAD.copy()
     for index, (car, row, start, speed) in enumerate(zip(CARS, (80, 220), (20, 540), (45.0, -40.0), strict=True)):
         if index < cars:
-            shift = np.array([[1.0, 0, start + speed * time_s], [0, 1.0, row]])
-            mask = cv2.warpAffine(np.ones_like(car), shift, SIZE[::-1])
-            image = image * (1 - mask) + cv2.warpAffine(car, shift, SIZE[::-1]) * mask
-    noise = np.random.default_rng(int(time_s * 1000)).normal(0, 1.5, SIZE)
-    return np.clip(image + noise, 0, 255).astype(np.uint8)
+            paste(image, car, start + speed * time_s, row)
+    return noisy(image, 1.5, int(time_s * 1000))
 
 
 def test_moving_cars_are_regions_and_the_road_is_not() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from drawn_pictures import noisy, paste
 
 from autocalib_ros.config import Options
 from autocalib_ros.perception.frame_gate import FrameGate, FrameStatus
@@ -31,11 +32,8 @@ def drawn(index: int, cars: int, noise: float = 0.0, first: int = 0) -> np.ndarr
     image = ROAD.copy()
     for car, (row, start, step) in list(zip(CARS, PLACES, strict=True))[first:cars]:
         column = (start + step * index + 60) % (SIZE[1] + 120) - 60
-        place = np.array([[1.0, 0, column], [0, 1.0, row]])
-        inside = cv2.warpAffine(np.ones_like(car), place, SIZE[::-1])
-        image = image * (1 - inside) + cv2.warpAffine(car, place, SIZE[::-1]) * inside
-    image += np.random.default_rng(index).normal(0, noise, SIZE) if noise else 0.0
-    return np.clip(image, 0, 255).astype(np.uint8)
+        paste(image, car, column, row)
+    return noisy(image, noise, index)
 
 
 def encoded(image: np.ndarray, quality: int) -> np.ndarray:
