@@ -1,5 +1,6 @@
 """Tests run as the programs do: with one thread for linear algebra; those that cost nothing are marked `unit`."""
 
+import gc
 import os
 from collections import defaultdict
 
@@ -9,6 +10,7 @@ from autocalib_ros.util.threads import limit_blas_threads
 from stored_results import quick_folder
 
 limit_blas_threads()
+gc.disable()  # while tests are collected: what they import stays until the end
 os.environ.pop('FORCE_COLOR', None)  # some test machines set it, and messages are compared as they are
 
 COSTS_S = {'slow': 60.0, 'solve': 2.0, 'dds': 1.5, 'render': 1.5, 'unit': 0.02}
@@ -38,6 +40,12 @@ def pytest_configure(config):
     """Keep the tests of a module in one process, where several run: they share solutions, pages and recordings."""
     if getattr(config.option, 'dist', 'no') == 'load':
         config.option.dist = 'loadfile'
+
+
+def pytest_collection_finish():
+    """Look for garbage from here on, and not among what was imported."""
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from collections import Counter
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -108,7 +109,9 @@ def run_without_ros(modules: list[str], then: str = '') -> subprocess.CompletedP
     )
 
 
-IMPORTS = {module: imported_modules(module, path) for module, path in MODULES.items()}
+@cache
+def imports() -> dict[str, list[str]]:
+    return {module: imported_modules(module, path) for module, path in MODULES.items()}
 
 
 def test_every_module_lives_in_a_known_room() -> None:
@@ -118,7 +121,7 @@ def test_every_module_lives_in_a_known_room() -> None:
 def test_imports_run_downward_only() -> None:
     upward = [
         f'{module} imports {name}, which does not lie below it'
-        for module, names in IMPORTS.items()
+        for module, names in imports().items()
         for name in names
         if name.startswith('autocalib_ros.')
         and room_of(name) not in ('', room_of(module))
@@ -129,7 +132,7 @@ def test_imports_run_downward_only() -> None:
 
 def test_no_circle_of_files() -> None:
     """Whole-file circles hide which file knows which; imports inside functions count too."""
-    graph = {module: {name for name in names if name in MODULES} - {module} for module, names in IMPORTS.items()}
+    graph = {module: {name for name in names if name in MODULES} - {module} for module, names in imports().items()}
     while leaves := [module for module, below in graph.items() if not below & set(graph)]:
         for module in leaves:
             del graph[module]
@@ -139,7 +142,7 @@ def test_no_circle_of_files() -> None:
 def test_only_the_live_shell_imports_ros() -> None:
     assert not [
         f'{module} imports {name}'
-        for module, names in IMPORTS.items()
+        for module, names in imports().items()
         for name in names
         if room_of(module) != 'ros' and (root_of(name) in ROS_PACKAGES or root_of(name).endswith('_msgs'))
     ]
@@ -148,7 +151,7 @@ def test_only_the_live_shell_imports_ros() -> None:
 def test_only_the_offline_shell_imports_rosbags() -> None:
     assert not [
         f'{module} imports {name}'
-        for module, names in IMPORTS.items()
+        for module, names in imports().items()
         for name in names
         if not room_of(module).startswith('offline') and root_of(name) == 'rosbags'
     ]

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from recorded_clips import DATA, needs_recorded_clips
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
@@ -30,7 +29,6 @@ from autocalib_ros.results.refusals import Reason
 from solved_once import solve_once
 
 TYPES = get_typestore(Stores.ROS2_JAZZY).types
-DATA = Path(os.environ.get('AUTOCALIB_TEST_DATA', '')) / 'data'
 SIZE = (1280, 720)
 K = (560.0, 0.0, 630.0, 0.0, 560.0, 371.0, 0.0, 0.0, 1.0)
 TALL = (560.0, 0.0, 630.0, 0.0, 548.0, 371.0, 0.0, 0.0, 1.0)
@@ -408,9 +406,7 @@ def test_the_truth_of_the_simulator_is_met():
     assert worst_px(truth_of(Simulation(options))) < 1e-4  # its pixels are rounded to 4 digits, half of it
 
 
-@pytest.mark.skipif(
-    'AUTOCALIB_TEST_DATA' not in os.environ, reason='AUTOCALIB_TEST_DATA does not name a folder with recorded clips'
-)
+@needs_recorded_clips
 def test_the_truth_of_a_rendered_scene_is_met():
     assert worst_px(json.loads((DATA / 'scenes' / 'S1' / 'truth.json').read_text())) < 1e-4
 

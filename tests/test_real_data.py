@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from recorded_clips import DATA, needs_recorded_clips
 
 from autocalib_ros.config import DetectorOptions, Options
 from autocalib_ros.evidence.snapshot import TrackKind
@@ -23,14 +23,7 @@ from autocalib_ros.perception.detector.detector import open_detector
 from autocalib_ros.perception.picture_area import PictureArea
 from autocalib_ros.results.calibration import Calibration, Refusal
 
-DATA = Path(os.environ.get('AUTOCALIB_TEST_DATA', '')) / 'data'
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(
-        'AUTOCALIB_TEST_DATA' not in os.environ or not DATA.is_dir(),
-        reason='AUTOCALIB_TEST_DATA does not name a folder with recorded clips',
-    ),
-]
+pytestmark = [pytest.mark.slow, needs_recorded_clips]
 
 
 def result_of(clip: Path, height_m: float, duration_s: float | None = None) -> Calibration | Refusal:

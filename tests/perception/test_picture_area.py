@@ -7,7 +7,6 @@ from functools import cache
 import cv2
 import numpy as np
 import pytest
-from drawn_pictures import noisy
 
 from autocalib_ros.perception.background import Background, median
 from autocalib_ros.perception.ignore_regions import black_out
@@ -41,7 +40,8 @@ def _street(index: int, gain: float) -> np.ndarray:
         x, y = int(250 - 60 * share), int(235 - 140 * share)
         cv2.line(image, (x, y), (x - 4, y - 10), (235, 235, 235), 2)
     cv2.rectangle(image, (20 + 25 * index, 140), (60 + 25 * index, 165), (40, 40, 160), -1)
-    return noisy(gain * image, 2.0, index)
+    noise = np.random.default_rng(index).normal(0.0, 2.0, image.shape)
+    return np.clip(gain * image + noise, 0, 255).astype(np.uint8)
 
 
 def night(index: int, sky: int = 14) -> np.ndarray:

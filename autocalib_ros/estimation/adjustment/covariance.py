@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 MIN_EIGENVALUE_RATIO = 1e-10
 """Smallest eigenvalue of the information over the largest; below it the covariance is infinite (singular)."""
@@ -99,7 +99,7 @@ def small_sample_factor(moves: np.ndarray) -> np.ndarray:
     """
     squares = moves**2
     dof = 3.0 * squares.sum(axis=0) ** 2 / np.maximum((squares**2).sum(axis=0), 1e-300)
-    return stats.t.ppf(0.975, np.maximum(dof, 1.0)) / stats.norm.ppf(0.975)
+    return special.stdtrit(np.maximum(dof, 1.0), 0.975) / special.ndtri(0.975)
 
 
 def intraclass_correlation(groups: np.ndarray, scores: np.ndarray) -> float:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import accumulate
 
 import numpy as np
-from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from autocalib_ros.lens.camera import Camera
@@ -73,7 +73,7 @@ def random_sway(generator: np.random.Generator) -> Sway:
     pushes = generator.normal(
         scale=0.5 * amplitude * np.sqrt(1 - keep**2), size=(int(SWAY_DURATION_S / SWAY_STEP_S), 3)
     )
-    walk = lfilter([1.0], [1.0, -keep], pushes, axis=0)
+    walk = np.array(list(accumulate(pushes, lambda before, push: push + keep * before)))
     ticks = SWAY_STEP_S * np.arange(len(walk))
 
     def sway(times_s: np.ndarray) -> np.ndarray:

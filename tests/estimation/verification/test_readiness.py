@@ -18,14 +18,15 @@ from autocalib_ros.estimation.verification.readiness import (
 )
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.evidence.stillness import Stillness, ViewChange, ViewChangeKind, drift_limit_px, sway_limit_px
-from autocalib_ros.offline.synthetic.junction import Junction, synthetic_evidence
+from autocalib_ros.offline.synthetic.junction import Junction
+from solved_once import evidence_once
 
 GATE = GateOptions()
 
 
 def evidence_after(seconds: float, newest_track_s: float, tracks: int = 17) -> Evidence:
     """So many tracks, the last of which ended then."""
-    evidence = synthetic_evidence(Junction(tracks=tracks), np.random.default_rng(0))
+    evidence = evidence_once(Junction(tracks=tracks))
     return replace(
         evidence, newest_stamp_ns=int(seconds * 1e9), times_s=evidence.times_s - evidence.times_s.max() + newest_track_s
     )
@@ -95,8 +96,9 @@ def test_the_limit_of_the_drift_scales_with_the_width_down_to_what_video_scatter
 
 
 def stood(start_s: float, end_s: float, recorded_s: float, *changes: ViewChange, travel_px: float = 0.0) -> Evidence:
-    evidence = synthetic_evidence(Junction(tracks=60), np.random.default_rng(0))
-    return replace(evidence, stillness=Stillness(start_s, end_s, recorded_s, 0.0, travel_px, changes))
+    return replace(
+        evidence_once(Junction(tracks=60)), stillness=Stillness(start_s, end_s, recorded_s, 0.0, travel_px, changes)
+    )
 
 
 TURN, ZOOM, CUT = ViewChangeKind.TURN, ViewChangeKind.ZOOM, ViewChangeKind.CUT
