@@ -116,7 +116,7 @@ def evidence_from_tracks(
     buffer = EvidenceBuffer(BufferOptions())
     for track in tracks:
         buffer.add_track(track)
-    for segments in sorted((part for track in tracks for part in _segments(track)), key=lambda part: part.time_s):
+    for segments in _segments(tracks):
         buffer.add_segments(segments)
     return buffer.snapshot(
         image_size=image_size,
@@ -191,10 +191,18 @@ def _longest_run(seen: np.ndarray) -> tuple[int, int]:
     return int(first), int(last)
 
 
-def _segments(track: Track) -> Iterator[Segments]:
-    """Yield the displacement of a point between consecutive keypoint frames."""
-    first, last = np.ceil(track.times_s[0] / SEGMENT_INTERVAL_S), np.floor(track.times_s[-1] / SEGMENT_INTERVAL_S)
-    frames = np.arange(first, last + 1) * SEGMENT_INTERVAL_S
-    places = CubicSpline(track.times_s, track.points_px)(frames)
-    for time_s, before, after in zip(frames[1:], places[:-1], places[1:], strict=True):
-        yield Segments(float(time_s), np.array([track.vehicle]), np.concatenate([before, after])[None])
+def _segments(tracks: list[Track]) -> Iterator[Segments]:
+    """Yield the displacements of the points of all tracks between consecutive keypoint frames, frame by frame."""
+    times_s, vehicles, ends_px = [np.zeros(0)], [np.zeros(0, int)], [np.zeros((0, 4))]
+    for track in tracks:
+        first, last = np.ceil(track.times_s[0] / SEGMENT_INTERVAL_S), np.floor(track.times_s[-1] / SEGMENT_INTERVAL_S)
+        frames = np.arange(first, last + 1) * SEGMENT_INTERVAL_S
+        places = CubicSpline(track.times_s, track.points_px)(frames)
+        times_s.append(frames[1:])
+        vehicles.append(np.full(len(frames[1:]), track.vehicle))
+        ends_px.append(np.hstack([places[:-1], places[1:]]))
+    time_s, vehicle, ends = np.concatenate(times_s), np.concatenate(vehicles), np.concatenate(ends_px)
+    in_order = np.argsort(time_s, kind='stable')
+    for frame in np.split(in_order, np.flatnonzero(np.diff(time_s[in_order])) + 1):
+        if len(frame):
+            yield Segments(float(time_s[frame[0]]), vehicle[frame], ends[frame])
