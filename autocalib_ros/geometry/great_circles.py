@@ -48,7 +48,7 @@ def unproject_rays(camera: Camera, pixels: np.ndarray) -> Rays:
     if not camera.has_square_pixels:
         x = camera.pixel_aspect * x - camera.skew * y
     radius = np.maximum(np.sqrt(x * x + y * y), 1e-9)
-    theta, _ = camera.angle(radius)
+    theta = camera.nearest_angle(radius)
     # half-angle formulas: one tangent is cheaper than a sine and a cosine
     half = np.tan(0.5 * theta)
     cosine2 = 1.0 / (1.0 + half * half)

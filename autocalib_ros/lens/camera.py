@@ -67,7 +67,7 @@ class Camera:
     def __post_init__(self) -> None:
         numbers = (self.focal_px, *self.principal_point_px, *self.k, self.pixel_aspect, self.skew)
         positive = min(self.focal_px, self.pixel_aspect) > 0
-        if not np.isfinite(numbers).all() or not positive or min(self.width, self.height) < 1:
+        if not all(map(math.isfinite, numbers)) or not positive or min(self.width, self.height) < 1:
             raise UsageError(
                 f'a camera needs a positive focal length and pixel aspect, a size and finite numbers, got {self}'
             )
@@ -168,6 +168,12 @@ class Camera:
 
     def angle(self, radius_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the angles in radians of image radii in pixel heights, by Newton's method, and where it converged."""
+        theta = self.nearest_angle(radius_px)
+        radius = np.asarray(radius_px, float) / self.focal_px
+        return theta, np.abs(theta * _power_series(self.k, theta * theta) - radius) < 1e-6
+
+    def nearest_angle(self, radius_px: np.ndarray) -> np.ndarray:
+        """Return the angles of `angle`; a radius out of the range of the lens model gets the angle at its limit."""
         radius = np.asarray(radius_px, float) / self.focal_px
         limit = self.max_angle_rad
         theta = np.clip(radius, 0.0, limit)
@@ -180,7 +186,7 @@ class Camera:
                 # converged: each step doubles the digits; out of range the angle stays at its limit
                 if np.abs(theta - before).max(initial=0.0) < 1e-8:
                     break
-        return theta, np.abs(theta * _power_series(self.k, theta * theta) - radius) < 1e-6
+        return theta
 
     def undistort(self, pixels: np.ndarray, focal_px: float | None = None) -> np.ndarray:
         """Return pixels (..., 2) of a distortion-free camera with the same principal point and pixel shape.
@@ -208,7 +214,9 @@ def scale_factors(calibrated: tuple[int, int], images: tuple[int, int]) -> tuple
 
 def _power_series(k: tuple[float, ...], t2: np.ndarray) -> np.ndarray:
     """Return 1 + k1 t2 + k2 t2^2 + ..., with the shape of `t2`; trailing zero coefficients cost nothing."""
-    order = max((power for power, factor in enumerate(k, 1) if factor), default=0)
+    order = len(k)
+    while order and not k[order - 1]:
+        order -= 1
     if not order:
         return np.ones_like(t2)
     total = t2 * k[order - 1]
