@@ -71,10 +71,10 @@ class LensPrior:
         k1, k2, k3, k4 = camera.k
         return replace(
             camera,
-            focal_px=camera.focal_px * float(np.exp(np.clip(change[0], -1.0, 1.0))),
+            focal_px=camera.focal_px * float(np.exp(min(max(change[0], -1.0), 1.0))),
             principal_point_px=(float(cx + change[1]), float(cy + change[2])),
             k=(float(k1 + change[3]), float(k2 + change[4]), k3, k4),
-            pixel_aspect=camera.pixel_aspect * float(np.exp(np.clip(change[5], -1.0, 1.0))),
+            pixel_aspect=camera.pixel_aspect * float(np.exp(min(max(change[5], -1.0), 1.0))),
         )
 
     def step(self, camera: Camera, other: Camera) -> np.ndarray:

@@ -7,7 +7,7 @@ fitted by expectation-maximisation; lens, plane and the angle between the two di
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -93,7 +93,7 @@ class _GridState:
     rotation: np.ndarray
     skew_rad: float = 0.0
 
-    @property
+    @cached_property
     def directions(self) -> np.ndarray:
         """The two directions and the vertical one, shape (3, 3)."""
         along, across, up = self.rotation.T
@@ -101,11 +101,13 @@ class _GridState:
 
     def moved(self, step: np.ndarray, prior: LensPrior) -> _GridState:
         """Return the state after a step of the lens, of rotations about the axes of the plane, and of the skew."""
-        lens = len(prior.free)
+        size = len(prior.free)
+        lens, turn, skew = step[:size], step[size : size + 3], step[size + 3]
+        # most steps change few parameters: those of the numerical derivatives one each
         return _GridState(
-            prior.moved(self.camera, step[:lens]),
-            self.rotation @ Rotation.from_rotvec(step[lens : lens + 3]).as_matrix(),
-            self.skew_rad + float(step[lens + 3]),
+            prior.moved(self.camera, lens) if lens.any() else self.camera,
+            self.rotation @ Rotation.from_rotvec(turn).as_matrix() if turn.any() else self.rotation,
+            self.skew_rad + float(skew),
         )
 
 

@@ -12,6 +12,7 @@ from autocalib_ros.estimation.observations.track_set import count_earlier, kish_
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.great_circles import bearing_change, unproject_rays
 from autocalib_ros.geometry.robust_kernels import wrap_undirected
+from autocalib_ros.geometry.small_matrices import cross
 from autocalib_ros.lens.camera import Camera
 
 MAX_DISTANCE_TO_TRAFFIC = 0.06
@@ -110,8 +111,8 @@ class ProjectedSegments:
         middle, step = (ends_px[:, :2] + ends_px[:, 2:]) / 2, ends_px[:, 2:] - ends_px[:, :2]
         rays = unproject_rays(camera, middle)
         along = bearing_change(rays, camera, middle, step)
-        along /= np.maximum(np.linalg.norm(along, axis=1), 1e-12)[:, None]
-        return cls(rays.bearings, along, np.cross(rays.bearings, along))
+        along /= np.maximum(np.sqrt((along * along).sum(axis=1)), 1e-12)[:, None]
+        return cls(rays.bearings, along, cross(rays.bearings, along))
 
     def residuals(self, directions: np.ndarray) -> np.ndarray:
         """Angle of each segment from each direction (..., 3), within plus and minus pi / 2, shape (..., n)."""
@@ -119,7 +120,7 @@ class ProjectedSegments:
 
     def leverages(self, directions: np.ndarray, normal: np.ndarray) -> np.ndarray:
         """Derivative of the residuals by a rotation of the directions (k, 3) about the normal (3,), shape (k, n)."""
-        turned = np.cross(normal, directions)
+        turned = cross(normal, directions)
         sine, cosine = directions @ self.circles.T, directions @ self.along.T
         sine_by, cosine_by = turned @ self.circles.T, turned @ self.along.T
         return (cosine * sine_by - sine * cosine_by) / np.maximum(sine**2 + cosine**2, 1e-12)
