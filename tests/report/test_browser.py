@@ -52,10 +52,10 @@ def test_a_touch_enlarges_a_picture_and_leaves_the_page_as_wide(page, written):
     assert page.value('document.documentElement.scrollWidth <= document.documentElement.clientWidth')
 
 
-def test_the_browser_collects_the_complaints_of_a_page(tmp_path):
+def test_the_browser_collects_the_complaints_of_a_page(page, tmp_path):
     path = tmp_path / 'bad.html'
     path.write_text('<img src="https://example.invalid/a.png"><script>console.error("broken"); nothing.there</script>')
-    with browser() as one:
-        one.open(path, 390)
-        complaints = ' '.join(one.complaints)
+    page.open(path, 390)
+    complaints = ' '.join(page.complaints)
+    page.complaints.clear()  # those of the other pages are none
     assert 'broken' in complaints and 'nothing is not defined' in complaints and 'example.invalid' in complaints
