@@ -22,7 +22,7 @@ SMALL = {
     'height_px': 180,
     'focal_px': 140.0,
     'rate_hz': 10.0,
-    'duration_s': 40.0,
+    'duration_s': 28.0,
     'noise_sigma': 0.0,
     'pedestrians': 0,
 }

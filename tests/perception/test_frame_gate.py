@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from types import SimpleNamespace
 
 import cv2
@@ -40,6 +41,7 @@ PATTERN = 10 * texture(3, (HEIGHT, WIDTH), 60.0)
 """What the correction changes slowly over the image, counts."""
 
 
+@cache
 def counts(index: int) -> np.ndarray:
     """Two warm cars on a cool road, counts (h, w): what an open shutter shows."""
     heat, time_s = ROAD.copy(), index / RATE_HZ
