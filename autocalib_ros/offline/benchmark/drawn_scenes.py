@@ -146,7 +146,7 @@ def draw_scene(number: int, seed: int = 0) -> Scene:
 def gather(scene: Scene) -> Evidence:
     """Render a scene and gather its evidence as from a camera."""
     simulation, calibrator, normaliser = Simulation(scene.options), AutoCalibrator(Options()), IntensityNormaliser()
-    compression = [cv2.IMWRITE_DRAWN_JPEG_QUALITY, scene.jpeg_quality]
+    compression = [cv2.IMWRITE_JPEG_QUALITY, scene.jpeg_quality]
     for index in range(scene.options.frame_count):
         image = simulation.frame(index)
         if scene.options.thermal:
