@@ -34,7 +34,7 @@ def solved(junction: Junction, evidence: Evidence) -> Calibration:
 
 @pytest.fixture(scope='module')
 def many() -> tuple[Junction, Calibration]:
-    junction, evidence = watched(180)
+    junction, evidence = watched(350)
     return junction, solved(junction, evidence)
 
 
