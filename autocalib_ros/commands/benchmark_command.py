@@ -92,6 +92,37 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     scenes.add_argument(
         '--evidence', type=Path, metavar='FOLDER', help='folder that keeps the evidence; what is there is not rendered'
     )
+    stability = what.add_parser(
+        'stability',
+        help='results with a tenth of the vehicles left out',
+        description='Solve stored evidence again and again with a tenth of its vehicles left out at random. Exit '
+        'status: 0 if at least 95 %% of the draws have the verdict of all vehicles and the numbers spread by at most '
+        'half a stated standard deviation, 3 otherwise.',
+    )
+    stability.add_argument('files', metavar='EVIDENCE', nargs='+', type=Path, help='evidence files (.npz)')
+    stability.add_argument('--draws', type=int, default=20, metavar='N', help='draws per file (default: %(default)s)')
+    stability.add_argument(
+        '--camera-height', type=float, default=8.0, metavar='H', help='height in metres (default: %(default)s)'
+    )
+    stability.add_argument('--jobs', type=int, default=1, metavar='J', help='number of processes (default: 1)')
+    variants = what.add_parser(
+        'options',
+        help='documented options, and pairs of them, on stored evidence with known truth',
+        description='Solve stored evidence whose truth is known with other values of the documented options. Exit '
+        'status: 0 unless an option makes a result wrong with confidence (3.5 stated standard deviations at a grade '
+        'above assumed), 3 otherwise.',
+    )
+    variants.add_argument(
+        'folder',
+        metavar='FOLDER',
+        nargs='?',
+        type=Path,
+        default=Path('tests/golden'),
+        help='folder with the evidence and expected.json (default: %(default)s)',
+    )
+    variants.add_argument('--only', nargs='+', default=[], metavar='OPTION', help='options to vary (default: all)')
+    variants.add_argument('--pairs', action='store_true', help='also each pair of options')
+    variants.add_argument('--jobs', type=int, default=1, metavar='J', help='number of processes (default: 1)')
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -111,10 +142,8 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.update:
             golden.update(arguments.folder, golden_run)
         return MOVED if golden_run.moved else DONE
-    if arguments.what == 'streams':
-        return _run_streams(arguments)
-    if arguments.what == 'scenes':
-        return _run_scenes(arguments)
+    if arguments.what in BENCHMARK_TABLES:
+        return BENCHMARK_TABLES[arguments.what](arguments)
     from autocalib_ros.offline.benchmark.monte_carlo import run_monte_carlo
     from autocalib_ros.offline.benchmark.table import format_tables
 
@@ -162,3 +191,37 @@ def _run_scenes(arguments: argparse.Namespace) -> int:
         print(scenes.format_run(scene_run), flush=True)
     print(scenes.format_summary(runs))
     return MOVED if any(each.wrong for each in runs) else DONE
+
+
+def _run_stability(arguments: argparse.Namespace) -> int:
+    from autocalib_ros.config import Options
+    from autocalib_ros.offline.benchmark import stability
+
+    options, stable = Options(camera_height=arguments.camera_height), True
+    print(stability.STABILITY_HEADER)
+    for each in stability.measure_stability(arguments.files, options, draws=arguments.draws, jobs=arguments.jobs):
+        stable &= each.stable
+        print(stability.format_stability(each), flush=True)
+    return DONE if stable else MOVED
+
+
+def _run_options(arguments: argparse.Namespace) -> int:
+    from autocalib_ros.offline.benchmark import option_variants
+
+    wrong = False
+    print(option_variants.VARIANT_HEADER)
+    for each in option_variants.measure_variants(
+        arguments.folder, pairs=arguments.pairs, jobs=arguments.jobs, only=arguments.only
+    ):
+        wrong |= each.wrong
+        print(option_variants.format_variant(each), flush=True)
+    return MOVED if wrong else DONE
+
+
+BENCHMARK_TABLES = {
+    'streams': _run_streams,
+    'scenes': _run_scenes,
+    'stability': _run_stability,
+    'options': _run_options,
+}
+"""Benchmarks that print one row after the other."""

@@ -9,10 +9,10 @@ import numpy as np
 from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment, adjust, regroup_vehicles
 from autocalib_ros.estimation.adjustment.model_selection import noise_cost
 from autocalib_ros.estimation.adjustment.noise_model import DEFAULT_CAMERA_HEIGHT_M
-from autocalib_ros.estimation.observations.track_set import TrackSet
+from autocalib_ros.estimation.observations.track_set import TrackSet, evenly_spaced
 from autocalib_ros.estimation.one_road import CrossTraffic, complete_one_road
 from autocalib_ros.estimation.people.pedestrians import people
-from autocalib_ros.estimation.solution import Observations, Solution
+from autocalib_ros.estimation.solution import MAX_SUBSAMPLE_TRACKS, Observations, Solution
 from autocalib_ros.estimation.straight.initialisation import select_lens_family
 from autocalib_ros.estimation.straight.roads import add_further_roads, expect_right_angle, main_road
 from autocalib_ros.estimation.turning.turning_traffic import (
@@ -21,6 +21,7 @@ from autocalib_ros.estimation.turning.turning_traffic import (
     widen_by_point_slip,
     widen_by_tracklet_difference,
 )
+from autocalib_ros.estimation.verification.focal_modes import widen_by_focal_modes
 from autocalib_ros.estimation.verification.gates import check_focal_length, check_halves, check_lens, check_plane
 from autocalib_ros.estimation.verification.ground_normal import LevelCamera, PlaneEstimate
 from autocalib_ros.estimation.verification.identifiability import fix_unidentifiable, free_k2, lens_assumptions
@@ -79,6 +80,8 @@ def refine_and_verify(
     # Errors that no residual shows widen the covariance.
     fit = widen_by_point_slip(fit, observations.windows)
     fit = widen_by_tracklet_difference(fit, tracklet_state)
+    # Other focal lengths that are about as probable widen it, too.
+    fit = widen_by_focal_modes(fit, tracks.subset(evenly_spaced(len(tracks), MAX_SUBSAMPLE_TRACKS)))
     uncertain = check_focal_length(fit, gate, turned=turned)
     assumptions = lens_assumptions(fit, fixed)
     if not fit.plane_known:

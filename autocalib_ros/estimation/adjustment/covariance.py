@@ -139,6 +139,12 @@ def propagate_covariance(function: Callable[[np.ndarray], np.ndarray], size: int
     return slopes.T @ covariance @ slopes
 
 
+def sigma_of_information(information: np.ndarray, prior: np.ndarray) -> np.ndarray:
+    """Return the standard deviations (parameters,) of independent rows, with the diagonal `prior` (parameters,)."""
+    inverse = np.linalg.pinv(information + np.diag(prior), hermitian=True)
+    return np.sqrt(np.maximum(np.diag(inverse), 1e-300))
+
+
 def sigma_without_prior(information: np.ndarray, prior: np.ndarray) -> np.ndarray:
     """Return the standard deviation of each parameter without its own prior, shape (parameters,).
 
