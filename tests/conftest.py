@@ -7,9 +7,11 @@ from collections import defaultdict
 import pytest
 
 from autocalib_ros.util.threads import limit_blas_threads
-from stored_results import quick_folder
 
-limit_blas_threads()
+limit_blas_threads()  # before the first import of numpy
+
+from stored_results import quick_folder  # noqa: E402
+
 gc.disable()  # while tests are collected: what they import stays until the end
 os.environ.pop('FORCE_COLOR', None)  # some test machines set it, and messages are compared as they are
 
