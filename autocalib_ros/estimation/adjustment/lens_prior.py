@@ -104,6 +104,13 @@ class LensPrior:
         """Return the mean with a starting focal length, or with the prior's own where it has one."""
         return self.centre if self.focal_known else replace(self.centre, focal_px=float(focal_px))
 
+    def starts(self, focal_px: float) -> list[Camera]:
+        """Return lenses to start from with a focal length: the mean, and both ends of a family that spans several."""
+        mean = self.start(focal_px)
+        if self.family != 'kannala_brandt' or self.sigma[3] <= 0:
+            return [mean]
+        return [mean, *(replace(mean, k=(*k[:2], 0.0, 0.0)) for k in (EQUIDISTANT, DISTORTION_FREE))]
+
     def with_fixed(self, names: tuple[str, ...]) -> LensPrior:
         """Return the prior with the parameters `names` fixed."""
         fixed = np.array([name in names for name in LENS_PARAMETERS])

@@ -57,14 +57,18 @@ def _from_trials(
     """Return adjusted solutions of the best trials, and the consensus scores of all trials, shape (trials,)."""
     prior = config.prior
     trials = [prior.centre.focal_px] if prior.focal_known else focal_trials(subsample, prior.centre, FOCAL_TRIALS)
-    found = [consensus_directions(prior.start(trial), subsample, generator, inlier_px=inlier_px) for trial in trials]
-    starts = [initial_state(prior.start(trials[index]), found[index]) for index in _peaks(found)[:MAX_STARTS]]
-    fits = [adjust(start, subsample, config) for start in starts]
+    fits: list[Adjustment] = []
+    scores: list[np.ndarray] = []
+    for lenses in zip(*(prior.starts(trial) for trial in trials), strict=True):
+        found = [consensus_directions(lens, subsample, generator, inlier_px=inlier_px) for lens in lenses]
+        starts = [initial_state(lenses[index], found[index]) for index in _peaks(found)[:MAX_STARTS]]
+        fits += [adjust(start, subsample, config) for start in starts]
+        scores.append(np.array([item.score for item in found]))
     # two coincident roads fit the errors of one road, and so look more probable than they are
     fits = [fit for fit in fits if roads_separated(fit)] or fits
     # traffic is below the horizon
     fits = [fit for fit in fits if below_horizon(fit, subsample)] or fits
-    return fits, np.array([item.score for item in found])
+    return fits, np.max(scores, axis=0)
 
 
 def below_horizon(fit: Adjustment, tracks: TrackSet) -> bool:

@@ -28,12 +28,13 @@ MAX_PROPOSAL_TRACKS = 40
 """Unexplained tracks, evenly spaced, each pair of which proposes a direction."""
 ROAD_INLIER_DEG = 1.0
 """Angle in degrees between a track's direction and a further road within which the track supports it."""
-RIGHT_ANGLE_SIGMAS = 2.5
-RIGHT_ANGLE_FLOOR_DEG = 2.0
-"""Two roads are expected at 90 degrees within this many standard deviations, or within this many degrees: junctions
-are built to about a degree, and tracked points drift by another degree across the driving direction. Within either
-limit 90 degrees are more probable than any other angle: more than half of all junctions are square, the others spread
-over tens of degrees."""
+SQUARE_FRACTION, SKEW_SPREAD_DEG = 0.6, 90.0
+"""More than half of all junctions are square, the others cross at any angle."""
+HEADING_DRIFT_DEG = 1.0
+"""Standard deviation by which the drift of tracked points across the driving direction changes a measured crossing
+angle."""
+MIN_SQUARE_ODDS = 9.0
+"""Odds for a right angle, from which on it is expected: one in ten would be skewed."""
 MAX_NOISE_RATIO = 4.0
 """Largest ratio of the residual scale of tracks on roads to that of turning vehicles (both squared, whitened); above
 it the further road consists of similar turns. Judgement."""
@@ -148,7 +149,7 @@ def _angles_in_plane(state: AdjustmentState, normals: np.ndarray) -> np.ndarray:
 
 
 def expect_right_angle(fit: Adjustment, tracks: TrackSet, options: JointOptions) -> tuple[Adjustment, Statement | None]:
-    """Expect the first two roads at 90 degrees, to `RIGHT_ANGLE_SIGMA_RAD`, if the measured angle allows it.
+    """Expect the first two roads at 90 degrees, to `RIGHT_ANGLE_SIGMA_RAD`, if the measured angle makes it likely.
 
     Returns the solution and the angle as an assumption or a check, None with fewer than two roads. An angle given by
     an option is exact; with `road_angle` 'free' none is expected.
@@ -159,12 +160,19 @@ def expect_right_angle(fit: Adjustment, tracks: TrackSet, options: JointOptions)
     if config.crossing_rad is not None:
         return fit, assumption('crossing_angle', angle_deg=options.crossing_deg, sigma_deg=None, source='given')
     sigma = float(fit.sigma(lambda state: np.array([crossing_deg(state)]))[0])
-    if options.road_angle == 'free' or abs(90.0 - angle) > max(RIGHT_ANGLE_SIGMAS * sigma, RIGHT_ANGLE_FLOOR_DEG):
+    if options.road_angle == 'free' or _square_odds(angle, sigma) < MIN_SQUARE_ODDS:
         return fit, check('crossing_angle', angle_deg=angle, sigma_deg=min(sigma, 90.0), source='measured')
     squared = adjust(
         fit.state, tracks, replace(config, crossing_rad=np.pi / 2, crossing_sigma_rad=RIGHT_ANGLE_SIGMA_RAD)
     )
     return squared, assumption('crossing_angle', angle_deg=angle, sigma_deg=sigma, source='expected')
+
+
+def _square_odds(angle_deg: float, sigma_deg: float) -> float:
+    """Return the odds of a right angle against any other for a measured crossing angle."""
+    spread = float(np.sqrt(sigma_deg**2 + HEADING_DRIFT_DEG**2 + np.degrees(RIGHT_ANGLE_SIGMA_RAD) ** 2))
+    density = np.exp(-0.5 * ((90.0 - angle_deg) / spread) ** 2) / (spread * np.sqrt(2.0 * np.pi))
+    return float(SQUARE_FRACTION * density / ((1.0 - SQUARE_FRACTION) / SKEW_SPREAD_DEG))
 
 
 def main_road(fit: Adjustment, tracks: TrackSet) -> tuple[np.ndarray, TrackSet]:
