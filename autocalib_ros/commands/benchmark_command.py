@@ -27,8 +27,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=['joint', 'paper'],
         help='robust method, published method, or both (default)',
     )
-    accuracy.add_argument('--jobs', type=int, default=1, metavar='J', help='number of processes (default: %(default)s)')
-    accuracy.add_argument('--seed', type=int, default=0, metavar='S', help='seed of the draws (default: %(default)s)')
+    _add_jobs(accuracy)
+    _add_seed(accuracy)
     accuracy.add_argument('--out', type=Path, metavar='FILE', help='CSV file to write, one row per run')
     golden = what.add_parser(
         'golden',
@@ -36,14 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         description='Solve stored evidence and list every value that moved. Exit status: 0 if nothing moved, 3 '
         'otherwise, also with --update.',
     )
-    golden.add_argument(
-        'folder',
-        metavar='FOLDER',
-        nargs='?',
-        type=Path,
-        default=Path('tests/golden'),
-        help='folder with the evidence and expected.json (default: %(default)s)',
-    )
+    _add_folder(golden)
     golden.add_argument('--only', nargs='+', default=[], metavar='NAME', help='cases to solve (default: all)')
     golden.add_argument(
         '--tolerance',
@@ -57,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     golden.add_argument(
         '--update', action='store_true', help='store the new values of the cases that moved as the expected ones'
     )
-    golden.add_argument('--jobs', type=int, default=1, metavar='J', help='number of processes (default: %(default)s)')
+    _add_jobs(golden)
     streams = what.add_parser(
         'streams',
         help='uneven time stamps and repeated images, applied to recordings',
@@ -75,9 +68,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     streams.add_argument('--start', type=float, default=0.0, metavar='S', help='seconds to skip at the start')
     streams.add_argument('--duration', type=float, metavar='S', help='seconds of each recording to use')
-    streams.add_argument(
-        '--camera-height', type=float, default=8.0, metavar='H', help='height in metres (default: %(default)s)'
-    )
+    _add_camera_height(streams)
     scenes = what.add_parser(
         'scenes',
         help='errors against ground truth on scenes that are drawn, rendered and replayed',
@@ -87,8 +78,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     scenes.add_argument('--count', type=int, default=60, metavar='N', help='number of scenes (default: %(default)s)')
     scenes.add_argument('--first', type=int, default=0, metavar='N', help='number of the first one (default: 0)')
-    scenes.add_argument('--seed', type=int, default=0, metavar='S', help='seed of the draws (default: %(default)s)')
-    scenes.add_argument('--jobs', type=int, default=1, metavar='J', help='number of processes (default: %(default)s)')
+    _add_seed(scenes)
+    _add_jobs(scenes)
     scenes.add_argument(
         '--evidence', type=Path, metavar='FOLDER', help='folder that keeps the evidence; what is there is not rendered'
     )
@@ -101,10 +92,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     stability.add_argument('files', metavar='EVIDENCE', nargs='+', type=Path, help='evidence files (.npz)')
     stability.add_argument('--draws', type=int, default=20, metavar='N', help='draws per file (default: %(default)s)')
-    stability.add_argument(
-        '--camera-height', type=float, default=8.0, metavar='H', help='height in metres (default: %(default)s)'
-    )
-    stability.add_argument('--jobs', type=int, default=1, metavar='J', help='number of processes (default: 1)')
+    _add_camera_height(stability)
+    _add_jobs(stability)
     variants = what.add_parser(
         'options',
         help='documented options, and pairs of them, on stored evidence with known truth',
@@ -112,7 +101,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'status: 0 unless an option makes a result wrong with confidence (3.5 stated standard deviations at a grade '
         'above assumed), 3 otherwise.',
     )
-    variants.add_argument(
+    _add_folder(variants)
+    variants.add_argument('--only', nargs='+', default=[], metavar='OPTION', help='options to vary (default: all)')
+    variants.add_argument('--pairs', action='store_true', help='also each pair of options')
+    _add_jobs(variants)
+
+
+def _add_folder(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
         'folder',
         metavar='FOLDER',
         nargs='?',
@@ -120,9 +116,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=Path('tests/golden'),
         help='folder with the evidence and expected.json (default: %(default)s)',
     )
-    variants.add_argument('--only', nargs='+', default=[], metavar='OPTION', help='options to vary (default: all)')
-    variants.add_argument('--pairs', action='store_true', help='also each pair of options')
-    variants.add_argument('--jobs', type=int, default=1, metavar='J', help='number of processes (default: 1)')
+
+
+def _add_jobs(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument('--jobs', type=int, default=1, metavar='J', help='number of processes (default: %(default)s)')
+
+
+def _add_seed(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument('--seed', type=int, default=0, metavar='S', help='seed of the draws (default: %(default)s)')
+
+
+def _add_camera_height(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        '--camera-height', type=float, default=8.0, metavar='H', help='height in metres (default: %(default)s)'
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:

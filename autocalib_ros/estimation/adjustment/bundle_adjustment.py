@@ -111,7 +111,7 @@ class Adjustment:
     @property
     def crossing_known(self) -> bool:
         """Whether the angle between the first two roads was given or assumed."""
-        return self.problem.config.crossing_rad is not None and len(self.state.angles_rad) > 1
+        return self.problem.parameters.crossing_known
 
     @property
     def focal_sigma(self) -> float:
@@ -238,10 +238,10 @@ def _evaluate(last: Problem, state: AdjustmentState, warm_start: WarmStart, trac
     covariance = jackknife_covariance(rows.gradient, rows.curvature, weight, second_order, problem.vehicle_ids, prior)
     covariance += np.diag(_unmodelled_sigmas(problem.parameters) ** 2)
     road = problem.block_of_row == 0
-    covariance += _heading_bias_covariance(problem, rows.curvature[road], weight, rows.curvature, prior)
+    information = np.tensordot(weight, rows.curvature, 1)
+    covariance += _heading_bias_covariance(problem, rows.curvature[road], weight[road], information + np.diag(prior))
     whitened2 = np.full(len(tracks), np.inf)
     whitened2[problem.used] = rows.squared[road]
-    information = np.tensordot(weight, rows.curvature, 1)
     scores = rows.gradient[road] * np.sqrt(robust_weight[road])[:, None]
     scores = scores / np.sqrt(np.maximum(np.diag(information), 1e-12))
     return Adjustment(
@@ -260,23 +260,22 @@ def _evaluate(last: Problem, state: AdjustmentState, warm_start: WarmStart, trac
 
 
 def _heading_bias_covariance(
-    problem: Problem, on_roads: np.ndarray, weight: np.ndarray, curvatures: np.ndarray, prior: np.ndarray
+    problem: Problem, curvatures: np.ndarray, weight: np.ndarray, information: np.ndarray
 ) -> np.ndarray:
     """Return the covariance (parameters, parameters) from a common heading error of the tracks of each direction.
 
     The errors of vehicles are independent, but for this one: the view of a body changes alike for all that drive the
-    same way, and their tracked points drift alike.
+    same way, and their tracked points drift alike. `curvatures` (tracks, parameters, parameters) and `weight` (tracks,)
+    are of the tracks on roads, `information` (parameters, parameters) of all rows and the prior.
     """
     parameters = problem.parameters
-    size, heading = parameters.size, np.flatnonzero(np.abs(parameters.axes[:, 2]) > 0.5)
-    if not len(on_roads) or not len(heading) or not np.isfinite(curvatures).all():
-        return np.zeros((size, size))
-    of_heading = on_roads[:, :, parameters.lens + int(heading[0])]  # J^T j by a turn of the track's road in the plane
-    inverse = np.linalg.pinv(np.tensordot(weight, curvatures, 1) + np.diag(prior), hermitian=True)
+    heading = np.flatnonzero(np.abs(parameters.axes[:, 2]) > 0.5)
+    if not len(curvatures) or not len(heading) or not np.isfinite(information).all():
+        return np.zeros((parameters.size, parameters.size))
+    of_heading = curvatures[:, :, parameters.lens + int(heading[0])]  # J^T j by a turn of the track's road in the plane
+    inverse = np.linalg.pinv(information, hermitian=True)
     directions = problem.straight.driving_directions()
-    shifts = [
-        inverse @ ((weight[: len(on_roads)] * (directions == each)) @ of_heading) for each in np.unique(directions)
-    ]
+    shifts = [inverse @ ((weight * (directions == each)) @ of_heading) for each in np.unique(directions)]
     return HEADING_BIAS_RAD**2 * np.array(shifts).T @ np.array(shifts)
 
 

@@ -105,9 +105,7 @@ def _other_alone(fit: Adjustment, step: np.ndarray, shared: np.ndarray, mode: Mo
 def _log_densities(fit: Adjustment, step: np.ndarray, shared: np.ndarray, mode: Mode) -> tuple[float, float]:
     """Return the log densities of the differences of focal length and plane: both right, and one of them wrong."""
     parameters = fit.problem.parameters
-    free, axes = parameters.config.prior.free, parameters.axes
-    focal = np.flatnonzero(free == 0)
-    tilts = parameters.lens + np.flatnonzero(np.abs(axes[:, :2]).sum(axis=1) > 0.5)
+    focal, tilts = np.flatnonzero(parameters.config.prior.free == 0), parameters.tilts
     compared = np.concatenate([focal, tilts])
     at = np.searchsorted(shared, compared)
     unmodelled = np.concatenate([np.full(len(focal), UNMODELLED_FOCAL), np.full(len(tilts), UNMODELLED_RAD)])

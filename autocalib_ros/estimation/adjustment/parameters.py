@@ -95,6 +95,11 @@ class Parameterisation:
             return every[:2]  # without roads, the heading in the plane is arbitrary
         return every if roads > 1 or self.config.turning else every[1:]  # rotation about a lone road is unobservable
 
+    @cached_property
+    def tilts(self) -> np.ndarray:
+        """Indices (n,) of the parameters that tilt the plane: rotations about axes in it."""
+        return self.lens + np.flatnonzero(np.abs(self.axes[:, :2]).sum(axis=1) > 0.5)
+
     @property
     def crossing_known(self) -> bool:
         """Whether the angle of the second road to the first is given or assumed."""

@@ -96,23 +96,23 @@ def refine_with_markings(
     accepted = _accepted_modes(candidates, grids, evidence)
     if isinstance(accepted, Reason):
         return accepted
-    tilting = np.flatnonzero(np.abs(parameters.axes[:, :2]).sum(axis=1) > 0.5)
-    shared = np.concatenate([np.arange(parameters.lens), parameters.lens + tilting])
-    modes = [_mode_of(grid, fit, parameters.axes[tilting]) for _, grid in accepted]
+    shared = np.concatenate([np.arange(parameters.lens), parameters.tilts])
+    modes = [_mode_of(grid, fit) for _, grid in accepted]
     combined = combine(fit, modes, shared)
     both = evaluate_at(parameters.state(combined.step), tracks, fit.problem.config, combined.covariance)
     described = accepted[modes.index(combined.likeliest)]
     return MarkingsRefinement(both, combined.likeliest.state, combined.both_right, _describe(*described))
 
 
-def _mode_of(grid: MarkingGrid, fit: Adjustment, tilting: np.ndarray) -> Mode:
-    """Return a grid as a mode of the parameters of a fit: the lens, and rotations of the plane about axes (n, 3)."""
-    state, lens = fit.state, fit.problem.parameters.lens
+def _mode_of(grid: MarkingGrid, fit: Adjustment) -> Mode:
+    """Return a grid as a mode of the parameters of a fit: the lens, and the rotations that tilt the plane."""
+    state, parameters = fit.state, fit.problem.parameters
     normal = grid.rotation[:, 2] * np.sign(state.rotation[:, 2] @ grid.rotation[:, 2])
     turn, _ = Rotation.align_vectors(normal[None], state.rotation[:, 2][None])
     seen = AdjustmentState(grid.camera, turn.as_matrix() @ state.rotation, state.angles_rad)
     # rotations about the axes of the grid become rotations about the axes of the roads, but for the heading
-    to_roads = block_diag(np.eye(lens), tilting @ seen.rotation.T @ grid.rotation)
+    tilting = parameters.axes[parameters.tilts - parameters.lens]
+    to_roads = block_diag(np.eye(parameters.lens), tilting @ seen.rotation.T @ grid.rotation)
     return Mode(seen, to_roads @ grid.covariance[:-1, :-1] @ to_roads.T, -grid.negative_log_evidence)
 
 

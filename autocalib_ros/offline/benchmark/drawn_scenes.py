@@ -20,7 +20,7 @@ from autocalib_ros.config import Options
 from autocalib_ros.errors import UsageError
 from autocalib_ros.estimation.estimate import solve
 from autocalib_ros.evidence.snapshot import Evidence
-from autocalib_ros.geometry.ground_plane import angles_deg, tilt_and_roll_deg
+from autocalib_ros.offline.benchmark.monte_carlo import nan_if_none, pose_errors_deg
 from autocalib_ros.offline.benchmark.processes import map_in_order
 from autocalib_ros.offline.simulate.lens import look_rotation
 from autocalib_ros.offline.simulate.options import SimulationOptions
@@ -192,27 +192,18 @@ def compare_with_truth(scene: Scene, result: Calibration | Refusal) -> SceneRun:
     if isinstance(result, Refusal):
         return SceneRun(scene.number, scene.kind, result.code)
     true, sigma = scene.options, result.stddev
-    run = SceneRun(
+    up = look_rotation(true.yaw_deg or 0.0, true.pitch_deg, true.roll_deg)[2]
+    tilt, roll, normal = pose_errors_deg(result.ground, up)
+    return SceneRun(
         scene.number,
         scene.kind,
         result.grade,
         accepted=True,
-        focal=(result.camera.focal_px / true.focal_px - 1.0, _number(sigma.focal_px) / true.focal_px),
+        focal=(result.camera.focal_px / true.focal_px - 1.0, nan_if_none(sigma.focal_px) / true.focal_px),
+        tilt_deg=(tilt, nan_if_none(sigma.tilt_deg)),
+        roll_deg=(roll, nan_if_none(sigma.roll_deg)),
+        normal_deg=normal,
     )
-    if result.ground is None:
-        return run
-    up = look_rotation(true.yaw_deg or 0.0, true.pitch_deg, true.roll_deg)[2]
-    tilt, roll = tilt_and_roll_deg(result.ground.normal_in_camera) - tilt_and_roll_deg(up)
-    return replace(
-        run,
-        tilt_deg=(float(tilt), _number(sigma.tilt_deg)),
-        roll_deg=(float((roll + 180) % 360 - 180), _number(sigma.roll_deg)),
-        normal_deg=float(angles_deg(result.ground.normal_in_camera, up)),
-    )
-
-
-def _number(sigma: float | None) -> float:
-    return np.nan if sigma is None else float(sigma)
 
 
 def measure_scenes(

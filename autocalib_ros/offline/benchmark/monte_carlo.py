@@ -145,7 +145,7 @@ def compare_calibrations(
     if isinstance(result, Refusal):
         return Run(family=task.family, method=method, run=task.run, accepted=False, code=result.code, cpu_s=cpu_s)
     true, sigma = junction.camera, result.stddev
-    tilt, roll, normal = _pose_errors_deg(result.ground, junction.normal_in_camera)
+    tilt, roll, normal = pose_errors_deg(result.ground, junction.normal_in_camera)
     return Run(
         family=task.family,
         method=method,
@@ -154,23 +154,24 @@ def compare_calibrations(
         code='',
         grade=result.grade,
         focal_error=result.camera.focal_px / true.focal_px - 1,
-        focal_sigma=_nan_if_none(sigma.focal_px) / true.focal_px,
+        focal_sigma=nan_if_none(sigma.focal_px) / true.focal_px,
         rays_deg=mean_ray_error_deg(result.camera, true),
         normal_deg=normal,
         tilt_error_deg=tilt,
-        tilt_sigma_deg=_nan_if_none(sigma.tilt_deg),
+        tilt_sigma_deg=nan_if_none(sigma.tilt_deg),
         roll_error_deg=roll,
-        roll_sigma_deg=_nan_if_none(sigma.roll_deg),
+        roll_sigma_deg=nan_if_none(sigma.roll_deg),
         distance_error=distance_error(result.camera, result.ground, junction),
         cpu_s=cpu_s,
     )
 
 
-def _nan_if_none(value: float | None) -> float:
+def nan_if_none(value: float | None) -> float:
+    """Return a number, nan if there is none."""
     return NAN if value is None else float(value)
 
 
-def _pose_errors_deg(ground: GroundPlane | None, true_normal: np.ndarray) -> tuple[float, float, float]:
+def pose_errors_deg(ground: GroundPlane | None, true_normal: np.ndarray) -> tuple[float, float, float]:
     """Return the errors of tilt and roll, and the angle between the ground normals, in degrees."""
     if ground is None:
         return NAN, NAN, NAN

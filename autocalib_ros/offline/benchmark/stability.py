@@ -17,6 +17,7 @@ from autocalib_ros.errors import UsageError
 from autocalib_ros.estimation.estimate import solve
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
+from autocalib_ros.offline.benchmark.monte_carlo import nan_if_none
 from autocalib_ros.offline.benchmark.processes import map_in_order
 from autocalib_ros.results.calibration import Calibration
 from autocalib_ros.revalidation import GRADES
@@ -94,7 +95,7 @@ def _solved(evidence: Evidence, options: Options) -> tuple[str, np.ndarray, np.n
         return result.code, np.full(3, np.nan), np.full(3, np.nan)
     sigma, ground = result.stddev, result.ground
     tilts = np.full(2, np.nan) if ground is None else tilt_and_roll_deg(ground.normal_in_camera)
-    stated = [np.nan if each is None else each for each in (sigma.focal_px, sigma.tilt_deg, sigma.roll_deg)]
+    stated = [nan_if_none(each) for each in (sigma.focal_px, sigma.tilt_deg, sigma.roll_deg)]
     focal = result.camera.focal_px
     return result.grade, np.array([np.log(focal), *tilts]), np.array([stated[0] / focal, *stated[1:]])
 

@@ -1,4 +1,4 @@
-"""Squeezed pixels, told or found by the traffic."""
+"""Squeezed pixels, given or found by the traffic."""
 
 from __future__ import annotations
 
