@@ -25,6 +25,8 @@ import numpy as np
 
 from autocalib_ros.errors import UsageError
 
+ANGLE_STEP_RAD = 1e-5
+"""Newton step after which the angle of an image radius has converged: its error is the square of the step."""
 MAX_ANGLE_ITERATIONS = 20
 """Upper limit: Newton's method doubles the number of correct digits, so four or five iterations are usual."""
 MONOTONICITY_GRID_RAD = np.linspace(0.0, np.pi, 721)
@@ -176,15 +178,16 @@ class Camera:
         """Return the angles of `angle`; a radius out of the range of the lens model gets the angle at its limit."""
         radius = np.asarray(radius_px, float) / self.focal_px
         limit = self.max_angle_rad
-        theta = np.clip(radius, 0.0, limit)
+        theta = np.minimum(np.maximum(radius, 0.0), limit)
         if any(self.k):
             for _ in range(MAX_ANGLE_ITERATIONS):
-                before, t2 = theta, theta * theta
-                error = theta * _power_series(self.k, t2) - radius
-                theta = theta - error / np.maximum(_power_series(self._derivative_k, t2), 1e-3)
-                theta = np.minimum(np.maximum(theta, 0.0), limit)
-                # converged: each step doubles the digits; out of range the angle stays at its limit
-                if np.abs(theta - before).max(initial=0.0) < 1e-8:
+                t2 = theta * theta
+                step = theta * _power_series(self.k, t2)
+                step -= radius
+                step /= np.maximum(_power_series(self._derivative_k, t2), 1e-3)
+                before, theta = theta, np.minimum(np.maximum(theta - step, 0.0), limit)
+                # each step squares the error; out of range the angle stays at its limit
+                if np.abs(theta - before).max(initial=0.0) < ANGLE_STEP_RAD:
                     break
         return theta
 

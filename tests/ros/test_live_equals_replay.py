@@ -38,10 +38,10 @@ def bag(tmp_path_factory) -> Path:
     write_bag(
         path,
         SimulationOptions(
-            width_px=480,
-            height_px=270,
-            focal_px=210.0,
-            principal_point_offset_px=(3.0, -2.0),
+            width_px=320,
+            height_px=180,
+            focal_px=140.0,
+            principal_point_offset_px=(2.0, -1.5),
             camera_height_m=HEIGHT_M,
             duration_s=30.0,
             rate_hz=8.0,

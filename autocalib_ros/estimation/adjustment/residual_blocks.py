@@ -189,10 +189,12 @@ class PlanarMotionBlock:
         self.vehicle_ids, self.vehicle_weight = self._windows.bodies, self._windows.body_weights
         self._base = view = self._view(parameters.base)
         self.warm_start = initial_motion(view) if motion is None else refined(view, motion)
-        self._distances = view.distances(self.warm_start)
-        self._slopes = view.jacobian(self.warm_start, self._distances)
+        self._distances, *slopes = view.distances_and_jacobian(self.warm_start)
+        self._slopes = np.stack(slopes, axis=-1)
         self._root = np.sqrt(robust_weight(self._distances))
         self.dof = np.maximum(view.mask.sum(axis=1) - 2, 1)
+        self._follow: np.ndarray | None = None
+        """Derivative of the motion of each window by the parameters, shape (windows, 2, parameters)."""
 
     def _view(self, state: AdjustmentState) -> WindowRays:
         return WindowRays.of(self._windows, state.camera, state.rotation, self._parameters.config.options)
@@ -202,7 +204,8 @@ class PlanarMotionBlock:
         if not len(self.dof):
             return self.warm_start, np.zeros(0)
         view = self._view(self._parameters.state(step))
-        motion = refined(view, self.warm_start)
+        near = self.warm_start if self._follow is None else self.warm_start.moved(*-(self._follow @ step).T)
+        motion = refined(view, near)
         return motion, ((self._root * view.distances(motion)) ** 2).sum(axis=1) / self.dof
 
     def linearise(self) -> LinearisedRows:
@@ -216,8 +219,10 @@ class PlanarMotionBlock:
         jacobian = self._root[..., None] * np.stack(columns, axis=-1)
         own = self._root[..., None] * self._slopes
         matrix = own.transpose(0, 2, 1) @ own + 1e-9 * np.eye(2)
-        jacobian = jacobian - own @ np.linalg.solve(matrix, own.transpose(0, 2, 1) @ jacobian)
-        return LinearisedRows.of(self._root * self._distances, jacobian, self.dof, np.ones(len(self.dof)))
+        self._follow = np.linalg.solve(matrix, own.transpose(0, 2, 1) @ jacobian)
+        return LinearisedRows.of(
+            self._root * self._distances, jacobian - own @ self._follow, self.dof, np.ones(len(self.dof))
+        )
 
     def distances_px(self) -> tuple[np.ndarray, np.ndarray]:
         """Return observed pixels (n, 2) and their distances (n,) from the motions of their windows, at the base."""

@@ -7,6 +7,7 @@ point heights are not needed. Residuals are Sampson distances (Sampson 1982) in 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -25,8 +26,8 @@ CAUCHY_SCALE = 2.0
 Judgement."""
 WARM_START_ROUNDS = 5
 """Iterations on the motion of each window after a small change of lens and plane."""
-DERIVATIVE_STEP = 1e-6
-"""Step of the numerical derivatives in radians."""
+NEGLIGIBLE_GAIN = 1e-5
+"""Predicted relative decrease of the cost of all windows below which their motions have converged."""
 MIN_TURN_DEG = 5.0
 """Smallest turn within a window that counts as turning. Judgement."""
 MAX_SIDE_SLIP_DEG, MAX_SIDE_SLIP_FRACTION = 4.0, 0.25
@@ -91,7 +92,7 @@ class WindowRays:
         return replace(self, first=first, second=second)
 
     @cached_property
-    def _components(self) -> tuple[np.ndarray, ...]:
+    def components(self) -> tuple[np.ndarray, ...]:
         """Bearing, radial and tangential of both ends, each by component, shape (3, windows, points)."""
         return tuple(
             np.ascontiguousarray(np.moveaxis(vectors, -1, 0))
@@ -101,56 +102,110 @@ class WindowRays:
 
     def distances(self, motion: PlanarMotion) -> np.ndarray:
         """Signed Sampson distances in standard deviations, shape (windows, points); 0 outside the mask."""
-        cosine, sine = np.cos(motion.turn_rad)[:, None], np.sin(motion.turn_rad)[:, None]
-        along, across = np.cos(motion.heading_rad)[:, None], np.sin(motion.heading_rad)[:, None]
-        (x, y, z), radial, tangential, (u, v, w), radial_second, tangential_second = self._components
+        lines = _EpipolarLines.of(self, motion)
+        return lines.error / np.sqrt(lines.gradient2) * self._masked_weight
+
+    def distances_and_jacobian(self, motion: PlanarMotion) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the distances and their derivatives by turn and by heading, each of shape (windows, points)."""
+        lines = _EpipolarLines.of(self, motion)
+        scale = self._masked_weight / np.sqrt(lines.gradient2)
+        ratio = lines.error / lines.gradient2
+        by_turn, by_heading = (
+            scale * (error - ratio * half_gradient2) for error, half_gradient2 in lines.derivatives(self, motion)
+        )
+        return scale * lines.error, by_turn, by_heading
+
+    @cached_property
+    def _masked_weight(self) -> np.ndarray:
+        """One over the standard deviation, 0 outside the mask, shape (windows, points)."""
+        return self.mask / self.sigma_px
+
+
+@dataclass(frozen=True)
+class _EpipolarLines:
+    """Epipolar error of each point of the windows, with the lines of both ends; by component, (windows, points)."""
+
+    turned: tuple[np.ndarray, ...]
+    """x and y of the first bearing after the turn."""
+    back: tuple[np.ndarray, ...]
+    """Line of the second point in the frame of the first, R^T (b x t)."""
+    error: np.ndarray
+    gradient2: np.ndarray
+    """Squared norm of the derivative of the error by the pixels of both ends."""
+    slopes: tuple[np.ndarray, ...]
+    """Derivative of the error along the radial and tangential direction of the second end, and of the first."""
+
+    @classmethod
+    def of(cls, view: WindowRays, motion: PlanarMotion) -> _EpipolarLines:
+        (cosine, sine), (along, across) = _cosine_sine(motion.turn_rad), _cosine_sine(motion.heading_rad)
+        (x, y, z), radial, tangential, (u, v, w), radial_second, tangential_second = view.components
         turned = (cosine * x - sine * y, sine * x + cosine * y)
         # the epipolar line of the first point, t x R a, and that of the second, R^T (b x t)
         line = (across * z, -along * z, along * turned[1] - across * turned[0])
-        line_back_xy = (-w * across, w * along)
-        line_back = (
-            cosine * line_back_xy[0] + sine * line_back_xy[1],
-            cosine * line_back_xy[1] - sine * line_back_xy[0],
-            u * across - v * along,
+        # R^T turns the heading back: the line of the second point is b x t in the frame of the first
+        along_back, across_back = cosine * along + sine * across, cosine * across - sine * along
+        back = (-w * across_back, w * along_back, u * across - v * along)
+        slopes = (
+            _dot_components(radial_second, line),
+            _dot_components(tangential_second, line),
+            _dot_components(radial, back),
+            _dot_components(tangential, back),
         )
-        gradient2 = (
-            _dot_components(radial_second, line) ** 2
-            + _dot_components(tangential_second, line) ** 2
-            + _dot_components(radial, line_back) ** 2
-            + _dot_components(tangential, line_back) ** 2
+        gradient2 = np.maximum(_dot_components(slopes, slopes) + slopes[3] ** 2, 1e-18)
+        return cls(turned, back, u * line[0] + v * line[1] + w * line[2], gradient2, slopes)
+
+    def derivatives(self, view: WindowRays, motion: PlanarMotion) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Yield the derivatives of the error and of half the squared gradient, by the turn and by the heading."""
+        along, across = _cosine_sine(motion.heading_rad)
+        (_, _, z), radial, tangential, (u, v, w), radial_second, tangential_second = view.components
+        turned, back, slopes = self.turned, self.back, self.slopes
+        rise = along * turned[0] + across * turned[1]
+        by_turn = (
+            radial_second[2] * rise,
+            tangential_second[2] * rise,
+            radial[0] * back[1] - radial[1] * back[0],
+            tangential[0] * back[1] - tangential[1] * back[0],
         )
-        epipolar_error = u * line[0] + v * line[1] + w * line[2]
-        return self.mask * epipolar_error / (np.sqrt(np.maximum(gradient2, 1e-18)) * self.sigma_px)
-
-    def jacobian(self, motion: PlanarMotion, here: np.ndarray) -> np.ndarray:
-        """Derivatives of the distances `here` by turn and heading, shape (windows, points, 2)."""
-        return (
-            np.stack(
-                [
-                    self.distances(motion.moved(DERIVATIVE_STEP, 0.0)) - here,
-                    self.distances(motion.moved(0.0, DERIVATIVE_STEP)) - here,
-                ],
-                axis=-1,
-            )
-            / DERIVATIVE_STEP
+        yield w * rise, _dot_components(slopes, by_turn) + slopes[3] * by_turn[3]
+        line = (along * z, across * z, -rise)
+        line_back = (-back[1], back[0], u * along + v * across)
+        by_heading = (
+            _dot_components(radial_second, line),
+            _dot_components(tangential_second, line),
+            _dot_components(radial, line_back),
+            _dot_components(tangential, line_back),
+        )
+        yield (
+            u * line[0] + v * line[1] + w * line[2],
+            _dot_components(slopes, by_heading) + slopes[3] * by_heading[3],
         )
 
 
-def _dot_components(vectors: np.ndarray, other: tuple[np.ndarray, ...]) -> np.ndarray:
+def _cosine_sine(angle_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return cosine and sine, shape (windows, 1), of the angle of each window."""
+    return np.cos(angle_rad)[:, None], np.sin(angle_rad)[:, None]
+
+
+def _dot_components(vectors: np.ndarray | tuple[np.ndarray, ...], other: tuple[np.ndarray, ...]) -> np.ndarray:
     """Scalar product of vectors that are given by component, (3, ...)."""
     return vectors[0] * other[0] + vectors[1] * other[1] + vectors[2] * other[2]
 
 
 def turn_sigma(view: WindowRays, motion: PlanarMotion) -> np.ndarray:
     """Standard deviation of each window's turn in radians, shape (windows,)."""
-    here = view.distances(motion)
-    a, b, d = _normal_matrix(view.jacobian(motion, here), robust_weight(here))
+    here, by_turn, by_heading = view.distances_and_jacobian(motion)
+    a, b, d = _normal_matrix(by_turn, by_heading, robust_weight(here))
     return np.sqrt(d / np.maximum(a * d - b * b, 1e-12))
 
 
-def _normal_matrix(jacobian: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Entries (windows,) of the weighted J^T J, of Jacobians (windows, points, 2) and weights (windows, points)."""
-    return tuple((weight * jacobian[..., i] * jacobian[..., j]).sum(axis=1) for i, j in ((0, 0), (0, 1), (1, 1)))
+def _normal_matrix(by_turn: np.ndarray, by_heading: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Entries (windows,) of the weighted J^T J, of derivatives and weights of shape (windows, points)."""
+    weighted = weight * by_turn
+    return (
+        (weighted * by_turn).sum(axis=1),
+        (weighted * by_heading).sum(axis=1),
+        (weight * by_heading * by_heading).sum(axis=1),
+    )
 
 
 def without_side_slip(
@@ -272,27 +327,27 @@ def initial_motion(view: WindowRays) -> PlanarMotion:
 def refined(view: WindowRays, motion: PlanarMotion, rounds: int = WARM_START_ROUNDS) -> PlanarMotion:
     """Refine the motion of each window by Levenberg-Marquardt iterations."""
     damping = np.full(len(view.mask), 1e-4)
-    here = view.distances(motion)
-    cost = point_cost(here)
+    cost = None
     for _ in range(rounds):
-        jacobian, weight = view.jacobian(motion, here), robust_weight(here)
-        a, b, d = _normal_matrix(jacobian, weight)
-        p, q = ((weight * jacobian[..., i] * here).sum(axis=1) for i in (0, 1))
+        here, by_turn, by_heading = view.distances_and_jacobian(motion)
+        cost = point_cost(here) if cost is None else cost
+        weight = robust_weight(here)
+        a, b, d = _normal_matrix(by_turn, by_heading, weight)
+        here *= weight
+        p, q = (by_turn * here).sum(axis=1), (by_heading * here).sum(axis=1)
         lift = damping * (a + d) + 1e-9
         a, d = a + lift, d + lift
         determinant = a * d - b * b
-        trial = motion.moved(
-            np.clip((b * q - d * p) / determinant, -0.2, 0.2), np.clip((b * p - a * q) / determinant, -0.2, 0.2)
-        )
-        there = view.distances(trial)
-        cost_there = point_cost(there)
+        turn = np.clip((b * q - d * p) / determinant, -0.2, 0.2)
+        heading = np.clip((b * p - a * q) / determinant, -0.2, 0.2)
+        if -(turn * p + heading * q).sum() < NEGLIGIBLE_GAIN * cost.sum():
+            break
+        trial = motion.moved(turn, heading)
+        cost_there = point_cost(view.distances(trial))
         better = cost_there <= cost
-        gain = np.max(cost - cost_there, initial=0.0, where=better)
         motion = PlanarMotion(
             np.where(better, trial.turn_rad, motion.turn_rad), np.where(better, trial.heading_rad, motion.heading_rad)
         )
-        here, cost = np.where(better[:, None], there, here), np.where(better, cost_there, cost)
+        cost = np.where(better, cost_there, cost)
         damping = np.where(better, np.maximum(damping / 10, 1e-6), np.minimum(damping * 20, 1e3))
-        if better.all() and gain < 1e-4:
-            break
     return motion
