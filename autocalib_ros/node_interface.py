@@ -161,6 +161,7 @@ DIAGNOSTIC_VALUES = {
     'height_m': 'height of the camera above the road',
     'height_sigma_m': 'its standard deviation',
     'assumptions': 'assumptions of the calibration',
+    'verification': 'how many checks passed, and [which failed](calibration-json.md#verification)',
     'no_ground_plane': 'why there is no ground plane',
     'newest_stamp_s': 'stamp of the newest image that the calibration rests on',
 }

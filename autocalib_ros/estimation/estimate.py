@@ -25,6 +25,7 @@ from autocalib_ros.estimation.publish import (
     with_requested_model,
 )
 from autocalib_ros.estimation.solution import Observations, Solution, accepted, append_reason, is_better
+from autocalib_ros.estimation.solution_rows import with_solution_rows
 from autocalib_ros.estimation.strategies import (
     complete_with_lane_markings,
     estimate_from_lane_markings,
@@ -97,7 +98,7 @@ def _estimate_and_scale(
         solution = find_solution(traffic, tracks, options, height_m=height_m, lens=lens)
     if isinstance(solution, Reason):
         return solution
-    return draft.calibration(solution, kept[tracks.indices]), solution.from_markings
+    return draft.calibration(with_solution_rows(solution, options.gate), kept[tracks.indices]), solution.from_markings
 
 
 def _unusual_height_m(solution: Solution | Reason, options: Options) -> float | None:

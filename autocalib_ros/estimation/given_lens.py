@@ -20,6 +20,7 @@ from autocalib_ros.estimation.solution import Solution
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.results.refusals import Reason, reason
 from autocalib_ros.results.statements import check
+from autocalib_ros.results.verification_table import VerificationRow, verified
 
 CONTRADICTION_SIGMAS, DOUBT_SIGMAS = 3.0, 2.0
 """A lens that differs by more standard deviations from what the traffic asks for is refused (0.3 % of right ones), or
@@ -70,9 +71,10 @@ def verify_given_lens(
     `solve_free` solves without the given lens.
     """
     if isinstance(found, Solution):
-        contradiction, doubt = _test_by_release(lens, found, tracks)
+        contradiction, doubt, compared = _test_by_release(lens, found, tracks)
         if contradiction is not None:
             return _in_words_of(contradiction, lens, solve_free(), tracks)
+        found = found.compared(*compared)
         if found.full:
             return found if doubt is None else _doubted(found, doubt)
     free = solve_free()
@@ -84,27 +86,34 @@ def verify_given_lens(
     return contradiction or found
 
 
-def _test_by_release(lens: Camera, found: Solution, tracks: TrackSet) -> tuple[Reason | None, _Release | None]:
-    """Return why the traffic contradicts the lens, or the release that makes it doubtful; None where it does not."""
+def _test_by_release(
+    lens: Camera, found: Solution, tracks: TrackSet
+) -> tuple[Reason | None, _Release | None, tuple[VerificationRow, ...]]:
+    """Return why the traffic contradicts the lens, or the release that makes it doubtful; None where it does not.
+
+    And the comparison of the focal lengths, where the traffic gives one.
+    """
     loose = LOOSE_PRINCIPAL_POINT_SIGMA_FRACTION * lens.width
     focal = _released(lens, found, tracks, [np.inf, 0.0, 0.0, 0.0, 0.0, 0.0])
     change, sigmas = focal.change(lambda camera: np.array([np.log(camera.focal_px)]))
     beyond = abs(change[0]) > LENS_TOLERANCE
     if beyond and sigmas > CONTRADICTION_SIGMAS:
         sigma_px = focal.fit.focal_sigma * focal.camera.focal_px
-        return _focal_contradiction(lens, focal.camera.focal_px, sigma_px), None
+        return _focal_contradiction(lens, focal.camera.focal_px, sigma_px), None, ()
+    limit = max(DOUBT_SIGMAS * abs(change[0]) / sigmas, LENS_TOLERANCE) if sigmas > 0 else LENS_TOLERANCE
+    compared = (verified('given_lens', abs(change[0]), limit),) if sigmas > 0 else ()
     doubt = focal if beyond and sigmas > DOUBT_SIGMAS else None
     point = _released(lens, found, tracks, [0.0, loose, loose * lens.pixel_aspect, 0.0, 0.0, 0.0])
     change, sigmas = point.change(lambda camera: np.array(camera.principal_point_px))
     if np.hypot(*change) > LENS_TOLERANCE * lens.width and sigmas > CONTRADICTION_SIGMAS:
-        return _point_contradiction(lens, point.fit), None
+        return _point_contradiction(lens, point.fit), None, ()
     shape = _released(lens, found, tracks, [0.0, 0.0, 0.0, 0.0, 0.0, np.inf])
     change, sigmas = shape.change(lambda camera: np.array([np.log(camera.pixel_aspect)]))
     if abs(change[0]) > LENS_TOLERANCE and sigmas > CONTRADICTION_SIGMAS:
         numbers = {'aspect': lens.pixel_aspect, 'traffic_aspect': shape.camera.pixel_aspect}
         sigma = abs(change[0]) / sigmas * shape.camera.pixel_aspect
-        return reason('given_lens', 'pixel_aspect', **numbers, sigma=sigma), None
-    return None, doubt
+        return reason('given_lens', 'pixel_aspect', **numbers, sigma=sigma), None, ()
+    return None, doubt, compared
 
 
 def _released(lens: Camera, found: Solution, tracks: TrackSet, sigma: list[float]) -> _Release:

@@ -23,6 +23,7 @@ from autocalib_ros.estimation.verification.identifiability import lens_assumptio
 from autocalib_ros.geometry.ground_plane import unsigned_angle_deg
 from autocalib_ros.results.refusals import Reason, reason
 from autocalib_ros.results.statements import Statement, assumption, check
+from autocalib_ros.results.verification_table import VerificationRow, verified
 
 PLANE_TOLERANCE_DEG = 1.5
 """Two planes that differ by less agree, whatever their sigmas: the promised accuracy of the ground normal."""
@@ -46,14 +47,17 @@ def complete_one_road(
 ) -> Solution:
     """Complete the solution of one road, whose plane may rotate about it; without a plane if nothing fixes it."""
     along, flow = main_road(fit, tracks)
-    across, checks = _assumption_across_road(fit, tracks, observations)
+    across, compared = _assumption_across_road(fit, tracks, observations)
     plane = PlaneEstimate.of(fit, tracks, None if isinstance(across, Reason) else across)
     if isinstance(across, LevelCamera | TransverseDirection):
         assumptions = (*assumptions, across.assumption)
         refusal = check_plane(plane, observations.gate)
     else:
         refusal = across or _one_direction(fit, crossing)
-    solution = Solution(fit, plane, along, flow, assumptions, (halves, *checks), refusal)
+    solution = Solution(fit, plane, along, flow, assumptions, (halves,), refusal)
+    if compared is not None:
+        statement = check('edges_and_level', difference_deg=compared.value)
+        solution = replace(solution, checks=(halves, statement)).compared(compared)
     return _with_lane_changes(solution, tracks, observations)
 
 
@@ -67,19 +71,22 @@ def _one_direction(fit: Adjustment, crossing: CrossTraffic | None) -> Reason:
 
 def _assumption_across_road(
     fit: Adjustment, tracks: TrackSet, observations: Observations
-) -> tuple[LevelCamera | TransverseDirection | Reason | None, tuple[Statement, ...]]:
-    """What the options allow to assume of the direction across the road; a reason if two assumptions disagree."""
+) -> tuple[LevelCamera | TransverseDirection | Reason | None, VerificationRow | None]:
+    """What the options allow to assume of the direction across the road; a reason if two assumptions disagree.
+
+    And their comparison, where there are two.
+    """
     options = fit.problem.config.options
     level = LevelCamera(options.roll_prior_deg) if options.roll_prior_deg > 0 else None
     edges = None
     if options.transverse_edges:
         edges = find_transverse_direction(observations.evidence, fit, tracks, observations.generator)
     if level is None or edges is None:
-        return level or edges, ()
-    combined, difference_deg = combine_assumptions(level, edges, fit.state)
+        return level or edges, None
+    combined, difference_deg, limit_deg = combine_assumptions(level, edges, fit.state)
     if combined is None:
-        return reason('plane_uncertain', 'edges_and_level', difference_deg=difference_deg), ()
-    return combined, (check('edges_and_level', difference_deg=difference_deg),) if difference_deg >= 0 else ()
+        return reason('plane_uncertain', 'edges_and_level', difference_deg=difference_deg), None
+    return combined, verified('edges_and_level', difference_deg, limit_deg) if difference_deg >= 0 else None
 
 
 def _with_lane_changes(found: Solution, tracks: TrackSet, observations: Observations) -> Solution:
@@ -104,10 +111,12 @@ def _with_lane_changes(found: Solution, tracks: TrackSet, observations: Observat
             *checks,
             check('lane_changes', vehicles=vehicles, sigma_deg=sigma_deg, difference_deg=difference_deg),
         )
+        found = found.compared(verified('lane_changes', difference_deg, limit_deg))
         if found.plane.worst_sigma_deg <= plane.worst_sigma_deg:
             return replace(found, checks=checks)
     along, flow = main_road(fit, tracks)
-    return Solution(fit, plane, along, flow, (*lens_assumptions(fit, ()), statement), checks, None, reduced=True)
+    solution = Solution(fit, plane, along, flow, (*lens_assumptions(fit, ()), statement), checks, None, reduced=True)
+    return solution.compared(*found.comparisons)
 
 
 def _sigma_about_road_deg(fit: Adjustment, plane: PlaneEstimate) -> float:

@@ -30,6 +30,7 @@ from autocalib_ros.results.calibration import (
 )
 from autocalib_ros.results.refusals import Reason, reason
 from autocalib_ros.results.statements import check
+from autocalib_ros.results.verification_table import verified
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,7 @@ class ResultDraft:
             grade='lens',
             assumptions=solution.assumptions,
             checks=(*stillness_checks(self.evidence), *solution.checks),
+            verification=solution.comparisons,
             camera=solution.fit.state.camera,
             ground=None,
             ground_refusal=solution.plane_refusal,
@@ -156,10 +158,13 @@ def _with_ground(lens: Calibration, solution: Solution, options: Options) -> Cal
     uncertain = check_scale(height_m, height_sigma_m, options.gate)
     if uncertain:
         return replace(lens, ground_refusal=uncertain)
+    measured_height = scale.metric and height_sigma_m > 0
+    height_row = verified('height_sigma', height_sigma_m / height_m, options.gate.max_sigma_height_rel)
     normal = plane.normal(plane.fit.state)
     tilt, roll = plane.sigma(lambda _, normal: tilt_and_roll_deg(normal))
     return replace(
         lens,
+        verification=(*lens.verification, height_row) if measured_height else lens.verification,
         grade='unit_scale' if not scale.metric else 'assumed' if solution.assumed else 'full',
         ground=ground_plane(normal, solution.along, height_m, metric=scale.metric),
         assumptions=(*lens.assumptions, *scale.assumption(height_m, height_sigma_m)),
@@ -168,7 +173,7 @@ def _with_ground(lens: Calibration, solution: Solution, options: Options) -> Cal
             lens.stddev,
             tilt_deg=float(tilt),
             roll_deg=float(roll),
-            height_m=height_sigma_m if scale.metric and height_sigma_m > 0 else None,
+            height_m=height_sigma_m if measured_height else None,
             ground_point_m=_ground_point_stddev(plane, scale) if scale.metric else (),
         ),
     )

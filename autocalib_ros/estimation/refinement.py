@@ -16,6 +16,8 @@ from autocalib_ros.estimation.solution import MAX_SUBSAMPLE_TRACKS, Observations
 from autocalib_ros.estimation.straight.initialisation import select_lens_family
 from autocalib_ros.estimation.straight.roads import add_further_roads, expect_right_angle, main_road
 from autocalib_ros.estimation.turning.turning_traffic import (
+    MAX_TRACKLET_DIFFERENCE_SIGMAS,
+    TrackletComparison,
     refine_with_tracklets,
     refine_with_turning,
     widen_by_point_slip,
@@ -28,6 +30,7 @@ from autocalib_ros.estimation.verification.identifiability import fix_unidentifi
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.results.refusals import Reason
 from autocalib_ros.results.statements import Statement, check
+from autocalib_ros.results.verification_table import VerificationRow, verified
 
 LEVEL_ROLL_TOLERANCE_DEG = 5.0
 """Roll up to which pedestrians are classified as if the camera were level."""
@@ -66,42 +69,51 @@ def refine_and_verify(
     # k2 is free within its prior where the plane is known.
     fit = free_k2(fit, tracks)
     # Turning vehicles as rigid bodies over several seconds.
-    fit, tracklet_state = refine_with_tracklets(fit, tracks, observations.windows, observations.instants)
+    fit, tracklets = refine_with_tracklets(fit, tracks, observations.windows, observations.instants)
     # Parameters that the evidence does not determine return to their prior.
     fit, fixed = fix_unidentifiable(fit, tracks)
     # Gates on the lens; cross-validation in time.
-    failed = _check_lens(fit, tracks, observations, turned=turned)
-    if failed:
+    shares = _check_lens(fit, tracks, observations, turned=turned)
+    if isinstance(shares, Reason):
         # a lens that the traffic does not determine bends roads: then few vehicles seem to follow one
-        return (failed.code == 'turning_traffic' and check_focal_length(fit, gate, turned=turned)) or failed
+        return (shares.code == 'turning_traffic' and check_focal_length(fit, gate, turned=turned)) or shares
     halves = check_halves(fit, tracks, gate)
     if isinstance(halves, Reason):
         return halves
     # Errors that no residual shows widen the covariance.
     fit = widen_by_point_slip(fit, observations.windows)
-    fit = widen_by_tracklet_difference(fit, tracklet_state)
+    fit = widen_by_tracklet_difference(fit, tracklets)
     # Other focal lengths that are about as probable widen it, too.
     fit = widen_by_focal_modes(fit, tracks.subset(evenly_spaced(len(tracks), MAX_SUBSAMPLE_TRACKS)))
     uncertain = check_focal_length(fit, gate, turned=turned)
     assumptions = lens_assumptions(fit, fixed)
+    compared = (*shares, *halves.rows, *_tracklet_rows(tracklets))
     if not fit.plane_known:
         if uncertain:
             return uncertain
-        return complete_one_road(fit, tracks, observations, assumptions, halves, crossing)
+        return complete_one_road(fit, tracks, observations, assumptions, halves.statement, crossing).compared(*compared)
     if fit.crossing_known and angle:
         assumptions = (*assumptions, angle)
     along, flow = main_road(fit, tracks)
     plane = PlaneEstimate.of(fit, tracks)
-    checks = (*_plane_checks(fit, angle), halves)
-    return Solution(fit, plane, along, flow, assumptions, checks, check_plane(plane, gate), lens_refusal=uncertain)
+    checks = (*_plane_checks(fit, angle), halves.statement)
+    refusal = check_plane(plane, gate)
+    return Solution(fit, plane, along, flow, assumptions, checks, refusal, lens_refusal=uncertain, comparisons=compared)
 
 
-def _check_lens(fit: Adjustment, tracks: TrackSet, observations: Observations, *, turned: bool) -> Reason | None:
+def _tracklet_rows(compared: TrackletComparison | None) -> tuple[VerificationRow, ...]:
+    limit = MAX_TRACKLET_DIFFERENCE_SIGMAS
+    return () if compared is None else (verified('tracklets', compared.sigmas, limit),)
+
+
+def _check_lens(
+    fit: Adjustment, tracks: TrackSet, observations: Observations, *, turned: bool
+) -> Reason | tuple[VerificationRow, ...]:
     """Check the lens; if too few tracks follow the road, check again without pedestrians."""
     evidence = observations.evidence
-    failed = check_lens(fit, tracks, evidence, turned=turned)
-    if failed is None or failed.code != 'turning_traffic':
-        return failed
+    outcome = check_lens(fit, tracks, evidence, turned=turned)
+    if not isinstance(outcome, Reason) or outcome.code != 'turning_traffic':
+        return outcome
     return check_lens(fit, tracks, evidence, turned=turned, driving=_vehicle_tracks(fit, tracks, evidence))
 
 

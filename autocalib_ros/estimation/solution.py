@@ -15,6 +15,7 @@ from autocalib_ros.estimation.verification.ground_normal import PlaneEstimate
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.results.refusals import Reason
 from autocalib_ros.results.statements import Statement
+from autocalib_ros.results.verification_table import VerificationRow
 
 MAX_SUBSAMPLE_TRACKS = 200
 """Tracks, evenly spaced in the list of all, by which initial solutions are made and compared. The adjustment itself
@@ -61,6 +62,13 @@ class Solution:
     """Whether lens and plane come from the lane markings."""
     of_traffic: Adjustment | None = None
     """The adjustment of the traffic that lane markings replaced; None if `fit` is it, or there is none."""
+    comparisons: tuple[VerificationRow, ...] = ()
+    """Comparisons between sources that speak of the same thing, as rows of the verification table."""
+
+    def compared(self, *rows: VerificationRow) -> Solution:
+        """Return the solution with further comparisons; one of a kind that it has replaces it."""
+        kinds = {row.kind for row in rows}
+        return replace(self, comparisons=(*(row for row in self.comparisons if row.kind not in kinds), *rows))
 
     @property
     def assumed(self) -> bool:

@@ -32,6 +32,7 @@ from autocalib_ros.estimation.verification.identifiability import lens_assumptio
 from autocalib_ros.geometry.ground_plane import unsigned_angle_deg
 from autocalib_ros.results.refusals import Reason, reason
 from autocalib_ros.results.statements import Statement, check
+from autocalib_ros.results.verification_table import VerificationRow, verified
 
 MAX_CONFIRMING_SIGMA_DEG = 4.5
 """Traffic whose plane, or whose road, is less certain than this (one sigma) does not confirm lane markings."""
@@ -81,9 +82,10 @@ def estimate_from_lane_markings(observations: Observations, config: AdjustmentCo
     if isinstance(found, Reason):
         return found
     fit, statement = found
-    checks = verify_with_traffic(fit, _planes_of_traffic(fit, observations, config))
-    if isinstance(checks, Reason):
-        return checks
+    verification = verify_with_traffic(fit, _planes_of_traffic(fit, observations, config))
+    if isinstance(verification, Reason):
+        return verification
+    checks, rows = verification
     along, flow = main_road(fit, observations.tracks)
     plane = PlaneEstimate.of(fit, observations.tracks)
     return Solution(
@@ -96,6 +98,7 @@ def estimate_from_lane_markings(observations: Observations, config: AdjustmentCo
         check_plane(plane, observations.gate, assumed=True),
         reduced=True,
         from_markings=True,
+        comparisons=rows,
     )
 
 
@@ -137,6 +140,7 @@ def _combined_with_lane_markings(found: Solution, observations: Observations) ->
     focal = abs(float(np.log(traffic.state.camera.focal_px / sharper.markings.camera.focal_px)))
     normal_deg = unsigned_angle_deg(traffic.state.rotation[:, 2], sharper.markings.rotation[:, 2])
     contradicted = sharper.both_right < MIN_BOTH_RIGHT
+    found = found.compared(verified('lane_markings', sharper.both_right, MIN_BOTH_RIGHT))
     compared = check('lane_markings', focal=focal, normal_deg=normal_deg, used=not contradicted)
     plane = PlaneEstimate.of(sharper.fit, observations.tracks)
     if contradicted and not sharper.fit.focal_sigma <= observations.gate.max_sigma_focal_rel:
@@ -163,23 +167,30 @@ def _prior_for_markings(prior: LensPrior) -> LensPrior:
     return prior.with_free_k2() if prior.sigma[3] > 0 and prior.sigma[4] <= 0 else prior
 
 
-def verify_with_traffic(by_markings: Adjustment, planes: Iterable[PlaneEstimate]) -> tuple[Statement, ...] | Reason:
+def verify_with_traffic(
+    by_markings: Adjustment, planes: Iterable[PlaneEstimate]
+) -> tuple[tuple[Statement, ...], tuple[VerificationRow, ...]] | Reason:
     """Check lane markings against planes from the traffic, seen through the lens of the markings.
 
-    Each plane that is certain enough has to agree, and at least one has to be.
+    Each plane that is certain enough has to agree, and at least one has to be. Returns the comparisons in words, and as
+    rows of the verification table.
     """
-    by_markings, checks, best_deg = condition_on_lens(by_markings), [], np.inf
+    by_markings, checks, rows, best_deg = condition_on_lens(by_markings), [], [], np.inf
     for plane in planes:
         difference_deg, own_deg, other_deg, what = _difference_from(by_markings, plane)
         best_deg, sigma_deg = min(best_deg, own_deg), float(np.hypot(own_deg, other_deg))
         if own_deg > MAX_CONFIRMING_SIGMA_DEG:
             continue
-        if difference_deg > max(AGREEMENT_SIGMAS * sigma_deg, PLANE_TOLERANCE_DEG):
+        row = verified(
+            f'markings_and_traffic_{what}', difference_deg, max(AGREEMENT_SIGMAS * sigma_deg, PLANE_TOLERANCE_DEG)
+        )
+        if not row.passed:
             cause = 'road' if what == 'road' else ''
             return reason('markings_contradicted', cause, difference_deg=difference_deg, sigma_deg=sigma_deg)
+        rows.append(row)
         checks.append(check(f'markings_and_traffic_{what}', difference_deg=difference_deg, sigma_deg=sigma_deg))
     if checks:
-        return tuple(checks)
+        return tuple(checks), tuple(rows)
     if best_deg >= 90.0:
         return reason('markings_unconfirmed', 'no_traffic')
     return reason('markings_unconfirmed', sigma_deg=best_deg, limit_deg=MAX_CONFIRMING_SIGMA_DEG)

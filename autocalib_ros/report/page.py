@@ -273,6 +273,7 @@ def _page(scene: ReportScene, drawn: list[_Drawn]) -> str:
         rows=[*number_rows(result, scene.accepted_at_s), *file_rows(result, scene.evidence)],
         assumptions=tuple(map(str, result.assumptions)) if isinstance(result, Calibration) else (),
         checks=tuple(map(str, result.checks)) if isinstance(result, Calibration) else (),
+        verification=result.verification if isinstance(result, Calibration) else (),
         chapters=[(chapter, figures) for chapter, figures in chapters if figures],
     )
 

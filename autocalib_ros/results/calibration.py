@@ -13,6 +13,7 @@ from autocalib_ros.lens.camera import Camera
 from autocalib_ros.lens.camera_info import CameraInfo, camera_info
 from autocalib_ros.results.refusals import Reason
 from autocalib_ros.results.statements import Statement, Value
+from autocalib_ros.results.verification_table import VerificationRow
 
 GROUND_DISTANCES_M = (10.0, 20.0, 40.0)
 """Distances from the camera's foot point at which the sigma of a road point is given."""
@@ -147,6 +148,8 @@ class Calibration:
     """What was assumed: kinds of `statements.ASSUMPTIONS`."""
     checks: tuple[Statement, ...] = ()
     """What was measured or cross-checked: kinds of `statements.CHECKS`."""
+    verification: tuple[VerificationRow, ...] = ()
+    """The verification table: each check with its value and limit. Empty for method paper, which has none."""
     camera: Camera
     ground: GroundPlane | None
     ground_refusal: Reason | None

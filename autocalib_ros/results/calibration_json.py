@@ -24,6 +24,7 @@ from autocalib_ros.results.calibration import (
 )
 from autocalib_ros.results.refusals import Reason
 from autocalib_ros.results.statements import UNKNOWN_KIND, Statement, Value
+from autocalib_ros.results.verification_table import VerificationRow
 from autocalib_ros.util.files import write_atomically
 
 MAX_JSON_BYTES = 1_000_000
@@ -95,6 +96,7 @@ def _parse_calibration(document: Mapping[str, Any]) -> Calibration:
         grade=grade,
         assumptions=tuple(map(_parse_statement, document['assumptions'])),
         checks=tuple(map(_parse_statement, document['checks'])),
+        verification=tuple(map(_parse_row, document.get('verification', ()))),
         camera=camera,
         ground=None if pose is None else _parse_ground(pose, metric=grade != 'unit_scale'),
         ground_refusal=None if reason is None else _parse_reason(reason),
@@ -121,6 +123,13 @@ def _parse_statement(entry: Any) -> Statement:
     if isinstance(entry, str):
         return Statement(SCALE_OF_VERSION_1 if entry.startswith('scale by ') else UNKNOWN_KIND, entry)
     return Statement(str(entry['kind']), str(entry['text']), _parse_values(entry['values']))
+
+
+def _parse_row(entry: Mapping[str, Any]) -> VerificationRow:
+    value, passed = _optional_float(entry['value']), entry['passed']
+    if not isinstance(passed, bool):
+        raise InputError(f'true or false was expected for passed, got {reprlib.repr(passed)}')
+    return VerificationRow(str(entry['check']), value, float(entry['limit']), passed)
 
 
 def _parse_reason(entry: Mapping[str, Any]) -> Reason:
@@ -202,6 +211,7 @@ def to_json(result: Calibration | Refusal, *, accepted_at_s: float | None = None
         'method': result.method,
         'assumptions': [],
         'checks': [],
+        'verification': [],
         'refusal': None,
         'image_size': list(evidence.image_size),
         'camera': None,
@@ -234,6 +244,10 @@ def _statement_json(statement: Statement) -> dict[str, Any]:
     return {'kind': statement.kind, 'text': statement.text, 'values': dict(statement.values)}
 
 
+def _row_json(row: VerificationRow) -> dict[str, Any]:
+    return {'check': row.kind, 'value': row.value, 'limit': row.limit, 'passed': row.passed, 'text': str(row)}
+
+
 def _refusal_json(refusal: Refusal | Reason) -> dict[str, Any]:
     return {
         'code': refusal.code,
@@ -249,6 +263,7 @@ def _calibration_json(result: Calibration) -> dict[str, Any]:
         'grade': result.grade,
         'assumptions': [_statement_json(statement) for statement in result.assumptions],
         'checks': [_statement_json(statement) for statement in result.checks],
+        'verification': [_row_json(row) for row in result.verification],
         'refusal': _refusal_json(result.ground_refusal) if result.ground_refusal else None,
         'camera': {
             'model': 'kannala_brandt',

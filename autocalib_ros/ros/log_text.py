@@ -7,6 +7,7 @@ import math
 from autocalib_ros.calibrator import CalibrationProgress
 from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.results.calibration import Calibration, Refusal
+from autocalib_ros.results.verification_table import summarise_verification
 
 
 def describe(result: Calibration | Refusal) -> str:
@@ -20,10 +21,12 @@ def describe_refusal(refusal: Refusal) -> str:
 
 
 def describe_calibration(result: Calibration) -> str:
-    """Return focal length, tilt, height, grade and assumptions as one line."""
+    """Return focal length, tilt, height, grade, assumptions and verification as one line."""
     assumptions = '; '.join(map(str, result.assumptions)) or 'none'
     numbers = ', '.join(describe_numbers(result))
-    return _one_line(f'calibrated, grade {result.grade}: {numbers}; assumptions: {assumptions}')
+    verification = summarise_verification(result.verification)
+    checked = f'; {verification}' if verification else ''
+    return _one_line(f'calibrated, grade {result.grade}: {numbers}; assumptions: {assumptions}{checked}')
 
 
 def describe_numbers(result: Calibration) -> list[str]:

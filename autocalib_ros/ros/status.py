@@ -10,6 +10,7 @@ from enum import Enum
 from autocalib_ros.calibrator import CalibrationProgress
 from autocalib_ros.perception.frame_clock import ClockSummary
 from autocalib_ros.results.calibration import Calibration, StandardDeviations
+from autocalib_ros.results.verification_table import summarise_verification
 from autocalib_ros.ros.log_text import tilt_deg
 from autocalib_ros.ros.watchdog import NoImageDiagnosis
 
@@ -195,6 +196,7 @@ def _result_values(result: Calibration | None) -> Iterator[tuple[str, str]]:
     yield 'height_m', _number(ground.height_m if ground is not None and ground.metric else None, '.3f')
     yield 'height_sigma_m', _number(sigma.height_m, '.3g')
     yield 'assumptions', '' if result is None else '; '.join(map(str, result.assumptions))
+    yield 'verification', '' if result is None else summarise_verification(result.verification)
     yield 'no_ground_plane', '' if refusal is None else refusal.message
     yield 'newest_stamp_s', _number(None if result is None else result.newest_stamp_ns * 1e-9, '.3f')
 

@@ -24,6 +24,7 @@ from autocalib_ros.results.calibration import (
 )
 from autocalib_ros.results.statements import assumption, check
 from autocalib_ros.results.store import StoredCalibration
+from autocalib_ros.results.verification_table import verified
 
 SIZE = (640, 360)
 LOOKS_ALONG = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -50,6 +51,7 @@ def calibration(
             assumption('scale_height', given_m=8.1, given_sigma_m=0.0),
         ),
         checks=(check('halves', focal=0.004, normal_deg=0.2),),
+        verification=(verified('halves_focal', 0.004, 0.03), verified('lane_markings', 0.1 + 0.2, 0.5)),
         camera=camera,
         ground=GroundPlane(pitched, height_m),
         ground_refusal=None,

@@ -19,6 +19,7 @@ from autocalib_ros.results.calibration import (
 from autocalib_ros.results.calibration_json import calibration_from_json, calibration_json
 from autocalib_ros.results.refusals import Reason
 from autocalib_ros.results.statements import Statement
+from autocalib_ros.results.verification_table import VerificationRow
 from random_geometry import SIZE, between, ground_planes, lenses, reproducible
 
 COUNTS = st.integers(0, 10**6)
@@ -29,6 +30,7 @@ ITEMS = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, a
 VALUES = st.dictionaries(WORDS, ITEMS, max_size=3)
 STATEMENTS = st.builds(Statement, WORDS, WORDS, VALUES)
 ARRAYS = ('ground', 'road_directions', 'covariance')
+ROWS = st.builds(VerificationRow, WORDS, st.none() | NUMBERS, NUMBERS, st.booleans())
 
 
 def summaries() -> st.SearchStrategy[EvidenceSummary]:
@@ -86,6 +88,7 @@ def calibrations(draw: st.DrawFn) -> Calibration:
         grade=draw(st.sampled_from(['full', 'assumed'])) if metric else 'unit_scale' if ground else 'lens',
         assumptions=tuple(draw(st.lists(STATEMENTS, max_size=3))),
         checks=tuple(draw(st.lists(STATEMENTS, max_size=3))),
+        verification=tuple(draw(st.lists(ROWS, max_size=3))),
         camera=draw(lenses()),
         ground=ground,
         ground_refusal=None if ground else draw(st.builds(Reason, WORDS, WORDS, WORDS, VALUES)),

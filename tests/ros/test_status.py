@@ -144,6 +144,7 @@ def test_numbers_of_the_calibration_are_reported():
         'height_m': '8.000',
         'height_sigma_m': '0.1',
         'assumptions': 'the two roads are perpendicular',
+        'verification': '',
         'no_ground_plane': '',
         'newest_stamp_s': '1700000000.250',
     }

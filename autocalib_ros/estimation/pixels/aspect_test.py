@@ -22,6 +22,7 @@ from autocalib_ros.estimation.solution import Solution
 from autocalib_ros.estimation.verification.gates import check_plane
 from autocalib_ros.results.refusals import Reason, reason
 from autocalib_ros.results.statements import Statement, assumption, check
+from autocalib_ros.results.verification_table import verified
 
 FREEDOM = 10.0
 """Degrees of freedom of Student's t for the error of a measured pixel aspect: about as many vehicles decide it, and
@@ -131,6 +132,7 @@ def choose_aspect(
             return found
         return _clear_other(hypotheses, solve_under, tracks) or found
     measured = measure_aspect(found, tracks)
+    found = _compared(found, measured, expected, near)
     contradicted = measured.sigmas_from(expected, near) > CONSISTENT_SIGMAS
     less_likely = any(measured.log_odds(aspect, expected) > 0.0 for aspect in hypotheses.others.values())
     if contradicted or (less_likely and not _is_confirmed(found)):
@@ -145,6 +147,13 @@ def choose_aspect(
         farthest = max(undecided, key=lambda aspect: abs(np.log(aspect / expected)))
         return _widened(found, measured, measured.state_at(farthest), gate, against=farthest)
     return found
+
+
+def _compared(found: Solution, measured: MeasuredAspect, aspect: float, its_sigma: float) -> Solution:
+    """Add the comparison of a pixel aspect with the measured one, where the traffic measures it."""
+    if not np.isfinite(measured.sigma):
+        return found
+    return found.compared(verified('pixel_aspect', measured.sigmas_from(aspect, its_sigma), CONSISTENT_SIGMAS))
 
 
 def _is_confirmed(found: Solution) -> bool:
@@ -180,6 +189,7 @@ def _clear_other(
         measured = measure_aspect(found, tracks)
         if measured.sigmas_from(aspect, sigma) > CONSISTENT_SIGMAS:
             continue
+        found = _compared(found, measured, aspect, sigma)
         odds = {other: measured.log_odds(aspect, other, sigma) for other in (expected, *others.values())}
         odds[expected] -= 0.0 if hypotheses.doubtful else EXPECTED_NATS
         odds[expected] += MARKINGS_NATS * (_is_confirmed(found) - confirmed)

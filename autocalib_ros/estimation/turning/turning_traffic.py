@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -74,27 +74,43 @@ def refine_with_turning(fit: Adjustment, tracks: TrackSet, windows: TwoFrameWind
     )
 
 
+@dataclass(frozen=True)
+class TrackletComparison:
+    """A solution from tracklets against that from windows."""
+
+    state: AdjustmentState
+    """From the tracklets."""
+    sigmas: float
+    """Larger difference in focal length or normal, in standard deviations of the less certain solution."""
+
+    @property
+    def rejected(self) -> bool:
+        """Whether the two contradict each other."""
+        return not self.sigmas <= MAX_TRACKLET_DIFFERENCE_SIGMAS
+
+
 def refine_with_tracklets(
     fit: Adjustment, tracks: TrackSet, windows: TwoFrameWindows, instants: ResampledTracks
-) -> tuple[Adjustment, AdjustmentState | None]:
+) -> tuple[Adjustment, TrackletComparison | None]:
     """Run the final adjustment with tracklets where there are any, and with correlated errors within each vehicle.
 
     Windows and tracklets come from the same tracks. If their solutions differ by more than their uncertainty, one of
-    the two models is wrong: then the window solution is returned, which assumes less, together with the state from the
+    the two models is wrong: then the window solution is returned, which assumes less. The comparison is None without
     tracklets.
     """
     config = replace(fit.problem.config, vehicle_correlation=fit.vehicle_correlation)
     turning = _turning_windows(fit, windows) if config.turning else None
     tracklets = no_tracklets() if turning is None else find_tracklets(turning, instants, MAX_TRACKLETS)
-    with_tracklets = None
+    compared = None
     if turning is not None and len(tracklets):
         segments_only = turning.subset(turning.from_segments).balanced_subset(MAX_TURNING_WINDOWS)
         bundle = TrackletBundle(tracklets, config.options.noise_px, config.options.drift_px)
         with_tracklets = _adjust_with_tracklets(fit, tracks, replace(config, windows=segments_only, bundle=bundle))
-        if not compare_solutions(fit, with_tracklets).exceeds(MAX_TRACKLET_DIFFERENCE_SIGMAS):
-            return with_tracklets, None
+        compared = TrackletComparison(with_tracklets.state, compare_solutions(fit, with_tracklets).in_sigmas)
+        if not compared.rejected:
+            return with_tracklets, compared
     with_windows = adjust(fit.state, tracks, config, refine=True, warm_start=fit.problem.warm_start)
-    return with_windows, None if with_tracklets is None else with_tracklets.state
+    return with_windows, compared
 
 
 def _adjust_with_tracklets(fit: Adjustment, tracks: TrackSet, config: AdjustmentConfig) -> Adjustment:
@@ -143,11 +159,11 @@ def restart_tracklets(fit: Adjustment, tracks: TrackSet) -> Adjustment:
     return fit
 
 
-def widen_by_tracklet_difference(fit: Adjustment, tracklet_state: AdjustmentState | None) -> Adjustment:
+def widen_by_tracklet_difference(fit: Adjustment, compared: TrackletComparison | None) -> Adjustment:
     """Add the difference to a rejected tracklet solution, if there is one, to the covariance."""
-    if tracklet_state is None:
+    if compared is None or not compared.rejected:
         return fit
-    step = fit.problem.parameters.step_to(tracklet_state)
+    step = fit.problem.parameters.step_to(compared.state)
     return replace(fit, covariance=fit.covariance + np.outer(step, step))
 
 

@@ -33,13 +33,15 @@ class SolutionDifference:
         """Standard deviations (2,) of the two differences between independent solutions."""
         return np.hypot(*self.sigmas_of_each)
 
-    def exceeds(self, sigmas: float) -> bool:
-        """Whether either difference exceeds this many standard deviations of the less certain solution.
+    @property
+    def in_sigmas(self) -> float:
+        """The larger of both differences, in standard deviations of the less certain solution.
 
         Two estimates from the same evidence, one of them efficient, differ by less than that: the variance of the
         difference is the difference of the variances (Hausman 1978, "Specification tests in econometrics").
         """
-        return bool((np.array([self.focal, self.normal_deg]) > sigmas * self.sigmas_of_each.max(axis=0)).any())
+        sigmas = np.maximum(self.sigmas_of_each.max(axis=0), 1e-12)
+        return float((np.array([self.focal, self.normal_deg]) / sigmas).max())
 
 
 def compare_solutions(first: Adjustment, second: Adjustment) -> SolutionDifference:

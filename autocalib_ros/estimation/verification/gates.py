@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.ground_plane import MIN_FRACTION_BELOW_HORIZON
 from autocalib_ros.results.refusals import Reason, reason
 from autocalib_ros.results.statements import Statement, check
+from autocalib_ros.results.verification_table import VerificationRow, verified
 
 MIN_STRAIGHT_FRACTION = 0.25
 """Fraction of the vehicles that have to follow the roads. Below it the traffic turns, and the common direction is that
@@ -77,23 +78,24 @@ def check_lens(
     *,
     turned: bool,
     driving: np.ndarray | None = None,
-) -> Reason | None:
+) -> Reason | tuple[VerificationRow, ...]:
     """Check the lens; `turned` marks a solution that was initialised by turning traffic.
 
     `tracks` are those selected from the evidence. `driving` is a mask (tracks,) of the tracks of vehicles: pedestrians
-    need not follow a road.
+    need not follow a road. Returns the rows of the verification table where all is well.
     """
     failed_check = _check_horizon(fit, tracks) or _check_lens_model(fit)
     if failed_check or (turned and motion_constrains_focal(fit)):
-        return failed_check
+        return failed_check or ()
     needed = MIN_STRAIGHT_FRACTION if len(fit.state.angles_rad) > 1 else MIN_ONE_ROAD_FRACTION
     fraction = _straight_fraction(fit, tracks, driving)
     if (
         needed == MIN_ONE_ROAD_FRACTION > fraction > MIN_KEPT_ROAD_FRACTION
         and lane_keeping_fraction(fit, evidence) > MIN_LANE_KEEPING_FRACTION
     ):
-        return None
-    return _turning_traffic_reason(fit, fraction, needed) if fraction < needed else None
+        needed = MIN_KEPT_ROAD_FRACTION
+    share = verified('straight_share', fraction, needed)
+    return (share,) if share.passed else _turning_traffic_reason(fit, fraction, needed)
 
 
 def check_markings_view(fit: Adjustment, tracks: TrackSet) -> Reason | None:
@@ -164,10 +166,21 @@ def _check_lens_model(fit: Adjustment) -> Reason | None:
     camera, prior = fit.state.camera, fit.problem.config.prior
     if prior.sigma[3] <= 0:
         return None
-    off = abs(camera.k[0] - prior.centre.k[0]) / prior.sigma[3]
+    off = k1_prior_sigmas(fit)
     if off > MAX_K1_SIGMAS:
         return reason('lens_model', family=prior.family, k1=camera.k[0], sigmas=off, limit=MAX_K1_SIGMAS)
     return None
+
+
+def k1_prior_sigmas(fit: Adjustment) -> float:
+    """Return the deviation of k1 from the mean of its lens family, in standard deviations of its prior."""
+    prior = fit.problem.config.prior
+    return abs(fit.state.camera.k[0] - prior.centre.k[0]) / float(prior.sigma[3])
+
+
+def max_plane_sigma_deg(plane: PlaneEstimate, gate: GateOptions, *, assumed: bool) -> float:
+    """Return the largest standard deviation of tilt and roll; one that rests on an assumption may be less certain."""
+    return gate.max_sigma_tilt_deg * (ASSUMED_PLANE_SIGMA_FACTOR if assumed or plane.assumed is not None else 1.0)
 
 
 def check_plane(plane: PlaneEstimate, gate: GateOptions, *, assumed: bool = False) -> Reason | None:
@@ -177,13 +190,25 @@ def check_plane(plane: PlaneEstimate, gate: GateOptions, *, assumed: bool = Fals
         return reason('plane_uncertain', 'level_road')
     if plane.assumed is not None and plane.fraction_below_horizon < MIN_FRACTION_BELOW_HORIZON:
         return _above_horizon_reason(plane.fraction_below_horizon)
-    needed = gate.max_sigma_tilt_deg * (ASSUMED_PLANE_SIGMA_FACTOR if assumed or plane.assumed is not None else 1.0)
+    needed = max_plane_sigma_deg(plane, gate, assumed=assumed)
     if not sigma <= needed:
         return reason('plane_uncertain', sigma_deg=min(sigma, 90.0), limit_deg=needed)
     return None
 
 
-def check_halves(fit: Adjustment, tracks: TrackSet, gate: GateOptions) -> Reason | Statement:
+@dataclass(frozen=True)
+class ComparedHalves:
+    """The comparison of two halves of the traffic, or why there is none."""
+
+    statement: Statement
+    rows: tuple[VerificationRow, ...] = ()
+
+
+NOT_COMPARED = ComparedHalves(check('halves_not_compared'))
+"""Of traffic too little for two halves."""
+
+
+def check_halves(fit: Adjustment, tracks: TrackSet, gate: GateOptions) -> Reason | ComparedHalves:
     """Cross-validate in time: solve the earlier and the later half of the vehicles, and compare."""
     config = replace(fit.problem.config, vehicle_correlation=fit.vehicle_correlation)
     tracklets = no_tracklets() if config.bundle is None else config.bundle.tracklets
@@ -197,12 +222,12 @@ def check_halves(fit: Adjustment, tracks: TrackSet, gate: GateOptions) -> Reason
         part, bundle = tracks.subset(half), config.bundle and config.bundle.subset(living)
         part_setting = replace(config, windows=config.windows.subset(seen), bundle=bundle)
         if half.sum() + seen.sum() + living.sum() < MIN_RESIDUAL_ROWS or (config.turning and not part_setting.turning):
-            return check('halves_not_compared')
+            return NOT_COMPARED
         _, motion, shapes = fit.problem.warm_start
         warm_start = None, motion.subset(seen) if motion else None, shapes.subset(living) if bundle and shapes else None
         fits.append(adjust(fit.state, part, part_setting, refine=True, warm_start=warm_start))
         if any(mask.sum() < gate.min_tracks_per_road // 2 for mask in road_support(fits[-1], part)):
-            return check('halves_not_compared')
+            return NOT_COMPARED
     apart = compare_solutions(*fits)
     focal, turn = apart.focal, apart.normal_deg if fit.plane_known else 0.0  # one road does not determine the normal
     # a large sigma of one half excuses no difference that the sigma of the whole rules out
@@ -210,11 +235,13 @@ def check_halves(fit: Adjustment, tracks: TrackSet, gate: GateOptions) -> Reason
         (HALVES_FOCAL_TOLERANCE, HALVES_NORMAL_TOLERANCE_DEG),
         np.minimum(MAX_HALVES_SIGMAS * apart.sigmas, MAX_WHOLE_SIGMAS * expected_half_differences(fit, *fits)),
     )
-    if focal > focal_limit or turn > turn_limit:
+    rows = verified('halves_focal', focal, focal_limit), verified('halves_normal', turn, turn_limit)
+    if not all(row.passed for row in rows):
         return reason(
             'halves_disagree', focal=focal, focal_limit=focal_limit, normal_deg=turn, normal_limit_deg=turn_limit
         )
-    return check('halves', focal=focal, normal_deg=turn if fit.plane_known else None)
+    statement = check('halves', focal=focal, normal_deg=turn if fit.plane_known else None)
+    return ComparedHalves(statement, rows if fit.plane_known else rows[:1])
 
 
 def _earlier_half(*seen: tuple[np.ndarray, np.ndarray]) -> list[np.ndarray]:

@@ -56,14 +56,14 @@ class LevelCamera:
 
 def combine_assumptions(
     level: LevelCamera, square: TransverseDirection, state: AdjustmentState
-) -> tuple[TransverseDirection | None, float]:
-    """Combine two assumptions weighted by inverse variance; and their difference in degrees.
+) -> tuple[TransverseDirection | None, float, float]:
+    """Combine two assumptions weighted by inverse variance; their difference, and its limit, in degrees.
 
     None instead of the combination if they contradict each other. The difference is a rotation about the road, nan if
     the roll does not determine the plane.
     """
     if not level.constrains_plane(state):
-        return square, np.nan
+        return square, np.nan, np.nan
     along = state.directions[0]
     across = square.across(state)
     up = np.cross(along, across)
@@ -80,7 +80,8 @@ def combine_assumptions(
         step_sigma_rad=square.step_sigma_rad * sigma / both,
         level_sigma_deg=level.sigma_deg,
     )
-    return joined if abs(turn(0.0)) <= AGREEMENT_SIGMAS * both else None, float(np.degrees(abs(turn(0.0))))
+    difference, limit = abs(turn(0.0)), AGREEMENT_SIGMAS * both
+    return joined if difference <= limit else None, float(np.degrees(difference)), float(np.degrees(limit))
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from dataclasses import replace
 from autocalib_ros.offline.terminal.style import align_columns
 from autocalib_ros.report.text import number_rows, remedy
 from autocalib_ros.results.calibration import Calibration, Refusal
+from autocalib_ros.results.verification_table import summarise_verification
 
 INDENT = '  '
 
@@ -28,6 +29,7 @@ def summary_lines(
     remarks = [
         *(('assumed', statement.text) for statement in result.assumptions),
         *(('checked', statement.text) for statement in result.checks),
+        ('verified', summarise_verification(result.verification)),
         ('what helps', remedy(result)),
     ]
     return [INDENT + line for line in lines] + _wrap_pairs(remarks, columns)

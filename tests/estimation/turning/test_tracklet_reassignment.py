@@ -20,7 +20,7 @@ from autocalib_ros.estimation.observations.tracklets import Tracklets, find_trac
 from autocalib_ros.estimation.observations.two_frame_windows import ResampledTracks, TwoFrameWindows, find_windows
 from autocalib_ros.estimation.turning import turning_traffic as turning
 from autocalib_ros.estimation.verification.consistency import compare_solutions, expected_half_differences
-from autocalib_ros.estimation.verification.gates import check_halves
+from autocalib_ros.estimation.verification.gates import ComparedHalves, check_halves
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera
@@ -28,7 +28,6 @@ from autocalib_ros.offline.synthetic.drives import drive_arc
 from autocalib_ros.offline.synthetic.junction import Junction, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration
 from autocalib_ros.results.refusals import Reason
-from autocalib_ros.results.statements import Statement
 
 pytestmark = pytest.mark.solve
 
@@ -83,13 +82,13 @@ def test_tracklets_that_contradict_windows_are_rejected(monkeypatch: pytest.Monk
     if isinstance(result, Calibration) and result.ground is not None:
         assert sigmas_off(result) < 3.0
     windows, fit, tracks = by_windows(evidence_of(1))
-    kept, tracklet_state = turning.refine_with_tracklets(fit, tracks, windows, ResampledTracks(evidence_of(1)))
-    assert tracklet_state is not None
+    kept, compared = turning.refine_with_tracklets(fit, tracks, windows, ResampledTracks(evidence_of(1)))
+    assert compared is not None and compared.rejected
     assert compare_solutions(kept, fit).normal_deg < 0.1
     assert turning.widen_by_tracklet_difference(kept, None) is kept
-    widened = turning.widen_by_tracklet_difference(kept, tracklet_state)
+    widened = turning.widen_by_tracklet_difference(kept, compared)
     before, after = compare_solutions(kept, kept).sigmas[1], compare_solutions(widened, widened).sigmas[1]
-    apart_deg = np.degrees(np.arccos(kept.state.rotation[:, 2] @ tracklet_state.rotation[:, 2]))
+    apart_deg = np.degrees(np.arccos(kept.state.rotation[:, 2] @ compared.state.rotation[:, 2]))
     assert apart_deg > 5.0
     assert after**2 - before**2 == pytest.approx(2 * apart_deg**2, rel=0.05)  # as of two estimates with that error each
 
@@ -125,7 +124,9 @@ def test_a_tracklet_in_a_wrong_minimum_is_restarted() -> None:
 def test_halves_bound_the_standard_deviation_of_the_whole() -> None:
     generator = np.random.default_rng(1)
     _, fit, nothing = by_windows(slid(synthetic_evidence(TURNING, generator), generator, 8.0))
-    assert isinstance(check_halves(fit, nothing, GateOptions()), Statement)
+    agreed = check_halves(fit, nothing, GateOptions())
+    assert isinstance(agreed, ComparedHalves) and agreed.statement.kind == 'halves'
+    assert [(row.kind, row.passed) for row in agreed.rows] == [('halves_focal', True), ('halves_normal', True)]
     boasting = replace(fit, covariance=1e-4 * fit.covariance)
     doubt = check_halves(boasting, nothing, GateOptions())
     assert isinstance(doubt, Reason) and doubt.code == 'halves_disagree'

@@ -201,8 +201,8 @@ def test_a_level_camera_and_edges_are_combined_by_their_variances() -> None:
     state = state_of(camera_from_ground)
     square = transverse_direction_at(edges, state, np.random.default_rng(0))
     assert square is not None
-    joined, apart_deg = combine_assumptions(LevelCamera(1.0), square, state)
-    assert joined is not None
+    joined, apart_deg, limit_deg = combine_assumptions(LevelCamera(1.0), square, state)
+    assert joined is not None and apart_deg < limit_deg
     # for a road straight ahead, roll and rotation about the road are nearly the same
     assert apart_deg == pytest.approx(2.0, abs=1.0)
     assert joined.step_sigma_rad < square.step_sigma_rad
@@ -217,8 +217,8 @@ def test_edges_that_contradict_a_level_camera_are_noticed() -> None:
         traffic(camera_from_ground, np.random.default_rng(5)), state, np.random.default_rng(0)
     )
     assert square is not None
-    joined, apart_deg = combine_assumptions(LevelCamera(1.0), square, state)
-    assert joined is None and apart_deg > 5.0
+    joined, apart_deg, limit_deg = combine_assumptions(LevelCamera(1.0), square, state)
+    assert joined is None and apart_deg > limit_deg > 2.0
 
 
 def with_boxes(junction: Junction, clutter: float = 0.5) -> Evidence:

@@ -1,0 +1,119 @@
+"""The verification of a calibration as a table: what was checked, its value, its limit, and whether it passed.
+
+A row is made by `verified`, which takes the kind, the value and the limit. A check that fails without a refusal has
+cost something: it widened the standard deviations or lowered the grade, and the text of the kind says which.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class VerifiedQuantity:
+    """One quantity that is compared with a limit."""
+
+    name: str
+    """What is compared, in words."""
+    unit: str
+    """'%' for a fraction, 'degrees', 'px', or 'sigma': standard deviations of a difference."""
+    cost: str
+    """What a failure costs."""
+    at_least: bool = False
+    """Whether the limit is the smallest value that passes, and not the largest."""
+
+
+REFUSED = 'no calibration'
+NO_PLANE = 'no ground plane'
+GRADE_ASSUMED = 'not grade full'
+WIDENED = 'wider standard deviations'
+
+VERIFIED_QUANTITIES: dict[str, VerifiedQuantity] = {
+    'focal_sigma': VerifiedQuantity('standard deviation of the focal length', '%', REFUSED),
+    'plane_sigma': VerifiedQuantity('standard deviation of tilt or roll, the larger', 'degrees', NO_PLANE),
+    'height_sigma': VerifiedQuantity('standard deviation of the camera height', '%', NO_PLANE),
+    'below_horizon': VerifiedQuantity('tracked points below the horizon', '%', REFUSED, at_least=True),
+    'straight_share': VerifiedQuantity('vehicles that follow the roads', '%', REFUSED, at_least=True),
+    'k1_prior': VerifiedQuantity('k1 against its lens family', 'sigma', REFUSED),
+    'principal_point_prior': VerifiedQuantity(
+        'principal point against the centre of the picture', 'sigma', GRADE_ASSUMED
+    ),
+    'halves_focal': VerifiedQuantity('focal length, earlier against later traffic', '%', REFUSED),
+    'halves_normal': VerifiedQuantity('ground normal, earlier against later traffic', 'degrees', REFUSED),
+    'tracklets': VerifiedQuantity('turning vehicles over seconds against between two instants', 'sigma', WIDENED),
+    'lane_markings': VerifiedQuantity(
+        'probability that traffic and lane markings are both right', '%', GRADE_ASSUMED, at_least=True
+    ),
+    'markings_and_traffic_normal': VerifiedQuantity('ground normal, lane markings against traffic', 'degrees', REFUSED),
+    'markings_and_traffic_road': VerifiedQuantity(
+        'direction of the road, lane markings against traffic', 'degrees', REFUSED
+    ),
+    'edges_and_level': VerifiedQuantity('plane by vehicle edges against by a level camera', 'degrees', NO_PLANE),
+    'lane_changes': VerifiedQuantity('plane by lane changes against the assumed plane', 'degrees', NO_PLANE),
+    'pixel_aspect': VerifiedQuantity('pixel aspect against the one by the traffic', 'sigma', WIDENED),
+    'given_lens': VerifiedQuantity('given focal length against the one by the traffic', '%', GRADE_ASSUMED),
+}
+"""Every quantity of a verification, by its kind."""
+
+
+@dataclass(frozen=True)
+class VerificationRow:
+    """One check of a calibration."""
+
+    kind: str
+    """Key of `VERIFIED_QUANTITIES`, or of those of a newer version."""
+    value: float | None
+    """None if it cannot be computed; such a check has failed."""
+    limit: float
+    passed: bool
+
+    @property
+    def name(self) -> str:
+        """What is compared, in words."""
+        return VERIFIED_QUANTITIES[self.kind].name if self.kind in VERIFIED_QUANTITIES else self.kind
+
+    @property
+    def value_text(self) -> str:
+        """The value with its unit."""
+        return 'unknown' if self.value is None else _with_unit(self.value, self.kind)
+
+    @property
+    def limit_text(self) -> str:
+        """The limit with its unit, and on which side of it a value passes."""
+        quantity = VERIFIED_QUANTITIES.get(self.kind)
+        side = 'at least' if quantity is not None and quantity.at_least else 'at most'
+        return f'{side} {_with_unit(self.limit, self.kind)}'
+
+    @property
+    def outcome(self) -> str:
+        """'passed', or 'failed' with what that cost."""
+        if self.passed or self.kind not in VERIFIED_QUANTITIES:
+            return 'passed' if self.passed else 'failed'
+        return f'failed: {VERIFIED_QUANTITIES[self.kind].cost}'
+
+    def __str__(self) -> str:
+        return f'{self.name} {self.value_text} ({self.limit_text}): {self.outcome}'
+
+
+def verified(kind: str, value: float, limit: float) -> VerificationRow:
+    """Return the row of a comparison; a value that is not finite fails."""
+    quantity, value, limit = VERIFIED_QUANTITIES[kind], float(value), float(limit)
+    if not math.isfinite(value):
+        return VerificationRow(kind, None, limit, False)
+    return VerificationRow(kind, value, limit, value >= limit if quantity.at_least else value <= limit)
+
+
+def summarise_verification(rows: Sequence[VerificationRow]) -> str:
+    """Return how many checks passed and which failed, on one line; '' without any."""
+    failed = [str(row) for row in rows if not row.passed]
+    if not rows:
+        return ''
+    counts = f'{len(rows) - len(failed)} of {len(rows)} checks passed'
+    return '; '.join([counts, *failed])
+
+
+def _with_unit(value: float, kind: str) -> str:
+    unit = VERIFIED_QUANTITIES[kind].unit if kind in VERIFIED_QUANTITIES else ''
+    return f'{100.0 * value:.3g} %' if unit == '%' else f'{value:.3g} {unit}'.rstrip()
