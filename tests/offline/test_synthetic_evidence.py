@@ -12,12 +12,14 @@ from autocalib_ros.errors import UsageError
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.benchmark.families import (
+    PRINCIPAL_POINT_SIGMA,
+    WIDTH,
     draw_distortion_free_lens,
-    families,
     radial,
     short_piece,
     standard_junction,
 )
+from autocalib_ros.offline.benchmark.monte_carlo import Task, draw_evidence, families, given_lens
 from autocalib_ros.offline.simulate.junctions import junction as crossing
 from autocalib_ros.offline.simulate.motorway import highway
 from autocalib_ros.offline.simulate.network import Network
@@ -338,3 +340,34 @@ def test_a_shadow_stays_on_one_side_whatever_the_heading() -> None:
     path, heading = drive_ring(CLEAN, generator, radius_m=15.0)
     offset = shadow(path, heading, generator)[0] - path
     assert np.ptp(offset, axis=0).max() < 1e-9 and 0.5 <= np.hypot(*offset[0]) <= 2.0
+
+
+def test_a_wrong_lens_file_is_of_another_focal_length_each_run() -> None:
+    lenses = []
+    for run in range(4):
+        task = Task('wrong_lens_file', 0, run, ('joint',))
+        junction, _ = draw_evidence(task.family, task.seed, task.run)
+        lens = given_lens(task, junction.camera)
+        assert lens is not None and lens == given_lens(task, junction.camera)
+        assert abs(np.log(lens.focal_px / junction.camera.focal_px)) > 0.05
+        lenses.append(lens.focal_px / junction.camera.focal_px)
+    assert len(set(lenses)) == 4
+    assert given_lens(Task('standard', 0, 0, ('joint',)), junction.camera) is None
+
+
+def test_a_bar_hides_one_side_and_moves_the_centre() -> None:
+    junction, evidence = drawn('one_sided_bar')
+    first, last = junction.visible_columns_px
+    assert (first > 0) != (last < WIDTH)
+    assert abs(junction.camera.principal_point_px[0] - 0.5 * (first + last)) < 5 * PRINCIPAL_POINT_SIGMA * WIDTH
+    assert evidence.points_px[:, 0].min() > first - 5 and evidence.points_px[:, 0].max() < last + 5
+
+
+def test_the_earlier_view_of_two_is_turned() -> None:
+    junction, evidence = drawn('mixed_views')
+    middle_s = 0.5 * (evidence.times_s.max() + evidence.times_s.min())
+    roads = junction.camera_from_ground @ np.array([[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]])
+    normals, _ = circles(junction, evidence)
+    through = np.abs(normals @ roads).min(axis=1)
+    earlier = np.array([track.times_s.max() < middle_s for track in evidence.tracks()])
+    assert np.median(through[~earlier]) < 0.3 * np.median(through[earlier])

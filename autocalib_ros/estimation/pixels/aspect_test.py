@@ -39,11 +39,16 @@ MARKINGS_NATS = 3.0
 chance one grid of lines in twenty does. Judgement."""
 CLEAR_NATS = 4.5
 """Smallest log odds between two pixel aspects of which one is taken for sure: 1 in 90 is wrong."""
+UNUSUAL_SIGMA, UNUSUAL_STEPS = 0.12, 141
+"""Standard deviation of the logarithm of a pixel aspect other than the expected one: most squeezes are of 2 to 20 %,
+and wider ones go with sizes by which they are known. And the number of values tried, up to four deviations."""
 CONTRADICTIONS = ('horizon', 'too_little_curvature', 'lens_model', 'halves_disagree', 'markings_contradicted')
 """Refusals of the expected pixels after which others are tried: those that a squeeze causes."""
 POSSIBLE_CONTRADICTIONS = ('no_agreement', 'turning_traffic', 'too_little_turning', 'one_direction')
 """The same for sizes that are usually squeezed: a squeeze may cause them, but most often the traffic does."""
 
+ASPECT_STEP = 1e-3
+"""Step of the logarithm of the pixel aspect for the derivative of lens and plane by it."""
 ASPECT = LENS_PARAMETERS.index('pixel aspect')
 """Index of the pixel aspect among the parameters of a lens."""
 
@@ -84,6 +89,20 @@ class MeasuredAspect:
         squares = np.square([self.sigmas_from(other, sigma), self.sigmas_from(aspect, sigma)])
         losses = 0.5 * (FREEDOM + 1.0) * np.log1p(squares / FREEDOM)
         return float(losses[0] - losses[1])
+
+    def unexpected(self, expected: float, prior_odds: float) -> tuple[float, float]:
+        """Return the probability of another pixel aspect than the expected one, and its mean squared logarithm.
+
+        Bayesian model averaging (Hoeting et al. 1999) over the expected aspect and normally distributed others, whose
+        prior odds against it are `prior_odds`.
+        """
+        deviations = np.linspace(-4.0, 4.0, UNUSUAL_STEPS)
+        logs, prior = UNUSUAL_SIGMA * deviations, np.exp(-0.5 * deviations**2)
+        away = (np.log(self.aspect / expected) - np.append(logs, 0.0)) / self.sigma
+        likelihood = (1.0 + away**2 / FREEDOM) ** (-0.5 * (FREEDOM + 1.0))
+        posterior = prior / prior.sum() * likelihood[:-1]
+        other, as_expected = prior_odds * float(posterior.sum()), float(likelihood[-1])
+        return other / (other + as_expected), float((posterior * logs**2).sum() / posterior.sum())
 
     def state_at(self, aspect: float) -> AdjustmentState:
         """Return the state that the traffic would give with another pixel aspect, to first order.
@@ -146,7 +165,7 @@ def choose_aspect(
     if hypotheses.doubtful and undecided:
         farthest = max(undecided, key=lambda aspect: abs(np.log(aspect / expected)))
         return _widened(found, measured, measured.state_at(farthest), gate, against=farthest)
-    return found
+    return found if near > 0.0 else _averaged(found, measured, expected, gate)
 
 
 def _compared(found: Solution, measured: MeasuredAspect, aspect: float, its_sigma: float) -> Solution:
@@ -237,6 +256,23 @@ def _with_near_aspect(found: Solution, hypotheses: AspectHypotheses) -> Solution
     return replace(found, assumptions=(*found.assumptions, statement))
 
 
+def _averaged(found: Solution, measured: MeasuredAspect, expected: float, gate: GateOptions) -> Solution | Reason:
+    """Widen the covariance for the chance that the pixels are not as expected; a reason if that is too much.
+
+    Traffic that hardly measures the pixel aspect tells squeezed pixels from another focal length hardly either.
+    """
+    if not np.isfinite(measured.free.covariance).all():
+        return found
+    prior_odds = np.exp(-EXPECTED_NATS - MARKINGS_NATS * _is_confirmed(found))
+    probability, square = measured.unexpected(expected, float(prior_odds))
+    before, after = (measured.state_at(expected * float(np.exp(step))) for step in (0.0, ASPECT_STEP))
+    step = _same_change(found.fit, before, after) / ASPECT_STEP
+    fit = replace(found.fit, covariance=found.fit.covariance + probability * square * np.outer(step, step))
+    if fit.focal_sigma > gate.max_sigma_focal_rel >= found.fit.focal_sigma:
+        return _uncertain(measured, fit, gate, against=measured.aspect)
+    return replace(found, fit=fit, plane=replace(found.plane, fit=fit))
+
+
 def _widened(
     found: Solution, measured: MeasuredAspect, state: AdjustmentState, gate: GateOptions, *, against: float
 ) -> Solution | Reason:
@@ -247,18 +283,23 @@ def _widened(
     expected = found.fit.problem.config.prior.centre.pixel_aspect
     sigma, sigmas = measured.aspect * measured.sigma, measured.sigmas_from(expected)
     if not (np.isfinite(sigma) and fit.focal_sigma <= gate.max_sigma_focal_rel):
-        return reason(
-            'pixel_aspect',
-            aspect=against,
-            measured=measured.aspect,
-            sigma=min(sigma, 9.99),
-            focal=min(fit.focal_sigma, 9.99) if np.isfinite(sigma) else 9.99,
-            limit=gate.max_sigma_focal_rel,
-        )
+        return _uncertain(measured, fit, gate, against=against)
     uncertain = found.plane_refusal or check_plane(plane, gate, assumed=True)
     statement = check('pixel_aspect', aspect=against, measured=measured.aspect, sigma=min(sigma, 9.99), sigmas=sigmas)
     return replace(
         found, fit=fit, plane=plane, plane_refusal=uncertain, reduced=True, checks=(*found.checks, statement)
+    )
+
+
+def _uncertain(measured: MeasuredAspect, fit: Adjustment, gate: GateOptions, *, against: float) -> Reason:
+    sigma = measured.aspect * measured.sigma
+    return reason(
+        'pixel_aspect',
+        aspect=against,
+        measured=measured.aspect,
+        sigma=min(sigma, 9.99),
+        focal=min(fit.focal_sigma, 9.99) if np.isfinite(sigma) else 9.99,
+        limit=gate.max_sigma_focal_rel,
     )
 
 

@@ -321,8 +321,3 @@ UNDERDETERMINED: dict[str, Family] = {
     'short_piece': family_of(short_piece),
     'distortion_free_skew': family_of(distortion_free_skew),
 }
-
-
-def families() -> dict[str, Family]:
-    """Return all families by name, determined ones first."""
-    return {**DETERMINED, **UNDERDETERMINED}

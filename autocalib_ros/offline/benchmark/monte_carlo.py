@@ -24,7 +24,8 @@ from autocalib_ros.estimation.estimate import solve
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.ground_plane import GroundPlane, angles_deg, tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera, pixel_grid
-from autocalib_ros.offline.benchmark.families import families
+from autocalib_ros.offline.benchmark.broken_families import BROKEN, GIVEN_LENSES
+from autocalib_ros.offline.benchmark.families import DETERMINED, UNDERDETERMINED, Family
 from autocalib_ros.offline.benchmark.processes import map_in_order
 from autocalib_ros.offline.ground_truth import MAX_COMPARED_RANGE_M, median_distance_error
 from autocalib_ros.offline.synthetic.junction import Junction
@@ -38,6 +39,8 @@ GROUND_GRID = 5
 """Number of ranges, and of bearings, of the road points between which distances are compared."""
 MAX_BEARING_DEG = 40.0
 """Largest bearing of those road points from the viewing direction, to either side."""
+LENS_FILE = 1
+"""Part of the seed of a lens file: it does not depend on how the traffic was drawn."""
 NAN = math.nan
 
 
@@ -105,6 +108,11 @@ def run_monte_carlo(
     return done
 
 
+def families() -> dict[str, Family]:
+    """Return all families by name: determined ones, underdetermined ones, and those that break an assumption."""
+    return {**DETERMINED, **UNDERDETERMINED, **BROKEN}
+
+
 def select_families(names: Sequence[str]) -> list[str]:
     """Return the names of the families, all families if `names` is empty, or raise UsageError."""
     every = list(families())
@@ -122,15 +130,25 @@ def run_task(task: Task) -> list[Run]:
 
 def draw_evidence(family: str, seed: int, run: int) -> tuple[Junction, Evidence]:
     """Draw the ground truth and the evidence of one run of a family."""
-    sequence = np.random.SeedSequence([seed, zlib.crc32(family.encode()), run])
-    return families()[family](np.random.default_rng(sequence))
+    return families()[family](_generator(family, seed, run))
+
+
+def _generator(family: str, seed: int, run: int, *more: int) -> np.random.Generator:
+    return np.random.default_rng(np.random.SeedSequence([seed, zlib.crc32(family.encode()), run, *more]))
+
+
+def given_lens(task: Task, true: Camera) -> Camera | None:
+    """Return the lens that the family of a task is solved with; None if it is solved without one."""
+    draw = GIVEN_LENSES.get(task.family)
+    return None if draw is None else draw(true, _generator(task.family, task.seed, task.run, LENS_FILE))
 
 
 def run_method(task: Task, method: str, junction: Junction, evidence: Evidence) -> Run:
     """Solve with the true camera height; record an exception of the solver instead of stopping the benchmark."""
     began = time.process_time()
     try:
-        result = solve(evidence, Options(camera_height=junction.height_m, method=method))
+        options = Options(camera_height=junction.height_m, method=method)
+        result = solve(evidence, options, lens=given_lens(task, junction.camera))
     except Exception as error:
         return Run(
             family=task.family, method=method, run=task.run, accepted=False, code=f'crash:{type(error).__name__}'

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
+from autocalib_ros.offline.benchmark.broken_families import BROKEN
 from autocalib_ros.offline.benchmark.families import UNDERDETERMINED
 from autocalib_ros.offline.benchmark.monte_carlo import Run
 
@@ -25,11 +26,13 @@ SIGMAS_FORMAT = NAME_FORMAT + '{:>7}{:>8}{:>7}{:>8}{:>7}{:>7}{:>8}{:>7}{:>8}'
 
 def format_tables(runs: Sequence[Run]) -> str:
     """Return tables of errors, of stated standard deviations against errors, and the list of crashes."""
-    determined = [run for run in runs if run.family not in UNDERDETERMINED]
+    determined = [run for run in runs if run.family not in {**UNDERDETERMINED, **BROKEN}]
     doubtful = [run for run in runs if run.family in UNDERDETERMINED]
+    broken = [run for run in runs if run.family in BROKEN]
     blocks = [
         *_blocks('Evidence that determines the calibration', determined),
         *_blocks('Evidence that does not, or that is misleading', doubtful),
+        *_blocks('Evidence that breaks an assumption', broken),
         *_crashes(runs),
     ]
     return '\n\n'.join(blocks)

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from squeezed_evidence import squeezed
 
 from autocalib_ros.config import LensOptions, Options
+from autocalib_ros.estimation.pixels.aspect_test import UNUSUAL_SIGMA, MeasuredAspect
 from autocalib_ros.evidence.snapshot import Evidence
+from autocalib_ros.offline.benchmark.monte_carlo import draw_evidence
 from autocalib_ros.offline.synthetic.junction import Junction
 from autocalib_ros.results.calibration import Calibration, Refusal
 from solved_once import evidence_once, solve_once
@@ -66,12 +70,44 @@ def test_a_told_aspect_gives_the_calibration_of_the_picture_before_it_was_squeez
 
 
 def test_a_rounded_size_widens_the_focal_length_by_the_squeeze(two_roads: Evidence) -> None:
-    plain, rounded = solve_once(two_roads, OPTIONS), solve_once(squeezed(two_roads, 1280, 704), OPTIONS)
+    plain = solve_once(two_roads, replace(OPTIONS, lens=LensOptions(pixel_aspect=1.0)))
+    rounded = solve_once(squeezed(two_roads, 1280, 704), OPTIONS)
     assert 'nearly_square_pixels' in kinds(rounded)
     across, down = rounded.camera.matrix[0, 0], rounded.camera.matrix[1, 1]
     assert rounded.stddev.focal_px > 1.3 * plain.stddev.focal_px
     assert abs(across - FOCAL_PX) < 3 * rounded.stddev.focal_px
     assert abs(down - FOCAL_PX * 704 / 720) < 3 * rounded.stddev.focal_px
+
+
+def measured(aspect: float, sigma: float) -> MeasuredAspect:
+    camera = SimpleNamespace(pixel_aspect=aspect)
+    return MeasuredAspect(SimpleNamespace(state=SimpleNamespace(camera=camera), sigma=lambda _: np.array([sigma])))
+
+
+def test_pixels_are_less_surely_square_the_farther_the_measured_aspect_is() -> None:
+    odds = 0.05
+    chances = [measured(aspect, 0.04).unexpected(1.0, odds)[0] for aspect in (1.0, 1.04, 1.08, 1.12, 1.2)]
+    assert chances == sorted(chances) and chances[0] < 0.02 and chances[-1] > 0.5
+    # a measurement that tells nothing leaves the prior
+    chance, square = measured(1.0, 100.0).unexpected(1.0, odds)
+    assert chance == pytest.approx(odds / (1 + odds), rel=0.01) and square == pytest.approx(UNUSUAL_SIGMA**2, rel=0.01)
+    # one that is exact leaves nothing
+    chance, square = measured(1.0, 1e-3).unexpected(1.0, odds)
+    assert chance * square < 1e-6
+
+
+def test_a_told_aspect_costs_no_uncertainty(two_roads: Evidence) -> None:
+    plain = solve_once(two_roads, OPTIONS)
+    told = solve_once(two_roads, replace(OPTIONS, lens=LensOptions(pixel_aspect=1.0)))
+    assert told.camera.focal_px == pytest.approx(plain.camera.focal_px)
+    assert 1.05 < plain.stddev.focal_px / told.stddev.focal_px < 1.5
+
+
+@pytest.mark.parametrize('run', [5, 6])
+def test_a_squeeze_that_the_traffic_hints_at_is_not_answered_with_confidence(run: int) -> None:
+    junction, evidence = draw_evidence('squeezed_pixels', 0, run)
+    result = solve_once(evidence, Options(camera_height=junction.height_m))
+    assert not result or abs(result.camera.focal_px - junction.camera.focal_px) < 3 * result.stddev.focal_px
 
 
 def test_an_undecided_aspect_of_a_squeezed_size_is_refused_with_the_option_to_set() -> None:

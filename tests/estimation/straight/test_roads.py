@@ -16,8 +16,7 @@ from autocalib_ros.estimation.observations.track_set import select_tracks
 from autocalib_ros.estimation.verification.gates import NOT_COMPARED, check_halves
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.offline.benchmark.families import families
-from autocalib_ros.offline.benchmark.monte_carlo import draw_evidence
+from autocalib_ros.offline.benchmark.monte_carlo import draw_evidence, families
 from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration, Refusal
 from solved_once import solved_junction
