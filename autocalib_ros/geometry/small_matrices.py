@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 NEXT, LAST = [1, 2, 0], [2, 0, 1]
@@ -22,7 +24,26 @@ def dot(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 def cross(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Return the cross products of vectors (..., 3) that broadcast against each other, shape (..., 3)."""
     (x, y, z), (u, v, w) = ([vectors[..., axis] for axis in range(3)] for vectors in (first, second))
-    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=-1)
+    first_component = y * w - z * v
+    product = np.empty((*first_component.shape, 3))
+    product[..., 0], product[..., 1], product[..., 2] = first_component, z * u - x * w, x * v - y * u
+    return product
+
+
+def rotation_matrix(vector: np.ndarray) -> np.ndarray:
+    """Return the rotation matrix (3, 3) of a rotation vector (3,) in radians, by the formula of Rodrigues."""
+    x, y, z = (float(component) for component in vector)
+    half = 0.5 * math.sqrt(x * x + y * y + z * z)
+    # sin(angle) / angle and (1 - cos(angle)) / angle^2
+    ratio = math.sin(half) / half if half else 1.0
+    first, second = ratio * math.cos(half), 0.5 * ratio * ratio
+    return np.array(
+        [
+            [1.0 - second * (y * y + z * z), second * x * y - first * z, second * x * z + first * y],
+            [second * x * y + first * z, 1.0 - second * (x * x + z * z), second * y * z - first * x],
+            [second * x * z - first * y, second * y * z + first * x, 1.0 - second * (x * x + y * y)],
+        ]
+    )
 
 
 def cofactors(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

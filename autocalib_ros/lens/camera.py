@@ -145,8 +145,8 @@ class Camera:
     @cached_property
     def max_angle_rad(self) -> float:
         """Largest angle up to which r(theta) increases; beyond it the polynomial is not invertible."""
-        if not any(self.k):
-            return float(np.pi)
+        if min(self.k) >= 0.0:
+            return math.pi
         falling = np.flatnonzero(self.radius_derivative(MONOTONICITY_GRID_RAD) <= 0)
         return float(MONOTONICITY_GRID_RAD[falling[0] - 1]) if len(falling) else float(np.pi)
 
@@ -177,14 +177,14 @@ class Camera:
     def nearest_angle(self, radius_px: np.ndarray) -> np.ndarray:
         """Return the angles of `angle`; a radius out of the range of the lens model gets the angle at its limit."""
         radius = np.asarray(radius_px, float) / self.focal_px
-        limit = self.max_angle_rad
+        limit, slope_k = self.max_angle_rad, self._derivative_k
         theta = np.minimum(np.maximum(radius, 0.0), limit)
         if any(self.k):
             for _ in range(MAX_ANGLE_ITERATIONS):
                 t2 = theta * theta
                 step = theta * _power_series(self.k, t2)
                 step -= radius
-                step /= np.maximum(_power_series(self._derivative_k, t2), 1e-3)
+                step /= np.maximum(_power_series(slope_k, t2), 1e-3)
                 before, theta = theta, np.minimum(np.maximum(theta - step, 0.0), limit)
                 # each step squares the error; out of range the angle stays at its limit
                 if np.abs(theta - before).max(initial=0.0) < ANGLE_STEP_RAD:

@@ -4,8 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from autocalib_ros.geometry.small_matrices import cofactors, cross, dot, inverse_cholesky_factors, smallest_eigenvectors
+from autocalib_ros.geometry.small_matrices import (
+    cofactors,
+    cross,
+    dot,
+    inverse_cholesky_factors,
+    rotation_matrix,
+    smallest_eigenvectors,
+)
 
 COUNT = 300
 
@@ -60,3 +68,9 @@ def test_products_agree_with_numpy(shapes: tuple[tuple[int, ...], tuple[int, ...
     first, second = (generator.normal(size=shape) for shape in shapes)
     np.testing.assert_allclose(dot(first, second), (first * second).sum(axis=-1), atol=1e-14)
     np.testing.assert_allclose(cross(first, second), np.cross(first, second), atol=1e-14)
+
+
+@pytest.mark.parametrize('angle_rad', [0.0, 1e-200, 1e-8, 1e-3, 1.0, np.pi, 6.0])
+def test_rotation_matrices_are_those_of_scipy(angle_rad: float) -> None:
+    vector = angle_rad * np.array([0.6, -0.64, 0.48])
+    np.testing.assert_allclose(rotation_matrix(vector), Rotation.from_rotvec(vector).as_matrix(), atol=1e-14)

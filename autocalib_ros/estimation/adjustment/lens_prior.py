@@ -7,6 +7,7 @@ with standard deviations; a standard deviation of zero fixes a parameter.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -69,36 +70,45 @@ class LensPrior:
         change[self.free] = step * self.units
         cx, cy = camera.principal_point_px
         k1, k2, k3, k4 = camera.k
-        return replace(
-            camera,
-            focal_px=camera.focal_px * float(np.exp(min(max(change[0], -1.0), 1.0))),
-            principal_point_px=(float(cx + change[1]), float(cy + change[2])),
-            k=(float(k1 + change[3]), float(k2 + change[4]), k3, k4),
-            pixel_aspect=camera.pixel_aspect * float(np.exp(min(max(change[5], -1.0), 1.0))),
+        log_focal, right, down, more_k1, more_k2, log_aspect = change.tolist()
+        return Camera(
+            camera.width,
+            camera.height,
+            camera.focal_px * math.exp(min(max(log_focal, -1.0), 1.0)),
+            (cx + right, cy + down),
+            (k1 + more_k1, k2 + more_k2, k3, k4),
+            camera.pixel_aspect * math.exp(min(max(log_aspect, -1.0), 1.0)),
+            camera.skew,
         )
 
     def step(self, camera: Camera, other: Camera) -> np.ndarray:
         """Return the step (free,) by which `moved` takes a camera to another."""
-        shift = np.subtract(other.principal_point_px, camera.principal_point_px)
+        (cx, cy), (other_cx, other_cy) = camera.principal_point_px, other.principal_point_px
         change = np.array(
             [
-                np.log(other.focal_px / camera.focal_px),
-                *shift,
+                math.log(other.focal_px / camera.focal_px),
+                other_cx - cx,
+                other_cy - cy,
                 other.k[0] - camera.k[0],
                 other.k[1] - camera.k[1],
-                np.log(other.pixel_aspect / camera.pixel_aspect),
+                math.log(other.pixel_aspect / camera.pixel_aspect),
             ]
         )
         return change[self.free] / self.units
 
     def deviations(self, camera: Camera) -> np.ndarray:
         """Return the deviation of each free parameter from the mean in sigmas, 0 for an unknown one, shape (free,)."""
-        return np.where(np.isfinite(self.sigma[self.free]), self.step(self.centre, camera), 0.0)
+        return np.where(self._is_known, self.step(self.centre, camera), 0.0)
+
+    @cached_property
+    def _is_known(self) -> np.ndarray:
+        """Whether the mean of each free parameter is known, shape (free,)."""
+        return np.isfinite(self.sigma[self.free])
 
     @cached_property
     def information(self) -> np.ndarray:
         """Diagonal of the prior information in units of the free parameters: 1 known, 0 unknown, shape (free,)."""
-        return np.isfinite(self.sigma[self.free]).astype(float)
+        return self._is_known.astype(float)
 
     def start(self, focal_px: float) -> Camera:
         """Return the mean with a starting focal length, or with the prior's own where it has one."""

@@ -13,6 +13,7 @@ from autocalib_ros.estimation.adjustment.lens_prior import LensPrior
 from autocalib_ros.estimation.motion.rigid_bodies import TrackletBundle
 from autocalib_ros.estimation.observations.two_frame_windows import TwoFrameWindows, no_windows
 from autocalib_ros.geometry.great_circles import Rays
+from autocalib_ros.geometry.small_matrices import rotation_matrix
 from autocalib_ros.lens.camera import Camera
 
 RIGHT_ANGLE_SIGMA_RAD = np.radians(1.0)
@@ -139,7 +140,7 @@ class Parameterisation:
 
     def turned(self, step: np.ndarray) -> np.ndarray:
         """Return the rotation matrix (3, 3) of a step (rotations,) about the axes."""
-        return Rotation.from_rotvec(step @ self.axes).as_matrix()
+        return rotation_matrix(step @ self.axes)
 
     def prior_gradient(self, state: AdjustmentState) -> tuple[np.ndarray, np.ndarray]:
         """Return gradient and diagonal information of the prior at a state, (parameters,) each."""

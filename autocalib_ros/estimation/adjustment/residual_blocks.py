@@ -98,6 +98,8 @@ class StraightTrackBlock:
 
     def at(self, step: np.ndarray) -> np.ndarray:
         """Return the mean squared whitened distance of each track at a parameter step, shape (tracks,)."""
+        if not len(self.dof):
+            return np.zeros(0)
         state = self._parameters.state(step)
         rays = unproject_rays(state.camera, self._tracks.pixels)
         distance = rays.distance_px(self._circles(state, rays)[:, None])
@@ -127,6 +129,8 @@ class StraightTrackBlock:
         that small term shifts the minimum. Road derivatives are closed-form: a direction d that moves by dd turns a
         normal n by -(n.dd) d. The circle's angle about its direction is projected out.
         """
+        if not len(self.dof):  # empty arrays cost as much as small ones
+            return LinearisedRows.none(self._parameters.size)
         rays, normals, parameters = self._rays, self._normals[:, None], self._parameters
         scale = rays.pixel_scale(normals)
         distance = dot(rays.bearings, normals) * scale
@@ -211,7 +215,7 @@ class PlanarMotionBlock:
     def linearise(self) -> LinearisedRows:
         """Return the rows at the base, by forward differences; the motion of each window is projected out."""
         parameters = self._parameters
-        if not len(self.dof):  # most adjustments have no windows, and empty arrays cost as much as small ones
+        if not len(self.dof):  # as in most adjustments
             return LinearisedRows.none(parameters.size)
         columns = [
             (self._distances_at(unit) - self._distances) / DIFFERENTIATION_STEP for unit in np.eye(parameters.size)

@@ -6,17 +6,18 @@ fitted by expectation-maximisation; lens, plane and the angle between the two di
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from autocalib_ros.estimation.adjustment.covariance import jackknife_covariance
 from autocalib_ros.estimation.adjustment.lens_prior import LensPrior
 from autocalib_ros.estimation.adjustment.parameters import RIGHT_ANGLE_SIGMA_RAD
 from autocalib_ros.estimation.markings.road_segments import ProjectedSegments, RoadSegments
 from autocalib_ros.geometry.robust_kernels import STUDENT_FREEDOM, student_density, student_weight, wrap_undirected
+from autocalib_ros.geometry.small_matrices import cross, rotation_matrix
 from autocalib_ros.lens.camera import Camera
 
 LINE_END_SIGMA_PX, MARKING_SIGMA_RAD = 0.4, np.radians(0.5)
@@ -38,7 +39,7 @@ START_FRACTIONS = np.array([0.35, 0.35, 0.1])[:, None]
 MIN_DIRECTION_FRACTION, MAX_DIRECTION_FRACTION, MAX_ALIGNED_FRACTION = 0.02, 0.9, 0.95
 """Limits of the fraction of one direction, and of their sum."""
 GRID_DERIVATIVE_STEP = 1e-5
-"""Step of the numerical derivatives."""
+"""Step of the numerical derivatives by the lens."""
 LENS_CACHE_SIZE = 8
 """Lenses whose projected segments are cached: that of a state, and those one parameter step away. Most steps keep the
 lens."""
@@ -85,7 +86,7 @@ def _noise_rad(segments: RoadSegments) -> np.ndarray:
     return LINE_END_SIGMA_PX * np.sqrt(2.0) / segments.lengths_px
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _GridState:
     """The estimated state: a lens, and a plane with its two directions."""
 
@@ -96,17 +97,28 @@ class _GridState:
     @cached_property
     def directions(self) -> np.ndarray:
         """The two directions and the vertical one, shape (3, 3)."""
-        along, across, up = self.rotation.T
-        return np.stack([along, np.cos(self.skew_rad) * across - np.sin(self.skew_rad) * along, up])
+        return self._in_plane @ self.rotation.T
+
+    @property
+    def _in_plane(self) -> np.ndarray:
+        """The directions in the frame of the plane, shape (3, 3)."""
+        return np.array([[1.0, 0.0, 0.0], [-math.sin(self.skew_rad), math.cos(self.skew_rad), 0.0], [0.0, 0.0, 1.0]])
+
+    @property
+    def direction_changes(self) -> np.ndarray:
+        """Derivatives of the directions by rotations about the axes of the plane, and by the skew, shape (4, 3, 3)."""
+        changes = np.zeros((4, 3, 3))
+        changes[:3] = cross(np.eye(3)[:, None], self._in_plane)
+        changes[3, 1, :2] = -math.cos(self.skew_rad), -math.sin(self.skew_rad)
+        return changes @ self.rotation.T
 
     def moved(self, step: np.ndarray, prior: LensPrior) -> _GridState:
         """Return the state after a step of the lens, of rotations about the axes of the plane, and of the skew."""
         size = len(prior.free)
         lens, turn, skew = step[:size], step[size : size + 3], step[size + 3]
-        # most steps change few parameters: those of the numerical derivatives one each
         return _GridState(
             prior.moved(self.camera, lens) if lens.any() else self.camera,
-            self.rotation @ Rotation.from_rotvec(turn).as_matrix() if turn.any() else self.rotation,
+            self.rotation @ rotation_matrix(turn) if turn.any() else self.rotation,
             self.skew_rad + float(skew),
         )
 
@@ -120,14 +132,16 @@ class _GridMixture:
         self._project = lru_cache(maxsize=LENS_CACHE_SIZE)(
             partial(ProjectedSegments.from_camera, ends_px=segments.ends_px)
         )
+        self.residuals = lru_cache(maxsize=1)(self._residuals)
 
-    def residuals(self, state: _GridState) -> np.ndarray:
+    def _residuals(self, state: _GridState) -> np.ndarray:
         """Residuals from each direction, shape (3, n)."""
         return self._project(state.camera).residuals(state.directions)
 
     def sigmas(self, state: _GridState, width_rad: float) -> np.ndarray:
         """Their standard deviations, shape (3, n)."""
-        leverages = self._project(state.camera).leverages(state.directions[:2], state.rotation[:, 2])
+        directions, up = state.directions[:2], state.rotation[:, 2]
+        leverages = self._project(state.camera).residual_changes(directions, cross(up, directions))
         direction_sigmas = np.concatenate(
             [MARKING_SIGMA_RAD * leverages, np.full((1, len(self.segments)), POST_SIGMA_RAD)]
         )
@@ -136,7 +150,7 @@ class _GridMixture:
     def cost(self, state: _GridState, sigmas: np.ndarray) -> tuple[float, np.ndarray]:
         """Negative log-posterior, and the responsibilities (3, n)."""
         projected = self._project(state.camera)
-        each = self.fractions[:, None] * student_density(projected.residuals(state.directions), sigmas)
+        each = self.fractions[:, None] * student_density(self.residuals(state), sigmas)
         each[:2] *= projected.bearings @ state.rotation[:, 2] < -MIN_DEPRESSION_SINE
         density = each.sum(axis=0) + (1.0 - self.fractions.sum()) / np.pi
         deviations = np.append(self.prior.deviations(state.camera), state.skew_rad / RIGHT_ANGLE_SIGMA_RAD)
@@ -158,22 +172,17 @@ class _GridMixture:
 
     def linearised(
         self, state: _GridState, responsibilities: np.ndarray, sigmas: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Gradient (n, p) and information (n, p, p) of each segment by the parameters, before its weight."""
-        here, size = self.residuals(state), len(self.prior.free) + 4
-        jacobian = np.stack(
-            [
-                wrap_undirected(self.residuals(state.moved(GRID_DERIVATIVE_STEP * unit, self.prior)) - here)
-                / GRID_DERIVATIVE_STEP
-                for unit in np.eye(size)
-            ],
-            axis=-1,
-        )
-        weights = responsibilities * student_weight(here, sigmas) / sigmas**2
-        return (
-            ((weights * here)[..., None] * jacobian).sum(axis=0),
-            np.einsum('kn,kni,knj->nij', weights, jacobian, jacobian),
-        )
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Residuals (3, n), Jacobian (3, n, p) by the parameters, and weights (3, n) before those of the segments."""
+        projected, lens = self._project(state.camera), len(self.prior.free)
+        here = self.residuals(state)
+        jacobian = np.empty((*here.shape, lens + 4))
+        for column, unit in enumerate(np.eye(lens)):
+            other = self._project(self.prior.moved(state.camera, GRID_DERIVATIVE_STEP * unit))
+            jacobian[..., column] = wrap_undirected(other.residuals(state.directions) - here) / GRID_DERIVATIVE_STEP
+        turns = projected.residual_changes(state.directions, state.direction_changes)
+        jacobian[..., lens:] = np.moveaxis(turns, 0, -1)
+        return here, jacobian, responsibilities * student_weight(here, sigmas) / sigmas**2
 
     def prior_terms(self, state: _GridState) -> tuple[np.ndarray, np.ndarray]:
         """Gradient (p,) and information (p,) of the prior of lens and skew."""
@@ -205,7 +214,9 @@ def refine_grid(
                 break
     sigmas = mixture.sigmas(state, 0.0)
     cost, responsibilities = mixture.cost(state, sigmas)
-    gradients, curvatures = mixture.linearised(state, responsibilities, sigmas)
+    residuals, jacobian, weights = mixture.linearised(state, responsibilities, sigmas)
+    gradients = ((weights * residuals)[..., None] * jacobian).sum(axis=0)
+    curvatures = np.einsum('kn,kni,knj->nij', weights, jacobian, jacobian)
     _, prior_information = mixture.prior_terms(state)
     # the Hessian also has the derivatives of the robust weights and of the responsibilities: a multiple of g g^T
     aligned = responsibilities.sum(axis=0)
@@ -235,10 +246,11 @@ def _damped_step(
 ) -> tuple[_GridState, float, float] | None:
     """Return the state after a step that lowers the cost, its size and the next damping; None if no step does."""
     cost, responsibilities = mixture.cost(state, sigmas)
-    gradients, curvatures = mixture.linearised(state, responsibilities, sigmas)
+    residuals, jacobian, weights = mixture.linearised(state, responsibilities, sigmas)
     prior_gradient, prior_information = mixture.prior_terms(state)
-    gradient = mixture.weights @ gradients + prior_gradient
-    information = np.tensordot(mixture.weights, curvatures, 1) + np.diag(prior_information)
+    weighted = (mixture.weights * weights)[..., None] * jacobian
+    gradient = np.tensordot(residuals, weighted, 2) + prior_gradient
+    information = np.tensordot(weighted, jacobian, ((0, 1), (0, 1))) + np.diag(prior_information)
     for _ in range(MAX_DAMPING_TRIALS):
         damped = information + damping * np.diag(np.diag(information)) + 1e-9 * np.eye(len(gradient))
         step = np.clip(-np.linalg.solve(damped, gradient), -0.5, 0.5)

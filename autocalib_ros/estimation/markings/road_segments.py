@@ -118,9 +118,8 @@ class ProjectedSegments:
         """Angle of each segment from each direction (..., 3), within plus and minus pi / 2, shape (..., n)."""
         return wrap_undirected(np.arctan2(directions @ self.circles.T, directions @ self.along.T))
 
-    def leverages(self, directions: np.ndarray, normal: np.ndarray) -> np.ndarray:
-        """Derivative of the residuals by a rotation of the directions (k, 3) about the normal (3,), shape (k, n)."""
-        turned = cross(normal, directions)
+    def residual_changes(self, directions: np.ndarray, changes: np.ndarray) -> np.ndarray:
+        """Change (..., k, n) of the residuals for small changes (..., k, 3) of the directions (k, 3)."""
         sine, cosine = directions @ self.circles.T, directions @ self.along.T
-        sine_by, cosine_by = turned @ self.circles.T, turned @ self.along.T
-        return (cosine * sine_by - sine * cosine_by) / np.maximum(sine**2 + cosine**2, 1e-12)
+        lever = np.maximum(sine * sine + cosine * cosine, 1e-12)
+        return cosine / lever * (changes @ self.circles.T) - sine / lever * (changes @ self.along.T)

@@ -8,14 +8,14 @@ point heights are not needed. Residuals are Sampson distances (Sampson 1982) in 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from autocalib_ros.config import JointOptions
 from autocalib_ros.estimation.observations.two_frame_windows import TwoFrameWindows
-from autocalib_ros.geometry.great_circles import Rays, unproject_rays
+from autocalib_ros.geometry.great_circles import unproject_rays
 from autocalib_ros.geometry.robust_kernels import cauchy_loss, cauchy_weight
 from autocalib_ros.lens.camera import Camera
 
@@ -65,8 +65,8 @@ class PlanarMotion:
 class WindowRays:
     """Windows as rays: bearings in the frame of the plane, whose z axis is the normal."""
 
-    first: Rays
-    second: Rays
+    components: np.ndarray
+    """Bearing, radial and tangential vectors by component, of both ends; shape (3, 3, 2, windows, points)."""
     mask: np.ndarray
     sigma_px: np.ndarray
     """Standard deviation of a tracked point over the window, shape (windows, points)."""
@@ -76,29 +76,28 @@ class WindowRays:
         cls, windows: TwoFrameWindows, camera: Camera, camera_from_plane: np.ndarray, options: JointOptions
     ) -> WindowRays:
         """Unproject windows with a camera over a plane (3, 3)."""
-        rays = unproject_rays(camera, np.stack([windows.first_px, windows.second_px]))
-        first, second = (Rays(rays.bearings[at], rays.radial[at], rays.tangential[at]) for at in (0, 1))
-        lengths = np.hypot(*np.moveaxis(windows.second_px - windows.first_px, -1, 0))
+        rays = unproject_rays(camera, windows.ends_px)
+        components = np.empty((3, 3, *windows.ends_px.shape[:-1]))
+        for kind, vectors in enumerate((rays.bearings, rays.radial, rays.tangential)):
+            np.matmul(camera_from_plane.T, vectors.reshape(-1, 3).T, out=components[kind].reshape(3, -1))
         # a tracked point drifts as a random walk; each end gets half of the variance
-        sigma = np.sqrt(options.noise_px**2 + 0.5 * options.drift_px**2 * lengths)
-        return cls(first, second, windows.mask, sigma).turned(camera_from_plane)
+        sigma = np.sqrt(options.noise_px**2 + 0.5 * options.drift_px**2 * windows.lengths_px)
+        return cls(components, windows.mask, sigma)
 
     def turned(self, rotation: np.ndarray) -> WindowRays:
         """Return the rays in a rotated frame, old_from_new (3, 3)."""
-        first, second = (
-            Rays(rays.bearings @ rotation, rays.radial @ rotation, rays.tangential @ rotation)
-            for rays in (self.first, self.second)
-        )
-        return replace(self, first=first, second=second)
+        turned = (rotation.T @ self.components.reshape(3, 3, -1)).reshape(self.components.shape)
+        return WindowRays(turned, self.mask, self.sigma_px)
 
-    @cached_property
-    def components(self) -> tuple[np.ndarray, ...]:
-        """Bearing, radial and tangential of both ends, each by component, shape (3, windows, points)."""
-        return tuple(
-            np.ascontiguousarray(np.moveaxis(vectors, -1, 0))
-            for rays in (self.first, self.second)
-            for vectors in (rays.bearings, rays.radial, rays.tangential)
-        )
+    @property
+    def first(self) -> np.ndarray:
+        """Vectors of the first end by kind and component, shape (3, 3, windows, points)."""
+        return self.components[:, :, 0]
+
+    @property
+    def second(self) -> np.ndarray:
+        """Vectors of the second end by kind and component, shape (3, 3, windows, points)."""
+        return self.components[:, :, 1]
 
     def distances(self, motion: PlanarMotion) -> np.ndarray:
         """Signed Sampson distances in standard deviations, shape (windows, points); 0 outside the mask."""
@@ -138,7 +137,7 @@ class _EpipolarLines:
     @classmethod
     def of(cls, view: WindowRays, motion: PlanarMotion) -> _EpipolarLines:
         (cosine, sine), (along, across) = _cosine_sine(motion.turn_rad), _cosine_sine(motion.heading_rad)
-        (x, y, z), radial, tangential, (u, v, w), radial_second, tangential_second = view.components
+        ((x, y, z), radial, tangential), ((u, v, w), radial_second, tangential_second) = view.first, view.second
         turned = (cosine * x - sine * y, sine * x + cosine * y)
         # the epipolar line of the first point, t x R a, and that of the second, R^T (b x t)
         line = (across * z, -along * z, along * turned[1] - across * turned[0])
@@ -157,7 +156,7 @@ class _EpipolarLines:
     def derivatives(self, view: WindowRays, motion: PlanarMotion) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Yield the derivatives of the error and of half the squared gradient, by the turn and by the heading."""
         along, across = _cosine_sine(motion.heading_rad)
-        (_, _, z), radial, tangential, (u, v, w), radial_second, tangential_second = view.components
+        ((_, _, z), radial, tangential), ((u, v, w), radial_second, tangential_second) = view.first, view.second
         turned, back, slopes = self.turned, self.back, self.slopes
         rise = along * turned[0] + across * turned[1]
         by_turn = (
@@ -301,16 +300,12 @@ def initial_motion(view: WindowRays) -> PlanarMotion:
     count = len(view.mask)
     best = np.full(count, np.inf)
     best_motion = PlanarMotion(np.zeros(count), np.zeros(count))
+    first, (u, v, w) = view.first[0], view.second[0]
     for turn in np.radians([*START_TURNS_DEG, *(-turn for turn in START_TURNS_DEG[1:])]):
-        rotated = view.first.bearings @ np.array(
-            [[np.cos(turn), np.sin(turn), 0.0], [-np.sin(turn), np.cos(turn), 0.0], [0.0, 0.0, 1.0]]
-        )
         # b . (t x R a) = t . (R a x b)
-        a, b = rotated, view.second.bearings
-        x, y = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1], a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
-        size = view.mask / np.maximum(
-            np.sqrt(x * x + y * y + (a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]) ** 2), 1e-3
-        )
+        a, b = np.cos(turn) * first[0] - np.sin(turn) * first[1], np.sin(turn) * first[0] + np.cos(turn) * first[1]
+        x, y = b * w - first[2] * v, first[2] * u - a * w
+        size = view.mask / np.maximum(np.sqrt(x * x + y * y + (a * v - b * u) ** 2), 1e-3)
         x, y = x * size, y * size
         heading = 0.5 * np.arctan2(2 * (x * y).sum(axis=1), (x * x - y * y).sum(axis=1)) + np.pi / 2
         trial = PlanarMotion(np.full(count, turn), heading)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
@@ -73,6 +74,16 @@ class TwoFrameWindows:
             self.tracks[keep],
         )
 
+    @cached_property
+    def ends_px(self) -> np.ndarray:
+        """Observed pixels at both instants, shape (2, windows, SAMPLES_PER_TRACK, 2)."""
+        return np.stack([self.first_px, self.second_px])
+
+    @cached_property
+    def lengths_px(self) -> np.ndarray:
+        """Displacement of each point, shape (windows, SAMPLES_PER_TRACK)."""
+        return np.hypot(*np.moveaxis(self.second_px - self.first_px, -1, 0))
+
     @property
     def from_segments(self) -> np.ndarray:
         """Mask of the windows that come from segments, shape (windows,)."""
@@ -85,7 +96,7 @@ class TwoFrameWindows:
 
     def balanced_subset(self, limit: int) -> TwoFrameWindows:
         """Return at most `limit` windows, bodies in turn; first those with most points and largest motion."""
-        length = np.hypot(*np.moveaxis(self.second_px - self.first_px, -1, 0)).mean(axis=1)
+        length = self.lengths_px.mean(axis=1)
         best_first = np.lexsort((-length, -self.mask.sum(axis=1)))
         return self.subset(np.sort(round_robin(self.bodies, best_first)[:limit]))
 
