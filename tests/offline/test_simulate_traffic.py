@@ -109,7 +109,7 @@ def test_no_vehicle_brakes_or_accelerates_beyond_reason(traffic):
 
 def test_turning_vehicles_slow_down_in_the_curve(traffic):
     vehicle = _crossings(traffic, 'right')[0]
-    _, (start, end, radius), _ = vehicle.route.path.curves()  # the arc between its clothoids
+    _, (start, end, radius), _ = vehicle.route.path.curves  # the arc between its clothoids
     inside = (vehicle.s > start + 1) & (vehicle.s < end)
     assert vehicle.speeds_mps[inside].max() ** 2 / radius < 4.0  # m/s^2
 

@@ -38,6 +38,12 @@ class PathSegment:
     def at(self, s: np.ndarray | float) -> np.ndarray:
         """Return (x, y, heading) rows (..., 3) at arc lengths s, extrapolated beyond both ends."""
         s = np.asarray(s, float)
+        if self.straight:
+            poses = np.empty((*s.shape, 3))
+            poses[..., 0] = self.x + s * math.cos(self.heading)
+            poses[..., 1] = self.y + s * math.sin(self.heading)
+            poses[..., 2] = self.heading
+            return poses
         between = self._heading(s[..., None] * GAUSS_NODES)
         dx, dy = s * (np.cos(between) @ GAUSS_WEIGHTS), s * (np.sin(between) @ GAUSS_WEIGHTS)
         return np.stack([self.x + dx, self.y + dy, self._heading(s)], -1)
@@ -97,13 +103,14 @@ class Path:
                 out[on_segment] = segment.at(s[on_segment] - starts[i])
         return out
 
-    def curves(self) -> list[tuple[float, float, float]]:
-        """Return (start, end, minimum radius) of every curved segment."""
-        return [
+    @cached_property
+    def curves(self) -> tuple[tuple[float, float, float], ...]:
+        """Start, end and minimum radius of every curved segment."""
+        return tuple(
             (float(start), float(start) + p.length, 1.0 / p.max_curvature)
             for start, p in zip(self.starts, self.segments, strict=True)
             if not p.straight
-        ]
+        )
 
 
 def straight_lane(

@@ -68,19 +68,46 @@ def simulate_traffic(network: Network, options: SimulationOptions) -> SimulatedT
     signals = SignalController(network.phases, -WARM_UP_S)
     arrivals = _Arrivals(network.routes, options, rng)
     drivers: list[_Driver] = []
+    fleet = _Fleet(drivers)
     done: list[Vehicle] = []
     steps = math.ceil((options.duration_s + WARM_UP_S) / STEP_S) + 2
     for i in range(steps):
         now = i * STEP_S - WARM_UP_S
         signals.update(now, {d.route.signal for d in drivers if _requests_green(d)})
         arrivals.admit(now, drivers)
-        _step_drivers(drivers, signals)
+        if len(drivers) > len(fleet.drivers):
+            fleet = _Fleet(drivers)
+        _step_drivers(fleet, signals)
         gone = [d for d in drivers if d.s > d.route.path.length]
-        done += [d.vehicle() for d in gone]
-        drivers = [d for d in drivers if d.s <= d.route.path.length]
+        if gone:
+            done += [d.vehicle() for d in gone]
+            drivers = [d for d in drivers if d.s <= d.route.path.length]
+            fleet = _Fleet(drivers)
     done += [d.vehicle() for d in drivers if len(d.trace) > 1]
     recorded = [v for v in done if v.start_s + len(v.s) * STEP_S > 0.0]
     return SimulatedTraffic(tuple(sorted(recorded, key=lambda v: v.number)), tuple(signals.green_phases))
+
+
+class _Fleet:
+    """Drivers with what does not change as they drive, (n,) and (n, n) each."""
+
+    def __init__(self, drivers: list[_Driver]) -> None:
+        self.drivers = tuple(drivers)
+        self.max_acceleration = np.array([d.shape.acceleration_mps2 for d in drivers])
+        self.headway = np.array([d.headway_s for d in drivers])
+        self.half = np.array([d.shape.length_m / 2 for d in drivers])
+        self.lengths = np.array([d.route.path.length for d in drivers])
+        stop = np.array([d.route.stop_s for d in drivers])
+        self.line = np.minimum(stop, self.lengths)
+        # A leader counts on the entry lane until its tail has diverged, then on a shared exit lane.
+        self.diverge = np.array([d.route.diverge_s for d in drivers]) + 2 * self.half + 1.0
+        names = [d.route.entry_lane for d in drivers] + [d.route.exit_lane for d in drivers]
+        entry_lane, exit_lane = np.split(_integer_codes(names), 2)
+        self.same_entry, self.same_exit = entry_lane[:, None] == entry_lane, exit_lane[:, None] == exit_lane
+        self.same_route = self.same_entry & self.same_exit
+        no_stop_line = stop <= 0
+        self.both_without_line = no_stop_line[:, None] & no_stop_line
+        self.enters_exit_lane = entry_lane[:, None] == exit_lane
 
 
 class _Arrivals:
@@ -142,22 +169,22 @@ def _requests_green(driver: _Driver) -> bool:
     return math.isfinite(ahead) and 0.0 < ahead < 40.0
 
 
-def _step_drivers(drivers: list[_Driver], signals: SignalController) -> None:
+def _step_drivers(fleet: _Fleet, signals: SignalController) -> None:
     """Advance all drivers by one time step."""
+    drivers = fleet.drivers
     if not drivers:
         return
     v = np.array([d.v for d in drivers])
-    gap, leader_v = _leaders(drivers)
+    gap, leader_v = _leaders(fleet, v)
     stop = np.array([_stop_line_gap(d, signals, drivers) for d in drivers])
     leader_v = np.where(stop < gap, 0.0, leader_v)
     gap = np.minimum(gap, stop)
     desired_v = np.array([min(d.cruise_mps, _curve_speed_limit(d)) for d in drivers])
-    max_acceleration = np.array([d.shape.acceleration_mps2 for d in drivers])
-    headway = np.array([d.headway_s for d in drivers])
+    max_acceleration = fleet.max_acceleration
     # Intelligent driver model: free-road term, desired gap s*, acceleration.
     free = 1 - (v / desired_v) ** 4
     desired_gap = STANDSTILL_GAP_M + np.maximum(
-        0.0, v * headway + v * (v - leader_v) / (2 * np.sqrt(max_acceleration * _COMFORTABLE_BRAKING_MPS2))
+        0.0, v * fleet.headway + v * (v - leader_v) / (2 * np.sqrt(max_acceleration * _COMFORTABLE_BRAKING_MPS2))
     )
     acceleration = max_acceleration * (free - (desired_gap / np.maximum(gap, 0.1)) ** 2)
     new_v = np.maximum(0.0, v + np.clip(acceleration, -_MAX_BRAKING_MPS2, None) * STEP_S)
@@ -168,48 +195,37 @@ def _step_drivers(drivers: list[_Driver], signals: SignalController) -> None:
         d.v = speed
 
 
-def _leaders(drivers: list[_Driver]) -> tuple[np.ndarray, np.ndarray]:
+def _leaders(fleet: _Fleet, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the gap to the leading vehicle and its speed, (n,) each; (inf, 0) without a leader."""
-    s = np.array([d.s for d in drivers])
-    half = np.array([d.shape.length_m / 2 for d in drivers])
-    names = [d.route.entry_lane for d in drivers] + [d.route.exit_lane for d in drivers]
-    entry_lane, exit_lane = np.split(_integer_codes(names), 2)
-    stop = np.array([d.route.stop_s for d in drivers])
-    past_line = s > np.minimum(stop, [d.route.path.length for d in drivers])
-    remaining = np.array([d.route.path.length for d in drivers]) - s
-    # A leader counts on the entry lane until its tail has diverged, then on a shared exit lane.
-    diverge = np.array([d.route.diverge_s for d in drivers]) + 2 * half + 1.0
-    same_route = (entry_lane[:, None] == entry_lane) & (exit_lane[:, None] == exit_lane)
-    ahead = (entry_lane[:, None] == entry_lane) & (same_route | (s < diverge)[None, :])
+    s = np.array([d.s for d in fleet.drivers])
+    past_line, remaining, on_entry_lane = s > fleet.line, fleet.lengths - s, s < fleet.diverge
+    ahead = fleet.same_entry & (fleet.same_route | on_entry_lane[None, :])
     along = np.where(ahead, s[None, :] - s[:, None], np.inf)
-    merging = (exit_lane[:, None] == exit_lane) & past_line[:, None] & past_line[None, :]
+    merging = fleet.same_exit & past_line[:, None] & past_line[None, :]
     # A vehicle that changes lanes occupies the target lane from the start and its old lane until it has left it.
-    no_stop_line, on_entry_lane = stop <= 0, s < diverge
-    crossing = (entry_lane[:, None] == exit_lane) & on_entry_lane[:, None]
-    crossing |= crossing.T | ((entry_lane[:, None] == entry_lane) & on_entry_lane[:, None] & on_entry_lane)
-    merging |= crossing & no_stop_line[:, None] & no_stop_line
-    merged = np.where(merging & ~same_route, remaining[:, None] - remaining[None, :], np.inf)
+    crossing = fleet.enters_exit_lane & on_entry_lane[:, None]
+    crossing |= crossing.T | (fleet.same_entry & on_entry_lane[:, None] & on_entry_lane)
+    merging |= crossing & fleet.both_without_line
+    merged = np.where(merging & ~fleet.same_route, remaining[:, None] - remaining[None, :], np.inf)
     along[along <= 0] = np.inf
     merged[merged <= 0] = np.inf
-    distance_ahead_m = np.minimum(np.minimum(along, merged), _ring_distances(drivers))
-    gaps = distance_ahead_m - half[:, None] - half[None, :]
+    gaps = np.minimum(along, merged)
+    _lower_to_ring_distances(gaps, fleet.drivers)
+    gaps = gaps - fleet.half[:, None] - fleet.half[None, :]
     np.fill_diagonal(gaps, np.inf)
     leader = gaps.argmin(1)
-    gap = gaps[np.arange(len(drivers)), leader]
-    speeds = np.array([d.v for d in drivers])[leader]
-    return gap, np.where(np.isfinite(gap), speeds, 0.0)
+    gap = gaps[np.arange(len(s)), leader]
+    return gap, np.where(np.isfinite(gap), v[leader], 0.0)
 
 
-def _ring_distances(drivers: list[_Driver]) -> np.ndarray:
-    """Return the distance round a ring (n, n) from each vehicle on it to each one ahead, inf elsewhere.
+def _lower_to_ring_distances(distances: np.ndarray, drivers: tuple[_Driver, ...]) -> None:
+    """Lower distances (n, n) to those round a ring from each vehicle on it to each one ahead.
 
     A vehicle is on the ring from its give-way line until its tail has left.
     """
-    distances = np.full((len(drivers), len(drivers)), np.inf)
     on_ring = [i for i, d in enumerate(drivers) if _is_on_ring(d)]
     for i, j in permutations(on_ring, 2):
-        distances[i, j] = _ring_distance(drivers[i], drivers[j])
-    return distances
+        distances[i, j] = min(distances[i, j], _ring_distance(drivers[i], drivers[j]))
 
 
 def _ring_distance(driver: _Driver, other: _Driver) -> float:
@@ -235,7 +251,7 @@ def _is_on_ring(driver: _Driver) -> bool:
     )
 
 
-def _must_yield(driver: _Driver, ring: Circulation, drivers: list[_Driver]) -> bool:
+def _must_yield(driver: _Driver, ring: Circulation, drivers: tuple[_Driver, ...]) -> bool:
     """Whether a vehicle on the ring passes the entry of this driver within the critical gap."""
     for other in drivers:
         other_ring = other.route.ring
@@ -254,7 +270,7 @@ def _integer_codes(names: list[str]) -> np.ndarray:
     return np.array([numbers.setdefault(name, len(numbers)) for name in names])
 
 
-def _stop_line_gap(driver: _Driver, signals: SignalController, drivers: list[_Driver]) -> float:
+def _stop_line_gap(driver: _Driver, signals: SignalController, drivers: tuple[_Driver, ...]) -> float:
     """Return the gap to the stop line if the driver has to stop there, else inf."""
     ahead = driver.route.stop_s - driver.s - driver.shape.length_m / 2
     if ahead < -0.3 or math.isinf(ahead):
@@ -275,7 +291,7 @@ def _stop_line_gap(driver: _Driver, signals: SignalController, drivers: list[_Dr
 def _curve_speed_limit(driver: _Driver) -> float:
     """Return the speed limit of the curves ahead, with comfortable braking before them."""
     limit = math.inf
-    for start, end, radius in driver.route.path.curves():
+    for start, end, radius in driver.route.path.curves:
         if driver.s < end:
             ahead = max(0.0, start - driver.s)
             limit = min(limit, math.sqrt(_LATERAL_ACCELERATION_MPS2 * radius + 2 * _CURVE_BRAKING_MPS2 * ahead))

@@ -238,7 +238,7 @@ def test_the_published_method_takes_a_distance(evidence: Evidence) -> None:
 
 # Seeds of their own: Monte Carlo of what is clicked, taped and driven.
 
-SEEDS = range(12)
+SEEDS = range(6)
 
 
 def draws() -> Iterator[tuple[np.random.Generator, Solution]]:
@@ -266,7 +266,7 @@ def score(options: Options, solution: Solution) -> float:
 
 
 @pytest.mark.slow
-def test_heights_lie_within_their_deviations_over_twelve_draws() -> None:
+def test_heights_lie_within_their_deviations_over_six_draws() -> None:
     exact, clicked, driven = [], [], []
     near, far = pixels_of(NEAR_M), pixels_of(FAR_M)
     metres = float(np.hypot(*np.subtract(*FAR_M)))
@@ -295,10 +295,10 @@ def test_heights_lie_within_their_deviations_over_twelve_draws() -> None:
             )
         )
     for scores in (exact, clicked, driven):
-        # twelve tell a root mean square to 20 % and a mean to 0.29, one sigma
+        # six tell a root mean square to 29 % and a mean to 0.41, one sigma
         assert 0.35 < np.sqrt(np.mean(np.square(scores))) < 1.5
         assert abs(np.mean(scores)) < 0.7
-        assert np.abs(scores).max() < 4.0  # 36 normal draws exceed it once in 400 times
+        assert np.abs(scores).max() < 4.0  # 18 normal draws exceed it once in 900 times
 
 
 # What gives no scale.
