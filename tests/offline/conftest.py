@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ import pytest
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
+from shared_backdrops import share_backdrops
 
 from autocalib_ros.offline.replay_recording import ReplayResult
 from synthetic_results import full_result, grey_road, junction_evidence, lens_result, refusal
@@ -21,6 +22,14 @@ WIDTH, HEIGHT = 32, 24
 SECOND = 1_000_000_000
 TYPES = get_typestore(Stores.ROS2_JAZZY)
 TYPES1 = get_typestore(Stores.ROS1_NOETIC)
+
+
+@pytest.fixture(scope='module')
+def shared_backdrops() -> Iterator[None]:
+    """Paint the static scene once for the simulations of a module that show the same one."""
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        share_backdrops(monkeypatch)
+        yield
 
 
 def picture(index: int) -> np.ndarray:

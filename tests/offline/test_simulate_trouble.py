@@ -15,7 +15,7 @@ from autocalib_ros.offline.simulate.options import SimulationOptions
 from autocalib_ros.offline.simulate.simulation import Simulation
 from autocalib_ros.offline.simulate.weather import GroundBuffer, box_corners
 
-pytestmark = pytest.mark.render
+pytestmark = [pytest.mark.render, pytest.mark.usefixtures('shared_backdrops')]
 
 SMALL = {
     'width_px': 320,
