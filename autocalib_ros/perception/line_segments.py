@@ -1,4 +1,7 @@
-"""Line segments of the static scene by LSD on the background image: lane markings, kerbs, joints of slabs."""
+"""Line segments of the static scene: lane markings, kerbs, joints of slabs.
+
+LSD finds them on the background image, and a fit to their edges gives their direction.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,8 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
+
+from autocalib_ros.perception.edge_fit import fit_edges
 
 MIN_LINE_LENGTH = 0.02
 """Shortest segment, fraction of the image width: dashes and crosswalk stripes are longer. Judgement."""
@@ -62,10 +67,9 @@ class LineSegmentDetector:
         if grey is None or found is None:
             return
         lines = found.reshape(-1, 4).astype(float)
-        length = np.hypot(lines[:, 2] - lines[:, 0], lines[:, 3] - lines[:, 1])
-        longest = np.argsort(-length, kind='stable')
-        longest = longest[length[longest] >= max(MIN_LINE_LENGTH_PX, MIN_LINE_LENGTH * grey.shape[1])]
-        lines = lines[longest]
+        least = max(MIN_LINE_LENGTH_PX, MIN_LINE_LENGTH * grey.shape[1])
+        lines = fit_edges(lines[_lengths(lines) >= least], grey)
+        lines = lines[np.argsort(-_lengths(lines), kind='stable')]
         lines = lines[_shares_inside(lines, _border_zone(grey.shape, no_picture)) <= MAX_ALONG_BORDER]
         lines = lines[~self._touches_ignored(lines)]
         self._lines = lines[_shares_of_samples(lines, grey, samples) > MIN_SHARE_OF_SAMPLES][:MAX_LINES]
@@ -80,6 +84,11 @@ class LineSegmentDetector:
     def lines_px(self) -> np.ndarray:
         """Segments x0, y0, x1, y1 in pixels of the background passed to `find`, longest first, shape (n, 4)."""
         return self._lines
+
+
+def _lengths(lines: np.ndarray) -> np.ndarray:
+    """Return the lengths (n,) of segments (n, 4)."""
+    return np.asarray(np.hypot(lines[:, 2] - lines[:, 0], lines[:, 3] - lines[:, 1]))
 
 
 def _shares_inside(lines: np.ndarray, mask: np.ndarray) -> np.ndarray:
