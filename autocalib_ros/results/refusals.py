@@ -189,11 +189,24 @@ REFUSALS = (
     RefusalCode(
         code='halves_disagree',
         cause='Cross-validation in time failed: the earlier and the later half of the traffic give different results.',
-        limit='3 % in focal length and 1.5 degrees in the ground normal, or 3.5 sigma if that is larger',
+        limit='3 % in focal length and 1.5 degrees in the ground normal, or 3.5 sigma if that is larger; 0.3 % by '
+        'chance for focal length and rotation together; and 4 sigma for the share of vehicles on the roads',
         remedy='record for longer, and check that the camera is firmly fixed',
         missing='agreement of both halves of the traffic',
         message='the earlier and the later half of the traffic disagree: focal length by {focal:.1%} (limit '
         '{focal_limit:.1%}), ground normal by {normal_deg:.1f} degrees (limit {normal_limit_deg:.1f})',
+        variants={
+            'share': (
+                'the earlier and the later half of the traffic disagree: {earlier:.0%} of the vehicles follow the '
+                'roads in one and {later:.0%} in the other, {sigmas:.1f} sigma (limit {limit:g})',
+                '',
+            ),
+            'pose': (
+                'the earlier and the later half of the traffic disagree: focal length and rotation of the camera '
+                'together by {sigmas:.1f} sigma (limit {limit:.1f}), {turned_deg:.1f} degrees of rotation',
+                '',
+            ),
+        },
     ),
     RefusalCode(
         code='given_lens',

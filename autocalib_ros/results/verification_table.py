@@ -40,8 +40,10 @@ VERIFIED_QUANTITIES: dict[str, VerifiedQuantity] = {
     'principal_point_prior': VerifiedQuantity(
         'principal point against the centre of the picture', 'sigma', GRADE_ASSUMED
     ),
+    'halves_share': VerifiedQuantity('share of vehicles on the roads, earlier against later traffic', 'sigma', REFUSED),
     'halves_focal': VerifiedQuantity('focal length, earlier against later traffic', '%', REFUSED),
     'halves_normal': VerifiedQuantity('ground normal, earlier against later traffic', 'degrees', REFUSED),
+    'halves_pose': VerifiedQuantity('focal length and rotation, earlier against later traffic', 'sigma', REFUSED),
     'tracklets': VerifiedQuantity('turning vehicles over seconds against between two instants', 'sigma', WIDENED),
     'lane_markings': VerifiedQuantity(
         'probability that traffic and lane markings are both right', '%', GRADE_ASSUMED, at_least=True

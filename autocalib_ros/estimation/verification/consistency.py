@@ -6,6 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
+from scipy.stats import f as f_distribution
 
 from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment
 from autocalib_ros.estimation.adjustment.covariance import propagate_sigma
@@ -15,6 +17,12 @@ from autocalib_ros.geometry.ground_plane import unsigned_angle_deg
 REGULARISING_INFORMATION = 1e-9
 """Information added along every parameter, so that an undetermined parameter has a large variance and the inverse
 exists."""
+
+HALF_MODEL_SIGMAS = (0.01, np.radians(0.3))
+"""Standard deviations of the difference between two halves that no residual shows: log focal length, and rotation of
+the camera about each axis in radians (their traffic covers other parts of the road, which is not planar)."""
+HALF_CONTRADICTION = 3e-3
+"""Probability that two consistent halves differ by more."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +60,30 @@ def compare_solutions(first: Adjustment, second: Adjustment) -> SolutionDifferen
         unsigned_angle_deg(first.state.rotation[:, 2], second.state.rotation[:, 2]),
         np.array([_focal_and_normal_sigma(fit.sigma(_change_from(fit))) for fit in (first, second)]),
     )
+
+
+def half_difference_sigmas(first: Adjustment, second: Adjustment, vehicles: int) -> tuple[float, float] | None:
+    """Return the difference between the solutions of two halves, and its limit, in standard deviations.
+
+    Focal length and all of the rotation of the camera against the roads together, with their covariance: a camera that
+    turned in between turns about an axis of which traffic is far more certain than of others. Hotelling's T squared
+    (1931), whose limit allows for covariances that are estimated from few vehicles, those of the smaller half. None
+    where a half determines nothing.
+    """
+    origin = first.state.rotation
+
+    def pose(state: AdjustmentState) -> np.ndarray:
+        return np.array([np.log(state.camera.focal_px), *Rotation.from_matrix(origin.T @ state.rotation).as_rotvec()])
+
+    covariance = first.covariance_of(pose) + second.covariance_of(pose)
+    compared = 1 + len(first.problem.parameters.axes)
+    if not np.isfinite(covariance).all() or vehicles <= compared:
+        return None
+    model = np.square([HALF_MODEL_SIGMAS[0], *3 * (HALF_MODEL_SIGMAS[1],)])
+    change = pose(second.state) - pose(first.state)
+    value = float(np.sqrt(change @ np.linalg.solve(covariance + np.diag(model), change)))
+    scale = compared * (vehicles - 1) / (vehicles - compared)
+    return value, float(np.sqrt(scale * f_distribution.isf(HALF_CONTRADICTION, compared, vehicles - compared)))
 
 
 def expected_half_differences(whole: Adjustment, *halves: Adjustment) -> np.ndarray:

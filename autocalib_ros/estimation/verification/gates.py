@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from autocalib_ros.config import GateOptions
 from autocalib_ros.estimation.adjustment.bundle_adjustment import (
@@ -19,7 +20,11 @@ from autocalib_ros.estimation.observations.track_set import TrackSet, Unprojecte
 from autocalib_ros.estimation.observations.tracklets import no_tracklets
 from autocalib_ros.estimation.straight.initialisation import MAX_FOCAL_DIAGONALS
 from autocalib_ros.estimation.straight.roads import MIN_VEHICLES_PER_ROAD
-from autocalib_ros.estimation.verification.consistency import compare_solutions, expected_half_differences
+from autocalib_ros.estimation.verification.consistency import (
+    compare_solutions,
+    expected_half_differences,
+    half_difference_sigmas,
+)
 from autocalib_ros.estimation.verification.ground_normal import LevelCamera, PlaneEstimate, orient_above_traffic
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.ground_plane import MIN_FRACTION_BELOW_HORIZON
@@ -52,6 +57,9 @@ ASSUMED_PLANE_SIGMA_FACTOR = 3.0
 MAX_HALVES_SIGMAS, MAX_WHOLE_SIGMAS = 3.5, 3.0
 """Allowed difference between two halves of the evidence: in their own sigmas, and in the sigmas that follow from the
 whole."""
+MAX_SHARE_SIGMAS = 4.0
+"""Largest difference between the shares of vehicles that follow the roads in two halves, in standard deviations of
+independent vehicles (0.006 %; vehicles come in platoons, so that three would be exceeded by honest traffic)."""
 HALVES_FOCAL_TOLERANCE = 0.03
 HALVES_NORMAL_TOLERANCE_DEG = 1.5
 """Difference between two halves that is always allowed: the promised accuracy."""
@@ -217,17 +225,20 @@ def check_halves(fit: Adjustment, tracks: TrackSet, gate: GateOptions) -> Reason
         (tracklets.bodies, tracklets.times_s),
         (config.windows.bodies, config.windows.times_s),
     )
+    share = _compare_shares(fit, tracks, early)
+    if isinstance(share, Reason):
+        return share
     fits = []
     for half, seen, living in ((early, windows, lived), (~early, ~windows, ~lived)):
         part, bundle = tracks.subset(half), config.bundle and config.bundle.subset(living)
         part_setting = replace(config, windows=config.windows.subset(seen), bundle=bundle)
         if half.sum() + seen.sum() + living.sum() < MIN_RESIDUAL_ROWS or (config.turning and not part_setting.turning):
-            return NOT_COMPARED
+            return ComparedHalves(NOT_COMPARED.statement, share)
         _, motion, shapes = fit.problem.warm_start
         warm_start = None, motion.subset(seen) if motion else None, shapes.subset(living) if bundle and shapes else None
         fits.append(adjust(fit.state, part, part_setting, refine=True, warm_start=warm_start))
         if any(mask.sum() < gate.min_tracks_per_road // 2 for mask in road_support(fits[-1], part)):
-            return NOT_COMPARED
+            return ComparedHalves(NOT_COMPARED.statement, share)
     apart = compare_solutions(*fits)
     focal, turn = apart.focal, apart.normal_deg if fit.plane_known else 0.0  # one road does not determine the normal
     # a large sigma of one half excuses no difference that the sigma of the whole rules out
@@ -240,8 +251,45 @@ def check_halves(fit: Adjustment, tracks: TrackSet, gate: GateOptions) -> Reason
         return reason(
             'halves_disagree', focal=focal, focal_limit=focal_limit, normal_deg=turn, normal_limit_deg=turn_limit
         )
+    together = _compare_poses(*fits)
+    if isinstance(together, Reason):
+        return together
     statement = check('halves', focal=focal, normal_deg=turn if fit.plane_known else None)
-    return ComparedHalves(statement, rows if fit.plane_known else rows[:1])
+    return ComparedHalves(statement, (*share, *(rows if fit.plane_known else rows[:1]), *together))
+
+
+def _compare_shares(fit: Adjustment, tracks: TrackSet, early: np.ndarray) -> Reason | tuple[VerificationRow, ...]:
+    """Compare the shares of vehicles that follow the roads in two halves, the earlier one of tracks `early` (tracks,).
+
+    A camera that turned in between shows one half a road where the other half has none; a half without support is then
+    no lack of traffic. Two halves of at least `MIN_VEHICLES_PER_ROAD` vehicles each, of at least half as many as in the
+    other.
+    """
+    following = [
+        np.bincount(np.unique(tracks.vehicles[half], return_inverse=True)[1], fit.inliers()[half])
+        for half in (early, ~early)
+    ]
+    counts = np.array([len(each) for each in following])
+    if counts.min() < max(MIN_VEHICLES_PER_ROAD, 0.5 * counts.max()):
+        return ()
+    earlier, later = (float((each > 0).mean()) for each in following)
+    whole = float((np.concatenate(following) > 0).mean())
+    sigma = float(np.sqrt(max(whole * (1.0 - whole), 1e-9) * (1.0 / counts).sum()))
+    row = verified('halves_share', abs(earlier - later) / sigma, MAX_SHARE_SIGMAS)
+    if row.passed:
+        return (row,)
+    return reason('halves_disagree', 'share', earlier=earlier, later=later, sigmas=row.value, limit=row.limit)
+
+
+def _compare_poses(first: Adjustment, second: Adjustment) -> Reason | tuple[VerificationRow, ...]:
+    """Compare focal length and rotation of two halves together; no row where a half determines nothing."""
+    vehicles = min(len(np.unique(fit.problem.vehicle_ids)) for fit in (first, second))
+    difference = half_difference_sigmas(first, second, vehicles)
+    row = None if difference is None else verified('halves_pose', *difference)
+    if row is None or row.passed:
+        return () if row is None else (row,)
+    turned = Rotation.from_matrix(first.state.rotation.T @ second.state.rotation).magnitude()
+    return reason('halves_disagree', 'pose', sigmas=row.value, limit=row.limit, turned_deg=float(np.degrees(turned)))
 
 
 def _earlier_half(*seen: tuple[np.ndarray, np.ndarray]) -> list[np.ndarray]:

@@ -126,7 +126,11 @@ def test_halves_bound_the_standard_deviation_of_the_whole() -> None:
     _, fit, nothing = by_windows(slid(synthetic_evidence(TURNING, generator), generator, 8.0))
     agreed = check_halves(fit, nothing, GateOptions())
     assert isinstance(agreed, ComparedHalves) and agreed.statement.kind == 'halves'
-    assert [(row.kind, row.passed) for row in agreed.rows] == [('halves_focal', True), ('halves_normal', True)]
+    assert [(row.kind, row.passed) for row in agreed.rows] == [
+        ('halves_focal', True),
+        ('halves_normal', True),
+        ('halves_pose', True),
+    ]
     boasting = replace(fit, covariance=1e-4 * fit.covariance)
     doubt = check_halves(boasting, nothing, GateOptions())
     assert isinstance(doubt, Reason) and doubt.code == 'halves_disagree'
