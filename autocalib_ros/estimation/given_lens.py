@@ -71,12 +71,14 @@ def verify_given_lens(
     `solve_free` solves without the given lens.
     """
     if isinstance(found, Solution):
-        contradiction, doubt, compared = _test_by_release(lens, found, tracks)
-        if contradiction is not None:
-            return _in_words_of(contradiction, lens, solve_free(), tracks)
-        found = found.compared(*compared)
+        tested = _test_by_release(lens, found, tracks)
+        if isinstance(tested, Reason):
+            return _in_words_of(tested, lens, solve_free(), tracks)
+        release, row = tested
+        if row is not None:
+            found = found.compared(row)
         if found.full:
-            return found if doubt is None else _doubted(found, doubt)
+            return found if row is None or row.passed else _doubted(found, release)
     free = solve_free()
     if isinstance(free, Reason):
         return found
@@ -88,32 +90,31 @@ def verify_given_lens(
 
 def _test_by_release(
     lens: Camera, found: Solution, tracks: TrackSet
-) -> tuple[Reason | None, _Release | None, tuple[VerificationRow, ...]]:
-    """Return why the traffic contradicts the lens, or the release that makes it doubtful; None where it does not.
+) -> Reason | tuple[_Release, VerificationRow | None]:
+    """Return why the traffic contradicts the lens, else the release of its focal length and the comparison of both.
 
-    And the comparison of the focal lengths, where the traffic gives one.
+    The comparison fails where the lens is doubtful; None if the traffic gives no focal length.
     """
     loose = LOOSE_PRINCIPAL_POINT_SIGMA_FRACTION * lens.width
     focal = _released(lens, found, tracks, [np.inf, 0.0, 0.0, 0.0, 0.0, 0.0])
     change, sigmas = focal.change(lambda camera: np.array([np.log(camera.focal_px)]))
-    beyond = abs(change[0]) > LENS_TOLERANCE
-    if beyond and sigmas > CONTRADICTION_SIGMAS:
+    if abs(change[0]) > LENS_TOLERANCE and sigmas > CONTRADICTION_SIGMAS:
         sigma_px = focal.fit.focal_sigma * focal.camera.focal_px
-        return _focal_contradiction(lens, focal.camera.focal_px, sigma_px), None, ()
-    limit = max(DOUBT_SIGMAS * abs(change[0]) / sigmas, LENS_TOLERANCE) if sigmas > 0 else LENS_TOLERANCE
-    compared = (verified('given_lens', abs(change[0]), limit),) if sigmas > 0 else ()
-    doubt = focal if beyond and sigmas > DOUBT_SIGMAS else None
+        return _focal_contradiction(lens, focal.camera.focal_px, sigma_px)
+    row = None
+    if sigmas > 0:
+        row = verified('given_lens', abs(change[0]), max(DOUBT_SIGMAS * abs(change[0]) / sigmas, LENS_TOLERANCE))
     point = _released(lens, found, tracks, [0.0, loose, loose * lens.pixel_aspect, 0.0, 0.0, 0.0])
     change, sigmas = point.change(lambda camera: np.array(camera.principal_point_px))
     if np.hypot(*change) > LENS_TOLERANCE * lens.width and sigmas > CONTRADICTION_SIGMAS:
-        return _point_contradiction(lens, point.fit), None, ()
+        return _point_contradiction(lens, point.fit)
     shape = _released(lens, found, tracks, [0.0, 0.0, 0.0, 0.0, 0.0, np.inf])
     change, sigmas = shape.change(lambda camera: np.array([np.log(camera.pixel_aspect)]))
     if abs(change[0]) > LENS_TOLERANCE and sigmas > CONTRADICTION_SIGMAS:
         numbers = {'aspect': lens.pixel_aspect, 'traffic_aspect': shape.camera.pixel_aspect}
         sigma = abs(change[0]) / sigmas * shape.camera.pixel_aspect
-        return reason('given_lens', 'pixel_aspect', **numbers, sigma=sigma), None, ()
-    return None, doubt, compared
+        return reason('given_lens', 'pixel_aspect', **numbers, sigma=sigma)
+    return focal, row
 
 
 def _released(lens: Camera, found: Solution, tracks: TrackSet, sigma: list[float]) -> _Release:

@@ -115,8 +115,8 @@ def _with_lane_changes(found: Solution, tracks: TrackSet, observations: Observat
         if found.plane.worst_sigma_deg <= plane.worst_sigma_deg:
             return replace(found, checks=checks)
     along, flow = main_road(fit, tracks)
-    solution = Solution(fit, plane, along, flow, (*lens_assumptions(fit, ()), statement), checks, None, reduced=True)
-    return solution.compared(*found.comparisons)
+    assumptions, rows = (*lens_assumptions(fit, ()), statement), found.comparisons
+    return Solution(fit, plane, along, flow, assumptions, checks, None, reduced=True, comparisons=rows)
 
 
 def _sigma_about_road_deg(fit: Adjustment, plane: PlaneEstimate) -> float:

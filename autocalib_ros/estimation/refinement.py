@@ -16,8 +16,6 @@ from autocalib_ros.estimation.solution import MAX_SUBSAMPLE_TRACKS, Observations
 from autocalib_ros.estimation.straight.initialisation import select_lens_family
 from autocalib_ros.estimation.straight.roads import add_further_roads, expect_right_angle, main_road
 from autocalib_ros.estimation.turning.turning_traffic import (
-    MAX_TRACKLET_DIFFERENCE_SIGMAS,
-    TrackletComparison,
     refine_with_tracklets,
     refine_with_turning,
     widen_by_point_slip,
@@ -30,7 +28,7 @@ from autocalib_ros.estimation.verification.identifiability import fix_unidentifi
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.results.refusals import Reason
 from autocalib_ros.results.statements import Statement, check
-from autocalib_ros.results.verification_table import VerificationRow, verified
+from autocalib_ros.results.verification_table import VerificationRow
 
 LEVEL_ROLL_TOLERANCE_DEG = 5.0
 """Roll up to which pedestrians are classified as if the camera were level."""
@@ -73,10 +71,10 @@ def refine_and_verify(
     # Parameters that the evidence does not determine return to their prior.
     fit, fixed = fix_unidentifiable(fit, tracks)
     # Gates on the lens; cross-validation in time.
-    shares = _check_lens(fit, tracks, observations, turned=turned)
-    if isinstance(shares, Reason):
+    explained = _check_lens(fit, tracks, observations, turned=turned)
+    if isinstance(explained, Reason):
         # a lens that the traffic does not determine bends roads: then few vehicles seem to follow one
-        return (shares.code == 'turning_traffic' and check_focal_length(fit, gate, turned=turned)) or shares
+        return (explained.code == 'turning_traffic' and check_focal_length(fit, gate, turned=turned)) or explained
     halves = check_halves(fit, tracks, gate)
     if isinstance(halves, Reason):
         return halves
@@ -87,7 +85,7 @@ def refine_and_verify(
     fit = widen_by_focal_modes(fit, tracks.subset(evenly_spaced(len(tracks), MAX_SUBSAMPLE_TRACKS)))
     uncertain = check_focal_length(fit, gate, turned=turned)
     assumptions = lens_assumptions(fit, fixed)
-    compared = (*shares, *halves.rows, *_tracklet_rows(tracklets))
+    compared = (*explained, *halves.rows, *(() if tracklets is None else (tracklets.row,)))
     if not fit.plane_known:
         if uncertain:
             return uncertain
@@ -99,11 +97,6 @@ def refine_and_verify(
     checks = (*_plane_checks(fit, angle), halves.statement)
     refusal = check_plane(plane, gate)
     return Solution(fit, plane, along, flow, assumptions, checks, refusal, lens_refusal=uncertain, comparisons=compared)
-
-
-def _tracklet_rows(compared: TrackletComparison | None) -> tuple[VerificationRow, ...]:
-    limit = MAX_TRACKLET_DIFFERENCE_SIGMAS
-    return () if compared is None else (verified('tracklets', compared.sigmas, limit),)
 
 
 def _check_lens(

@@ -139,8 +139,8 @@ def _combined_with_lane_markings(found: Solution, observations: Observations) ->
         return sharper
     focal = abs(float(np.log(traffic.state.camera.focal_px / sharper.markings.camera.focal_px)))
     normal_deg = unsigned_angle_deg(traffic.state.rotation[:, 2], sharper.markings.rotation[:, 2])
-    contradicted = sharper.both_right < MIN_BOTH_RIGHT
-    found = found.compared(verified('lane_markings', sharper.both_right, MIN_BOTH_RIGHT))
+    row = verified('lane_markings', sharper.both_right, MIN_BOTH_RIGHT)
+    found, contradicted = found.compared(row), not row.passed
     compared = check('lane_markings', focal=focal, normal_deg=normal_deg, used=not contradicted)
     plane = PlaneEstimate.of(sharper.fit, observations.tracks)
     if contradicted and not sharper.fit.focal_sigma <= observations.gate.max_sigma_focal_rel:

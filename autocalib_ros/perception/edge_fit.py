@@ -37,9 +37,9 @@ def fit_edges(lines: np.ndarray, grey: np.ndarray) -> np.ndarray:
     profiles across a segment, weighted by the change, and a line through the centres by iteratively reweighted least
     squares with Tukey's biweight (Beaton & Tukey 1974).
     """
-    fitted = lines
+    fitted, levels = lines, grey.astype(np.float32)
     for _ in range(EDGE_FIT_ROUNDS if len(lines) else 0):
-        fitted = _fit_once(fitted, grey)
+        fitted = _fit_once(fitted, levels)
     return fitted
 
 
@@ -60,7 +60,7 @@ def _profiles(lines: np.ndarray, normal: np.ndarray, shares: np.ndarray, grey: n
     on_line = middle[:, None] + shares[:, None] * along[:, None]
     points = on_line[:, :, None] + _profile_offsets()[:, None] * normal[:, None, None]
     x, y = np.moveaxis(points.reshape(len(lines), -1, 2).astype(np.float32), -1, 0)
-    levels = cv2.remap(grey.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    levels = cv2.remap(grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(levels.reshape(points.shape[:3]))
 
 

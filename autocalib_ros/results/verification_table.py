@@ -72,28 +72,30 @@ class VerificationRow:
     passed: bool
 
     @property
+    def _quantity(self) -> VerifiedQuantity:
+        return VERIFIED_QUANTITIES.get(self.kind, VerifiedQuantity(self.kind, '', ''))
+
+    @property
     def name(self) -> str:
         """What is compared, in words."""
-        return VERIFIED_QUANTITIES[self.kind].name if self.kind in VERIFIED_QUANTITIES else self.kind
+        return self._quantity.name
 
     @property
     def value_text(self) -> str:
         """The value with its unit."""
-        return 'unknown' if self.value is None else _with_unit(self.value, self.kind)
+        return 'unknown' if self.value is None else _with_unit(self.value, self._quantity.unit)
 
     @property
     def limit_text(self) -> str:
         """The limit with its unit, and on which side of it a value passes."""
-        quantity = VERIFIED_QUANTITIES.get(self.kind)
-        side = 'at least' if quantity is not None and quantity.at_least else 'at most'
-        return f'{side} {_with_unit(self.limit, self.kind)}'
+        side = 'at least' if self._quantity.at_least else 'at most'
+        return f'{side} {_with_unit(self.limit, self._quantity.unit)}'
 
     @property
     def outcome(self) -> str:
         """'passed', or 'failed' with what that cost."""
-        if self.passed or self.kind not in VERIFIED_QUANTITIES:
-            return 'passed' if self.passed else 'failed'
-        return f'failed: {VERIFIED_QUANTITIES[self.kind].cost}'
+        cost = self._quantity.cost
+        return 'passed' if self.passed else f'failed: {cost}' if cost else 'failed'
 
     def __str__(self) -> str:
         return f'{self.name} {self.value_text} ({self.limit_text}): {self.outcome}'
@@ -116,6 +118,5 @@ def summarise_verification(rows: Sequence[VerificationRow]) -> str:
     return '; '.join([counts, *failed])
 
 
-def _with_unit(value: float, kind: str) -> str:
-    unit = VERIFIED_QUANTITIES[kind].unit if kind in VERIFIED_QUANTITIES else ''
+def _with_unit(value: float, unit: str) -> str:
     return f'{100.0 * value:.3g} %' if unit == '%' else f'{value:.3g} {unit}'.rstrip()

@@ -87,7 +87,7 @@ class MeasuredAspect:
         `sigma` is the standard deviation of the logarithm of either.
         """
         squares = np.square([self.sigmas_from(other, sigma), self.sigmas_from(aspect, sigma)])
-        losses = 0.5 * (FREEDOM + 1.0) * np.log1p(squares / FREEDOM)
+        losses = _student_loss(squares)
         return float(losses[0] - losses[1])
 
     def unexpected(self, expected: float, prior_odds: float) -> tuple[float, float]:
@@ -99,7 +99,7 @@ class MeasuredAspect:
         deviations = np.linspace(-4.0, 4.0, UNUSUAL_STEPS)
         logs, prior = UNUSUAL_SIGMA * deviations, np.exp(-0.5 * deviations**2)
         away = (np.log(self.aspect / expected) - np.append(logs, 0.0)) / self.sigma
-        likelihood = (1.0 + away**2 / FREEDOM) ** (-0.5 * (FREEDOM + 1.0))
+        likelihood = np.exp(-_student_loss(away**2))
         posterior = prior / prior.sum() * likelihood[:-1]
         other, as_expected = prior_odds * float(posterior.sum()), float(likelihood[-1])
         return other / (other + as_expected), float((posterior * logs**2).sum() / posterior.sum())
@@ -115,6 +115,11 @@ class MeasuredAspect:
         at = int(np.flatnonzero(parameters.config.prior.free == ASPECT)[0])
         change = float(np.log(aspect / self.aspect))
         return parameters.state(covariance[:, at] / max(covariance[at, at], 1e-12) * change)
+
+
+def _student_loss(squares: np.ndarray) -> np.ndarray:
+    """Negative log density, up to a constant, of squared differences in standard deviations."""
+    return 0.5 * (FREEDOM + 1.0) * np.log1p(squares / FREEDOM)
 
 
 def measure_aspect(found: Solution, tracks: TrackSet) -> MeasuredAspect:
@@ -267,9 +272,15 @@ def _averaged(found: Solution, measured: MeasuredAspect, expected: float, gate: 
     probability, square = measured.unexpected(expected, float(prior_odds))
     before, after = (measured.state_at(expected * float(np.exp(step))) for step in (0.0, ASPECT_STEP))
     step = _same_change(found.fit, before, after) / ASPECT_STEP
-    fit = replace(found.fit, covariance=found.fit.covariance + probability * square * np.outer(step, step))
-    if fit.focal_sigma > gate.max_sigma_focal_rel >= found.fit.focal_sigma:
-        return _uncertain(measured, fit, gate, against=measured.aspect)
+    covering = _covering(found, np.sqrt(probability * square) * step)
+    if covering.fit.focal_sigma > gate.max_sigma_focal_rel >= found.fit.focal_sigma:
+        return _uncertain(measured, covering.fit, gate, against=measured.aspect)
+    return covering
+
+
+def _covering(found: Solution, step: np.ndarray) -> Solution:
+    """Return a solution whose covariance covers a step (parameters,)."""
+    fit = replace(found.fit, covariance=found.fit.covariance + np.outer(step, step))
     return replace(found, fit=fit, plane=replace(found.plane, fit=fit))
 
 
@@ -277,18 +288,14 @@ def _widened(
     found: Solution, measured: MeasuredAspect, state: AdjustmentState, gate: GateOptions, *, against: float
 ) -> Solution | Reason:
     """Add the difference to the state with another pixel aspect to the covariance; a reason if that is too much."""
-    step = _same_change(found.fit, (found.of_traffic or found.fit).state, state)
-    fit = replace(found.fit, covariance=found.fit.covariance + np.outer(step, step))
-    plane = replace(found.plane, fit=fit)
+    covering = _covering(found, _same_change(found.fit, (found.of_traffic or found.fit).state, state))
     expected = found.fit.problem.config.prior.centre.pixel_aspect
     sigma, sigmas = measured.aspect * measured.sigma, measured.sigmas_from(expected)
-    if not (np.isfinite(sigma) and fit.focal_sigma <= gate.max_sigma_focal_rel):
-        return _uncertain(measured, fit, gate, against=against)
-    uncertain = found.plane_refusal or check_plane(plane, gate, assumed=True)
+    if not (np.isfinite(sigma) and covering.fit.focal_sigma <= gate.max_sigma_focal_rel):
+        return _uncertain(measured, covering.fit, gate, against=against)
+    uncertain = found.plane_refusal or check_plane(covering.plane, gate, assumed=True)
     statement = check('pixel_aspect', aspect=against, measured=measured.aspect, sigma=min(sigma, 9.99), sigmas=sigmas)
-    return replace(
-        found, fit=fit, plane=plane, plane_refusal=uncertain, reduced=True, checks=(*found.checks, statement)
-    )
+    return replace(covering, plane_refusal=uncertain, reduced=True, checks=(*found.checks, statement))
 
 
 def _uncertain(measured: MeasuredAspect, fit: Adjustment, gate: GateOptions, *, against: float) -> Reason:

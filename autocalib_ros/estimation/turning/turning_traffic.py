@@ -21,6 +21,7 @@ from autocalib_ros.estimation.observations.track_set import TrackSet
 from autocalib_ros.estimation.observations.tracklets import find_tracklets, no_tracklets
 from autocalib_ros.estimation.observations.two_frame_windows import ResampledTracks, TwoFrameWindows
 from autocalib_ros.estimation.verification.consistency import compare_solutions
+from autocalib_ros.results.verification_table import VerificationRow, verified
 
 START_FOCAL_DIAGONALS = (0.35, 0.55, 0.85)
 """Initial focal lengths in image diagonals: lenses of about 100, 75 and 50 degrees across the diagonal."""
@@ -84,9 +85,14 @@ class TrackletComparison:
     """Larger difference in focal length or normal, in standard deviations of the less certain solution."""
 
     @property
+    def row(self) -> VerificationRow:
+        """The comparison as a row of the verification table."""
+        return verified('tracklets', self.sigmas, MAX_TRACKLET_DIFFERENCE_SIGMAS)
+
+    @property
     def rejected(self) -> bool:
         """Whether the two contradict each other."""
-        return not self.sigmas <= MAX_TRACKLET_DIFFERENCE_SIGMAS
+        return not self.row.passed
 
 
 def refine_with_tracklets(

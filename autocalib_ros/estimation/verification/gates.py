@@ -228,17 +228,18 @@ def check_halves(fit: Adjustment, tracks: TrackSet, gate: GateOptions) -> Reason
     share = _compare_shares(fit, tracks, early)
     if isinstance(share, Reason):
         return share
+    not_compared = replace(NOT_COMPARED, rows=share)
     fits = []
     for half, seen, living in ((early, windows, lived), (~early, ~windows, ~lived)):
         part, bundle = tracks.subset(half), config.bundle and config.bundle.subset(living)
         part_setting = replace(config, windows=config.windows.subset(seen), bundle=bundle)
         if half.sum() + seen.sum() + living.sum() < MIN_RESIDUAL_ROWS or (config.turning and not part_setting.turning):
-            return ComparedHalves(NOT_COMPARED.statement, share)
+            return not_compared
         _, motion, shapes = fit.problem.warm_start
         warm_start = None, motion.subset(seen) if motion else None, shapes.subset(living) if bundle and shapes else None
         fits.append(adjust(fit.state, part, part_setting, refine=True, warm_start=warm_start))
         if any(mask.sum() < gate.min_tracks_per_road // 2 for mask in road_support(fits[-1], part)):
-            return ComparedHalves(NOT_COMPARED.statement, share)
+            return not_compared
     apart = compare_solutions(*fits)
     focal, turn = apart.focal, apart.normal_deg if fit.plane_known else 0.0  # one road does not determine the normal
     # a large sigma of one half excuses no difference that the sigma of the whole rules out
@@ -265,9 +266,9 @@ def _compare_shares(fit: Adjustment, tracks: TrackSet, early: np.ndarray) -> Rea
     no lack of traffic. Two halves of at least `MIN_VEHICLES_PER_ROAD` vehicles each, of at least half as many as in the
     other.
     """
+    on_road = fit.inliers()
     following = [
-        np.bincount(np.unique(tracks.vehicles[half], return_inverse=True)[1], fit.inliers()[half])
-        for half in (early, ~early)
+        np.bincount(np.unique(tracks.vehicles[half], return_inverse=True)[1], on_road[half]) for half in (early, ~early)
     ]
     counts = np.array([len(each) for each in following])
     if counts.min() < max(MIN_VEHICLES_PER_ROAD, 0.5 * counts.max()):
@@ -285,9 +286,11 @@ def _compare_poses(first: Adjustment, second: Adjustment) -> Reason | tuple[Veri
     """Compare focal length and rotation of two halves together; no row where a half determines nothing."""
     vehicles = min(len(np.unique(fit.problem.vehicle_ids)) for fit in (first, second))
     difference = half_difference_sigmas(first, second, vehicles)
-    row = None if difference is None else verified('halves_pose', *difference)
-    if row is None or row.passed:
-        return () if row is None else (row,)
+    if difference is None:
+        return ()
+    row = verified('halves_pose', *difference)
+    if row.passed:
+        return (row,)
     turned = Rotation.from_matrix(first.state.rotation.T @ second.state.rotation).magnitude()
     return reason('halves_disagree', 'pose', sigmas=row.value, limit=row.limit, turned_deg=float(np.degrees(turned)))
 

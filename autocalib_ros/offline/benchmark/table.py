@@ -26,7 +26,7 @@ SIGMAS_FORMAT = NAME_FORMAT + '{:>7}{:>8}{:>7}{:>8}{:>7}{:>7}{:>8}{:>7}{:>8}'
 
 def format_tables(runs: Sequence[Run]) -> str:
     """Return tables of errors, of stated standard deviations against errors, and the list of crashes."""
-    determined = [run for run in runs if run.family not in {**UNDERDETERMINED, **BROKEN}]
+    determined = [run for run in runs if run.family not in UNDERDETERMINED and run.family not in BROKEN]
     doubtful = [run for run in runs if run.family in UNDERDETERMINED]
     broken = [run for run in runs if run.family in BROKEN]
     blocks = [

@@ -96,11 +96,11 @@ def test_pixels_are_less_surely_square_the_farther_the_measured_aspect_is() -> N
     assert chance * square < 1e-6
 
 
-def test_a_told_aspect_costs_no_uncertainty(two_roads: Evidence) -> None:
+def test_a_stated_aspect_adds_no_uncertainty(two_roads: Evidence) -> None:
     plain = solve_once(two_roads, OPTIONS)
-    told = solve_once(two_roads, replace(OPTIONS, lens=LensOptions(pixel_aspect=1.0)))
-    assert told.camera.focal_px == pytest.approx(plain.camera.focal_px)
-    assert 1.05 < plain.stddev.focal_px / told.stddev.focal_px < 1.5
+    stated = solve_once(two_roads, replace(OPTIONS, lens=LensOptions(pixel_aspect=1.0)))
+    assert stated.camera.focal_px == pytest.approx(plain.camera.focal_px)
+    assert 1.05 < plain.stddev.focal_px / stated.stddev.focal_px < 1.5
 
 
 @pytest.mark.parametrize('run', [5, 6])
