@@ -21,11 +21,11 @@ its prior: 0.1 % of the lenses exceed it."""
 def with_solution_rows(found: Solution, gate: GateOptions) -> Solution:
     """Return a solution with all rows of its verification table.
 
-    A principal point that contradicts its prior lowers the grade: then the picture was cut, or the lens is another.
+    Some failed checks lower the grade: a principal point that contradicts its prior, for one, means that the picture
+    was cut, or that the lens is another.
     """
     found = found.compared(*_rows(found, gate))
-    contradicted = any(row.kind == 'principal_point_prior' and not row.passed for row in found.comparisons)
-    return replace(found, reduced=True) if contradicted else found
+    return replace(found, reduced=True) if any(row.lowers_grade for row in found.comparisons) else found
 
 
 def _rows(found: Solution, gate: GateOptions) -> Iterator[VerificationRow]:

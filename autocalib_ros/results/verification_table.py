@@ -41,6 +41,9 @@ VERIFIED_QUANTITIES: dict[str, VerifiedQuantity] = {
         'principal point against the centre of the picture', 'sigma', GRADE_ASSUMED
     ),
     'halves_share': VerifiedQuantity('share of vehicles on the roads, earlier against later traffic', 'sigma', REFUSED),
+    'halves_roads': VerifiedQuantity(
+        'share of vehicles on each road, earlier against later traffic', 'sigma', GRADE_ASSUMED
+    ),
     'halves_focal': VerifiedQuantity('focal length, earlier against later traffic', '%', REFUSED),
     'halves_normal': VerifiedQuantity('ground normal, earlier against later traffic', 'degrees', REFUSED),
     'halves_pose': VerifiedQuantity('focal length and rotation, earlier against later traffic', 'sigma', REFUSED),
@@ -90,6 +93,11 @@ class VerificationRow:
         """The limit with its unit, and on which side of it a value passes."""
         side = 'at least' if self._quantity.at_least else 'at most'
         return f'{side} {_with_unit(self.limit, self._quantity.unit)}'
+
+    @property
+    def lowers_grade(self) -> bool:
+        """Whether the check failed and thereby costs grade full."""
+        return not self.passed and self._quantity.cost == GRADE_ASSUMED
 
     @property
     def outcome(self) -> str:

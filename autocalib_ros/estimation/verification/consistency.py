@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import special
 from scipy.spatial.transform import Rotation
-from scipy.stats import f as f_distribution
 
 from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment
 from autocalib_ros.estimation.adjustment.covariance import propagate_sigma
@@ -83,7 +83,7 @@ def half_difference_sigmas(first: Adjustment, second: Adjustment, vehicles: int)
     change = pose(second.state) - pose(first.state)
     value = float(np.sqrt(change @ np.linalg.solve(covariance + np.diag(model), change)))
     scale = compared * (vehicles - 1) / (vehicles - compared)
-    return value, float(np.sqrt(scale * f_distribution.isf(HALF_CONTRADICTION, compared, vehicles - compared)))
+    return value, float(np.sqrt(scale * special.fdtri(compared, vehicles - compared, 1.0 - HALF_CONTRADICTION)))
 
 
 def expected_half_differences(whole: Adjustment, *halves: Adjustment) -> np.ndarray:

@@ -228,7 +228,7 @@ def check_halves(fit: Adjustment, tracks: TrackSet, gate: GateOptions) -> Reason
     share = _compare_shares(fit, tracks, early)
     if isinstance(share, Reason):
         return share
-    not_compared = replace(NOT_COMPARED, rows=share)
+    not_compared = replace(NOT_COMPARED, rows=(*share, *_compare_roads(fit, tracks, early)))
     fits = []
     for half, seen, living in ((early, windows, lived), (~early, ~windows, ~lived)):
         part, bundle = tracks.subset(half), config.bundle and config.bundle.subset(living)
@@ -263,23 +263,54 @@ def _compare_shares(fit: Adjustment, tracks: TrackSet, early: np.ndarray) -> Rea
     """Compare the shares of vehicles that follow the roads in two halves, the earlier one of tracks `early` (tracks,).
 
     A camera that turned in between shows one half a road where the other half has none; a half without support is then
-    no lack of traffic. Two halves of at least `MIN_VEHICLES_PER_ROAD` vehicles each, of at least half as many as in the
-    other.
+    no lack of traffic.
     """
     on_road = fit.inliers()
-    following = [
-        np.bincount(np.unique(tracks.vehicles[half], return_inverse=True)[1], on_road[half]) for half in (early, ~early)
-    ]
-    counts = np.array([len(each) for each in following])
-    if counts.min() < max(MIN_VEHICLES_PER_ROAD, 0.5 * counts.max()):
+    following = [_vehicles_with(on_road[half], tracks.vehicles[half]) for half in (early, ~early)]
+    compared = _share_difference(*following)
+    if compared is None:
         return ()
-    earlier, later = (float((each > 0).mean()) for each in following)
-    whole = float((np.concatenate(following) > 0).mean())
-    sigma = float(np.sqrt(max(whole * (1.0 - whole), 1e-9) * (1.0 / counts).sum()))
-    row = verified('halves_share', abs(earlier - later) / sigma, MAX_SHARE_SIGMAS)
+    earlier, later, sigmas = compared
+    row = verified('halves_share', sigmas, MAX_SHARE_SIGMAS)
     if row.passed:
         return (row,)
     return reason('halves_disagree', 'share', earlier=earlier, later=later, sigmas=row.value, limit=row.limit)
+
+
+def _compare_roads(fit: Adjustment, tracks: TrackSet, early: np.ndarray) -> tuple[VerificationRow, ...]:
+    """Compare how the vehicles of each half are spread over the roads, where the halves cannot be solved each.
+
+    One road early and another one late may be the phases of a traffic light, or two views, and nothing tells which.
+    """
+    on_road = fit.inliers()
+    vehicles, labels = tracks.vehicles[on_road], fit.labels[on_road]
+    differences = [
+        _share_difference(
+            *(_vehicles_with(labels[half] == road, vehicles[half]) for half in (early[on_road], ~early[on_road]))
+        )
+        for road in range(len(fit.state.angles_rad))
+    ]
+    sigmas = [compared[2] for compared in differences if compared is not None]
+    return (verified('halves_roads', max(sigmas), MAX_SHARE_SIGMAS),) if len(sigmas) > 1 else ()
+
+
+def _vehicles_with(seen: np.ndarray, vehicles: np.ndarray) -> np.ndarray:
+    """Mask (vehicles,) of the distinct vehicles of which any track (tracks,) is `seen`."""
+    return np.bincount(np.unique(vehicles, return_inverse=True)[1], seen) > 0
+
+
+def _share_difference(earlier: np.ndarray, later: np.ndarray) -> tuple[float, float, float] | None:
+    """Return the shares of two masks of vehicles, and their difference in standard deviations of independent ones.
+
+    None for fewer than `MIN_VEHICLES_PER_ROAD` vehicles in a half, or for less than half as many as in the other.
+    """
+    counts = np.array([len(earlier), len(later)])
+    if counts.min() < max(MIN_VEHICLES_PER_ROAD, 0.5 * counts.max()):
+        return None
+    whole = float(np.concatenate([earlier, later]).mean())
+    sigma = float(np.sqrt(max(whole * (1.0 - whole), 1e-9) * (1.0 / counts).sum()))
+    shares = float(earlier.mean()), float(later.mean())
+    return (*shares, abs(shares[0] - shares[1]) / sigma)
 
 
 def _compare_poses(first: Adjustment, second: Adjustment) -> Reason | tuple[VerificationRow, ...]:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import make_interp_spline
 
 from autocalib_ros.config import BufferOptions
 from autocalib_ros.errors import UsageError
@@ -197,7 +197,7 @@ def _segments(tracks: list[Track]) -> Iterator[Segments]:
     for track in tracks:
         first, last = np.ceil(track.times_s[0] / SEGMENT_INTERVAL_S), np.floor(track.times_s[-1] / SEGMENT_INTERVAL_S)
         frames = np.arange(first, last + 1) * SEGMENT_INTERVAL_S
-        places = CubicSpline(track.times_s, track.points_px)(frames)
+        places = make_interp_spline(track.times_s, track.points_px)(frames)
         times_s.append(frames[1:])
         vehicles.append(np.full(len(frames[1:]), track.vehicle))
         ends_px.append(np.hstack([places[:-1], places[1:]]))

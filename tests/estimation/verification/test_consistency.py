@@ -1,12 +1,16 @@
 """Comparison of two halves of the traffic: focal length and rotation of the camera together."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from autocalib_ros.config import Options
+from autocalib_ros.evidence.snapshot import Track
 from autocalib_ros.offline.benchmark.monte_carlo import draw_evidence
+from autocalib_ros.offline.synthetic.junction import Junction, evidence_from_tracks
 from autocalib_ros.results.calibration import Calibration, Refusal
-from solved_once import solve_once
+from solved_once import evidence_once, solve_once
 
 pytestmark = pytest.mark.solve
 
@@ -26,3 +30,26 @@ def test_halves_of_one_view_agree() -> None:
     rows = {row.kind: row for row in result.verification}
     assert rows['halves_pose'].passed and rows['halves_share'].passed
     assert np.isfinite(rows['halves_pose'].limit) and rows['halves_pose'].limit > 4.0
+
+
+def traffic_of(junction: Junction, first_vehicle: int = 0, begin_s: float = 0.0) -> list[Track]:
+    evidence, tracks = evidence_once(junction), []
+    bounds = zip(evidence.track_starts[:-1], evidence.track_starts[1:], strict=True)
+    for vehicle, (first, last) in zip(evidence.track_vehicles, bounds, strict=True):
+        times_s = evidence.times_s[first:last] + begin_s
+        tracks.append(Track(int(vehicle) + first_vehicle, times_s, evidence.points_px[first:last]))
+    return tracks
+
+
+@pytest.mark.parametrize(('begin_s', 'expected'), [(0.0, 'full'), (200.0, 'assumed')])
+def test_roads_that_are_never_seen_in_the_same_half_cost_grade_full(begin_s: float, expected: str) -> None:
+    along = Junction(road_angles_deg=(0.0,), turning_fraction=0.0, vehicles=30)
+    across = replace(along, road_angles_deg=(90.0,))
+    tracks = [*traffic_of(along), *traffic_of(across, 100, begin_s)]
+    newest_s = max(track.times_s[-1] for track in tracks)
+    evidence = evidence_from_tracks(tracks, along.image_size, newest_s)
+    result = solve_once(evidence, Options(camera_height=along.height_m))
+    assert isinstance(result, Calibration) and result.grade == expected
+    rows = {row.kind: row for row in result.verification}
+    assert ('halves_roads' in rows) == (expected == 'assumed')
+    assert expected == 'full' or not rows['halves_roads'].passed
