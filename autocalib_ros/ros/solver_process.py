@@ -15,7 +15,6 @@ from multiprocessing.process import BaseProcess
 
 from autocalib_ros.config import Options
 from autocalib_ros.errors import AutocalibError
-from autocalib_ros.estimation.estimate import solve
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.results.calibration import Calibration, Refusal
@@ -82,6 +81,8 @@ def _run_child(pipe: Connection) -> None:
     """Solve the problems that arrive until the parent closes the pipe."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is handled by the parent
     os.nice(NICENESS)
+    from autocalib_ros.estimation.estimate import solve  # here alone: the parent starts faster and smaller without it
+
     while True:
         try:
             evidence, options, lens = pipe.recv()

@@ -160,6 +160,7 @@ def run_node(options: argparse.Namespace) -> dict:  # noqa: C901  one clock afte
     from autocalib_ros.util.threads import limit_blas_threads
 
     limit_blas_threads()
+    from autocalib_ros.estimation.estimate import solve
     from autocalib_ros.ros import autocalib_node, diagnostics, image_input, node, worker
     from autocalib_ros.ros import solver_process as solver
 
@@ -202,7 +203,7 @@ def run_node(options: argparse.Namespace) -> dict:  # noqa: C901  one clock afte
         began, timed.solving = time.perf_counter(), True
         try:
             if options.solve_in_thread:
-                return solver.solve(*given, **named)
+                return solve(*given, **named)
             return own_solve(solver_process, *given, **named)
         finally:
             timed.solving = False
