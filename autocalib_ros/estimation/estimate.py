@@ -98,7 +98,9 @@ def _estimate_and_scale(
         solution = find_solution(traffic, tracks, options, height_m=height_m, lens=lens)
     if isinstance(solution, Reason):
         return solution
-    return draft.calibration(with_solution_rows(solution, options.gate), kept[tracks.indices]), solution.from_markings
+    return draft.calibration(
+        with_solution_rows(solution, options.gate), traffic, kept[tracks.indices]
+    ), solution.from_markings
 
 
 def _unusual_height_m(solution: Solution | Reason, options: Options) -> float | None:

@@ -17,6 +17,7 @@ from autocalib_ros.estimation.solution import Solution
 from autocalib_ros.estimation.verification.ground_normal import PlaneEstimate
 from autocalib_ros.estimation.verification.readiness import stillness_checks
 from autocalib_ros.estimation.verification.scale import Scale, check_scale, known_scale
+from autocalib_ros.estimation.verification.vehicle_size import measure_vehicle_size
 from autocalib_ros.evidence.snapshot import Evidence, TrackKind
 from autocalib_ros.geometry.ground_plane import ground_plane, ground_points, pixels_ahead, tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera
@@ -57,8 +58,11 @@ class ResultDraft:
         """Return a refusal."""
         return Refusal.from_reason(why, self.options.method, self.evidence.summary(), self.figures)
 
-    def calibration(self, solution: Solution, tracks: np.ndarray) -> Calibration:
-        """Return a solution, whose tracks have these indices (n,) in the evidence, with its scale, if there is one."""
+    def calibration(self, solution: Solution, traffic: Evidence, tracks: np.ndarray) -> Calibration:
+        """Return a solution from traffic with its scale, if there is one.
+
+        `tracks` are the indices (n,) of the tracks of the solution in the whole evidence.
+        """
         lens = Calibration(
             method=self.options.method,
             grade='lens',
@@ -75,7 +79,7 @@ class ResultDraft:
             newest_stamp_ns=self.evidence.newest_stamp_ns,
             figures=self._figures(solution, tracks),
         )
-        return _with_ground(lens, solution, self.options)
+        return _with_ground(lens, solution, traffic, self.options)
 
     def _figures(self, solution: Solution, tracks: np.ndarray) -> Figures:
         """Add the label of each track, the residuals, and the orientations of the segments in the estimated lens."""
@@ -149,7 +153,7 @@ def count_pedestrians(result: Calibration, pedestrians: int) -> Calibration:
     )
 
 
-def _with_ground(lens: Calibration, solution: Solution, options: Options) -> Calibration:
+def _with_ground(lens: Calibration, solution: Solution, traffic: Evidence, options: Options) -> Calibration:
     """Add the ground plane to a lens if the traffic gives one and the scale is known."""
     plane, scale = solution.plane, solution.plane_refusal or scale_of(solution, options)
     if isinstance(scale, Reason):
@@ -162,10 +166,17 @@ def _with_ground(lens: Calibration, solution: Solution, options: Options) -> Cal
     height_row = verified('height_sigma', height_sigma_m / height_m, options.gate.max_sigma_height_rel)
     normal = plane.normal(plane.fit.state)
     tilt, roll = plane.sigma(lambda _, normal: tilt_and_roll_deg(normal))
+    size = measure_vehicle_size(traffic, *plane.lens_and_normal, height_m) if scale.metric else None
+    assumed = solution.assumed or (size is not None and size.row.lowers_grade)
     return replace(
         lens,
-        verification=(*lens.verification, height_row) if measured_height else lens.verification,
-        grade='unit_scale' if not scale.metric else 'assumed' if solution.assumed else 'full',
+        checks=(*lens.checks, *(() if size is None else (size.statement(height_m),))),
+        verification=(
+            *lens.verification,
+            *((height_row,) if measured_height else ()),
+            *(() if size is None else (size.row,)),
+        ),
+        grade='unit_scale' if not scale.metric else 'assumed' if assumed else 'full',
         ground=ground_plane(normal, solution.along, height_m, metric=scale.metric),
         assumptions=(*lens.assumptions, *scale.assumption(height_m, height_sigma_m)),
         covariance=_covariance(plane, scale) if scale.metric else None,

@@ -212,6 +212,8 @@ CHECKS: dict[str, Wording] = {
     'edges_and_level': 'edges of vehicles and a level camera differ by {difference_deg:.1f} degrees about the road',
     'lane_changes': '{vehicles} vehicles that change lanes (+- {sigma_deg:.1f} degrees about the road) differ by '
     '{difference_deg:.1f} degrees from the assumed plane',
+    'vehicle_size': '{vehicles} vehicles are {ratio:.2f} times as large as usual at a camera height of {height_m:.3g} '
+    'm; {usual_height_m:.3g} +- {usual_height_sigma_m:.2g} m would make them usual',
     'lane_markings': _lane_markings_difference,
     'markings_and_traffic_normal': 'ground normals from traffic and lane markings differ by {difference_deg:.1f} '
     'degrees ({sigma_deg:.1f} expected)',
