@@ -38,7 +38,10 @@ def verdict(result: Calibration | Refusal) -> str:
     down, _ = tilt_and_roll_deg(result.ground.normal_in_camera)
     pose = f'the camera looks {_with_sigma(down, result.stddev.tilt_deg, 1)} degrees down'
     if result.ground.metric:
-        done = 'Calibrated, ground plane by assumption' if result.grade == 'assumed' else 'Calibrated'
+        done = 'Calibrated'
+        if result.grade == 'assumed':
+            contradicted = any(row.lowers_grade for row in result.verification)
+            done += ', but a check contradicts it' if contradicted else ', ground plane by assumption'
         return f'{done}: {focal}; {pose} from {result.ground.height_m:.2f} m above the road.'
     return f'Calibrated: {focal}; {pose}; lengths on the road are in camera heights, because the height was not given.'
 

@@ -53,3 +53,9 @@ def test_a_row_of_a_newer_version_is_still_shown():
 def test_every_quantity_has_a_name_of_its_own():
     names = [quantity.name for quantity in VERIFIED_QUANTITIES.values()]
     assert len(set(names)) == len(names)
+
+
+def test_only_a_failed_check_that_costs_the_grade_lowers_it() -> None:
+    assert verified('vehicle_size', 0.5, 0.25).lowers_grade
+    assert not verified('vehicle_size', 0.1, 0.25).lowers_grade
+    assert not verified('pixel_aspect', 9.0, 4.0).lowers_grade
