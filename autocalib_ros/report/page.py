@@ -25,7 +25,7 @@ from autocalib_ros.report import (
 )
 from autocalib_ros.report.canvas import STYLE, jpeg, png, render_bgr
 from autocalib_ros.report.scene import ReportScene
-from autocalib_ros.report.text import file_rows, how_sure, needs, next_step, number_rows, verdict
+from autocalib_ros.report.text import contradictions, file_rows, how_sure, needs, next_step, number_rows, verdict
 from autocalib_ros.results.calibration import Calibration, Refusal
 from autocalib_ros.util.files import write_atomically
 
@@ -267,6 +267,7 @@ def _page(scene: ReportScene, drawn: list[_Drawn]) -> str:
         source=scene.source,
         version=__version__,
         how_sure=how_sure(result),
+        contradictions=contradictions(result),
         next_step=next_step(result),
         code=_code(result),
         needs=needs(result, scene.evidence, scene.options.gate),

@@ -40,10 +40,15 @@ def verdict(result: Calibration | Refusal) -> str:
     if result.ground.metric:
         done = 'Calibrated'
         if result.grade == 'assumed':
-            contradicted = any(row.lowers_grade for row in result.verification)
-            done += ', but a check contradicts it' if contradicted else ', ground plane by assumption'
+            done += ', but a check contradicts it' if contradictions(result) else ', ground plane by assumption'
         return f'{done}: {focal}; {pose} from {result.ground.height_m:.2f} m above the road.'
     return f'Calibrated: {focal}; {pose}; lengths on the road are in camera heights, because the height was not given.'
+
+
+def contradictions(result: Calibration | Refusal) -> list[str]:
+    """Return the failed checks that cost grade full, in words."""
+    rows = () if isinstance(result, Refusal) else result.verification
+    return [f'{row.name}: {row.value_text}, {row.limit_text}' for row in rows if row.lowers_grade]
 
 
 def remedy(result: Calibration | Refusal) -> str:
@@ -244,6 +249,15 @@ def next_step(result: Calibration | Refusal) -> str:
     if result.grade == 'unit_scale':
         return 'Give the height of the camera above the road to get metres.'
     check = 'Check that the ground grid lies flat along the road markings'
+    size = next((each.values for each in result.checks if each.kind == 'vehicle_size'), None)
+    if size and any(row.kind == 'vehicle_size' and row.lowers_grade for row in result.verification):
+        height = f'{size["usual_height_m"]:.3g} +- {size["usual_height_sigma_m"]:.2g} m'
+        return (
+            f'Check the camera height, or the length or speed from which it follows: at {height} the vehicles would be '
+            'as large as usual.'
+        )
+    if contradictions(result):
+        return f'{check}, and find out why the check failed before you rely on the result.'
     if result.grade == 'assumed':
         return f'{check}; the ground plane depends on an assumption until crossing or turning traffic is observed.'
     return f'{check} and that the speeds are plausible for this road; then use the files.'

@@ -14,7 +14,7 @@ from autocalib_ros.estimation.verification.vehicle_size import (
 )
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.offline.synthetic.junction import Junction, evidence_from_tracks
-from autocalib_ros.report.text import verdict
+from autocalib_ros.report.text import next_step, verdict
 from autocalib_ros.results.calibration import Calibration
 from silhouette_evidence import driven, with_outlines
 from solved_once import evidence_once, solve_once
@@ -58,4 +58,5 @@ def test_a_wrong_height_costs_grade_full(told: float, grade: str) -> None:
     assert isinstance(result, Calibration) and result.grade == grade
     (row,) = [row for row in result.verification if row.kind == 'vehicle_size']
     assert row.passed is (grade == 'full')
+    assert ('Check the camera height' in next_step(result)) is not row.passed
     assert verdict(result).startswith('Calibrated:' if row.passed else 'Calibrated, but a check contradicts it:')
