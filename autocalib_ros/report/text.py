@@ -40,15 +40,26 @@ def verdict(result: Calibration | Refusal) -> str:
     if result.ground.metric:
         done = 'Calibrated'
         if result.grade == 'assumed':
-            done += ', but a check contradicts it' if contradictions(result) else ', ground plane by assumption'
+            done += _lesser_grade(result)
         return f'{done}: {focal}; {pose} from {result.ground.height_m:.2f} m above the road.'
     return f'Calibrated: {focal}; {pose}; lengths on the road are in camera heights, because the height was not given.'
 
 
+def _lesser_grade(result: Calibration) -> str:
+    """Return why a calibration with a metric ground plane has not grade full."""
+    if contradictions(result):
+        return ', but a check contradicts it'
+    return ', too uncertain for grade full' if _is_uncertain(result) else ', ground plane by assumption'
+
+
+def _is_uncertain(result: Calibration) -> bool:
+    return any(row.lowers_grade and not row.contradicts for row in result.verification)
+
+
 def contradictions(result: Calibration | Refusal) -> list[str]:
-    """Return the failed checks that cost grade full, in words."""
+    """Return the failed checks that contradict a calibration, in words."""
     rows = () if isinstance(result, Refusal) else result.verification
-    return [f'{row.name}: {row.value_text}, {row.limit_text}' for row in rows if row.lowers_grade]
+    return [f'{row.name}: {row.value_text}, {row.limit_text}' for row in rows if row.contradicts]
 
 
 def remedy(result: Calibration | Refusal) -> str:
@@ -258,6 +269,8 @@ def next_step(result: Calibration | Refusal) -> str:
         )
     if contradictions(result):
         return f'{check}, and find out why the check failed before you rely on the result.'
+    if _is_uncertain(result):
+        return f'{check}; more traffic, above all on crossing roads or turning, makes the result more certain.'
     if result.grade == 'assumed':
         return f'{check}; the ground plane depends on an assumption until crossing or turning traffic is observed.'
     return f'{check} and that the speeds are plausible for this road; then use the files.'

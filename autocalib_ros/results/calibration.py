@@ -142,8 +142,8 @@ class Calibration:
 
     method: str
     grade: str
-    """'full': lens and metric ground plane; 'assumed': the same, but the plane rests on an assumption; 'unit_scale':
-    the plane in units of the camera height; 'lens': no plane."""
+    """'full': lens and metric ground plane; 'assumed': the same, but the plane rests on an assumption, a check
+    contradicts it, or it is too uncertain; 'unit_scale': the plane in units of the camera height; 'lens': no plane."""
     assumptions: tuple[Statement, ...]
     """What was assumed: kinds of `statements.ASSUMPTIONS`."""
     checks: tuple[Statement, ...] = ()

@@ -28,11 +28,16 @@ class VerifiedQuantity:
 REFUSED = 'no calibration'
 NO_PLANE = 'no ground plane'
 GRADE_ASSUMED = 'not grade full'
+TOO_UNCERTAIN = 'too uncertain for grade full'
 WIDENED = 'wider standard deviations'
 
 VERIFIED_QUANTITIES: dict[str, VerifiedQuantity] = {
     'focal_sigma': VerifiedQuantity('standard deviation of the focal length', '%', REFUSED),
+    'focal_sigma_full': VerifiedQuantity('standard deviation of the focal length, for grade full', '%', TOO_UNCERTAIN),
     'plane_sigma': VerifiedQuantity('standard deviation of tilt or roll, the larger', 'degrees', NO_PLANE),
+    'plane_sigma_full': VerifiedQuantity(
+        'standard deviation of tilt or roll, the larger, for grade full', 'degrees', TOO_UNCERTAIN
+    ),
     'height_sigma': VerifiedQuantity('standard deviation of the camera height', '%', NO_PLANE),
     'vehicle_size': VerifiedQuantity('size of the vehicles against the usual one', '%', GRADE_ASSUMED),
     'below_horizon': VerifiedQuantity('tracked points below the horizon', '%', REFUSED, at_least=True),
@@ -98,6 +103,11 @@ class VerificationRow:
     @property
     def lowers_grade(self) -> bool:
         """Whether the check failed and thereby costs grade full."""
+        return not self.passed and self._quantity.cost in (GRADE_ASSUMED, TOO_UNCERTAIN)
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether the check failed because two sources, or a source and its prior, contradict each other."""
         return not self.passed and self._quantity.cost == GRADE_ASSUMED
 
     @property

@@ -46,3 +46,15 @@ def test_a_junction_has_a_table_of_what_was_verified() -> None:
     assert {'focal_sigma', 'plane_sigma', 'k1_prior', 'straight_share', 'halves_focal', 'pixel_aspect'} <= rows.keys()
     assert rows['focal_sigma'].value == pytest.approx(result.stddev.focal_px / result.camera.focal_px, rel=1e-6)
     assert rows['plane_sigma'].value == pytest.approx(max(result.stddev.tilt_deg, result.stddev.roll_deg), rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ('focal_sigma', 'plane_sigma_deg', 'full'), [(0.02, 0.5, True), (0.04, 0.5, False), (0.02, 1.3, False)]
+)
+def test_an_uncertain_result_has_not_grade_full(focal_sigma: float, plane_sigma_deg: float, full: bool) -> None:
+    certain = solution_with_point(639.5)
+    fit = SimpleNamespace(**{**vars(certain.fit), 'focal_sigma': focal_sigma})
+    plane = SimpleNamespace(**{**vars(certain.plane), 'worst_sigma_deg': plane_sigma_deg})
+    found = with_solution_rows(replace(certain, fit=fit, plane=plane), GateOptions())
+    assert found.reduced is not full
+    assert not any(row.contradicts for row in found.comparisons)

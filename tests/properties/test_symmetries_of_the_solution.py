@@ -22,7 +22,7 @@ JUNCTION = Junction(vehicles=40, points_per_vehicle=2, turning_fraction=0.1)
 
 def solved(evidence: Evidence, options: Options = OPTIONS) -> Calibration:
     result = solve_once(evidence, options)
-    assert isinstance(result, Calibration) and result.grade == 'full', result
+    assert isinstance(result, Calibration) and result.ground is not None, result
     return result
 
 
