@@ -23,6 +23,7 @@ from autocalib_ros.estimation.publish import (
     find_pedestrians,
     scale_of,
     with_requested_model,
+    with_vehicle_size,
 )
 from autocalib_ros.estimation.solution import Observations, Solution, accepted, append_reason, is_better
 from autocalib_ros.estimation.solution_rows import with_solution_rows
@@ -83,6 +84,8 @@ def _solve_joint(traffic: Evidence, kept: np.ndarray, draft: ResultDraft, lens: 
         driving = kept[~np.isin(traffic.track_vehicles, pedestrians)]
         again = check_readiness(vehicles, draft.options.gate) or _estimate_and_scale(vehicles, driving, draft, lens)
         result = choose_solution(result, again if isinstance(again, Reason) else again[0])
+    # The size of the vehicles tests the scale.
+    result = with_vehicle_size(result, traffic.without_vehicles(pedestrians))
     return count_pedestrians(result, len(pedestrians))
 
 
@@ -98,9 +101,7 @@ def _estimate_and_scale(
         solution = find_solution(traffic, tracks, options, height_m=height_m, lens=lens)
     if isinstance(solution, Reason):
         return solution
-    return draft.calibration(
-        with_solution_rows(solution, options.gate), traffic, kept[tracks.indices]
-    ), solution.from_markings
+    return draft.calibration(with_solution_rows(solution, options.gate), kept[tracks.indices]), solution.from_markings
 
 
 def _unusual_height_m(solution: Solution | Reason, options: Options) -> float | None:

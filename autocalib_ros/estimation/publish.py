@@ -58,11 +58,8 @@ class ResultDraft:
         """Return a refusal."""
         return Refusal.from_reason(why, self.options.method, self.evidence.summary(), self.figures)
 
-    def calibration(self, solution: Solution, traffic: Evidence, tracks: np.ndarray) -> Calibration:
-        """Return a solution from traffic with its scale, if there is one.
-
-        `tracks` are the indices (n,) of the tracks of the solution in the whole evidence.
-        """
+    def calibration(self, solution: Solution, tracks: np.ndarray) -> Calibration:
+        """Return a solution, whose tracks have these indices (n,) in the evidence, with its scale, if there is one."""
         lens = Calibration(
             method=self.options.method,
             grade='lens',
@@ -79,7 +76,7 @@ class ResultDraft:
             newest_stamp_ns=self.evidence.newest_stamp_ns,
             figures=self._figures(solution, tracks),
         )
-        return _with_ground(lens, solution, traffic, self.options)
+        return _with_ground(lens, solution, self.options)
 
     def _figures(self, solution: Solution, tracks: np.ndarray) -> Figures:
         """Add the label of each track, the residuals, and the orientations of the segments in the estimated lens."""
@@ -144,6 +141,22 @@ def choose_solution(of_all: Calibration, of_vehicles: Calibration | Reason) -> C
     return replace(of_all, checks=(*of_all.checks, check('pedestrians_kept', without=without)))
 
 
+def with_vehicle_size(result: Calibration, vehicles: Evidence) -> Calibration:
+    """Add the comparison of the vehicles with usual ones, which tests the scale; contradiction lowers the grade."""
+    ground = result.ground
+    if ground is None or not ground.metric:
+        return result
+    size = measure_vehicle_size(vehicles, result.camera, ground.normal_in_camera, ground.height_m)
+    if size is None:
+        return result
+    return replace(
+        result,
+        grade='assumed' if size.row.lowers_grade else result.grade,
+        checks=(*result.checks, size.statement(ground.height_m)),
+        verification=(*result.verification, size.row),
+    )
+
+
 def count_pedestrians(result: Calibration, pedestrians: int) -> Calibration:
     """Count pedestrians apart from the vehicles."""
     counts = result.evidence
@@ -153,7 +166,7 @@ def count_pedestrians(result: Calibration, pedestrians: int) -> Calibration:
     )
 
 
-def _with_ground(lens: Calibration, solution: Solution, traffic: Evidence, options: Options) -> Calibration:
+def _with_ground(lens: Calibration, solution: Solution, options: Options) -> Calibration:
     """Add the ground plane to a lens if the traffic gives one and the scale is known."""
     plane, scale = solution.plane, solution.plane_refusal or scale_of(solution, options)
     if isinstance(scale, Reason):
@@ -166,17 +179,10 @@ def _with_ground(lens: Calibration, solution: Solution, traffic: Evidence, optio
     height_row = verified('height_sigma', height_sigma_m / height_m, options.gate.max_sigma_height_rel)
     normal = plane.normal(plane.fit.state)
     tilt, roll = plane.sigma(lambda _, normal: tilt_and_roll_deg(normal))
-    size = measure_vehicle_size(traffic, *plane.lens_and_normal, height_m) if scale.metric else None
-    assumed = solution.assumed or (size is not None and size.row.lowers_grade)
     return replace(
         lens,
-        checks=(*lens.checks, *(() if size is None else (size.statement(height_m),))),
-        verification=(
-            *lens.verification,
-            *((height_row,) if measured_height else ()),
-            *(() if size is None else (size.row,)),
-        ),
-        grade='unit_scale' if not scale.metric else 'assumed' if assumed else 'full',
+        verification=(*lens.verification, height_row) if measured_height else lens.verification,
+        grade='unit_scale' if not scale.metric else 'assumed' if solution.assumed else 'full',
         ground=ground_plane(normal, solution.along, height_m, metric=scale.metric),
         assumptions=(*lens.assumptions, *scale.assumption(height_m, height_sigma_m)),
         covariance=_covariance(plane, scale) if scale.metric else None,

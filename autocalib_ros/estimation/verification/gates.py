@@ -58,8 +58,11 @@ MAX_HALVES_SIGMAS, MAX_WHOLE_SIGMAS = 3.5, 3.0
 """Allowed difference between two halves of the evidence: in their own sigmas, and in the sigmas that follow from the
 whole."""
 MAX_SHARE_SIGMAS = 4.0
-"""Largest difference between the shares of vehicles that follow the roads in two halves, in standard deviations of
-independent vehicles (0.006 %; vehicles come in platoons, so that three would be exceeded by honest traffic)."""
+"""Largest difference between the shares of vehicles that follow the roads in two halves, in standard deviations: it is
+exceeded by 0.006 % of normal differences, and by 0.4 % where the standard deviation comes from blocks."""
+SHARE_BLOCKS, MIN_BLOCK_VEHICLES = 5, 2
+"""Blocks of vehicles in a row in each half, by which the standard deviation of a share is measured, and fewest vehicles
+in a block. Judgement."""
 HALVES_FOCAL_TOLERANCE = 0.03
 HALVES_NORMAL_TOLERANCE_DEG = 1.5
 """Difference between two halves that is always allowed: the promised accuracy."""
@@ -266,8 +269,7 @@ def _compare_shares(fit: Adjustment, tracks: TrackSet, early: np.ndarray) -> Rea
     no lack of traffic.
     """
     on_road = fit.inliers()
-    following = [_vehicles_with(on_road[half], tracks.vehicles[half]) for half in (early, ~early)]
-    compared = _share_difference(*following)
+    compared = share_difference(*_halves_in_order(tracks, np.ones(len(tracks), bool), on_road, early))
     if compared is None:
         return ()
     earlier, later, sigmas = compared
@@ -283,34 +285,46 @@ def _compare_roads(fit: Adjustment, tracks: TrackSet, early: np.ndarray) -> tupl
     One road early and another one late may be the phases of a traffic light, or two views, and nothing tells which.
     """
     on_road = fit.inliers()
-    vehicles, labels = tracks.vehicles[on_road], fit.labels[on_road]
     differences = [
-        _share_difference(
-            *(_vehicles_with(labels[half] == road, vehicles[half]) for half in (early[on_road], ~early[on_road]))
-        )
+        share_difference(*_halves_in_order(tracks, on_road, fit.labels == road, early))
         for road in range(len(fit.state.angles_rad))
     ]
     sigmas = [compared[2] for compared in differences if compared is not None]
     return (verified('halves_roads', max(sigmas), MAX_SHARE_SIGMAS),) if len(sigmas) > 1 else ()
 
 
-def _vehicles_with(seen: np.ndarray, vehicles: np.ndarray) -> np.ndarray:
-    """Mask (vehicles,) of the distinct vehicles of which any track (tracks,) is `seen`."""
-    return np.bincount(np.unique(vehicles, return_inverse=True)[1], seen) > 0
+def _halves_in_order(tracks: TrackSet, of: np.ndarray, seen: np.ndarray, early: np.ndarray) -> list[np.ndarray]:
+    """Return for each half, of the vehicles with a track (tracks,) in the mask `of`, which have one that is `seen`.
+
+    In the order of their mean times.
+    """
+    halves = []
+    for half in (early, ~early):
+        rows = np.flatnonzero(half & of)
+        _, first, vehicle = np.unique(tracks.vehicles[rows], return_index=True, return_inverse=True)
+        times = _mean_times(tracks.vehicles[rows], tracks.times_s[rows])[first]
+        halves.append((np.bincount(vehicle, seen[rows], len(first)) > 0)[np.argsort(times, kind='stable')])
+    return halves
 
 
-def _share_difference(earlier: np.ndarray, later: np.ndarray) -> tuple[float, float, float] | None:
-    """Return the shares of two masks of vehicles, and their difference in standard deviations of independent ones.
+def share_difference(earlier: np.ndarray, later: np.ndarray) -> tuple[float, float, float] | None:
+    """Return the shares of two masks of vehicles, in order of time, and their difference in standard deviations.
 
     None for fewer than `MIN_VEHICLES_PER_ROAD` vehicles in a half, or for less than half as many as in the other.
+    Vehicles come in platoons and in the phases of traffic lights, so that the standard deviation is not only that of
+    independent vehicles: where it is larger, that of the means of `SHARE_BLOCKS` blocks in a row is taken.
     """
     counts = np.array([len(earlier), len(later)])
     if counts.min() < max(MIN_VEHICLES_PER_ROAD, 0.5 * counts.max()):
         return None
     whole = float(np.concatenate([earlier, later]).mean())
-    sigma = float(np.sqrt(max(whole * (1.0 - whole), 1e-9) * (1.0 / counts).sum()))
+    independent = max(whole * (1.0 - whole), 1e-9) * float((1.0 / counts).sum())
+    in_blocks = 0.0
+    if counts.min() >= MIN_BLOCK_VEHICLES * SHARE_BLOCKS:
+        blocks = [[part.mean() for part in np.array_split(half, SHARE_BLOCKS)] for half in (earlier, later)]
+        in_blocks = float(sum(np.var(means, ddof=1) for means in blocks)) / SHARE_BLOCKS
     shares = float(earlier.mean()), float(later.mean())
-    return (*shares, abs(shares[0] - shares[1]) / sigma)
+    return (*shares, abs(shares[0] - shares[1]) / float(np.sqrt(max(independent, in_blocks))))
 
 
 def _compare_poses(first: Adjustment, second: Adjustment) -> Reason | tuple[VerificationRow, ...]:

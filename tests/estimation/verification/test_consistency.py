@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from autocalib_ros.config import Options
+from autocalib_ros.estimation.verification.gates import share_difference
 from autocalib_ros.evidence.snapshot import Track
 from autocalib_ros.offline.benchmark.monte_carlo import draw_evidence
 from autocalib_ros.offline.synthetic.junction import Junction, evidence_from_tracks
@@ -53,3 +54,14 @@ def test_roads_that_are_never_seen_in_the_same_half_cost_grade_full(begin_s: flo
     rows = {row.kind: row for row in result.verification}
     assert ('halves_roads' in rows) == (expected == 'assumed')
     assert expected == 'full' or not rows['halves_roads'].passed
+
+
+def test_platoons_and_phases_of_a_traffic_light_make_shares_less_certain() -> None:
+    phases = np.repeat([1, 0, 1, 0, 1], 20).astype(bool)  # most follow the roads in one phase, and few in the next
+    shares = share_difference(phases, np.repeat([1, 1, 0, 1, 1], 20).astype(bool))
+    assert shares is not None
+    earlier, later, sigmas = shares
+    assert (earlier, later) == (0.6, 0.8) and sigmas < 1.0
+    mixed = share_difference(phases[np.arange(100) * 7 % 100], np.ones(100, bool))
+    assert mixed is not None and mixed[2] > 6.0
+    assert share_difference(np.zeros(20, bool), np.ones(20, bool))[2] > 6.0
