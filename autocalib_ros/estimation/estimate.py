@@ -22,6 +22,7 @@ from autocalib_ros.estimation.publish import (
     count_pedestrians,
     find_pedestrians,
     scale_of,
+    with_certainty,
     with_requested_model,
     with_vehicle_size,
 )
@@ -84,8 +85,8 @@ def _solve_joint(traffic: Evidence, kept: np.ndarray, draft: ResultDraft, lens: 
         driving = kept[~np.isin(traffic.track_vehicles, pedestrians)]
         again = check_readiness(vehicles, draft.options.gate) or _estimate_and_scale(vehicles, driving, draft, lens)
         result = choose_solution(result, again if isinstance(again, Reason) else again[0])
-    # The size of the vehicles tests the scale.
-    result = with_vehicle_size(result, traffic.without_vehicles(pedestrians))
+    # The size of the vehicles tests the scale, and grade full asks for certainty.
+    result = with_certainty(with_vehicle_size(result, traffic.without_vehicles(pedestrians)))
     return count_pedestrians(result, len(pedestrians))
 
 

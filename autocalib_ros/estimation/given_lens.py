@@ -31,6 +31,9 @@ point: the promised accuracy, as between two halves of the traffic."""
 TRAFFIC_RADIUS_QUANTILE = 0.75
 """Quantile of the distances of tracked points from the principal point at which the angles of two lenses are compared:
 lens curvature shows in the outer half of the traffic, and few points lie farther out."""
+MAX_TESTING_SIGMA = 0.033
+"""Largest standard deviation of the focal length by the traffic that tests a lens: one that is 10 % off, as of another
+mode or camera, is then noticed at three of them."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +80,7 @@ def verify_given_lens(
         release, row = tested
         if row is not None:
             found = found.compared(row)
+        found = found.compared(verified('given_lens_sigma', release.fit.focal_sigma, MAX_TESTING_SIGMA))
         if found.full:
             return found if row is None or row.passed else _doubted(found, release)
     free = solve_free()

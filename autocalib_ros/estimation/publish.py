@@ -33,6 +33,10 @@ from autocalib_ros.results.refusals import Reason, reason
 from autocalib_ros.results.statements import check
 from autocalib_ros.results.verification_table import verified
 
+MAX_FULL_FOCAL_SIGMA, MAX_FULL_PLANE_SIGMA_DEG = 0.03, 1.2
+"""Largest standard deviations, of the focal length (relative) and of tilt or roll, of grade full: nine in ten of the
+results at the limit are within 5 % and 2 degrees."""
+
 
 @dataclass(frozen=True)
 class ResultDraft:
@@ -139,6 +143,17 @@ def choose_solution(of_all: Calibration, of_vehicles: Calibration | Reason) -> C
     else:
         return of_vehicles
     return replace(of_all, checks=(*of_all.checks, check('pedestrians_kept', without=without)))
+
+
+def with_certainty(result: Calibration) -> Calibration:
+    """Add the limits of grade full for the standard deviations; a less certain result is of grade assumed."""
+    sigma, rows = result.stddev, []
+    if sigma.focal_px:
+        rows.append(verified('focal_sigma_full', sigma.focal_px / result.camera.focal_px, MAX_FULL_FOCAL_SIGMA))
+    if sigma.tilt_deg is not None and sigma.roll_deg is not None:
+        rows.append(verified('plane_sigma_full', max(sigma.tilt_deg, sigma.roll_deg), MAX_FULL_PLANE_SIGMA_DEG))
+    lowered = result.grade == 'full' and any(row.lowers_grade for row in rows)
+    return replace(result, grade='assumed' if lowered else result.grade, verification=(*result.verification, *rows))
 
 
 def with_vehicle_size(result: Calibration, vehicles: Evidence) -> Calibration:

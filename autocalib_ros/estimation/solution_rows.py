@@ -18,11 +18,6 @@ MAX_PRINCIPAL_POINT_SIGMAS = 3.5
 its prior: 0.1 % of the lenses exceed it."""
 
 
-MAX_FULL_FOCAL_SIGMA, MAX_FULL_PLANE_SIGMA_DEG = 0.03, 1.2
-"""Largest standard deviations, of the focal length (relative) and of tilt or roll, of grade full: nine in ten of the
-results at the limit are within 5 % and 2 degrees."""
-
-
 def with_solution_rows(found: Solution, gate: GateOptions) -> Solution:
     """Return a solution with all rows of its verification table.
 
@@ -37,7 +32,6 @@ def _rows(found: Solution, gate: GateOptions) -> Iterator[VerificationRow]:
     prior = found.fit.problem.config.prior
     if not prior.focal_known:
         yield verified('focal_sigma', found.fit.focal_sigma, gate.max_sigma_focal_rel)
-        yield verified('focal_sigma_full', found.fit.focal_sigma, MAX_FULL_FOCAL_SIGMA)
     if prior.sigma[3] > 0:
         yield verified('k1_prior', k1_prior_sigmas(found.fit), MAX_K1_SIGMAS)
     if (prior.sigma[1:3] > 0).all():
@@ -50,4 +44,3 @@ def _rows(found: Solution, gate: GateOptions) -> Iterator[VerificationRow]:
         yield verified('below_horizon', plane.fraction_below_horizon, MIN_FRACTION_BELOW_HORIZON)
         limit_deg = max_plane_sigma_deg(plane, gate, assumed=found.assumed)
         yield verified('plane_sigma', plane.worst_sigma_deg, limit_deg)
-        yield verified('plane_sigma_full', plane.worst_sigma_deg, MAX_FULL_PLANE_SIGMA_DEG)

@@ -77,7 +77,8 @@ def estimate_from_lane_markings(observations: Observations, config: AdjustmentCo
     """Estimate from lane markings; the traffic, seen through the lens that they give, has to confirm the plane."""
     priors = [_prior_for_markings(prior) for prior in observations.priors]
     if config.options.principal_point_sigma_px < 0:
-        priors += [prior.with_loose_principal_point() for prior in priors]
+        # distortion shows the principal point; without it, it trades against focal length and tilt
+        priors += [prior.with_loose_principal_point() for prior in priors if prior.family == 'equidistant']
     found = fit_to_markings(observations.evidence, observations.tracks, priors, config, observations.gate)
     if isinstance(found, Reason):
         return found

@@ -64,6 +64,9 @@ VERIFIED_QUANTITIES: dict[str, VerifiedQuantity] = {
     'edges_and_level': VerifiedQuantity('plane by vehicle edges against by a level camera', 'degrees', NO_PLANE),
     'lane_changes': VerifiedQuantity('plane by lane changes against the assumed plane', 'degrees', NO_PLANE),
     'pixel_aspect': VerifiedQuantity('pixel aspect against the one by the traffic', 'sigma', WIDENED),
+    'given_lens_sigma': VerifiedQuantity(
+        'standard deviation of the focal length by the traffic, which tests the given one', '%', TOO_UNCERTAIN
+    ),
     'given_lens': VerifiedQuantity('given focal length against the one by the traffic', '%', GRADE_ASSUMED),
 }
 """Every quantity of a verification, by its kind."""
