@@ -100,7 +100,7 @@ class Browser:
 def browser() -> Iterator[Browser]:
     """Start Chromium, and end it."""
     (child_in, write), (read, child_out) = os.pipe(), os.pipe()
-    with tempfile.TemporaryDirectory() as home:
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as home:  # a browser that ends still writes
         # the pipe is on descriptors 3 and 4 of the browser
         command = (
             f'exec {chromium()} --headless=new --no-sandbox --disable-gpu --disable-dev-shm-usage --no-first-run'
