@@ -80,13 +80,13 @@ def _solve_joint(traffic: Evidence, kept: np.ndarray, draft: ResultDraft, lens: 
     result, from_markings = found
     # Pedestrians and cyclists are known once lens and plane are: all is estimated again without them.
     pedestrians = find_pedestrians(result, traffic)
+    vehicles = traffic.without_vehicles(pedestrians)
     if len(pedestrians) and not from_markings:
-        vehicles = traffic.without_vehicles(pedestrians)
         driving = kept[~np.isin(traffic.track_vehicles, pedestrians)]
         again = check_readiness(vehicles, draft.options.gate) or _estimate_and_scale(vehicles, driving, draft, lens)
         result = choose_solution(result, again if isinstance(again, Reason) else again[0])
     # The size of the vehicles tests the scale, and grade full asks for certainty.
-    result = with_certainty(with_vehicle_size(result, traffic.without_vehicles(pedestrians)))
+    result = with_certainty(with_vehicle_size(result, vehicles))
     return count_pedestrians(result, len(pedestrians))
 
 

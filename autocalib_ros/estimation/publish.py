@@ -31,7 +31,7 @@ from autocalib_ros.results.calibration import (
 )
 from autocalib_ros.results.refusals import Reason, reason
 from autocalib_ros.results.statements import check
-from autocalib_ros.results.verification_table import verified
+from autocalib_ros.results.verification_table import VerificationRow, verified
 
 MAX_FULL_FOCAL_SIGMA, MAX_FULL_PLANE_SIGMA_DEG = 0.03, 1.2
 """Largest standard deviations, of the focal length (relative) and of tilt or roll, of grade full: nine in ten of the
@@ -152,8 +152,7 @@ def with_certainty(result: Calibration) -> Calibration:
         rows.append(verified('focal_sigma_full', sigma.focal_px / result.camera.focal_px, MAX_FULL_FOCAL_SIGMA))
     if sigma.tilt_deg is not None and sigma.roll_deg is not None:
         rows.append(verified('plane_sigma_full', max(sigma.tilt_deg, sigma.roll_deg), MAX_FULL_PLANE_SIGMA_DEG))
-    lowered = result.grade == 'full' and any(row.lowers_grade for row in rows)
-    return replace(result, grade='assumed' if lowered else result.grade, verification=(*result.verification, *rows))
+    return _with_rows(result, *rows)
 
 
 def with_vehicle_size(result: Calibration, vehicles: Evidence) -> Calibration:
@@ -164,12 +163,14 @@ def with_vehicle_size(result: Calibration, vehicles: Evidence) -> Calibration:
     size = measure_vehicle_size(vehicles, result.camera, ground.normal_in_camera, ground.height_m)
     if size is None:
         return result
-    return replace(
-        result,
-        grade='assumed' if size.row.lowers_grade else result.grade,
-        checks=(*result.checks, size.statement(ground.height_m)),
-        verification=(*result.verification, size.row),
-    )
+    compared = _with_rows(result, size.row)
+    return replace(compared, checks=(*compared.checks, size.statement(ground.height_m)))
+
+
+def _with_rows(result: Calibration, *rows: VerificationRow) -> Calibration:
+    """Add rows to the verification table; one that failed lowers grade full, if that is what it costs."""
+    lowered = result.grade == 'full' and any(row.lowers_grade for row in rows)
+    return replace(result, grade='assumed' if lowered else result.grade, verification=(*result.verification, *rows))
 
 
 def count_pedestrians(result: Calibration, pedestrians: int) -> Calibration:

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
+MAD_TO_SIGMA = 1.4826
+"""Standard deviation over median absolute deviation of a normal distribution."""
 STUDENT_FREEDOM, STUDENT_PEAK_DENSITY = 4.0, 0.375
 """Degrees of freedom of Student's t distribution, and its density at 0 for unit scale: edges of wheels and lamps make
 long tails."""

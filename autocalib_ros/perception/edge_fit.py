@@ -9,6 +9,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from autocalib_ros.geometry.robust_kernels import MAD_TO_SIGMA
+
 EDGE_REACH_PX = 2.5
 """Distance on either side of a segment in which its edge is looked for, pixels: beyond the soft edge, from which LSD is
 off by less than half a pixel in 19 of 20 segments of rendered scenes."""
@@ -100,7 +102,7 @@ def _robust_lines(
         spread = np.maximum((robust * from_mean**2).sum(axis=1), 1e-9)
         slope = (robust * from_mean * (centres - centre[:, None])).sum(axis=1) / spread
         residuals = centres - centre[:, None] - slope[:, None] * from_mean
-        sigma = np.maximum(1.4826 * np.median(np.abs(residuals), axis=1), MIN_EDGE_SIGMA_PX)
+        sigma = np.maximum(MAD_TO_SIGMA * np.median(np.abs(residuals), axis=1), MIN_EDGE_SIGMA_PX)
         scaled = residuals / (EDGE_REJECTION_SIGMAS * sigma[:, None])
         robust = weights * np.maximum(1.0 - scaled**2, 0.0) ** 2
     return centre - slope * share, slope, np.asarray((robust > 0.25 * np.maximum(weights, 1e-9)).mean(axis=1))

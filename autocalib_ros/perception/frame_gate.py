@@ -11,6 +11,7 @@ from enum import Enum
 import cv2
 import numpy as np
 
+from autocalib_ros.geometry.robust_kernels import MAD_TO_SIGMA
 from autocalib_ros.perception.repeats import RepeatDetector
 
 COMPARISON_WIDTH_PX = 64
@@ -119,7 +120,7 @@ def _downsampled(image: np.ndarray) -> np.ndarray:
 
 def _robust_spread(image: np.ndarray) -> float:
     """Return the robust standard deviation of an image, 1.4826 times the median absolute deviation."""
-    return 1.4826 * float(np.median(np.abs(image - np.median(image))))
+    return MAD_TO_SIGMA * float(np.median(np.abs(image - np.median(image))))
 
 
 def _correlation(before: np.ndarray, current: np.ndarray) -> float:

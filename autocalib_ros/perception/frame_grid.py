@@ -11,6 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from autocalib_ros.geometry.robust_kernels import MAD_TO_SIGMA
+
 MIN_IMAGES, MIN_JITTERED_IMAGES = 8, 24
 """Images from which a grid is found: if the stamps are nearly even, and if they jitter or images are lost. With 24 the
 period of stamps with a jitter of 30 % of a frame is known to 0.9 %."""
@@ -204,4 +206,4 @@ def _robust_line(
 
 def _spread(values: np.ndarray) -> float:
     """Return the robust standard deviation around 0, 1.4826 times the median absolute value."""
-    return 1.4826 * float(np.median(np.abs(values)))
+    return MAD_TO_SIGMA * float(np.median(np.abs(values)))

@@ -38,10 +38,8 @@ def verdict(result: Calibration | Refusal) -> str:
     down, _ = tilt_and_roll_deg(result.ground.normal_in_camera)
     pose = f'the camera looks {_with_sigma(down, result.stddev.tilt_deg, 1)} degrees down'
     if result.ground.metric:
-        done = 'Calibrated'
-        if result.grade == 'assumed':
-            done += _lesser_grade(result)
-        return f'{done}: {focal}; {pose} from {result.ground.height_m:.2f} m above the road.'
+        done = _lesser_grade(result) if result.grade == 'assumed' else ''
+        return f'Calibrated{done}: {focal}; {pose} from {result.ground.height_m:.2f} m above the road.'
     return f'Calibrated: {focal}; {pose}; lengths on the road are in camera heights, because the height was not given.'
 
 
@@ -261,7 +259,7 @@ def next_step(result: Calibration | Refusal) -> str:
         return 'Give the height of the camera above the road to get metres.'
     check = 'Check that the ground grid lies flat along the road markings'
     size = next((each.values for each in result.checks if each.kind == 'vehicle_size'), None)
-    if size and any(row.kind == 'vehicle_size' and row.lowers_grade for row in result.verification):
+    if size and any(row.kind == 'vehicle_size' and row.contradicts for row in result.verification):
         height = f'{size["usual_height_m"]:.3g} +- {size["usual_height_sigma_m"]:.2g} m'
         return (
             f'Check the camera height, or the length or speed from which it follows: at {height} the vehicles would be '

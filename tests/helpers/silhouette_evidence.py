@@ -67,6 +67,25 @@ def driven(
     return tracks, outlines
 
 
+def crossing_bodies(
+    junction: Junction,
+    first: int,
+    count: int,
+    size_m: tuple[float, float, float],
+    speeds_m_s: tuple[float, float],
+    seed: int = 1,
+) -> tuple[list[Track], list[Outlines]]:
+    """Tracks and outlines of bodies that cross a junction along one of its roads, in either direction."""
+    generator, tracks, outlines = np.random.default_rng(seed), [], []
+    for number in range(count):
+        heading, speed = np.pi / 2 * generator.integers(4), generator.uniform(*speeds_m_s)
+        way = np.array([np.cos(heading), np.sin(heading)])
+        start = np.array(junction.centre_m) + generator.uniform(-5.0, 5.0, 2) - 5.0 * speed * way
+        own = driven(junction, first + number, 3.0 * number, size_m, start, heading, speed, generator)
+        tracks, outlines = [*tracks, *own[0]], [*outlines, *own[1]]
+    return tracks, outlines
+
+
 def with_outlines(evidence: Evidence, outlines: list[Outlines]) -> Evidence:
     """Put outlines into evidence."""
     buffer = EvidenceBuffer(BufferOptions())

@@ -12,7 +12,7 @@ import numpy as np
 
 from autocalib_ros.estimation.observations.grouping import component_labels
 from autocalib_ros.estimation.observations.track_set import TrackSet
-from autocalib_ros.geometry.robust_kernels import geman_mcclure_weight
+from autocalib_ros.geometry.robust_kernels import MAD_TO_SIGMA, geman_mcclure_weight
 
 MAX_NEIGHBOUR_M = 4.0
 """Largest distance between neighbouring points of one body: the length of a car."""
@@ -120,7 +120,7 @@ def corroboration_weights(
     corroborated = counts >= MIN_CORROBORATING_TRACKS
     if corroborated.sum() < MIN_VEHICLES_FOR_SPREAD:
         return np.ones(len(off_deg))
-    spread = max(MIN_HEADING_SPREAD_DEG, 1.4826 * float(np.median(np.abs(median[corroborated]))))
+    spread = max(MIN_HEADING_SPREAD_DEG, MAD_TO_SIGMA * float(np.median(np.abs(median[corroborated]))))
     weight = geman_mcclure_weight((median / (GEMAN_MCCLURE_SCALE * spread)) ** 2, 1.0)
     return (weight * np.where(corroborated, 1.0, SINGLE_TRACK_WEIGHT))[inverse]
 

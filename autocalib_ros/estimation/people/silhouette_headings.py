@@ -22,7 +22,7 @@ MIN_HEADING_SPEED_M_S = 1.0
 
 
 def are_whole(evidence: Evidence) -> np.ndarray:
-    """Mask (outlines,) of the silhouettes that show a whole body, as far as the picture tells."""
+    """Mask (outlines,) of the silhouettes that show a whole body: clear of others and of the border, in one piece."""
     cell_px = MOTION_CELL * evidence.image_size[0]
     apart = evidence.outlines_px[:, -1] >= MIN_CLEARANCE_CELLS * cell_px
     return apart & ~_are_fragmented(evidence.outline_vehicles, evidence.outline_times_s)

@@ -16,6 +16,7 @@ from autocalib_ros.estimation.adjustment.bundle_adjustment import (
     road_support,
 )
 from autocalib_ros.estimation.adjustment.covariance import sigma_without_prior
+from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig
 from autocalib_ros.estimation.observations.track_set import TrackSet, UnprojectedTracks, long_tracks
 from autocalib_ros.estimation.observations.tracklets import no_tracklets
 from autocalib_ros.estimation.straight.initialisation import MAX_FOCAL_DIAGONALS
@@ -231,18 +232,12 @@ def check_halves(fit: Adjustment, tracks: TrackSet, gate: GateOptions) -> Reason
     share = _compare_shares(fit, tracks, early)
     if isinstance(share, Reason):
         return share
-    not_compared = replace(NOT_COMPARED, rows=(*share, *_compare_roads(fit, tracks, early)))
     fits = []
-    for half, seen, living in ((early, windows, lived), (~early, ~windows, ~lived)):
-        part, bundle = tracks.subset(half), config.bundle and config.bundle.subset(living)
-        part_setting = replace(config, windows=config.windows.subset(seen), bundle=bundle)
-        if half.sum() + seen.sum() + living.sum() < MIN_RESIDUAL_ROWS or (config.turning and not part_setting.turning):
-            return not_compared
-        _, motion, shapes = fit.problem.warm_start
-        warm_start = None, motion.subset(seen) if motion else None, shapes.subset(living) if bundle and shapes else None
-        fits.append(adjust(fit.state, part, part_setting, refine=True, warm_start=warm_start))
-        if any(mask.sum() < gate.min_tracks_per_road // 2 for mask in road_support(fits[-1], part)):
-            return not_compared
+    for masks in ((early, windows, lived), (~early, ~windows, ~lived)):
+        solved = _solve_half(fit, tracks, config, gate, masks)
+        if solved is None:
+            return replace(NOT_COMPARED, rows=(*share, *_compare_roads(fit, tracks, early)))
+        fits.append(solved)
     apart = compare_solutions(*fits)
     focal, turn = apart.focal, apart.normal_deg if fit.plane_known else 0.0  # one road does not determine the normal
     # a large sigma of one half excuses no difference that the sigma of the whole rules out
@@ -260,6 +255,27 @@ def check_halves(fit: Adjustment, tracks: TrackSet, gate: GateOptions) -> Reason
         return together
     statement = check('halves', focal=focal, normal_deg=turn if fit.plane_known else None)
     return ComparedHalves(statement, (*share, *(rows if fit.plane_known else rows[:1]), *together))
+
+
+def _solve_half(
+    fit: Adjustment,
+    tracks: TrackSet,
+    config: AdjustmentConfig,
+    gate: GateOptions,
+    masks: tuple[np.ndarray, np.ndarray, np.ndarray],
+) -> Adjustment | None:
+    """Solve half of the traffic, given by masks of tracks, windows and tracklets; None if it has too little."""
+    half, seen, living = masks
+    part, bundle = tracks.subset(half), config.bundle and config.bundle.subset(living)
+    part_setting = replace(config, windows=config.windows.subset(seen), bundle=bundle)
+    if half.sum() + seen.sum() + living.sum() < MIN_RESIDUAL_ROWS or (config.turning and not part_setting.turning):
+        return None
+    _, motion, shapes = fit.problem.warm_start
+    warm_start = None, motion.subset(seen) if motion else None, shapes.subset(living) if bundle and shapes else None
+    solved = adjust(fit.state, part, part_setting, refine=True, warm_start=warm_start)
+    if any(mask.sum() < gate.min_tracks_per_road // 2 for mask in road_support(solved, part)):
+        return None
+    return solved
 
 
 def _compare_shares(fit: Adjustment, tracks: TrackSet, early: np.ndarray) -> Reason | tuple[VerificationRow, ...]:

@@ -16,6 +16,7 @@ from autocalib_ros.config import GateOptions, Options, ScaleOptions
 from autocalib_ros.estimation.adjustment.noise_model import DEFAULT_CAMERA_HEIGHT_M
 from autocalib_ros.estimation.observations.track_set import TrackSet
 from autocalib_ros.geometry.ground_plane import ground_points
+from autocalib_ros.geometry.robust_kernels import MAD_TO_SIGMA
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.results.refusals import Reason, reason
 from autocalib_ros.results.statements import Statement, Value, assumption
@@ -33,8 +34,6 @@ TRIM_FRACTION = 0.25
 """Fraction of the slowest and of the fastest vehicles that is trimmed from the mean speed."""
 STEP_PX = 1e-3
 """Step of the numerical derivative by the given pixels."""
-MAD_TO_SIGMA = 1.4826
-"""Standard deviation over median absolute deviation of a normal distribution."""
 M_S_PER_KM_H = 1 / 3.6
 
 HeightFunction = Callable[[Camera, np.ndarray], float]

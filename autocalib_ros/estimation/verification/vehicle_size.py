@@ -1,4 +1,4 @@
-"""The size of vehicles, by which a wrong scale shows: cars are as large everywhere.
+"""The size of vehicles reveals a wrong scale: cars are about as large everywhere.
 
 A silhouette of a moving vehicle is as wide as its length and its width appear from the camera. The median over all
 vehicles, in units of a usual car, tests the given height, length or speed, and with it the plane.
@@ -15,6 +15,7 @@ from autocalib_ros.estimation.people.ground_positions import MAX_PERSON_DISTANCE
 from autocalib_ros.estimation.people.metric_silhouettes import measure_silhouettes
 from autocalib_ros.estimation.people.silhouette_headings import RoadDisplacements, are_whole
 from autocalib_ros.evidence.snapshot import Evidence
+from autocalib_ros.geometry.robust_kernels import MAD_TO_SIGMA
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.results.statements import Statement, check
 from autocalib_ros.results.verification_table import VerificationRow, verified
@@ -34,6 +35,8 @@ USUAL_SIZE_SIGMA = 0.08
 Judgement."""
 MAX_SIZE_SIGMAS = 3.0
 """Largest deviation from the usual size in standard deviations."""
+MEDIAN_TO_MEAN_ERROR = 1.2533
+"""Standard error of the median over that of the mean of a normal distribution, sqrt(pi / 2)."""
 
 
 @dataclass(frozen=True)
@@ -46,14 +49,17 @@ class VehicleSize:
     vehicles: int
 
     @property
+    def sigma(self) -> float:
+        """Standard deviation of the logarithm of the ratio for a right scale."""
+        return float(np.hypot(USUAL_SIZE_SIGMA, self.error))
+
+    @property
     def row(self) -> VerificationRow:
         """The comparison with the usual size."""
-        limit = MAX_SIZE_SIGMAS * float(np.hypot(USUAL_SIZE_SIGMA, self.error))
-        return verified('vehicle_size', abs(float(np.log(self.ratio))), limit)
+        return verified('vehicle_size', abs(float(np.log(self.ratio))), MAX_SIZE_SIGMAS * self.sigma)
 
     def statement(self, height_m: float) -> Statement:
         """Return the size in words, with the camera height by which it would be the usual one."""
-        sigma = float(np.hypot(USUAL_SIZE_SIGMA, self.error))
         usual_m = height_m / self.ratio
         return check(
             'vehicle_size',
@@ -61,7 +67,7 @@ class VehicleSize:
             ratio=self.ratio,
             height_m=height_m,
             usual_height_m=usual_m,
-            usual_height_sigma_m=usual_m * sigma,
+            usual_height_sigma_m=usual_m * self.sigma,
         )
 
 
@@ -70,6 +76,8 @@ def measure_vehicle_size(evidence: Evidence, camera: Camera, normal: np.ndarray,
     rows = np.flatnonzero(are_whole(evidence) & (np.ptp(evidence.outlines_px[:, :-1:2], axis=1) > MIN_WIDTH_PX))
     sizes = measure_silhouettes(evidence.outlines_px, camera, normal, height_m)
     rows = rows[sizes.distance[rows] < MAX_PERSON_DISTANCE_HEIGHTS * height_m]
+    if len(rows) < MIN_WHOLE_SILHOUETTES * MIN_VEHICLES:  # as in all evidence without silhouettes
+        return None
     moves = RoadDisplacements.of(evidence, camera, normal, height_m)
     ratios, speeds = [], []
     for group in group_indices(evidence.outline_vehicles[rows], MIN_WHOLE_SILHOUETTES):
@@ -89,6 +97,5 @@ def measure_vehicle_size(evidence: Evidence, camera: Camera, normal: np.ndarray,
     if len(logs) < MIN_VEHICLES:
         return None
     middle = float(np.median(logs))
-    # the standard error of a median, with the spread from the median absolute deviation
-    error = 1.2533 * 1.4826 * float(np.median(np.abs(logs - middle))) / np.sqrt(len(logs))
+    error = MEDIAN_TO_MEAN_ERROR * MAD_TO_SIGMA * float(np.median(np.abs(logs - middle))) / np.sqrt(len(logs))
     return VehicleSize(float(np.exp(middle)), float(error), len(logs))

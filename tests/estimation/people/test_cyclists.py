@@ -12,7 +12,7 @@ from autocalib_ros.estimation.people.cyclists import find_cyclists
 from autocalib_ros.evidence.snapshot import Evidence, Outlines, Track
 from autocalib_ros.offline.synthetic.junction import Junction, evidence_from_tracks, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration
-from silhouette_evidence import CAR_M, RIDER_M, driven, with_outlines
+from silhouette_evidence import CAR_M, RIDER_M, crossing_bodies, with_outlines
 from solved_once import solve_once
 
 pytestmark = pytest.mark.solve
@@ -21,23 +21,10 @@ JUNCTION = Junction(vehicles=30)
 FIRST_RIDER, FIRST_CAR = 1000, 2000
 
 
-def ridden(
-    number: int, size_m: tuple[float, float, float], speed_m_s: float | None, generator: np.random.Generator
-) -> tuple[list[Track], list[Outlines]]:
-    """Silhouettes of a body that crosses the junction along one of its roads, in either direction."""
-    heading = np.pi / 2 * generator.integers(4)
-    speed = speed_m_s or generator.uniform(4.0, 7.0)
-    way = np.array([np.cos(heading), np.sin(heading)])
-    start = np.array(JUNCTION.centre_m) + generator.uniform(-5.0, 5.0, 2) - 5.0 * speed * way
-    return driven(JUNCTION, number, 3.0 * (number % 1000), size_m, start, heading, speed, generator)
-
-
 def several(
-    first: int, count: int, size_m: tuple[float, float, float], speed_m_s: float | None = None, seed: int = 1
+    first: int, count: int, size_m: tuple[float, float, float], speeds_m_s: tuple[float, float] = (4.0, 7.0)
 ) -> tuple[list[Track], list[Outlines]]:
-    generator = np.random.default_rng(seed)
-    pairs = [ridden(first + number, size_m, speed_m_s, generator) for number in range(count)]
-    return [track for tracks, _ in pairs for track in tracks], [each for _, outlines in pairs for each in outlines]
+    return crossing_bodies(JUNCTION, first, count, size_m, speeds_m_s)
 
 
 def told(tracks: list[Track], outlines: list[Outlines]) -> np.ndarray:
@@ -59,7 +46,7 @@ def test_no_vehicle_that_is_seen_whole_is_a_cyclist(size_m: tuple[float, float, 
 
 
 def test_faster_than_bicycles_is_a_vehicle() -> None:
-    assert not len(told(*several(FIRST_RIDER, 20, RIDER_M, speed_m_s=13.0)))
+    assert not len(told(*several(FIRST_RIDER, 20, RIDER_M, speeds_m_s=(13.0, 13.0))))
 
 
 def test_a_part_of_a_car_that_is_as_low_as_a_bumper_is_no_rider() -> None:

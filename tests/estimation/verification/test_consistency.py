@@ -34,12 +34,10 @@ def test_halves_of_one_view_agree() -> None:
 
 
 def traffic_of(junction: Junction, first_vehicle: int = 0, begin_s: float = 0.0) -> list[Track]:
-    evidence, tracks = evidence_once(junction), []
-    bounds = zip(evidence.track_starts[:-1], evidence.track_starts[1:], strict=True)
-    for vehicle, (first, last) in zip(evidence.track_vehicles, bounds, strict=True):
-        times_s = evidence.times_s[first:last] + begin_s
-        tracks.append(Track(int(vehicle) + first_vehicle, times_s, evidence.points_px[first:last]))
-    return tracks
+    return [
+        replace(track, vehicle=track.vehicle + first_vehicle, times_s=track.times_s + begin_s)
+        for track in evidence_once(junction).tracks()
+    ]
 
 
 @pytest.mark.parametrize(('begin_s', 'expected'), [(0.0, 'full'), (200.0, 'assumed')])
