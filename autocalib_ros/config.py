@@ -283,19 +283,24 @@ class JointOptions(_Validated):
     roll_prior_deg: float = option(
         0.0,
         'single road: standard deviation of the roll of a level camera, degrees; gives a ground plane of grade '
-        'assumed; 0: no such assumption',
+        'fair at most; 0: no such assumption',
         low=0,
         high=10,
     )
     transverse_edges: bool = option(
         True,
         'single road: assume that bumpers, windscreens and roof lines of vehicles are perpendicular to it; gives a '
-        'ground plane of grade assumed',
+        'ground plane of grade fair at most',
+    )
+    single_road: bool = option(
+        True,
+        'single road: assume usual fields of view, a level camera within 3 degrees, and edges and lines along, across '
+        'and upright to it; gives lens and ground plane with the uncertainty that this leaves',
     )
     road_markings: bool = option(
         True,
         'when traffic alone gives no full result: assume that lane lines, stop lines, crosswalks and kerbs are '
-        'parallel or perpendicular; gives lens and ground plane of grade assumed if traffic confirms them',
+        'parallel or perpendicular; gives lens and ground plane of grade fair at most if traffic confirms them',
     )
 
     def __post_init__(self) -> None:
@@ -389,12 +394,18 @@ class GateOptions(_Validated):
     min_tracks: int = option(40, 'minimum number of tracks', low=4, high=100000)
     min_tracks_per_road: int = option(10, 'minimum number of tracks on each of two roads', low=2, high=100000)
     min_coverage: float = option(0.15, 'minimum fraction of image cells crossed by tracks', low=0, high=1)
-    max_sigma_focal_rel: float = option(
-        0.05, 'maximum standard deviation of the focal length, fraction of it', low=0, high=1
+    least_grade: str = option(
+        'auto',
+        'lowest grade that is accepted: full, fair, coarse or assumed; auto: fair for what the node publishes, coarse '
+        'for a recording',
+        choices=('auto', 'full', 'fair', 'coarse', 'assumed'),
     )
-    max_sigma_tilt_deg: float = option(1.5, 'maximum standard deviation of the ground normal, degrees', low=0, high=45)
+    max_sigma_focal_rel: float = option(
+        0.25, 'maximum standard deviation of a focal length from traffic, fraction of it', low=0, high=1
+    )
+    max_sigma_tilt_deg: float = option(5.0, 'maximum standard deviation of the ground normal, degrees', low=0, high=45)
     max_sigma_height_rel: float = option(
-        0.2, 'maximum standard deviation of the camera height, fraction of it', low=0, high=1
+        0.25, 'maximum standard deviation of the camera height, fraction of it', low=0, high=1
     )
     max_drift_px: float = option(
         3.0,
@@ -402,6 +413,11 @@ class GateOptions(_Validated):
         '1.5 px of the image',
         low=0.1,
     )
+
+    @property
+    def least(self) -> str:
+        """The lowest grade that is accepted; that of a recording where the option leaves it open."""
+        return 'coarse' if self.least_grade == 'auto' else self.least_grade
 
 
 @dataclass(frozen=True, kw_only=True)

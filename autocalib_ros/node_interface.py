@@ -152,7 +152,7 @@ DIAGNOSTIC_VALUES = {
     'queued': 'images that another followed within half a period (doublets, bursts)',
     'odd_stamps': 'images whose stamp was wrong; they got the time of their place in the sequence',
     'clock_steps': 'times the clock of the stamps was set back while the images went on',
-    'grade': 'grade of the published calibration: `full`, `assumed`, `unit_scale` or `lens`',
+    'grade': 'grade of the published calibration: `full`, `fair`, `coarse`, `assumed`, `unit_scale` or `lens`',
     'focal_px': 'focal length',
     'focal_sigma_px': 'its standard deviation',
     'tilt_deg': 'tilt of the optical axis below the horizontal',

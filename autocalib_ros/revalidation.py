@@ -17,10 +17,8 @@ from autocalib_ros.estimation.verification.scale import Scale, known_scale
 from autocalib_ros.geometry.ground_plane import GroundPlane, tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.results.calibration import Calibration, StandardDeviations
+from autocalib_ros.results.grades import rank_of
 from autocalib_ros.results.statements import SCALE_KINDS
-
-GRADES = ('lens', 'unit_scale', 'assumed', 'full')
-"""Grades in ascending order."""
 
 
 class CalibrationState(Enum):
@@ -152,17 +150,13 @@ def _at_least_as_precise(fresh: Calibration, before: Calibration) -> bool:
     sigmas = [(fresh.stddev.focal_px, before.stddev.focal_px)]
     if before.ground is not None:
         sigmas += [(fresh.stddev.tilt_deg, before.stddev.tilt_deg), (fresh.stddev.roll_deg, before.stddev.roll_deg)]
-    return _rank(fresh.grade) >= _rank(before.grade) and all(
+    return rank_of(fresh.grade) >= rank_of(before.grade) and all(
         _sigma_or_inf(new) <= _sigma_or_inf(old) for new, old in sigmas
     )
 
 
 def _sigma_or_inf(sigma: float | None) -> float:
     return math.inf if sigma is None else sigma
-
-
-def _rank(grade: str) -> int:
-    return GRADES.index(grade) if grade in GRADES else -1
 
 
 def with_current_options(kept: Calibration, options: Options, lens: Camera | None) -> Calibration:
@@ -188,7 +182,7 @@ def with_current_options(kept: Calibration, options: Options, lens: Camera | Non
             ground=None,
             ground_refusal=scale,
             covariance=None,
-            stddev=replace(kept.stddev, tilt_deg=None, roll_deg=None, height_m=None, ground_point_m=()),
+            stddev=replace(kept.stddev, tilt_deg=None, roll_deg=None, height_m=None, ground_point_m=(), ground=None),
         )
     return _scaled(kept, kept.ground, scale)
 
@@ -200,10 +194,11 @@ def _scaled(kept: Calibration, ground: GroundPlane, scale: Scale) -> Calibration
     others = tuple(statement for statement in kept.assumptions if statement.kind not in SCALE_KINDS)
     return replace(
         kept,
-        grade=kept.grade if ground.metric else 'assumed',
+        # lengths are as certain as the new scale allows, which is not computed without the evidence
+        grade=kept.grade if ground.metric else 'fair',
         ground=replace(ground, height_m=height, metric=True),
         assumptions=(*others, *scale.assumption(height)),
         covariance=None,
         # the accuracy at fixed distances is unknown after rescaling
-        stddev=replace(kept.stddev, height_m=scale.sigma or None, ground_point_m=()),
+        stddev=replace(kept.stddev, height_m=scale.sigma or None, ground_point_m=(), ground=None),
     )

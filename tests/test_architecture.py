@@ -27,6 +27,7 @@ LAYERS = (
     ('estimation.straight', 'estimation.vehicle_edges'),
     ('estimation.verification',),
     ('estimation.markings', 'estimation.turning', 'estimation.paper'),
+    ('estimation.single_road',),
     ('estimation',),
     ('report', 'calibrator', 'revalidation'),
     ('offline.terminal',),

@@ -13,7 +13,7 @@ from recorded_clips import DATA, needs_recorded_clips
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
-from autocalib_ros.config import JointOptions, Options, ScaleOptions
+from autocalib_ros.config import GateOptions, JointOptions, Options, ScaleOptions
 from autocalib_ros.errors import InputError
 from autocalib_ros.geometry.ground_plane import GroundPlane, pixels_ahead
 from autocalib_ros.ground import Ground
@@ -469,7 +469,9 @@ SCALES = {
     'distance': Options(
         scale_from='distance', scale=ScaleOptions(distance_px='500 500 900 450', distance_m=10.0, distance_sigma_m=0.1)
     ),
-    'assumed': Options(camera_height=HEIGHT_M, joint=JointOptions(roll_prior_deg=2.0)),
+    'assumed': Options(
+        camera_height=HEIGHT_M, joint=JointOptions(roll_prior_deg=2.0), gate=GateOptions(least_grade='assumed')
+    ),
 }
 ONE_ROAD = Junction(
     road_angles_deg=(0.0,),
@@ -514,7 +516,7 @@ def test_a_file_is_read(tmp_path, pixels):
         ('{', 'is not JSON'),
         ('[]', 'holds no names with values'),
         ('{"version": 1}', 'holds no calibration'),
-        (json.dumps(document() | {'version': 3}), 'its version is 3; versions 1 and 2 can be read'),
+        (json.dumps(document() | {'version': 4}), 'its version is 4; versions 1 to 3 can be read'),
         (
             json.dumps(document() | {'state': 'refused', 'refusal': {'code': 'no_motion', 'message': 'nothing moves'}}),
             'no calibration .no_motion: nothing moves.',

@@ -74,7 +74,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='errors against ground truth on scenes that are drawn, rendered and replayed',
         description='Draw scenes (layout, pose, lens, size, light), render and compress their pictures, calibrate from '
         'them, and compare errors with the stated standard deviations. Exit status: 0 unless a result is wrong by more '
-        'than 5 %% or 2 degrees at a grade above assumed, 3 otherwise.',
+        'than 5 %% or 2 degrees at grade full, 3 otherwise.',
     )
     scenes.add_argument('--count', type=int, default=60, metavar='N', help='number of scenes (default: %(default)s)')
     scenes.add_argument('--first', type=int, default=0, metavar='N', help='number of the first one (default: 0)')
@@ -98,8 +98,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'options',
         help='documented options, and pairs of them, on stored evidence with known truth',
         description='Solve stored evidence whose truth is known with other values of the documented options. Exit '
-        'status: 0 unless an option makes a result wrong with confidence (3.5 stated standard deviations at a grade '
-        'above assumed), 3 otherwise.',
+        'status: 0 unless an option makes a result wrong with confidence (3.5 stated standard deviations), 3 '
+        'otherwise.',
     )
     _add_folder(variants)
     variants.add_argument('--only', nargs='+', default=[], metavar='OPTION', help='options to vary (default: all)')

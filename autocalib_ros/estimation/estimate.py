@@ -21,19 +21,27 @@ from autocalib_ros.estimation.publish import (
     choose_solution,
     count_pedestrians,
     find_pedestrians,
+    require_grade,
     scale_of,
-    with_certainty,
     with_requested_model,
     with_vehicle_size,
 )
-from autocalib_ros.estimation.solution import Observations, Solution, accepted, append_reason, is_better
+from autocalib_ros.estimation.solution import (
+    Observations,
+    Solution,
+    accepted,
+    append_reason,
+    is_better,
+)
 from autocalib_ros.estimation.solution_rows import with_solution_rows
 from autocalib_ros.estimation.strategies import (
     complete_with_lane_markings,
     estimate_from_lane_markings,
+    estimate_from_single_road,
     estimate_from_straight_traffic,
     estimate_from_turning_traffic,
     sharpen_with_lane_markings,
+    with_single_road,
 )
 from autocalib_ros.estimation.verification.readiness import check_readiness
 from autocalib_ros.estimation.verification.scale import is_unusual
@@ -68,8 +76,11 @@ def solve(evidence: Evidence, options: Options, *, lens: Camera | None = None) -
         result = solve_paper(evidence, options, draft.intrinsics, draft.figures)
     else:
         result = _solve_joint(traffic, kept, draft, lens)
-    # A lens that the requested distortion model cannot represent is refused.
-    return draft.refusal(result) if isinstance(result, Reason) else with_requested_model(result, options)
+    # A result of too low a grade, or a lens that the requested distortion model cannot represent, is refused.
+    if isinstance(result, Reason):
+        return draft.refusal(result)
+    modelled = with_requested_model(result, options)
+    return require_grade(modelled, options.gate.least) if isinstance(modelled, Calibration) else modelled
 
 
 def _solve_joint(traffic: Evidence, kept: np.ndarray, draft: ResultDraft, lens: Camera | None) -> Calibration | Reason:
@@ -85,9 +96,8 @@ def _solve_joint(traffic: Evidence, kept: np.ndarray, draft: ResultDraft, lens: 
         driving = kept[~np.isin(traffic.track_vehicles, pedestrians)]
         again = check_readiness(vehicles, draft.options.gate) or _estimate_and_scale(vehicles, driving, draft, lens)
         result = choose_solution(result, again if isinstance(again, Reason) else again[0])
-    # The size of the vehicles tests the scale, and grade full asks for certainty.
-    result = with_certainty(with_vehicle_size(result, vehicles))
-    return count_pedestrians(result, len(pedestrians))
+    # The size of the vehicles tests the scale.
+    return count_pedestrians(with_vehicle_size(result, vehicles), len(pedestrians))
 
 
 def _estimate_and_scale(
@@ -131,9 +141,15 @@ def find_solution(
     instants = ResampledTracks(evidence)
     windows = find_windows(evidence, instants)
 
+    given = options.lens.pixel_aspect
+    hypotheses = AspectHypotheses.of(evidence.image_size)
+    if evidence.pixel_aspect > 0.0:
+        hypotheses = hypotheses.expecting(evidence.pixel_aspect)
+    unmeasured = 0.0 if given > 0.0 or evidence.pixel_aspect > 0.0 else hypotheses.unmeasured_sigma
+
     def estimate_under(priors: list[LensPrior]) -> Solution | Reason:
         generator = np.random.default_rng(options.random_seed)
-        observations = Observations(tracks, windows, instants, priors, gate, evidence, generator)
+        observations = Observations(tracks, windows, instants, priors, gate, evidence, generator, unmeasured)
         return _estimate(observations, AdjustmentConfig(priors[0], joint, height_m, crossing_rad))
 
     def estimate_with_aspect(aspect: float, sigma: float) -> Solution | Reason:
@@ -144,41 +160,65 @@ def find_solution(
         return verify_given_lens(
             lens, estimate_under([known_lens(lens)]), tracks, lambda: estimate_with_aspect(lens.pixel_aspect, 0.0)
         )
-    given = options.lens.pixel_aspect
     if given > 0.0:
         return with_stated_aspect(estimate_with_aspect(given, 0.0), given, 'given')
-    hypotheses = AspectHypotheses.of(evidence.image_size)
-    if evidence.pixel_aspect > 0.0:
-        hypotheses = hypotheses.expecting(evidence.pixel_aspect)
     found = choose_aspect(hypotheses, estimate_with_aspect, tracks, gate)
     return with_stated_aspect(found, evidence.pixel_aspect, 'recording')
 
 
 def _estimate(observations: Observations, config: AdjustmentConfig) -> Solution | Reason:
     """Estimate lens, plane and roads under the priors of the observations, by one strategy after the other."""
-    joint = config.options
     # Traffic: straight first; turning alone if that leaves anything open.
     straight, turning = estimate_from_straight_traffic(observations, config), None
     found = accepted(straight)
     if not (isinstance(found, Solution) and found.full):
         turning = estimate_from_turning_traffic(observations, config)
         found = found if turning is None or not is_better(accepted(turning), found) else accepted(turning)
-    if not joint.road_markings:
-        return found
     # Lane markings: a sharper estimate if the traffic gives all, another strategy if it does not.
+    if config.options.road_markings:
+        found = _with_lane_markings(found, (straight, turning), observations, config)
+    # A single road: its vehicles and scenery, and wide priors.
+    if config.options.single_road and _leaves_a_road_open(found):
+        found = with_single_road(found, estimate_from_single_road(found, observations, config))
+    return found
+
+
+def _with_lane_markings(
+    found: Solution | Reason,
+    by_traffic: tuple[Solution | Reason | None, ...],
+    observations: Observations,
+    config: AdjustmentConfig,
+) -> Solution | Reason:
+    """Sharpen what was found with lane markings, complete solutions of the traffic with them, or use them alone."""
     if isinstance(found, Solution) and found.full:
         return sharpen_with_lane_markings(found, observations)
     markings = estimate_from_lane_markings(observations, config)
     completed = [
         complete_with_lane_markings(traffic, observations)
-        for traffic in (straight, turning)
-        if isinstance(traffic, Solution) and traffic.lens_refusal
+        for traffic in by_traffic
+        if isinstance(traffic, Solution) and traffic.fit.plane_known and not traffic.full
     ]
     best = found
     for other in (*completed, markings):
         best = other if is_better(other, best) else best
-    if best is not found:
-        return best
-    if isinstance(markings, Reason) and markings.code != 'no_markings':
+    if best is found and isinstance(markings, Reason) and markings.code != 'no_markings':
         return append_reason(found, markings)
-    return found
+    return best
+
+
+SINGLE_ROAD_CODES = (
+    'no_agreement',
+    'too_little_curvature',
+    'too_little_turning',
+    'turning_traffic',
+    'one_direction',
+)
+"""Reasons that one straight road without visible curvature gives; other ones contradict something."""
+
+
+def _leaves_a_road_open(found: Solution | Reason) -> bool:
+    """Whether a road may be there, but lens or plane about it are open."""
+    missing = found if isinstance(found, Reason) else found.plane_refusal
+    if missing is None:
+        return isinstance(found, Solution) and not found.from_markings and not found.sharp
+    return missing.code in SINGLE_ROAD_CODES

@@ -10,10 +10,11 @@ from autocalib_ros.config import Options
 from autocalib_ros.estimation.adjustment.noise_model import DEFAULT_CAMERA_HEIGHT_M
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentState
 from autocalib_ros.estimation.adjustment.residuals import collect_residuals
+from autocalib_ros.estimation.certainty import certainty_of_lengths
 from autocalib_ros.estimation.paper.intrinsics import PaperIntrinsics
 from autocalib_ros.estimation.paper.vanishing_point_voting import segment_orientations
 from autocalib_ros.estimation.people.pedestrians import people
-from autocalib_ros.estimation.solution import Solution
+from autocalib_ros.estimation.solution import SHARP_FOCAL_SIGMA, Solution
 from autocalib_ros.estimation.verification.ground_normal import PlaneEstimate
 from autocalib_ros.estimation.verification.readiness import stillness_checks
 from autocalib_ros.estimation.verification.scale import Scale, check_scale, known_scale
@@ -29,13 +30,13 @@ from autocalib_ros.results.calibration import (
     Refusal,
     StandardDeviations,
 )
-from autocalib_ros.results.refusals import Reason, reason
+from autocalib_ros.results.grades import GroundSigma, rank_of
+from autocalib_ros.results.refusals import WAIT, Reason, reason
 from autocalib_ros.results.statements import check
 from autocalib_ros.results.verification_table import VerificationRow, verified
 
-MAX_FULL_FOCAL_SIGMA, MAX_FULL_PLANE_SIGMA_DEG = 0.03, 1.2
-"""Largest standard deviations, of the focal length (relative) and of tilt or roll, of grade full: nine in ten of the
-results at the limit are within 5 % and 2 degrees."""
+MAX_CERTAINTY_LOST = 2.0
+"""Factor by which lengths may be less certain without pedestrians; half of the tracks make 1.4. Judgement."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +130,7 @@ def find_pedestrians(result: Calibration, evidence: Evidence) -> np.ndarray:
 
 
 def choose_solution(of_all: Calibration, of_vehicles: Calibration | Reason) -> Calibration:
-    """Choose the solution of vehicles alone, unless it lacks a ground plane or has a lower grade.
+    """Choose the solution of vehicles alone, unless it lacks a ground plane or is much less certain.
 
     If it lacks one, too few vehicles are left. That is no evidence against the plane of all tracks: pedestrians walk
     on it too, and it has passed the same gates.
@@ -138,21 +139,11 @@ def choose_solution(of_all: Calibration, of_vehicles: Calibration | Reason) -> C
         without = of_vehicles.message
     elif of_vehicles.ground_refusal is not None:
         without = of_vehicles.ground_refusal.message
-    elif of_all.grade == 'full' and of_vehicles.grade != 'full':
+    elif _certainty_lost(of_all, of_vehicles) > MAX_CERTAINTY_LOST:
         without = f'grade {of_vehicles.grade}'
     else:
         return of_vehicles
     return replace(of_all, checks=(*of_all.checks, check('pedestrians_kept', without=without)))
-
-
-def with_certainty(result: Calibration) -> Calibration:
-    """Add the limits of grade full for the standard deviations; a less certain result is of grade assumed."""
-    sigma, rows = result.stddev, []
-    if sigma.focal_px:
-        rows.append(verified('focal_sigma_full', sigma.focal_px / result.camera.focal_px, MAX_FULL_FOCAL_SIGMA))
-    if sigma.tilt_deg is not None and sigma.roll_deg is not None:
-        rows.append(verified('plane_sigma_full', max(sigma.tilt_deg, sigma.roll_deg), MAX_FULL_PLANE_SIGMA_DEG))
-    return _with_rows(result, *rows)
 
 
 def with_vehicle_size(result: Calibration, vehicles: Evidence) -> Calibration:
@@ -170,7 +161,15 @@ def with_vehicle_size(result: Calibration, vehicles: Evidence) -> Calibration:
 def _with_rows(result: Calibration, *rows: VerificationRow) -> Calibration:
     """Add rows to the verification table; one that failed lowers grade full, if that is what it costs."""
     lowered = result.grade == 'full' and any(row.lowers_grade for row in rows)
-    return replace(result, grade='assumed' if lowered else result.grade, verification=(*result.verification, *rows))
+    return replace(result, grade='fair' if lowered else result.grade, verification=(*result.verification, *rows))
+
+
+def _certainty_lost(of_all: Calibration, of_vehicles: Calibration) -> float:
+    """Return the factor by which lengths on the road are less certain by vehicles alone."""
+    whole, part = of_all.stddev.ground, of_vehicles.stddev.ground
+    if whole is None or part is None:
+        return 1.0 if whole is part else np.inf
+    return part.worst / max(whole.worst, 1e-9)
 
 
 def count_pedestrians(result: Calibration, pedestrians: int) -> Calibration:
@@ -195,10 +194,13 @@ def _with_ground(lens: Calibration, solution: Solution, options: Options) -> Cal
     height_row = verified('height_sigma', height_sigma_m / height_m, options.gate.max_sigma_height_rel)
     normal = plane.normal(plane.fit.state)
     tilt, roll = plane.sigma(lambda _, normal: tilt_and_roll_deg(normal))
+    certainty = certainty_of_lengths(plane, scale)
+    sigma = None if certainty is None else certainty.ground_sigma
     return replace(
         lens,
         verification=(*lens.verification, height_row) if measured_height else lens.verification,
-        grade='unit_scale' if not scale.metric else 'assumed' if solution.assumed else 'full',
+        grade=_grade(sigma, solution) if scale.metric else 'unit_scale',
+        helpful=None if certainty is None or not scale.metric else certainty.most_helpful(),
         ground=ground_plane(normal, solution.along, height_m, metric=scale.metric),
         assumptions=(*lens.assumptions, *scale.assumption(height_m, height_sigma_m)),
         covariance=_covariance(plane, scale) if scale.metric else None,
@@ -208,8 +210,52 @@ def _with_ground(lens: Calibration, solution: Solution, options: Options) -> Cal
             roll_deg=float(roll),
             height_m=height_sigma_m if measured_height else None,
             ground_point_m=_ground_point_stddev(plane, scale) if scale.metric else (),
+            ground=sigma,
         ),
     )
+
+
+def _grade(sigma: GroundSigma | None, solution: Solution) -> str:
+    """Return the grade of a metric plane; one that rests on an assumption, or is contradicted, is fair at most."""
+    grade = 'assumed' if sigma is None else sigma.grade
+    return 'fair' if grade == 'full' and solution.assumed else grade
+
+
+def require_grade(result: Calibration, least: str) -> Calibration | Refusal:
+    """Return the result; if its grade is below `least`, the lens alone if that is certain, else a refusal.
+
+    The refusal has the result as its candidate.
+    """
+    sigma, helpful = result.stddev.ground, result.helpful
+    certain = rank_of(result.grade) >= rank_of(least)
+    if result.grade == 'unit_scale':
+        certain = sigma is None or rank_of(sigma.grade) >= rank_of(least)
+    if certain or result.grade == 'lens' or result.method == 'paper':
+        return result
+    why = reason(
+        'grade_too_low',
+        '' if sigma else 'no_road_ahead',
+        grade=result.grade,
+        least=least,
+        along=sigma.along if sigma else None,
+        across=sigma.across if sigma else None,
+        helpful=helpful.text if helpful else WAIT,
+    )
+    if result.stddev.focal_px is not None and result.stddev.focal_px <= SHARP_FOCAL_SIGMA * result.camera.focal_px:
+        return _lens_of(result, why)
+    refused = Refusal.from_reason(why, result.method, result.evidence, result.figures)
+    return replace(refused, candidate=result)
+
+
+def _lens_of(result: Calibration, why: Reason) -> Calibration:
+    """Return the lens of a result alone, with the reason why its plane is not accepted."""
+    sigma = StandardDeviations(
+        focal_px=result.stddev.focal_px,
+        principal_point_px=result.stddev.principal_point_px,
+        k1=result.stddev.k1,
+        k2=result.stddev.k2,
+    )
+    return replace(result, grade='lens', ground=None, ground_refusal=why, covariance=None, helpful=None, stddev=sigma)
 
 
 def _lens_stddev(solution: Solution) -> StandardDeviations:

@@ -20,6 +20,9 @@ from autocalib_ros.results.verification_table import VerificationRow
 MAX_SUBSAMPLE_TRACKS = 200
 """Tracks, evenly spaced in the list of all, by which initial solutions are made and compared. The adjustment itself
 uses every track."""
+SHARP_FOCAL_SIGMA, SHARP_PLANE_SIGMA_DEG = 0.05, 1.5
+"""Standard deviations of the focal length (relative) and of tilt or roll up to which a solution is not completed by
+further strategies. Judgement."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +37,8 @@ class Observations:
     gate: GateOptions
     evidence: Evidence
     generator: np.random.Generator
+    unmeasured_aspect_sigma: float = 0.0
+    """Standard deviation of the log pixel aspect where the traffic cannot measure it."""
 
     @property
     def subsample(self) -> TrackSet:
@@ -58,6 +63,8 @@ class Solution:
     """Why the traffic alone does not determine the lens; lane markings may complete it."""
     reduced: bool = False
     """Whether the plane rests on less than crossing roads or turning vehicles, without an assumption in `plane`."""
+    single_road: bool = False
+    """Whether lens and plane come from one road and wide priors; the pixel aspect is in the covariance."""
     from_markings: bool = False
     """Whether lens and plane come from the lane markings."""
     of_traffic: Adjustment | None = None
@@ -77,8 +84,13 @@ class Solution:
 
     @property
     def full(self) -> bool:
-        """Whether crossing roads or turning vehicles determine all of it."""
-        return self.plane_refusal is None and self.lens_refusal is None and not self.assumed
+        """Whether crossing roads or turning vehicles determine all of it, with certainty."""
+        return self.plane_refusal is None and self.lens_refusal is None and not self.assumed and self.sharp
+
+    @property
+    def sharp(self) -> bool:
+        """Whether lens and plane are so certain that no further strategy needs to be tried."""
+        return self.fit.focal_sigma <= SHARP_FOCAL_SIGMA and self.plane.worst_sigma_deg <= SHARP_PLANE_SIGMA_DEG
 
 
 def accepted(found: Solution | Reason) -> Solution | Reason:

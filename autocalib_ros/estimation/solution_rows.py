@@ -9,7 +9,7 @@ import numpy as np
 
 from autocalib_ros.config import GateOptions
 from autocalib_ros.estimation.solution import Solution
-from autocalib_ros.estimation.verification.gates import MAX_K1_SIGMAS, k1_prior_sigmas, max_plane_sigma_deg
+from autocalib_ros.estimation.verification.gates import MAX_K1_SIGMAS, k1_prior_sigmas
 from autocalib_ros.geometry.ground_plane import MIN_FRACTION_BELOW_HORIZON
 from autocalib_ros.results.verification_table import VerificationRow, verified
 
@@ -42,5 +42,4 @@ def _rows(found: Solution, gate: GateOptions) -> Iterator[VerificationRow]:
     if found.plane_refusal is None:
         plane = found.plane
         yield verified('below_horizon', plane.fraction_below_horizon, MIN_FRACTION_BELOW_HORIZON)
-        limit_deg = max_plane_sigma_deg(plane, gate, assumed=found.assumed)
-        yield verified('plane_sigma', plane.worst_sigma_deg, limit_deg)
+        yield verified('plane_sigma', plane.worst_sigma_deg, gate.max_sigma_tilt_deg)

@@ -15,9 +15,11 @@ from autocalib_ros.estimation.markings.markings_solution import (
     fit_to_markings,
     refine_with_markings,
 )
+from autocalib_ros.estimation.observations.track_set import TrackSet
 from autocalib_ros.estimation.one_road import PLANE_TOLERANCE_DEG, CrossTraffic
 from autocalib_ros.estimation.refinement import refine_and_verify, select_noise_model
-from autocalib_ros.estimation.solution import Observations, Solution
+from autocalib_ros.estimation.single_road.road_solution import complete_single_road, solve_single_road
+from autocalib_ros.estimation.solution import SHARP_FOCAL_SIGMA, Observations, Solution, append_reason, is_better
 from autocalib_ros.estimation.straight.initialisation import solve_from_consensus
 from autocalib_ros.estimation.straight.roads import (
     add_further_roads,
@@ -29,7 +31,7 @@ from autocalib_ros.estimation.turning.turning_traffic import fit_turning_traffic
 from autocalib_ros.estimation.verification.gates import check_plane, check_straight_traffic
 from autocalib_ros.estimation.verification.ground_normal import AGREEMENT_SIGMAS, PlaneEstimate
 from autocalib_ros.estimation.verification.identifiability import lens_assumptions
-from autocalib_ros.geometry.ground_plane import unsigned_angle_deg
+from autocalib_ros.geometry.ground_plane import MIN_FRACTION_BELOW_HORIZON, unsigned_angle_deg
 from autocalib_ros.results.refusals import Reason, reason
 from autocalib_ros.results.statements import Statement, check
 from autocalib_ros.results.verification_table import VerificationRow, verified
@@ -73,6 +75,71 @@ def estimate_from_turning_traffic(observations: Observations, config: Adjustment
     return refine_and_verify(fit, tracks, observations, turned=True)
 
 
+def estimate_from_single_road(
+    found: Solution | Reason, observations: Observations, config: AdjustmentConfig
+) -> Solution | Reason:
+    """Estimate from one straight road, its vehicles and scenery, and wide priors of field of view and roll.
+
+    The lens is that of what was found, if the traffic of one road has determined it.
+    """
+    evidence, tracks = observations.evidence, observations.tracks
+    if isinstance(found, Solution) and not found.fit.plane_known:
+        completed = complete_single_road(found.fit, evidence, tracks)
+        if isinstance(completed, Reason):
+            return completed
+        solution = replace(
+            found.compared(*completed.rows),
+            assumptions=(*found.assumptions, *completed.assumptions),
+            checks=(*found.checks, *completed.checks),
+            of_traffic=found.fit,
+        )
+        return _about_single_road(solution, completed.fit, tracks)
+    prior = config.prior
+    if len(prior.free):
+        aspect_sigma = float(np.hypot(prior.sigma[5], observations.unmeasured_aspect_sigma))
+        prior = prior.with_pixel_aspect(prior.centre.pixel_aspect, aspect_sigma)
+    single = solve_single_road(
+        evidence, tracks, replace(config, prior=prior), observations.gate, observations.generator
+    )
+    if isinstance(single, Reason):
+        return single
+    plane = PlaneEstimate.of(single.fit, tracks)
+    solution = Solution(
+        single.fit,
+        plane,
+        single.fit.state.directions[0],
+        tracks,
+        single.assumptions,
+        single.checks,
+        None,
+        single_road=True,
+        comparisons=single.rows,
+    )
+    return _about_single_road(solution, single.fit, tracks)
+
+
+def _about_single_road(solution: Solution, fit: Adjustment, tracks: TrackSet) -> Solution | Reason:
+    """Return a solution with the lens, plane and traffic of a single road; a reason if its traffic is in the sky."""
+    plane = PlaneEstimate.of(fit, tracks)
+    if plane.fraction_below_horizon < MIN_FRACTION_BELOW_HORIZON:
+        return reason('horizon', fraction=1 - plane.fraction_below_horizon, limit=1 - MIN_FRACTION_BELOW_HORIZON)
+    flow = tracks.subset(fit.inliers() & (fit.labels == 0))
+    along = fit.state.directions[0]
+    return replace(solution, fit=fit, plane=plane, along=along, flow=flow, plane_refusal=None, reduced=True)
+
+
+def with_single_road(found: Solution | Reason, single: Solution | Reason) -> Solution | Reason:
+    """Return the more certain of what was found and a solution of a single road, and compare their planes."""
+    if isinstance(single, Reason):
+        return append_reason(found, single)
+    if isinstance(found, Reason) or found.plane_refusal:
+        return single
+    difference_deg = unsigned_angle_deg(found.plane.normal(found.fit.state), single.plane.normal(single.fit.state))
+    limit_deg = AGREEMENT_SIGMAS * float(np.hypot(found.plane.worst_sigma_deg, single.plane.worst_sigma_deg))
+    better = single if is_better(single, found) else found
+    return better.compared(verified('single_road', difference_deg, limit_deg))
+
+
 def estimate_from_lane_markings(observations: Observations, config: AdjustmentConfig) -> Solution | Reason:
     """Estimate from lane markings; the traffic, seen through the lens that they give, has to confirm the plane."""
     priors = [_prior_for_markings(prior) for prior in observations.priors]
@@ -96,7 +163,7 @@ def estimate_from_lane_markings(observations: Observations, config: AdjustmentCo
         flow,
         (*lens_assumptions(fit, ()), statement),
         checks,
-        check_plane(plane, observations.gate, assumed=True),
+        check_plane(plane, observations.gate),
         reduced=True,
         from_markings=True,
         comparisons=rows,
@@ -119,9 +186,9 @@ def sharpen_with_lane_markings(found: Solution, observations: Observations) -> S
 
 
 def complete_with_lane_markings(traffic: Solution, observations: Observations) -> Solution | Reason:
-    """Complete a solution whose lens is too uncertain by traffic alone with lane markings; a reason if they fail."""
-    if not traffic.fit.focal_sigma <= MAX_NEAR_FOCAL_SIGMA and traffic.lens_refusal:
-        return traffic.lens_refusal
+    """Complete a solution that is too uncertain by traffic alone with lane markings; a reason if they fail."""
+    if not traffic.fit.focal_sigma <= MAX_NEAR_FOCAL_SIGMA:
+        return traffic.lens_refusal or traffic
     combined = _combined_with_lane_markings(traffic, observations)
     if isinstance(combined, Reason):
         return combined
@@ -144,7 +211,7 @@ def _combined_with_lane_markings(found: Solution, observations: Observations) ->
     found, contradicted = found.compared(row), not row.passed
     compared = check('lane_markings', focal=focal, normal_deg=normal_deg, used=not contradicted)
     plane = PlaneEstimate.of(sharper.fit, observations.tracks)
-    if contradicted and not sharper.fit.focal_sigma <= observations.gate.max_sigma_focal_rel:
+    if contradicted and not sharper.fit.focal_sigma <= SHARP_FOCAL_SIGMA:
         # lane markings that could not give the lens themselves lower the grade, but do not replace the traffic
         return replace(found, checks=(*found.checks, compared), reduced=True)
     along, flow = main_road(sharper.fit, observations.tracks)
@@ -156,7 +223,7 @@ def _combined_with_lane_markings(found: Solution, observations: Observations) ->
         flow=flow,
         checks=(*found.checks, compared),
         assumptions=(*found.assumptions, sharper.assumption),
-        plane_refusal=check_plane(plane, observations.gate, assumed=contradicted),
+        plane_refusal=check_plane(plane, observations.gate),
         reduced=contradicted,
         from_markings=not contradicted,
         of_traffic=traffic,

@@ -259,7 +259,7 @@ def _page(scene: ReportScene, drawn: list[_Drawn]) -> str:
     template = environment.from_string(
         (files('autocalib_ros.report') / 'templates' / 'report.html.j2').read_text(encoding='utf-8')
     )
-    result = scene.result
+    result, found = scene.result, scene.calibration
     chapters = [(chapter, [one for one in drawn if one.entry.chapter == chapter]) for chapter in CHAPTERS]
     return template.render(
         verdict=verdict(result),
@@ -272,9 +272,9 @@ def _page(scene: ReportScene, drawn: list[_Drawn]) -> str:
         code=_code(result),
         needs=needs(result, scene.evidence, scene.options.gate),
         rows=[*number_rows(result, scene.accepted_at_s), *file_rows(result, scene.evidence)],
-        assumptions=tuple(map(str, result.assumptions)) if isinstance(result, Calibration) else (),
-        checks=tuple(map(str, result.checks)) if isinstance(result, Calibration) else (),
-        verification=result.verification if isinstance(result, Calibration) else (),
+        assumptions=tuple(map(str, found.assumptions)) if found else (),
+        checks=tuple(map(str, found.checks)) if found else (),
+        verification=found.verification if found else (),
         chapters=[(chapter, figures) for chapter, figures in chapters if figures],
     )
 

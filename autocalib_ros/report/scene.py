@@ -67,15 +67,15 @@ class ReportScene:
 
     @property
     def calibration(self) -> Calibration | None:
-        """The result if it is a calibration."""
-        return self.result if isinstance(self.result, Calibration) else None
+        """The result if it is a calibration, else its candidate."""
+        return self.result.candidate
 
     @property
     def calibrated(self) -> Calibration:
-        """The calibration, for figures that are drawn only if there is one; ValueError for a refusal."""
-        if isinstance(self.result, Refusal):
+        """The calibration or candidate, for figures that are drawn only if there is one; ValueError otherwise."""
+        if self.calibration is None:
             raise ValueError('the result is a refusal')
-        return self.result
+        return self.calibration
 
     @property
     def ground(self) -> GroundPlane:
@@ -86,7 +86,7 @@ class ReportScene:
 
     @property
     def has_ground(self) -> bool:
-        """Whether the result is a calibration with a ground plane."""
+        """Whether there is a calibration, or a candidate, with a ground plane."""
         return self.calibration is not None and self.calibration.ground is not None
 
     @cached_property

@@ -38,25 +38,23 @@ def verdict(result: Calibration | Refusal) -> str:
     down, _ = tilt_and_roll_deg(result.ground.normal_in_camera)
     pose = f'the camera looks {_with_sigma(down, result.stddev.tilt_deg, 1)} degrees down'
     if result.ground.metric:
-        done = _lesser_grade(result) if result.grade == 'assumed' else ''
-        return f'Calibrated{done}: {focal}; {pose} from {result.ground.height_m:.2f} m above the road.'
+        return f'Calibrated{_lesser_grade(result)}: {focal}; {pose} from {result.ground.height_m:.2f} m above the road.'
     return f'Calibrated: {focal}; {pose}; lengths on the road are in camera heights, because the height was not given.'
 
 
 def _lesser_grade(result: Calibration) -> str:
-    """Return why a calibration with a metric ground plane has not grade full."""
-    if contradictions(result):
-        return ', but a check contradicts it'
-    return ', too uncertain for grade full' if _is_uncertain(result) else ', ground plane by assumption'
-
-
-def _is_uncertain(result: Calibration) -> bool:
-    return any(row.lowers_grade and not row.contradicts for row in result.verification)
+    """Return the grade of a calibration with a metric ground plane, and why it is not full; '' for grade full."""
+    if result.grade == 'full':
+        return ''
+    sigma = result.stddev.ground
+    uncertain = '' if sigma is None or sigma.grade == 'full' else f', {sigma}'
+    why = ', but a check contradicts it' if contradictions(result) else uncertain or ', ground plane by assumption'
+    return f' (grade {result.grade}{why})'
 
 
 def contradictions(result: Calibration | Refusal) -> list[str]:
     """Return the failed checks that contradict a calibration, in words."""
-    rows = () if isinstance(result, Refusal) else result.verification
+    rows = () if result.candidate is None else result.candidate.verification
     return [f'{row.name}: {row.value_text}, {row.limit_text}' for row in rows if row.contradicts]
 
 
@@ -81,7 +79,8 @@ def _sentence(text: str) -> str:
 
 def number_rows(result: Calibration | Refusal, accepted_at_s: float | None = None) -> list[TableRow]:
     """Return the table rows of lens, ground plane, published method and evidence."""
-    rows = [] if isinstance(result, Refusal) else [*_lens_rows(result), *_ground_rows(result), *_paper_rows(result)]
+    found = result.candidate
+    rows = [] if found is None else [*_lens_rows(found), *_ground_rows(found), *_paper_rows(found)]
     return rows + _evidence_rows(result, accepted_at_s)
 
 
@@ -228,18 +227,21 @@ def _number(value: float | None, digits: int) -> str:
 
 
 def how_sure(result: Calibration | Refusal) -> str:
-    """Return the uncertainty of the result, one standard deviation, as text; '' for a refusal."""
-    if isinstance(result, Refusal):
+    """Return the uncertainty of the result, one standard deviation, as text; '' for a refusal without a candidate."""
+    found = result.candidate
+    if found is None:
         return ''
-    sigma, parts = result.stddev, []
-    if result.method == 'paper':
+    sigma, parts = found.stddev, []
+    if found.method == 'paper':
         return 'Unknown: the published method gives no uncertainty.'
     if sigma.focal_px == 0:
         parts.append('the lens is assumed exact')
     elif sigma.focal_px is not None:
-        parts.append(f'focal length ± {100 * sigma.focal_px / result.camera.focal_px:.2g} %')
+        parts.append(f'focal length ± {100 * sigma.focal_px / found.camera.focal_px:.2g} %')
     if sigma.tilt_deg is not None and sigma.roll_deg is not None:
         parts.append(f'tilt ± {sigma.tilt_deg:.2f} and roll ± {sigma.roll_deg:.2f} degrees')
+    if sigma.ground is not None:
+        parts.append(str(sigma.ground))
     places = [
         f'± {sigma_m:.2f} m at {distance:g} m'
         for distance, sigma_m in zip(GROUND_DISTANCES_M, sigma.ground_point_m, strict=False)
@@ -267,9 +269,9 @@ def next_step(result: Calibration | Refusal) -> str:
         )
     if contradictions(result):
         return f'{check}, and find out why the check failed before you rely on the result.'
-    if _is_uncertain(result):
-        return f'{check}; more traffic, above all on crossing roads or turning, makes the result more certain.'
-    if result.grade == 'assumed':
+    if result.helpful is not None:
+        return f'{check}. What would help most: {result.helpful.text}.'
+    if result.grade != 'full':
         return f'{check}; the ground plane depends on an assumption until crossing or turning traffic is observed.'
     return f'{check} and that the speeds are plausible for this road; then use the files.'
 

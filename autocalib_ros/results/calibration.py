@@ -11,10 +11,13 @@ import numpy as np
 from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.lens.camera_info import CameraInfo, camera_info
+from autocalib_ros.results.grades import GroundSigma, HelpfulMeasure
 from autocalib_ros.results.refusals import Reason
 from autocalib_ros.results.statements import Statement, Value
 from autocalib_ros.results.verification_table import VerificationRow
 
+GRADED_DISTANCE_M = 20.0
+"""Distance from the camera's foot point at which the certainty of lengths is graded."""
 GROUND_DISTANCES_M = (10.0, 20.0, 40.0)
 """Distances from the camera's foot point at which the sigma of a road point is given."""
 COVARIANCE_PARAMETERS = (
@@ -60,6 +63,8 @@ class StandardDeviations:
     k2: float | None = None
     ground_point_m: tuple[float | None, ...] = ()
     """Of the road point of a pixel straight ahead, at each of `GROUND_DISTANCES_M`; None outside the image."""
+    ground: GroundSigma | None = None
+    """Of short lengths on the road about `GRADED_DISTANCE_M` ahead, relative; it decides the grade."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,6 +122,8 @@ class Refusal:
     evidence: EvidenceSummary
     values: Mapping[str, Value] = field(default_factory=dict, compare=False)
     """The numbers of the message and the limit that they missed."""
+    candidate: Calibration | None = field(default=None, compare=False, repr=False)
+    """What was found but is too uncertain to be accepted."""
     figures: Figures = field(default_factory=Figures, compare=False, repr=False)
 
     def __bool__(self) -> bool:
@@ -142,8 +149,8 @@ class Calibration:
 
     method: str
     grade: str
-    """'full': lens and metric ground plane; 'assumed': the same, but the plane rests on an assumption, a check
-    contradicts it, or it is too uncertain; 'unit_scale': the plane in units of the camera height; 'lens': no plane."""
+    """One of `grades.GRADES`. Of a metric plane by its `GroundSigma`; at most 'fair' if it rests on an assumption or a
+    check contradicts it. 'unit_scale': the plane in units of the camera height; 'lens': no plane."""
     assumptions: tuple[Statement, ...]
     """What was assumed: kinds of `statements.ASSUMPTIONS`."""
     checks: tuple[Statement, ...] = ()
@@ -157,6 +164,8 @@ class Calibration:
     road_directions: np.ndarray
     """Unit vectors in the camera optical frame, shape (n, 3)."""
     stddev: StandardDeviations
+    helpful: HelpfulMeasure | None = field(default=None, compare=False)
+    """The one further measure that would help most; None if there is none, or grade full without it."""
     covariance: np.ndarray | None = field(default=None, compare=False, repr=False)
     """Of `COVARIANCE_PARAMETERS`, shape (10, 10); None without a metric ground plane or an estimate."""
     paper: PaperReport | None
@@ -166,6 +175,11 @@ class Calibration:
     distortion_model: str = 'auto'
     rectified_balance: float = 0.0
     figures: Figures = field(default_factory=Figures, compare=False, repr=False)
+
+    @property
+    def candidate(self) -> Calibration:
+        """The calibration itself: what a refusal holds if it is too uncertain to be accepted."""
+        return self
 
     @cached_property
     def camera_info(self) -> CameraInfo:

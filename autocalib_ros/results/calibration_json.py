@@ -22,6 +22,7 @@ from autocalib_ros.results.calibration import (
     Refusal,
     StandardDeviations,
 )
+from autocalib_ros.results.grades import GroundSigma, HelpfulMeasure
 from autocalib_ros.results.refusals import Reason
 from autocalib_ros.results.statements import UNKNOWN_KIND, Statement, Value
 from autocalib_ros.results.verification_table import VerificationRow
@@ -54,7 +55,7 @@ def read_json(path: Path) -> Mapping[str, Any]:
 def calibration_from_json(document: Mapping[str, Any]) -> Calibration:
     """Return the calibration of a document of calibration.json; InputError says what is wrong with it."""
     if document.get('version') not in READ_VERSIONS:
-        versions = ' and '.join(map(str, READ_VERSIONS))
+        versions = f'{READ_VERSIONS[0]} to {READ_VERSIONS[-1]}'
         raise InputError(f'its version is {reprlib.repr(document.get("version"))}; versions {versions} can be read')
     if document.get('state') != 'calibrated':
         raise InputError(
@@ -101,7 +102,7 @@ def _parse_calibration(document: Mapping[str, Any]) -> Calibration:
         ground=None if pose is None else _parse_ground(pose, metric=grade != 'unit_scale'),
         ground_refusal=None if reason is None else _parse_reason(reason),
         road_directions=np.array(document['road_directions_in_camera'], float).reshape(-1, 3),
-        stddev=_parse_stddev(document['stddev']),
+        stddev=_parse_stddev(document['stddev'], document.get('ground_sigma_rel')),
         paper=None if paper is None else _parse_paper(paper),
         evidence=EvidenceSummary(
             image_size=(width, height),
@@ -114,6 +115,7 @@ def _parse_calibration(document: Mapping[str, Any]) -> Calibration:
             people=int(evidence.get('people', 0)),
         ),
         newest_stamp_ns=int(document['newest_stamp_ns']),
+        helpful=_parse_helpful(document.get('helpful_measure')),
         covariance=_parse_covariance(document.get('covariance')),
     )
 
@@ -154,13 +156,18 @@ def _parse_ground(pose: Mapping[str, Any], *, metric: bool) -> GroundPlane:
     return GroundPlane(rotation, height, metric)
 
 
-def _parse_stddev(sigma: Mapping[str, Any]) -> StandardDeviations:
+def _parse_stddev(sigma: Mapping[str, Any], ground: Mapping[str, Any] | None) -> StandardDeviations:
     point = sigma['principal_point_px']
     return StandardDeviations(
         **{name: _optional_float(sigma[name]) for name in ('focal_px', 'k1', 'k2', 'tilt_deg', 'roll_deg', 'height_m')},
         principal_point_px=None if point is None else _numbers(point, float, 2),
         ground_point_m=tuple(_optional_float(value) for value in sigma['ground_point_m'].values()),
+        ground=None if ground is None else GroundSigma(float(ground['along']), float(ground['across'])),
     )
+
+
+def _parse_helpful(entry: Mapping[str, Any] | None) -> HelpfulMeasure | None:
+    return None if entry is None else HelpfulMeasure(str(entry['kind']), float(entry['expected_sigma_rel']))
 
 
 def _parse_covariance(entry: Mapping[str, Any] | None) -> np.ndarray | None:
@@ -194,9 +201,10 @@ def _reject_constant(name: str) -> NoReturn:
     raise ValueError(f'{name} is no number')
 
 
-JSON_VERSION = 2
-READ_VERSIONS = (1, 2)
-"""Version 1 holds assumptions and checks as texts."""
+JSON_VERSION = 3
+READ_VERSIONS = (1, 2, 3)
+"""Version 1 holds assumptions and checks as texts; versions 1 and 2 grade planes as full or assumed, without
+`ground_sigma_rel`."""
 SCALE_OF_VERSION_1 = 'scale_height'
 """Kind of the scale in a file of version 1: the text alone names its source."""
 
@@ -218,6 +226,9 @@ def to_json(result: Calibration | Refusal, *, accepted_at_s: float | None = None
         'camera_info': None,
         'ground_from_camera': None,
         'road_directions_in_camera': [],
+        'ground_sigma_rel': None,
+        'helpful_measure': None,
+        'candidate': None,
         'stddev': None,
         'covariance': None,
         'paper': None,
@@ -235,6 +246,7 @@ def to_json(result: Calibration | Refusal, *, accepted_at_s: float | None = None
     }
     if isinstance(result, Refusal):
         document['refusal'] = _refusal_json(result)
+        document['candidate'] = None if result.candidate is None else _calibration_json(result.candidate)
     else:
         document.update(_calibration_json(result))
     return document
@@ -283,6 +295,16 @@ def _calibration_json(result: Calibration) -> dict[str, Any]:
         },
         'newest_stamp_ns': result.newest_stamp_ns,
         'road_directions_in_camera': np.asarray(result.road_directions).tolist(),
+        'ground_sigma_rel': None
+        if sigma.ground is None
+        else {'along': sigma.ground.along, 'across': sigma.ground.across},
+        'helpful_measure': None
+        if result.helpful is None
+        else {
+            'kind': result.helpful.kind,
+            'text': result.helpful.text,
+            'expected_sigma_rel': result.helpful.expected,
+        },
         'stddev': {
             'focal_px': sigma.focal_px,
             'principal_point_px': None if sigma.principal_point_px is None else list(sigma.principal_point_px),

@@ -132,6 +132,7 @@ REFUSALS = (
         missing='an identifiable focal length',
         message='focal length not identifiable: support of straight traffic at the best candidate is {contrast:.2f} '
         'times the median (at least {limit:g} needed)',
+        variants={'single_road': ('no usual lens shows the one road that was found as straight', '')},
     ),
     RefusalCode(
         code='turning_traffic',
@@ -161,7 +162,7 @@ REFUSALS = (
     RefusalCode(
         code='too_little_curvature',
         cause='The focal length is uncertain: straight traffic shows too little lens curvature.',
-        limit='gate.max_sigma_focal_rel, 5 % (one sigma); or a focal length above 1.5 image diagonals; or a '
+        limit='gate.max_sigma_focal_rel, 25 % (one sigma); or a focal length above 1.5 image diagonals; or a '
         'distortion-free lens without a known road angle or focal length',
         remedy='wait for traffic nearer the borders of the image; a lens without distortion needs the angle between '
         'two roads (joint.road_angle) or its focal length (joint.focal_prior_px)',
@@ -172,7 +173,7 @@ REFUSALS = (
     RefusalCode(
         code='too_little_turning',
         cause='The focal length is uncertain: too few vehicles turn, or they turn too little.',
-        limit='gate.max_sigma_focal_rel (5 % of the focal length, one sigma)',
+        limit='gate.max_sigma_focal_rel (25 % of the focal length, one sigma)',
         remedy='wait for more turning vehicles, or for straight traffic',
         missing='turning traffic',
         message='turning traffic does not determine the lens: focal length {focal_px:.0f} px +- {sigma:.1%} '
@@ -245,7 +246,7 @@ REFUSALS = (
         code='pixel_aspect',
         cause='The pixels may not be square: the traffic cannot tell, or it contradicts square pixels and every usual '
         'squeeze.',
-        limit='gate.max_sigma_focal_rel, 5 % (one sigma), with the difference that the pixel aspect makes',
+        limit='gate.max_sigma_focal_rel, 25 % (one sigma), with the difference that the pixel aspect makes',
         remedy='set lens.pixel_aspect, the width of a pixel over its height: 1 if the images are not squeezed, else '
         'the shape of the picture over that of the image (720x576 of a 16:9 picture: 1.422); or wait for traffic '
         'nearer the borders of the image',
@@ -287,10 +288,27 @@ REFUSALS = (
         },
     ),
     RefusalCode(
+        code='grade_too_low',
+        cause='Lens and ground plane are known, but lengths on the road are too uncertain. calibration.json holds the '
+        'result as its candidate.',
+        limit='gate.least_grade: fair (10 %) for what the node publishes, coarse (25 %) for a recording; one standard '
+        'deviation of a length on the road 20 m ahead, along or across the view',
+        remedy='give one more number, {helpful}; or ' + WAIT,
+        missing='certainty of lengths on the road',
+        message='the result is of grade {grade}, at least {least} is asked for: lengths on the road along the view '
+        '+- {along:.0%}, across it +- {across:.0%}',
+        variants={
+            'no_road_ahead': (
+                'the result is of grade {grade}, at least {least} is asked for: the camera sees no road ahead of it, '
+                'by which it could be graded',
+                'turn the camera so that it sees the road ahead',
+            )
+        },
+    ),
+    RefusalCode(
         code='plane_uncertain',
         cause='The ground normal is too uncertain, or two estimates of it disagree.',
-        limit='gate.max_sigma_tilt_deg, 1.5 degrees (one sigma); three times that for a plane that rests on an '
-        'assumption',
+        limit='gate.max_sigma_tilt_deg, 5 degrees (one sigma)',
         remedy='wait for more traffic on the quieter road',
         missing='a certain ground plane',
         message='ground normal +- {sigma_deg:.1f} degrees (at most {limit_deg:g} allowed)',
@@ -404,17 +422,24 @@ REFUSALS = (
     ),
     RefusalCode(
         code='too_few_vehicles',
-        cause='Too few vehicles drive straight along the busiest road to measure its mean speed.',
-        limit='10 vehicles',
+        cause='Too few vehicles drive straight along the busiest road to measure its mean speed, or lens and plane '
+        'from a single road.',
+        limit='10 vehicles for the speed, 8 for a single road',
         remedy=WAIT,
         missing='vehicles along the busiest road',
         message='{vehicles} vehicles drive straight along the busiest road (at least {limit} needed to compare their '
         'speed with the given mean)',
+        variants={
+            'single_road': (
+                '{vehicles} vehicles follow the one straight road that was found (at least {limit} needed)',
+                '',
+            )
+        },
     ),
     RefusalCode(
         code='scale_uncertain',
         cause='The camera height that follows from the given scale is too uncertain.',
-        limit='gate.max_sigma_height_rel, 20 % (one sigma)',
+        limit='gate.max_sigma_height_rel, 25 % (one sigma)',
         remedy='give a longer distance on the road nearer to the camera, wait for more traffic, or give the camera '
         'height',
         missing='a certain scale',

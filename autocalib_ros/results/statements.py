@@ -175,6 +175,10 @@ def _pixel_aspect(aspect: float, source: str) -> str:
 ASSUMPTIONS: dict[str, Wording] = {
     'lens_given': 'the lens is given: only the pose was estimated',
     'lens_family': _lens_family,
+    'lens_barrel': 'lens from equidistant (k1 = 0) to distortion-free (1/3), by how much straight traffic curves: k1 = '
+    '{k1:.2f} +- {sigma:.2f}',
+    'field_of_view': 'field of view across the image {view_deg:.0f} degrees (focal length +- {sigma:.0%}): usual '
+    'ones are {usual_deg:.0f} degrees within a factor of 1.65',
     'principal_point': _principal_point,
     'focal_given': _focal_given,
     'pixel_aspect': _pixel_aspect,
@@ -207,6 +211,8 @@ CHECKS: dict[str, Wording] = {
     'still_part': _still_part,
     'crossing_angle': _crossing_angle,
     'turning_vehicles': '{vehicles} turning vehicles move as rigid bodies in the plane',
+    'single_road': 'one road, which {following:.0%} of the vehicles follow: {edges} vehicle edges and {lines} still '
+    'lines along, across and upright to it',
     'halves': _halves,
     'halves_not_compared': 'not cross-validated in time: the earlier or the later half has too little traffic',
     'edges_and_level': 'edges of vehicles and a level camera differ by {difference_deg:.1f} degrees about the road',

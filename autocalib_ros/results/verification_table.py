@@ -27,47 +27,46 @@ class VerifiedQuantity:
 
 REFUSED = 'no calibration'
 NO_PLANE = 'no ground plane'
-GRADE_ASSUMED = 'not grade full'
-TOO_UNCERTAIN = 'too uncertain for grade full'
+CONTRADICTED = 'grade fair at most'
+GRADE_FAIR = 'no grade full'
 WIDENED = 'wider standard deviations'
 
 VERIFIED_QUANTITIES: dict[str, VerifiedQuantity] = {
     'focal_sigma': VerifiedQuantity('standard deviation of the focal length', '%', REFUSED),
-    'focal_sigma_full': VerifiedQuantity('standard deviation of the focal length, for grade full', '%', TOO_UNCERTAIN),
     'plane_sigma': VerifiedQuantity('standard deviation of tilt or roll, the larger', 'degrees', NO_PLANE),
-    'plane_sigma_full': VerifiedQuantity(
-        'standard deviation of tilt or roll, the larger, for grade full', 'degrees', TOO_UNCERTAIN
-    ),
     'height_sigma': VerifiedQuantity('standard deviation of the camera height', '%', NO_PLANE),
-    'vehicle_size': VerifiedQuantity('size of the vehicles against the usual one', '%', GRADE_ASSUMED),
+    'vehicle_size': VerifiedQuantity('size of the vehicles against the usual one', '%', CONTRADICTED),
     'below_horizon': VerifiedQuantity('tracked points below the horizon', '%', REFUSED, at_least=True),
     'straight_share': VerifiedQuantity('vehicles that follow the roads', '%', REFUSED, at_least=True),
     'k1_prior': VerifiedQuantity('k1 against its lens family', 'sigma', REFUSED),
     'principal_point_prior': VerifiedQuantity(
-        'principal point against the centre of the picture', 'sigma', GRADE_ASSUMED
+        'principal point against the centre of the picture', 'sigma', CONTRADICTED
     ),
     'halves_share': VerifiedQuantity('share of vehicles on the roads, earlier against later traffic', 'sigma', REFUSED),
     'halves_roads': VerifiedQuantity(
-        'share of vehicles on each road, earlier against later traffic', 'sigma', GRADE_ASSUMED
+        'share of vehicles on each road, earlier against later traffic', 'sigma', CONTRADICTED
     ),
     'halves_focal': VerifiedQuantity('focal length, earlier against later traffic', '%', REFUSED),
     'halves_normal': VerifiedQuantity('ground normal, earlier against later traffic', 'degrees', REFUSED),
     'halves_pose': VerifiedQuantity('focal length and rotation, earlier against later traffic', 'sigma', REFUSED),
     'tracklets': VerifiedQuantity('turning vehicles over seconds against between two instants', 'sigma', WIDENED),
     'lane_markings': VerifiedQuantity(
-        'probability that traffic and lane markings are both right', '%', GRADE_ASSUMED, at_least=True
+        'probability that traffic and lane markings are both right', '%', CONTRADICTED, at_least=True
     ),
     'markings_and_traffic_normal': VerifiedQuantity('ground normal, lane markings against traffic', 'degrees', REFUSED),
     'markings_and_traffic_road': VerifiedQuantity(
         'direction of the road, lane markings against traffic', 'degrees', REFUSED
     ),
+    'single_road': VerifiedQuantity(
+        'plane by further roads or turning traffic against by a single road', 'degrees', CONTRADICTED
+    ),
     'edges_and_level': VerifiedQuantity('plane by vehicle edges against by a level camera', 'degrees', NO_PLANE),
     'lane_changes': VerifiedQuantity('plane by lane changes against the assumed plane', 'degrees', NO_PLANE),
     'pixel_aspect': VerifiedQuantity('pixel aspect against the one by the traffic', 'sigma', WIDENED),
     'given_lens_sigma': VerifiedQuantity(
-        'standard deviation of the focal length by the traffic, which tests the given one', '%', TOO_UNCERTAIN
+        'standard deviation of the focal length by the traffic, which tests the given one', '%', GRADE_FAIR
     ),
-    'given_lens': VerifiedQuantity('given focal length against the one by the traffic', '%', GRADE_ASSUMED),
+    'given_lens': VerifiedQuantity('given focal length against the one by the traffic', '%', CONTRADICTED),
 }
 """Every quantity of a verification, by its kind."""
 
@@ -106,12 +105,12 @@ class VerificationRow:
     @property
     def lowers_grade(self) -> bool:
         """Whether the check failed and thereby costs grade full."""
-        return not self.passed and self._quantity.cost in (GRADE_ASSUMED, TOO_UNCERTAIN)
+        return not self.passed and self._quantity.cost in (CONTRADICTED, GRADE_FAIR)
 
     @property
     def contradicts(self) -> bool:
         """Whether the check failed because two sources, or a source and its prior, contradict each other."""
-        return not self.passed and self._quantity.cost == GRADE_ASSUMED
+        return not self.passed and self._quantity.cost == CONTRADICTED
 
     @property
     def outcome(self) -> str:

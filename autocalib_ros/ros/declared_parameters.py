@@ -46,6 +46,9 @@ def read(given: dict[str, Any]) -> tuple[Options, NodeOptions]:
         if name not in items:
             raise UsageError(unknown_parameter(name))
         require_float(items[name], value)
+    # consumers of camera_info and tf see no standard deviation
+    if given.get('gate.least_grade', 'auto') == 'auto':
+        given = {**given, 'gate.least_grade': 'fair'}
     of_node = {item.name for item in walk_options(NodeOptions())}
     return (
         with_overrides(Options(), {name: value for name, value in given.items() if name not in of_node}),

@@ -8,7 +8,6 @@ import pytest
 
 from autocalib_ros.config import GateOptions, Options
 from autocalib_ros.estimation.adjustment.lens_prior import lens_priors
-from autocalib_ros.estimation.publish import with_certainty
 from autocalib_ros.estimation.solution import Solution
 from autocalib_ros.estimation.solution_rows import with_solution_rows
 from autocalib_ros.offline.synthetic.junction import Junction, synthetic_evidence
@@ -47,15 +46,3 @@ def test_a_junction_has_a_table_of_what_was_verified() -> None:
     assert {'focal_sigma', 'plane_sigma', 'k1_prior', 'straight_share', 'halves_focal', 'pixel_aspect'} <= rows.keys()
     assert rows['focal_sigma'].value == pytest.approx(result.stddev.focal_px / result.camera.focal_px, rel=1e-6)
     assert rows['plane_sigma'].value == pytest.approx(max(result.stddev.tilt_deg, result.stddev.roll_deg), rel=1e-6)
-
-
-@pytest.mark.solve
-@pytest.mark.parametrize(
-    ('focal', 'plane_deg', 'grade'), [(0.02, 0.5, 'full'), (0.04, 0.5, 'assumed'), (0.02, 1.3, 'assumed')]
-)
-def test_an_uncertain_result_has_not_grade_full(focal: float, plane_deg: float, grade: str) -> None:
-    result = solve_once(synthetic_evidence(Junction(), np.random.default_rng(0)), Options(camera_height=8.0))
-    sigma = replace(result.stddev, focal_px=focal * result.camera.focal_px, tilt_deg=plane_deg)
-    found = with_certainty(replace(result, grade='full', verification=(), stddev=sigma))
-    assert found.grade == grade
-    assert not any(row.contradicts for row in found.verification)

@@ -75,7 +75,7 @@ def test_the_summary_counts_and_names_the_worst() -> None:
     text = scenes.format_summary(runs)
     assert 'junction    2 of 2 accepted' in text and 'roundabout  0 of 1 accepted' in text
     assert 'beyond 3.5: 1 of 2, worst 4.0' in text
-    assert text.endswith('above grade assumed: 1')
+    assert text.endswith('at grade full: 1')
     assert [scenes.format_run(run).endswith('WRONG') for run in runs] == [False, True, False]
 
 

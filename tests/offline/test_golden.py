@@ -260,7 +260,7 @@ def test_stored_cases_and_stored_evidence_belong_together() -> None:
     assert all(case.description and case.made and case.expected for case in cases)
     assert sum(path.stat().st_size for path in STORED.glob('*.npz')) < 3.2e6
     grades = {case.expected.verdict['grade'] for case in cases}
-    assert grades == {None, 'full', 'assumed', 'lens', 'unit_scale'}
+    assert grades == {None, 'full', 'fair', 'coarse', 'lens', 'unit_scale'}
 
 
 def test_stored_evidence_has_edges_outlines_and_markings() -> None:

@@ -17,6 +17,7 @@ from autocalib_ros.results.calibration import (
     StandardDeviations,
 )
 from autocalib_ros.results.calibration_json import calibration_from_json, calibration_json
+from autocalib_ros.results.grades import GRADE_LIMITS
 from autocalib_ros.results.refusals import Reason
 from autocalib_ros.results.statements import Statement
 from autocalib_ros.results.verification_table import VerificationRow
@@ -85,7 +86,7 @@ def calibrations(draw: st.DrawFn) -> Calibration:
     metric = ground is not None and ground.metric
     return Calibration(
         method=draw(st.sampled_from(['joint', 'paper'])),
-        grade=draw(st.sampled_from(['full', 'assumed'])) if metric else 'unit_scale' if ground else 'lens',
+        grade=draw(st.sampled_from([*GRADE_LIMITS, 'assumed'])) if metric else 'unit_scale' if ground else 'lens',
         assumptions=tuple(draw(st.lists(STATEMENTS, max_size=3))),
         checks=tuple(draw(st.lists(STATEMENTS, max_size=3))),
         verification=tuple(draw(st.lists(ROWS, max_size=3))),

@@ -11,6 +11,7 @@ import pytest
 from autocalib_ros.errors import InputError
 from autocalib_ros.results.calibration import Refusal
 from autocalib_ros.results.calibration_json import calibration_from_json, calibration_json, read_json, to_json
+from autocalib_ros.results.grades import HelpfulMeasure
 from autocalib_ros.results.refusals import Reason
 from autocalib_ros.results.statements import SCALE_KINDS
 from stored_results import calibration, lens_only
@@ -20,6 +21,7 @@ CASES = {
     'whole': WHOLE,
     'lens only': replace(lens_only(WHOLE), ground_refusal=Reason('no_height', 'none given', 'give it'), paper=None),
     'unit scale': replace(WHOLE, grade='unit_scale', ground=replace(WHOLE.ground, height_m=1.0, metric=False)),
+    'helpful measure': replace(WHOLE, grade='fair', helpful=HelpfulMeasure('focal', 0.04)),
     'squeezed pixels': replace(WHOLE, camera=replace(WHOLE.camera, pixel_aspect=64 / 45, skew=0.001)),
     'no roads, no deviations': replace(
         lens_only(WHOLE),
@@ -31,7 +33,8 @@ CASES = {
 
 def test_whole_case_leaves_no_field_of_a_calibration_untested():
     unset = [item.name for item in fields(WHOLE) if getattr(WHOLE, item.name) is None]
-    assert unset == ['ground_refusal']  # which goes with no ground plane: the case 'lens only'
+    # nothing helps a calibration of grade full: the case 'helpful measure'
+    assert unset == ['ground_refusal', 'helpful']  # the first goes with no ground plane: the case 'lens only'
 
 
 @pytest.mark.parametrize('name', CASES)
@@ -72,7 +75,7 @@ POSE = broken()['ground_from_camera']
 @pytest.mark.parametrize(
     ('document', 'expected'),
     [
-        (broken(version=3), 'version is 3; versions 1 and 2 can be read'),
+        (broken(version=4), 'version is 4; versions 1 to 3 can be read'),
         (broken(assumptions=[{'kind': 'a', 'text': 'b', 'values': [1]}]), 'numbers, texts or null were expected'),
         (broken(checks=[{'kind': 'a', 'text': 'b', 'values': {'c': [1]}}]), 'numbers, texts or null were expected'),
         (broken(state='refused'), "state is 'refused'"),

@@ -42,7 +42,7 @@ def test_a_summary_counts_and_names_what_failed():
     assert summarise_verification((good, good)) == '2 of 2 checks passed'
     assert summarise_verification((good, bad)) == (
         '1 of 2 checks passed; probability that traffic and lane markings are both right 2 % (at least 50 %): '
-        'failed: not grade full'
+        'failed: grade fair at most'
     )
 
 

@@ -61,6 +61,7 @@ def fit_to_markings(
     if isinstance(accepted, Reason):
         return accepted
     segments, best = accepted
+    best = _covering_others(segments, best, grids)
     state = AdjustmentState(best.camera, best.rotation, np.array([0.0, np.pi / 2 + best.skew_rad]))
     fit = evaluate_at(state, tracks, replace(config, prior=best.prior, crossing_rad=None), best.covariance)
     if not fit.focal_sigma <= gate.max_sigma_focal_rel:
@@ -199,6 +200,30 @@ def check_ambiguity(segments: RoadSegments, grids: list[MarkingGrid], gate: Gate
         if other.prior is best.prior and np.log(focals[1] / focals[0]) > gate.max_sigma_focal_rel:
             return reason('no_markings', 'two_lenses', focal_px=focals[0], other_focal_px=focals[1])
     return None
+
+
+def _covering_others(segments: RoadSegments, best: MarkingGrid, grids: list[MarkingGrid]) -> MarkingGrid:
+    """Return the best grid with a covariance that covers other lenses of its family, each by its probability.
+
+    These are of nearly the same plane: another plane is an ambiguity, which is refused.
+    """
+    near = [
+        other
+        for other in grids
+        if other.prior is best.prior
+        and other.negative_log_evidence < best.negative_log_evidence + AMBIGUITY_NATS
+        and _normal_difference_deg(segments, best, other) <= MAX_AMBIGUITY_DEG
+    ]
+    weights = np.exp([best.negative_log_evidence - other.negative_log_evidence for other in near])
+    covariance = best.covariance.copy()
+    for other, weight in zip(near, weights / max(float(weights.sum()), 1.0), strict=True):
+        step = np.zeros(len(covariance))
+        step[: len(best.prior.free)] = best.prior.step(best.camera, other.camera)
+        up = other.rotation[:, 2] * np.sign(best.rotation[:, 2] @ other.rotation[:, 2])
+        turn, _ = Rotation.align_vectors(up[None], best.rotation[:, 2][None])
+        step[len(best.prior.free) : len(best.prior.free) + 3] = best.rotation.T @ turn.as_rotvec()
+        covariance += weight * np.outer(step, step)
+    return replace(best, covariance=covariance)
 
 
 def _normal_difference_deg(segments: RoadSegments, one: MarkingGrid, other: MarkingGrid) -> float:

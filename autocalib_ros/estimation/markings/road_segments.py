@@ -62,7 +62,7 @@ def segments_on_road(evidence: Evidence) -> RoadSegments:
     if not len(ends) or not len(evidence.points_px):
         return RoadSegments(np.zeros((0, 4)), np.zeros(0, int))
     ends = ends[all_within(sample_segments(ends), traffic_cells(evidence), MAX_DISTANCE_TO_TRAFFIC * width)]
-    segments = RoadSegments(ends, _group_ids(ends, width))
+    segments = RoadSegments(ends, group_segments(ends, width))
     best_first = segments.subset(np.argsort(-segments.lengths_px, kind='stable'))
     return best_first.subset(np.argsort(count_earlier(best_first.groups), kind='stable')[:MAX_ROAD_LINES])
 
@@ -85,7 +85,7 @@ def all_within(points: np.ndarray, positions: np.ndarray, max_distance: float) -
     return np.isfinite(distances).reshape(points.shape[:2]).all(axis=1)
 
 
-def _group_ids(ends: np.ndarray, width: int) -> np.ndarray:
+def group_segments(ends: np.ndarray, width: int) -> np.ndarray:
     """Number the groups of segments (n, 4), shape (n,)."""
     middle, step = (ends[:, :2] + ends[:, 2:]) / 2, ends[:, 2:] - ends[:, :2]
     heading = np.arctan2(step[:, 1], step[:, 0])

@@ -29,6 +29,8 @@ TELEVISION_SIGMA = float(np.log(720 / 704))
 RECORDER_SQUEEZES = (2.0, 3 / 2, 4 / 3, 1 / 2)
 """Pixel aspects with which recorders store pictures of sensors: half of the columns (1080N), two thirds (DVCPRO HD),
 three quarters (HDV), half of the lines (2CIF)."""
+UNUSUAL_RMS = 0.04
+"""Standard deviation of the log aspect of images whose size is that of a sensor: one in eight is squeezed, by 12 %."""
 MIN_SQUEEZE = 0.002
 """Smallest squeeze, in log aspect, that is one: less moves a point at the border of an image by about one pixel."""
 
@@ -68,6 +70,14 @@ class AspectHypotheses:
         others = {name: aspect for name, aspect in aspects.items() if not _is_near(size, aspect, 1.0, near_sigma)}
         others_sigma = TELEVISION_SIGMA if television else near_sigma
         return cls(size, others, near_sigma, others_sigma, television or recorder)
+
+    @property
+    def unmeasured_sigma(self) -> float:
+        """Standard deviation of the log aspect where nothing measures it: over what images of the size usually are."""
+        if not self.doubtful:
+            return 0.0 if self.near_sigma else UNUSUAL_RMS
+        logs = np.log(np.array([self.expected, *self.others.values()]) / self.expected)
+        return float(np.sqrt(np.mean(logs**2) + self.others_sigma**2))
 
     def expecting(self, aspect: float) -> AspectHypotheses:
         """Return the hypotheses for a recording that states a pixel aspect: that one is expected, not 1."""

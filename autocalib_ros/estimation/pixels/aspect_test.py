@@ -32,8 +32,9 @@ CONSISTENT_SIGMAS = 4.0
 consistent ones, by that distribution)."""
 EXCLUDED_SIGMAS = 8.0
 """The same for a measurement that starts from a solution with wrong pixels: twice as much, as it is less exact."""
-EXPECTED_NATS = 3.0
-"""Log prior odds of the expected pixel aspect: about one recording in twenty has another. Judgement."""
+EXPECTED_NATS = 2.0
+"""Log prior odds of the expected pixel aspect: about one recording in eight has another: two of 17 public
+clips of road cameras. Judgement."""
 MARKINGS_NATS = 3.0
 """Log odds for a pixel aspect with which lane markings agree with the traffic, against one with which they do not: by
 chance one grid of lines in twenty does. Judgement."""
@@ -155,6 +156,8 @@ def choose_aspect(
         if found.code not in tried_after:
             return found
         return _clear_other(hypotheses, solve_under, tracks) or found
+    if found.single_road:
+        return found
     measured = measure_aspect(found, tracks)
     found = _compared(found, measured, expected, near)
     contradicted = measured.sigmas_from(expected, near) > CONSISTENT_SIGMAS
@@ -208,7 +211,7 @@ def _clear_other(
         if first is not None and first.sigmas_from(aspect, sigma) > EXCLUDED_SIGMAS:
             continue
         found = solve_under(aspect, sigma)
-        if isinstance(found, Reason):
+        if isinstance(found, Reason) or found.single_road:
             continue
         measured = measure_aspect(found, tracks)
         if measured.sigmas_from(aspect, sigma) > CONSISTENT_SIGMAS:
@@ -293,7 +296,7 @@ def _widened(
     sigma, sigmas = measured.aspect * measured.sigma, measured.sigmas_from(expected)
     if not (np.isfinite(sigma) and covering.fit.focal_sigma <= gate.max_sigma_focal_rel):
         return _uncertain(measured, covering.fit, gate, against=against)
-    uncertain = found.plane_refusal or check_plane(covering.plane, gate, assumed=True)
+    uncertain = found.plane_refusal or check_plane(covering.plane, gate)
     statement = check('pixel_aspect', aspect=against, measured=measured.aspect, sigma=min(sigma, 9.99), sigmas=sigmas)
     return replace(covering, plane_refusal=uncertain, reduced=True, checks=(*found.checks, statement))
 

@@ -53,8 +53,6 @@ MAX_K1_SIGMAS = 3.5
 MAX_MOTION_FOCAL_SIGMA = 0.1
 """Relative sigma of the focal length from the motion of turning vehicles alone, below which that motion confirms the
 lens: turns mistaken for roads have larger errors. Judgement."""
-ASSUMED_PLANE_SIGMA_FACTOR = 3.0
-"""Factor by which the sigma of a plane that rests on an assumption may exceed that of a measured one. Judgement."""
 MAX_HALVES_SIGMAS, MAX_WHOLE_SIGMAS = 3.5, 3.0
 """Allowed difference between two halves of the evidence: in their own sigmas, and in the sigmas that follow from the
 whole."""
@@ -190,21 +188,15 @@ def k1_prior_sigmas(fit: Adjustment) -> float:
     return abs(fit.state.camera.k[0] - prior.centre.k[0]) / float(prior.sigma[3])
 
 
-def max_plane_sigma_deg(plane: PlaneEstimate, gate: GateOptions, *, assumed: bool) -> float:
-    """Return the largest standard deviation of tilt and roll; one that rests on an assumption may be less certain."""
-    return gate.max_sigma_tilt_deg * (ASSUMED_PLANE_SIGMA_FACTOR if assumed or plane.assumed is not None else 1.0)
-
-
-def check_plane(plane: PlaneEstimate, gate: GateOptions, *, assumed: bool = False) -> Reason | None:
-    """Check the ground plane; one that is `assumed` may be less certain."""
+def check_plane(plane: PlaneEstimate, gate: GateOptions) -> Reason | None:
+    """Check the ground plane."""
     sigma = plane.worst_sigma_deg
     if isinstance(plane.assumed, LevelCamera) and not plane.assumed.constrains_plane(plane.fit.state):
         return reason('plane_uncertain', 'level_road')
     if plane.assumed is not None and plane.fraction_below_horizon < MIN_FRACTION_BELOW_HORIZON:
         return _above_horizon_reason(plane.fraction_below_horizon)
-    needed = max_plane_sigma_deg(plane, gate, assumed=assumed)
-    if not sigma <= needed:
-        return reason('plane_uncertain', sigma_deg=min(sigma, 90.0), limit_deg=needed)
+    if not sigma <= gate.max_sigma_tilt_deg:
+        return reason('plane_uncertain', sigma_deg=min(sigma, 90.0), limit_deg=gate.max_sigma_tilt_deg)
     return None
 
 

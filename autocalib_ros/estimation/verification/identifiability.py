@@ -62,7 +62,7 @@ def _restored(camera: Camera, prior: Camera, name: str) -> Camera:
     return replace(camera, k=(prior.k[0], k2, k3, k4) if name == 'k1' else (k1, prior.k[1], k3, k4))
 
 
-def _principal_point_assumption(prior: LensPrior) -> Statement:
+def principal_point_assumption(prior: LensPrior) -> Statement:
     """Return where the principal point was assumed; a picture that does not fill the images is named."""
     sigma_px, down_px = prior.sigma[1:3]
     more: dict[str, object] = {}
@@ -80,7 +80,7 @@ def lens_assumptions(fit: Adjustment, fixed: tuple[str, ...]) -> tuple[Statement
         return (assumption('lens_given'),)
     statements = [
         assumption('lens_family', family=prior.family, k1_sigma=prior.sigma[3]),
-        _principal_point_assumption(prior),
+        principal_point_assumption(prior),
     ]
     if prior.focal_known:
         focal_px = prior.centre.focal_px

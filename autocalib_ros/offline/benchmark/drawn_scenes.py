@@ -62,7 +62,7 @@ DRAWN_JPEG_QUALITY = (60, 95)
 """Range of the quality with which the pictures are compressed."""
 FALSE_SIGMAS = 3.5
 WRONG_FOCAL, WRONG_DEG = 0.05, 2.0
-"""Errors that no answer above grade assumed may have."""
+"""Errors that no answer of grade full may have."""
 
 
 @dataclass(frozen=True)
@@ -105,8 +105,8 @@ class SceneRun:
 
     @property
     def wrong(self) -> bool:
-        """Whether the result is beyond what an answer above grade assumed may have."""
-        graded = self.verdict in ('full', 'unit_scale', 'lens')
+        """Whether the result is beyond what an answer of grade full, or a lens alone, may have."""
+        graded = self.verdict in ('full', 'lens')
         return graded and bool(abs(self.focal[0]) > WRONG_FOCAL or self.normal_deg > WRONG_DEG)
 
 
@@ -265,5 +265,5 @@ def format_summary(runs: Sequence[SceneRun]) -> str:
             f'normal median {np.median(normal):.2f}, worst {normal.max():.2f} degrees'
         )
     wrong = sum(run.wrong for run in runs)
-    lines.append(f'wrong by more than {100 * WRONG_FOCAL:.0f} % or {WRONG_DEG:g} degrees above grade assumed: {wrong}')
+    lines.append(f'wrong by more than {100 * WRONG_FOCAL:.0f} % or {WRONG_DEG:g} degrees at grade full: {wrong}')
     return '\n'.join(lines)

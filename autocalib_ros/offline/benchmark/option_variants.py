@@ -1,7 +1,7 @@
 """Documented options on stored evidence with known truth: `autocalib benchmark options`.
 
 No option, and no pair of options, may make a result wrong with confidence: beyond `MAX_VARIANT_SIGMAS` of its stated
-standard deviations at a grade above assumed.
+standard deviations.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class VariantRun:
     accepted: int
     cases: int
     worst: float
-    """Largest error of focal length, tilt or roll above grade assumed, in stated standard deviations."""
+    """Largest error of focal length, tilt or roll, in stated standard deviations."""
     worst_case: str
 
     @property
@@ -88,7 +88,7 @@ def run_variant(task: VariantTask) -> VariantRun:
         if not isinstance(result, Calibration):
             continue
         accepted += 1
-        error = 0.0 if result.grade == 'assumed' else _worst_z(result, dict(case.truth or {}))
+        error = _worst_z(result, dict(case.truth or {}))
         if error > worst:
             worst, worst_case = error, case.name
     return VariantRun(task.changes, accepted, len(task.cases), worst, worst_case)

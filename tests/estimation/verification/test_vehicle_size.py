@@ -49,11 +49,12 @@ def test_few_vehicles_or_no_silhouettes_measure_nothing() -> None:
 
 
 @pytest.mark.solve
-@pytest.mark.parametrize(('height_ratio', 'grade'), [(1.0, 'full'), (1.7, 'assumed')])
+@pytest.mark.parametrize(('height_ratio', 'grade'), [(1.0, 'full'), (1.7, 'fair')])
 def test_a_wrong_height_costs_grade_full(height_ratio: float, grade: str) -> None:
     result = solve_once(cars(30), Options(camera_height=height_ratio * JUNCTION.height_m))
     assert isinstance(result, Calibration) and result.grade == grade
     (row,) = [row for row in result.verification if row.kind == 'vehicle_size']
     assert row.passed is (grade == 'full')
     assert ('Check the camera height' in next_step(result)) is not row.passed
-    assert verdict(result).startswith('Calibrated:' if row.passed else 'Calibrated, but a check contradicts it:')
+    doubt = '' if row.passed else ' (grade fair, but a check contradicts it)'
+    assert verdict(result).startswith(f'Calibrated{doubt}:')

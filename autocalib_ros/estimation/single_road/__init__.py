@@ -1,0 +1,1 @@
+"""Lens and plane from a single straight road: a posterior over focal length, curvature and the turn about the road."""

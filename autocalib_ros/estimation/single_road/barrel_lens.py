@@ -1,0 +1,94 @@
+"""One-parameter lens family from equidistant to distortion-free, and where to look for its focal length.
+
+The projection r = f tan(sqrt(kappa) theta) / sqrt(kappa) is distortion-free at kappa = 1, stereographic at 1/4 and
+equidistant at 0. Straight paths show one number of it, the barrel (1 - kappa) / f^2, and no focal length: to second
+order a pinhole picture of radius r_u is compressed to r_u (1 - barrel r_u^2 / 3).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from autocalib_ros.estimation.adjustment.lens_prior import DISTORTION_FREE, LensPrior
+from autocalib_ros.lens.camera import Camera
+
+MIN_KAPPA, MAX_KAPPA = -0.15, 1.05
+"""Lenses from slightly beyond equidistant to slightly beyond distortion-free."""
+USUAL_KAPPAS = ((0.95, 0.15), (0.0, 0.09))
+"""Mean and standard deviation of usual narrow and wide lenses, a third of all each; another third is spread evenly.
+Those of wide lenses are the same as of the family near equidistant. Judgement."""
+USUAL_VIEW_DEG, USUAL_VIEW_FACTOR = 45.0, 1.65
+"""Median and spread (one standard deviation is this factor) of the horizontal field of view of roadside cameras: 26 to
+86 degrees, median 38, on 18 measured ones (BrnoCompSpeed, Sochor et al. 2018), and wide-angle lenses besides."""
+MIN_VIEW_DEG, MAX_VIEW_DEG = 18.0, 180.0
+"""Fields of view that are tried: two standard deviations of the prior to the narrow side, and a fisheye's."""
+TRIAL_KAPPAS, TRIAL_VIEWS_DEG = (1.0, 0.6, 0.3, 0.0), (50.0, 75.0, 100.0, 125.0, 150.0)
+"""Curvatures with a given focal length, and fields of view of equidistant lenses, at which roads are looked for."""
+TRIAL_KAPPAS, TRIAL_VIEWS_DEG = (1.0, 0.6, 0.3, 0.0), (50.0, 75.0, 100.0, 125.0, 150.0)
+"""Curvatures with a given focal length, and fields of view of equidistant lenses, at which roads are looked for."""
+FOCAL_NODES, KNOWN_FOCAL_NODES, KNOWN_FOCAL_SIGMAS = 36, 15, 2.8
+"""Focal lengths that are tried, without and with a given one, and up to how many standard deviations from it."""
+
+
+def barrel_coefficients(kappa: float) -> tuple[float, float, float, float]:
+    """Return k1 to k4 of a lens: the Taylor series of tan(sqrt(kappa) theta) / sqrt(kappa)."""
+    k1, k2, k3, k4 = (each * kappa ** (power + 1) for power, each in enumerate(DISTORTION_FREE))
+    return k1, k2, k3, k4
+
+
+@dataclass(frozen=True)
+class LensChoice:
+    """Lenses of the family that a prior allows, about its principal point."""
+
+    prior: LensPrior
+
+    @property
+    def known(self) -> bool:
+        """Whether the lens is known."""
+        return not len(self.prior.free)
+
+    def focal_lengths(self) -> np.ndarray:
+        """Return the focal lengths to try in ascending order, shape (n,)."""
+        centre = self.prior.centre
+        if self.known:
+            return np.array([centre.focal_px])
+        if self.prior.focal_known:
+            reach = KNOWN_FOCAL_SIGMAS * max(float(self.prior.sigma[0]), 1e-3)
+            return centre.focal_px * np.exp(np.linspace(-reach, reach, KNOWN_FOCAL_NODES))
+        half = 0.5 * centre.width * centre.pixel_aspect
+        shortest, longest = half / np.radians(MAX_VIEW_DEG / 2), half / np.tan(np.radians(MIN_VIEW_DEG / 2))
+        return np.geomspace(shortest, longest, FOCAL_NODES)
+
+    def trials(self) -> list[Camera]:
+        """Return lenses through one of which a straight road looks about straight, in the order of their barrel."""
+        centre = self.prior.centre
+        if self.known:
+            return [centre]
+        if self.prior.focal_known:
+            return [self.lens(centre.focal_px, kappa) for kappa in TRIAL_KAPPAS]
+        half = 0.5 * centre.width * centre.pixel_aspect
+        narrow = self.lens(half / np.tan(np.radians(USUAL_VIEW_DEG / 2)), 1.0)
+        return [narrow, *(self.lens(half / np.radians(view / 2), 0.0) for view in TRIAL_VIEWS_DEG)]
+
+    def lens(self, focal_px: float, kappa: float) -> Camera:
+        """Return a lens of the family."""
+        if self.known:
+            return self.prior.centre
+        return replace(self.prior.centre, focal_px=float(focal_px), k=barrel_coefficients(kappa))
+
+    def log_prior(self, focal_px: float, kappa: float) -> float:
+        """Return the log prior density of a lens, by log focal length and kappa."""
+        usual = sum(
+            np.exp(-0.5 * ((kappa - mean) / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi)) for mean, sigma in USUAL_KAPPAS
+        )
+        of_kappa = float(np.log((usual + 1.0) / 3.0))
+        if self.prior.focal_known:
+            away = np.log(focal_px / self.prior.centre.focal_px) / max(float(self.prior.sigma[0]), 1e-3)
+        else:
+            half = 0.5 * self.prior.centre.width * self.prior.centre.pixel_aspect
+            root = np.sqrt(max(kappa, 1e-6))
+            view_deg = 2 * np.degrees(np.arctan(root * half / focal_px) / root)
+            away = np.log(view_deg / USUAL_VIEW_DEG) / np.log(USUAL_VIEW_FACTOR)
+        return of_kappa - 0.5 * float(away) ** 2

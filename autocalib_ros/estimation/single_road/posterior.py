@@ -1,0 +1,406 @@
+"""Posterior of lens and plane over a single straight road, on a grid of focal length, curvature and turn.
+
+Straight tracks give the vanishing point of the road, and how much the lens curves. Edges of vehicles and lines of the
+still scene lie along, across and upright to the road, which gives the turn about it and, by their angles, the focal
+length. What they leave open is closed by wide priors of field of view and roll. Mean and covariance are over the whole
+grid, so that the standard deviations cover all lenses and planes that the evidence leaves.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.linalg import block_diag
+from scipy.spatial.transform import Rotation
+from scipy.special import logsumexp
+
+from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment, adjust, evaluate_at
+from autocalib_ros.estimation.adjustment.lens_prior import DISTORTION_FREE, LensPrior, known_lens
+from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig, AdjustmentState, Parameterisation
+from autocalib_ros.estimation.observations.track_set import TrackSet, UnprojectedTracks
+from autocalib_ros.estimation.single_road.barrel_lens import MAX_KAPPA, MIN_KAPPA, LensChoice
+from autocalib_ros.estimation.single_road.direction_mixture import (
+    MIXTURE_ROUNDS,
+    SEARCHED_TURNS_RAD,
+    TURNS_RAD,
+    DirectionMixture,
+    SeenSegments,
+    Tilts,
+    across_and_up,
+)
+from autocalib_ros.geometry.great_circles import quadratic_forms, squared_distances, unproject_rays
+from autocalib_ros.geometry.robust_kernels import cauchy_weight, geman_mcclure_bounded_loss
+from autocalib_ros.geometry.small_matrices import smallest_eigenvectors
+from autocalib_ros.lens.camera import Camera
+
+ROAD_OFFSETS = np.stack(np.meshgrid(*2 * (np.arange(-2.0, 3.0),)), axis=-1).reshape(-1, 2)
+REWEIGHTINGS = 4
+"""Rounds of the search for the direction where most planes meet."""
+SEARCH_REACH_RAD = 0.12 * 0.6 ** np.arange(16)
+"""Offsets of the search for the direction of the road, in units of its reach; and the reach, round by round."""
+TEMPER = 0.5
+"""Share of the log likelihood of edges and lines that counts: those of one scene repeat each other. Judgement."""
+TRACK_FREEDOM = 1.0
+"""Independent observations that a straight track counts as: drivers keep their lane, and follow bends, together."""
+MIN_DISTANCE_PX, ROBUST_LIMIT = 0.2, 4.0
+"""Least typical distance of a track from its path, and the squared distance, in units of the typical one, at which a
+track weighs a quarter."""
+KAPPA_NODES = 5
+"""Curvatures at each focal length, within 2.5 standard deviations of what straight tracks show."""
+QUADRATURE = ((0.0, 2 / 3), (np.sqrt(3.0), 1 / 6), (-np.sqrt(3.0), 1 / 6))
+"""Gauss-Hermite quadrature of three points: standard deviations, and weights."""
+MIN_SPACINGS, FINER_SHIFTS = 1.5, np.linspace(-2.5, 2.5, 16)
+"""Where the focal length is more certain than so many spacings of the grid, a finer one follows, with these shifts in
+spacings of the first."""
+KAPPA_TRIALS = 9
+"""Curvatures at each focal length by which straight tracks measure it."""
+MIN_WEIGHT = 1e-4
+"""Lenses less probable than this share of the likeliest are left out of what follows."""
+ROAD_SIGMA_RAD = np.radians(0.5)
+"""Standard deviation of the direction of the road under the camera from that of its vanishing point: carriageways
+differ by about a degree, and the grade changes along a road. Judgement."""
+COMMON_TILTS = (
+    (Tilts(across_rad=np.radians(0.75)), Tilts()),
+    (Tilts(upright_rad=np.radians(1.5)), Tilts()),
+    (Tilts(), Tilts(upright_rad=np.radians(1.2))),
+    (Tilts(), Tilts(grade_rad=np.radians(1.2))),
+)
+"""Errors common to all vehicle edges, and to all lines, one standard deviation each: bumpers rise at their ends, sides
+lean inwards; bank and grade of the road (2 %). Judgement."""
+MIN_KAPPA_REACH = 0.02
+"""Least range of the curvature, to either side, at one focal length."""
+NEAR_TURNS_RAD = np.radians(np.arange(-5.0, 5.1, 1.0))
+"""Turns about the best one, in the rounds after the first."""
+
+
+@dataclass(frozen=True)
+class _Node:
+    """One lens of the grid."""
+
+    camera: Camera
+    along: np.ndarray
+    """Direction of the road through this lens, from straight tracks, shape (3,)."""
+    log_weight: float
+    """Log prior and likelihood of the tracks, times the width of the node."""
+    turns: np.ndarray
+    """Turns about the road, shape (t,)."""
+    log_density: np.ndarray
+    """Log likelihood of edges and lines and log prior of the roll at these turns, shape (t,)."""
+
+    @property
+    def log_evidence(self) -> float:
+        """Log of the weight of the node, its turn integrated out."""
+        return self.log_weight + float(logsumexp(self.log_density))
+
+    @property
+    def turn_moments(self) -> tuple[float, float]:
+        """Mean and variance of the turn."""
+        weights = np.exp(self.log_density - logsumexp(self.log_density))
+        mean = float(weights @ self.turns)
+        return mean, float(weights @ (self.turns - mean) ** 2)
+
+
+@dataclass(frozen=True)
+class _RoadScene:
+    """Edges and lines about the road, and the prior of the roll."""
+
+    mixtures: tuple[DirectionMixture, DirectionMixture]
+    """Of vehicle edges and of still lines; either may be empty."""
+    roll_sigma_rad: float
+
+    def fitted_to(self, node: _Node) -> _FittedScene:
+        """Fit shares and spreads through a lens, and find the best turn."""
+        seen = tuple(mixture.through(node.camera, node.along) for mixture in self.mixtures)
+        fitted = _FittedScene(self, node, self.mixtures, seen, 0.0)
+        turns = SEARCHED_TURNS_RAD
+        for _ in range(MIXTURE_ROUNDS):
+            turn = float(turns[np.argmax(fitted.log_density(turns))])
+            mixtures = tuple(
+                mixture if mixture.empty else mixture.fitted(each, turn)
+                for mixture, each in zip(fitted.mixtures, seen, strict=True)
+            )
+            fitted = replace(fitted, mixtures=mixtures, turn=turn)
+            turns = turn + NEAR_TURNS_RAD
+        return fitted
+
+
+@dataclass(frozen=True)
+class _FittedScene:
+    """The scene through one lens, with fitted shares and spreads."""
+
+    scene: _RoadScene
+    node: _Node
+    mixtures: tuple[DirectionMixture, ...]
+    seen: tuple[SeenSegments, ...]
+    turn: float
+    """The best turn, among those that were tried."""
+
+    def log_density(self, turns: np.ndarray) -> np.ndarray:
+        """Return the log likelihood of the segments and the log prior of the roll at turns (t,)."""
+        _, up = across_and_up(self.node.along, turns)
+        rolls = np.arctan2(-up[:, 0], -up[:, 1])
+        density = -0.5 * (rolls / self.scene.roll_sigma_rad) ** 2
+        for mixture, each in zip(self.mixtures, self.seen, strict=True):
+            if not mixture.empty:
+                density = density + TEMPER * mixture.log_likelihood(each, turns)
+        return density
+
+    def weighed(self, tilts: tuple[Tilts, Tilts] = (Tilts(), Tilts())) -> _Node:
+        """Return the lens with the density of its turns, where edges and lines have common errors `tilts`."""
+        tilted = tuple(replace(mixture, tilts=tilt) for mixture, tilt in zip(self.mixtures, tilts, strict=True))
+        turns = self.turn + TURNS_RAD
+        return replace(self.node, turns=turns, log_density=replace(self, mixtures=tilted).log_density(turns))
+
+
+def road_posterior(
+    fit: Adjustment,
+    tracks: TrackSet,
+    choice: LensChoice,
+    segments: tuple[DirectionMixture, DirectionMixture],
+    roll_sigma_rad: float,
+) -> Adjustment:
+    """Return lens and plane, with their covariance, of a road whose lens the traffic does not determine.
+
+    `fit` is a solution of the road by any lens, `tracks` those by which lenses are compared. `segments` are vehicle
+    edges and still lines, either may be empty; `roll_sigma_rad` is the standard deviation of the roll.
+    """
+    scene, solve = _RoadScene(segments, roll_sigma_rad), _RoadThrough(fit, tracks)
+    focals = choice.focal_lengths()
+    fitted = [scene.fitted_to(node) for node in _lens_nodes(solve, choice, focals)]
+    mean, sigma = _focal_moments([each.weighed() for each in fitted])
+    spacing = float(np.log(focals[1] / focals[0])) if len(focals) > 1 else 0.0
+    if sigma < MIN_SPACINGS * spacing:
+        focals = np.exp(mean + spacing * FINER_SHIFTS)
+        fitted = [scene.fitted_to(node) for node in _lens_nodes(solve, choice, focals)]
+    base = scene.fitted_to(_mean_node([each.weighed() for each in fitted], solve, choice)).weighed()
+    parameters = _parameters(base, fit.problem.config, _published_prior(choice, base.camera))
+    covariance = _covariance(fitted, parameters) + _prior_covariance(parameters, tracks)
+    turns = slice(parameters.lens + 1, parameters.lens + 3)
+    covariance[turns, turns] += _road_covariance(parameters.base, solve.adjusted(base))
+    return evaluate_at(parameters.base, tracks, parameters.config, covariance)
+
+
+def road_posterior_with_lens(
+    fit: Adjustment,
+    tracks: TrackSet,
+    segments: tuple[DirectionMixture, DirectionMixture],
+    roll_sigma_rad: float,
+) -> Adjustment:
+    """Return lens and plane, with their covariance, of a road whose lens the traffic determines.
+
+    `fit` is the solution of that one road; the rest as for `road_posterior`.
+    """
+    scene, parameters = _RoadScene(segments, roll_sigma_rad), fit.problem.parameters
+    covariance, focal = fit.covariance, int(np.flatnonzero(np.append(parameters.config.prior.free, 0) == 0)[0])
+    free = focal < parameters.lens and covariance[focal, focal] > 0
+    step = covariance[focal] / np.sqrt(covariance[focal, focal]) if free else np.zeros(parameters.size)
+    states = [(parameters.state(shift * step), weight) for shift, weight in (QUADRATURE if free else ((0.0, 1.0),))]
+    nodes = [
+        _Node(state.camera, state.directions[0], float(np.log(weight)), np.zeros(1), np.zeros(1))
+        for state, weight in states
+    ]
+    fitted = [scene.fitted_to(node) for node in nodes]
+    own = _parameters(fitted[0].weighed(), fit.problem.config, parameters.config.prior)
+    # what the focal length does not explain: other lens parameters, and the direction of the road
+    turned = own.base.rotation.T @ parameters.base.rotation @ parameters.axes.T
+    to_own = block_diag(np.eye(parameters.lens), turned)
+    rest = to_own @ (covariance - np.outer(step, step)) @ to_own.T
+    return evaluate_at(own.base, tracks, own.config, _covariance(fitted, own) + rest)
+
+
+def _parameters(base: _Node, config: AdjustmentConfig, prior: LensPrior) -> Parameterisation:
+    """Return the parameters about a lens and its mean turn: the lens, and all rotations of the plane."""
+    state = _state_at(base, base.turn_moments[0])
+    return Parameterisation(state, replace(config, prior=prior, crossing_rad=np.pi / 2, crossing_sigma_rad=0.0))
+
+
+def _covariance(fitted: list[_FittedScene], parameters: Parameterisation) -> np.ndarray:
+    """Return the covariance over lenses and turns, with errors common to all edges or lines, and of the road itself."""
+    nodes = [each.weighed() for each in fitted]
+    evidence = np.array([node.log_evidence for node in nodes])
+    kept = np.flatnonzero(evidence > evidence.max() + np.log(MIN_WEIGHT)).tolist()
+    mean, covariance = _moments([nodes[index] for index in kept], parameters)
+    for tilts in COMMON_TILTS:
+        change = _moments([fitted[index].weighed(tilts) for index in kept], parameters)[0] - mean
+        covariance = covariance + np.outer(change, change)
+    covariance += np.outer(mean, mean)  # the state is that of the mean lens, which is near the mean state
+    road = np.zeros(len(covariance))
+    road[parameters.lens + 1 : parameters.lens + 3] = ROAD_SIGMA_RAD**2
+    return covariance + np.diag(road)
+
+
+def _published_prior(choice: LensChoice, camera: Camera) -> LensPrior:
+    """Return the prior with a mean of the lens itself: k1 free, further coefficients fixed."""
+    if choice.known:
+        return choice.prior
+    sigma = choice.prior.sigma.copy()
+    sigma[3], sigma[4] = max(sigma[3], 1e-3), 0.0
+    return replace(choice.prior, family='barrel', centre=camera, sigma=sigma)
+
+
+def _lens_nodes(solve: _RoadThrough, choice: LensChoice, focals: np.ndarray) -> list[_Node]:
+    """Return the lenses of the grid of focal lengths (n,), with the direction of the road through each."""
+    if choice.known:
+        return [_node(solve, choice.prior.centre, 0.0)]
+    return [node for focal_px in focals.tolist() for node in _curvature_nodes(solve, choice, focal_px)]
+
+
+def _curvature_nodes(solve: _RoadThrough, choice: LensChoice, focal_px: float) -> list[_Node]:
+    """Return the lenses of one focal length, about the curvature that straight tracks show."""
+    tried = np.linspace(MIN_KAPPA, MAX_KAPPA, KAPPA_TRIALS)
+    costs = np.array([solve(choice.lens(focal_px, kappa))[1] for kappa in tried.tolist()])
+    near = np.linspace(MIN_KAPPA, MAX_KAPPA, 50 * KAPPA_TRIALS)
+    density = np.exp(-CubicSpline(tried, costs - costs.min())(near))
+    density /= density.sum()
+    mean = float(density @ near)
+    reach = max(2.5 * float(np.sqrt(density @ (near - mean) ** 2)), MIN_KAPPA_REACH)
+    kappas = np.linspace(max(mean - reach, MIN_KAPPA), min(mean + reach, MAX_KAPPA), KAPPA_NODES)
+    width = float(np.log(kappas[1] - kappas[0]))
+    return [
+        _node(solve, choice.lens(focal_px, kappa), choice.log_prior(focal_px, kappa) + width)
+        for kappa in kappas.tolist()
+    ]
+
+
+@dataclass(frozen=True)
+class _RoadThrough:
+    """Finds the direction of the road through a given lens."""
+
+    start: Adjustment
+    tracks: TrackSet
+
+    @cached_property
+    def scale(self) -> float:
+        """Typical squared distance of a track from its path, px^2."""
+        return max(float(np.median(self.start.distance_px[self.start.inliers()] ** 2)), MIN_DISTANCE_PX**2)
+
+    @cached_property
+    def weights(self) -> np.ndarray:
+        """Independent observations that each track counts as, shape (tracks,)."""
+        return 0.5 * TRACK_FREEDOM * self.tracks.kish_weight(self.start.problem.config.vehicle_correlation)
+
+    def __call__(self, camera: Camera) -> tuple[np.ndarray, float]:
+        """Return the direction (3,) of the road through a lens, and the negative log likelihood of the tracks.
+
+        By distances in the image, with one scale for all lenses: a longer lens does not gain by deviations that are
+        given as angles. Found by a search that narrows about the place where the road vanishes.
+        """
+        state, matrix = self.start.state, UnprojectedTracks.through(camera, self.tracks).matrix
+        forms, cost = quadratic_forms(matrix), np.inf
+        # the road vanishes in the same place of the image, or where most planes through tracks and camera meet
+        place = unproject_rays(camera, state.camera.project(state.directions[:1])[0]).bearings[0]
+        starts = np.array([place, _common_direction(smallest_eigenvectors(matrix)[0], self.weights)])
+        along = starts[np.argmin(self._losses(forms, starts))]
+        along = along * (np.sign(along @ state.directions[0]) or 1.0)
+        for reach in SEARCH_REACH_RAD:
+            sideways = np.linalg.svd(along[None])[2][1:]
+            tried = along + reach * ROAD_OFFSETS @ sideways
+            tried /= np.linalg.norm(tried, axis=1, keepdims=True)
+            costs = self._losses(forms, tried)
+            along, cost = tried[np.argmin(costs)], float(costs.min())
+        return along, cost
+
+    def _losses(self, forms: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Return the negative log likelihood at directions (n, 3), shape (n,)."""
+        loss = geman_mcclure_bounded_loss(squared_distances(forms, directions) / self.scale, ROBUST_LIMIT)
+        return loss @ self.weights
+
+    def adjusted(self, node: _Node) -> Adjustment:
+        """Return the adjustment of the road through a lens, with its covariance."""
+        state, config = self.start.state, self.start.problem.config
+        turn, _ = Rotation.align_vectors(node.along[None], state.directions[:1])
+        moved = AdjustmentState(node.camera, turn.as_matrix() @ state.rotation, np.zeros(1))
+        return adjust(moved, self.tracks, replace(config, prior=known_lens(node.camera)), refine=True)
+
+
+def _common_direction(normals: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return the direction (3,) that is perpendicular to most unit normals (n, 3), by iterated reweighting."""
+    kept = weights
+    for _ in range(REWEIGHTINGS):
+        along = np.linalg.eigh((normals * kept[:, None]).T @ normals)[1][:, 0]
+        off = np.abs(normals @ along)
+        kept = weights * cauchy_weight((off / max(float(np.median(off)), 1e-6)) ** 2)
+    return along
+
+
+def _node(solve: _RoadThrough, camera: Camera, log_weight: float) -> _Node:
+    along, cost = solve(camera)
+    return _Node(camera, along, log_weight - cost, np.zeros(1), np.zeros(1))
+
+
+def _focal_moments(nodes: list[_Node]) -> tuple[float, float]:
+    """Return mean and standard deviation of the log focal length."""
+    evidence, logs = np.array([node.log_evidence for node in nodes]), np.log([node.camera.focal_px for node in nodes])
+    weights = np.exp(evidence - logsumexp(evidence))
+    mean = float(weights @ logs)
+    return mean, float(np.sqrt(weights @ (logs - mean) ** 2))
+
+
+def _mean_node(nodes: list[_Node], solve: _RoadThrough, choice: LensChoice) -> _Node:
+    """Return the node at the mean log focal length and the mean curvature."""
+    evidence = np.array([node.log_evidence for node in nodes])
+    weights = np.exp(evidence - logsumexp(evidence))
+    focal_px = float(np.exp(_focal_moments(nodes)[0]))
+    kappa = float(weights @ [node.camera.k[0] for node in nodes]) / DISTORTION_FREE[0]
+    return _node(solve, choice.lens(focal_px, kappa), 0.0)
+
+
+def _state_at(node: _Node, turn: float) -> AdjustmentState:
+    """Return the state with the road and the direction across it as its two axes."""
+    across, up = (each[0] for each in across_and_up(node.along, np.array([turn])))
+    across = np.cross(up, node.along)
+    rotation = np.column_stack([node.along, across, up])
+    return AdjustmentState(node.camera, rotation, np.array([0.0, np.pi / 2]))
+
+
+def _moments(nodes: list[_Node], parameters: Parameterisation) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean (p,) and covariance (p, p) of the steps from the base to what the nodes give."""
+    evidence = np.array([node.log_evidence for node in nodes])
+    weights = np.exp(evidence - logsumexp(evidence))
+    steps, within = [], np.zeros((parameters.size, parameters.size))
+    lens = parameters.lens
+    for node, weight in zip(nodes, weights, strict=True):
+        turn, variance = node.turn_moments
+        steps.append(parameters.step_to(_state_at(node, turn)))
+        own = np.zeros_like(within)
+        own[lens, lens] = variance
+        within += weight * own
+    points = np.array(steps)
+    mean = weights @ points
+    return mean, within + (points - mean).T @ ((points - mean) * weights[:, None])
+
+
+def _road_covariance(base: AdjustmentState, road: Adjustment) -> np.ndarray:
+    """Covariance (2, 2) of the rotations of the road about the direction across and about the normal."""
+    axes = base.rotation
+    spread = road.covariance_of(lambda state: state.directions[0])
+    # a rotation by w about y moves x by -w z, one by w about z moves it by w y
+    by = np.stack([-axes[:, 2], axes[:, 1]])
+    return by @ spread @ by.T
+
+
+def _prior_covariance(parameters: Parameterisation, tracks: TrackSet) -> np.ndarray:
+    """Covariance of principal point and pixel aspect under their priors, with the rotation that keeps the traffic.
+
+    The evidence does not measure them.
+    """
+    prior, base = parameters.config.prior, parameters.base
+    covariance = np.zeros((parameters.size, parameters.size))
+    pixels = tracks.pixels[tracks.weights > 0][:: max(1, int((tracks.weights > 0).sum() // 200))]
+    before = unproject_rays(base.camera, pixels).bearings
+    for index in (1, 2, 5):
+        at = np.flatnonzero(prior.free == index)
+        if not len(at):
+            continue
+        step = np.zeros(parameters.lens)
+        step[at] = 1.0
+        after = unproject_rays(prior.moved(base.camera, step), pixels).bearings
+        turn, _ = Rotation.align_vectors(after, before)
+        change = np.zeros(parameters.size)
+        change[: parameters.lens] = step
+        change[parameters.lens : parameters.lens + 3] = base.rotation.T @ turn.as_rotvec()
+        covariance += np.outer(change, change)
+    return covariance

@@ -1,0 +1,212 @@
+"""The strategy for one straight road: which traffic follows it, and what lens and plane the scene then leaves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from autocalib_ros.config import GateOptions
+from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment, adjust, evaluate_at
+from autocalib_ros.estimation.adjustment.lens_prior import known_lens
+from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig, AdjustmentState
+from autocalib_ros.estimation.markings.road_segments import group_segments
+from autocalib_ros.estimation.observations.track_set import TrackSet, evenly_spaced, kish_weight
+from autocalib_ros.estimation.single_road.barrel_lens import USUAL_VIEW_DEG, LensChoice
+from autocalib_ros.estimation.single_road.direction_mixture import STILL_SEGMENTS, VEHICLE_EDGES, DirectionMixture
+from autocalib_ros.estimation.single_road.posterior import road_posterior, road_posterior_with_lens
+from autocalib_ros.estimation.straight.initialisation import solve_from_consensus
+from autocalib_ros.estimation.vehicle_edges.transverse_edges import select_vehicle_edges
+from autocalib_ros.estimation.verification.gates import ComparedHalves, check_halves
+from autocalib_ros.estimation.verification.identifiability import lens_assumptions, principal_point_assumption
+from autocalib_ros.evidence.snapshot import Evidence
+from autocalib_ros.geometry.ground_plane import unsigned_angle_deg
+from autocalib_ros.lens.camera import field_of_view_deg
+from autocalib_ros.results.refusals import Reason, reason
+from autocalib_ros.results.statements import Statement, assumption, check
+from autocalib_ros.results.verification_table import VerificationRow, verified
+
+MAX_COMPARED_TRACKS = 200
+"""Tracks, evenly spaced in the list of all, by which lenses are compared."""
+MAX_ROAD_SEGMENTS = 300
+"""Most edges, and most still lines, in the posterior: the longest."""
+SEGMENT_CORRELATION = 0.3
+"""Correlation of the errors of the edges of one vehicle, or of the lines of one group. Judgement."""
+FIXED_LENS_SIGMA = np.array([1e-3, 0.0, 0.0, 0.0, 0.0, 0.0])
+"""Of a lens that is fixed but for its focal length, which is known: no other one is tried."""
+DEFAULT_ROLL_SIGMA_DEG = 3.0
+"""Standard deviation of the roll of a camera over a single road: 2.1 degrees on 18 measured ones (BrnoCompSpeed), and
+the camber of roads."""
+MIN_BARREL_GAIN = 1.1
+"""Factor by which more vehicles have to follow the road through a lens with more barrel distortion. Judgement."""
+SAME_ROAD_DEG = 10.0
+"""Roads through two lenses that differ by less are one."""
+MIN_ROAD_VEHICLES = 8
+"""Fewest vehicles that follow the road; among fewer, one that changes lanes weighs too much. Judgement."""
+MIN_FOLLOWING = 0.25
+"""Share of the vehicles that has to follow the road: on bends fewer than 15 % follow any straight line."""
+
+
+@dataclass(frozen=True)
+class SingleRoad:
+    """Lens and plane of a single road, with what was assumed and compared."""
+
+    fit: Adjustment
+    assumptions: tuple[Statement, ...]
+    checks: tuple[Statement, ...]
+    rows: tuple[VerificationRow, ...]
+
+
+def solve_single_road(
+    evidence: Evidence,
+    tracks: TrackSet,
+    config: AdjustmentConfig,
+    gate: GateOptions,
+    generator: np.random.Generator,
+) -> SingleRoad | Reason:
+    """Estimate lens and plane from one straight road, the scene along it, and wide priors; a reason if that fails."""
+    choice = LensChoice(config.prior)
+    subsample = tracks.subset(evenly_spaced(len(tracks), MAX_COMPARED_TRACKS))
+    road = _find_road(choice, subsample, config, generator)
+    if road is None:
+        return reason('no_direction', tracks=len(tracks))
+    start, compared = road
+    whole = adjust(start.state, tracks, start.problem.config, refine=True)
+    following = _following(whole, tracks)
+    if isinstance(following, Reason):
+        return following
+    halves = check_halves(whole, tracks, gate)
+    if isinstance(halves, Reason):
+        return halves
+    roll_deg, segments = config.options.roll_prior_deg or DEFAULT_ROLL_SIGMA_DEG, _segments(evidence, whole, tracks)
+    fit = road_posterior(start, subsample.subset(compared), choice, segments, float(np.radians(roll_deg)))
+    return _finished(
+        evaluate_at(fit.state, tracks, fit.problem.config, fit.covariance),
+        _lens_statements(fit, choice),
+        roll_deg,
+        segments,
+        following,
+        halves,
+    )
+
+
+def complete_single_road(fit: Adjustment, evidence: Evidence, tracks: TrackSet) -> SingleRoad | Reason:
+    """Complete a solution of one road, whose lens the traffic determines, with the plane; a reason if that fails."""
+    following = _following(fit, tracks)
+    if isinstance(following, Reason):
+        return following
+    options = fit.problem.config.options
+    roll_deg, segments = options.roll_prior_deg or DEFAULT_ROLL_SIGMA_DEG, _segments(evidence, fit, tracks)
+    solved = road_posterior_with_lens(fit, tracks, segments, float(np.radians(roll_deg)))
+    return _finished(solved, (), roll_deg, segments, following)
+
+
+def _following(fit: Adjustment, tracks: TrackSet) -> float | Reason:
+    """Return the share of the vehicles that follow the road; a reason if it is, or they are, too few."""
+    inliers = fit.inliers()
+    vehicles = len(np.unique(tracks.vehicles[inliers]))
+    if vehicles < MIN_ROAD_VEHICLES or not np.isfinite(fit.covariance).all():
+        return reason('too_few_vehicles', 'single_road', vehicles=vehicles, limit=MIN_ROAD_VEHICLES)
+    following = float((tracks.vehicle_weight * inliers).sum() / max(tracks.vehicle_weight.sum(), 1e-9))
+    if following < MIN_FOLLOWING:
+        return reason('turning_traffic', 'one_road', fraction=following, limit=MIN_FOLLOWING, roads=1)
+    return following
+
+
+def _finished(
+    fit: Adjustment,
+    assumptions: tuple[Statement, ...],
+    roll_deg: float,
+    segments: tuple[DirectionMixture, DirectionMixture],
+    following: float,
+    halves: ComparedHalves | None = None,
+) -> SingleRoad:
+    edges, lines = segments
+    seen = check('single_road', edges=len(edges.weights), lines=len(lines.weights), following=following)
+    return SingleRoad(
+        fit,
+        (*assumptions, assumption('level_camera', sigma_deg=roll_deg)),
+        (seen,) if halves is None else (seen, halves.statement),
+        (verified('straight_share', following, MIN_FOLLOWING), *(() if halves is None else halves.rows)),
+    )
+
+
+def _segments(evidence: Evidence, fit: Adjustment, tracks: TrackSet) -> tuple[DirectionMixture, DirectionMixture]:
+    """Return the edges of the vehicles that follow the road, and the lines of the still scene, as options allow."""
+    options = fit.problem.config.options
+    edges, lines = _edges(evidence, tracks.subset(fit.inliers())), _lines(evidence)
+    return edges if options.transverse_edges else edges.without(), lines if options.road_markings else lines.without()
+
+
+def _find_road(
+    choice: LensChoice, tracks: TrackSet, config: AdjustmentConfig, generator: np.random.Generator
+) -> tuple[Adjustment, np.ndarray] | None:
+    """Return the road that most vehicles follow, through the lens that shows it best, and the tracks that follow it.
+
+    The mask (tracks,) is of those that follow the same road through any of the lenses that are tried. None without one.
+    """
+    found = []
+    for lens in choice.trials():
+        trial = replace(config, prior=replace(known_lens(lens), sigma=FIXED_LENS_SIGMA), crossing_rad=None)
+        solved = solve_from_consensus(tracks, trial, generator)
+        if solved is not None and len(solved[0].state.angles_rad):
+            found.append(_busiest_road(solved[0], tracks, replace(trial, prior=known_lens(lens))))
+    if not found:
+        return None
+    follow = np.array([float(tracks.vehicle_weight @ fit.inliers()) for fit in found])
+    # straighter lenses come first: barrel distortion is believed where it explains clearly more
+    best = found[int(np.argmax(follow > follow.max() / MIN_BARREL_GAIN))]
+    same = [
+        fit.inliers()
+        for fit in found
+        if unsigned_angle_deg(fit.state.directions[0], best.state.directions[0]) < SAME_ROAD_DEG
+    ]
+    return best, np.any(same, axis=0)
+
+
+def _busiest_road(fit: Adjustment, tracks: TrackSet, config: AdjustmentConfig) -> Adjustment:
+    """Return the solution of the road with the most vehicles alone."""
+    followed = fit.inliers()
+    weights = [tracks.vehicle_weight @ (followed & (fit.labels == road)) for road in range(len(fit.state.angles_rad))]
+    along, up = fit.state.directions[int(np.argmax(weights))], fit.state.rotation[:, 2]
+    state = AdjustmentState(fit.state.camera, np.column_stack([along, np.cross(up, along), up]), np.zeros(1))
+    return adjust(state, tracks, config, refine=True)
+
+
+def _lens_statements(fit: Adjustment, choice: LensChoice) -> tuple[Statement, ...]:
+    """Return what was assumed of the lens."""
+    prior = choice.prior
+    if choice.known:
+        return lens_assumptions(fit, ())
+    k1_sigma = float(fit.sigma(lambda state: np.array([state.camera.k[0]]))[0])
+    statements = [
+        assumption('lens_barrel', k1=fit.state.camera.k[0], sigma=k1_sigma),
+        principal_point_assumption(prior),
+    ]
+    if prior.focal_known:
+        sigma_px = prior.sigma[0] * prior.centre.focal_px
+        return (*statements, assumption('focal_given', focal_px=prior.centre.focal_px, sigma_px=sigma_px))
+    view_deg = field_of_view_deg(fit.state.camera)[0]
+    return (
+        *statements,
+        assumption('field_of_view', usual_deg=USUAL_VIEW_DEG, view_deg=view_deg, sigma=fit.focal_sigma),
+    )
+
+
+def _edges(evidence: Evidence, along: TrackSet) -> DirectionMixture:
+    """Return the longest edges of the vehicles that follow the road."""
+    edges = select_vehicle_edges(evidence, along)
+    longest = edges.subset(_longest(edges.ends_px))
+    return DirectionMixture(VEHICLE_EDGES, longest.ends_px, kish_weight(longest.vehicles, SEGMENT_CORRELATION))
+
+
+def _lines(evidence: Evidence) -> DirectionMixture:
+    """Return the longest lines of the still scene."""
+    ends = evidence.still_lines_px[_longest(evidence.still_lines_px)]
+    groups = group_segments(ends, evidence.image_size[0])
+    return DirectionMixture(STILL_SEGMENTS, ends, kish_weight(groups, SEGMENT_CORRELATION))
+
+
+def _longest(ends: np.ndarray) -> np.ndarray:
+    """Return the indices of the longest of segments (n, 4)."""
+    return np.argsort(-np.hypot(*(ends[:, 2:] - ends[:, :2]).T), kind='stable')[:MAX_ROAD_SEGMENTS]

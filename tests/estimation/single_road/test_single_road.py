@@ -1,0 +1,128 @@
+"""Lens and plane of a single road: the posterior over focal length, curvature and turn."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from autocalib_ros.config import JointOptions, LensOptions, Options
+from autocalib_ros.estimation.adjustment.lens_prior import lens_priors
+from autocalib_ros.estimation.single_road.barrel_lens import LensChoice, barrel_coefficients
+from autocalib_ros.estimation.single_road.direction_mixture import (
+    STILL_SEGMENTS,
+    DirectionMixture,
+    across_and_up,
+)
+from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
+from autocalib_ros.lens.camera import Camera
+from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_evidence
+from autocalib_ros.results.calibration import Calibration
+from solved_once import solve_once
+
+SIZE = (1280, 720)
+PINHOLE = Camera(*SIZE, 1000.0, (639.5, 359.5), (1 / 3, 2 / 15, 17 / 315, 62 / 2835))
+ROAD = Junction(
+    camera=PINHOLE,
+    road_angles_deg=(0.0,),
+    turning_fraction=0.0,
+    vehicles=60,
+    camera_from_ground=pose(18.0, 0.5, 20.0),
+    centre_m=(14.0, 0.0),
+)
+SQUARE = LensOptions(pixel_aspect=1.0)
+
+
+def scenery(junction: Junction, generator: np.random.Generator, count: int = 40) -> np.ndarray:
+    """Return image segments (n, 4) across and upright to the road of a junction, with 0.3 px of noise."""
+    height = junction.height_m
+    places = np.column_stack([generator.uniform(8, 40, 2 * count), generator.uniform(-8, 8, 2 * count)])
+    steps = np.repeat([[0.0, 2.0, 0.0], [0.0, 0.0, 2.0]], count, axis=0)
+    starts = np.column_stack([places, np.zeros(len(places))])
+    ends = []
+    for points in (starts, starts + steps):
+        in_camera = (points - [0.0, 0.0, height]) @ junction.camera_from_ground.T
+        pixels, valid = junction.camera.project(in_camera)
+        ends.append(np.where(valid[:, None], pixels + generator.normal(0, 0.3, pixels.shape), np.nan))
+    segments = np.hstack(ends)
+    inside = (segments >= 0).all(axis=1) & (segments <= np.tile(SIZE, 2)).all(axis=1)
+    return segments[inside & (np.hypot(*(segments[:, 2:] - segments[:, :2]).T) > 12)]
+
+
+def test_coefficients_are_those_of_the_classical_projections() -> None:
+    assert barrel_coefficients(0.0) == (0.0, 0.0, 0.0, 0.0)
+    assert barrel_coefficients(1.0) == pytest.approx((1 / 3, 2 / 15, 17 / 315, 62 / 2835))
+    theta, kappa = 0.6, 0.4
+    exact = np.tan(np.sqrt(kappa) * theta) / np.sqrt(kappa)
+    lens = Camera(*SIZE, 1.0, (0.0, 0.0), barrel_coefficients(kappa))
+    assert float(lens.radius(np.array(theta))) == pytest.approx(exact, rel=1e-4)
+
+
+def test_a_given_focal_length_limits_those_that_are_tried() -> None:
+    given = LensChoice(lens_priors(SIZE, JointOptions(focal_prior_px=900.0, focal_sigma_px=90.0))[0])
+    assert given.focal_lengths().min() > 0.7 * 900 and given.focal_lengths().max() < 1.4 * 900
+    free = LensChoice(lens_priors(SIZE, JointOptions())[0])
+    assert free.focal_lengths().min() < 410 and free.focal_lengths().max() > 4000
+    # usual fields of view are the more probable ones
+    assert free.log_prior(1400.0, 1.0) > free.log_prior(4000.0, 1.0) + 1.0
+
+
+def test_directions_about_a_road_are_level_without_a_turn() -> None:
+    along = pose(20.0, 0.0, 30.0)[:, 0]
+    across, up = across_and_up(along, np.array([0.0, 0.1]))
+    tilt, roll = tilt_and_roll_deg(up[0])
+    assert (tilt, abs(roll)) == (pytest.approx(20.0), pytest.approx(0.0, abs=1e-9))
+    np.testing.assert_allclose(across @ along, 0.0, atol=1e-12)
+    assert abs(tilt_and_roll_deg(up[1])[1]) > 1.0
+
+
+def test_the_likelihood_of_the_scenery_is_highest_at_the_true_turn_and_lens() -> None:
+    generator = np.random.default_rng(0)
+    ends = scenery(ROAD, generator)
+    mixture = DirectionMixture(STILL_SEGMENTS, ends, np.ones(len(ends)))
+    along = ROAD.camera_from_ground[:, 0]
+    turns = np.radians(np.arange(-10.0, 10.1, 0.5))
+    by_lens = {}
+    for factor in (0.7, 1.0, 1.4):
+        camera = replace(PINHOLE, focal_px=factor * PINHOLE.focal_px)
+        seen_at = PINHOLE.project(along[None])[0]
+        through, _ = camera.unproject(seen_at)
+        by_lens[factor] = mixture.log_likelihood(mixture.through(camera, through[0]), turns)
+    _, up = across_and_up(along, turns)
+    found = up[np.argmax(by_lens[1.0])]
+    assert float(found @ ROAD.normal_in_camera) > np.cos(np.radians(1.0))
+    assert by_lens[1.0].max() > max(by_lens[0.7].max(), by_lens[1.4].max()) + 5.0
+
+
+@pytest.mark.solve
+@pytest.mark.parametrize('given', [False, True])
+def test_a_road_without_curvature_gives_what_its_scenery_shows(given: bool) -> None:
+    generator = np.random.default_rng(1)
+    evidence = replace(synthetic_evidence(ROAD, generator), still_lines_px=scenery(ROAD, generator))
+    joint = JointOptions(focal_prior_px=1050.0, focal_sigma_px=105.0) if given else JointOptions()
+    result = solve_once(evidence, Options(camera_height=ROAD.height_m, joint=joint, lens=SQUARE))
+    found = result.candidate
+    assert found is not None and found.ground is not None
+    sigma = found.stddev.focal_px / found.camera.focal_px
+    assert abs(np.log(found.camera.focal_px / PINHOLE.focal_px)) < 2.5 * sigma < 0.5
+    error = np.subtract(tilt_and_roll_deg(found.ground.normal_in_camera), tilt_and_roll_deg(ROAD.normal_in_camera))
+    assert (np.abs(error) < 2.5 * np.array([found.stddev.tilt_deg, found.stddev.roll_deg])).all()
+    kinds = {statement.kind for statement in found.assumptions}
+    assert 'level_camera' in kinds and ('focal_given' if given else 'field_of_view') in kinds
+
+
+@pytest.mark.solve
+def test_a_wider_uncertainty_of_the_focal_length_makes_lengths_less_certain() -> None:
+    evidence = synthetic_evidence(ROAD, np.random.default_rng(2))
+    sigmas = []
+    for sigma_px in (20.0, 200.0):
+        joint = JointOptions(focal_prior_px=1000.0, focal_sigma_px=sigma_px)
+        found = solve_once(evidence, Options(camera_height=ROAD.height_m, joint=joint, lens=SQUARE)).candidate
+        sigmas.append(found.stddev.ground.worst)
+    assert sigmas[0] < sigmas[1]
+
+
+@pytest.mark.solve
+def test_the_option_switches_it_off() -> None:
+    evidence = synthetic_evidence(ROAD, np.random.default_rng(2))
+    result = solve_once(evidence, Options(camera_height=ROAD.height_m, joint=JointOptions(single_road=False)))
+    assert not isinstance(result, Calibration) and result.candidate is None
