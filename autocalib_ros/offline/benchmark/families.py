@@ -15,6 +15,7 @@ import numpy as np
 
 from autocalib_ros.evidence.snapshot import Evidence, Track
 from autocalib_ros.lens.camera import Camera, image_centre
+from autocalib_ros.offline.benchmark.road_families import single_road, single_road_bend, single_road_jam
 from autocalib_ros.offline.simulate.junctions import junction as crossing
 from autocalib_ros.offline.simulate.motorway import highway
 from autocalib_ros.offline.simulate.network import Network
@@ -308,6 +309,8 @@ DETERMINED: dict[str, Family] = {
     'skew_turning': family_of(skew_turning),
     'tee': family_of(tee),
     'sparse': family_of(sparse),
+    'single_road': single_road,
+    'single_road_jam': single_road_jam,
 }
 UNDERDETERMINED: dict[str, Family] = {
     'radial': family_of(radial),
@@ -318,6 +321,7 @@ UNDERDETERMINED: dict[str, Family] = {
     'noise': noise,
     'waved': family_of(swaying_camera),
     'waved_unseen': undetected_sway,
+    'single_road_bend': single_road_bend,
     'short_piece': family_of(short_piece),
     'distortion_free_skew': family_of(distortion_free_skew),
 }
