@@ -300,6 +300,8 @@ def initial_motion(view: WindowRays) -> PlanarMotion:
     count = len(view.mask)
     best = np.full(count, np.inf)
     best_motion = PlanarMotion(np.zeros(count), np.zeros(count))
+    if not count:  # empty arrays cost as much as small ones
+        return best_motion
     first, (u, v, w) = view.first[0], view.second[0]
     for turn in np.radians([*START_TURNS_DEG, *(-turn for turn in START_TURNS_DEG[1:])]):
         # b . (t x R a) = t . (R a x b)
@@ -321,6 +323,8 @@ def initial_motion(view: WindowRays) -> PlanarMotion:
 
 def refined(view: WindowRays, motion: PlanarMotion, rounds: int = WARM_START_ROUNDS) -> PlanarMotion:
     """Refine the motion of each window by Levenberg-Marquardt iterations."""
+    if not len(view.mask):
+        return motion
     damping = np.full(len(view.mask), 1e-4)
     cost = None
     for _ in range(rounds):
