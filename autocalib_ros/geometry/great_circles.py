@@ -15,6 +15,9 @@ import numpy as np
 from autocalib_ros.geometry.small_matrices import LAST, NEXT, cofactors, cross, dot, smallest_eigenvectors
 from autocalib_ros.lens.camera import Camera
 
+MIN_RADIUS_SLOPE = 1e-3
+"""Smallest derivative of the image radius by the angle, in focal lengths: a ray farther out bends no more."""
+
 
 @dataclass(frozen=True)
 class Rays:
@@ -54,7 +57,7 @@ def unproject_rays(camera: Camera, pixels: np.ndarray) -> Rays:
     cosine2 = 1.0 / (1.0 + half * half)
     sine, cosine = 2.0 * half * cosine2, (1.0 - half * half) * cosine2
     x, y = x / radius, y / radius
-    outward = 1.0 / np.maximum(camera.radius_derivative(theta), 1e-3 * camera.focal_px)
+    outward = 1.0 / np.maximum(camera.radius_derivative(theta), MIN_RADIUS_SLOPE * camera.focal_px)
     around = sine / radius
     rays = Rays(*(np.empty((*radius.shape, 3)) for _ in range(3)))
     rays.bearings[..., 0], rays.bearings[..., 1], rays.bearings[..., 2] = sine * x, sine * y, cosine

@@ -24,6 +24,7 @@ from autocalib_ros.estimation.motion.rigid_bodies import StructureAndMotion, Tra
 from autocalib_ros.estimation.observations.track_set import TrackSet, UnprojectedTracks
 from autocalib_ros.estimation.observations.vehicle_grouping import corroboration_weights, heading_error_deg
 from autocalib_ros.geometry.great_circles import Rays, fit_circles_through, unproject_rays
+from autocalib_ros.geometry.lens_slopes import PolarRays
 from autocalib_ros.geometry.small_matrices import cross, dot
 
 DIFFERENTIATION_STEP = 1e-6
@@ -125,17 +126,19 @@ class StraightTrackBlock:
     def linearise(self) -> LinearisedRows:
         """Return the rows at the base.
 
-        Lens derivatives are forward differences of the exact residual: its pixel scale changes with the lens, and
-        that small term shifts the minimum. Road derivatives are closed-form: a direction d that moves by dd turns a
-        normal n by -(n.dd) d. The circle's angle about its direction is projected out.
+        Derivatives are closed-form. Those by the lens are of the exact residual: its pixel scale changes with the
+        lens, and that small term shifts the minimum. A direction d that moves by dd turns a normal n by -(n.dd) d. The
+        circle's angle about its direction is projected out.
         """
         if not len(self.dof):  # empty arrays cost as much as small ones
             return LinearisedRows.none(self._parameters.size)
         rays, normals, parameters = self._rays, self._normals[:, None], self._parameters
         scale = rays.pixel_scale(normals)
         distance = dot(rays.bearings, normals) * scale
+        prior = parameters.config.prior
+        lens = PolarRays(parameters.base.camera, self._tracks.pixels, rays.bearings)
         columns = [
-            (self._distance(unit, normals) - distance) / DIFFERENTIATION_STEP for unit in np.eye(parameters.lens)
+            slope * unit for slope, unit in zip(lens.distance_slopes(normals, prior.free), prior.units, strict=True)
         ]
         across = distance * scale
         # derivative by the normal of n.b over its gradient norm: the second term is the change of the norm
@@ -159,11 +162,6 @@ class StraightTrackBlock:
             jacobian - free * along,
             self.dof,
             self._lane_keeping_weights(distance),
-        )
-
-    def _distance(self, unit: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        return unproject_rays(self._parameters.camera(DIFFERENTIATION_STEP * unit), self._tracks.pixels).distance_px(
-            normals
         )
 
     def _turns(self) -> list[np.ndarray]:
