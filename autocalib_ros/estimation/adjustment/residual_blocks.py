@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from autocalib_ros.estimation.adjustment.noise_model import locate_on_road, whitening_matrices
+from autocalib_ros.estimation.adjustment.noise_model import RoadPositions, locate_on_road, whitening_matrices
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentState, Parameterisation, upward_normal
 from autocalib_ros.estimation.motion.planar_motion import (
     PlanarMotion,
@@ -80,6 +80,11 @@ class StraightTrackBlock:
         self.dof = np.maximum(self._mask.sum(axis=1) - 1, 1)
         self._directions = base.directions[labels]
         self._rays = unprojected.rays
+        if not len(labels):  # empty arrays cost as much as small ones
+            nowhere, samples = np.zeros(self._mask.shape), self._mask.shape[1]
+            self._normals, self._road = np.zeros((0, 3)), RoadPositions(nowhere, nowhere)
+            self.whiten = np.zeros((0, samples, samples))
+            return
         normals, _ = fit_circles_through(unprojected.matrix, self._directions)
         self._scale = self._rays.pixel_scale(normals[:, None])
         self._up = upward_normal(base, config, self._rays)

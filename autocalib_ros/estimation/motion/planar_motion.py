@@ -187,7 +187,10 @@ def _cosine_sine(angle_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _dot_components(vectors: np.ndarray | tuple[np.ndarray, ...], other: tuple[np.ndarray, ...]) -> np.ndarray:
     """Scalar product of vectors that are given by component, (3, ...)."""
-    return vectors[0] * other[0] + vectors[1] * other[1] + vectors[2] * other[2]
+    total = vectors[0] * other[0]
+    total += vectors[1] * other[1]
+    total += vectors[2] * other[2]
+    return total
 
 
 def turn_sigma(view: WindowRays, motion: PlanarMotion) -> np.ndarray:

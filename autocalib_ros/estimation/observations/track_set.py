@@ -160,7 +160,7 @@ class UnprojectedTracks:
     def through(cls, camera: Camera, tracks: TrackSet) -> UnprojectedTracks:
         """Unproject tracks and compute their scatter matrices."""
         rays = unproject_rays(camera, tracks.pixels)
-        return cls(rays, circle_scatter(rays, tracks.weights))
+        return cls(rays, circle_scatter(rays, tracks.weights) if len(tracks) else np.zeros((0, 3, 3)))
 
     def subset(self, keep: np.ndarray) -> UnprojectedTracks:
         """Return the tracks of a mask or of indices `keep`."""
