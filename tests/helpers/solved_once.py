@@ -7,13 +7,15 @@ import pickle
 
 import numpy as np
 
-from autocalib_ros.config import Options
+from autocalib_ros.config import JointOptions, Options
 from autocalib_ros.estimation.estimate import solve
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.synthetic.junction import Junction, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration, Refusal
 
+ONE_FAMILY = JointOptions(lens_prior='equidistant')
+"""For questions that do not depend on how the family of the lens is chosen: each of the others is another solution."""
 _RESULTS: dict[bytes, Calibration | Refusal] = {}
 _TRAFFIC: dict[bytes, Evidence] = {}
 

@@ -12,7 +12,7 @@ from autocalib_ros.estimation.observations.selection import drop_pedestrians
 from autocalib_ros.evidence.snapshot import Evidence, TrackKind
 from autocalib_ros.offline.synthetic.junction import Junction, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration, Refusal
-from solved_once import solve_once
+from solved_once import ONE_FAMILY, solve_once
 
 
 def with_people(evidence: Evidence, count: int, generator: np.random.Generator) -> Evidence:
@@ -37,7 +37,7 @@ def with_people(evidence: Evidence, count: int, generator: np.random.Generator) 
 def test_pedestrians_change_neither_lens_nor_plane_nor_the_labels_of_vehicles() -> None:
     evidence = synthetic_evidence(Junction(), np.random.default_rng(3))
     crowd = with_people(evidence, 80, np.random.default_rng(4))
-    alone, among = (solve_once(one, Options(camera_height=8.0)) for one in (evidence, crowd))
+    alone, among = (solve_once(one, Options(camera_height=8.0, joint=ONE_FAMILY)) for one in (evidence, crowd))
     assert isinstance(alone, Calibration) and isinstance(among, Calibration)
     assert among.camera == alone.camera
     np.testing.assert_array_equal(among.ground.normal_in_camera, alone.ground.normal_in_camera)

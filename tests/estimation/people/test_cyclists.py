@@ -13,7 +13,7 @@ from autocalib_ros.evidence.snapshot import Evidence, Outlines, Track
 from autocalib_ros.offline.synthetic.junction import Junction, evidence_from_tracks, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration
 from silhouette_evidence import CAR_M, RIDER_M, crossing_bodies, with_outlines
-from solved_once import solve_once
+from solved_once import ONE_FAMILY, solve_once
 
 pytestmark = pytest.mark.solve
 
@@ -105,7 +105,7 @@ def street() -> tuple[Evidence, Evidence]:
 
 @pytest.mark.solve
 def test_lens_and_plane_come_from_vehicles_alone(street: tuple[Evidence, Evidence]) -> None:
-    alone, among = (solve_once(each, Options(camera_height=JUNCTION.height_m)) for each in street)
+    alone, among = (solve_once(each, Options(camera_height=JUNCTION.height_m, joint=ONE_FAMILY)) for each in street)
     assert isinstance(alone, Calibration) and isinstance(among, Calibration)
     found = among.evidence.people
     assert 17 <= found <= 21
@@ -121,7 +121,7 @@ def test_lens_and_plane_come_from_vehicles_alone(street: tuple[Evidence, Evidenc
 def test_with_too_few_vehicles_left_cyclists_stay_in_the_plane_and_are_reported(
     street: tuple[Evidence, Evidence],
 ) -> None:
-    options = Options(camera_height=JUNCTION.height_m)
+    options = Options(camera_height=JUNCTION.height_m, joint=ONE_FAMILY)
     _, among = street
     least = int((among.track_vehicles < FIRST_RIDER).sum()) + 20
     demanding = replace(options, gate=replace(options.gate, min_tracks=least))

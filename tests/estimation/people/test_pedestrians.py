@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -13,6 +11,7 @@ from autocalib_ros.estimation.people.pedestrians import find_pedestrians
 from autocalib_ros.evidence.snapshot import Evidence, Track
 from autocalib_ros.offline.synthetic.junction import Junction, evidence_from_tracks, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration
+from solved_once import ONE_FAMILY
 
 FIRST_WALKER = 1000
 """Vehicle numbers from here on are pedestrians."""
@@ -102,7 +101,7 @@ def test_cars_in_a_jam_are_not_pedestrians():
 @pytest.mark.solve
 def test_a_calibration_counts_pedestrians_apart_from_vehicles_and_is_no_worse(street):
     junction, evidence = street
-    result = solve(evidence, replace(Options(), camera_height=junction.height_m))
+    result = solve(evidence, Options(camera_height=junction.height_m, joint=ONE_FAMILY))
     assert isinstance(result, Calibration)
     assert result.evidence.people == pytest.approx(30, abs=5)
     assert result.evidence.vehicles + result.evidence.people == evidence.summary().vehicles
@@ -118,6 +117,6 @@ def test_pedestrians_beside_a_single_road_are_not_turning_traffic():
     evidence = _joined(junction, synthetic_evidence(junction, generator), people)
     # More than a third of all objects follow no road.
     assert (np.unique(evidence.track_vehicles) >= FIRST_WALKER).mean() > 0.35
-    result = solve(evidence, replace(Options(), camera_height=junction.height_m))
+    result = solve(evidence, Options(camera_height=junction.height_m, joint=ONE_FAMILY))
     assert isinstance(result, Calibration), result
     assert abs(result.camera.focal_px - junction.camera.focal_px) < 3.0 * result.stddev.focal_px

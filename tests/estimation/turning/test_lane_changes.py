@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from autocalib_ros.config import JointOptions, Options
+from autocalib_ros.config import Options
 from autocalib_ros.estimation.estimate import solve
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.offline.benchmark.families import motorway
 from autocalib_ros.offline.synthetic.junction import Junction, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration
+from solved_once import ONE_FAMILY
 
 pytestmark = pytest.mark.solve
 
@@ -27,7 +28,7 @@ def watched(vehicles: int) -> tuple[Junction, Evidence]:
 
 
 def solved(junction: Junction, evidence: Evidence) -> Calibration:
-    options = Options(camera_height=junction.height_m, joint=JointOptions(single_road=False))
+    options = Options(camera_height=junction.height_m, joint=replace(ONE_FAMILY, single_road=False))
     result = solve(evidence, options)
     assert isinstance(result, Calibration), result.message
     return result

@@ -28,6 +28,7 @@ from autocalib_ros.offline.synthetic.drives import drive_arc
 from autocalib_ros.offline.synthetic.junction import Junction, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration
 from autocalib_ros.results.refusals import Reason
+from solved_once import ONE_FAMILY
 
 pytestmark = pytest.mark.solve
 
@@ -62,7 +63,7 @@ def sigmas_off(result: Calibration) -> float:
 def test_few_vehicles_whose_points_slide_do_not_mislead(seed: int) -> None:
     generator = np.random.default_rng(seed)
     evidence = slid(synthetic_evidence(TURNING, generator), generator, 1.0)
-    result = solve(evidence, Options(camera_height=8.0), lens=TURNING.camera)
+    result = solve(evidence, Options(camera_height=8.0, joint=ONE_FAMILY), lens=TURNING.camera)
     if isinstance(result, Calibration) and result.ground is not None:
         assert sigmas_off(result) < 3.0
 
@@ -78,7 +79,7 @@ def turned_lives(windows: TwoFrameWindows, instants: ResampledTracks, limit: int
 
 def test_tracklets_that_contradict_windows_are_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(turning, 'find_tracklets', partial(turned_lives, by_deg=8.0))
-    result = solve(evidence_of(1), Options(camera_height=8.0), lens=TURNING.camera)
+    result = solve(evidence_of(1), Options(camera_height=8.0, joint=ONE_FAMILY), lens=TURNING.camera)
     if isinstance(result, Calibration) and result.ground is not None:
         assert sigmas_off(result) < 3.0
     windows, fit, tracks = by_windows(evidence_of(1))

@@ -119,7 +119,7 @@ def test_pedestrians_are_not_rigid_bodies() -> None:
 
 def test_a_known_lens_and_turning_traffic_give_the_plane() -> None:
     evidence = synthetic_evidence(FEWER, np.random.default_rng(2))
-    result = solve_once(evidence, Options(camera_height=8.0), lens=FEWER.camera)
+    result = solve_once(evidence, ONE_FAMILY, lens=FEWER.camera)
     assert isinstance(result, Calibration) and result.camera == FEWER.camera
     sigma = result.stddev
     assert sigma.tilt_deg is not None and sigma.roll_deg is not None

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from autocalib_ros.config import GateOptions, JointOptions, Options
+from autocalib_ros.config import GateOptions, Options
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentState
 from autocalib_ros.estimation.estimate import find_solution
 from autocalib_ros.estimation.observations.track_set import select_tracks
@@ -25,7 +25,7 @@ from autocalib_ros.geometry.robust_kernels import wrap_undirected
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration
-from solved_once import solve_once
+from solved_once import ONE_FAMILY, solve_once
 
 pytestmark = pytest.mark.solve
 
@@ -247,7 +247,7 @@ ROLLED = replace(ONE_ROAD, camera_from_ground=pose(35.0, 5.0, 60.0))
 
 
 def test_one_road_and_edges_give_an_assumed_plane_of_a_rolled_camera() -> None:
-    result = solve_once(with_boxes(ROLLED), Options(camera_height=HEIGHT_M))
+    result = solve_once(with_boxes(ROLLED), Options(camera_height=HEIGHT_M, joint=ONE_FAMILY))
     assert isinstance(result, Calibration) and result.ground is not None
     assert result.grade in ('fair', 'coarse')
     assert 'transverse_edges' in [statement.kind for statement in result.assumptions]
@@ -258,7 +258,8 @@ def test_one_road_and_edges_give_an_assumed_plane_of_a_rolled_camera() -> None:
 
 @pytest.mark.solve
 def test_edges_are_not_used_if_switched_off() -> None:
-    options = Options(camera_height=HEIGHT_M, joint=JointOptions(transverse_edges=False, single_road=False))
+    joint = replace(ONE_FAMILY, transverse_edges=False, single_road=False)
+    options = Options(camera_height=HEIGHT_M, joint=joint)
     result = solve_once(with_boxes(ROLLED), options)
     assert isinstance(result, Calibration) and result.ground_refusal is not None
     assert result.ground_refusal.code == 'one_direction'
@@ -267,7 +268,9 @@ def test_edges_are_not_used_if_switched_off() -> None:
 @pytest.mark.solve
 def test_edges_that_contradict_a_level_camera_are_refused_with_a_reason() -> None:
     junction = replace(ONE_ROAD, camera_from_ground=pose(35.0, 9.0, 60.0))
-    result = solve_once(with_boxes(junction), Options(camera_height=HEIGHT_M, joint=JointOptions(roll_prior_deg=1.0)))
+    result = solve_once(
+        with_boxes(junction), Options(camera_height=HEIGHT_M, joint=replace(ONE_FAMILY, roll_prior_deg=1.0))
+    )
     assert isinstance(result, Calibration) and result.ground is None and result.ground_refusal is not None
     assert result.ground_refusal.code == 'plane_uncertain'
     assert 'edges of vehicles and a level camera disagree' in result.ground_refusal.message
@@ -275,7 +278,7 @@ def test_edges_that_contradict_a_level_camera_are_refused_with_a_reason() -> Non
 
 @pytest.fixture(scope='module')
 def assumed() -> Solution:
-    evidence, options = with_boxes(ROLLED), Options(camera_height=HEIGHT_M)
+    evidence, options = with_boxes(ROLLED), Options(camera_height=HEIGHT_M, joint=ONE_FAMILY)
     solution = find_solution(
         evidence,
         select_tracks(evidence, options.joint.max_tracks),

@@ -11,7 +11,7 @@ from autocalib_ros.evidence.snapshot import Track
 from autocalib_ros.offline.benchmark.monte_carlo import draw_evidence
 from autocalib_ros.offline.synthetic.junction import Junction, evidence_from_tracks
 from autocalib_ros.results.calibration import Calibration, Refusal
-from solved_once import evidence_once, solve_once
+from solved_once import ONE_FAMILY, evidence_once, solve_once
 
 pytestmark = pytest.mark.solve
 
@@ -19,14 +19,14 @@ pytestmark = pytest.mark.solve
 @pytest.mark.parametrize(('run', 'number'), [(8, 'earlier'), (10, 'later'), (28, 'turned_deg')])
 def test_a_camera_that_turned_in_between_is_noticed_by_its_traffic(run: int, number: str) -> None:
     junction, evidence = draw_evidence('mixed_views', 0, run)
-    result = solve_once(evidence, Options(camera_height=junction.height_m))
+    result = solve_once(evidence, Options(camera_height=junction.height_m, joint=ONE_FAMILY))
     assert isinstance(result, Refusal) and result.code == 'halves_disagree'
     assert result.values['sigmas'] > result.values['limit'] and number in result.values
 
 
 def test_halves_of_one_view_agree() -> None:
     junction, evidence = draw_evidence('many', 0, 0)
-    result = solve_once(evidence, Options(camera_height=junction.height_m))
+    result = solve_once(evidence, Options(camera_height=junction.height_m, joint=ONE_FAMILY))
     assert isinstance(result, Calibration)
     rows = {row.kind: row for row in result.verification}
     assert rows['halves_pose'].passed and rows['halves_share'].passed
@@ -47,7 +47,7 @@ def test_roads_that_are_never_seen_in_the_same_half_cost_grade_full(begin_s: flo
     tracks = [*traffic_of(along), *traffic_of(across, 100, begin_s)]
     newest_s = max(track.times_s[-1] for track in tracks)
     evidence = evidence_from_tracks(tracks, along.image_size, newest_s)
-    result = solve_once(evidence, Options(camera_height=along.height_m))
+    result = solve_once(evidence, Options(camera_height=along.height_m, joint=ONE_FAMILY))
     assert isinstance(result, Calibration) and result.grade == expected
     rows = {row.kind: row for row in result.verification}
     assert ('halves_roads' in rows) == (expected == 'fair')

@@ -18,7 +18,7 @@ from autocalib_ros.offline.synthetic.junction import Junction, evidence_from_tra
 from autocalib_ros.report.text import next_step, verdict
 from autocalib_ros.results.calibration import Calibration
 from silhouette_evidence import crossing_bodies, with_outlines
-from solved_once import evidence_once, solve_once
+from solved_once import ONE_FAMILY, evidence_once, solve_once
 
 JUNCTION = Junction()
 SEEN_M = (SILHOUETTE_SHARE * USUAL_CAR_M[0], SILHOUETTE_SHARE * USUAL_CAR_M[1], 1.3)
@@ -51,7 +51,7 @@ def test_few_vehicles_or_no_silhouettes_measure_nothing() -> None:
 @pytest.mark.solve
 @pytest.mark.parametrize(('height_ratio', 'grade'), [(1.0, 'full'), (1.7, 'fair')])
 def test_a_wrong_height_costs_grade_full(height_ratio: float, grade: str) -> None:
-    result = solve_once(cars(30), Options(camera_height=height_ratio * JUNCTION.height_m))
+    result = solve_once(cars(30), Options(camera_height=height_ratio * JUNCTION.height_m, joint=ONE_FAMILY))
     assert isinstance(result, Calibration) and result.grade == grade
     (row,) = [row for row in result.verification if row.kind == 'vehicle_size']
     assert row.passed is (grade == 'full')
