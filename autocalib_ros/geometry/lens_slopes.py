@@ -1,6 +1,6 @@
-"""Derivatives, in closed form, of the distances of pixels from great circles by the parameters of the lens.
+"""Derivatives, in closed form, of distances from great circles and of headings by the parameters of the lens.
 
-A parameter turns the ray of a pixel away from the optical axis or around it. The pixel scale of the distance changes,
+A parameter turns the ray of a pixel away from the optical axis or around it. The scale of a step in the image changes,
 too, with the image radius and with the slope of the angle by that radius.
 """
 
@@ -74,6 +74,35 @@ class PolarRays:
             if parameter == LOG_ASPECT:
                 half_norm2 = half_norm2 + by_u * by_u
             yield scale * (lever * change.wider + sine * swing - product * half_norm2 / norm2)
+
+    def heading_slopes(
+        self, ways_px: np.ndarray, directions: np.ndarray, parameters: np.ndarray
+    ) -> Iterator[np.ndarray]:
+        """Yield the derivatives (k, n) of headings by each parameter, for pixels (n, 2).
+
+        A heading is the angle on the unit sphere from the image displacement (n, 2) of a pixel to a direction (k, 3).
+        """
+        x, y, sine, cosine, slope = self._x, self._y, self._sine, self._cosine, self._slope
+        # each direction along the radius, around the axis and along the axis; the displacement, too
+        level_x, level_y, deep = (directions[:, axis, None] for axis in range(3))
+        level, around = level_x * x + level_y * y, level_y * x - level_x * y
+        outwards, near = cosine * level - sine * deep, sine * level + cosine * deep
+        lever = np.maximum(outwards * outwards + around * around, 1e-12)
+        way_x, way_y = self._camera.pixel_aspect * ways_px[:, 0] - self._camera.skew * ways_px[:, 1], ways_px[:, 1]
+        radial, tangential = way_x * x + way_y * y, way_y * x - way_x * y
+        wide = sine / self._radius
+        first, second = slope * radial, wide * tangential
+        length2 = np.maximum(first * first + second * second, 1e-24)
+        for parameter, change in zip(parameters, self._changes(parameters), strict=True):
+            longer_x = self._camera.pixel_aspect * ways_px[:, 0] if parameter == LOG_ASPECT else 0.0
+            more_first = first * change.steeper + slope * (tangential * change.turned + longer_x * x)
+            more_second = wide * (-radial * change.turned - longer_x * y) + second * (
+                cosine / np.maximum(sine, 1e-12) * change.wider - change.longer
+            )
+            more_outwards, more_around = cosine * around * change.turned - near * change.wider, -level * change.turned
+            yield (outwards * more_around - around * more_outwards) / lever - (
+                first * more_second - second * more_first
+            ) / length2
 
     def _changes(self, parameters: np.ndarray) -> Iterator[_RayChange]:
         """Yield how the rays change with each parameter; one at the limit of the lens model keeps its angle."""

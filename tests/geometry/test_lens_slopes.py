@@ -1,4 +1,4 @@
-"""Derivatives of distances by the lens against differences of the distances."""
+"""Derivatives of distances and headings by the lens against differences of them."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from autocalib_ros.estimation.markings.road_segments import ProjectedSegments
 from autocalib_ros.geometry.great_circles import unproject_rays
 from autocalib_ros.geometry.lens_slopes import CENTRE_X, CENTRE_Y, K1, K2, LOG_ASPECT, LOG_FOCAL, PolarRays
+from autocalib_ros.geometry.robust_kernels import wrap_undirected
 from autocalib_ros.lens.camera import Camera
 
 STEP = 1e-6
@@ -31,11 +33,15 @@ def moved(camera: Camera, parameter: int, step: float) -> Camera:
     return replace(camera, pixel_aspect=camera.pixel_aspect * np.exp(step))
 
 
-@pytest.mark.parametrize('parameter', [LOG_FOCAL, CENTRE_X, CENTRE_Y, K1, K2, LOG_ASPECT])
-@pytest.mark.parametrize(
+each_lens = pytest.mark.parametrize(
     'camera', [EQUIDISTANT, BARREL, SQUEEZED, NARROW], ids=['square', 'barrel', 'squeezed', 'narrow']
 )
-def test_slopes_by_the_lens_are_those_of_small_steps(camera: Camera, parameter: int) -> None:
+each_parameter = pytest.mark.parametrize('parameter', [LOG_FOCAL, CENTRE_X, CENTRE_Y, K1, K2, LOG_ASPECT])
+
+
+@each_parameter
+@each_lens
+def test_slopes_of_distances_are_those_of_small_steps(camera: Camera, parameter: int) -> None:
     generator = np.random.default_rng(0)
     pixels = generator.uniform(0.0, 1.0, (40, 10, 2)) * (camera.width, camera.height)
     normals = generator.normal(size=(40, 1, 3))
@@ -48,3 +54,21 @@ def test_slopes_by_the_lens_are_those_of_small_steps(camera: Camera, parameter: 
     )
     expected = (ahead - behind) / (2 * STEP)
     np.testing.assert_allclose(slope, expected, atol=1e-7 * np.abs(expected).max())
+
+
+@each_parameter
+@each_lens
+def test_slopes_of_headings_are_those_of_small_steps(camera: Camera, parameter: int) -> None:
+    generator = np.random.default_rng(1)
+    middles = generator.uniform(0.0, 1.0, (60, 2)) * (camera.width, camera.height)
+    ways = generator.normal(0.0, 20.0, (60, 2))
+    ends = np.concatenate([middles - ways / 2, middles + ways / 2], axis=1)
+    directions = np.linalg.qr(generator.normal(size=(3, 3)))[0]
+    ahead, behind = (
+        ProjectedSegments.from_camera(moved(camera, parameter, step), ends).residuals(directions)
+        for step in (STEP, -STEP)
+    )
+    rays = PolarRays(camera, middles, unproject_rays(camera, middles).bearings)
+    (slope,) = rays.heading_slopes(ways, directions, np.array([parameter]))
+    expected = wrap_undirected(ahead - behind) / (2 * STEP)
+    np.testing.assert_allclose(slope, expected, atol=1e-7 * np.abs(expected).max() + 1e-8)

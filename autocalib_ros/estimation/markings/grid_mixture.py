@@ -15,8 +15,9 @@ import numpy as np
 from autocalib_ros.estimation.adjustment.covariance import jackknife_covariance
 from autocalib_ros.estimation.adjustment.lens_prior import LensPrior
 from autocalib_ros.estimation.adjustment.parameters import RIGHT_ANGLE_SIGMA_RAD
-from autocalib_ros.estimation.markings.road_segments import ProjectedSegments, RoadSegments
-from autocalib_ros.geometry.robust_kernels import STUDENT_FREEDOM, student_density, student_weight, wrap_undirected
+from autocalib_ros.estimation.markings.road_segments import ProjectedSegments, RoadSegments, middles_and_ways
+from autocalib_ros.geometry.lens_slopes import PolarRays
+from autocalib_ros.geometry.robust_kernels import STUDENT_FREEDOM, student_density, student_weight
 from autocalib_ros.geometry.small_matrices import cross, rotation_matrix
 from autocalib_ros.lens.camera import Camera
 
@@ -38,11 +39,8 @@ START_FRACTIONS = np.array([0.35, 0.35, 0.1])[:, None]
 """Initial fractions of the two directions and the vertical one."""
 MIN_DIRECTION_FRACTION, MAX_DIRECTION_FRACTION, MAX_ALIGNED_FRACTION = 0.02, 0.9, 0.95
 """Limits of the fraction of one direction, and of their sum."""
-GRID_DERIVATIVE_STEP = 1e-5
-"""Step of the numerical derivatives by the lens."""
-LENS_CACHE_SIZE = 8
-"""Lenses whose projected segments are cached: that of a state, and those one parameter step away. Most steps keep the
-lens."""
+LENS_CACHE_SIZE = 2
+"""Lenses whose projected segments are cached: that of a state, and that of the one that is tried next."""
 
 
 @dataclass(frozen=True)
@@ -129,6 +127,7 @@ class _GridMixture:
     def __init__(self, segments: RoadSegments, prior: LensPrior) -> None:
         self.segments, self.prior, self.weights, self._noise = segments, prior, segments.weights, _noise_rad(segments)
         self.fractions, self.scale = START_FRACTIONS[:, 0], 1.0
+        self._middles_px, self._ways_px = middles_and_ways(segments.ends_px)
         self._project = lru_cache(maxsize=LENS_CACHE_SIZE)(
             partial(ProjectedSegments.from_camera, ends_px=segments.ends_px)
         )
@@ -177,9 +176,10 @@ class _GridMixture:
         projected, lens = self._project(state.camera), len(self.prior.free)
         here = self.residuals(state)
         jacobian = np.empty((*here.shape, lens + 4))
-        for column, unit in enumerate(np.eye(lens)):
-            other = self._project(self.prior.moved(state.camera, GRID_DERIVATIVE_STEP * unit))
-            jacobian[..., column] = wrap_undirected(other.residuals(state.directions) - here) / GRID_DERIVATIVE_STEP
+        rays = PolarRays(state.camera, self._middles_px, projected.bearings)
+        slopes = rays.heading_slopes(self._ways_px, state.directions, self.prior.free)
+        for column, (slope, unit) in enumerate(zip(slopes, self.prior.units, strict=True)):
+            jacobian[..., column] = slope * unit
         turns = projected.residual_changes(state.directions, state.direction_changes)
         jacobian[..., lens:] = np.moveaxis(turns, 0, -1)
         return here, jacobian, responsibilities * student_weight(here, sigmas) / sigmas**2

@@ -87,11 +87,16 @@ def all_within(points: np.ndarray, positions: np.ndarray, max_distance: float) -
 
 def group_segments(ends: np.ndarray, width: int) -> np.ndarray:
     """Number the groups of segments (n, 4), shape (n,)."""
-    middle, step = (ends[:, :2] + ends[:, 2:]) / 2, ends[:, 2:] - ends[:, :2]
+    middle, step = middles_and_ways(ends)
     heading = np.arctan2(step[:, 1], step[:, 0])
     near = np.hypot(*(middle[:, None] - middle).transpose(2, 0, 1)) < MAX_GROUP_DISTANCE * width
     parallel = np.abs(wrap_undirected(heading[:, None] - heading)) < MAX_GROUP_ANGLE_RAD
     return component_labels(np.array(np.nonzero(near & parallel)), len(ends))
+
+
+def middles_and_ways(ends_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the middles (n, 2) of segments (n, 4), and the ways (n, 2) from end to end."""
+    return (ends_px[:, :2] + ends_px[:, 2:]) / 2, ends_px[:, 2:] - ends_px[:, :2]
 
 
 @dataclass(frozen=True)
@@ -108,7 +113,7 @@ class ProjectedSegments:
     @classmethod
     def from_camera(cls, camera: Camera, ends_px: np.ndarray) -> ProjectedSegments:
         """Unproject segments (n, 4) through a lens."""
-        middle, step = (ends_px[:, :2] + ends_px[:, 2:]) / 2, ends_px[:, 2:] - ends_px[:, :2]
+        middle, step = middles_and_ways(ends_px)
         rays = unproject_rays(camera, middle)
         along = bearing_change(rays, camera, middle, step)
         along /= np.maximum(np.sqrt((along * along).sum(axis=1)), 1e-12)[:, None]
