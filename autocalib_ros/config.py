@@ -224,6 +224,14 @@ class PaperOptions(_Validated):
 class LensOptions(_Validated):
     """What is known of the lens and its images besides the camera_info file."""
 
+    focal_px: float = option(
+        0.0, 'focal length of the lens, as from its data sheet, pixels; 0: unknown', low=0, high=1e6
+    )
+    focal_sigma_px: float = option(0.0, 'standard deviation of lens.focal_px, pixels; 0: 10 % of it', low=0, high=1e6)
+    hfov_deg: float = option(
+        0.0, 'field of view across the image, as from the data sheet, degrees; 0: unknown', low=0, high=180
+    )
+    hfov_sigma_deg: float = option(0.0, 'standard deviation of lens.hfov_deg, degrees; 0: 10 % of it', low=0, high=90)
     pixel_aspect: float = option(
         0.0,
         'width of a pixel over its height (sample aspect ratio), for images that a recorder squeezed: 1.4222 for '
@@ -231,6 +239,11 @@ class LensOptions(_Validated):
         low=0,
         high=10,
     )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.focal_px > 0 and self.hfov_deg > 0:
+            raise UsageError("give 'lens.focal_px' or 'lens.hfov_deg', not both: either follows from the other")
 
     def pixel_aspect_or(self, recorded: float) -> float:
         """Return the pixel aspect of the option, else that of the recording (0: it says nothing), else 1."""
@@ -322,16 +335,42 @@ class JointOptions(_Validated):
         return angle if 10.0 <= angle <= 170.0 else None
 
 
+@dataclass(frozen=True)
+class KnownDistance:
+    """A straight distance on the road between two pixels of the full image."""
+
+    pixels: tuple[tuple[float, float], ...]
+    """(u, v) of both ends."""
+    metres: float
+
+
+def _known_distance(text: str) -> KnownDistance:
+    """Parse one distance of `distances`; raise UsageError with the expected form."""
+    try:
+        numbers = [float(word) for word in text.replace(',', ' ').split()]
+    except ValueError:
+        numbers = []
+    if len(numbers) != 5 or not all(map(math.isfinite, numbers)) or not 0 < numbers[4] <= 1000:
+        raise UsageError(
+            "option 'scale.distances' takes five numbers for each distance, two pixels and up to 1000 metres, with ; "
+            f"between, for example '412 530 888 530 12.5; 400 300 420 420 30'; got {text.strip()!r}"
+        )
+    return KnownDistance(((numbers[0], numbers[1]), (numbers[2], numbers[3])), numbers[4])
+
+
 MIN_PIXEL_SEPARATION_SIGMAS = 10.0
 """Minimum distance of the two pixels of a known length, in units of their standard deviation: 10 % of the scale."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ScaleOptions(_Validated):
-    """Metric scale of the ground plane from a known distance or speed, for scale_from other than height."""
+    """Metric scale of the ground plane from known distances or speed, besides the camera height."""
 
     distance_px: str = option(
         '', "two road pixels of the full image with a known distance between them, as text: 'u1 v1 u2 v2'"
+    )
+    distances: str = option(
+        '', "further known distances, as text: 'u1 v1 u2 v2 metres; ...', two road pixels of the full image each"
     )
     distance_m: float = option(0.0, 'straight distance between them on the road, metres; 0: unknown', low=0, high=1000)
     distance_sigma_m: float = option(0.05, 'standard deviation of distance_m, metres', low=0, high=100)
@@ -354,12 +393,12 @@ class ScaleOptions(_Validated):
     )
 
     def __post_init__(self) -> None:
-        pixels = self.pixels
+        distances = self.known_distances
         super().__post_init__()
-        separation = math.dist(*pixels) if pixels else math.inf
+        separation = min((math.dist(*distance.pixels) for distance in distances), default=math.inf)
         if separation < max(MIN_PIXEL_SEPARATION_SIGMAS * self.pixel_sigma_px, 1.0):
             raise UsageError(
-                f"the pixels of 'scale.distance_px' are {separation:.1f} px apart, too close for a scale when "
+                f'the pixels of a known distance are {separation:.1f} px apart, too close for a scale when '
                 f'each has a standard deviation of {self.pixel_sigma_px:g} px: choose two pixels farther apart'
             )
 
@@ -377,12 +416,19 @@ class ScaleOptions(_Validated):
             )
         return tuple(zip(numbers[::2], numbers[1::2], strict=True))
 
+    @property
+    def known_distances(self) -> tuple[KnownDistance, ...]:
+        """All known distances: that of `distance_px`, and those of `distances`."""
+        given = [text for text in self.distances.split(';') if text.strip()]
+        first = (KnownDistance(self.pixels, self.distance_m),) if self.pixels else ()
+        return (*first, *map(_known_distance, given))
+
     def require_inside(self, width: int, height: int) -> None:
-        """Raise UsageError if a pixel of `distance_px` lies outside an image of `width` x `height`."""
-        for u, v in self.pixels:
+        """Raise UsageError if a pixel of a known distance lies outside an image of `width` x `height`."""
+        for u, v in (pixel for distance in self.known_distances for pixel in distance.pixels):
             if not (-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5):
                 raise UsageError(
-                    f"pixel ({u:g}, {v:g}) of 'scale.distance_px' lies outside the images, which have {width}x{height}:"
+                    f'pixel ({u:g}, {v:g}) of a known distance lies outside the images, which have {width}x{height}:'
                     ' give pixels of the full image as the camera sends it'
                 )
 
@@ -405,7 +451,7 @@ class GateOptions(_Validated):
     )
     max_sigma_tilt_deg: float = option(5.0, 'maximum standard deviation of the ground normal, degrees', low=0, high=45)
     max_sigma_height_rel: float = option(
-        0.25, 'maximum standard deviation of the camera height, fraction of it', low=0, high=1
+        0.5, 'maximum standard deviation of the camera height, fraction of it', low=0, high=1
     )
     max_drift_px: float = option(
         3.0,
@@ -430,9 +476,10 @@ class Options(_Validated):
         choices=('joint', 'paper'),
     )
     scale_from: str = option(
-        'height',
-        'source of the metric scale: camera height, a distance on the road, or the mean traffic speed',
-        choices=('height', 'distance', 'speed'),
+        'all',
+        'source of the metric scale; all: camera height, distances on the road and the mean traffic speed, as many of '
+        'them as are given; the others: only that one may be given',
+        choices=('all', 'height', 'distance', 'speed'),
     )
     camera_height: float = option(0.0, 'height of the camera above the road, metres; 0: unknown', low=0, high=500)
     camera_height_sigma: float = option(0.0, 'standard deviation of camera_height, metres; 0: exact', low=0, high=100)
@@ -482,7 +529,7 @@ class Options(_Validated):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._require_one_scale()
+        self._require_consistent_scale()
         _ = self.ignored_polygons
 
     @property
@@ -492,29 +539,36 @@ class Options(_Validated):
             _polygon(text) for text in self.ignore_regions.strip().rstrip(';').split(';') if self.ignore_regions.strip()
         )
 
-    def _require_one_scale(self) -> None:
-        """Raise UsageError unless exactly the values that `scale_from` needs are given."""
+    def _require_consistent_scale(self) -> None:
+        """Raise UsageError unless the values that `scale_from` needs are given, and only those if it names one."""
         scale = self.scale
         given = {
             'height': {'camera_height': self.camera_height > 0},
             'distance': {'scale.distance_px': bool(scale.pixels), 'scale.distance_m': scale.distance_m > 0},
             'speed': {'scale.speed_km_h': scale.speed_km_h > 0},
         }
+        if self.scale_from == 'distance' and scale.distances.strip():
+            given['distance'] = {'scale.distances': True}
         for source, parts in given.items():
             extra = [name for name, there in parts.items() if there]
-            if source != self.scale_from and extra:
+            if self.scale_from not in ('all', source) and extra:
                 raise UsageError(
                     f"the scale comes from one source: 'scale_from' is {self.scale_from}, but '{extra[0]}' is given "
-                    f"too; remove it, or set 'scale_from' to {source} and give only the values for that"
+                    "too; remove it, or set 'scale_from' to all, which uses both"
                 )
-        missing = [name for name, there in given[self.scale_from].items() if not there]
+        missing = [name for name, there in given.get(self.scale_from, {}).items() if not there]
         if self.scale_from != 'height' and missing:
             raise UsageError(f"'scale_from' {self.scale_from} needs '{missing[0]}'")
+        pixels, metres = given['distance'].get('scale.distance_px'), given['distance'].get('scale.distance_m')
+        if pixels != metres:
+            raise UsageError(
+                f"a known distance needs 'scale.{'distance_m' if pixels else 'distance_px'}': give both or neither"
+            )
         if self.camera_height_sigma > 0 and not self.camera_height > 0:
             raise UsageError("'camera_height_sigma' needs 'camera_height': give both or neither")
-        if self.scale_from == 'speed' and self.method == 'paper':
+        if scale.speed_km_h > 0 and self.method == 'paper':
             raise UsageError(
-                "'method' paper does not assign traffic to roads: use 'scale_from' height or distance with it"
+                "'method' paper does not assign traffic to roads: use the height or distance with it, not the speed"
             )
 
 

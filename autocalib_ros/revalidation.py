@@ -170,7 +170,7 @@ def with_current_options(kept: Calibration, options: Options, lens: Camera | Non
     size = kept.evidence.image_size
     if lens is not None and max_lens_difference_px(lens.scaled_to(*size), kept.camera) > SAME_LENS_TOLERANCE_PX:
         raise UsageError("its lens differs from that of 'camera_info_file'")
-    given_now = options.camera_height > 0 or options.scale_from == 'distance'
+    given_now = options.camera_height > 0 or options.scale.known_distances
     if kept.ground is None or not given_now:
         return kept
     options.scale.require_inside(*size)

@@ -91,12 +91,12 @@ def test_help_imports_nothing_heavy(tmp_path):
         (['replay', 'x', '--camera-height', '-3'], "'camera_height' lies between 0 and 500; got -3.0"),
         (['replay', 'x', '--camera-height', 'nan'], "'camera_height' lies between 0 and 500; got nan"),
         (['replay', 'x', '--camera-height', 'inf'], "'camera_height' lies between 0 and 500; got inf"),
-        (['replay', 'x', '--camera-height', '8', '--scale-speed', '50'], 'not allowed with argument --camera-height'),
-        (['evidence', 'x', '--scale-speed', '50', '-p', 'camera_height=8'], "'camera_height' is given too"),
+        (['replay', 'x', '--focal-px', '800', '--hfov-deg', '50'], 'not allowed with argument --focal-px'),
+        (['evidence', 'x', '--scale-speed', '5', '-p', 'scale_from=height'], "'scale.speed_km_h' is given too"),
         (['replay', 'x', '--scale-distance', '1', '2', '3', '4'], 'expected 5 arguments'),
         (['replay', 'x', '--scale-distance', '1', '2', '3', '4', '5'], 'px apart'),
-        (['replay', 'x', '--scale-distance', '1', '2', '300', '4', '0'], "needs 'scale.distance_m'"),
-        (['evidence', 'x', '--scale-speed', '0'], "needs 'scale.speed_km_h'"),
+        (['replay', 'x', '--distance', '1', '2', '300', '4', '0'], 'up to 1000 metres'),
+        (['evidence', 'x', '-p', 'scale_from=speed'], "needs 'scale.speed_km_h'"),
         (['evidence', 'x', '-p', 'scale_from=distance'], "needs 'scale.distance_px'"),
         (['demo', '--scale-from', 'guess'], "invalid choice: 'guess'"),
         (['replay', 'x', '-p', 'camera_hight=3'], "did you mean 'camera_height'?"),
@@ -178,7 +178,7 @@ def test_a_lens_of_another_shape_is_noticed_at_the_first_image(still_video, tmp_
 def test_pixels_outside_the_image_are_noticed_at_the_first_image(still_video, tmp_path, capsys):
     command = ['replay', str(still_video), '--quiet', '--out', str(tmp_path / 'out')]
     assert main([*command, '--scale-distance', '10', '80', '400', '80', '12.5']) == 2
-    assert "(400, 80) of 'scale.distance_px' lies outside the images, which have 160x96" in one_line(
+    assert '(400, 80) of a known distance lies outside the images, which have 160x96' in one_line(
         capsys.readouterr().err
     )
 

@@ -49,12 +49,13 @@ def replay_and_report(
 
 def warn_missing_scale(options: Options, lens: Camera | None) -> None:
     """Warn on stderr if no metric scale is given: the result has no metric ground plane."""
-    if options.scale_from == 'height' and options.camera_height == 0:
+    given = options.scale
+    if not (options.camera_height or given.known_distances or given.speed_km_h):
         scale = 'is given in units of that height' if options.allow_unit_scale else 'is left out'
         calibrated = 'the lens is calibrated' if lens is None else 'the lens is known'
         print_stderr(
-            f'No camera height given: {calibrated}, the ground plane {scale} (see --camera-height, --scale-distance'
-            ' and --scale-speed).'
+            f'No camera height given: {calibrated}, the ground plane {scale} (see --camera-height, --distance and'
+            ' --scale-speed).'
         )
 
 

@@ -14,25 +14,40 @@ if TYPE_CHECKING:
 
 def add_solve_options(parser: argparse.ArgumentParser) -> None:
     """Add the arguments for the solver, the metric scale and the printed output."""
-    scale = parser.add_mutually_exclusive_group()
-    scale.add_argument(
+    known = parser.add_argument_group('what is known', 'as many of these as are known; together they have to agree')
+    known.add_argument(
         '--camera-height',
         type=float,
         metavar='H',
         help='height of the camera above the road in metres; without a metric scale only the lens is calibrated',
     )
-    scale.add_argument(
+    known.add_argument(
+        '--camera-height-sigma', type=float, metavar='S', help='standard deviation of the height (default: exact)'
+    )
+    known.add_argument(
+        '--distance',
         '--scale-distance',
+        dest='distance',
         type=float,
         nargs=5,
+        action='append',
         metavar=('U1', 'V1', 'U2', 'V2', 'METRES'),
-        help='alternative: two pixels on the road and the distance between them in metres',
+        help='two pixels on the road and the distance between them in metres; repeatable',
     )
-    scale.add_argument(
-        '--scale-speed',
+    known.add_argument(
+        '--scale-speed', type=float, metavar='KM_H', help='mean speed of the moving traffic on the busiest road in km/h'
+    )
+    lens = known.add_mutually_exclusive_group()
+    lens.add_argument(
+        '--focal-px', type=float, metavar='F', help='focal length from the data sheet in pixels, +- 10 %%'
+    )
+    lens.add_argument('--hfov-deg', type=float, metavar='A', help='field of view across the image in degrees, +- 10 %%')
+    known.add_argument('--focal-sigma-px', type=float, metavar='S', help='standard deviation of --focal-px')
+    known.add_argument(
+        '--roll-sigma-deg',
         type=float,
-        metavar='KM_H',
-        help='alternative: mean speed of the moving traffic on the busiest road in km/h',
+        metavar='S',
+        help='single road: standard deviation of the roll of a level camera in degrees (default: 3)',
     )
     parser.add_argument(
         '--camera-info',
@@ -67,7 +82,7 @@ def options_from_arguments(arguments: argparse.Namespace) -> Options:
 
     values: dict[str, Any] = read_params_file(arguments.params_file) if arguments.params_file else {}
     values.update(parse_assignments(arguments.param))
-    values.update(_scale_values(arguments))
+    values.update(_known_values(arguments))
     if arguments.method is not None:
         values['method'] = arguments.method
     if arguments.allow_unit_scale:
@@ -75,20 +90,20 @@ def options_from_arguments(arguments: argparse.Namespace) -> Options:
     return override_options(Options(), values)
 
 
-def _scale_values(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return the options of the scale source given on the command line, if any."""
-    if arguments.camera_height is not None:
-        return {'camera_height': arguments.camera_height}
-    if arguments.scale_distance is not None:
-        *pixels, metres = arguments.scale_distance
-        return {
-            'scale_from': 'distance',
-            'scale.distance_px': ' '.join(f'{value:g}' for value in pixels),
-            'scale.distance_m': metres,
-        }
-    if arguments.scale_speed is not None:
-        return {'scale_from': 'speed', 'scale.speed_km_h': arguments.scale_speed}
-    return {}
+def _known_values(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return the options for what is known, as far as it is given on the command line."""
+    given = {
+        'camera_height': arguments.camera_height,
+        'camera_height_sigma': arguments.camera_height_sigma,
+        'scale.speed_km_h': arguments.scale_speed,
+        'lens.focal_px': arguments.focal_px,
+        'lens.focal_sigma_px': arguments.focal_sigma_px,
+        'lens.hfov_deg': arguments.hfov_deg,
+        'joint.roll_prior_deg': arguments.roll_sigma_deg,
+    }
+    if arguments.distance:
+        given['scale.distances'] = '; '.join(' '.join(f'{value:g}' for value in each) for each in arguments.distance)
+    return {name: value for name, value in given.items() if value is not None}
 
 
 def read_known_lens(arguments: argparse.Namespace, options: Options) -> Camera | None:

@@ -8,6 +8,7 @@ from autocalib_ros.config import Options
 from autocalib_ros.estimation.adjustment.lens_prior import LensPrior, known_lens, lens_priors
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig
 from autocalib_ros.estimation.given_lens import check_principal_point, verify_given_lens
+from autocalib_ros.estimation.known_lengths import adjust_to_lengths
 from autocalib_ros.estimation.observations.selection import drop_pedestrians
 from autocalib_ros.estimation.observations.track_set import TrackSet, select_tracks
 from autocalib_ros.estimation.observations.two_frame_windows import ResampledTracks, find_windows
@@ -112,15 +113,16 @@ def _estimate_and_scale(
         solution = find_solution(traffic, tracks, options, height_m=height_m, lens=lens)
     if isinstance(solution, Reason):
         return solution
+    solution = adjust_to_lengths(solution, tracks, options)
     return draft.calibration(with_solution_rows(solution, options.gate), kept[tracks.indices]), solution.from_markings
 
 
 def _unusual_height_m(solution: Solution | Reason, options: Options) -> float | None:
     """Height of the camera that follows from the solution, if it is unlike the default for an unknown height."""
-    if options.scale_from == 'height' or isinstance(solution, Reason) or solution.plane_refusal:
+    if options.camera_height > 0 or isinstance(solution, Reason) or solution.plane_refusal:
         return None
     scale = scale_of(solution, options)
-    if isinstance(scale, Reason):
+    if isinstance(scale, Reason) or not scale.metric:
         return None
     height_m = scale.height(*solution.plane.lens_and_normal)
     return height_m if is_unusual(height_m) else None
@@ -153,7 +155,7 @@ def find_solution(
         return _estimate(observations, AdjustmentConfig(priors[0], joint, height_m, crossing_rad))
 
     def estimate_with_aspect(aspect: float, sigma: float) -> Solution | Reason:
-        families = lens_priors(evidence.image_size, joint, evidence.picture, aspect)
+        families = lens_priors(evidence.image_size, joint, evidence.picture, aspect, options.lens)
         return estimate_under([prior.with_pixel_aspect(aspect, sigma) for prior in families])
 
     if lens is not None:

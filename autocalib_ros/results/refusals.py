@@ -439,7 +439,7 @@ REFUSALS = (
     RefusalCode(
         code='scale_uncertain',
         cause='The camera height that follows from the given scale is too uncertain.',
-        limit='gate.max_sigma_height_rel, 25 % (one sigma)',
+        limit='gate.max_sigma_height_rel, 50 % (one sigma)',
         remedy='give a longer distance on the road nearer to the camera, wait for more traffic, or give the camera '
         'height',
         missing='a certain scale',

@@ -197,14 +197,15 @@ ASSUMPTIONS: dict[str, Wording] = {
     'scale_height': _scale_height,
     'scale_distance': _scale_distance,
     'scale_speed': _scale_speed,
+    'scale_combined': 'scale from {sources} measures together: camera height {height_m:.3f} +- {height_sigma_m:.2g} m',
     'paper_lens': 'equidistant lens with the principal point at the centre of the picture',
     'paper_roads': 'the two roads are perpendicular',
     'paper_uncertainty': 'the published method gives no uncertainty',
 }
 """Wording of every assumption, by its kind."""
 
-SCALE_KINDS = ('scale_height', 'scale_distance', 'scale_speed')
-"""Kinds that say where the scale comes from; at most one stands in a calibration."""
+SCALE_KINDS = ('scale_height', 'scale_distance', 'scale_speed', 'scale_combined')
+"""Kinds that say where the scale comes from: one, or several and that of their combination."""
 
 CHECKS: dict[str, Wording] = {
     'sway': 'the camera sways by {sway_px:.1f} px about its rest position (95 % of the images): compensated',

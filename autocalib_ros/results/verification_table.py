@@ -35,6 +35,7 @@ VERIFIED_QUANTITIES: dict[str, VerifiedQuantity] = {
     'focal_sigma': VerifiedQuantity('standard deviation of the focal length', '%', REFUSED),
     'plane_sigma': VerifiedQuantity('standard deviation of tilt or roll, the larger', 'degrees', NO_PLANE),
     'height_sigma': VerifiedQuantity('standard deviation of the camera height', '%', NO_PLANE),
+    'known_lengths': VerifiedQuantity('known lengths against each other', 'sigma', CONTRADICTED),
     'vehicle_size': VerifiedQuantity('size of the vehicles against the usual one', '%', CONTRADICTED),
     'below_horizon': VerifiedQuantity('tracked points below the horizon', '%', REFUSED, at_least=True),
     'straight_share': VerifiedQuantity('vehicles that follow the roads', '%', REFUSED, at_least=True),

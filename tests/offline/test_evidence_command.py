@@ -191,7 +191,7 @@ def test_a_distance_above_the_horizon_leaves_the_lens(without_height):
 def test_pixels_outside_the_image_are_wrong_usage(without_height):
     status, stdout, stderr = without_height('--scale-distance', 600, 720, 600, 500, 10.0)
     assert (status, stdout, stderr.count('\n')) == (2, '', 1)
-    assert "(600, 720) of 'scale.distance_px' lies outside the images, which have 1280x720" in stderr
+    assert '(600, 720) of a known distance lies outside the images, which have 1280x720' in stderr
 
 
 def test_a_lens_of_another_shape_is_wrong_usage(evidence, tmp_path):

@@ -169,7 +169,7 @@ def test_source_of_the_scale_changes_at_once_or_not_at_all(bench: Bench):
         Parameter('camera_height', value=0.0),
     ]
     assert not set_remotely(bench, *changes[:2], atomically=True)[0].successful
-    assert (node.options.scale_from, node.get_parameter('scale_from').value) == ('height', 'height')
+    assert (node.options.scale_from, node.get_parameter('scale_from').value) == ('all', 'all')
     assert set_remotely(bench, *changes, atomically=True)[0].successful
     assert (node.options.scale_from, node.options.scale.speed_km_h, node.options.camera_height) == ('speed', 50.0, 0.0)
 
@@ -207,7 +207,7 @@ def test_every_line_of_an_example_file_gives_the_reason(request, name):
         ({'tracking.max_points': 3.5}, "'max_points' takes a int"),
         ({'method': 'magic'}, 'one of joint, paper'),
         ({'scale_from': 'distance'}, "needs 'scale.distance_px'"),
-        ({'scale.speed_km_h': 50.0}, "'scale.speed_km_h' is given too"),
+        ({'scale.distance_m': 12.0}, "needs 'scale.distance_px'"),
         ({'scale.distance_px': [412.0, 530.0, 888.0, 530.0]}, 'four numbers in one text'),
         ({'scale.distance_m': 12}, 'scale.distance_m:=12.0, not 12'),
     ],
@@ -224,7 +224,7 @@ def test_node_ends_with_status_2_and_one_line_at_what_it_cannot_use(tmp_path):
         'camera_height:=8': ['write camera_height:=8.0, not 8'],
         'camera_height:=501.0': ['lies between 0 and 500'],
         'camera_hight:=8.0': ["did you mean 'camera_height'?"],
-        'scale.distance_px:=412 530 888 530': ["'scale.distance_px' is given too"],
+        'scale.distance_px:=412 530 888 530': ["needs 'scale.distance_m'"],
         'scale.distance_px:=[412.0, 530.0, 888.0, 530.0]': ['four numbers in one text'],
         f'camera_info_file:={tmp_path}/none.yaml': [f'{tmp_path}/none.yaml', 'No such file or directory'],
         f'camera_info_file:={tmp_path}/lens.yaml': [f'{tmp_path}/lens.yaml', "it has no 'image_height'"],

@@ -13,7 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
-from autocalib_ros.config import JointOptions
+from autocalib_ros.config import JointOptions, LensOptions
 from autocalib_ros.evidence.picture import Picture
 from autocalib_ros.lens.camera import Camera
 
@@ -33,6 +33,8 @@ unless the option gives pixels. Judgement."""
 LOOSE_PRINCIPAL_POINT_SIGMA_FRACTION = 0.1
 """Standard deviation of the principal point, fraction of the image width, where the evidence identifies it: an image
 may be cropped or digitally zoomed. Judgement."""
+DATA_SHEET_SIGMA = 0.1
+"""Relative standard deviation of a focal length or field of view from a data sheet, unless another is given."""
 LENS_PARAMETERS = ('focal length', 'principal point x', 'principal point y', 'k1', 'k2', 'pixel aspect')
 """Names of the lens parameters, in the order of `LensPrior.sigma`."""
 
@@ -48,6 +50,9 @@ class LensPrior:
     """Of log f (inf: unknown), cx and cy in pixels, k1, k2, log pixel aspect (inf: unknown); 0: fixed, shape (6,)."""
     picture: Picture | None = None
     """The picture whose centre is the mean of the principal point; None if the lens is known."""
+
+    view_deg: float = 0.0
+    """Field of view across the image from which the focal length follows, degrees; 0 if it is given itself."""
 
     @property
     def focal_known(self) -> bool:
@@ -121,6 +126,24 @@ class LensPrior:
             return [mean]
         return [mean, *(replace(mean, k=(*k[:2], 0.0, 0.0)) for k in (EQUIDISTANT, DISTORTION_FREE))]
 
+    def with_data_sheet(self, known: LensOptions) -> LensPrior:
+        """Return the prior with the focal length or the field of view of the data sheet, if either is given.
+
+        Of a field of view the focal length is that of the family.
+        """
+        sigma = self.sigma.copy()
+        if known.focal_px > 0:
+            sigma[0] = known.focal_sigma_px / known.focal_px or DATA_SHEET_SIGMA
+            return replace(self, centre=replace(self.centre, focal_px=known.focal_px), sigma=sigma)
+        if known.hfov_deg > 0:
+            sigma[0] = known.hfov_sigma_deg / known.hfov_deg or DATA_SHEET_SIGMA
+            half = 0.5 * self.centre.width * self.centre.pixel_aspect
+            reach = float(replace(self.centre, focal_px=1.0).radius(np.array(np.radians(known.hfov_deg) / 2)))
+            return replace(
+                self, centre=replace(self.centre, focal_px=half / reach), sigma=sigma, view_deg=known.hfov_deg
+            )
+        return self
+
     def with_fixed(self, names: tuple[str, ...]) -> LensPrior:
         """Return the prior with the parameters `names` fixed."""
         fixed = np.array([name in names for name in LENS_PARAMETERS])
@@ -162,7 +185,11 @@ def known_lens(lens: Camera) -> LensPrior:
 
 
 def lens_priors(
-    image_size: tuple[int, int], options: JointOptions, picture: Picture | None = None, pixel_aspect: float = 1.0
+    image_size: tuple[int, int],
+    options: JointOptions,
+    picture: Picture | None = None,
+    pixel_aspect: float = 1.0,
+    known: LensOptions | None = None,
 ) -> list[LensPrior]:
     """Return the priors of the lens families to choose from, the most common one first.
 
@@ -180,7 +207,7 @@ def lens_priors(
     names = list(families) if options.lens_prior == 'auto' else [options.lens_prior]
     start_px = focal if focal > 0 else float(image_size[0])
     centre = Camera(*image_size, start_px, picture.lens_centre_px, pixel_aspect=pixel_aspect)
-    return [
+    priors = [
         LensPrior(
             name,
             replace(centre, k=families[name][0]),
@@ -189,6 +216,7 @@ def lens_priors(
         )
         for name in names
     ]
+    return priors if known is None else [prior.with_data_sheet(known) for prior in priors]
 
 
 def _principal_point_sigma_px(picture: Picture, given_px: float, pixel_aspect: float) -> tuple[float, float]:

@@ -56,8 +56,13 @@ class LensChoice:
             return np.array([centre.focal_px])
         if self.prior.focal_known:
             reach = KNOWN_FOCAL_SIGMAS * max(float(self.prior.sigma[0]), 1e-3)
-            return centre.focal_px * np.exp(np.linspace(-reach, reach, KNOWN_FOCAL_NODES))
-        half = 0.5 * centre.width * centre.pixel_aspect
+            low, high = centre.focal_px * np.exp([-reach, reach])
+            if self.prior.view_deg > 0:  # the focal length of a field of view depends on the curvature
+                low, high = (
+                    self._focal_of_view(kappa) * np.exp(shift) for kappa, shift in ((0.0, -reach), (1.0, reach))
+                )
+            return np.geomspace(low, high, KNOWN_FOCAL_NODES)
+        half = self._half_width
         shortest, longest = half / np.radians(MAX_VIEW_DEG / 2), half / np.tan(np.radians(MIN_VIEW_DEG / 2))
         return np.geomspace(shortest, longest, FOCAL_NODES)
 
@@ -68,7 +73,7 @@ class LensChoice:
             return [centre]
         if self.prior.focal_known:
             return [self.lens(centre.focal_px, kappa) for kappa in TRIAL_KAPPAS]
-        half = 0.5 * centre.width * centre.pixel_aspect
+        half = self._half_width
         narrow = self.lens(half / np.tan(np.radians(USUAL_VIEW_DEG / 2)), 1.0)
         return [narrow, *(self.lens(half / np.radians(view / 2), 0.0) for view in TRIAL_VIEWS_DEG)]
 
@@ -85,10 +90,20 @@ class LensChoice:
         )
         of_kappa = float(np.log((usual + 1.0) / 3.0))
         if self.prior.focal_known:
-            away = np.log(focal_px / self.prior.centre.focal_px) / max(float(self.prior.sigma[0]), 1e-3)
+            expected_px = self._focal_of_view(kappa) if self.prior.view_deg > 0 else self.prior.centre.focal_px
+            away = np.log(focal_px / expected_px) / max(float(self.prior.sigma[0]), 1e-3)
         else:
-            half = 0.5 * self.prior.centre.width * self.prior.centre.pixel_aspect
             root = np.sqrt(max(kappa, 1e-6))
-            view_deg = 2 * np.degrees(np.arctan(root * half / focal_px) / root)
+            view_deg = 2 * np.degrees(np.arctan(root * self._half_width / focal_px) / root)
             away = np.log(view_deg / USUAL_VIEW_DEG) / np.log(USUAL_VIEW_FACTOR)
         return of_kappa - 0.5 * float(away) ** 2
+
+    @property
+    def _half_width(self) -> float:
+        """Half of the width of the image, in units of the height of a pixel."""
+        return 0.5 * self.prior.centre.width * self.prior.centre.pixel_aspect
+
+    def _focal_of_view(self, kappa: float) -> float:
+        """Return the focal length at which a lens has the given field of view."""
+        root, half_rad = np.sqrt(max(kappa, 1e-6)), np.radians(min(self.prior.view_deg, MAX_VIEW_DEG)) / 2
+        return float(self._half_width * root / np.tan(min(root * half_rad, 1.5)))

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from autocalib_ros.config import GateOptions, Options, ScaleOptions
+from autocalib_ros.config import GateOptions, KnownDistance, Options, ScaleOptions
 from autocalib_ros.estimation.adjustment.noise_model import DEFAULT_CAMERA_HEIGHT_M
 from autocalib_ros.estimation.observations.track_set import TrackSet
 from autocalib_ros.geometry.ground_plane import ground_points
@@ -32,6 +32,8 @@ MIN_FLOW_SPEED_FRACTION = 0.4
 fifth."""
 TRIM_FRACTION = 0.25
 """Fraction of the slowest and of the fastest vehicles that is trimmed from the mean speed."""
+MIN_SCALE_SIGMA = 1e-3
+"""Least relative standard deviation of a source of scale: a height that is given as exact is not."""
 STEP_PX = 1e-3
 """Step of the numerical derivative by the given pixels."""
 M_S_PER_KM_H = 1 / 3.6
@@ -55,31 +57,70 @@ class Scale:
     """Numbers of that assumption."""
     derived: bool = False
     """Whether the height follows from lens and plane; otherwise it was given."""
+    sources: tuple[Scale, ...] = ()
+    """The sources that it combines; empty for one alone."""
 
     def assumption(self, height: float, sigma: float | None = None) -> tuple[Statement, ...]:
         """Return the source of the scale, with the height and its total standard deviation if they follow from it."""
         if not self.metric:
             return ()
+        if self.sources:
+            each = [assumption(source.kind, **source.values) for source in self.sources]
+            count = len(self.sources)
+            return (*each, assumption('scale_combined', sources=count, height_m=height, height_sigma_m=sigma))
         derived = {'height_m': height, 'height_sigma_m': sigma} if self.derived else {}
         return (assumption(self.kind, **self.values, **derived),)
 
 
 def known_scale(options: Options, camera: Camera, normal: np.ndarray, flow: TrackSet | None = None) -> Scale | Reason:
-    """Return the scale that the options ask for, or why there is none.
+    """Return the scale that follows from all that the options give, or why there is none.
 
     `flow` holds straight tracks along the busiest road, for the scale from their speed.
     """
-    if options.scale_from == 'distance':
-        return _scale_from_distance(options.scale, camera, normal)
-    if options.scale_from == 'speed' and flow is not None:
-        return _scale_from_speed(options.scale, camera, normal, flow)
-    height, sigma = options.camera_height, options.camera_height_sigma
-    if height > 0:
-        values = {'given_m': height, 'given_sigma_m': sigma}
-        return Scale(lambda *_: height, sigma, True, 'scale_height', values)
+    sources = scale_sources(options, camera, normal, flow)
+    if isinstance(sources, Reason):
+        return sources
+    if sources:
+        return sources[0] if len(sources) == 1 else _combined(sources, camera, normal)
     if options.allow_unit_scale:
         return Scale(lambda *_: 1.0, 0.0, False)
     return reason('no_height')
+
+
+def scale_sources(
+    options: Options, camera: Camera, normal: np.ndarray, flow: TrackSet | None = None
+) -> list[Scale] | Reason:
+    """Return a scale for each height, distance and speed that the options give; a reason if one of them gives none."""
+    given, found = options.scale, []
+    height, sigma = options.camera_height, options.camera_height_sigma
+    if height > 0:
+        values = {'given_m': height, 'given_sigma_m': sigma}
+        found.append(Scale(lambda *_: height, sigma, True, 'scale_height', values))
+    for distance in given.known_distances:
+        scale = _scale_from_distance(given, distance, camera, normal)
+        if isinstance(scale, Reason):
+            return scale
+        found.append(scale)
+    if given.speed_km_h > 0 and flow is not None:
+        scale = _scale_from_speed(given, camera, normal, flow)
+        if isinstance(scale, Scale):
+            found.append(scale)
+        elif not found:
+            return scale
+    return found
+
+
+def _combined(sources: list[Scale], camera: Camera, normal: np.ndarray) -> Scale:
+    """Return the scale of several sources: the mean of their log heights, by their own variances."""
+    heights = np.array([source.height(camera, normal) for source in sources])
+    sigmas = np.maximum(np.array([source.sigma for source in sources]) / heights, MIN_SCALE_SIGMA)
+    weights = sigmas**-2 / float((sigmas**-2).sum())
+
+    def height(lens: Camera, up: np.ndarray) -> float:
+        return float(np.exp(weights @ np.log([source.height(lens, up) for source in sources])))
+
+    relative = float((sigmas**-2).sum()) ** -0.5
+    return Scale(height, relative * height(camera, normal), True, derived=True, sources=tuple(sources))
 
 
 def check_scale(height: float, sigma: float, gate: GateOptions) -> Reason | None:
@@ -94,12 +135,14 @@ def is_unusual(height_m: float) -> bool:
     return abs(np.log(height_m / DEFAULT_CAMERA_HEIGHT_M)) > np.log(SIMILAR_HEIGHT_FACTOR)
 
 
-def _scale_from_distance(given: ScaleOptions, camera: Camera, normal: np.ndarray) -> Scale | Reason:
+def _scale_from_distance(
+    given: ScaleOptions, distance: KnownDistance, camera: Camera, normal: np.ndarray
+) -> Scale | Reason:
     """Return the scale from two pixels on the road and the metres between them."""
-    pixels = np.array(given.pixels)
+    pixels, metres = np.array(distance.pixels), distance.metres
     bearings, valid = camera.unproject(pixels)
     below = -(bearings @ normal)
-    for (u, v), sine, there in zip(given.pixels, below, valid, strict=True):
+    for (u, v), sine, there in zip(distance.pixels, below, valid, strict=True):
         if not there:
             return reason('scale_off_road', 'outside_lens', u=u, v=v)
         if sine < MIN_DEPRESSION_SCALE_SINE:
@@ -115,19 +158,17 @@ def _scale_from_distance(given: ScaleOptions, camera: Camera, normal: np.ndarray
     slopes = np.array(
         [length(camera, normal, pixels + step) - length(camera, normal, pixels - step) for step in steps]
     ) / (2 * STEP_PX)
-    relative = np.hypot(
-        given.distance_sigma_m / given.distance_m, given.pixel_sigma_px * np.linalg.norm(slopes) / heights
-    )
+    relative = np.hypot(given.distance_sigma_m / metres, given.pixel_sigma_px * np.linalg.norm(slopes) / heights)
     return Scale(
-        lambda lens, up: given.distance_m / length(lens, up),
-        float(given.distance_m / heights * relative),
+        lambda lens, up: metres / length(lens, up),
+        float(metres / heights * relative),
         True,
         'scale_distance',
         {
-            'distance_m': given.distance_m,
+            'distance_m': metres,
             'distance_sigma_m': given.distance_sigma_m,
             'pixel_sigma_px': given.pixel_sigma_px,
-            'pixels': ' and '.join(f'({u:g}, {v:g})' for u, v in given.pixels),
+            'pixels': ' and '.join(f'({u:g}, {v:g})' for u, v in distance.pixels),
         },
         derived=True,
     )
