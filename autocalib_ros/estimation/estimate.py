@@ -181,7 +181,7 @@ def _estimate(observations: Observations, config: AdjustmentConfig) -> Solution 
         found = _with_lane_markings(found, (straight, turning), observations, config)
     # A single road: its vehicles and scenery, and wide priors.
     if config.options.single_road and _leaves_a_road_open(found):
-        found = with_single_road(found, estimate_from_single_road(found, observations, config))
+        found = with_single_road(found, estimate_from_single_road(observations, config))
     return found
 
 
@@ -222,5 +222,5 @@ def _leaves_a_road_open(found: Solution | Reason) -> bool:
     """Whether a road may be there, but lens or plane about it are open."""
     missing = found if isinstance(found, Reason) else found.plane_refusal
     if missing is None:
-        return isinstance(found, Solution) and not found.from_markings and not found.sharp
+        return isinstance(found, Solution) and not found.from_markings and not (found.fit.plane_known and found.sharp)
     return missing.code in SINGLE_ROAD_CODES

@@ -14,7 +14,7 @@ from autocalib_ros.estimation.certainty import certainty_of_lengths
 from autocalib_ros.estimation.paper.intrinsics import PaperIntrinsics
 from autocalib_ros.estimation.paper.vanishing_point_voting import segment_orientations
 from autocalib_ros.estimation.people.pedestrians import people
-from autocalib_ros.estimation.solution import SHARP_FOCAL_SIGMA, Solution
+from autocalib_ros.estimation.solution import Solution
 from autocalib_ros.estimation.verification.ground_normal import PlaneEstimate
 from autocalib_ros.estimation.verification.readiness import stillness_checks
 from autocalib_ros.estimation.verification.scale import Scale, check_scale, known_scale
@@ -30,7 +30,7 @@ from autocalib_ros.results.calibration import (
     Refusal,
     StandardDeviations,
 )
-from autocalib_ros.results.grades import GroundSigma, rank_of
+from autocalib_ros.results.grades import GRADE_LIMITS, GroundSigma, rank_of
 from autocalib_ros.results.refusals import WAIT, Reason, reason
 from autocalib_ros.results.statements import check
 from autocalib_ros.results.verification_table import VerificationRow, verified
@@ -227,21 +227,28 @@ def require_grade(result: Calibration, least: str) -> Calibration | Refusal:
     The refusal has the result as its candidate.
     """
     sigma, helpful = result.stddev.ground, result.helpful
-    certain = rank_of(result.grade) >= rank_of(least)
-    if result.grade == 'unit_scale':
-        certain = sigma is None or rank_of(sigma.grade) >= rank_of(least)
-    if certain or result.grade == 'lens' or result.method == 'paper':
+    grade = result.grade if result.grade != 'unit_scale' or sigma is None else sigma.grade
+    if result.method == 'paper' or rank_of(grade) >= rank_of(least):
         return result
+    lens_certain = (result.stddev.focal_px or 0.0) <= GRADE_LIMITS['fair'] * result.camera.focal_px
+    if result.grade == 'lens':
+        if lens_certain:
+            return result
+        missing = result.ground_refusal
+        cause, remedy = 'lens', WAIT if missing is None else missing.remedy
+    else:
+        cause, remedy = '' if sigma else 'no_road_ahead', helpful.text if helpful else WAIT
     why = reason(
         'grade_too_low',
-        '' if sigma else 'no_road_ahead',
+        cause,
         grade=result.grade,
         least=least,
         along=sigma.along if sigma else None,
         across=sigma.across if sigma else None,
-        helpful=helpful.text if helpful else WAIT,
+        focal=(result.stddev.focal_px or 0.0) / result.camera.focal_px,
+        helpful=remedy,
     )
-    if result.stddev.focal_px is not None and result.stddev.focal_px <= SHARP_FOCAL_SIGMA * result.camera.focal_px:
+    if lens_certain:
         return _lens_of(result, why)
     refused = Refusal.from_reason(why, result.method, result.evidence, result.figures)
     return replace(refused, candidate=result)

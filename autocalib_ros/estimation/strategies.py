@@ -15,10 +15,9 @@ from autocalib_ros.estimation.markings.markings_solution import (
     fit_to_markings,
     refine_with_markings,
 )
-from autocalib_ros.estimation.observations.track_set import TrackSet
 from autocalib_ros.estimation.one_road import PLANE_TOLERANCE_DEG, CrossTraffic
 from autocalib_ros.estimation.refinement import refine_and_verify, select_noise_model
-from autocalib_ros.estimation.single_road.road_solution import complete_single_road, solve_single_road
+from autocalib_ros.estimation.single_road.road_solution import solve_single_road
 from autocalib_ros.estimation.solution import SHARP_FOCAL_SIGMA, Observations, Solution, append_reason, is_better
 from autocalib_ros.estimation.straight.initialisation import solve_from_consensus
 from autocalib_ros.estimation.straight.roads import (
@@ -75,68 +74,47 @@ def estimate_from_turning_traffic(observations: Observations, config: Adjustment
     return refine_and_verify(fit, tracks, observations, turned=True)
 
 
-def estimate_from_single_road(
-    found: Solution | Reason, observations: Observations, config: AdjustmentConfig
-) -> Solution | Reason:
-    """Estimate from one straight road, its vehicles and scenery, and wide priors of field of view and roll.
-
-    The lens is that of what was found, if the traffic of one road has determined it.
-    """
-    evidence, tracks = observations.evidence, observations.tracks
-    if isinstance(found, Solution) and not found.fit.plane_known:
-        completed = complete_single_road(found.fit, evidence, tracks)
-        if isinstance(completed, Reason):
-            return completed
-        solution = replace(
-            found.compared(*completed.rows),
-            assumptions=(*found.assumptions, *completed.assumptions),
-            checks=(*found.checks, *completed.checks),
-            of_traffic=found.fit,
-        )
-        return _about_single_road(solution, completed.fit, tracks)
-    prior = config.prior
+def estimate_from_single_road(observations: Observations, config: AdjustmentConfig) -> Solution | Reason:
+    """Estimate from one straight road, its vehicles and scenery, and wide priors of field of view and roll."""
+    tracks, prior = observations.tracks, config.prior
     if len(prior.free):
         aspect_sigma = float(np.hypot(prior.sigma[5], observations.unmeasured_aspect_sigma))
         prior = prior.with_pixel_aspect(prior.centre.pixel_aspect, aspect_sigma)
-    single = solve_single_road(
-        evidence, tracks, replace(config, prior=prior), observations.gate, observations.generator
+    found = solve_single_road(
+        observations.evidence, tracks, replace(config, prior=prior), observations.gate, observations.generator
     )
-    if isinstance(single, Reason):
-        return single
-    plane = PlaneEstimate.of(single.fit, tracks)
-    solution = Solution(
-        single.fit,
-        plane,
-        single.fit.state.directions[0],
-        tracks,
-        single.assumptions,
-        single.checks,
-        None,
-        single_road=True,
-        comparisons=single.rows,
-    )
-    return _about_single_road(solution, single.fit, tracks)
-
-
-def _about_single_road(solution: Solution, fit: Adjustment, tracks: TrackSet) -> Solution | Reason:
-    """Return a solution with the lens, plane and traffic of a single road; a reason if its traffic is in the sky."""
-    plane = PlaneEstimate.of(fit, tracks)
+    if isinstance(found, Reason):
+        return found
+    fit, plane = found.fit, PlaneEstimate.of(found.fit, tracks)
     if plane.fraction_below_horizon < MIN_FRACTION_BELOW_HORIZON:
         return reason('horizon', fraction=1 - plane.fraction_below_horizon, limit=1 - MIN_FRACTION_BELOW_HORIZON)
-    flow = tracks.subset(fit.inliers() & (fit.labels == 0))
-    along = fit.state.directions[0]
-    return replace(solution, fit=fit, plane=plane, along=along, flow=flow, plane_refusal=None, reduced=True)
+    return Solution(
+        fit,
+        plane,
+        fit.state.directions[0],
+        tracks.subset(fit.inliers() & (fit.labels == 0)),
+        found.assumptions,
+        found.checks,
+        None,
+        reduced=True,
+        single_road=True,
+        comparisons=found.rows,
+    )
 
 
 def with_single_road(found: Solution | Reason, single: Solution | Reason) -> Solution | Reason:
-    """Return the more certain of what was found and a solution of a single road, and compare their planes."""
+    """Return a solution of a single road, or what was found if that is more certain by other traffic than straight one.
+
+    Straight traffic on one road shows how much the lens curves, and no focal length but for an assumed lens family.
+    Where both have a plane they are compared.
+    """
     if isinstance(single, Reason):
         return append_reason(found, single)
     if isinstance(found, Reason) or found.plane_refusal:
         return single
     difference_deg = unsigned_angle_deg(found.plane.normal(found.fit.state), single.plane.normal(single.fit.state))
     limit_deg = AGREEMENT_SIGMAS * float(np.hypot(found.plane.worst_sigma_deg, single.plane.worst_sigma_deg))
-    better = single if is_better(single, found) else found
+    better = single if not found.fit.plane_known or is_better(single, found) else found
     return better.compared(verified('single_road', difference_deg, limit_deg))
 
 

@@ -298,11 +298,15 @@ REFUSALS = (
         message='the result is of grade {grade}, at least {least} is asked for: lengths on the road along the view '
         '+- {along:.0%}, across it +- {across:.0%}',
         variants={
+            'lens': (
+                'the lens alone is known, and its focal length to +- {focal:.0%} only (10 % without a ground plane)',
+                '{helpful}',
+            ),
             'no_road_ahead': (
                 'the result is of grade {grade}, at least {least} is asked for: the camera sees no road ahead of it, '
                 'by which it could be graded',
                 'turn the camera so that it sees the road ahead',
-            )
+            ),
         },
     ),
     RefusalCode(

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from autocalib_ros.config import JointOptions, LensOptions, Options, ScaleOptions
+from autocalib_ros.config import GateOptions, LensOptions, Options, ScaleOptions
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration
@@ -34,12 +34,13 @@ def distance(ends: tuple[tuple[float, float], ...], factor: float = 1.0) -> str:
 
 def found(*distances: str, height: float = 0.0) -> Calibration:
     scale = ScaleOptions(distances='; '.join(distances), distance_sigma_m=0.1)
-    options = Options(camera_height=height, scale=scale, lens=LensOptions(pixel_aspect=1.0), joint=JointOptions())
+    gate = GateOptions(least_grade='assumed')
+    options = Options(camera_height=height, scale=scale, lens=LensOptions(pixel_aspect=1.0), gate=gate)
     return solve_once(synthetic_evidence(ROAD, np.random.default_rng(0)), options).candidate
 
 
 def test_a_length_along_and_one_across_make_the_other_lengths_certain() -> None:
-    alone, both = found(distance(ALONG)), found(distance(ALONG), distance(ACROSS))
+    alone, both = found(height=ROAD.height_m), found(distance(ALONG), distance(ACROSS))
     assert both.stddev.ground.worst < 0.6 * alone.stddev.ground.worst
     assert both.stddev.focal_px / both.camera.focal_px < alone.stddev.focal_px / alone.camera.focal_px
     error = np.log(both.camera.focal_px / PINHOLE.focal_px)

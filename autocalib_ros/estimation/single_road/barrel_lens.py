@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from autocalib_ros.config import JointOptions
 from autocalib_ros.estimation.adjustment.lens_prior import DISTORTION_FREE, LensPrior
 from autocalib_ros.lens.camera import Camera
 
@@ -28,7 +29,7 @@ TRIAL_KAPPAS, TRIAL_VIEWS_DEG = (1.0, 0.6, 0.3, 0.0), (50.0, 75.0, 100.0, 125.0,
 """Curvatures with a given focal length, and fields of view of equidistant lenses, at which roads are looked for."""
 TRIAL_KAPPAS, TRIAL_VIEWS_DEG = (1.0, 0.6, 0.3, 0.0), (50.0, 75.0, 100.0, 125.0, 150.0)
 """Curvatures with a given focal length, and fields of view of equidistant lenses, at which roads are looked for."""
-FOCAL_NODES, KNOWN_FOCAL_NODES, KNOWN_FOCAL_SIGMAS = 36, 15, 2.8
+FOCAL_NODES, KNOWN_FOCAL_NODES, KNOWN_FOCAL_SIGMAS = 32, 15, 2.8
 """Focal lengths that are tried, without and with a given one, and up to how many standard deviations from it."""
 
 
@@ -43,6 +44,8 @@ class LensChoice:
     """Lenses of the family that a prior allows, about its principal point."""
 
     prior: LensPrior
+    options: JointOptions
+    """Of the lens family: `lens_prior` and `k1_sigma`."""
 
     @property
     def known(self) -> bool:
@@ -85,10 +88,7 @@ class LensChoice:
 
     def log_prior(self, focal_px: float, kappa: float) -> float:
         """Return the log prior density of a lens, by log focal length and kappa."""
-        usual = sum(
-            np.exp(-0.5 * ((kappa - mean) / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi)) for mean, sigma in USUAL_KAPPAS
-        )
-        of_kappa = float(np.log((usual + 1.0) / 3.0))
+        of_kappa = float(np.log(sum(self._kappa_densities(kappa))))
         if self.prior.focal_known:
             expected_px = self._focal_of_view(kappa) if self.prior.view_deg > 0 else self.prior.centre.focal_px
             away = np.log(focal_px / expected_px) / max(float(self.prior.sigma[0]), 1e-3)
@@ -97,6 +97,20 @@ class LensChoice:
             view_deg = 2 * np.degrees(np.arctan(root * self._half_width / focal_px) / root)
             away = np.log(view_deg / USUAL_VIEW_DEG) / np.log(USUAL_VIEW_FACTOR)
         return of_kappa - 0.5 * float(away) ** 2
+
+    def _kappa_densities(self, kappa: float) -> list[float]:
+        """Return the densities of a curvature under the families that may be, each times its probability."""
+        families = {'distortion_free': USUAL_KAPPAS[0], 'equidistant': USUAL_KAPPAS[1]}
+        chosen = self.options.lens_prior
+        if chosen in families:  # its k1 is given with a standard deviation, and kappa is three times k1
+            families = {chosen: (1.0 if chosen == 'distortion_free' else 0.0, max(3.0 * self.options.k1_sigma, 1e-3))}
+        spread = {'auto': 1.0, 'kannala_brandt': 1.0}.get(chosen, 0.0)
+        usual = [] if chosen == 'kannala_brandt' else list(families.values())
+        densities = [
+            float(np.exp(-0.5 * ((kappa - mean) / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi))) for mean, sigma in usual
+        ]
+        parts = [*densities, *([spread] if spread else [])]
+        return [part / len(parts) for part in parts]
 
     @property
     def _half_width(self) -> float:

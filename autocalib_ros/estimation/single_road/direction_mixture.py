@@ -26,7 +26,7 @@ MIXTURE_ROUNDS = 3
 """Rounds of expectation-maximisation; shares and spreads then change by a few per cent at most."""
 SEARCHED_TURNS_RAD = np.radians(np.arange(-40.0, 40.1, 2.5))
 """Turns from a level camera at which the best one is looked for."""
-TURNS_RAD = np.radians(np.arange(-12.0, 12.01, 0.5))
+TURNS_RAD = np.radians(np.arange(-12.0, 12.01, 0.75))
 """Turns about the best one at which the likelihood is evaluated."""
 
 
@@ -162,7 +162,7 @@ class SeenSegments:
         leverages[0] = self.stretch
         for index, directions in ((1, across), (2, up)):
             residuals[index] = self.projected.residuals(directions)
-            aside = np.cross(directions, self.along)
+            aside = cross(directions, self.along[None])
             changes = [
                 self.projected.residual_changes(directions, np.broadcast_to(by, directions.shape))
                 for by in (self.along, aside)

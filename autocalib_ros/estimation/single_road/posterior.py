@@ -13,7 +13,6 @@ from functools import cached_property
 
 import numpy as np
 from scipy.interpolate import CubicSpline
-from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 from scipy.special import logsumexp
 
@@ -48,15 +47,15 @@ TRACK_FREEDOM = 1.0
 MIN_DISTANCE_PX, ROBUST_LIMIT = 0.2, 4.0
 """Least typical distance of a track from its path, and the squared distance, in units of the typical one, at which a
 track weighs a quarter."""
-KAPPA_NODES = 5
+KAPPA_NODES = 4
 """Curvatures at each focal length, within 2.5 standard deviations of what straight tracks show."""
-QUADRATURE = ((0.0, 2 / 3), (np.sqrt(3.0), 1 / 6), (-np.sqrt(3.0), 1 / 6))
-"""Gauss-Hermite quadrature of three points: standard deviations, and weights."""
 MIN_SPACINGS, FINER_SHIFTS = 1.5, np.linspace(-2.5, 2.5, 16)
 """Where the focal length is more certain than so many spacings of the grid, a finer one follows, with these shifts in
 spacings of the first."""
 KAPPA_TRIALS = 9
 """Curvatures at each focal length by which straight tracks measure it."""
+MAX_NATS_BEHIND = 15.0
+"""Lenses through which the tracks are less probable by more are left out: edges and lines do not make up for it."""
 MIN_WEIGHT = 1e-4
 """Lenses less probable than this share of the likeliest are left out of what follows."""
 ROAD_SIGMA_RAD = np.radians(0.5)
@@ -162,7 +161,7 @@ def road_posterior(
     segments: tuple[DirectionMixture, DirectionMixture],
     roll_sigma_rad: float,
 ) -> Adjustment:
-    """Return lens and plane, with their covariance, of a road whose lens the traffic does not determine.
+    """Return lens and plane, with their covariance, of one straight road.
 
     `fit` is a solution of the road by any lens, `tracks` those by which lenses are compared. `segments` are vehicle
     edges and still lines, either may be empty; `roll_sigma_rad` is the standard deviation of the roll.
@@ -181,34 +180,6 @@ def road_posterior(
     turns = slice(parameters.lens + 1, parameters.lens + 3)
     covariance[turns, turns] += _road_covariance(parameters.base, solve.adjusted(base))
     return evaluate_at(parameters.base, tracks, parameters.config, covariance)
-
-
-def road_posterior_with_lens(
-    fit: Adjustment,
-    tracks: TrackSet,
-    segments: tuple[DirectionMixture, DirectionMixture],
-    roll_sigma_rad: float,
-) -> Adjustment:
-    """Return lens and plane, with their covariance, of a road whose lens the traffic determines.
-
-    `fit` is the solution of that one road; the rest as for `road_posterior`.
-    """
-    scene, parameters = _RoadScene(segments, roll_sigma_rad), fit.problem.parameters
-    covariance, focal = fit.covariance, int(np.flatnonzero(np.append(parameters.config.prior.free, 0) == 0)[0])
-    free = focal < parameters.lens and covariance[focal, focal] > 0
-    step = covariance[focal] / np.sqrt(covariance[focal, focal]) if free else np.zeros(parameters.size)
-    states = [(parameters.state(shift * step), weight) for shift, weight in (QUADRATURE if free else ((0.0, 1.0),))]
-    nodes = [
-        _Node(state.camera, state.directions[0], float(np.log(weight)), np.zeros(1), np.zeros(1))
-        for state, weight in states
-    ]
-    fitted = [scene.fitted_to(node) for node in nodes]
-    own = _parameters(fitted[0].weighed(), fit.problem.config, parameters.config.prior)
-    # what the focal length does not explain: other lens parameters, and the direction of the road
-    turned = own.base.rotation.T @ parameters.base.rotation @ parameters.axes.T
-    to_own = block_diag(np.eye(parameters.lens), turned)
-    rest = to_own @ (covariance - np.outer(step, step)) @ to_own.T
-    return evaluate_at(own.base, tracks, own.config, _covariance(fitted, own) + rest)
 
 
 def _parameters(base: _Node, config: AdjustmentConfig, prior: LensPrior) -> Parameterisation:
@@ -245,7 +216,9 @@ def _lens_nodes(solve: _RoadThrough, choice: LensChoice, focals: np.ndarray) -> 
     """Return the lenses of the grid of focal lengths (n,), with the direction of the road through each."""
     if choice.known:
         return [_node(solve, choice.prior.centre, 0.0)]
-    return [node for focal_px in focals.tolist() for node in _curvature_nodes(solve, choice, focal_px)]
+    nodes = [node for focal_px in focals.tolist() for node in _curvature_nodes(solve, choice, focal_px)]
+    best = max(node.log_weight for node in nodes)
+    return [node for node in nodes if node.log_weight > best - MAX_NATS_BEHIND]
 
 
 def _curvature_nodes(solve: _RoadThrough, choice: LensChoice, focal_px: float) -> list[_Node]:

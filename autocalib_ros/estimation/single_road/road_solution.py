@@ -14,10 +14,10 @@ from autocalib_ros.estimation.markings.road_segments import group_segments
 from autocalib_ros.estimation.observations.track_set import TrackSet, evenly_spaced, kish_weight
 from autocalib_ros.estimation.single_road.barrel_lens import USUAL_VIEW_DEG, LensChoice
 from autocalib_ros.estimation.single_road.direction_mixture import STILL_SEGMENTS, VEHICLE_EDGES, DirectionMixture
-from autocalib_ros.estimation.single_road.posterior import road_posterior, road_posterior_with_lens
+from autocalib_ros.estimation.single_road.posterior import road_posterior
 from autocalib_ros.estimation.straight.initialisation import solve_from_consensus
 from autocalib_ros.estimation.vehicle_edges.transverse_edges import select_vehicle_edges
-from autocalib_ros.estimation.verification.gates import ComparedHalves, check_halves
+from autocalib_ros.estimation.verification.gates import check_halves
 from autocalib_ros.estimation.verification.identifiability import lens_assumptions, principal_point_assumption
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.ground_plane import unsigned_angle_deg
@@ -28,7 +28,7 @@ from autocalib_ros.results.verification_table import VerificationRow, verified
 
 MAX_COMPARED_TRACKS = 200
 """Tracks, evenly spaced in the list of all, by which lenses are compared."""
-MAX_ROAD_SEGMENTS = 300
+MAX_ROAD_SEGMENTS = 200
 """Most edges, and most still lines, in the posterior: the longest."""
 SEGMENT_CORRELATION = 0.3
 """Correlation of the errors of the edges of one vehicle, or of the lines of one group. Judgement."""
@@ -65,7 +65,7 @@ def solve_single_road(
     generator: np.random.Generator,
 ) -> SingleRoad | Reason:
     """Estimate lens and plane from one straight road, the scene along it, and wide priors; a reason if that fails."""
-    choice = LensChoice(config.prior)
+    choice = LensChoice(config.prior, config.options)
     subsample = tracks.subset(evenly_spaced(len(tracks), MAX_COMPARED_TRACKS))
     road = _find_road(choice, subsample, config, generator)
     if road is None:
@@ -80,25 +80,14 @@ def solve_single_road(
         return halves
     roll_deg, segments = config.options.roll_prior_deg or DEFAULT_ROLL_SIGMA_DEG, _segments(evidence, whole, tracks)
     fit = road_posterior(start, subsample.subset(compared), choice, segments, float(np.radians(roll_deg)))
-    return _finished(
+    edges, lines = segments
+    seen = check('single_road', edges=len(edges.weights), lines=len(lines.weights), following=following)
+    return SingleRoad(
         evaluate_at(fit.state, tracks, fit.problem.config, fit.covariance),
-        _lens_statements(fit, choice),
-        roll_deg,
-        segments,
-        following,
-        halves,
+        (*_lens_statements(fit, choice), assumption('level_camera', sigma_deg=roll_deg)),
+        (seen, halves.statement),
+        (verified('straight_share', following, MIN_FOLLOWING), *halves.rows),
     )
-
-
-def complete_single_road(fit: Adjustment, evidence: Evidence, tracks: TrackSet) -> SingleRoad | Reason:
-    """Complete a solution of one road, whose lens the traffic determines, with the plane; a reason if that fails."""
-    following = _following(fit, tracks)
-    if isinstance(following, Reason):
-        return following
-    options = fit.problem.config.options
-    roll_deg, segments = options.roll_prior_deg or DEFAULT_ROLL_SIGMA_DEG, _segments(evidence, fit, tracks)
-    solved = road_posterior_with_lens(fit, tracks, segments, float(np.radians(roll_deg)))
-    return _finished(solved, (), roll_deg, segments, following)
 
 
 def _following(fit: Adjustment, tracks: TrackSet) -> float | Reason:
@@ -111,24 +100,6 @@ def _following(fit: Adjustment, tracks: TrackSet) -> float | Reason:
     if following < MIN_FOLLOWING:
         return reason('turning_traffic', 'one_road', fraction=following, limit=MIN_FOLLOWING, roads=1)
     return following
-
-
-def _finished(
-    fit: Adjustment,
-    assumptions: tuple[Statement, ...],
-    roll_deg: float,
-    segments: tuple[DirectionMixture, DirectionMixture],
-    following: float,
-    halves: ComparedHalves | None = None,
-) -> SingleRoad:
-    edges, lines = segments
-    seen = check('single_road', edges=len(edges.weights), lines=len(lines.weights), following=following)
-    return SingleRoad(
-        fit,
-        (*assumptions, assumption('level_camera', sigma_deg=roll_deg)),
-        (seen,) if halves is None else (seen, halves.statement),
-        (verified('straight_share', following, MIN_FOLLOWING), *(() if halves is None else halves.rows)),
-    )
 
 
 def _segments(evidence: Evidence, fit: Adjustment, tracks: TrackSet) -> tuple[DirectionMixture, DirectionMixture]:

@@ -58,9 +58,10 @@ def test_coefficients_are_those_of_the_classical_projections() -> None:
 
 
 def test_a_given_focal_length_limits_those_that_are_tried() -> None:
-    given = LensChoice(lens_priors(SIZE, JointOptions(focal_prior_px=900.0, focal_sigma_px=90.0))[0])
+    sheet = LensOptions(focal_px=900.0)
+    given = LensChoice(lens_priors(SIZE, JointOptions(), known=sheet)[0], JointOptions())
     assert given.focal_lengths().min() > 0.7 * 900 and given.focal_lengths().max() < 1.4 * 900
-    free = LensChoice(lens_priors(SIZE, JointOptions())[0])
+    free = LensChoice(lens_priors(SIZE, JointOptions())[0], JointOptions())
     assert free.focal_lengths().min() < 410 and free.focal_lengths().max() > 4000
     # usual fields of view are the more probable ones
     assert free.log_prior(1400.0, 1.0) > free.log_prior(4000.0, 1.0) + 1.0

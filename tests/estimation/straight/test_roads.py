@@ -157,7 +157,7 @@ def test_a_distortion_free_lens_is_found_when_the_angle_of_the_roads_is_given() 
 
 
 def test_parameters_that_one_road_cannot_identify_are_fixed_and_reported() -> None:
-    result = solved(ONE_ROAD)
+    result = solved(ONE_ROAD, options=replace(OPTIONS, joint=JointOptions(single_road=False)))
     assert isinstance(result, Calibration)
     assert 'parameter_fixed' in [statement.kind for statement in result.assumptions]
 

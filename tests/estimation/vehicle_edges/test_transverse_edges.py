@@ -243,11 +243,12 @@ def with_boxes(junction: Junction, clutter: float = 0.5) -> Evidence:
     )
 
 
+EDGES_ALONE = replace(ONE_FAMILY, single_road=False)
 ROLLED = replace(ONE_ROAD, camera_from_ground=pose(35.0, 5.0, 60.0))
 
 
 def test_one_road_and_edges_give_an_assumed_plane_of_a_rolled_camera() -> None:
-    result = solve_once(with_boxes(ROLLED), Options(camera_height=HEIGHT_M, joint=ONE_FAMILY))
+    result = solve_once(with_boxes(ROLLED), Options(camera_height=HEIGHT_M, joint=EDGES_ALONE))
     assert isinstance(result, Calibration) and result.ground is not None
     assert result.grade in ('fair', 'coarse')
     assert 'transverse_edges' in [statement.kind for statement in result.assumptions]
@@ -258,7 +259,7 @@ def test_one_road_and_edges_give_an_assumed_plane_of_a_rolled_camera() -> None:
 
 @pytest.mark.solve
 def test_edges_are_not_used_if_switched_off() -> None:
-    joint = replace(ONE_FAMILY, transverse_edges=False, single_road=False)
+    joint = replace(EDGES_ALONE, transverse_edges=False)
     options = Options(camera_height=HEIGHT_M, joint=joint)
     result = solve_once(with_boxes(ROLLED), options)
     assert isinstance(result, Calibration) and result.ground_refusal is not None
@@ -269,7 +270,7 @@ def test_edges_are_not_used_if_switched_off() -> None:
 def test_edges_that_contradict_a_level_camera_are_refused_with_a_reason() -> None:
     junction = replace(ONE_ROAD, camera_from_ground=pose(35.0, 9.0, 60.0))
     result = solve_once(
-        with_boxes(junction), Options(camera_height=HEIGHT_M, joint=replace(ONE_FAMILY, roll_prior_deg=1.0))
+        with_boxes(junction), Options(camera_height=HEIGHT_M, joint=replace(EDGES_ALONE, roll_prior_deg=1.0))
     )
     assert isinstance(result, Calibration) and result.ground is None and result.ground_refusal is not None
     assert result.ground_refusal.code == 'plane_uncertain'
@@ -278,7 +279,7 @@ def test_edges_that_contradict_a_level_camera_are_refused_with_a_reason() -> Non
 
 @pytest.fixture(scope='module')
 def assumed() -> Solution:
-    evidence, options = with_boxes(ROLLED), Options(camera_height=HEIGHT_M, joint=ONE_FAMILY)
+    evidence, options = with_boxes(ROLLED), Options(camera_height=HEIGHT_M, joint=EDGES_ALONE)
     solution = find_solution(
         evidence,
         select_tracks(evidence, options.joint.max_tracks),
