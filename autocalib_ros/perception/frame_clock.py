@@ -127,6 +127,8 @@ class TimedImage:
     """Number of the image in order of arrival, from 0."""
     time_ns: int
     """Time of exposure on a clock that is never set: that of the stamps, less all steps so far."""
+    lost: int = 0
+    """Slots of the grid without an image before it; 0 without a grid, and after a pause."""
 
 
 @dataclass(frozen=True)
@@ -169,6 +171,7 @@ class FrameClock:
 
     def _leave_grid(self) -> None:
         self._grid: FrameGrid | None = None
+        self._lost_by_grid = 0
         self._unsearched = 0
         self._slot = 0
         self._window: deque[tuple[int, int, bool]] = deque(maxlen=MAX_IMAGES)
@@ -424,7 +427,9 @@ class FrameClock:
         if after_queued and self._window:
             self._window[-1] = (*self._window[-1][:2], False)
         explained = fits or waited or after_queued
-        self._count(lost=slot - self._slot - 1, queued=int(after_queued), odd=int(not explained))
+        lost = slot - self._slot - 1
+        self._lost_by_grid += lost
+        self._count(lost=lost, queued=int(after_queued), odd=int(not explained))
         self._advances.append(slot - self._slot)
         self._surplus.append(False)
         self._slot = slot
@@ -432,7 +437,7 @@ class FrameClock:
         if fits and not waited and not (after_queued and abs(error) > QUEUED):
             self._errors.append(error)
         self._misfits.append(abs(error) > QUEUED and not waited and not after_queued)
-        self._emit(arrival, arrival.stamp_ns if abs(error) <= EVEN_FRAMES else grid.time_ns(slot), fits=fits)
+        self._emit(arrival, arrival.stamp_ns if abs(error) <= EVEN_FRAMES else grid.time_ns(slot), fits, lost)
         self._fit(grid)
 
     def _fit(self, grid: FrameGrid) -> None:
@@ -446,7 +451,8 @@ class FrameClock:
         fitted = fit_grid(grid, np.array(slots), np.array(stamps, np.int64), np.array(counts, bool))
         images, span = len(slots), slots[-1] - slots[0] + 1
         if not fitted.period_ns > 0 or span > SLOTS_PER_IMAGE['most'] * images:
-            self._leave_grid()  # it was found within a burst
+            self._count(lost=-self._lost_by_grid)
+            self._leave_grid()  # it was found within a burst, so its slots were none
         elif (
             self._rate_changed(grid)
             or self._misfit()
@@ -483,7 +489,7 @@ class FrameClock:
     def _misfit(self) -> bool:
         return sum(self._misfits) >= MISFITS or sum(self._surplus) >= MANY_LEFT_OUT
 
-    def _emit(self, arrival: _Arrival, clock_ns: int, fits: bool = True) -> None:
+    def _emit(self, arrival: _Arrival, clock_ns: int, fits: bool = True, lost: int = 0) -> None:
         """Give an image its time; look for a grid if there is none."""
         time_ns = clock_ns - self.offset_ns
         if self._time_ns is not None:
@@ -492,7 +498,7 @@ class FrameClock:
         self._time_ns = time_ns
         self._newest_ns = arrival.stamp_ns if fits else clock_ns
         self._previous_ns = arrival.stamp_ns
-        self._timed.append(TimedImage(arrival.image, time_ns))
+        self._timed.append(TimedImage(arrival.image, time_ns, lost))
         self._count(images=1)
         if fits:
             self._raw.append(arrival.stamp_ns)

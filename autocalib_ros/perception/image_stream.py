@@ -40,7 +40,7 @@ class ImageStream:
         if options.gate != self._gate:
             self._gate = options.gate
             self.observer.change_gate(options.gate)
-        observed = self.observer.observe(ready.image, time_s)
+        observed = self.observer.observe(ready.image, time_s, ready.lost)
         part = self._parts.part(observed.view, time_s)
         part.buffer.add(observed.tracks, observed.segments, observed.edges, observed.outlines)
         part.tracks_seen += len(observed.tracks)

@@ -15,6 +15,8 @@ class ReadyImage:
 
     time_ns: int
     image: np.ndarray
+    lost: int = 0
+    """Images that were lost between the one before and this one."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,7 @@ class ImageTiming:
         """Take the next image; return the images that have their time now."""
         reading = self._clock.add(stamp_ns)
         self._waiting[self._arrived] = image
-        ready = tuple(ReadyImage(timed.time_ns, self._waiting[timed.image]) for timed in reading.timed)
+        ready = tuple(ReadyImage(timed.time_ns, self._waiting[timed.image], timed.lost) for timed in reading.timed)
         held = self._clock.held
         self._waiting = {number: kept for number, kept in self._waiting.items() if number in held}
         if self._arrived in held:

@@ -84,13 +84,20 @@ class Observer:
         self._frame_gate = FrameGate(RepeatDetector(), LEVEL_SHIFT_THRESHOLD)
         self.repeated = 0
         """Number of images so far that repeat an earlier one."""
-        self._frames = 0
+        self._slots = 0
+        """Number of frames so far, with the lost ones and without repeats."""
+        self._lost = 0
+        """Images lost since the last one that was new."""
         self._vehicles = 0
         self._edge_finder = EdgeFinder()
         self._detections = 0
 
-    def observe(self, image: np.ndarray, time_s: float) -> FrameObservations:
-        """Process a grey (H, W) or BGR (H, W, 3) uint8 image; repeated frames and closed shutters yield nothing."""
+    def observe(self, image: np.ndarray, time_s: float, lost: int = 0) -> FrameObservations:
+        """Process a grey (H, W) or BGR (H, W, 3) uint8 image; repeated frames and closed shutters yield nothing.
+
+        Images that were `lost` before it count for the intervals between detections: traffic went on meanwhile.
+        """
+        self._lost += lost
         image = black_out(image, self._polygons)
         grey = self._tracked_image(image)
         status = self._frame_gate.classify(_downsampled(grey, self._ignored), time_s)
@@ -109,13 +116,13 @@ class Observer:
         if self._scene.picture_area.update(self._scene.background):
             self._exclude_no_picture()
         tracks = [self._to_full_size(track) for track in (*ended, *self._tracker.follow_new(grey, time_s))]
-        detect = self._frames % self._options.tracking.detect_every == 0
-        if detect or self._frames % MOTION_MASK_PERIOD == 0:
+        passed, self._slots, self._lost = self._slots, self._slots + 1 + self._lost, 0
+        detect = _reaches_multiple(passed, self._slots, self._options.tracking.detect_every)
+        if detect or _reaches_multiple(passed, self._slots, MOTION_MASK_PERIOD):
             self._motion.update(grey, time_s)
         if self._detector_tracks is not None:
             self._detector_tracks.follow(image, time_s, self._tracker, self._reduction)
         segments, edges, outlines = self._detect(grey, time_s) if detect else (None, None, None)
-        self._frames += 1
         return FrameObservations(tracks, segments, edges, outlines, self._view)
 
     def change_gate(self, gate: GateOptions) -> None:
@@ -316,6 +323,11 @@ class Observer:
     def _to_full_pixels(self, points_px: np.ndarray) -> np.ndarray:
         """Convert pixels (n, 2) of the tracked image to the full image; pixel centres are at integer coordinates."""
         return (points_px + 0.5) * self._reduction - 0.5 if self._reduction > 1 else points_px
+
+
+def _reaches_multiple(before: int, now: int, period: int) -> bool:
+    """Return whether one of the numbers from `before` to `now` - 1 is a multiple of the period."""
+    return -(-now // period) > -(-before // period)
 
 
 def _downsampled(grey: np.ndarray, ignored: np.ndarray | None) -> np.ndarray:

@@ -123,6 +123,22 @@ def test_what_happened_is_told():
     assert 'frame period 33.3' in str(told['dropped_2']) and '12 lost' in str(told['dropped_2'])
 
 
+def test_each_image_knows_how_many_were_lost_before_it():
+    arrived = STAMP_FAULTS['dropped_2'](exposures(900, 30.0), np.random.default_rng(1))
+    clock, lost = FrameClock(), {}
+    for stamp_ns in arrived.stamps_ns.tolist():
+        lost.update({arrived.images[timed.image]: timed.lost for timed in clock.add(stamp_ns).timed})
+    before = np.append(0, np.diff(arrived.images) - 1)
+    assert sum(lost.values()) == 12
+    assert {image for image, count in lost.items() if count == 2} == set(arrived.images[before == 2])
+
+
+@pytest.mark.parametrize('rate_hz', [15.0, 30.0])
+def test_images_that_wait_for_each_other_are_not_lost(rate_hz):
+    stamps = STAMP_FAULTS['bursts_of_10'](exposures(600, rate_hz), np.random.default_rng(1)).stamps_ns
+    assert clocked(stamps).summary.lost == 0  # also not by a grid that was found within the first burst
+
+
 @pytest.mark.parametrize('spread', [0.5, 0.8])
 def test_irregular_intervals_keep_their_stamps(spread):
     random = np.random.default_rng(3)

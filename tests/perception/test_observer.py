@@ -8,7 +8,7 @@ import pytest
 from drawn_pictures import noisy, paste
 
 from autocalib_ros.config import MotionOptions, Options
-from autocalib_ros.perception.background import Background
+from autocalib_ros.perception.background import MAX_SAMPLES, Background
 from autocalib_ros.perception.motion_mask import MotionMask
 from autocalib_ros.perception.observer import Observer
 
@@ -110,6 +110,19 @@ def test_a_wide_image_is_tracked_reduced_and_reported_in_full_pixels() -> None:
     assert len(ends) and (np.abs(newest[:, None] - ends).max(axis=2).min(axis=0) < 1e-9).all()
 
 
+def test_lost_images_do_not_delay_detections() -> None:
+    whole, half = Observer(Options(), (SIZE[1], SIZE[0])), Observer(Options(), (SIZE[1], SIZE[0]))
+    detected: tuple[list[float], list[float]] = [], []
+    for index in range(60):
+        time_s = 0.1 * index
+        image = scene(time_s)
+        seen = [whole.observe(image, time_s)]
+        seen += [half.observe(image, time_s, lost=int(index > 0))] if index % 2 == 0 else []
+        for times, observed in zip(detected, seen, strict=False):
+            times += [time_s] if observed.segments is not None else []
+    assert len(detected[0]) > 5 and detected[1] == detected[0]
+
+
 def test_passing_cars_are_not_drift(watched: tuple[list, list, Observer]) -> None:
     assert watched[2].drift_px < 0.5
 
@@ -127,7 +140,7 @@ def test_the_background_keeps_few_images() -> None:
     background = Background()
     for index in range(2000):
         background.update(np.zeros((36, 64), np.uint8), float(index))
-    assert len(background._samples) <= 9
+    assert len(background._samples) <= MAX_SAMPLES
 
 
 def test_repeated_pictures_change_nothing() -> None:
