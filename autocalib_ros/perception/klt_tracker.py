@@ -28,8 +28,11 @@ GAP_INTERVALS = 2.3
 USUAL_INTERVALS, USUAL_QUANTILE = 31, 0.75
 """Intervals whose upper quartile is the usual one: a second or two, so that a change of the rate is followed within a
 second. The upper quartile, because up to half of the images are repeats or lost at random without being gaps."""
+FRAME_QUANTILE = 0.25
+"""Quantile of these intervals that is one frame of the camera: where half of the images are lost at random, half of the
+intervals are single, and the upper quartile is two frames or three."""
 SHORTEST_INTERVAL = 0.5
-"""Fraction of the usual interval below which a stamp is in doubt, and the usual one is taken for velocities."""
+"""Fraction of a frame below which an interval is in doubt, and a frame is taken for velocities."""
 SAME_INTERVAL = 0.05
 """Relative difference up to which the ratio of two intervals is one of whole frames: less than the velocity of a
 vehicle changes."""
@@ -126,7 +129,8 @@ class PointTracker:
                 usual_s = float(np.quantile(self._intervals_s, USUAL_QUANTILE))
                 gap = interval_s > GAP_INTERVALS * usual_s
                 before = match_grey_levels(self._grey, grey) if gap else self._grey
-                interval_s = usual_s if interval_s < SHORTEST_INTERVAL * usual_s else interval_s
+                frame_s = float(np.quantile(self._intervals_s, FRAME_QUANTILE))
+                interval_s = frame_s if interval_s < SHORTEST_INTERVAL * frame_s else interval_s
                 finished = self._follow(before, grey, time_s, interval_s, gap, after_repeats=intervals > 1)
                 if intervals == 1 or not self._interval_s:
                     self._interval_s = interval_s

@@ -182,6 +182,18 @@ def test_lost_images_end_no_track(lost: tuple[int, ...]) -> None:
         np.testing.assert_allclose(np.diff(track.points_px[:, 0]) / np.diff(track.times_s), 60.0, atol=3.0)
 
 
+def test_single_frames_between_losses_are_taken_for_single_ones() -> None:
+    # three of every five images are lost: the upper quartile of the intervals is four frames, one frame is no odd stamp
+    tracker, finished = PointTracker(TrackingOptions()), []
+    for index in sorted([*range(0, 40, 5), *range(1, 40, 5)]):
+        finished += tracker.follow(scene((15.0 + 5.5 * index, 40.0)), 0.1 * index)
+        if index == 0:
+            tracker.add_points(GRID + (15.0, 40.0), np.zeros(len(GRID), int))
+    assert not finished and len(tracker.unfinished()) == len(GRID)
+    for track in tracker.unfinished():
+        np.testing.assert_allclose(np.diff(track.points_px[:, 0]) / np.diff(track.times_s), 55.0, atol=4.0)
+
+
 def test_one_short_interval_ends_no_track() -> None:
     # the stamp of one image 1 ms after the one before: the interval after it is no gap, nor is any later one
     tracker, finished = PointTracker(TrackingOptions()), []
