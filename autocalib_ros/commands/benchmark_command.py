@@ -56,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='uneven time stamps and repeated images, applied to recordings',
         description='Apply faults of time stamps and repeated images to recordings while they are read, and compare '
         'the results with those of the recordings as they are. Exit status: 0 if each verdict is the same, each focal '
-        'length within its standard deviation and at least 80 %% of the tracks are left, 3 otherwise.',
+        'length within its standard deviation and at least 80 %% of the expected tracks are left, 3 otherwise.',
     )
     streams.add_argument('recordings', metavar='RECORDING', nargs='+', type=Path, help='recordings to replay')
     streams.add_argument(

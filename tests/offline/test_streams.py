@@ -15,9 +15,18 @@ from autocalib_ros.config import Options
 from autocalib_ros.errors import UsageError
 from autocalib_ros.offline.benchmark import streams
 from autocalib_ros.offline.benchmark.repeating_source import RepeatingSource
-from autocalib_ros.offline.benchmark.streams import StreamRun, expand_kinds, format_run, run_stream, run_streams
+from autocalib_ros.offline.benchmark.streams import (
+    COMPARED_WITH,
+    StreamRun,
+    expand_kinds,
+    format_run,
+    run_stream,
+    run_streams,
+)
 from autocalib_ros.offline.recordings.sources import Frame, StoredImage
 from autocalib_ros.offline.simulate.repeat_faults import REPEAT_FAULTS, jpeg, skipping
+from autocalib_ros.offline.simulate.stamp_faults import MESSAGE_FAULTS, STAMP_FAULTS
+from autocalib_ros.perception.frame_clock import FrameClock
 from synthetic_results import refusal
 
 pytestmark = pytest.mark.render
@@ -117,6 +126,8 @@ EVEN = StreamRun('even', 'full', 100, 300, 0, 500.0, 10.0)
     [
         (StreamRun('x', 'full', 80, 300, 0, 509.0, 10.0), []),
         (StreamRun('x', 'full', 79, 300, 0, 511.0, 10.0), ['focal length', 'tracks']),
+        (StreamRun('dropped_half', 'full', 40, 150, 0, 509.0, 10.0), []),
+        (StreamRun('dropped_half', 'full', 39, 150, 0, 511.0, 10.0), ['focal length', 'tracks']),
         (StreamRun('x', 'assumed', 200, 300, 0, 500.0, 10.0), ['verdict']),
         (StreamRun('x', 'no_motion', 100, 300, 0), ['verdict']),
     ],
@@ -132,21 +143,27 @@ def test_two_refusals_are_one_verdict() -> None:
 
 def test_a_row_names_focal_length_sigmas_and_tracks() -> None:
     row = format_run(StreamRun('jitter_30', 'full', 90, 300, 7, 505.0, 11.0), EVEN)
-    assert row.split() == ['jitter_30', 'full', '505.0', '11.0', '+0.50', '90', '90', '7', 'ok']
+    assert row.split() == ['jitter_30', 'full', '505.0', '11.0', '+0.50', '90', '90', '7', 'even', 'ok']
     refused = format_run(StreamRun('jitter_30', 'no_motion', 3, 300, 0), EVEN)
-    assert refused.split() == ['jitter_30', 'no_motion', '-', '-', '-', '3', '3', '0', 'verdict,', 'tracks']
+    assert refused.split() == ['jitter_30', 'no_motion', '-', '-', '-', '3', '3', '0', 'even', 'verdict,', 'tracks']
 
 
 def test_kinds_are_names_or_groups() -> None:
     assert expand_kinds(['repeats', 'jitter_20', 'jitter_20']) == (*REPEAT_FAULTS, 'jitter_20')
-    assert 'constant' not in expand_kinds([]) and {'jitter_30', 'frozen_jpeg'} <= set(expand_kinds([]))
+    assert set(expand_kinds([])) == {*STAMP_FAULTS, *REPEAT_FAULTS} - {'even'}
     with pytest.raises(UsageError, match=r'no such fault: jiter; there are stamps, repeats, even, jitter_20'):
         expand_kinds(['jiter'])
 
 
-def test_a_stream_through_a_codec_is_compared_with_the_codec_alone(monkeypatch) -> None:
-    monkeypatch.setattr(streams, 'run_stream', lambda kind, source, options: StreamRun(kind, 'full', 9, 30, 0))
-    kinds = ['repeated_25_in_30', 'repeated_25_in_30_jpeg', 'frozen_jpeg', 'jitter_30']
+def test_a_stream_is_compared_with_an_even_one_of_its_codec_and_its_traffic(monkeypatch) -> None:
+    seen = {}
+
+    def run(kind, source, options):
+        seen[kind] = [frame.stamp_ns // INTERVAL_NS for frame in source.frames()]
+        return StreamRun(kind, 'full', 9, 30, 0)
+
+    monkeypatch.setattr(streams, 'run_stream', run)
+    kinds = ['repeated_25_in_30', 'repeated_25_in_30_jpeg', 'frozen_jpeg', 'jitter_30', *COMPARED_WITH]
     pairs = [(run.kind, even.kind) for run, even in run_streams(Road(9), kinds, Options())]
     assert pairs == [
         ('even', 'even'),
@@ -155,7 +172,22 @@ def test_a_stream_through_a_codec_is_compared_with_the_codec_alone(monkeypatch) 
         ('repeated_25_in_30_jpeg', 'even_jpeg'),
         ('frozen_jpeg', 'even_jpeg'),
         ('jitter_30', 'even'),
+        ('second_half', 'second_half'),
+        ('started_again', 'second_half'),
     ]
+    assert seen['even'] == seen['even_jpeg'] == list(range(9))
+    assert seen['second_half'] == [4, 5, 6, 7, 8]
+
+
+@pytest.mark.parametrize('kind', MESSAGE_FAULTS)
+def test_faults_that_only_messages_tell_come_as_from_messages(kind: str) -> None:
+    clock, times = FrameClock(), {}
+    for number, frame in enumerate(streams._with_fault(Road(300), kind).frames()):
+        times.update({timed.image: timed.time_ns for timed in clock.add(frame.stamp_ns).timed})
+        assert number < 300
+    errors = np.diff([times[image] for image in sorted(times)]) / INTERVAL_NS - np.diff(sorted(times))
+    # the receipt is late by a third of a frame on average, which the clock evens out after a second or two
+    assert len(times) >= 296 and np.quantile(np.abs(errors[70:]), 0.8) < 0.1
 
 
 @pytest.mark.parametrize(('verdict', 'status'), [('full', 0), ('no_motion', 3)])

@@ -1,8 +1,9 @@
 """Faults of streams, uneven stamps and repeated images, applied to recordings: `autocalib benchmark streams`.
 
-Each fault is applied to each recording while it is read. Against the recording as it is, or through the same codec
-without the fault, the verdict has to be the same, the focal length within its stated standard deviation, and at least
-`MIN_TRACKS` of the tracks have to be left.
+Each fault is applied to each recording while it is read, and compared with the recording as it is, or through the same
+codec without the fault. The verdict has to be the same, the focal length within its stated standard deviation, and at
+least `MIN_TRACKS` of the tracks have to be left, of those that the images can give that are left: see `COMPARED_WITH`
+and `SHARE_SEEN`.
 """
 
 from __future__ import annotations
@@ -19,24 +20,41 @@ from autocalib_ros.offline.benchmark.repeating_source import RepeatingSource
 from autocalib_ros.offline.recordings.open import open_source
 from autocalib_ros.offline.recordings.sources import Source
 from autocalib_ros.offline.simulate.repeat_faults import REPEAT_FAULTS, RepeatFault, every_image
-from autocalib_ros.offline.simulate.stamp_faults import STAMP_FAULTS, RestampedSource
+from autocalib_ros.offline.simulate.stamp_faults import (
+    MESSAGE_FAULTS,
+    SECOND_NS,
+    STAMP_FAULTS,
+    RestampedSource,
+    by_message,
+    second_half,
+)
 from autocalib_ros.results.calibration import Refusal
 
 EVEN = 'even'
 """The recording as it is."""
 MIN_TRACKS = 0.8
-"""Least number of tracks, fraction of those of the recording as it is."""
+"""Least number of tracks, fraction of those of the recording that a fault is compared with."""
 MAX_FOCAL_SIGMAS = 1.0
-"""Largest difference of the focal length, in its standard deviations of the recording as it is."""
-NEED_RECEIPT = ('seconds', 'constant', 'stopped')
-"""Faults that only the time of receipt mends, which a recording lacks: measured only if they are named."""
+"""Largest difference of the focal length, in its standard deviations of the recording that a fault is compared with."""
+MESSAGE_EPOCH_NS = 1_700_000_000 * SECOND_NS
+"""Time of the first image of faults that messages carry: headers hold the time of day, recordings begin at zero."""
+SECOND_HALF = 'second_half'
+COMPARED_WITH = {'started_again': SECOND_HALF}
+"""Faults that are compared with a part of the recording. Stamps that begin again are another recording, of a camera
+that may have moved: the evidence begins anew in the middle, and what is left is the second half.
+"""
+SHARE_SEEN = {'dropped_half': 0.5, 'replaced_1_in_2_jpeg': 0.5}
+"""Share of the camera's images that are seen under faults that take away more than a few, 1 under the others. As many
+tracks are expected: each vehicle is seen in half as many images, moves twice as far from one to the next, and a track
+needs `MIN_TRACK_SAMPLES` of them. Verdict and focal length are expected as without the fault.
+"""
 GROUPS = {
-    'stamps': tuple(name for name in STAMP_FAULTS if name not in (EVEN, *NEED_RECEIPT)),
+    'stamps': tuple(name for name in STAMP_FAULTS if name != EVEN),
     'repeats': tuple(REPEAT_FAULTS),
 }
 """Kinds of faults by a common name."""
-ROW_FORMAT = '{:<28}{:<26}{:>10}{:>9}{:>9}{:>8}{:>8}{:>10}  {}'
-HEADER_CELLS = ('kind', 'verdict', 'focal px', 'sigma', 'sigmas', 'tracks', '% even', 'repeated', '')
+ROW_FORMAT = '{:<28}{:<26}{:>10}{:>9}{:>9}{:>8}{:>8}{:>10}  {:<16}{}'
+HEADER_CELLS = ('kind', 'verdict', 'focal px', 'sigma', 'sigmas', 'tracks', '%', 'repeated', 'compared with', '')
 
 
 @dataclass(frozen=True)
@@ -59,13 +77,13 @@ class StreamRun:
         return (self.focal_px - even.focal_px) / even.focal_sigma_px
 
     def faults(self, even: StreamRun) -> list[str]:
-        """Return what differs too much from the recording as it is; two refusals are one verdict."""
+        """Return what differs too much from the recording to compare with; two refusals are one verdict."""
         sigmas = self.focal_sigmas(even)
         both_refused = self.focal_px is None and even.focal_px is None
         return [
             *(['verdict'] if self.verdict != even.verdict and not both_refused else []),
             *(['focal length'] if sigmas is not None and abs(sigmas) > MAX_FOCAL_SIGMAS else []),
-            *(['tracks'] if self.tracks < MIN_TRACKS * even.tracks else []),
+            *(['tracks'] if self.tracks < MIN_TRACKS * SHARE_SEEN.get(self.kind, 1.0) * even.tracks else []),
         ]
 
 
@@ -80,20 +98,24 @@ def expand_kinds(kinds: Sequence[str]) -> tuple[str, ...]:
 
 
 def run_streams(source: Source, kinds: Sequence[str], options: Options) -> Iterator[tuple[StreamRun, StreamRun]]:
-    """Yield the outcome of a recording with each kind of fault, and that without the fault.
+    """Yield the outcome of a recording with each kind of fault, and that which it is compared with.
 
-    Before the first fault of each codec, and first of all, the outcome without a fault is yielded.
+    That of each recording to compare with is yielded before its first fault, that of the recording as it is first.
     """
-    even: dict[str, StreamRun] = {}
+    runs: dict[str, StreamRun] = {}
     for kind in (EVEN, *kinds):
-        codec = REPEAT_FAULTS[kind].codec if kind in REPEAT_FAULTS else ''
-        if codec not in even:
-            name = f'{EVEN}_{codec}' if codec else EVEN
-            fault = RepeatFault(every_image, codec=codec)
-            even[codec] = run_stream(name, RepeatingSource(source, fault) if codec else source, options)
-            yield even[codec], even[codec]
+        name = compared_with(kind)
+        if name not in runs:
+            runs[name] = run_stream(name, _without_fault(source, name), options)
+            yield runs[name], runs[name]
         if kind != EVEN:
-            yield run_stream(kind, _with_fault(source, kind), options), even[codec]
+            yield run_stream(kind, _with_fault(source, kind), options), runs[name]
+
+
+def compared_with(kind: str) -> str:
+    """Return the name of the recording that a kind of fault is compared with."""
+    codec = REPEAT_FAULTS[kind].codec if kind in REPEAT_FAULTS else ''
+    return COMPARED_WITH.get(kind, f'{EVEN}_{codec}' if codec else EVEN)
 
 
 def run_stream(kind: str, source: Source, options: Options) -> StreamRun:
@@ -130,6 +152,7 @@ def format_run(run: StreamRun, even: StreamRun) -> str:
         run.tracks,
         _cell(100 * run.tracks / even.tracks if even.tracks else None, '.0f'),
         run.repeated,
+        even.kind,
         ', '.join(run.faults(even)) or 'ok',
     )
 
@@ -155,7 +178,17 @@ def measure_streams(
 def _with_fault(source: Source, kind: str) -> Source:
     if kind in REPEAT_FAULTS:
         return RepeatingSource(source, REPEAT_FAULTS[kind])
+    if kind in MESSAGE_FAULTS:
+        return RestampedSource(source, by_message(STAMP_FAULTS[kind]), epoch_ns=MESSAGE_EPOCH_NS)
     return RestampedSource(source, STAMP_FAULTS[kind])
+
+
+def _without_fault(source: Source, name: str) -> Source:
+    """Return a recording that faults are compared with."""
+    if name == SECOND_HALF:
+        return RestampedSource(source, second_half)
+    codec = name.removeprefix(EVEN).removeprefix('_')
+    return RepeatingSource(source, RepeatFault(every_image, codec=codec)) if codec else source
 
 
 def _cell(value: float | None, form: str) -> str:

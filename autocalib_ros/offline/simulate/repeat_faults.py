@@ -124,7 +124,7 @@ REPEAT_FAULTS: dict[str, RepeatFault] = {
     'replaced_1_in_2_jpeg': RepeatFault(replaced(2), 1.0, 'jpeg'),
     'frozen_jpeg': RepeatFault(frozen, 1.0, 'jpeg'),
 }
-"""Faults by name. `replaced_1_in_2_jpeg` halves the images, so that its tracks are those of half the rate."""
+"""Faults by name."""
 
 
 def _unchanged(image: np.ndarray) -> np.ndarray:

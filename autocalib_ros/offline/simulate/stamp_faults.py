@@ -12,9 +12,13 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from autocalib_ros.perception.header_stamps import HeaderStamps
+
 SECOND_NS, MILLISECOND_NS = 1_000_000_000, 1_000_000
 RARE_S = 5.0
 """Seconds between two faults of the kinds that happen now and then: often enough for a recording of 30 s."""
+MEAN_DELAY = 0.3
+"""Mean delay of the receipt of an image, frame intervals."""
 BURST = 10
 """Images that arrive together in the burst faults: a third of a second at 30 Hz, a short stall of a network."""
 
@@ -27,6 +31,8 @@ class StampedImages:
     """Index of each among the exposures, shape (m,)."""
     stamps_ns: np.ndarray
     """The stamp that each carries, int64, shape (m,)."""
+    seconds: np.ndarray | None = None
+    """Whole seconds in the header of each message, the rest is nanoseconds; None: those of the stamp."""
 
 
 StampFault = Callable[[np.ndarray, np.random.Generator], StampedImages]
@@ -49,7 +55,7 @@ def jitter(fraction: float) -> StampFault:
 
 def late_jitter(exposures_ns: np.ndarray, random: np.random.Generator) -> StampedImages:
     """Stamp on receipt, with delays of exponential distribution: most images in time, a few very late."""
-    return _all(_in_order(exposures_ns + random.exponential(0.3 * _period_ns(exposures_ns), len(exposures_ns))))
+    return _all(received(exposures_ns, random))
 
 
 def unsorted_jitter(exposures_ns: np.ndarray, random: np.random.Generator) -> StampedImages:
@@ -175,7 +181,8 @@ def wrapped(exposures_ns: np.ndarray, random: np.random.Generator) -> StampedIma
 
 def wrapped_in_seconds(exposures_ns: np.ndarray, random: np.random.Generator) -> StampedImages:
     """Right seconds with nanoseconds of the whole time in 32 bits, as a cast of the total to uint32 gives."""
-    return _all(exposures_ns // SECOND_NS * SECOND_NS + exposures_ns % 2**32)
+    seconds = exposures_ns // SECOND_NS
+    return replace(_all(seconds * SECOND_NS + exposures_ns % 2**32), seconds=seconds)
 
 
 def stepped(by_s: float) -> StampFault:
@@ -222,6 +229,11 @@ def started_again(exposures_ns: np.ndarray, random: np.random.Generator) -> Stam
     return _all(stamps)
 
 
+def second_half(exposures_ns: np.ndarray, random: np.random.Generator) -> StampedImages:
+    """Keep the images from the middle on: those that are left where the evidence begins anew there."""
+    return _some(exposures_ns, np.arange(len(exposures_ns)) >= len(exposures_ns) // 2)
+
+
 STAMP_FAULTS: dict[str, StampFault] = {
     'even': even,
     'jitter_20': jitter(0.2),
@@ -261,8 +273,24 @@ STAMP_FAULTS: dict[str, StampFault] = {
     'sent_twice': sent_twice,
     'started_again': started_again,
 }
-"""Faults by name. `seconds`, `constant` and `stopped` can be mended by the time of receipt only, and
-`wrapped_in_seconds` by the header's nanoseconds only, which videos lack."""
+"""Faults by name."""
+MESSAGE_FAULTS = ('seconds', 'constant', 'stopped', 'wrapped_in_seconds')
+"""Faults that only a message tells, by its time of receipt or by the nanoseconds in its header."""
+
+
+def by_message(fault: StampFault) -> StampFault:
+    """Return a fault as it comes from messages, whose headers and times of receipt `HeaderStamps` reads."""
+
+    def read(exposures_ns: np.ndarray, random: np.random.Generator) -> StampedImages:
+        arrived = fault(exposures_ns, random)
+        seconds = arrived.stamps_ns // SECOND_NS if arrived.seconds is None else arrived.seconds
+        nanoseconds = arrived.stamps_ns - seconds * SECOND_NS
+        receipts_ns = received(exposures_ns, random)[arrived.images].astype(np.int64)
+        headers = HeaderStamps(lambda text: None)
+        rows = np.column_stack([seconds, nanoseconds, receipts_ns]).tolist()
+        return StampedImages(arrived.images, np.array([headers.choose(*row) for row in rows], np.int64))
+
+    return read
 
 
 class StampedSource(Protocol):
@@ -299,6 +327,11 @@ class RestampedSource:
                 recent[read], read = next(frames), read + 1
             recent = {number: frame for number, frame in recent.items() if number >= image - 1}
             yield replace(recent[image], stamp_ns=stamp_ns)
+
+
+def received(exposures_ns: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    """Return times of receipt (n,) of images that come in order, with delays of exponential distribution."""
+    return _in_order(exposures_ns + random.exponential(MEAN_DELAY * _period_ns(exposures_ns), len(exposures_ns)))
 
 
 def _period_ns(exposures_ns: np.ndarray) -> float:
