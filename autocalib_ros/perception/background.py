@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import cv2
 import numpy as np
 
@@ -32,9 +34,11 @@ REDUCED_FLAGS = (
 
 
 class Background:
-    """Bounded set of JPEG samples; when it is full, every second one is dropped and the sampling interval doubles.
+    """Bounded set of JPEG samples, the first at or after each multiple of the sampling interval.
 
-    Once the interval has reached `MAX_INTERVAL_S`, the oldest sample is dropped instead.
+    At multiples, lost or late images change one sample and not all later ones. When there are too many, the interval
+    doubles, and those between its multiples are dropped. Once the interval has reached `MAX_INTERVAL_S`, the oldest
+    sample is dropped instead.
     """
 
     def __init__(self) -> None:
@@ -51,14 +55,14 @@ class Background:
         ok, encoded = cv2.imencode('.jpg', image, [cv2.IMWRITE_JPEG_QUALITY, 92])
         self._width = image.shape[1]
         if time_s >= self._next_s:
-            if len(self._regular) == MAX_SAMPLES:
-                self._thin()
             self._regular += [(time_s, encoded)] if ok else []
-            self._next_s = time_s + self._interval_s
+            while len(self._regular) > MAX_SAMPLES:
+                self._thin()
+            self._next_s = _next_multiple(time_s, self._interval_s)
             self._early = self._early if self._is_early else []
         else:
             self._early += [(time_s, encoded)] if ok else []
-        self._next_early_s = time_s + EARLY_INTERVAL_S
+        self._next_early_s = _next_multiple(time_s, EARLY_INTERVAL_S)
 
     @property
     def _is_early(self) -> bool:
@@ -72,8 +76,9 @@ class Background:
         if 2 * self._interval_s > MAX_INTERVAL_S:
             self._regular = self._regular[1:]
             return
-        self._regular = self._regular[::2]
         self._interval_s *= 2
+        first_of = {math.floor(time_s / self._interval_s): (time_s, data) for time_s, data in self._regular[::-1]}
+        self._regular = list(first_of.values())[::-1]
 
     def is_due(self, time_s: float) -> bool:
         """Whether an image of this time would be added."""
@@ -109,6 +114,11 @@ class Background:
     def _decoded(self, flags: int) -> list[np.ndarray]:
         images = [cv2.imdecode(encoded, flags) for _, encoded in self._samples]
         return [image for image in images if image is not None]
+
+
+def _next_multiple(time_s: float, interval_s: float) -> float:
+    """Return the first multiple of an interval after a time."""
+    return (math.floor(time_s / interval_s) + 1) * interval_s
 
 
 def median(images: list[np.ndarray]) -> np.ndarray:

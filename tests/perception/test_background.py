@@ -50,6 +50,18 @@ def test_images_between_the_intervals_are_not_kept() -> None:
     np.testing.assert_allclose(background.times_s, np.arange(7) / 2)
 
 
+@pytest.mark.parametrize('lost_s', [(2.0, 2.4), (6.9, 9.2), (30.0, 41.0)])
+def test_lost_images_change_no_sample_but_those_of_their_time(lost_s: tuple[float, float]) -> None:
+    whole, holed = Background(), Background()
+    for index in range(900):
+        time_s = index / 15
+        whole.update(flat(100), time_s)
+        if not lost_s[0] <= time_s < lost_s[1]:
+            holed.update(flat(100), time_s)
+    changed = set(whole.times_s) ^ set(holed.times_s)
+    assert all(lost_s[0] <= time_s <= lost_s[1] + 0.1 for time_s in changed)
+
+
 def test_where_vehicles_stand_for_a_third_of_the_time_the_road_is_seen_at_any_time() -> None:
     random, background, shares = np.random.default_rng(1), Background(), []
     for second in range(120):
@@ -64,7 +76,7 @@ def test_where_vehicles_stand_for_a_third_of_the_time_the_road_is_seen_at_any_ti
 
 def test_the_interval_grows_until_the_longest_and_no_more_images_are_held() -> None:
     background, image, gaps = Background(), flat(90), []
-    step_s, seconds = 1.0, 6 * MAX_SAMPLES * MAX_INTERVAL_S
+    step_s, seconds = 8.0, 6 * MAX_SAMPLES * MAX_INTERVAL_S
     for time_s in np.arange(0.0, seconds, step_s):
         background.update(image, float(time_s))
         assert len(background.times_s) <= MAX_SAMPLES
