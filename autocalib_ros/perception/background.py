@@ -18,6 +18,9 @@ EARLY_INTERVAL_S = 0.5
 the better one replaces."""
 MAX_INTERVAL_S = 300.0
 """Longest sampling interval: images older than `MAX_SAMPLES` of these show other light, dirt and road paint."""
+SAMPLE_TOLERANCE_S = 0.01
+"""An image this much before a multiple of the interval is at it, seconds: cameras of even rates have an image at each
+whole second, and neither rounding nor what is left of jitter decides between it and the next. Less than a frame."""
 MIN_SAMPLES = 5
 """The median of fewer images still shows passing vehicles. Judgement."""
 
@@ -54,15 +57,15 @@ class Background:
             return
         ok, encoded = cv2.imencode('.jpg', image, [cv2.IMWRITE_JPEG_QUALITY, 92])
         self._width = image.shape[1]
-        if time_s >= self._next_s:
+        if time_s >= self._next_s - SAMPLE_TOLERANCE_S:
             self._regular += [(time_s, encoded)] if ok else []
             while len(self._regular) > MAX_SAMPLES:
                 self._thin()
-            self._next_s = _next_multiple(time_s, self._interval_s)
+            self._next_s = self._interval_s * (_multiple(time_s, self._interval_s) + 1)
             self._early = self._early if self._is_early else []
         else:
             self._early += [(time_s, encoded)] if ok else []
-        self._next_early_s = _next_multiple(time_s, EARLY_INTERVAL_S)
+        self._next_early_s = EARLY_INTERVAL_S * (_multiple(time_s, EARLY_INTERVAL_S) + 1)
 
     @property
     def _is_early(self) -> bool:
@@ -77,12 +80,13 @@ class Background:
             self._regular = self._regular[1:]
             return
         self._interval_s *= 2
-        first_of = {math.floor(time_s / self._interval_s): (time_s, data) for time_s, data in self._regular[::-1]}
+        first_of = {_multiple(time_s, self._interval_s): (time_s, data) for time_s, data in self._regular[::-1]}
         self._regular = list(first_of.values())[::-1]
 
     def is_due(self, time_s: float) -> bool:
         """Whether an image of this time would be added."""
-        return time_s >= (min(self._next_s, self._next_early_s) if self._is_early else self._next_s)
+        next_s = min(self._next_s, self._next_early_s) if self._is_early else self._next_s
+        return time_s >= next_s - SAMPLE_TOLERANCE_S
 
     @property
     def times_s(self) -> tuple[float, ...]:
@@ -116,9 +120,9 @@ class Background:
         return [image for image in images if image is not None]
 
 
-def _next_multiple(time_s: float, interval_s: float) -> float:
-    """Return the first multiple of an interval after a time."""
-    return (math.floor(time_s / interval_s) + 1) * interval_s
+def _multiple(time_s: float, interval_s: float) -> int:
+    """Return the number of the last multiple of an interval."""
+    return math.floor((time_s + SAMPLE_TOLERANCE_S) / interval_s)
 
 
 def median(images: list[np.ndarray]) -> np.ndarray:

@@ -62,6 +62,15 @@ def test_lost_images_change_no_sample_but_those_of_their_time(lost_s: tuple[floa
     assert all(lost_s[0] <= time_s <= lost_s[1] + 0.1 for time_s in changed)
 
 
+@pytest.mark.parametrize('rate_hz', [15.0, 25.0, 30.0])
+def test_noise_of_the_times_changes_no_sample(rate_hz: float) -> None:
+    even, noisy, random = Background(), Background(), np.random.default_rng(2)
+    for index in range(900):
+        even.update(flat(100), index / rate_hz)
+        noisy.update(flat(100), index / rate_hz + random.uniform(-0.005, 0.005))
+    assert np.round(np.array(noisy.times_s) * rate_hz).tolist() == np.round(np.array(even.times_s) * rate_hz).tolist()
+
+
 def test_where_vehicles_stand_for_a_third_of_the_time_the_road_is_seen_at_any_time() -> None:
     random, background, shares = np.random.default_rng(1), Background(), []
     for second in range(120):
