@@ -227,8 +227,9 @@ def require_grade(result: Calibration, least: str) -> Calibration | Refusal:
     The refusal has the result as its candidate.
     """
     sigma, helpful = result.stddev.ground, result.helpful
-    grade = result.grade if result.grade != 'unit_scale' or sigma is None else sigma.grade
-    if result.method == 'paper' or rank_of(grade) >= rank_of(least):
+    ungraded = result.method == 'paper' or (result.grade == 'unit_scale' and sigma is None)
+    grade = sigma.grade if result.grade == 'unit_scale' and sigma else result.grade
+    if ungraded or rank_of(grade) >= rank_of(least):
         return result
     lens_certain = (result.stddev.focal_px or 0.0) <= GRADE_LIMITS['fair'] * result.camera.focal_px
     if result.grade == 'lens':

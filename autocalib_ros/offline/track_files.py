@@ -25,7 +25,7 @@ COLUMNS = ('time_s', 'vehicle_id', 'track_id', 'x_px', 'y_px')
 MOT_COLUMNS = 6
 """Fewest numbers in a line of a MOT file: frame, id, left, top, width, height."""
 SUFFIXES = ('.csv', '.txt')
-MIN_TRACK_POINTS = 3
+MIN_READ_POINTS = 3
 """Fewest points of a track; shorter ones have no direction that could be checked."""
 MAX_ID = 2**53
 """Largest vehicle or track number that a float holds exactly."""
@@ -51,7 +51,7 @@ def evidence_from_file(path: Path, image_size: tuple[int, int], fps: float | Non
         by_track[point.vehicle, point.track].append(point)
     tracks = [track for points in by_track.values() if (track := _track(points)) is not None]
     if not tracks:
-        raise InputError(f'{path} has no track of at least {MIN_TRACK_POINTS} points')
+        raise InputError(f'{path} has no track of at least {MIN_READ_POINTS} points')
     _require_inside(path, tracks, image_size)
     collected = EvidenceBuffer(buffer)
     for track in sorted(tracks, key=lambda each: float(each.times_s[-1])):
@@ -121,7 +121,7 @@ def _is_number(text: str) -> bool:
 def _track(points: list[_Point]) -> Track | None:
     """Return the track of points in the order of their times; None if there are too few, of different times."""
     times, first = np.unique([point.time_s for point in points], return_index=True)
-    if len(times) < MIN_TRACK_POINTS:
+    if len(times) < MIN_READ_POINTS:
         return None
     places = np.array([(points[index].x_px, points[index].y_px) for index in first])
     return Track(points[0].vehicle, times, places)
