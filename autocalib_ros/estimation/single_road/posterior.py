@@ -38,7 +38,7 @@ from autocalib_ros.lens.camera import Camera
 ROAD_OFFSETS = np.stack(np.meshgrid(*2 * (np.arange(-2.0, 3.0),)), axis=-1).reshape(-1, 2)
 REWEIGHTINGS = 4
 """Rounds of the search for the direction where most planes meet."""
-SEARCH_REACH_RAD = 0.12 * 0.6 ** np.arange(16)
+SEARCH_REACH_RAD = 0.12 * 0.55 ** np.arange(11)
 """Offsets of the search for the direction of the road, in units of its reach; and the reach, round by round."""
 TEMPER = 0.5
 """Share of the log likelihood of edges and lines that counts: those of one scene repeat each other. Judgement."""
@@ -52,7 +52,7 @@ KAPPA_NODES = 4
 MIN_SPACINGS, FINER_SHIFTS = 1.5, np.linspace(-2.5, 2.5, 16)
 """Where the focal length is more certain than so many spacings of the grid, a finer one follows, with these shifts in
 spacings of the first."""
-KAPPA_TRIALS = 9
+KAPPA_TRIALS = 7
 """Curvatures at each focal length by which straight tracks measure it."""
 MAX_NATS_BEHIND = 15.0
 """Lenses through which the tracks are less probable by more are left out: edges and lines do not make up for it."""

@@ -26,7 +26,7 @@ from autocalib_ros.results.refusals import Reason, reason
 from autocalib_ros.results.statements import Statement, assumption, check
 from autocalib_ros.results.verification_table import VerificationRow, verified
 
-MAX_COMPARED_TRACKS = 200
+MAX_COMPARED_TRACKS = 150
 """Tracks, evenly spaced in the list of all, by which lenses are compared."""
 MAX_ROAD_SEGMENTS = 200
 """Most edges, and most still lines, in the posterior: the longest."""
