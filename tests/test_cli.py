@@ -107,7 +107,7 @@ def test_help_imports_nothing_heavy(tmp_path):
         (['replay', 'x', '--camera-info', 'nowhere.yaml'], 'cannot read nowhere.yaml'),
         (['replay', 'x', '-p', 'detector.model=nowhere.onnx'], "'detector.model' is nowhere.onnx, which is not a file"),
         (['replay', 'x', '-p', 'detector.layout=yolo'], "'layout' is one of auto, yolox"),
-        (['evidence'], 'the following arguments are required: FILE.npz'),
+        (['evidence'], 'the following arguments are required: FILE'),
         (['evidence', 'nowhere.npz'], 'nowhere.npz'),
         (['evidence', 'nowhere.npz', '-p', 'camera_hight=3'], "did you mean 'camera_height'?"),
         (['demo', '--seed', 'x'], "invalid int value: 'x'"),

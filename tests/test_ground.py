@@ -13,7 +13,7 @@ from recorded_clips import DATA, needs_recorded_clips
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
-from autocalib_ros.config import GateOptions, JointOptions, Options, ScaleOptions
+from autocalib_ros.config import GateOptions, JointOptions, LensOptions, Options, ScaleOptions
 from autocalib_ros.errors import InputError
 from autocalib_ros.geometry.ground_plane import GroundPlane, pixels_ahead
 from autocalib_ros.ground import Ground
@@ -470,7 +470,10 @@ SCALES = {
         scale_from='distance', scale=ScaleOptions(distance_px='500 500 900 450', distance_m=10.0, distance_sigma_m=0.1)
     ),
     'assumed': Options(
-        camera_height=HEIGHT_M, joint=JointOptions(roll_prior_deg=2.0), gate=GateOptions(least_grade='assumed')
+        camera_height=HEIGHT_M,
+        joint=JointOptions(roll_prior_deg=2.0),
+        gate=GateOptions(least_grade='assumed'),
+        lens=LensOptions(pixel_aspect=1.0),
     ),
 }
 ONE_ROAD = Junction(
