@@ -181,6 +181,7 @@ ASSUMPTIONS: dict[str, Wording] = {
     'ones are {usual_deg:.0f} degrees within a factor of 1.65',
     'principal_point': _principal_point,
     'focal_given': _focal_given,
+    'view_given': 'field of view across the image {view_deg:g} +- {sigma_deg:.2g} degrees (given)',
     'pixel_aspect': _pixel_aspect,
     'squeezed_pixels': 'pixels {aspect:.4g} times as wide as high, a picture of {shape}: the traffic measures '
     '{measured:.3f} +- {sigma:.3f} (log odds {log_odds:.0f} against square pixels)',

@@ -27,8 +27,6 @@ MIN_VIEW_DEG, MAX_VIEW_DEG = 18.0, 180.0
 """Fields of view that are tried: two standard deviations of the prior to the narrow side, and a fisheye's."""
 TRIAL_KAPPAS, TRIAL_VIEWS_DEG = (1.0, 0.6, 0.3, 0.0), (50.0, 75.0, 100.0, 125.0, 150.0)
 """Curvatures with a given focal length, and fields of view of equidistant lenses, at which roads are looked for."""
-TRIAL_KAPPAS, TRIAL_VIEWS_DEG = (1.0, 0.6, 0.3, 0.0), (50.0, 75.0, 100.0, 125.0, 150.0)
-"""Curvatures with a given focal length, and fields of view of equidistant lenses, at which roads are looked for."""
 FOCAL_NODES, KNOWN_FOCAL_NODES, KNOWN_FOCAL_SIGMAS = 32, 15, 2.8
 """Focal lengths that are tried, without and with a given one, and up to how many standard deviations from it."""
 

@@ -35,9 +35,9 @@ from autocalib_ros.geometry.robust_kernels import cauchy_weight, geman_mcclure_b
 from autocalib_ros.geometry.small_matrices import smallest_eigenvectors
 from autocalib_ros.lens.camera import Camera
 
-ROAD_OFFSETS = np.stack(np.meshgrid(*2 * (np.arange(-2.0, 3.0),)), axis=-1).reshape(-1, 2)
 REWEIGHTINGS = 4
 """Rounds of the search for the direction where most planes meet."""
+ROAD_OFFSETS = np.stack(np.meshgrid(*2 * (np.arange(-2.0, 3.0),)), axis=-1).reshape(-1, 2)
 SEARCH_REACH_RAD = 0.12 * 0.55 ** np.arange(11)
 """Offsets of the search for the direction of the road, in units of its reach; and the reach, round by round."""
 TEMPER = 0.5

@@ -18,7 +18,11 @@ from autocalib_ros.estimation.single_road.posterior import road_posterior
 from autocalib_ros.estimation.straight.initialisation import solve_from_consensus
 from autocalib_ros.estimation.vehicle_edges.transverse_edges import select_vehicle_edges
 from autocalib_ros.estimation.verification.gates import check_halves
-from autocalib_ros.estimation.verification.identifiability import lens_assumptions, principal_point_assumption
+from autocalib_ros.estimation.verification.identifiability import (
+    given_focal_assumption,
+    lens_assumptions,
+    principal_point_assumption,
+)
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.ground_plane import unsigned_angle_deg
 from autocalib_ros.lens.camera import field_of_view_deg
@@ -155,8 +159,7 @@ def _lens_statements(fit: Adjustment, choice: LensChoice) -> tuple[Statement, ..
         principal_point_assumption(prior),
     ]
     if prior.focal_known:
-        sigma_px = prior.sigma[0] * prior.centre.focal_px
-        return (*statements, assumption('focal_given', focal_px=prior.centre.focal_px, sigma_px=sigma_px))
+        return (*statements, given_focal_assumption(prior))
     view_deg = field_of_view_deg(fit.state.camera)[0]
     return (
         *statements,

@@ -62,6 +62,14 @@ def _restored(camera: Camera, prior: Camera, name: str) -> Camera:
     return replace(camera, k=(prior.k[0], k2, k3, k4) if name == 'k1' else (k1, prior.k[1], k3, k4))
 
 
+def given_focal_assumption(prior: LensPrior) -> Statement:
+    """Return the focal length, or the field of view, that is given."""
+    if prior.view_deg > 0:
+        return assumption('view_given', view_deg=prior.view_deg, sigma_deg=prior.sigma[0] * prior.view_deg)
+    focal_px = prior.centre.focal_px
+    return assumption('focal_given', focal_px=focal_px, sigma_px=prior.sigma[0] * focal_px)
+
+
 def principal_point_assumption(prior: LensPrior) -> Statement:
     """Return where the principal point was assumed; a picture that does not fill the images is named."""
     sigma_px, down_px = prior.sigma[1:3]
@@ -83,8 +91,7 @@ def lens_assumptions(fit: Adjustment, fixed: tuple[str, ...]) -> tuple[Statement
         principal_point_assumption(prior),
     ]
     if prior.focal_known:
-        focal_px = prior.centre.focal_px
-        statements.append(assumption('focal_given', focal_px=focal_px, sigma_px=prior.sigma[0] * focal_px))
+        statements.append(given_focal_assumption(prior))
     # what is taken of the pixels has a statement of its own
     names = [name for name in fixed if name != 'pixel aspect']
     return (*statements, *(assumption('parameter_fixed', parameter=name) for name in names))

@@ -112,6 +112,17 @@ def test_a_road_without_curvature_gives_what_its_scenery_shows(given: bool) -> N
 
 
 @pytest.mark.solve
+def test_a_field_of_view_is_as_good_as_the_focal_length() -> None:
+    evidence = synthetic_evidence(ROAD, np.random.default_rng(2))
+    lens = LensOptions(pixel_aspect=1.0, hfov_deg=2 * float(np.degrees(np.arctan(640 / PINHOLE.focal_px))))
+    found = solve_once(evidence, Options(camera_height=ROAD.height_m, lens=lens)).candidate
+    assert abs(np.log(found.camera.focal_px / PINHOLE.focal_px)) < 2 * found.stddev.focal_px / found.camera.focal_px
+    assert found.stddev.focal_px < 0.15 * found.camera.focal_px
+    (given,) = [statement for statement in found.assumptions if statement.kind == 'view_given']
+    assert given.text.startswith('field of view across the image 65.2')
+
+
+@pytest.mark.solve
 def test_a_wider_uncertainty_of_the_focal_length_makes_lengths_less_certain() -> None:
     evidence = synthetic_evidence(ROAD, np.random.default_rng(2))
     sigmas = []
