@@ -17,7 +17,7 @@ from autocalib_ros.estimation.markings.markings_solution import (
 )
 from autocalib_ros.estimation.one_road import PLANE_TOLERANCE_DEG, CrossTraffic
 from autocalib_ros.estimation.refinement import refine_and_verify, select_noise_model
-from autocalib_ros.estimation.single_road.road_solution import solve_single_road
+from autocalib_ros.estimation.single_road.road_solution import SingleRoad, solve_single_road
 from autocalib_ros.estimation.solution import SHARP_FOCAL_SIGMA, Observations, Solution, append_reason, is_better
 from autocalib_ros.estimation.straight.initialisation import solve_from_consensus
 from autocalib_ros.estimation.straight.roads import (
@@ -80,11 +80,16 @@ def estimate_from_single_road(observations: Observations, config: AdjustmentConf
     if len(prior.free):
         aspect_sigma = float(np.hypot(prior.sigma[5], observations.unmeasured_aspect_sigma))
         prior = prior.with_pixel_aspect(prior.centre.pixel_aspect, aspect_sigma)
-    found = solve_single_road(
-        observations.evidence, tracks, replace(config, prior=prior), observations.gate, observations.generator
-    )
+
+    def solve_under(lens: LensPrior) -> SingleRoad | Reason:
+        setting = replace(config, prior=lens)
+        return solve_single_road(observations.evidence, tracks, setting, observations.gate, observations.generator)
+
+    found = solve_under(prior)
     if isinstance(found, Reason):
         return found
+    if prior.focal_known and len(prior.free) and prior.sigma[0] > 0:
+        found = found.compared_with_given(solve_under(prior.with_unknown_focal()))
     fit, plane = found.fit, PlaneEstimate.of(found.fit, tracks)
     if plane.fraction_below_horizon < MIN_FRACTION_BELOW_HORIZON:
         return reason('horizon', fraction=1 - plane.fraction_below_horizon, limit=1 - MIN_FRACTION_BELOW_HORIZON)

@@ -35,6 +35,9 @@ VERIFIED_QUANTITIES: dict[str, VerifiedQuantity] = {
     'focal_sigma': VerifiedQuantity('standard deviation of the focal length', '%', REFUSED),
     'plane_sigma': VerifiedQuantity('standard deviation of tilt or roll, the larger', 'degrees', NO_PLANE),
     'height_sigma': VerifiedQuantity('standard deviation of the camera height', '%', NO_PLANE),
+    'given_focal': VerifiedQuantity(
+        'given focal length or field of view against what the road shows', 'sigma', CONTRADICTED
+    ),
     'known_lengths': VerifiedQuantity('known lengths against each other', 'sigma', CONTRADICTED),
     'vehicle_size': VerifiedQuantity('size of the vehicles against the usual one', '%', CONTRADICTED),
     'below_horizon': VerifiedQuantity('tracked points below the horizon', '%', REFUSED, at_least=True),

@@ -144,6 +144,12 @@ class LensPrior:
             )
         return self
 
+    def with_unknown_focal(self) -> LensPrior:
+        """Return the prior without a focal length or field of view."""
+        sigma = self.sigma.copy()
+        sigma[0] = np.inf
+        return replace(self, sigma=sigma, view_deg=0.0)
+
     def with_fixed(self, names: tuple[str, ...]) -> LensPrior:
         """Return the prior with the parameters `names` fixed."""
         fixed = np.array([name in names for name in LENS_PARAMETERS])

@@ -88,13 +88,16 @@ class LensChoice:
         """Return the log prior density of a lens, by log focal length and kappa."""
         of_kappa = float(np.log(sum(self._kappa_densities(kappa))))
         if self.prior.focal_known:
-            expected_px = self._focal_of_view(kappa) if self.prior.view_deg > 0 else self.prior.centre.focal_px
-            away = np.log(focal_px / expected_px) / max(float(self.prior.sigma[0]), 1e-3)
+            away = np.log(focal_px / self.expected_focal_px(kappa)) / max(float(self.prior.sigma[0]), 1e-3)
         else:
             root = np.sqrt(max(kappa, 1e-6))
             view_deg = 2 * np.degrees(np.arctan(root * self._half_width / focal_px) / root)
             away = np.log(view_deg / USUAL_VIEW_DEG) / np.log(USUAL_VIEW_FACTOR)
         return of_kappa - 0.5 * float(away) ** 2
+
+    def expected_focal_px(self, kappa: float) -> float:
+        """Return the focal length that is given, or that follows from the given field of view."""
+        return self._focal_of_view(kappa) if self.prior.view_deg > 0 else self.prior.centre.focal_px
 
     def _kappa_densities(self, kappa: float) -> list[float]:
         """Return the densities of a curvature under the families that may be, each times its probability."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from autocalib_ros.config import GateOptions
 from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment, adjust, evaluate_at
-from autocalib_ros.estimation.adjustment.lens_prior import known_lens
+from autocalib_ros.estimation.adjustment.lens_prior import DISTORTION_FREE, known_lens
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig, AdjustmentState
 from autocalib_ros.estimation.markings.road_segments import group_segments
 from autocalib_ros.estimation.observations.track_set import TrackSet, evenly_spaced, kish_weight
@@ -47,6 +47,8 @@ SAME_ROAD_DEG = 10.0
 """Roads through two lenses that differ by less are one."""
 MIN_ROAD_VEHICLES = 8
 """Fewest vehicles that follow the road; among fewer, one that changes lanes weighs too much. Judgement."""
+MAX_GIVEN_SIGMAS = 3.0
+"""Largest difference of a given focal length from that of the road without it: 0.3 % of right ones exceed it."""
 MIN_FOLLOWING = 0.25
 """Share of the vehicles that has to follow the road: on bends fewer than 15 % follow any straight line."""
 
@@ -56,9 +58,21 @@ class SingleRoad:
     """Lens and plane of a single road, with what was assumed and compared."""
 
     fit: Adjustment
+    choice: LensChoice
+    """The lenses that were tried."""
     assumptions: tuple[Statement, ...]
     checks: tuple[Statement, ...]
     rows: tuple[VerificationRow, ...]
+
+    def compared_with_given(self, free: SingleRoad | Reason) -> SingleRoad:
+        """Return the solution with a given focal length compared with that of a solution without it."""
+        if isinstance(free, Reason):
+            return self
+        camera = free.fit.state.camera
+        given_px = self.choice.expected_focal_px(camera.k[0] / DISTORTION_FREE[0])
+        sigma = float(np.hypot(free.fit.focal_sigma, self.choice.prior.sigma[0]))
+        row = verified('given_focal', abs(float(np.log(camera.focal_px / given_px))) / sigma, MAX_GIVEN_SIGMAS)
+        return replace(self, rows=(*self.rows, row))
 
 
 def solve_single_road(
@@ -88,6 +102,7 @@ def solve_single_road(
     seen = check('single_road', edges=len(edges.weights), lines=len(lines.weights), following=following)
     return SingleRoad(
         evaluate_at(fit.state, tracks, fit.problem.config, fit.covariance),
+        choice,
         (*_lens_statements(fit, choice), assumption('level_camera', sigma_deg=roll_deg)),
         (seen, halves.statement),
         (verified('straight_share', following, MIN_FOLLOWING), *halves.rows),

@@ -134,6 +134,17 @@ def test_a_wider_uncertainty_of_the_focal_length_makes_lengths_less_certain() ->
 
 
 @pytest.mark.solve
+@pytest.mark.parametrize(('factor', 'passed'), [(1.05, True), (2.5, False)])
+def test_a_focal_length_that_the_road_contradicts_is_doubted(factor: float, passed: bool) -> None:
+    generator = np.random.default_rng(1)
+    evidence = replace(synthetic_evidence(ROAD, generator), still_lines_px=scenery(ROAD, generator))
+    lens = LensOptions(pixel_aspect=1.0, focal_px=factor * PINHOLE.focal_px)
+    found = solve_once(evidence, Options(camera_height=ROAD.height_m, lens=lens)).candidate
+    (row,) = [row for row in found.verification if row.kind == 'given_focal']
+    assert row.passed is passed and row.contradicts is not passed
+
+
+@pytest.mark.solve
 def test_the_option_switches_it_off() -> None:
     evidence = synthetic_evidence(ROAD, np.random.default_rng(2))
     result = solve_once(evidence, Options(camera_height=ROAD.height_m, joint=JointOptions(single_road=False)))
