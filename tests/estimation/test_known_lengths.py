@@ -18,7 +18,8 @@ ROAD = Junction(
     camera=PINHOLE,
     road_angles_deg=(0.0,),
     turning_fraction=0.0,
-    vehicles=50,
+    vehicles=40,
+    points_per_vehicle=2,
     camera_from_ground=pose(20.0, 0.5, 15.0),
     centre_m=(16.0, 0.0),
 )

@@ -14,8 +14,9 @@ from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.synthetic.junction import Junction, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration, Refusal
 
-ONE_FAMILY = JointOptions(lens_prior='equidistant')
-"""For questions that do not depend on how the family of the lens is chosen: each of the others is another solution."""
+ONE_FAMILY = JointOptions(lens_prior='equidistant', single_road=False)
+"""For questions that depend neither on how the family of the lens is chosen, each of which is another solution, nor on
+a single road without further evidence."""
 _RESULTS: dict[bytes, Calibration | Refusal] = {}
 _TRAFFIC: dict[bytes, Evidence] = {}
 

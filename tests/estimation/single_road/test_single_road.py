@@ -25,7 +25,8 @@ ROAD = Junction(
     camera=PINHOLE,
     road_angles_deg=(0.0,),
     turning_fraction=0.0,
-    vehicles=60,
+    vehicles=40,
+    points_per_vehicle=2,
     camera_from_ground=pose(18.0, 0.5, 20.0),
     centre_m=(14.0, 0.0),
 )

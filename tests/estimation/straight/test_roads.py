@@ -24,7 +24,7 @@ from solved_once import solved_junction
 pytestmark = pytest.mark.solve
 
 OPTIONS = Options(camera_height=8.0)
-ONE_FAMILY = replace(OPTIONS, joint=JointOptions(lens_prior='equidistant'))
+ONE_FAMILY = replace(OPTIONS, joint=JointOptions(lens_prior='equidistant', single_road=False))
 """For questions that do not depend on how the family of the lens is chosen: the others take half as long again."""
 ONE_ROAD = Junction(
     road_angles_deg=(0.0,),
