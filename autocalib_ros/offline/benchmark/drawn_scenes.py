@@ -105,9 +105,8 @@ class SceneRun:
 
     @property
     def wrong(self) -> bool:
-        """Whether the result is beyond what an answer of grade full, or a lens alone, may have."""
-        graded = self.verdict in ('full', 'lens')
-        return graded and bool(abs(self.focal[0]) > WRONG_FOCAL or self.normal_deg > WRONG_DEG)
+        """Whether the result is beyond what an answer of grade full may have."""
+        return self.verdict == 'full' and bool(abs(self.focal[0]) > WRONG_FOCAL or self.normal_deg > WRONG_DEG)
 
 
 def draw_scene(number: int, seed: int = 0) -> Scene:
