@@ -304,20 +304,23 @@ def _node(solve: _RoadThrough, camera: Camera, log_weight: float) -> _Node:
     return _Node(camera, along, log_weight - cost, np.zeros(1), np.zeros(1))
 
 
+def _weights(nodes: list[_Node]) -> np.ndarray:
+    """Return the probability of each node, shape (nodes,)."""
+    evidence = np.array([node.log_evidence for node in nodes])
+    return np.exp(evidence - logsumexp(evidence))
+
+
 def _focal_moments(nodes: list[_Node]) -> tuple[float, float]:
     """Return mean and standard deviation of the log focal length."""
-    evidence, logs = np.array([node.log_evidence for node in nodes]), np.log([node.camera.focal_px for node in nodes])
-    weights = np.exp(evidence - logsumexp(evidence))
+    weights, logs = _weights(nodes), np.log([node.camera.focal_px for node in nodes])
     mean = float(weights @ logs)
     return mean, float(np.sqrt(weights @ (logs - mean) ** 2))
 
 
 def _mean_node(nodes: list[_Node], solve: _RoadThrough, choice: LensChoice) -> _Node:
     """Return the node at the mean log focal length and the mean curvature."""
-    evidence = np.array([node.log_evidence for node in nodes])
-    weights = np.exp(evidence - logsumexp(evidence))
     focal_px = float(np.exp(_focal_moments(nodes)[0]))
-    kappa = float(weights @ [node.camera.k[0] for node in nodes]) / DISTORTION_FREE[0]
+    kappa = float(_weights(nodes) @ [node.camera.k[0] for node in nodes]) / DISTORTION_FREE[0]
     return _node(solve, choice.lens(focal_px, kappa), 0.0)
 
 
@@ -331,8 +334,7 @@ def _state_at(node: _Node, turn: float) -> AdjustmentState:
 
 def _moments(nodes: list[_Node], parameters: Parameterisation) -> tuple[np.ndarray, np.ndarray]:
     """Return mean (p,) and covariance (p, p) of the steps from the base to what the nodes give."""
-    evidence = np.array([node.log_evidence for node in nodes])
-    weights = np.exp(evidence - logsumexp(evidence))
+    weights = _weights(nodes)
     steps, within = [], np.zeros((parameters.size, parameters.size))
     lens = parameters.lens
     for node, weight in zip(nodes, weights, strict=True):
