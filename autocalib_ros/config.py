@@ -344,16 +344,22 @@ class KnownDistance:
     metres: float
 
 
-def _known_distance(text: str) -> KnownDistance:
-    """Parse one distance of `distances`; raise UsageError with the expected form."""
+def _numbers_in(text: object) -> list[float] | None:
+    """Return the finite numbers of a text, separated by blanks or commas; None where it holds anything else."""
     try:
-        numbers = [float(word) for word in text.replace(',', ' ').split()]
-    except ValueError:
-        numbers = []
-    if len(numbers) != 5 or not all(map(math.isfinite, numbers)) or not 0 < numbers[4] <= 1000:
+        numbers = [float(word) for word in str.replace(text, ',', ' ').split()]  # type: ignore[arg-type]
+    except (TypeError, ValueError):  # not text, or not numbers
+        return None
+    return numbers if all(map(math.isfinite, numbers)) else None
+
+
+def _known_distance(text: object) -> KnownDistance:
+    """Parse one distance of `distances`; raise UsageError with the expected form."""
+    numbers = _numbers_in(text) or []
+    if len(numbers) != 5 or not 0 < numbers[4] <= 1000:
         raise UsageError(
             "option 'scale.distances' takes five numbers for each distance, two pixels and up to 1000 metres, with ; "
-            f"between, for example '412 530 888 530 12.5; 400 300 420 420 30'; got {text.strip()!r}"
+            f"between, for example '412 530 888 530 12.5; 400 300 420 420 30'; got {text!r}"
         )
     return KnownDistance(((numbers[0], numbers[1]), (numbers[2], numbers[3])), numbers[4])
 
@@ -405,11 +411,8 @@ class ScaleOptions(_Validated):
     @property
     def pixels(self) -> tuple[tuple[float, float], ...]:
         """The two pixels (u, v) of `distance_px`; empty if it is empty."""
-        try:
-            numbers = [float(word) for word in self.distance_px.replace(',', ' ').split()]
-        except (ValueError, AttributeError):  # not numbers, or not text
-            numbers = [math.nan]
-        if len(numbers) not in (0, 4) or not all(map(math.isfinite, numbers)):
+        numbers = _numbers_in(self.distance_px)
+        if numbers is None or len(numbers) not in (0, 4):
             raise UsageError(
                 "option 'scale.distance_px' takes four numbers in one text, for example '412 530 888 530'; "
                 f'got {self.distance_px!r}'
@@ -419,7 +422,8 @@ class ScaleOptions(_Validated):
     @property
     def known_distances(self) -> tuple[KnownDistance, ...]:
         """All known distances: that of `distance_px`, and those of `distances`."""
-        given = [text for text in self.distances.split(';') if text.strip()]
+        texts = map(str.strip, self.distances.split(';')) if isinstance(self.distances, str) else [self.distances]
+        given = [text for text in texts if text != '']
         first = (KnownDistance(self.pixels, self.distance_m),) if self.pixels else ()
         return (*first, *map(_known_distance, given))
 
@@ -542,28 +546,28 @@ class Options(_Validated):
     def _require_consistent_scale(self) -> None:
         """Raise UsageError unless the values that `scale_from` needs are given, and only those if it names one."""
         scale = self.scale
-        given = {
+        parts = {
             'height': {'camera_height': self.camera_height > 0},
-            'distance': {'scale.distance_px': bool(scale.pixels), 'scale.distance_m': scale.distance_m > 0},
+            'distance': {
+                'scale.distance_px': bool(scale.pixels),
+                'scale.distance_m': scale.distance_m > 0,
+                'scale.distances': bool(scale.distances.strip()),
+            },
             'speed': {'scale.speed_km_h': scale.speed_km_h > 0},
         }
-        if self.scale_from == 'distance' and scale.distances.strip():
-            given['distance'] = {'scale.distances': True}
-        for source, parts in given.items():
-            extra = [name for name, there in parts.items() if there]
-            if self.scale_from not in ('all', source) and extra:
+        given = {source: [name for name, there in names.items() if there] for source, names in parts.items()}
+        for source, names in given.items():
+            if self.scale_from not in ('all', source) and names:
                 raise UsageError(
-                    f"the scale comes from one source: 'scale_from' is {self.scale_from}, but '{extra[0]}' is given "
+                    f"the scale comes from one source: 'scale_from' is {self.scale_from}, but '{names[0]}' is given "
                     "too; remove it, or set 'scale_from' to all, which uses both"
                 )
-        missing = [name for name, there in given.get(self.scale_from, {}).items() if not there]
-        if self.scale_from != 'height' and missing:
-            raise UsageError(f"'scale_from' {self.scale_from} needs '{missing[0]}'")
-        pixels, metres = given['distance'].get('scale.distance_px'), given['distance'].get('scale.distance_m')
-        if pixels != metres:
-            raise UsageError(
-                f"a known distance needs 'scale.{'distance_m' if pixels else 'distance_px'}': give both or neither"
-            )
+        if self.scale_from in ('distance', 'speed') and not given[self.scale_from]:
+            raise UsageError(f"'scale_from' {self.scale_from} needs '{next(iter(parts[self.scale_from]))}'")
+        pair = ('scale.distance_px', 'scale.distance_m')
+        missing = [name for name in pair if name not in given['distance']]
+        if len(missing) == 1:
+            raise UsageError(f"a known distance needs '{missing[0]}': give both or neither of {' and '.join(pair)}")
         if self.camera_height_sigma > 0 and not self.camera_height > 0:
             raise UsageError("'camera_height_sigma' needs 'camera_height': give both or neither")
         if scale.speed_km_h > 0 and self.method == 'paper':
@@ -635,10 +639,7 @@ MAX_PIXEL_COORDINATE = 1e5
 
 def _polygon(text: str) -> tuple[tuple[float, float], ...]:
     """Parse one polygon of `ignore_regions`; raise UsageError with the expected form."""
-    try:
-        numbers = [float(word) for word in text.replace(',', ' ').split()]
-    except ValueError:
-        numbers = []
+    numbers = _numbers_in(text) or []
     if len(numbers) < 6 or len(numbers) % 2 or not all(abs(number) <= MAX_PIXEL_COORDINATE for number in numbers):
         raise UsageError(
             "option 'ignore_regions' is polygons of at least three pixels u v each, separated by ;, for example "

@@ -57,6 +57,8 @@ PIXELS = '412 530 888 530'
         ({'scale_from': 'speed', 'scale.speed_km_h': 50.0, 'camera_height': 8.0}, "'camera_height' is given too"),
         ({'scale.distance_px': PIXELS}, "needs 'scale.distance_m'"),
         ({'scale.distances': '1 2 300 4'}, 'five numbers for each distance'),
+        ({'scale.distances': [1.0, 2.0, 300.0, 4.0, 5.0]}, 'five numbers for each distance'),
+        ({'scale_from': 'height', 'scale.distances': PIXELS + ' 9'}, "'scale.distances' is given too"),
         ({'scale.distances': '1 2 3 4 5'}, 'px apart'),
         ({'lens.focal_px': 800.0, 'lens.hfov_deg': 60.0}, 'not both'),
         (

@@ -51,6 +51,15 @@ from autocalib_ros.lens.camera import Camera
 from autocalib_ros.results.calibration import Calibration, Refusal
 from autocalib_ros.results.refusals import Reason, reason
 
+SINGLE_ROAD_CODES = (
+    'no_agreement',
+    'too_little_curvature',
+    'too_little_turning',
+    'turning_traffic',
+    'one_direction',
+)
+"""Reasons that one straight road without visible curvature gives; other ones contradict something."""
+
 
 def solve(evidence: Evidence, options: Options, *, lens: Camera | None = None) -> Calibration | Refusal:
     """Estimate lens and ground plane from a snapshot; a pure function of its arguments.
@@ -206,16 +215,6 @@ def _with_lane_markings(
     if best is found and isinstance(markings, Reason) and markings.code != 'no_markings':
         return append_reason(found, markings)
     return best
-
-
-SINGLE_ROAD_CODES = (
-    'no_agreement',
-    'too_little_curvature',
-    'too_little_turning',
-    'turning_traffic',
-    'one_direction',
-)
-"""Reasons that one straight road without visible curvature gives; other ones contradict something."""
 
 
 def _leaves_a_road_open(found: Solution | Reason) -> bool:

@@ -17,7 +17,7 @@ from autocalib_ros.estimation.adjustment.parameters import AdjustmentState
 from autocalib_ros.estimation.observations.track_set import TrackSet
 from autocalib_ros.estimation.solution import Solution
 from autocalib_ros.estimation.verification.ground_normal import STEP_RAD
-from autocalib_ros.estimation.verification.scale import MIN_SCALE_SIGMA, Scale, scale_sources
+from autocalib_ros.estimation.verification.scale import MIN_HEIGHT_M, Scale, relative_sigmas, scale_sources
 from autocalib_ros.results.refusals import Reason
 from autocalib_ros.results.verification_table import verified
 
@@ -47,7 +47,7 @@ def adjust_to_lengths(found: Solution, tracks: TrackSet, options: Options) -> So
     def differences(state: AdjustmentState, turn_rad: float = 0.0) -> np.ndarray:
         return differ @ _log_heights(sources, state, plane.normal(state, turn_rad))
 
-    noise = _noise(found, sources, differ)
+    noise = differ @ np.diag(relative_sigmas(sources, *plane.lens_and_normal) ** 2) @ differ.T
     if plane.assumed is not None:
         turned = differences(found.fit.state, STEP_RAD) - differences(found.fit.state, -STEP_RAD)
         turned *= plane.assumed.step_sigma_rad / (2 * STEP_RAD)
@@ -69,16 +69,9 @@ def adjust_to_lengths(found: Solution, tracks: TrackSet, options: Options) -> So
     found = found.compared(verified('known_lengths', contradiction, MAX_LENGTH_SIGMAS))
     updated = covariance - gain @ jacobian @ covariance
     fit = evaluate_at(parameters.state(step), tracks, parameters.config, 0.5 * (updated + updated.T))
-    return replace(found, fit=fit, plane=replace(plane, fit=fit), reduced=found.reduced)
+    return replace(found, fit=fit, plane=replace(plane, fit=fit))
 
 
 def _log_heights(sources: list[Scale], state: AdjustmentState, normal: np.ndarray) -> np.ndarray:
     """Log of the camera height by each source, shape (sources,)."""
-    return np.log([max(source.height(state.camera, normal), 1e-6) for source in sources])
-
-
-def _noise(found: Solution, sources: list[Scale], differ: np.ndarray) -> np.ndarray:
-    """Covariance of the differences between sources from their own standard deviations."""
-    heights = np.exp(_log_heights(sources, found.fit.state, found.plane.normal(found.fit.state)))
-    relative = np.maximum(np.array([source.sigma for source in sources]) / heights, MIN_SCALE_SIGMA)
-    return differ @ np.diag(relative**2) @ differ.T
+    return np.log([max(source.height(state.camera, normal), MIN_HEIGHT_M) for source in sources])

@@ -73,6 +73,39 @@ def _along_pixel_axes(rays: Rays, camera: Camera, x: np.ndarray, y: np.ndarray) 
     return Rays(rays.bearings, camera.pixel_aspect * by_x, by_y - camera.skew * by_x)
 
 
+def middles_and_ways(ends_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the middles (n, 2) of segments (n, 4), and the ways (n, 2) from end to end."""
+    return (ends_px[:, :2] + ends_px[:, 2:]) / 2, ends_px[:, 2:] - ends_px[:, :2]
+
+
+@dataclass(frozen=True)
+class SegmentRays:
+    """Line segments through a lens: the rays of their middles, and how these move with the segment."""
+
+    rays: Rays
+    """Of the middles."""
+    along: np.ndarray
+    """Change of the bearing by a pixel along the segment, shape (n, 3)."""
+    aside: np.ndarray
+    """Change of the bearing by a pixel at right angles to it, shape (n, 3)."""
+    lengths_px: np.ndarray
+    """Shape (n,)."""
+
+    @classmethod
+    def through(cls, camera: Camera, ends_px: np.ndarray) -> SegmentRays:
+        """Unproject segments x0, y0, x1, y1 (n, 4)."""
+        middle, way = middles_and_ways(ends_px)
+        lengths = np.maximum(np.hypot(*way.T), 1e-9)
+        unit = way / lengths[:, None]
+        rays = unproject_rays(camera, middle)
+        return cls(
+            rays,
+            bearing_change(rays, camera, middle, unit),
+            bearing_change(rays, camera, middle, np.column_stack([-unit[:, 1], unit[:, 0]])),
+            lengths,
+        )
+
+
 def bearing_change(rays: Rays, camera: Camera, pixels: np.ndarray, way_px: np.ndarray) -> np.ndarray:
     """Return the change (n, 3) of the bearings of pixels (n, 2) for image displacements `way_px` (n, 2)."""
     if not camera.has_square_pixels:

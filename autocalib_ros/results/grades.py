@@ -8,8 +8,6 @@ GRADE_LIMITS = {'full': 0.03, 'fair': 0.10, 'coarse': 0.25}
 """Largest relative standard deviation of a length on the road, along or across the view, of each grade."""
 GRADES = ('lens', 'unit_scale', 'assumed', *reversed(GRADE_LIMITS))
 """All grades in ascending order: no ground plane, a plane without metres, and metric planes by their certainty."""
-LEAST_GRADES = ('assumed', *reversed(GRADE_LIMITS))
-"""Grades that may be asked for."""
 
 
 @dataclass(frozen=True)

@@ -132,7 +132,6 @@ REFUSALS = (
         missing='an identifiable focal length',
         message='focal length not identifiable: support of straight traffic at the best candidate is {contrast:.2f} '
         'times the median (at least {limit:g} needed)',
-        variants={'single_road': ('no usual lens shows the one road that was found as straight', '')},
     ),
     RefusalCode(
         code='turning_traffic',

@@ -178,7 +178,7 @@ ASSUMPTIONS: dict[str, Wording] = {
     'lens_barrel': 'lens from equidistant (k1 = 0) to distortion-free (1/3), by how much straight traffic curves: k1 = '
     '{k1:.2f} +- {sigma:.2f}',
     'field_of_view': 'field of view across the image {view_deg:.0f} degrees (focal length +- {sigma:.0%}): usual '
-    'ones are {usual_deg:.0f} degrees within a factor of 1.65',
+    'ones are {usual_deg:.0f} degrees within a factor of {factor:.2f}',
     'principal_point': _principal_point,
     'focal_given': _focal_given,
     'view_given': 'field of view across the image {view_deg:g} +- {sigma_deg:.2g} degrees (given)',

@@ -28,7 +28,7 @@ class VerifiedQuantity:
 REFUSED = 'no calibration'
 NO_PLANE = 'no ground plane'
 CONTRADICTED = 'grade fair at most'
-GRADE_FAIR = 'no grade full'
+UNTESTED = 'no grade full'
 WIDENED = 'wider standard deviations'
 
 VERIFIED_QUANTITIES: dict[str, VerifiedQuantity] = {
@@ -68,7 +68,7 @@ VERIFIED_QUANTITIES: dict[str, VerifiedQuantity] = {
     'lane_changes': VerifiedQuantity('plane by lane changes against the assumed plane', 'degrees', NO_PLANE),
     'pixel_aspect': VerifiedQuantity('pixel aspect against the one by the traffic', 'sigma', WIDENED),
     'given_lens_sigma': VerifiedQuantity(
-        'standard deviation of the focal length by the traffic, which tests the given one', '%', GRADE_FAIR
+        'standard deviation of the focal length by the traffic, which tests the given one', '%', UNTESTED
     ),
     'given_lens': VerifiedQuantity('given focal length against the one by the traffic', '%', CONTRADICTED),
 }
@@ -109,7 +109,7 @@ class VerificationRow:
     @property
     def lowers_grade(self) -> bool:
         """Whether the check failed and thereby costs grade full."""
-        return not self.passed and self._quantity.cost in (CONTRADICTED, GRADE_FAIR)
+        return not self.passed and self._quantity.cost in (CONTRADICTED, UNTESTED)
 
     @property
     def contradicts(self) -> bool:

@@ -4,26 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pinhole_road import PINHOLE, ROAD
 
 from autocalib_ros.config import GateOptions, LensOptions, Options, ScaleOptions
-from autocalib_ros.lens.camera import Camera
-from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_evidence
+from autocalib_ros.offline.synthetic.junction import synthetic_evidence
 from autocalib_ros.results.calibration import Calibration
 from solved_once import solve_once
 
 pytestmark = pytest.mark.solve
 
-PINHOLE = Camera(1280, 720, 900.0, (639.5, 359.5), (1 / 3, 2 / 15, 17 / 315, 62 / 2835))
-ROAD = Junction(
-    camera=PINHOLE,
-    road_angles_deg=(0.0,),
-    turning_fraction=0.0,
-    vehicles=40,
-    points_per_vehicle=2,
-    camera_from_ground=pose(20.0, 0.5, 15.0),
-    centre_m=(16.0, 0.0),
-)
-ALONG, ACROSS = ((14.0, 1.0), (26.0, 1.0)), ((18.0, -2.0), (18.0, 5.0))
+ALONG, ACROSS = ((14.0, 1.0), (26.0, 1.0)), ((18.0, -5.0), (18.0, 2.0))
 """Ends of two lengths on the road, metres."""
 
 

@@ -129,7 +129,7 @@ class LensPrior:
     def with_data_sheet(self, known: LensOptions) -> LensPrior:
         """Return the prior with the focal length or the field of view of the data sheet, if either is given.
 
-        Of a field of view the focal length is that of the family.
+        A field of view gives each lens family a focal length of its own.
         """
         sigma = self.sigma.copy()
         if known.focal_px > 0:

@@ -15,7 +15,8 @@ import numpy as np
 from autocalib_ros.estimation.adjustment.covariance import jackknife_covariance
 from autocalib_ros.estimation.adjustment.lens_prior import LensPrior
 from autocalib_ros.estimation.adjustment.parameters import RIGHT_ANGLE_SIGMA_RAD
-from autocalib_ros.estimation.markings.road_segments import ProjectedSegments, RoadSegments, middles_and_ways
+from autocalib_ros.estimation.markings.road_segments import ProjectedSegments, RoadSegments
+from autocalib_ros.geometry.great_circles import middles_and_ways
 from autocalib_ros.geometry.lens_slopes import PolarRays
 from autocalib_ros.geometry.robust_kernels import STUDENT_FREEDOM, student_density, student_weight
 from autocalib_ros.geometry.small_matrices import cross, rotation_matrix

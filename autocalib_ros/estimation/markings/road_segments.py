@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from autocalib_ros.estimation.observations.grouping import component_labels
 from autocalib_ros.estimation.observations.track_set import count_earlier, kish_weight
 from autocalib_ros.evidence.snapshot import Evidence
-from autocalib_ros.geometry.great_circles import bearing_change, unproject_rays
+from autocalib_ros.geometry.great_circles import bearing_change, middles_and_ways, unproject_rays
 from autocalib_ros.geometry.robust_kernels import wrap_undirected
 from autocalib_ros.geometry.small_matrices import cross
 from autocalib_ros.lens.camera import Camera
@@ -92,11 +92,6 @@ def group_segments(ends: np.ndarray, width: int) -> np.ndarray:
     near = np.hypot(*(middle[:, None] - middle).transpose(2, 0, 1)) < MAX_GROUP_DISTANCE * width
     parallel = np.abs(wrap_undirected(heading[:, None] - heading)) < MAX_GROUP_ANGLE_RAD
     return component_labels(np.array(np.nonzero(near & parallel)), len(ends))
-
-
-def middles_and_ways(ends_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the middles (n, 2) of segments (n, 4), and the ways (n, 2) from end to end."""
-    return (ends_px[:, :2] + ends_px[:, 2:]) / 2, ends_px[:, 2:] - ends_px[:, :2]
 
 
 @dataclass(frozen=True)

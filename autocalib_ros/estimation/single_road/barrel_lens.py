@@ -17,7 +17,7 @@ from autocalib_ros.lens.camera import Camera
 
 MIN_KAPPA, MAX_KAPPA = -0.15, 1.05
 """Lenses from slightly beyond equidistant to slightly beyond distortion-free."""
-USUAL_KAPPAS = ((0.95, 0.15), (0.0, 0.09))
+USUAL_KAPPAS = {'distortion_free': (0.95, 0.15), 'equidistant': (0.0, 0.09)}
 """Mean and standard deviation of usual narrow and wide lenses, a third of all each; another third is spread evenly.
 Those of wide lenses are the same as of the family near equidistant. Judgement."""
 USUAL_VIEW_DEG, USUAL_VIEW_FACTOR = 45.0, 1.65
@@ -86,7 +86,7 @@ class LensChoice:
 
     def log_prior(self, focal_px: float, kappa: float) -> float:
         """Return the log prior density of a lens, by log focal length and kappa."""
-        of_kappa = float(np.log(sum(self._kappa_densities(kappa))))
+        of_kappa = float(np.log(self._kappa_density(kappa)))
         if self.prior.focal_known:
             away = np.log(focal_px / self.expected_focal_px(kappa)) / max(float(self.prior.sigma[0]), 1e-3)
         else:
@@ -99,19 +99,21 @@ class LensChoice:
         """Return the focal length that is given, or that follows from the given field of view."""
         return self._focal_of_view(kappa) if self.prior.view_deg > 0 else self.prior.centre.focal_px
 
-    def _kappa_densities(self, kappa: float) -> list[float]:
-        """Return the densities of a curvature under the families that may be, each times its probability."""
-        families = {'distortion_free': USUAL_KAPPAS[0], 'equidistant': USUAL_KAPPAS[1]}
-        chosen = self.options.lens_prior
-        if chosen in families:  # its k1 is given with a standard deviation, and kappa is three times k1
-            families = {chosen: (1.0 if chosen == 'distortion_free' else 0.0, max(3.0 * self.options.k1_sigma, 1e-3))}
-        spread = {'auto': 1.0, 'kannala_brandt': 1.0}.get(chosen, 0.0)
-        usual = [] if chosen == 'kannala_brandt' else list(families.values())
+    def _kappa_density(self, kappa: float) -> float:
+        """Return the density of a curvature over the lens families that may be, each as probable as the others."""
+        sigma = max(3.0 * self.options.k1_sigma, 1e-3)  # of kappa, which is three times k1
+        peaks = {
+            'auto': tuple(USUAL_KAPPAS.values()),
+            'distortion_free': ((1.0, sigma),),
+            'equidistant': ((0.0, sigma),),
+            'kannala_brandt': (),
+        }[self.options.lens_prior]
         densities = [
-            float(np.exp(-0.5 * ((kappa - mean) / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi))) for mean, sigma in usual
+            float(np.exp(-0.5 * ((kappa - mean) / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi))) for mean, sigma in peaks
         ]
-        parts = [*densities, *([spread] if spread else [])]
-        return [part / len(parts) for part in parts]
+        if self.options.lens_prior in ('auto', 'kannala_brandt'):
+            densities.append(1.0)  # anything in between
+        return float(np.mean(densities))
 
     @property
     def _half_width(self) -> float:

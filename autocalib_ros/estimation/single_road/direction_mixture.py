@@ -1,7 +1,7 @@
 """Segments along, across and upright to a road: a mixture of their image angles, as a function of the turn about it.
 
-Each segment lies along the road, across it, upright, or at any other angle. Peaks are Student's t distributions of the
-angle in the image, so that no lens is preferred for the mere scale of its angles; shares and spreads are fitted anew
+Each segment lies along the road, across it, upright, or at any other angle. The peaks are Student's t distributions of
+the angle in the image, not of that on the sphere, whose scale changes with the lens. Shares and spreads are refitted
 for every lens (profile likelihood).
 """
 
@@ -13,7 +13,7 @@ import numpy as np
 
 from autocalib_ros.estimation.adjustment.parameters import level_normal
 from autocalib_ros.estimation.markings.road_segments import ProjectedSegments
-from autocalib_ros.geometry.great_circles import bearing_change, unproject_rays
+from autocalib_ros.geometry.great_circles import SegmentRays
 from autocalib_ros.geometry.robust_kernels import student_density, student_weight
 from autocalib_ros.geometry.small_matrices import cross
 from autocalib_ros.lens.camera import Camera
@@ -75,16 +75,14 @@ class DirectionMixture:
 
     def through(self, camera: Camera, along: np.ndarray) -> SeenSegments:
         """Return the segments as seen through a lens about a road with the direction `along` (3,)."""
-        middle, step = (self.ends_px[:, :2] + self.ends_px[:, 2:]) / 2, self.ends_px[:, 2:] - self.ends_px[:, :2]
-        lengths = np.maximum(np.hypot(*step.T), 1e-9)
-        unit = step / lengths[:, None]
-        rays = unproject_rays(camera, middle)
-        forward = bearing_change(rays, camera, middle, unit)
-        aside = bearing_change(rays, camera, middle, np.column_stack([-unit[:, 1], unit[:, 0]]))
-        moved = cross(forward, aside)
-        stretch = np.sqrt((moved * moved).sum(axis=1)) / np.maximum((forward * forward).sum(axis=1), 1e-30)
-        noise = self.kind.end_sigma_px * np.sqrt(2.0) / lengths
-        return SeenSegments(ProjectedSegments.from_camera(camera, self.ends_px), along, stretch, noise)
+        segments = SegmentRays.through(camera, self.ends_px)
+        length2 = np.maximum((segments.along * segments.along).sum(axis=1), 1e-30)
+        moved = cross(segments.along, segments.aside)
+        stretch = np.sqrt((moved * moved).sum(axis=1)) / length2
+        noise = self.kind.end_sigma_px * np.sqrt(2.0) / segments.lengths_px
+        bearings, forward = segments.rays.bearings, segments.along / np.sqrt(length2)[:, None]
+        projected = ProjectedSegments(bearings, forward, cross(bearings, forward))
+        return SeenSegments(projected, along, stretch, noise)
 
     @property
     def spreads(self) -> np.ndarray:

@@ -14,9 +14,9 @@ from functools import cached_property
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
-from scipy.special import logsumexp
+from scipy.special import logsumexp, softmax
 
-from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment, adjust, evaluate_at
+from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment, adjust
 from autocalib_ros.estimation.adjustment.lens_prior import DISTORTION_FREE, LensPrior, known_lens
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig, AdjustmentState, Parameterisation
 from autocalib_ros.estimation.observations.track_set import TrackSet, UnprojectedTracks
@@ -30,7 +30,13 @@ from autocalib_ros.estimation.single_road.direction_mixture import (
     Tilts,
     across_and_up,
 )
-from autocalib_ros.geometry.great_circles import quadratic_forms, squared_distances, unproject_rays
+from autocalib_ros.estimation.vehicle_edges.edge_mixture import SYSTEMATIC_SIGMA_RAD
+from autocalib_ros.geometry.great_circles import (
+    orthonormal_basis,
+    quadratic_forms,
+    squared_distances,
+    unproject_rays,
+)
 from autocalib_ros.geometry.robust_kernels import cauchy_weight, geman_mcclure_bounded_loss
 from autocalib_ros.geometry.small_matrices import smallest_eigenvectors
 from autocalib_ros.lens.camera import Camera
@@ -50,8 +56,8 @@ track weighs a quarter."""
 KAPPA_NODES = 4
 """Curvatures at each focal length, within 2.5 standard deviations of what straight tracks show."""
 MIN_SPACINGS, FINER_SHIFTS = 1.5, np.linspace(-2.5, 2.5, 16)
-"""Where the focal length is more certain than so many spacings of the grid, a finer one follows, with these shifts in
-spacings of the first."""
+"""Standard deviation of the focal length, in spacings of the grid, below which a finer grid is solved; and the
+shifts of that grid from the mean, in spacings of the first."""
 KAPPA_TRIALS = 7
 """Curvatures at each focal length by which straight tracks measure it."""
 MAX_NATS_BEHIND = 15.0
@@ -62,13 +68,13 @@ ROAD_SIGMA_RAD = np.radians(0.5)
 """Standard deviation of the direction of the road under the camera from that of its vanishing point: carriageways
 differ by about a degree, and the grade changes along a road. Judgement."""
 COMMON_TILTS = (
-    (Tilts(across_rad=np.radians(0.75)), Tilts()),
-    (Tilts(upright_rad=np.radians(1.5)), Tilts()),
+    (Tilts(across_rad=float(SYSTEMATIC_SIGMA_RAD[0])), Tilts()),
+    (Tilts(upright_rad=float(SYSTEMATIC_SIGMA_RAD[1])), Tilts()),
     (Tilts(), Tilts(upright_rad=np.radians(1.2))),
     (Tilts(), Tilts(grade_rad=np.radians(1.2))),
 )
-"""Errors common to all vehicle edges, and to all lines, one standard deviation each: bumpers rise at their ends, sides
-lean inwards; bank and grade of the road (2 %). Judgement."""
+"""Errors common to all vehicle edges, and to all lines, one standard deviation each; of the lines bank and grade of the
+road (2 %). Judgement."""
 MIN_KAPPA_REACH = 0.02
 """Least range of the curvature, to either side, at one focal length."""
 NEAR_TURNS_RAD = np.radians(np.arange(-5.0, 5.1, 1.0))
@@ -97,7 +103,7 @@ class _Node:
     @property
     def turn_moments(self) -> tuple[float, float]:
         """Mean and variance of the turn."""
-        weights = np.exp(self.log_density - logsumexp(self.log_density))
+        weights = softmax(self.log_density)
         mean = float(weights @ self.turns)
         return mean, float(weights @ (self.turns - mean) ** 2)
 
@@ -160,26 +166,33 @@ def road_posterior(
     choice: LensChoice,
     segments: tuple[DirectionMixture, DirectionMixture],
     roll_sigma_rad: float,
-) -> Adjustment:
-    """Return lens and plane, with their covariance, of one straight road.
+) -> tuple[Parameterisation, np.ndarray]:
+    """Return the parameters about lens and plane of one straight road, and their covariance (p, p).
 
     `fit` is a solution of the road by any lens, `tracks` those by which lenses are compared. `segments` are vehicle
     edges and still lines, either may be empty; `roll_sigma_rad` is the standard deviation of the roll.
     """
     scene, solve = _RoadScene(segments, roll_sigma_rad), _RoadThrough(fit, tracks)
     focals = choice.focal_lengths()
-    fitted = [scene.fitted_to(node) for node in _lens_nodes(solve, choice, focals)]
-    mean, sigma = _focal_moments([each.weighed() for each in fitted])
+    fitted, nodes = _solve_grid(scene, solve, choice, focals)
+    mean, sigma = _focal_moments(nodes)
     spacing = float(np.log(focals[1] / focals[0])) if len(focals) > 1 else 0.0
     if sigma < MIN_SPACINGS * spacing:
-        focals = np.exp(mean + spacing * FINER_SHIFTS)
-        fitted = [scene.fitted_to(node) for node in _lens_nodes(solve, choice, focals)]
-    base = scene.fitted_to(_mean_node([each.weighed() for each in fitted], solve, choice)).weighed()
+        fitted, nodes = _solve_grid(scene, solve, choice, np.exp(mean + spacing * FINER_SHIFTS))
+    base = scene.fitted_to(_mean_node(nodes, solve, choice)).weighed()
     parameters = _parameters(base, fit.problem.config, _published_prior(choice, base.camera))
-    covariance = _covariance(fitted, parameters) + _prior_covariance(parameters, tracks)
+    covariance = _covariance(fitted, nodes, parameters) + _prior_covariance(parameters, tracks)
     turns = slice(parameters.lens + 1, parameters.lens + 3)
     covariance[turns, turns] += _road_covariance(parameters.base, solve.adjusted(base))
-    return evaluate_at(parameters.base, tracks, parameters.config, covariance)
+    return parameters, covariance
+
+
+def _solve_grid(
+    scene: _RoadScene, solve: _RoadThrough, choice: LensChoice, focals: np.ndarray
+) -> tuple[list[_FittedScene], list[_Node]]:
+    """Return the scene through each lens of a grid of focal lengths (n,), and the lenses with their turns weighed."""
+    fitted = [scene.fitted_to(node) for node in _lens_nodes(solve, choice, focals)]
+    return fitted, [each.weighed() for each in fitted]
 
 
 def _parameters(base: _Node, config: AdjustmentConfig, prior: LensPrior) -> Parameterisation:
@@ -188,9 +201,8 @@ def _parameters(base: _Node, config: AdjustmentConfig, prior: LensPrior) -> Para
     return Parameterisation(state, replace(config, prior=prior, crossing_rad=np.pi / 2, crossing_sigma_rad=0.0))
 
 
-def _covariance(fitted: list[_FittedScene], parameters: Parameterisation) -> np.ndarray:
+def _covariance(fitted: list[_FittedScene], nodes: list[_Node], parameters: Parameterisation) -> np.ndarray:
     """Return the covariance over lenses and turns, with errors common to all edges or lines, and of the road itself."""
-    nodes = [each.weighed() for each in fitted]
     evidence = np.array([node.log_evidence for node in nodes])
     kept = np.flatnonzero(evidence > evidence.max() + np.log(MIN_WEIGHT)).tolist()
     mean, covariance = _moments([nodes[index] for index in kept], parameters)
@@ -269,8 +281,7 @@ class _RoadThrough:
         along = starts[np.argmin(self._losses(forms, starts))]
         along = along * (np.sign(along @ state.directions[0]) or 1.0)
         for reach in SEARCH_REACH_RAD:
-            sideways = np.linalg.svd(along[None])[2][1:]
-            tried = along + reach * ROAD_OFFSETS @ sideways
+            tried = along + reach * ROAD_OFFSETS @ orthonormal_basis(along)
             tried /= np.linalg.norm(tried, axis=1, keepdims=True)
             costs = self._losses(forms, tried)
             along, cost = tried[np.argmin(costs)], float(costs.min())
@@ -306,8 +317,7 @@ def _node(solve: _RoadThrough, camera: Camera, log_weight: float) -> _Node:
 
 def _weights(nodes: list[_Node]) -> np.ndarray:
     """Return the probability of each node, shape (nodes,)."""
-    evidence = np.array([node.log_evidence for node in nodes])
-    return np.exp(evidence - logsumexp(evidence))
+    return softmax([node.log_evidence for node in nodes])
 
 
 def _focal_moments(nodes: list[_Node]) -> tuple[float, float]:
@@ -326,9 +336,8 @@ def _mean_node(nodes: list[_Node], solve: _RoadThrough, choice: LensChoice) -> _
 
 def _state_at(node: _Node, turn: float) -> AdjustmentState:
     """Return the state with the road and the direction across it as its two axes."""
-    across, up = (each[0] for each in across_and_up(node.along, np.array([turn])))
-    across = np.cross(up, node.along)
-    rotation = np.column_stack([node.along, across, up])
+    up = across_and_up(node.along, np.array([turn]))[1][0]
+    rotation = np.column_stack([node.along, np.cross(up, node.along), up])
     return AdjustmentState(node.camera, rotation, np.array([0.0, np.pi / 2]))
 
 

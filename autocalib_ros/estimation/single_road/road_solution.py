@@ -10,12 +10,13 @@ from autocalib_ros.config import GateOptions
 from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment, adjust, evaluate_at
 from autocalib_ros.estimation.adjustment.lens_prior import DISTORTION_FREE, known_lens
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig, AdjustmentState
-from autocalib_ros.estimation.markings.road_segments import group_segments
+from autocalib_ros.estimation.markings.road_segments import LINE_CORRELATION, group_segments
 from autocalib_ros.estimation.observations.track_set import TrackSet, evenly_spaced, kish_weight
-from autocalib_ros.estimation.single_road.barrel_lens import USUAL_VIEW_DEG, LensChoice
+from autocalib_ros.estimation.single_road.barrel_lens import USUAL_VIEW_DEG, USUAL_VIEW_FACTOR, LensChoice
 from autocalib_ros.estimation.single_road.direction_mixture import STILL_SEGMENTS, VEHICLE_EDGES, DirectionMixture
 from autocalib_ros.estimation.single_road.posterior import road_posterior
 from autocalib_ros.estimation.straight.initialisation import solve_from_consensus
+from autocalib_ros.estimation.vehicle_edges.edge_mixture import EDGE_CORRELATION
 from autocalib_ros.estimation.vehicle_edges.transverse_edges import select_vehicle_edges
 from autocalib_ros.estimation.verification.gates import check_halves
 from autocalib_ros.estimation.verification.identifiability import (
@@ -34,8 +35,6 @@ MAX_COMPARED_TRACKS = 150
 """Tracks, evenly spaced in the list of all, by which lenses are compared."""
 MAX_ROAD_SEGMENTS = 200
 """Most edges, and most still lines, in the posterior: the longest."""
-SEGMENT_CORRELATION = 0.3
-"""Correlation of the errors of the edges of one vehicle, or of the lines of one group. Judgement."""
 FIXED_LENS_SIGMA = np.array([1e-3, 0.0, 0.0, 0.0, 0.0, 0.0])
 """Of a lens that is fixed but for its focal length, which is known: no other one is tried."""
 DEFAULT_ROLL_SIGMA_DEG = 3.0
@@ -97,11 +96,14 @@ def solve_single_road(
     if isinstance(halves, Reason):
         return halves
     roll_deg, segments = config.options.roll_prior_deg or DEFAULT_ROLL_SIGMA_DEG, _segments(evidence, whole, tracks)
-    fit = road_posterior(start, subsample.subset(compared), choice, segments, float(np.radians(roll_deg)))
+    parameters, covariance = road_posterior(
+        start, subsample.subset(compared), choice, segments, float(np.radians(roll_deg))
+    )
+    fit = evaluate_at(parameters.base, tracks, parameters.config, covariance)
     edges, lines = segments
     seen = check('single_road', edges=len(edges.weights), lines=len(lines.weights), following=following)
     return SingleRoad(
-        evaluate_at(fit.state, tracks, fit.problem.config, fit.covariance),
+        fit,
         choice,
         (*_lens_statements(fit, choice), assumption('level_camera', sigma_deg=roll_deg)),
         (seen, halves.statement),
@@ -178,7 +180,13 @@ def _lens_statements(fit: Adjustment, choice: LensChoice) -> tuple[Statement, ..
     view_deg = field_of_view_deg(fit.state.camera)[0]
     return (
         *statements,
-        assumption('field_of_view', usual_deg=USUAL_VIEW_DEG, view_deg=view_deg, sigma=fit.focal_sigma),
+        assumption(
+            'field_of_view',
+            usual_deg=USUAL_VIEW_DEG,
+            factor=USUAL_VIEW_FACTOR,
+            view_deg=view_deg,
+            sigma=fit.focal_sigma,
+        ),
     )
 
 
@@ -186,14 +194,14 @@ def _edges(evidence: Evidence, along: TrackSet) -> DirectionMixture:
     """Return the longest edges of the vehicles that follow the road."""
     edges = select_vehicle_edges(evidence, along)
     longest = edges.subset(_longest(edges.ends_px))
-    return DirectionMixture(VEHICLE_EDGES, longest.ends_px, kish_weight(longest.vehicles, SEGMENT_CORRELATION))
+    return DirectionMixture(VEHICLE_EDGES, longest.ends_px, kish_weight(longest.vehicles, EDGE_CORRELATION))
 
 
 def _lines(evidence: Evidence) -> DirectionMixture:
     """Return the longest lines of the still scene."""
     ends = evidence.still_lines_px[_longest(evidence.still_lines_px)]
     groups = group_segments(ends, evidence.image_size[0])
-    return DirectionMixture(STILL_SEGMENTS, ends, kish_weight(groups, SEGMENT_CORRELATION))
+    return DirectionMixture(STILL_SEGMENTS, ends, kish_weight(groups, LINE_CORRELATION))
 
 
 def _longest(ends: np.ndarray) -> np.ndarray:

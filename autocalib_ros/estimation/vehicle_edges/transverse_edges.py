@@ -22,7 +22,7 @@ from autocalib_ros.estimation.adjustment.parameters import AdjustmentState, leve
 from autocalib_ros.estimation.observations.track_set import TrackSet, count_earlier
 from autocalib_ros.estimation.vehicle_edges.edge_mixture import EdgeTurns, find_transverse_peak
 from autocalib_ros.evidence.snapshot import Evidence
-from autocalib_ros.geometry.great_circles import bearing_change, unproject_rays
+from autocalib_ros.geometry.great_circles import SegmentRays
 from autocalib_ros.geometry.robust_kernels import wrap_undirected
 from autocalib_ros.geometry.small_matrices import cross, dot
 from autocalib_ros.lens.camera import Camera
@@ -75,25 +75,23 @@ def select_vehicle_edges(evidence: Evidence, tracks: TrackSet) -> VehicleEdges:
 
 def edge_turns(camera: Camera, along: np.ndarray, across: np.ndarray, ends_px: np.ndarray) -> EdgeTurns:
     """Return the turns of edges (n, 4) about a road `along` (3,), counted from `across` (3,)."""
-    middle, step = (ends_px[:, :2] + ends_px[:, 2:]) / 2, ends_px[:, 2:] - ends_px[:, :2]
-    length = np.maximum(np.hypot(*step.T), 1e-9)
-    rays, unit = unproject_rays(camera, middle), step / length[:, None]
-    circles = cross(rays.bearings, bearing_change(rays, camera, middle, unit))
-    slopes = cross(rays.bearings, bearing_change(rays, camera, middle, np.column_stack([-unit[:, 1], unit[:, 0]])))
+    edges = SegmentRays.through(camera, ends_px)
+    bearings = edges.rays.bearings
+    circles, slopes = cross(bearings, edges.along), cross(bearings, edges.aside)
     basis = np.stack([across, np.cross(along, across)])
     (p, q), (slope_p, slope_q) = basis @ circles.T, basis @ slopes.T
     aside2 = np.maximum(p * p + q * q, 1e-30)
     turns = np.arctan2(-p, q)
-    towards = cross(rays.bearings, along[None])
+    towards = cross(bearings, along[None])
     cosine = np.abs(dot(circles, towards)) / np.maximum(np.sqrt(dot(circles, circles) * dot(towards, towards)), 1e-30)
     # an edge along v + yaw d is met at the turn yaw (m . d) / (m . (d x v)), and m is perpendicular to bearing and v
     leverage = np.abs(circles @ along) / np.sqrt(aside2)
-    ahead, (beside, above) = rays.bearings @ along, basis @ rays.bearings.T
+    ahead, (beside, above) = bearings @ along, basis @ bearings.T
     beside, above = np.cos(turns) * beside + np.sin(turns) * above, np.cos(turns) * above - np.sin(turns) * beside
     oblique = beside / np.maximum(np.hypot(ahead, beside), 1e-9)
     return EdgeTurns(
         turns,
-        np.abs(p * slope_q - q * slope_p) / aside2 * EDGE_END_SIGMA_PX * np.sqrt(2.0) / length,
+        np.abs(p * slope_q - q * slope_p) / aside2 * EDGE_END_SIGMA_PX * np.sqrt(2.0) / edges.lengths_px,
         np.arccos(np.minimum(cosine, 1.0)),
         leverage,
         oblique * np.sign(above) * leverage,

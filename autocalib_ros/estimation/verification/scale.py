@@ -32,6 +32,8 @@ MIN_FLOW_SPEED_FRACTION = 0.4
 fifth."""
 TRIM_FRACTION = 0.25
 """Fraction of the slowest and of the fastest vehicles that is trimmed from the mean speed."""
+MIN_HEIGHT_M = 1e-6
+"""Least height that has a logarithm."""
 MIN_SCALE_SIGMA = 1e-3
 """Least relative standard deviation of a source of scale: a height that is given as exact is not."""
 STEP_PX = 1e-3
@@ -110,10 +112,15 @@ def scale_sources(
     return found
 
 
+def relative_sigmas(sources: list[Scale], camera: Camera, normal: np.ndarray) -> np.ndarray:
+    """Return the standard deviations of the sources alone, relative to their heights, shape (sources,)."""
+    relative = [source.sigma / max(source.height(camera, normal), MIN_HEIGHT_M) for source in sources]
+    return np.maximum(relative, MIN_SCALE_SIGMA)
+
+
 def _combined(sources: list[Scale], camera: Camera, normal: np.ndarray) -> Scale:
     """Return the scale of several sources: the mean of their log heights, by their own variances."""
-    heights = np.array([source.height(camera, normal) for source in sources])
-    sigmas = np.maximum(np.array([source.sigma for source in sources]) / heights, MIN_SCALE_SIGMA)
+    sigmas = relative_sigmas(sources, camera, normal)
     weights = sigmas**-2 / float((sigmas**-2).sum())
 
     def height(lens: Camera, up: np.ndarray) -> float:

@@ -41,7 +41,7 @@ MESSAGE_EPOCH_NS = 1_700_000_000 * SECOND_NS
 SECOND_HALF = 'second_half'
 COMPARED_WITH = {'started_again': SECOND_HALF}
 """Faults that are compared with a part of the recording. Stamps that begin again are another recording, of a camera
-that may have moved: the evidence begins anew in the middle, and what is left is the second half.
+that may have moved: the evidence is reset in the middle, and that of the second half is left.
 """
 SHARE_SEEN = {'dropped_half': 0.5, 'replaced_1_in_2_jpeg': 0.5}
 """Share of the camera's images that are seen under faults that take away more than a few, 1 under the others. As many

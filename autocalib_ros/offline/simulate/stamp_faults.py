@@ -230,7 +230,7 @@ def started_again(exposures_ns: np.ndarray, random: np.random.Generator) -> Stam
 
 
 def second_half(exposures_ns: np.ndarray, random: np.random.Generator) -> StampedImages:
-    """Keep the images from the middle on: those that are left where the evidence begins anew there."""
+    """Keep the images from the middle on: those that count where the evidence is reset in the middle."""
     return _some(exposures_ns, np.arange(len(exposures_ns)) >= len(exposures_ns) // 2)
 
 
@@ -275,7 +275,7 @@ STAMP_FAULTS: dict[str, StampFault] = {
 }
 """Faults by name."""
 MESSAGE_FAULTS = ('seconds', 'constant', 'stopped', 'wrapped_in_seconds')
-"""Faults that only a message tells, by its time of receipt or by the nanoseconds in its header."""
+"""Faults that need a message to be mended: its time of receipt, or the nanoseconds in its header."""
 
 
 def by_message(fault: StampFault) -> StampFault:

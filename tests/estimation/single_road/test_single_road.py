@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pinhole_road import PINHOLE, ROAD, SIZE
 
 from autocalib_ros.config import JointOptions, LensOptions, Options
 from autocalib_ros.estimation.adjustment.lens_prior import lens_priors
@@ -19,17 +20,6 @@ from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_e
 from autocalib_ros.results.calibration import Calibration
 from solved_once import solve_once
 
-SIZE = (1280, 720)
-PINHOLE = Camera(*SIZE, 1000.0, (639.5, 359.5), (1 / 3, 2 / 15, 17 / 315, 62 / 2835))
-ROAD = Junction(
-    camera=PINHOLE,
-    road_angles_deg=(0.0,),
-    turning_fraction=0.0,
-    vehicles=40,
-    points_per_vehicle=2,
-    camera_from_ground=pose(18.0, 0.5, 20.0),
-    centre_m=(14.0, 0.0),
-)
 SQUARE = LensOptions(pixel_aspect=1.0)
 
 
