@@ -30,7 +30,7 @@ class GroundSigma:
         return next((grade for grade, limit in GRADE_LIMITS.items() if self.worst <= limit), 'assumed')
 
     def __str__(self) -> str:
-        return f'lengths along the view +- {100 * self.along:.2g} %, across it +- {100 * self.across:.2g} %'
+        return f'lengths along the view ± {100 * self.along:.2g} %, across it ± {100 * self.across:.2g} %'
 
 
 @dataclass(frozen=True)
