@@ -27,10 +27,10 @@ from autocalib_ros.estimation.straight.roads import (
     main_road,
 )
 from autocalib_ros.estimation.turning.turning_traffic import fit_turning_traffic
-from autocalib_ros.estimation.verification.gates import check_plane, check_straight_traffic
+from autocalib_ros.estimation.verification.gates import check_below_horizon, check_plane, check_straight_traffic
 from autocalib_ros.estimation.verification.ground_normal import AGREEMENT_SIGMAS, PlaneEstimate
 from autocalib_ros.estimation.verification.identifiability import lens_assumptions
-from autocalib_ros.geometry.ground_plane import MIN_FRACTION_BELOW_HORIZON, unsigned_angle_deg
+from autocalib_ros.geometry.ground_plane import unsigned_angle_deg
 from autocalib_ros.results.refusals import Reason, reason
 from autocalib_ros.results.statements import Statement, check
 from autocalib_ros.results.verification_table import VerificationRow, verified
@@ -91,8 +91,9 @@ def estimate_from_single_road(observations: Observations, config: AdjustmentConf
     if prior.focal_known and len(prior.free) and prior.sigma[0] > 0:
         found = found.compared_with_given(solve_under(prior.with_unknown_focal()))
     fit, plane = found.fit, PlaneEstimate.of(found.fit, tracks)
-    if plane.fraction_below_horizon < MIN_FRACTION_BELOW_HORIZON:
-        return reason('horizon', fraction=1 - plane.fraction_below_horizon, limit=1 - MIN_FRACTION_BELOW_HORIZON)
+    above = check_below_horizon(plane.fraction_below_horizon)
+    if above:
+        return above
     return Solution(
         fit,
         plane,

@@ -18,7 +18,7 @@ from autocalib_ros.estimation.single_road.posterior import road_posterior
 from autocalib_ros.estimation.straight.initialisation import solve_from_consensus
 from autocalib_ros.estimation.vehicle_edges.edge_mixture import EDGE_CORRELATION
 from autocalib_ros.estimation.vehicle_edges.transverse_edges import select_vehicle_edges
-from autocalib_ros.estimation.verification.gates import check_halves
+from autocalib_ros.estimation.verification.gates import check_halves, straight_fraction, turning_traffic_reason
 from autocalib_ros.estimation.verification.identifiability import (
     given_focal_assumption,
     lens_assumptions,
@@ -113,14 +113,11 @@ def solve_single_road(
 
 def _following(fit: Adjustment, tracks: TrackSet) -> float | Reason:
     """Return the share of the vehicles that follow the road; a reason if it is, or they are, too few."""
-    inliers = fit.inliers()
-    vehicles = len(np.unique(tracks.vehicles[inliers]))
+    vehicles = len(np.unique(tracks.vehicles[fit.inliers()]))
     if vehicles < MIN_ROAD_VEHICLES or not np.isfinite(fit.covariance).all():
         return reason('too_few_vehicles', 'single_road', vehicles=vehicles, limit=MIN_ROAD_VEHICLES)
-    following = float((tracks.vehicle_weight * inliers).sum() / max(tracks.vehicle_weight.sum(), 1e-9))
-    if following < MIN_FOLLOWING:
-        return reason('turning_traffic', 'one_road', fraction=following, limit=MIN_FOLLOWING, roads=1)
-    return following
+    following = straight_fraction(fit, tracks)
+    return turning_traffic_reason(fit, following, MIN_FOLLOWING) if following < MIN_FOLLOWING else following
 
 
 def _segments(evidence: Evidence, fit: Adjustment, tracks: TrackSet) -> tuple[DirectionMixture, DirectionMixture]:

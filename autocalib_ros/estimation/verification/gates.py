@@ -73,9 +73,9 @@ def check_straight_traffic(fit: Adjustment, contrast: float, tracks: TrackSet) -
     `contrast` is the support at the best trial focal length over that at the median one.
     """
     prior = fit.problem.config.prior
-    fraction = _straight_fraction(fit, tracks)
+    fraction = straight_fraction(fit, tracks)
     if fraction < MIN_STRAIGHT_FRACTION:
-        return _turning_traffic_reason(fit, fraction, MIN_STRAIGHT_FRACTION)
+        return turning_traffic_reason(fit, fraction, MIN_STRAIGHT_FRACTION)
     if contrast < MIN_FOCAL_CONTRAST and not (prior.family == 'distortion_free' and len(fit.state.angles_rad) > 1):
         return reason('no_agreement', contrast=contrast, limit=MIN_FOCAL_CONTRAST)
     return _check_horizon(fit, tracks)
@@ -98,14 +98,14 @@ def check_lens(
     if failed_check or (turned and motion_constrains_focal(fit)):
         return failed_check or ()
     needed = MIN_STRAIGHT_FRACTION if len(fit.state.angles_rad) > 1 else MIN_ONE_ROAD_FRACTION
-    fraction = _straight_fraction(fit, tracks, driving)
+    fraction = straight_fraction(fit, tracks, driving)
     if (
         needed == MIN_ONE_ROAD_FRACTION > fraction > MIN_KEPT_ROAD_FRACTION
         and lane_keeping_fraction(fit, evidence) > MIN_LANE_KEEPING_FRACTION
     ):
         needed = MIN_KEPT_ROAD_FRACTION
     share = verified('straight_share', fraction, needed)
-    return (share,) if share.passed else _turning_traffic_reason(fit, fraction, needed)
+    return (share,) if share.passed else turning_traffic_reason(fit, fraction, needed)
 
 
 def check_markings_view(fit: Adjustment, tracks: TrackSet) -> Reason | None:
@@ -115,13 +115,14 @@ def check_markings_view(fit: Adjustment, tracks: TrackSet) -> Reason | None:
 
 def _check_horizon(fit: Adjustment, tracks: TrackSet) -> Reason | None:
     _, fraction_below_horizon = orient_above_traffic(fit.state.rotation[:, 2], fit.state.camera, tracks)
-    if not fit.plane_known or fraction_below_horizon >= MIN_FRACTION_BELOW_HORIZON:
+    return check_below_horizon(fraction_below_horizon) if fit.plane_known else None
+
+
+def check_below_horizon(fraction: float) -> Reason | None:
+    """Check the fraction of the tracked points that lie below the horizon of a plane."""
+    if fraction >= MIN_FRACTION_BELOW_HORIZON:
         return None
-    return _above_horizon_reason(fraction_below_horizon)
-
-
-def _above_horizon_reason(fraction_below_horizon: float) -> Reason:
-    return reason('horizon', fraction=1 - fraction_below_horizon, limit=1 - MIN_FRACTION_BELOW_HORIZON)
+    return reason('horizon', fraction=1 - fraction, limit=1 - MIN_FRACTION_BELOW_HORIZON)
 
 
 def motion_constrains_focal(fit: Adjustment) -> bool:
@@ -132,7 +133,8 @@ def motion_constrains_focal(fit: Adjustment) -> bool:
     return bool(sigma_without_prior(fit.turning_information, known)[0] < MAX_MOTION_FOCAL_SIGMA)
 
 
-def _straight_fraction(fit: Adjustment, tracks: TrackSet, driving: np.ndarray | None = None) -> float:
+def straight_fraction(fit: Adjustment, tracks: TrackSet, driving: np.ndarray | None = None) -> float:
+    """Return the fraction of the vehicles that follow the roads; `driving` is a mask (tracks,) of those that count."""
     weight = tracks.vehicle_weight if driving is None else tracks.vehicle_weight * driving
     return float((weight * fit.inliers()).sum() / max(weight.sum(), 1e-9))
 
@@ -149,7 +151,8 @@ def lane_keeping_fraction(fit: Adjustment, evidence: Evidence) -> float:
     return float(kept.sum() / following.sum()) if following.sum() >= MIN_VEHICLES_PER_ROAD else 0.0
 
 
-def _turning_traffic_reason(fit: Adjustment, fraction: float, limit: float) -> Reason:
+def turning_traffic_reason(fit: Adjustment, fraction: float, limit: float) -> Reason:
+    """Return the refusal of roads that only a `fraction` of the vehicles follow, less than `limit`."""
     roads = len(fit.state.angles_rad)
     return reason('turning_traffic', '' if roads > 1 else 'one_road', fraction=fraction, limit=limit, roads=roads)
 
@@ -193,8 +196,9 @@ def check_plane(plane: PlaneEstimate, gate: GateOptions) -> Reason | None:
     sigma = plane.worst_sigma_deg
     if isinstance(plane.assumed, LevelCamera) and not plane.assumed.constrains_plane(plane.fit.state):
         return reason('plane_uncertain', 'level_road')
-    if plane.assumed is not None and plane.fraction_below_horizon < MIN_FRACTION_BELOW_HORIZON:
-        return _above_horizon_reason(plane.fraction_below_horizon)
+    above = None if plane.assumed is None else check_below_horizon(plane.fraction_below_horizon)
+    if above:
+        return above
     if not sigma <= gate.max_sigma_tilt_deg:
         return reason('plane_uncertain', sigma_deg=min(sigma, 90.0), limit_deg=gate.max_sigma_tilt_deg)
     return None
