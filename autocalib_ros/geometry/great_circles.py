@@ -139,7 +139,12 @@ def fit_circles(rays: Rays, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def circle_scatter(rays: Rays, weights: np.ndarray) -> np.ndarray:
-    """Return each track's scatter (tracks, 3, 3) at the pixel scale of its own best great circle.
+    """Return each track's scatter (tracks, 3, 3) at the pixel scale of its own best great circle."""
+    return scatter(rays, weights, circle_pixel_scale(rays, weights))
+
+
+def circle_pixel_scale(rays: Rays, weights: np.ndarray) -> np.ndarray:
+    """Return pixels per unit of n.b (tracks, samples) at each track's best great circle.
 
     The scale depends on the circle: two fixed-point iterations from scale 1.
     """
@@ -147,7 +152,7 @@ def circle_scatter(rays: Rays, weights: np.ndarray) -> np.ndarray:
     for _ in range(2):
         normals, _ = smallest_eigenvectors(scatter(rays, weights, scale))
         scale = rays.pixel_scale(normals[:, None])
-    return scatter(rays, weights, scale)
+    return scale
 
 
 def orthonormal_basis(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

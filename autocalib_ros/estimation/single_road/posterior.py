@@ -19,8 +19,9 @@ from scipy.special import logsumexp, softmax
 from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment, adjust
 from autocalib_ros.estimation.adjustment.lens_prior import DISTORTION_FREE, LensPrior, known_lens
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig, AdjustmentState, Parameterisation
-from autocalib_ros.estimation.observations.track_set import TrackSet, UnprojectedTracks
+from autocalib_ros.estimation.observations.track_set import TrackSet
 from autocalib_ros.estimation.single_road.barrel_lens import MAX_KAPPA, MIN_KAPPA, LensChoice
+from autocalib_ros.estimation.single_road.bent_road import BEND_LOG_PRIOR, BENDS, BentRoad
 from autocalib_ros.estimation.single_road.direction_mixture import (
     MIXTURE_ROUNDS,
     SEARCHED_TURNS_RAD,
@@ -32,8 +33,10 @@ from autocalib_ros.estimation.single_road.direction_mixture import (
 )
 from autocalib_ros.estimation.vehicle_edges.edge_mixture import SYSTEMATIC_SIGMA_RAD
 from autocalib_ros.geometry.great_circles import (
+    circle_pixel_scale,
     orthonormal_basis,
     quadratic_forms,
+    scatter,
     squared_distances,
     unproject_rays,
 )
@@ -46,6 +49,8 @@ REWEIGHTINGS = 4
 ROAD_OFFSETS = np.stack(np.meshgrid(*2 * (np.arange(-2.0, 3.0),)), axis=-1).reshape(-1, 2)
 SEARCH_REACH_RAD = 0.12 * 0.55 ** np.arange(11)
 """Offsets of the search for the direction of the road, in units of its reach; and the reach, round by round."""
+BEND_SEARCH = 5
+"""Rounds of the search that are left out about the direction of the straight road."""
 TEMPER = 0.5
 """Share of the log likelihood of edges and lines that counts: those of one scene repeat each other. Judgement."""
 TRACK_FREEDOM = 1.0
@@ -172,7 +177,8 @@ def road_posterior(
     `fit` is a solution of the road by any lens, `tracks` those by which lenses are compared. `segments` are vehicle
     edges and still lines, either may be empty; `roll_sigma_rad` is the standard deviation of the roll.
     """
-    scene, solve = _RoadScene(segments, roll_sigma_rad), _RoadThrough(fit, tracks)
+    scene, straight = _RoadScene(segments, roll_sigma_rad), _RoadThrough(fit, tracks, bends=False)
+    solve = replace(straight, turn_rad=scene.fitted_to(_node(straight, fit.state.camera, 0.0)).turn, bends=True)
     focals = choice.focal_lengths()
     fitted, nodes = _solve_grid(scene, solve, choice, focals)
     mean, sigma = _focal_moments(nodes)
@@ -256,6 +262,10 @@ class _RoadThrough:
 
     start: Adjustment
     tracks: TrackSet
+    turn_rad: float = 0.0
+    """Turn of the plane about the road, at which bends are tried."""
+    bends: bool = True
+    """Whether the road may bend."""
 
     @cached_property
     def scale(self) -> float:
@@ -271,26 +281,45 @@ class _RoadThrough:
         """Return the direction (3,) of the road through a lens, and the negative log likelihood of the tracks.
 
         By distances in the image, with one scale for all lenses: a longer lens does not gain by deviations that are
-        given as angles. Found by a search that narrows about the place where the road vanishes.
+        given as angles. Found by a search that narrows about the place where the road vanishes. A bend of the road is
+        integrated out: it looks like barrel distortion.
         """
-        state, matrix = self.start.state, UnprojectedTracks.through(camera, self.tracks).matrix
-        forms, cost = quadratic_forms(matrix), np.inf
+        state, samples = self.start.state, self.tracks.weights
+        rays = unproject_rays(camera, self.tracks.pixels)
+        scale = circle_pixel_scale(rays, samples)
+        matrix = scatter(rays, samples, scale)
         # the road vanishes in the same place of the image, or where most planes through tracks and camera meet
         place = unproject_rays(camera, state.camera.project(state.directions[:1])[0]).bearings[0]
+        straight = quadratic_forms(matrix)
         starts = np.array([place, _common_direction(smallest_eigenvectors(matrix)[0], self.weights)])
-        along = starts[np.argmin(self._losses(forms, starts))]
+        along = starts[np.argmin(self._losses(straight, starts))]
         along = along * (np.sign(along @ state.directions[0]) or 1.0)
-        for reach in SEARCH_REACH_RAD:
+        along, cost = self._search(straight, along, SEARCH_REACH_RAD)
+        if not self.bends:
+            return along, cost
+        bent = BentRoad.about(rays, samples * scale * scale, along, self.turn_rad, self.weights)
+        likeliest = int(np.argmin(self._bend_costs(bent, along)))
+        along, _ = self._search(bent.forms(BENDS[[likeliest]]), along, SEARCH_REACH_RAD[BEND_SEARCH:])
+        return along, -float(logsumexp(-self._bend_costs(bent, along)))
+
+    def _search(self, forms: np.ndarray, along: np.ndarray, reaches: np.ndarray) -> tuple[np.ndarray, float]:
+        """Return the most probable direction (3,) near `along`, and its negative log likelihood."""
+        cost = np.inf
+        for reach in reaches:
             tried = along + reach * ROAD_OFFSETS @ orthonormal_basis(along)
             tried /= np.linalg.norm(tried, axis=1, keepdims=True)
             costs = self._losses(forms, tried)
             along, cost = tried[np.argmin(costs)], float(costs.min())
         return along, cost
 
+    def _bend_costs(self, bent: BentRoad, along: np.ndarray) -> np.ndarray:
+        """Return the negative log of likelihood and prior probability of each of `BENDS`, at one direction (3,)."""
+        return self._losses(bent.forms(BENDS), along[None]) - BEND_LOG_PRIOR
+
     def _losses(self, forms: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Return the negative log likelihood at directions (n, 3), shape (n,)."""
-        loss = geman_mcclure_bounded_loss(squared_distances(forms, directions) / self.scale, ROBUST_LIMIT)
-        return loss @ self.weights
+        """Return the negative log likelihood at directions (n, 3), or at one for the forms of n bends, shape (n,)."""
+        distances = squared_distances(forms, directions).reshape(-1, len(self.weights))
+        return geman_mcclure_bounded_loss(distances / self.scale, ROBUST_LIMIT) @ self.weights
 
     def adjusted(self, node: _Node) -> Adjustment:
         """Return the adjustment of the road through a lens, with its covariance."""
