@@ -111,11 +111,13 @@ def estimate_from_single_road(observations: Observations, config: AdjustmentConf
 def with_single_road(found: Solution | Reason, single: Solution | Reason) -> Solution | Reason:
     """Return a solution of a single road, or what was found if that is more certain by other traffic than straight one.
 
-    Straight traffic on one road shows how much the lens curves, and no focal length but for an assumed lens family.
-    Where both have a plane they are compared.
+    Straight traffic on one road shows how much the lens curves, and no focal length but for an assumed lens family: a
+    solution by that assumption stands and falls with that of the wider family. Where both have a plane they are
+    compared.
     """
     if isinstance(single, Reason):
-        return append_reason(found, single)
+        assumed = isinstance(found, Solution) and not found.fit.plane_known and len(found.fit.problem.config.prior.free)
+        return single if assumed else append_reason(found, single)
     if isinstance(found, Reason) or found.plane_refusal:
         return single
     difference_deg = unsigned_angle_deg(found.plane.normal(found.fit.state), single.plane.normal(single.fit.state))

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from autocalib_ros.estimation.adjustment.parameters import level_normal
 from autocalib_ros.estimation.markings.road_segments import ProjectedSegments
+from autocalib_ros.estimation.single_road.bent_road import Bend, across_and_up
 from autocalib_ros.geometry.great_circles import SegmentRays
 from autocalib_ros.geometry.robust_kernels import student_density, student_weight
 from autocalib_ros.geometry.small_matrices import cross
@@ -73,8 +73,8 @@ class DirectionMixture:
     """Spreads; None: the geometric mean of their limits."""
     tilts: Tilts = Tilts()
 
-    def through(self, camera: Camera, along: np.ndarray) -> SeenSegments:
-        """Return the segments as seen through a lens about a road with the direction `along` (3,)."""
+    def through(self, camera: Camera, along: np.ndarray, bend: Bend | None = None) -> SeenSegments:
+        """Return the segments as seen through a lens about a road with the direction `along` (3,), or along a bend."""
         segments = SegmentRays.through(camera, self.ends_px)
         length2 = np.maximum((segments.along * segments.along).sum(axis=1), 1e-30)
         moved = cross(segments.along, segments.aside)
@@ -82,7 +82,7 @@ class DirectionMixture:
         noise = self.kind.end_sigma_px * np.sqrt(2.0) / segments.lengths_px
         bearings, forward = segments.rays.bearings, segments.along / np.sqrt(length2)[:, None]
         projected = ProjectedSegments(bearings, forward, cross(bearings, forward))
-        return SeenSegments(projected, along, stretch, noise)
+        return SeenSegments(projected if bend is None else bend.straightened(projected), along, stretch, noise)
 
     @property
     def spreads(self) -> np.ndarray:
@@ -167,12 +167,3 @@ class SeenSegments:
             ]
             leverages[index] = np.hypot(*changes)
         return residuals, leverages
-
-
-def across_and_up(along: np.ndarray, turns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the directions across a road (3,) and up from it at turns (t,) from a level camera, shape (t, 3) each."""
-    up = level_normal(along)
-    up = -up if up[1] > 0 else up
-    level = np.cross(up, along)
-    cosine, sine = np.cos(turns)[:, None], np.sin(turns)[:, None]
-    return cosine * level + sine * up, cosine * up - sine * level

@@ -9,19 +9,21 @@ grid, so that the standard deviations cover all lenses and planes that the evide
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 from scipy.special import logsumexp, softmax
 
-from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment, adjust
-from autocalib_ros.estimation.adjustment.lens_prior import DISTORTION_FREE, LensPrior, known_lens
+from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment
+from autocalib_ros.estimation.adjustment.lens_prior import DISTORTION_FREE, LensPrior
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig, AdjustmentState, Parameterisation
 from autocalib_ros.estimation.observations.track_set import TrackSet
 from autocalib_ros.estimation.single_road.barrel_lens import MAX_KAPPA, MIN_KAPPA, LensChoice
-from autocalib_ros.estimation.single_road.bent_road import BEND_LOG_PRIOR, BENDS, BentRoad
+from autocalib_ros.estimation.single_road.bent_road import (
+    Bend,
+    across_and_up,
+)
 from autocalib_ros.estimation.single_road.direction_mixture import (
     MIXTURE_ROUNDS,
     SEARCHED_TURNS_RAD,
@@ -29,35 +31,16 @@ from autocalib_ros.estimation.single_road.direction_mixture import (
     DirectionMixture,
     SeenSegments,
     Tilts,
-    across_and_up,
 )
+from autocalib_ros.estimation.single_road.road_through_lens import RoadThrough
 from autocalib_ros.estimation.vehicle_edges.edge_mixture import SYSTEMATIC_SIGMA_RAD
 from autocalib_ros.geometry.great_circles import (
-    circle_pixel_scale,
-    orthonormal_basis,
-    quadratic_forms,
-    scatter,
-    squared_distances,
     unproject_rays,
 )
-from autocalib_ros.geometry.robust_kernels import cauchy_weight, geman_mcclure_bounded_loss
-from autocalib_ros.geometry.small_matrices import smallest_eigenvectors
 from autocalib_ros.lens.camera import Camera
 
-REWEIGHTINGS = 4
-"""Rounds of the search for the direction where most planes meet."""
-ROAD_OFFSETS = np.stack(np.meshgrid(*2 * (np.arange(-2.0, 3.0),)), axis=-1).reshape(-1, 2)
-SEARCH_REACH_RAD = 0.12 * 0.55 ** np.arange(11)
-"""Offsets of the search for the direction of the road, in units of its reach; and the reach, round by round."""
-BEND_SEARCH = 5
-"""Rounds of the search that are left out about the direction of the straight road."""
 TEMPER = 0.5
 """Share of the log likelihood of edges and lines that counts: those of one scene repeat each other. Judgement."""
-TRACK_FREEDOM = 1.0
-"""Independent observations that a straight track counts as: drivers keep their lane, and follow bends, together."""
-MIN_DISTANCE_PX, ROBUST_LIMIT = 0.2, 4.0
-"""Least typical distance of a track from its path, and the squared distance, in units of the typical one, at which a
-track weighs a quarter."""
 KAPPA_NODES = 4
 """Curvatures at each focal length, within 2.5 standard deviations of what straight tracks show."""
 MIN_SPACINGS, FINER_SHIFTS = 1.5, np.linspace(-2.5, 2.5, 16)
@@ -93,6 +76,8 @@ class _Node:
     camera: Camera
     along: np.ndarray
     """Direction of the road through this lens, from straight tracks, shape (3,)."""
+    bend: Bend | None
+    """The likeliest bend of the road; None: the road is straight."""
     log_weight: float
     """Log prior and likelihood of the tracks, times the width of the node."""
     turns: np.ndarray
@@ -123,7 +108,7 @@ class _RoadScene:
 
     def fitted_to(self, node: _Node) -> _FittedScene:
         """Fit shares and spreads through a lens, and find the best turn."""
-        seen = tuple(mixture.through(node.camera, node.along) for mixture in self.mixtures)
+        seen = tuple(mixture.through(node.camera, node.along, node.bend) for mixture in self.mixtures)
         fitted = _FittedScene(self, node, self.mixtures, seen, 0.0)
         turns = SEARCHED_TURNS_RAD
         for _ in range(MIXTURE_ROUNDS):
@@ -177,27 +162,26 @@ def road_posterior(
     `fit` is a solution of the road by any lens, `tracks` those by which lenses are compared. `segments` are vehicle
     edges and still lines, either may be empty; `roll_sigma_rad` is the standard deviation of the roll.
     """
-    scene, straight = _RoadScene(segments, roll_sigma_rad), _RoadThrough(fit, tracks, bends=False)
-    solve = replace(straight, turn_rad=scene.fitted_to(_node(straight, fit.state.camera, 0.0)).turn, bends=True)
+    scene, solve = _RoadScene(segments, roll_sigma_rad), RoadThrough(fit, tracks)
     focals = choice.focal_lengths()
     fitted, nodes = _solve_grid(scene, solve, choice, focals)
     mean, sigma = _focal_moments(nodes)
     spacing = float(np.log(focals[1] / focals[0])) if len(focals) > 1 else 0.0
     if sigma < MIN_SPACINGS * spacing:
         fitted, nodes = _solve_grid(scene, solve, choice, np.exp(mean + spacing * FINER_SHIFTS))
-    base = scene.fitted_to(_mean_node(nodes, solve, choice)).weighed()
+    base = _mean_node(nodes, scene, solve, choice)
     parameters = _parameters(base, fit.problem.config, _published_prior(choice, base.camera))
     covariance = _covariance(fitted, nodes, parameters) + _prior_covariance(parameters, tracks)
     turns = slice(parameters.lens + 1, parameters.lens + 3)
-    covariance[turns, turns] += _road_covariance(parameters.base, solve.adjusted(base))
+    covariance[turns, turns] += _road_covariance(parameters.base, solve.adjusted(base.camera, base.along))
     return parameters, covariance
 
 
 def _solve_grid(
-    scene: _RoadScene, solve: _RoadThrough, choice: LensChoice, focals: np.ndarray
+    scene: _RoadScene, solve: RoadThrough, choice: LensChoice, focals: np.ndarray
 ) -> tuple[list[_FittedScene], list[_Node]]:
     """Return the scene through each lens of a grid of focal lengths (n,), and the lenses with their turns weighed."""
-    fitted = [scene.fitted_to(node) for node in _lens_nodes(solve, choice, focals)]
+    fitted = [scene.fitted_to(node) for node in _lens_nodes(scene, solve, choice, focals)]
     return fitted, [each.weighed() for each in fitted]
 
 
@@ -230,16 +214,28 @@ def _published_prior(choice: LensChoice, camera: Camera) -> LensPrior:
     return replace(choice.prior, family='barrel', centre=camera, sigma=sigma)
 
 
-def _lens_nodes(solve: _RoadThrough, choice: LensChoice, focals: np.ndarray) -> list[_Node]:
+def _lens_nodes(scene: _RoadScene, solve: RoadThrough, choice: LensChoice, focals: np.ndarray) -> list[_Node]:
     """Return the lenses of the grid of focal lengths (n,), with the direction of the road through each."""
     if choice.known:
         return [_node(solve, choice.prior.centre, 0.0)]
-    nodes = [node for focal_px in focals.tolist() for node in _curvature_nodes(solve, choice, focal_px)]
+    nodes = [
+        node
+        for focal_px in focals.tolist()
+        for node in _curvature_nodes(_with_bends(solve, focal_px, scene, choice), choice, focal_px)
+    ]
     best = max(node.log_weight for node in nodes)
     return [node for node in nodes if node.log_weight > best - MAX_NATS_BEHIND]
 
 
-def _curvature_nodes(solve: _RoadThrough, choice: LensChoice, focal_px: float) -> list[_Node]:
+def _with_bends(solve: RoadThrough, focal_px: float, scene: _RoadScene, choice: LensChoice) -> RoadThrough:
+    """Return the same for a road that may bend: in a level plane, or in that of the scene at a focal length."""
+    lens = solve.start.state.camera
+    kappa = 1.0 - (1.0 - lens.k[0] / DISTORTION_FREE[0]) * (focal_px / lens.focal_px) ** 2  # of the same barrel
+    camera = choice.lens(focal_px, float(np.clip(kappa, MIN_KAPPA, MAX_KAPPA)))
+    return solve.on_planes((0.0, scene.fitted_to(_node(solve, camera, 0.0)).turn))
+
+
+def _curvature_nodes(solve: RoadThrough, choice: LensChoice, focal_px: float) -> list[_Node]:
     """Return the lenses of one focal length, about the curvature that straight tracks show."""
     tried = np.linspace(MIN_KAPPA, MAX_KAPPA, KAPPA_TRIALS)
     costs = np.array([solve(choice.lens(focal_px, kappa))[1] for kappa in tried.tolist()])
@@ -256,92 +252,9 @@ def _curvature_nodes(solve: _RoadThrough, choice: LensChoice, focal_px: float) -
     ]
 
 
-@dataclass(frozen=True)
-class _RoadThrough:
-    """Finds the direction of the road through a given lens."""
-
-    start: Adjustment
-    tracks: TrackSet
-    turn_rad: float = 0.0
-    """Turn of the plane about the road, at which bends are tried."""
-    bends: bool = True
-    """Whether the road may bend."""
-
-    @cached_property
-    def scale(self) -> float:
-        """Typical squared distance of a track from its path, px^2."""
-        return max(float(np.median(self.start.distance_px[self.start.inliers()] ** 2)), MIN_DISTANCE_PX**2)
-
-    @cached_property
-    def weights(self) -> np.ndarray:
-        """Independent observations that each track counts as, shape (tracks,)."""
-        return 0.5 * TRACK_FREEDOM * self.tracks.kish_weight(self.start.problem.config.vehicle_correlation)
-
-    def __call__(self, camera: Camera) -> tuple[np.ndarray, float]:
-        """Return the direction (3,) of the road through a lens, and the negative log likelihood of the tracks.
-
-        By distances in the image, with one scale for all lenses: a longer lens does not gain by deviations that are
-        given as angles. Found by a search that narrows about the place where the road vanishes. A bend of the road is
-        integrated out: it looks like barrel distortion.
-        """
-        state, samples = self.start.state, self.tracks.weights
-        rays = unproject_rays(camera, self.tracks.pixels)
-        scale = circle_pixel_scale(rays, samples)
-        matrix = scatter(rays, samples, scale)
-        # the road vanishes in the same place of the image, or where most planes through tracks and camera meet
-        place = unproject_rays(camera, state.camera.project(state.directions[:1])[0]).bearings[0]
-        straight = quadratic_forms(matrix)
-        starts = np.array([place, _common_direction(smallest_eigenvectors(matrix)[0], self.weights)])
-        along = starts[np.argmin(self._losses(straight, starts))]
-        along = along * (np.sign(along @ state.directions[0]) or 1.0)
-        along, cost = self._search(straight, along, SEARCH_REACH_RAD)
-        if not self.bends:
-            return along, cost
-        bent = BentRoad.about(rays, samples * scale * scale, along, self.turn_rad, self.weights)
-        likeliest = int(np.argmin(self._bend_costs(bent, along)))
-        along, _ = self._search(bent.forms(BENDS[[likeliest]]), along, SEARCH_REACH_RAD[BEND_SEARCH:])
-        return along, -float(logsumexp(-self._bend_costs(bent, along)))
-
-    def _search(self, forms: np.ndarray, along: np.ndarray, reaches: np.ndarray) -> tuple[np.ndarray, float]:
-        """Return the most probable direction (3,) near `along`, and its negative log likelihood."""
-        cost = np.inf
-        for reach in reaches:
-            tried = along + reach * ROAD_OFFSETS @ orthonormal_basis(along)
-            tried /= np.linalg.norm(tried, axis=1, keepdims=True)
-            costs = self._losses(forms, tried)
-            along, cost = tried[np.argmin(costs)], float(costs.min())
-        return along, cost
-
-    def _bend_costs(self, bent: BentRoad, along: np.ndarray) -> np.ndarray:
-        """Return the negative log of likelihood and prior probability of each of `BENDS`, at one direction (3,)."""
-        return self._losses(bent.forms(BENDS), along[None]) - BEND_LOG_PRIOR
-
-    def _losses(self, forms: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Return the negative log likelihood at directions (n, 3), or at one for the forms of n bends, shape (n,)."""
-        distances = squared_distances(forms, directions).reshape(-1, len(self.weights))
-        return geman_mcclure_bounded_loss(distances / self.scale, ROBUST_LIMIT) @ self.weights
-
-    def adjusted(self, node: _Node) -> Adjustment:
-        """Return the adjustment of the road through a lens, with its covariance."""
-        state, config = self.start.state, self.start.problem.config
-        turn, _ = Rotation.align_vectors(node.along[None], state.directions[:1])
-        moved = AdjustmentState(node.camera, turn.as_matrix() @ state.rotation, np.zeros(1))
-        return adjust(moved, self.tracks, replace(config, prior=known_lens(node.camera)), refine=True)
-
-
-def _common_direction(normals: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return the direction (3,) that is perpendicular to most unit normals (n, 3), by iterated reweighting."""
-    kept = weights
-    for _ in range(REWEIGHTINGS):
-        along = np.linalg.eigh((normals * kept[:, None]).T @ normals)[1][:, 0]
-        off = np.abs(normals @ along)
-        kept = weights * cauchy_weight((off / max(float(np.median(off)), 1e-6)) ** 2)
-    return along
-
-
-def _node(solve: _RoadThrough, camera: Camera, log_weight: float) -> _Node:
-    along, cost = solve(camera)
-    return _Node(camera, along, log_weight - cost, np.zeros(1), np.zeros(1))
+def _node(solve: RoadThrough, camera: Camera, log_weight: float) -> _Node:
+    along, cost, bend = solve(camera)
+    return _Node(camera, along, bend, log_weight - cost, np.zeros(1), np.zeros(1))
 
 
 def _weights(nodes: list[_Node]) -> np.ndarray:
@@ -356,11 +269,13 @@ def _focal_moments(nodes: list[_Node]) -> tuple[float, float]:
     return mean, float(np.sqrt(weights @ (logs - mean) ** 2))
 
 
-def _mean_node(nodes: list[_Node], solve: _RoadThrough, choice: LensChoice) -> _Node:
+def _mean_node(nodes: list[_Node], scene: _RoadScene, solve: RoadThrough, choice: LensChoice) -> _Node:
     """Return the node at the mean log focal length and the mean curvature."""
     focal_px = float(np.exp(_focal_moments(nodes)[0]))
     kappa = float(_weights(nodes) @ [node.camera.k[0] for node in nodes]) / DISTORTION_FREE[0]
-    return _node(solve, choice.lens(focal_px, kappa), 0.0)
+    return scene.fitted_to(
+        _node(_with_bends(solve, focal_px, scene, choice), choice.lens(focal_px, kappa), 0.0)
+    ).weighed()
 
 
 def _state_at(node: _Node, turn: float) -> AdjustmentState:

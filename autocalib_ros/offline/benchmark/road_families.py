@@ -63,11 +63,12 @@ def single_road_jam(generator: np.random.Generator) -> tuple[Junction, Evidence]
 
 def single_road_bend(generator: np.random.Generator) -> tuple[Junction, Evidence]:
     """Draw a road that bends: there is no straight part."""
-    radius_m, towards_rad = generator.uniform(80.0, 400.0), generator.choice([-1.0, 1.0]) * np.pi / 2
-    curve = partial(drive_bend, radius_m=float(radius_m), towards_rad=float(towards_rad))
+    radius_m, side = float(generator.uniform(80.0, 400.0)), float(generator.choice([-1.0, 1.0]))
+    curve = partial(drive_bend, radius_m=radius_m, towards_rad=side * np.pi / 2)
     junction = replace(_road(generator), drive=curve)
     evidence = synthetic_evidence(junction, generator)
-    return junction, _with_segments(junction, evidence, generator)
+    middle_m = np.array(junction.centre_m) + [0.0, side * radius_m]
+    return junction, _with_segments(junction, evidence, generator, middle_m)
 
 
 def _road(generator: np.random.Generator) -> Junction:
@@ -101,16 +102,23 @@ class _Leaning:
         columns = np.eye(3) + np.array([[0.0, 0.0, grade], [0.0, 0.0, lean], [0.0, across, 0.0]])
         return cls(columns / np.linalg.norm(columns, axis=0))
 
-    def draw(self, count: int, spread_deg: float, generator: np.random.Generator) -> np.ndarray:
-        """Draw directions (count, 3): a third of each kind, with a spread, and some of any direction."""
+    def draw(self, headings_rad: np.ndarray, spread_deg: float, generator: np.random.Generator) -> np.ndarray:
+        """Draw directions (n, 3) where the road has headings (n,): a third of each kind with a spread, some any."""
+        count = len(headings_rad)
         chosen = self.directions.T[generator.integers(0, 3, count)]
+        cosine, sine = np.cos(headings_rad), np.sin(headings_rad)
+        x, y = chosen[:, 0], chosen[:, 1]
+        chosen = np.column_stack([cosine * x - sine * y, sine * x + cosine * y, chosen[:, 2]])
         chosen = chosen + np.radians(spread_deg) * generator.normal(size=(count, 3))
         clutter = generator.uniform(size=count) < CLUTTER
         chosen[clutter] = generator.normal(size=(int(clutter.sum()), 3))
         return chosen / np.linalg.norm(chosen, axis=1, keepdims=True)
 
 
-def _with_segments(junction: Junction, evidence: Evidence, generator: np.random.Generator) -> Evidence:
+def _with_segments(
+    junction: Junction, evidence: Evidence, generator: np.random.Generator, middle_m: np.ndarray | None = None
+) -> Evidence:
+    """Add edges of vehicles and still lines to evidence of a straight road, or of a bend about `middle_m` (2,)."""
     bodies = _Leaning.drawn(generator, COMMON_ACROSS_DEG, COMMON_UPRIGHT_DEG, 0.0)
     scenery = _Leaning.drawn(generator, 0.0, GROUND_DEG, GROUND_DEG)
     ends, owners, times = [], [], []
@@ -121,14 +129,16 @@ def _with_segments(junction: Junction, evidence: Evidence, generator: np.random.
             continue
         count = EDGES_PER_VEHICLE // 2
         starts = place + generator.uniform([-2.0, -0.9, 0.2], [2.0, 0.9, 1.4], (count, 3))
-        found = _seen(junction, starts, 1.2 * bodies.draw(count, EDGE_SPREAD_DEG, generator), generator)
+        headings = np.full(count, _heading_rad(place[None], middle_m)[0])
+        found = _seen(junction, starts, 1.2 * bodies.draw(headings, EDGE_SPREAD_DEG, generator), generator)
         ends.append(found)
         owners.append(np.full(len(found), track.vehicle))
         times.append(np.full(len(found), track.times_s[sample]))
     height = junction.height_m
     near = np.column_stack([generator.uniform(1.0, 8.0, LINES), generator.uniform(-4.0, 4.0, LINES)]) * height
     starts = np.column_stack([near, np.zeros(LINES)])
-    lines = _seen(junction, starts, 2.5 * scenery.draw(LINES, LINE_SPREAD_DEG, generator), generator)
+    headings = _heading_rad(starts, middle_m)
+    lines = _seen(junction, starts, 2.5 * scenery.draw(headings, LINE_SPREAD_DEG, generator), generator)
     return replace(
         evidence,
         edges_px=np.concatenate([np.zeros((0, 4)), *ends]),
@@ -136,6 +146,14 @@ def _with_segments(junction: Junction, evidence: Evidence, generator: np.random.
         edge_times_s=np.concatenate([np.zeros(0), *times]),
         still_lines_px=lines,
     )
+
+
+def _heading_rad(places_m: np.ndarray, middle_m: np.ndarray | None) -> np.ndarray:
+    """Return the heading (n,) of a road along x, or of a bend about `middle_m` (2,), at places (n, 3)."""
+    if middle_m is None:
+        return np.zeros(len(places_m))
+    away = places_m[:, :2] - middle_m
+    return np.arctan(-away[:, 0] / away[:, 1])
 
 
 def _ground_place(junction: Junction, track: Track, sample: int) -> np.ndarray | None:

@@ -9,10 +9,10 @@ from pinhole_road import PINHOLE, ROAD, SIZE
 from autocalib_ros.config import JointOptions, LensOptions, Options
 from autocalib_ros.estimation.adjustment.lens_prior import lens_priors
 from autocalib_ros.estimation.single_road.barrel_lens import LensChoice, barrel_coefficients
+from autocalib_ros.estimation.single_road.bent_road import across_and_up
 from autocalib_ros.estimation.single_road.direction_mixture import (
     STILL_SEGMENTS,
     DirectionMixture,
-    across_and_up,
 )
 from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera
