@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -14,8 +15,10 @@ import pytest
 
 import autocalib_ros
 from autocalib_ros.cli import main
+from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.lens.camera_info_yaml import write_camera_info_yaml
+from autocalib_ros.offline.recordings.videos import VideoSource
 
 
 @pytest.fixture
@@ -239,6 +242,25 @@ def test_an_interrupt_ends_quietly(still_video, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr('autocalib_ros.offline.recordings.open.open_source', interrupted)
     assert main(['replay', str(still_video), '--out', str(tmp_path / 'out')]) == 130
     assert 'Traceback' not in capsys.readouterr().err
+
+
+def test_the_first_interrupt_solves_and_the_second_leaves(still_video, tmp_path, monkeypatch, capfd):
+    frames, interrupts = VideoSource.frames, [5]
+
+    def interrupted_frames(source):
+        for index, frame in enumerate(frames(source)):
+            for _ in range(interrupts.count(index)):
+                os.kill(os.getpid(), signal.SIGINT)
+            yield frame
+
+    monkeypatch.setattr(VideoSource, 'frames', interrupted_frames)
+    out = tmp_path / 'out'
+    assert main(['replay', str(still_video), '--out', str(out)]) == 3
+    assert 'Ctrl-C again leaves at once' in (told := capfd.readouterr().err) and 'Stopped after 6 images' in told
+    assert Evidence.load(out / 'evidence.npz').frames <= 6
+    interrupts.append(5)
+    assert main(['replay', str(still_video), '--out', str(out)]) == 130
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_json_is_calibration_json_and_the_rest_goes_to_stderr(still_video, tmp_path, capsys):

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from autocalib_ros.commands.interruption import first_interrupt_stops
 from autocalib_ros.config import Options
 
 if TYPE_CHECKING:
@@ -31,19 +32,33 @@ def replay_and_report(
     json: bool = False,
 ) -> ReplayResult:
     """Replay a recording, write the output files and print the result."""
-    from autocalib_ros.offline.outputs import write_outputs
+    from autocalib_ros.offline.outputs import EvidenceFile, write_outputs
     from autocalib_ros.offline.replay_recording import replay
     from autocalib_ros.offline.terminal.progress import progress_bar
 
     if not quiet:
         warn_missing_scale(options, lens)
-    with progress_bar(source.total, 'images', 'replay', quiet=quiet) as progress:
-        replayed = replay(source, options, progress.update_to, lens=lens, detector=detector)
+    file = EvidenceFile(out)
+    with (
+        first_interrupt_stops() as should_stop,
+        progress_bar(source.total, 'images', 'replay', quiet=quiet) as progress,
+    ):
+        replayed = replay(
+            source,
+            options,
+            progress.update_to,
+            lens=lens,
+            detector=detector,
+            should_stop=should_stop,
+            on_checkpoint=file.write,
+        )
+    if replayed.stopped:
+        print_stderr(f'Stopped after {replayed.frames} images; the result is of these.')
     if replayed.repeated and not quiet:
         print_stderr(f'{replayed.repeated} of {replayed.frames} images repeat an earlier one and are left out.')
     if not quiet and not replayed.evidence.picture.fills_image:
         print_stderr(replayed.evidence.picture.description)
-    print_result(replayed, out, write_outputs(out, replayed, source), quiet=quiet, json=json)
+    print_result(replayed, out, write_outputs(out, replayed, source, file), quiet=quiet, json=json)
     return replayed
 
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from autocalib_ros.errors import InputError
+from autocalib_ros.util.files import replaced_atomically
 
 FORMAT = 1
 """Version of the layout; other versions are refused."""
@@ -41,26 +42,21 @@ def write_evidence_file(
     frames: int,
     drift_px: float,
 ) -> None:
-    """Write arrays by name and the header; create the folder. InputError if that fails.
+    """Write arrays by name and the header atomically; create the folder. InputError if that fails.
 
     `stamps_ns` are those of the first and the newest image.
     """
-    path = Path(path)
     columns: dict[str, Any] = dict(arrays)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open('wb') as stream:
-            np.savez_compressed(
-                stream,
-                format=FORMAT,
-                image_size=image_size,
-                drift_px=drift_px,
-                frames=frames,
-                stamps_ns=np.array(stamps_ns, np.int64),
-                **columns,
-            )
-    except OSError as error:
-        raise InputError(f'cannot write {path}: {error.strerror or error}') from error
+    with replaced_atomically(path) as stream:
+        np.savez_compressed(
+            stream,
+            format=FORMAT,
+            image_size=image_size,
+            drift_px=drift_px,
+            frames=frames,
+            stamps_ns=np.array(stamps_ns, np.int64),
+            **columns,
+        )
 
 
 @contextmanager

@@ -2,34 +2,23 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from autocalib_ros.calibrator import AutoCalibrator
 from autocalib_ros.config import Options
-from autocalib_ros.errors import InputError
 from autocalib_ros.estimation.estimate import solve
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.lens.camera import Camera
+from autocalib_ros.offline.gather_evidence import ReplayControl, gather_evidence, scaled
 from autocalib_ros.offline.recordings.open import open_source
 from autocalib_ros.offline.recordings.sources import Source
 from autocalib_ros.perception.detector.detector import VehicleDetector
 from autocalib_ros.perception.frame_clock import ClockSummary
 from autocalib_ros.report.scene import SolutionSnapshot, append_snapshot
 from autocalib_ros.results.calibration import Calibration, Refusal
-
-LOG = logging.getLogger(__name__)
-
-SOLVE_AGAIN_GROWTH = 2.0
-"""Growth of the recording after which an accepted calibration is solved again, for the convergence plot of the report.
-
-With twice the evidence a standard deviation falls by a third."""
-PROGRESS_EVERY_FRAMES = 15
-"""Frames between progress updates."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,6 +39,8 @@ class ReplayResult:
     """Intermediate solutions and the last one, for the convergence plot of the report."""
     clock: ClockSummary = field(default_factory=ClockSummary)
     """What the frame clock made of the stamps."""
+    stopped: bool = False
+    """Whether the reading was stopped before the end of the recording."""
 
 
 def replay(
@@ -58,91 +49,50 @@ def replay(
     on_progress: Callable[[int, str], None] | None = None,
     lens: Camera | None = None,
     detector: VehicleDetector | None = None,
+    *,
+    should_stop: Callable[[], bool] = lambda: False,
+    on_checkpoint: Callable[[Evidence], None] | None = None,
 ) -> ReplayResult:
     """Collect evidence from a recording, given as a path or an open source, and solve at its end.
 
     If the view changes (cuts, zooms, a camera that is turned), the longest part in which it stands still is solved.
     `on_progress` receives the number of frames and a short note, whose first word is the state: collecting, solving,
-    calibrated or refused. With a known `lens` only the pose is estimated; UsageError if its aspect ratio differs from
-    that of the images. `detector` is an open detector; None opens the one of the options. InputError without an image.
+    calibrated or refused. Once `should_stop` returns true, what was seen so far is solved. `on_checkpoint` receives the
+    evidence so far every two minutes of the recording, and all of it before the last solution. With a known `lens` only
+    the pose is estimated; UsageError if its aspect ratio differs from that of the images. `detector` is an open
+    detector; None opens the one of the options. InputError without an image.
     """
     source = open_source(recording) if isinstance(recording, (str, Path)) else recording
-    report_progress = on_progress or (lambda done, note: None)
-    calibrator, accepted_at_s, count, note, scaled_lens = AutoCalibrator(options, detector), None, 0, '', None
-    latest: Calibration | Refusal | None = None
-    moments: tuple[SolutionSnapshot, ...] = ()
-    next_solve_s, part_start_s = 0.0, 0.0
-    for count, frame in enumerate(source.frames(), start=1):
-        scaled_lens = _scaled_lens(lens, (frame.image.shape[1], frame.image.shape[0]))
-        calibrator.add_image(frame.stamp_ns, frame.image)
-        due = _as_recorded(calibrator.snapshot_if_due(), source)
-        if due is not None and due.stillness.start_s != part_start_s:  # another still part of the recording
-            part_start_s = due.stillness.start_s
-            accepted_at_s, moments, latest, next_solve_s = None, (), None, 0.0
-        if due is not None and due.seconds >= next_solve_s:
-            report_progress(count, 'solving')
-            tried = solve(due, options, lens=scaled_lens)
-            moments = append_snapshot(moments, tried)
-            if tried and accepted_at_s is None:  # a live node would have accepted it at this time
-                accepted_at_s = due.seconds
-            latest = tried if tried or accepted_at_s is None else latest
-            next_solve_s = 0.0 if accepted_at_s is None else SOLVE_AGAIN_GROWTH * due.seconds
-        if on_progress is not None and count % PROGRESS_EVERY_FRAMES == 1:
-            note = _progress_note(calibrator, latest, accepted_at_s)
-        report_progress(count, note)
-    evidence = _as_recorded(calibrator.snapshot(longest_part=True), source)
-    if evidence is None:
-        raise InputError(f'{source.name} has no images')
-    if evidence.stillness.start_s != part_start_s:
-        accepted_at_s, moments = None, ()
-    clock = calibrator.clock()
-    if clock.is_uneven:
-        LOG.warning('%s: uneven time stamps, regularised: %s', source.name, clock)
-    report_progress(count, 'solving')
-    result = solve(evidence, options, lens=scaled_lens)
-    report_progress(count, 'calibrated' if result else 'refused')
-    if result and accepted_at_s is None:
-        accepted_at_s = evidence.seconds
+    control = ReplayControl(on_progress=on_progress, should_stop=should_stop, on_checkpoint=on_checkpoint)
+    gathered = gather_evidence(source, options, control, lens=lens, detector=detector)
+    evidence = gathered.evidence
+    if on_checkpoint is not None:
+        on_checkpoint(evidence)
+    control.report(gathered.frames, 'solving')
+    result = solve(evidence, options, lens=scaled(lens, evidence.image_size))
+    control.report(gathered.frames, 'calibrated' if result else 'refused')
+    accepted_at_s = gathered.accepted_at_s
     return ReplayResult(
         result=result,
         evidence=evidence,
-        accepted_at_s=accepted_at_s,
-        background=calibrator.background(longest_part=True),
-        frames=count,
-        repeated=calibrator.repeated,
+        accepted_at_s=evidence.seconds if result and accepted_at_s is None else accepted_at_s,
+        background=gathered.background,
+        frames=gathered.frames,
+        repeated=gathered.repeated,
         options=options,
-        moments=append_snapshot(moments, result),
-        clock=clock,
+        moments=append_snapshot(gathered.moments, result),
+        clock=gathered.clock,
+        stopped=gathered.stopped,
     )
-
-
-def _as_recorded(evidence: Evidence | None, source: Source) -> Evidence | None:
-    """Return evidence with the pixel aspect that its recording says."""
-    return evidence and replace(evidence, pixel_aspect=source.pixel_aspect)
-
-
-def _progress_note(
-    calibrator: AutoCalibrator, latest: Calibration | Refusal | None, accepted_at_s: float | None
-) -> str:
-    """Return state, progress of the evidence, and the missing evidence or the last refusal."""
-    if isinstance(latest, Calibration):
-        return f'calibrated since {accepted_at_s:.0f} s: focal length {latest.camera.focal_px:.0f} px'
-    progress = calibrator.progress()
-    # the evidence is complete but the solution was refused: the refusal says what is missing
-    return f'collecting {progress}' + (f': {latest.message}' if latest is not None and not progress.missing else '')
 
 
 def solve_evidence(evidence: Evidence, options: Options, lens: Camera | None = None) -> ReplayResult:
     """Solve saved evidence; the result has no background image and no time of first acceptance."""
     return ReplayResult(
-        result=solve(evidence, options, lens=_scaled_lens(lens, evidence.image_size)),
+        result=solve(evidence, options, lens=scaled(lens, evidence.image_size)),
         evidence=evidence,
         accepted_at_s=None,
         background=None,
         frames=evidence.frames,
         options=options,
     )
-
-
-def _scaled_lens(lens: Camera | None, image_size: tuple[int, int]) -> Camera | None:
-    return None if lens is None else lens.scaled_to(*image_size)

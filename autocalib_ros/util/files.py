@@ -6,20 +6,32 @@ import contextlib
 import glob
 import os
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
+from typing import BinaryIO
 
 from autocalib_ros.errors import InputError
 
 
 def write_atomically(path: Path, text: str) -> None:
     """Replace a file atomically, also across a power cut: readers see the old text or the new, never a part."""
+    with replaced_atomically(path) as stream:
+        stream.write(text.encode('utf-8'))
+
+
+@contextlib.contextmanager
+def replaced_atomically(path: Path) -> Iterator[BinaryIO]:
+    """Yield a stream whose bytes replace a file atomically when the block ends without an exception.
+
+    The folder is created. InputError if that fails.
+    """
     path = Path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=_prefix(path))
         try:
-            with os.fdopen(handle, 'w', encoding='utf-8') as stream:
-                stream.write(text)
+            with os.fdopen(handle, 'wb') as stream:
+                yield stream
                 stream.flush()
                 os.fsync(stream.fileno())
             os.chmod(temporary, 0o644)

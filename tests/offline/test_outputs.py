@@ -65,6 +65,34 @@ def test_a_refusal_removes_the_camera_info_of_an_earlier_run(tmp_path, refused, 
     assert (document['state'], document['refusal']['code']) == ('refused', 'too_few_tracks')
 
 
+def test_a_refusal_keeps_an_earlier_calibration_that_was_accepted(tmp_path, monkeypatch, full, refused, source, caplog):
+    monkeypatch.setattr('autocalib_ros.report.page.write_report', lambda path, _: path.write_text('page'))
+    outputs.write_outputs(tmp_path, full, source)
+    accepted = {name: (tmp_path / name).read_bytes() for name in ('calibration.json', 'evidence.npz')}
+    for _ in range(2):  # a second refusal keeps the calibration, and not the first refusal
+        outputs.write_outputs(tmp_path, refused, source)
+        assert json.loads((tmp_path / 'calibration.json').read_text())['state'] == 'refused'
+        assert {name: (tmp_path / f'{name}.bak').read_bytes() for name in accepted} == accepted
+        assert (tmp_path / 'camera_info.yaml.bak').exists() and not (tmp_path / 'camera_info.yaml').exists()
+    assert [record.message for record in caplog.records] == [
+        f'the earlier calibration in {tmp_path} was accepted and is kept: calibration.json.bak, camera_info.yaml.bak,'
+        ' report.html.bak'
+    ]
+
+
+def test_evidence_on_the_way_keeps_that_of_an_accepted_calibration(tmp_path, monkeypatch, full, refused, source):
+    monkeypatch.setattr('autocalib_ros.report.page.write_report', lambda path, _: path.write_text('page'))
+    outputs.write_outputs(tmp_path, full, source)
+    accepted = (tmp_path / 'evidence.npz').read_bytes()
+    for _ in range(2):  # runs that are killed after two checkpoints
+        file = outputs.EvidenceFile(tmp_path)
+        for _ in range(2):
+            file.write(refused.evidence.since(0.1))
+        assert (tmp_path / 'evidence.npz.bak').read_bytes() == accepted
+    outputs.write_outputs(tmp_path, full, source)
+    assert (tmp_path / 'evidence.npz').read_bytes() == accepted
+
+
 def test_what_stands_in_the_way_is_wrong_usage(tmp_path):
     (tmp_path / 'file').touch()
     with pytest.raises(UsageError, match='is a file, not a folder'):

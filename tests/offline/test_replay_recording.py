@@ -83,7 +83,8 @@ def test_a_known_lens_goes_into_each_solution_in_the_size_of_the_images(monkeypa
         reports.append(lens)
         return solve(evidence, options)
 
-    monkeypatch.setattr('autocalib_ros.offline.replay_recording.solve', recording_solve)
+    for module in ('gather_evidence', 'replay_recording'):
+        monkeypatch.setattr(f'autocalib_ros.offline.{module}.solve', recording_solve)
     options = Options(first_solve_s=0.0, gate=GateOptions(min_tracks=4))
     replay(Drive(150), options, lens=Camera.equidistant(320, 240, 200.0))
     assert len(reports) > 1
@@ -95,6 +96,22 @@ def test_a_lens_of_another_shape_is_noticed_at_the_first_image():
     with pytest.raises(UsageError, match='images of 160x90, and these images have 160x120'):
         replay(Drive(40), Options(), lambda done, note: reports.append(done), lens=Camera.equidistant(160, 90, 100.0))
     assert not reports
+
+
+def test_a_stopped_replay_solves_what_it_saw():
+    seen = []
+    replayed = replay(Drive(40), Options(), lambda done, note: seen.append(done), should_stop=lambda: seen[-1] == 25)
+    assert (replayed.frames, replayed.evidence.frames, replayed.stopped) == (25, 25, True)
+    assert replayed.result.evidence.seconds == pytest.approx(2.4)
+
+
+def test_the_evidence_so_far_is_handed_out_on_the_way_and_at_the_end(monkeypatch):
+    monkeypatch.setattr('autocalib_ros.offline.gather_evidence.CHECKPOINT_EVERY_S', 1.5)
+    stored = []
+    replayed = replay(Drive(40), Options(), on_checkpoint=stored.append)
+    assert [evidence.frames for evidence in stored] == [16, 31, 40]
+    assert stored[-1] is replayed.evidence
+    assert np.array_equal(replayed.evidence.points_px, replay(Drive(40), Options()).evidence.points_px)
 
 
 def test_evidence_solved_again_gives_the_same():
@@ -115,9 +132,8 @@ def test_a_refused_solution_is_what_is_missing_and_then_since_when_it_is_calibra
         code='x', message='the halves disagree', remedy='wait', method='joint', evidence=full.evidence.summary()
     )
     results = iter([refusal])
-    monkeypatch.setattr(
-        'autocalib_ros.offline.replay_recording.solve', lambda due, options, lens: next(results, accepted)
-    )
+    for module in ('gather_evidence', 'replay_recording'):
+        monkeypatch.setattr(f'autocalib_ros.offline.{module}.solve', lambda due, options, lens: next(results, accepted))
     reports = []
     # the box is all that there is to see, so that the background seems to drift by up to 100 px
     gate = GateOptions(min_tracks=4, min_coverage=0.0, max_drift_px=1000.0)

@@ -1,0 +1,181 @@
+"""Gather the evidence of one recording, with the solutions that a live node would have tried on the way."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from autocalib_ros.calibrator import AutoCalibrator
+from autocalib_ros.config import Options
+from autocalib_ros.errors import InputError
+from autocalib_ros.estimation.estimate import solve
+from autocalib_ros.evidence.snapshot import Evidence
+from autocalib_ros.lens.camera import Camera
+from autocalib_ros.offline.recordings.sources import Source
+from autocalib_ros.perception.detector.detector import VehicleDetector
+from autocalib_ros.perception.frame_clock import ClockSummary
+from autocalib_ros.report.scene import SolutionSnapshot, append_snapshot
+from autocalib_ros.results.calibration import Calibration, Refusal
+
+LOG = logging.getLogger(__name__)
+
+SOLVE_AGAIN_GROWTH = 2.0
+"""Growth of the recording after which an accepted calibration is solved again, for the convergence plot of the report.
+
+With twice the evidence a standard deviation falls by a third."""
+PROGRESS_EVERY_FRAMES = 15
+"""Frames between progress updates."""
+CHECKPOINT_EVERY_S = 120.0
+"""Seconds of recording after which its evidence so far is stored: as much is lost at most, and storing takes a second
+at the most."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplayControl:
+    """What the program around a replay wants to know and may decide while a recording is read."""
+
+    on_progress: Callable[[int, str], None] | None = None
+    """Receives the number of frames and a short note, whose first word is the state."""
+    should_stop: Callable[[], bool] = lambda: False
+    """Asked after each image; true: what was seen so far is solved."""
+    on_checkpoint: Callable[[Evidence], None] | None = None
+    """Receives the evidence so far every `CHECKPOINT_EVERY_S` of recording, and before the last solution."""
+
+    def report(self, frames: int, note: str) -> None:
+        """Report progress."""
+        if self.on_progress is not None:
+            self.on_progress(frames, note)
+
+
+@dataclass(frozen=True, kw_only=True)
+class GatheredEvidence:
+    """What one recording gave."""
+
+    evidence: Evidence
+    background: np.ndarray | None
+    """Background image without traffic, BGR uint8; None if unknown."""
+    frames: int
+    repeated: int
+    clock: ClockSummary
+    accepted_at_s: float | None
+    """Seconds of recording before the first accepted calibration; None without one."""
+    moments: tuple[SolutionSnapshot, ...]
+    """The solutions on the way."""
+    stopped: bool
+    """Whether `ReplayControl.should_stop` ended the reading."""
+
+
+class _Trials:
+    """Solutions while a recording is read, as a live node tries them."""
+
+    def __init__(self, options: Options) -> None:
+        self._options = options
+        self._part_start_s = self._next_solve_s = 0.0
+        self.latest: Calibration | Refusal | None = None
+        self.moments: tuple[SolutionSnapshot, ...] = ()
+        self.accepted_at_s: float | None = None
+
+    def begin_part(self, start_s: float) -> None:
+        """Forget the solutions if the evidence is of another still part of the recording than before."""
+        if start_s != self._part_start_s:
+            self._part_start_s, self._next_solve_s = start_s, 0.0
+            self.latest, self.moments, self.accepted_at_s = None, (), None
+
+    def is_due(self, seconds: float) -> bool:
+        """Whether evidence of this length is worth a solution."""
+        return seconds >= self._next_solve_s
+
+    def solve(self, evidence: Evidence, lens: Camera | None) -> None:
+        """Solve, and decide when to solve again."""
+        tried = solve(evidence, self._options, lens=lens)
+        self.moments = append_snapshot(self.moments, tried)
+        if tried and self.accepted_at_s is None:  # a live node would have accepted it at this time
+            self.accepted_at_s = evidence.seconds
+        self.latest = tried if tried or self.accepted_at_s is None else self.latest
+        self._next_solve_s = 0.0 if self.accepted_at_s is None else SOLVE_AGAIN_GROWTH * evidence.seconds
+
+
+def gather_evidence(
+    source: Source,
+    options: Options,
+    control: ReplayControl,
+    *,
+    lens: Camera | None = None,
+    detector: VehicleDetector | None = None,
+    frames_before: int = 0,
+    tries_solutions: bool = True,
+) -> GatheredEvidence:
+    """Read a recording to its end, or until the control stops it. InputError without an image.
+
+    If the view changes, the evidence is of the longest part in which it stands still. `frames_before` are added to the
+    frames reported.
+    """
+    calibrator, trials = AutoCalibrator(options, detector), _Trials(options)
+    count, note, stopped, checkpoint_s, first_ns = 0, '', False, CHECKPOINT_EVERY_S, None
+    for count, frame in enumerate(source.frames(), start=1):
+        scaled_lens = scaled(lens, (frame.image.shape[1], frame.image.shape[0]))
+        calibrator.add_image(frame.stamp_ns, frame.image)
+        first_ns = frame.stamp_ns if first_ns is None else first_ns
+        due = _as_recorded(calibrator.snapshot_if_due(), source) if tries_solutions else None
+        if due is not None:
+            trials.begin_part(due.stillness.start_s)
+            if trials.is_due(due.seconds):
+                control.report(frames_before + count, 'solving')
+                trials.solve(due, scaled_lens)
+        if control.on_checkpoint is not None and (frame.stamp_ns - first_ns) * 1e-9 >= checkpoint_s:
+            checkpoint_s = (frame.stamp_ns - first_ns) * 1e-9 + CHECKPOINT_EVERY_S
+            control.on_checkpoint(_longest_part(calibrator, source))
+        if control.on_progress is not None and count % PROGRESS_EVERY_FRAMES == 1:
+            note = _progress_note(calibrator, trials)
+        control.report(frames_before + count, note)
+        if control.should_stop():
+            stopped = True
+            break
+    if not count:
+        raise InputError(f'{source.name} has no images')
+    evidence = _longest_part(calibrator, source)
+    trials.begin_part(evidence.stillness.start_s)
+    clock = calibrator.clock()
+    if clock.is_uneven:
+        LOG.warning('%s: uneven time stamps, regularised: %s', source.name, clock)
+    return GatheredEvidence(
+        evidence=evidence,
+        background=calibrator.background(longest_part=True),
+        frames=count,
+        repeated=calibrator.repeated,
+        clock=clock,
+        accepted_at_s=trials.accepted_at_s,
+        moments=trials.moments,
+        stopped=stopped,
+    )
+
+
+def _longest_part(calibrator: AutoCalibrator, source: Source) -> Evidence:
+    """Return the evidence so far of the longest still part."""
+    evidence = _as_recorded(calibrator.snapshot(longest_part=True), source)
+    if evidence is None:
+        raise InputError(f'{source.name} has no images')
+    return evidence
+
+
+def _as_recorded(evidence: Evidence | None, source: Source) -> Evidence | None:
+    """Return evidence with the pixel aspect that its recording says."""
+    return evidence and replace(evidence, pixel_aspect=source.pixel_aspect)
+
+
+def _progress_note(calibrator: AutoCalibrator, trials: _Trials) -> str:
+    """Return state, progress of the evidence, and the missing evidence or the last refusal."""
+    latest = trials.latest
+    if isinstance(latest, Calibration):
+        return f'calibrated since {trials.accepted_at_s:.0f} s: focal length {latest.camera.focal_px:.0f} px'
+    progress = calibrator.progress()
+    # the evidence is complete but the solution was refused: the refusal says what is missing
+    return f'collecting {progress}' + (f': {latest.message}' if latest is not None and not progress.missing else '')
+
+
+def scaled(lens: Camera | None, image_size: tuple[int, int]) -> Camera | None:
+    """Return a lens for images of this size; UsageError if their aspect ratio differs."""
+    return None if lens is None else lens.scaled_to(*image_size)
