@@ -120,16 +120,18 @@ class AutoCalibrator:
         self._due_s = stream.time_s + self._options.solve_interval_s
         return self.snapshot()
 
-    def snapshot(self, *, longest_part: bool = False) -> Evidence | None:
+    def snapshot(self, *, longest_part: bool = False, landmarks: bool = False) -> Evidence | None:
         """Freeze the evidence so far; None before the first image.
 
-        Evidence is of the present view of the camera, or of the one that was still for the longest time.
+        Evidence is of the present view of the camera, or of the one that was still for the longest time; `landmarks`
+        says whether it holds those of the background, by which evidence of other recordings can be joined.
         """
         stream = self._stream
         if stream is None:
             return None
         view = stream.longest_view() if longest_part else stream.observer.view
-        return replace(stream.evidence(view), still_lines_px=stream.observer.still_lines(view))
+        evidence = replace(stream.evidence(view), still_lines_px=stream.observer.still_lines(view))
+        return evidence.with_landmarks(stream.observer.landmarks(view)) if landmarks else evidence
 
     def progress(self) -> CalibrationProgress:
         """Return how much of the evidence for a solution is there."""

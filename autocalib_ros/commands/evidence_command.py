@@ -26,7 +26,13 @@ DESCRIPTION = (
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the evidence file, the solver options and the output folder."""
-    parser.add_argument('file', metavar='FILE', type=Path, help='evidence.npz of a replay, or tracks (.csv, .txt)')
+    parser.add_argument(
+        'files',
+        metavar='FILE',
+        nargs='+',
+        type=Path,
+        help='evidence.npz of a replay, or tracks (.csv, .txt); several evidence.npz of the same view are joined',
+    )
     parser.add_argument(
         '--image-size', type=int, nargs=2, metavar=('WIDTH', 'HEIGHT'), help='tracks: size of their images in pixels'
     )
@@ -48,20 +54,30 @@ def run(arguments: argparse.Namespace) -> int:
     if not arguments.quiet:
         warn_missing_scale(options, lens)
     solved = solve_evidence(evidence, options, lens)
-    names = [] if out is None else outputs.write_result(out, solved, arguments.file.name)
+    first, more = arguments.files[0], len(arguments.files) - 1
+    name = f'{first.name} and {more} more' if more else first.name
+    names = [] if out is None else outputs.write_result(out, solved, name)
     print_result(solved, out, names, quiet=arguments.quiet, json=arguments.json)
     return DONE if solved.result else REFUSED
 
 
 def _read_evidence(arguments: argparse.Namespace, options: Options) -> Evidence:
-    """Return saved evidence, or that of a file of tracks; UsageError if the size of the images is not given."""
+    """Return saved evidence, several files joined, or that of a file of tracks.
+
+    UsageError if the size of the images of tracks is not given, or if tracks are among several files.
+    """
     from autocalib_ros.evidence.snapshot import Evidence
+    from autocalib_ros.offline.join_recordings import join_evidence
     from autocalib_ros.offline.track_files import SUFFIXES, evidence_from_file
 
-    if arguments.file.suffix.lower() not in SUFFIXES:
-        return Evidence.load(arguments.file)
+    files: list[Path] = arguments.files
+    tracks = [file for file in files if file.suffix.lower() in SUFFIXES]
+    if not tracks:
+        return join_evidence([(Evidence.load(file), str(file)) for file in files], options.gate).all()
+    if len(files) > 1:
+        raise UsageError(f'{tracks[0]} holds tracks, which have no background to join them by: give it alone')
     if arguments.image_size is None or min(arguments.image_size) < 1:
-        raise UsageError(f'{arguments.file} holds tracks: give the size of their images with --image-size WIDTH HEIGHT')
+        raise UsageError(f'{tracks[0]} holds tracks: give the size of their images with --image-size WIDTH HEIGHT')
     if arguments.fps is not None and not 0 < arguments.fps < math.inf:
         raise UsageError(f'--fps must be above 0; got {arguments.fps:g}')
-    return evidence_from_file(arguments.file, tuple(arguments.image_size), arguments.fps, options.buffer)
+    return evidence_from_file(tracks[0], tuple(arguments.image_size), arguments.fps, options.buffer)

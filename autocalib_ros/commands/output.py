@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from autocalib_ros.commands.interruption import first_interrupt_stops
+from autocalib_ros.commands.interruption import StopRequest
 from autocalib_ros.config import Options
 
 if TYPE_CHECKING:
+    from autocalib_ros.evidence.snapshot import Evidence
     from autocalib_ros.lens.camera import Camera
     from autocalib_ros.offline.recordings.sources import Source
     from autocalib_ros.offline.replay_recording import ReplayResult
@@ -22,7 +24,7 @@ def print_stderr(line: str) -> None:
 
 
 def replay_and_report(
-    source: Source,
+    sources: Sequence[Source],
     options: Options,
     out: Path,
     *,
@@ -30,27 +32,32 @@ def replay_and_report(
     detector: VehicleDetector | None = None,
     quiet: bool = False,
     json: bool = False,
+    stop: StopRequest | None = None,
+    before: Evidence | None = None,
 ) -> ReplayResult:
-    """Replay a recording, write the output files and print the result."""
+    """Replay recordings of one camera, write the output files and print the result.
+
+    `stop` is the request that live streams among the sources ask; `before` is evidence of an earlier run.
+    """
     from autocalib_ros.offline.outputs import EvidenceFile, write_outputs
     from autocalib_ros.offline.replay_recording import replay
     from autocalib_ros.offline.terminal.progress import progress_bar
 
     if not quiet:
         warn_missing_scale(options, lens)
-    file = EvidenceFile(out)
-    with (
-        first_interrupt_stops() as should_stop,
-        progress_bar(source.total, 'images', 'replay', quiet=quiet) as progress,
-    ):
+    file, stop = EvidenceFile(out), stop or StopRequest()
+    totals = [source.total for source in sources]
+    total = None if None in totals else sum(one for one in totals if one is not None)
+    with stop.listening(), progress_bar(total, 'images', 'replay', quiet=quiet) as progress:
         replayed = replay(
-            source,
+            sources,
             options,
             progress.update_to,
             lens=lens,
             detector=detector,
-            should_stop=should_stop,
+            should_stop=stop,
             on_checkpoint=file.write,
+            before=before,
         )
     if replayed.stopped:
         print_stderr(f'Stopped after {replayed.frames} images; the result is of these.')
@@ -58,7 +65,7 @@ def replay_and_report(
         print_stderr(f'{replayed.repeated} of {replayed.frames} images repeat an earlier one and are left out.')
     if not quiet and not replayed.evidence.picture.fills_image:
         print_stderr(replayed.evidence.picture.description)
-    print_result(replayed, out, write_outputs(out, replayed, source, file), quiet=quiet, json=json)
+    print_result(replayed, out, write_outputs(out, replayed, sources, file), quiet=quiet, json=json)
     return replayed
 
 

@@ -7,9 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from autocalib_ros.commands import DONE, REFUSED
+from autocalib_ros.commands.interruption import StopRequest
 from autocalib_ros.commands.output import print_stderr, replay_and_report
 from autocalib_ros.commands.solve_options import add_solve_options, options_from_arguments, read_known_lens
 from autocalib_ros.config import Options
+from autocalib_ros.errors import UsageError
 
 if TYPE_CHECKING:
     from autocalib_ros.offline.recordings.sources import Source
@@ -23,7 +25,11 @@ DEFAULT_OUT = Path('autocalib_out')
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the recording, the solver options and the output files."""
     parser.add_argument(
-        'source', metavar='SOURCE', type=Path, help='rosbag2 folder, .mcap, .db3, ROS 1 .bag or video file'
+        'sources',
+        metavar='SOURCE',
+        nargs='+',
+        help='rosbag2 folder, .mcap, .db3, ROS 1 .bag, video file, images (folder or pattern), folder of clips, stream '
+        '(rtsp://, http://) or camera device (/dev/video0); several ones of the same view are joined',
     )
     add_solve_options(parser)
     parser.add_argument('--topic', metavar='T', help='image topic; required if the recording has several')
@@ -37,28 +43,44 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='write a new rosbag2 with the images, CameraInfo and the ground transform',
     )
     parser.add_argument('--start', type=float, default=0.0, metavar='S', help='seconds to skip at the start')
-    parser.add_argument('--duration', type=float, metavar='S', help='seconds to use')
+    parser.add_argument('--duration', type=float, metavar='S', help='seconds to use; of a stream, to record')
+    parser.add_argument(
+        '--rate', type=float, metavar='HZ', help='images per second of image files and of videos without times'
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Calibrate from a recording; return the exit status."""
     options = options_from_arguments(arguments)
     lens = read_known_lens(arguments, options)
-    from autocalib_ros.offline.recordings.open import open_source
+    from autocalib_ros.offline.recordings.listing import recordings_of
+    from autocalib_ros.offline.recordings.open import open_sources
     from autocalib_ros.perception.detector.detector import open_detector
 
     detector = open_detector(options.detector)
     if detector is not None and not arguments.quiet:
         print_stderr(f'Vehicle tracks from a {detector}')
-    source = open_source(arguments.source, arguments.topic, arguments.start, arguments.duration)
+    stop = StopRequest()
+    sources = open_sources(
+        recordings_of(arguments.sources), arguments.topic, arguments.start, arguments.duration, arguments.rate, stop
+    )
+    if arguments.write_bag is not None and len(sources) > 1:
+        raise UsageError(f'--write-bag takes one recording, and there are {len(sources)}')
     from autocalib_ros.offline import outputs
 
     outputs.prepare_output_dir(arguments.out, arguments.write_bag)
     replayed = replay_and_report(
-        source, options, arguments.out, lens=lens, detector=detector, quiet=arguments.quiet, json=arguments.json
+        sources,
+        options,
+        arguments.out,
+        lens=lens,
+        detector=detector,
+        quiet=arguments.quiet,
+        json=arguments.json,
+        stop=stop,
     )
     if arguments.write_bag is not None:
-        _write_bag(arguments.write_bag, replayed.result, source, options)
+        _write_bag(arguments.write_bag, replayed.result, sources[0], options)
     return DONE if replayed.result else REFUSED
 
 

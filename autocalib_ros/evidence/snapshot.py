@@ -10,8 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from autocalib_ros.evidence.landmarks import DESCRIPTOR_BYTES, Landmarks
 from autocalib_ros.evidence.npz import evidence_file, write_evidence_file
 from autocalib_ros.evidence.picture import Picture
+from autocalib_ros.evidence.read_recording import ReadRecording, recording_arrays, recordings_of_arrays
 from autocalib_ros.evidence.stillness import Stillness
 from autocalib_ros.evidence.tables import OUTLINE_COLUMNS, TABLES, merged, require_array
 from autocalib_ros.results.calibration import EvidenceSummary
@@ -27,6 +29,9 @@ PICTURE = 'picture'
 """Saved only if the picture does not fill the images."""
 PIXEL_ASPECT = 'pixel_aspect'
 """Saved only if the recording says it."""
+LANDMARK_ARRAYS = ('landmarks_px', 'landmark_descriptors')
+RECORDING_ARRAYS = ('recording_names', 'recording_read_s')
+"""Saved only by a replay, as the landmarks."""
 
 
 class TrackKind(IntEnum):
@@ -131,6 +136,12 @@ class Evidence:
     """Sway, which is compensated, and the still part of the recording that the evidence is from."""
     pixel_aspect: float = 0.0
     """Width of a pixel over its height as the recording says; 0 if it says nothing."""
+    landmarks_px: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+    """As `Landmarks.points_px`, by which other recordings of the view are recognised; only a replay looks for them."""
+    landmark_descriptors: np.ndarray = field(default_factory=lambda: np.zeros((0, DESCRIPTOR_BYTES), np.uint8))
+    """As `Landmarks.descriptors`."""
+    recordings: tuple[ReadRecording, ...] = ()
+    """The recordings of a replay, and how far they were read."""
 
     def __post_init__(self) -> None:
         if not len(self.track_kinds):
@@ -141,6 +152,15 @@ class Evidence:
             object.__setattr__(self, 'picture', Picture.whole(self.image_size))
         elif self.picture.image_size != self.image_size:
             object.__setattr__(self, 'picture', self.picture.in_images_of(self.image_size))
+
+    @property
+    def landmarks(self) -> Landmarks:
+        """Landmarks of the still scene."""
+        return Landmarks(self.landmarks_px, self.landmark_descriptors)
+
+    def with_landmarks(self, landmarks: Landmarks) -> Evidence:
+        """Return the evidence with these landmarks."""
+        return replace(self, landmarks_px=landmarks.points_px, landmark_descriptors=landmarks.descriptors)
 
     @property
     def track_count(self) -> int:
@@ -220,6 +240,10 @@ class Evidence:
             arrays[STILLNESS] = self.stillness.as_array()
         if self.pixel_aspect:
             arrays[PIXEL_ASPECT] = np.array(self.pixel_aspect)
+        if len(self.landmarks):
+            arrays |= {name: getattr(self, name) for name in LANDMARK_ARRAYS}
+        if self.recordings:
+            arrays |= recording_arrays(self.recordings)
         write_evidence_file(
             path,
             arrays,
@@ -239,13 +263,19 @@ class Evidence:
             PICTURE,
             STILLNESS,
             PIXEL_ASPECT,
+            *LANDMARK_ARRAYS,
+            *RECORDING_ARRAYS,
         )
         with evidence_file(path, required, optional) as fields:
             if PICTURE in fields:
                 fields[PICTURE] = Picture.of_numbers(fields['image_size'], fields[PICTURE])
             if STILLNESS in fields:
                 fields[STILLNESS] = Stillness.from_array(fields[STILLNESS])
-            evidence = cls(**{**fields, PIXEL_ASPECT: float(fields.get(PIXEL_ASPECT, 0.0))})
+            recordings = [fields.pop(name) for name in RECORDING_ARRAYS if name in fields]
+            evidence = cls(
+                **{**fields, PIXEL_ASPECT: float(fields.get(PIXEL_ASPECT, 0.0))},
+                recordings=recordings_of_arrays(*recordings) if recordings else (),
+            )
             evidence.require_consistent()
         return evidence
 
@@ -259,6 +289,7 @@ class Evidence:
         require_array(TRACK_KINDS, self.track_kinds, (tracks,), integer=True)
         for table in TABLES:
             table.require_consistent(self)
+        self.landmarks.require_consistent()
         if not np.isin(self.track_kinds, list(TrackKind)).all():
             known = ', '.join(f'{kind:d} ({kind.name})' for kind in TrackKind)
             raise ValueError(f'{TRACK_KINDS} holds other values than {known}')

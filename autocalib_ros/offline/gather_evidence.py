@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from math import inf
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from autocalib_ros.calibrator import AutoCalibrator
 from autocalib_ros.config import Options
 from autocalib_ros.errors import InputError
 from autocalib_ros.estimation.estimate import solve
+from autocalib_ros.evidence.read_recording import ReadRecording
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.recordings.sources import Source
@@ -111,7 +113,7 @@ def gather_evidence(
     """Read a recording to its end, or until the control stops it. InputError without an image.
 
     If the view changes, the evidence is of the longest part in which it stands still. `frames_before` are added to the
-    frames reported.
+    frames reported. A recording that is joined with others `tries_solutions` at the end only.
     """
     calibrator, trials = AutoCalibrator(options, detector), _Trials(options)
     count, note, stopped, checkpoint_s, first_ns = 0, '', False, CHECKPOINT_EVERY_S, None
@@ -127,7 +129,7 @@ def gather_evidence(
                 trials.solve(due, scaled_lens)
         if control.on_checkpoint is not None and (frame.stamp_ns - first_ns) * 1e-9 >= checkpoint_s:
             checkpoint_s = (frame.stamp_ns - first_ns) * 1e-9 + CHECKPOINT_EVERY_S
-            control.on_checkpoint(_longest_part(calibrator, source))
+            control.on_checkpoint(_longest_part(calibrator, source, _seconds_read(source, first_ns, frame.stamp_ns)))
         if control.on_progress is not None and count % PROGRESS_EVERY_FRAMES == 1:
             note = _progress_note(calibrator, trials)
         control.report(frames_before + count, note)
@@ -136,7 +138,8 @@ def gather_evidence(
             break
     if not count:
         raise InputError(f'{source.name} has no images')
-    evidence = _longest_part(calibrator, source)
+    to_end = not stopped and source.window.duration_s is None
+    evidence = _longest_part(calibrator, source, inf if to_end else _seconds_read(source, first_ns, frame.stamp_ns))
     trials.begin_part(evidence.stillness.start_s)
     clock = calibrator.clock()
     if clock.is_uneven:
@@ -153,12 +156,17 @@ def gather_evidence(
     )
 
 
-def _longest_part(calibrator: AutoCalibrator, source: Source) -> Evidence:
-    """Return the evidence so far of the longest still part."""
-    evidence = _as_recorded(calibrator.snapshot(longest_part=True), source)
+def _seconds_read(source: Source, first_ns: int | None, newest_ns: int) -> float:
+    """Return the seconds from the first image of a recording to the newest one read."""
+    return source.window.start_s + (newest_ns - (newest_ns if first_ns is None else first_ns)) * 1e-9
+
+
+def _longest_part(calibrator: AutoCalibrator, source: Source, read_s: float) -> Evidence:
+    """Return the evidence so far of the longest still part, with its landmarks and what was read."""
+    evidence = _as_recorded(calibrator.snapshot(longest_part=True, landmarks=True), source)
     if evidence is None:
         raise InputError(f'{source.name} has no images')
-    return evidence
+    return replace(evidence, recordings=(ReadRecording.of(source.name, read_s),))
 
 
 def _as_recorded(evidence: Evidence | None, source: Source) -> Evidence | None:

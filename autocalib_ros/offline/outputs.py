@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 from autocalib_ros.errors import AutocalibError, InputError, UsageError
@@ -71,12 +72,17 @@ class EvidenceFile:
 
 
 def write_outputs(
-    out_dir: Path, replayed: ReplayResult, source: Source, evidence_file: EvidenceFile | None = None
+    out_dir: Path,
+    replayed: ReplayResult,
+    sources: Source | Sequence[Source],
+    evidence_file: EvidenceFile | None = None,
 ) -> list[str]:
     """Write the result files and the evidence of a replay; return the names of the files."""
+    listed = list(sources) if isinstance(sources, Sequence) else [sources]
+    first, more = listed[0], len(listed) - 1
     file = evidence_file or EvidenceFile(out_dir)
     file.write(replayed.evidence)
-    names = write_result(out_dir, replayed, source.name, camera_name(source))
+    names = write_result(out_dir, replayed, f'{first.name} and {more} more' if more else first.name, camera_name(first))
     if replayed.result:
         file.drop_backup()
     return [*names, EVIDENCE]

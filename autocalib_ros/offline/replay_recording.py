@@ -2,23 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 
 from autocalib_ros.config import Options
+from autocalib_ros.errors import InputError
 from autocalib_ros.estimation.estimate import solve
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.offline.gather_evidence import ReplayControl, gather_evidence, scaled
-from autocalib_ros.offline.recordings.open import open_source
+from autocalib_ros.offline.gather_evidence import (
+    GatheredEvidence,
+    ReplayControl,
+    gather_evidence,
+    scaled,
+)
+from autocalib_ros.offline.join_recordings import JoinedEvidence
+from autocalib_ros.offline.recordings.listing import recordings_of
+from autocalib_ros.offline.recordings.live_streams import StreamSource
+from autocalib_ros.offline.recordings.open import open_source, open_sources
 from autocalib_ros.offline.recordings.sources import Source
 from autocalib_ros.perception.detector.detector import VehicleDetector
 from autocalib_ros.perception.frame_clock import ClockSummary
 from autocalib_ros.report.scene import SolutionSnapshot, append_snapshot
 from autocalib_ros.results.calibration import Calibration, Refusal
+
+Recording: TypeAlias = Source | Path | str
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,10 +53,12 @@ class ReplayResult:
     """What the frame clock made of the stamps."""
     stopped: bool = False
     """Whether the reading was stopped before the end of the recording."""
+    left_out: tuple[str, ...] = ()
+    """Recordings that were not joined with the first one, and why."""
 
 
 def replay(
-    recording: Source | Path | str,
+    recording: Recording | Sequence[Recording],
     options: Options,
     on_progress: Callable[[int, str], None] | None = None,
     lens: Camera | None = None,
@@ -52,38 +66,84 @@ def replay(
     *,
     should_stop: Callable[[], bool] = lambda: False,
     on_checkpoint: Callable[[Evidence], None] | None = None,
+    before: Evidence | None = None,
 ) -> ReplayResult:
     """Collect evidence from a recording, given as a path or an open source, and solve at its end.
 
     If the view changes (cuts, zooms, a camera that is turned), the longest part in which it stands still is solved.
+    Several recordings of one view are joined: each is registered to the first by its background, one of another view is
+    left out and named. `before` is the evidence of an earlier run that they are added to.
+
     `on_progress` receives the number of frames and a short note, whose first word is the state: collecting, solving,
     calibrated or refused. Once `should_stop` returns true, what was seen so far is solved. `on_checkpoint` receives the
     evidence so far every two minutes of the recording, and all of it before the last solution. With a known `lens` only
     the pose is estimated; UsageError if its aspect ratio differs from that of the images. `detector` is an open
     detector; None opens the one of the options. InputError without an image.
     """
-    source = open_source(recording) if isinstance(recording, (str, Path)) else recording
+    sources = _opened(recording)
     control = ReplayControl(on_progress=on_progress, should_stop=should_stop, on_checkpoint=on_checkpoint)
-    gathered = gather_evidence(source, options, control, lens=lens, detector=detector)
-    evidence = gathered.evidence
+    joint = JoinedEvidence(options.gate, before)
+    gathered = _gather_all(sources, options, control, joint, lens, detector)
+    if not joint:
+        raise InputError('no evidence: there is no recording to read')
+    evidence, frames = joint.all(), sum(one.frames for one in gathered)
     if on_checkpoint is not None:
         on_checkpoint(evidence)
-    control.report(gathered.frames, 'solving')
+    control.report(frames, 'solving')
     result = solve(evidence, options, lens=scaled(lens, evidence.image_size))
-    control.report(gathered.frames, 'calibrated' if result else 'refused')
-    accepted_at_s = gathered.accepted_at_s
+    control.report(frames, 'calibrated' if result else 'refused')
+    alone = gathered[0] if len(gathered) == 1 and before is None else None
+    accepted_at_s = None if alone is None else alone.accepted_at_s
+    if result and alone is not None and accepted_at_s is None:
+        accepted_at_s = evidence.seconds
     return ReplayResult(
         result=result,
         evidence=evidence,
-        accepted_at_s=evidence.seconds if result and accepted_at_s is None else accepted_at_s,
-        background=gathered.background,
-        frames=gathered.frames,
-        repeated=gathered.repeated,
+        accepted_at_s=accepted_at_s,
+        background=next((one.background for one in gathered if one.background is not None), None),
+        frames=frames,
+        repeated=sum(one.repeated for one in gathered),
         options=options,
-        moments=append_snapshot(gathered.moments, result),
-        clock=gathered.clock,
-        stopped=gathered.stopped,
+        moments=append_snapshot(() if alone is None else alone.moments, result),
+        clock=gathered[-1].clock if gathered else ClockSummary(),
+        stopped=any(one.stopped for one in gathered),
+        left_out=tuple(joint.left_out),
     )
+
+
+def _opened(recording: Recording | Sequence[Recording]) -> list[Source]:
+    """Return open sources for paths, patterns and sources."""
+    if isinstance(recording, (str, Path)):
+        return open_sources(recordings_of([recording]))
+    listed: list[Recording] = list(recording) if isinstance(recording, (list, tuple)) else [recording]  # type: ignore[list-item]
+    return [open_source(one) if isinstance(one, (str, Path)) else one for one in listed]
+
+
+def _gather_all(
+    sources: Sequence[Source],
+    options: Options,
+    control: ReplayControl,
+    joint: JoinedEvidence,
+    lens: Camera | None,
+    detector: VehicleDetector | None,
+) -> list[GatheredEvidence]:
+    """Read the recordings one after the other and join their evidence; return what those that fit gave."""
+    gathered: list[GatheredEvidence] = []
+    # a live stream goes on while a solution takes its time
+    alone = len(sources) == 1 and not joint and not isinstance(sources[0], StreamSource)
+    store = control.on_checkpoint
+    within = replace(control, on_checkpoint=None if store is None else lambda part: store(joint.with_part(part)))
+    frames = 0
+    for source in sources:
+        found = gather_evidence(
+            source, options, within, lens=lens, detector=detector, frames_before=frames, tries_solutions=alone
+        )
+        frames += found.frames
+        if joint.add(found.evidence, source.name):
+            gathered.append(found)
+        if found.stopped:
+            break
+    return gathered
 
 
 def solve_evidence(evidence: Evidence, options: Options, lens: Camera | None = None) -> ReplayResult:

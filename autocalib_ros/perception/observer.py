@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from autocalib_ros.config import GateOptions, Options
+from autocalib_ros.evidence.landmarks import Landmarks
 from autocalib_ros.evidence.picture import Picture
 from autocalib_ros.evidence.snapshot import Edges, Outlines, Segments, Track, TrackKind
 from autocalib_ros.evidence.stillness import MIN_REPORTED_SWAY_PX, Stillness, drift_limit_px, sway_limit_px
@@ -19,6 +20,7 @@ from autocalib_ros.perception.edges import EdgeFinder
 from autocalib_ros.perception.frame_gate import LEVEL_SHIFT_THRESHOLD, FrameGate, FrameStatus
 from autocalib_ros.perception.ignore_regions import IgnoreMask, black_out, require_polygons_inside, union
 from autocalib_ros.perception.klt_tracker import PointTracker
+from autocalib_ros.perception.landmark_matching import find_landmarks
 from autocalib_ros.perception.line_segments import LineSegmentDetector
 from autocalib_ros.perception.motion_mask import MotionMask, Region, exclude_pixels
 from autocalib_ros.perception.picture_area import PictureArea
@@ -304,6 +306,16 @@ class Observer:
             tracked = [self._tracked_image(sample) for sample in samples]
             scene.lines.find(grey, times, scene.picture_area.mask, tracked)
         return self._to_full_pixels(scene.lines.lines_px.reshape(-1, 2)).reshape(-1, 4)
+
+    def landmarks(self, view: int) -> Landmarks:
+        """Return the landmarks of the background of a view in memory, pixels of the full image; none without one."""
+        scene = self._scenes[view]
+        samples = scene.background.grey_samples()
+        if not samples:
+            return Landmarks()
+        excluded = union(self._excluded_by_options, scene.picture_area.mask)
+        found = find_landmarks(self._tracked_image(median(samples)), excluded)
+        return Landmarks(self._to_full_pixels(found.points_px), found.descriptors)
 
     def picture(self, view: int) -> Picture:
         """Return the picture inside the images of a view in memory, pixels of the full image."""

@@ -15,7 +15,7 @@ from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.evidence.stillness import ViewChangeKind
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.recordings.open import open_source
-from autocalib_ros.offline.recordings.sources import Frame
+from autocalib_ros.offline.recordings.sources import Frame, TimeWindow
 from autocalib_ros.offline.replay_recording import replay, solve_evidence
 from autocalib_ros.results.calibration import Refusal
 
@@ -26,7 +26,7 @@ class Drive:
     """A minimal `Source` of generated images."""
 
     name, topic, image_type, camera_frame, duration_s = 'drive', '', '', '', None
-    pixel_aspect = 0.0
+    pixel_aspect, window = 0.0, TimeWindow()
 
     def __init__(self, total: int) -> None:
         self.total = total
@@ -149,7 +149,7 @@ class TwoViews:
     """A title card for three seconds, then a road with a box that crosses it, by `Frame`."""
 
     name, topic, image_type, camera_frame, duration_s = 'two views', '', '', '', None
-    pixel_aspect = 0.0
+    pixel_aspect, window = 0.0, TimeWindow()
 
     def frames(self):
         noise = np.random.default_rng(1)

@@ -23,7 +23,7 @@ from autocalib_ros.offline.benchmark.streams import (
     run_stream,
     run_streams,
 )
-from autocalib_ros.offline.recordings.sources import Frame, StoredImage
+from autocalib_ros.offline.recordings.sources import Frame, StoredImage, TimeWindow
 from autocalib_ros.offline.simulate.repeat_faults import REPEAT_FAULTS, jpeg, skipping
 from autocalib_ros.offline.simulate.stamp_faults import MESSAGE_FAULTS, STAMP_FAULTS
 from autocalib_ros.perception.frame_clock import FrameClock
@@ -44,7 +44,7 @@ class Road:
     """A minimal `Source`: three cars on a still road, one fast and near, one small and slow."""
 
     name, topic, image_type, camera_frame = 'road', '', '', ''
-    pixel_aspect = 0.0
+    pixel_aspect, window = 0.0, TimeWindow()
 
     def __init__(self, total: int) -> None:
         self.total, self.duration_s = total, total * INTERVAL_NS * 1e-9

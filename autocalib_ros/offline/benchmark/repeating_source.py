@@ -19,7 +19,7 @@ class RepeatingSource:
         self.order = fault.order(len(self._stamps_ns), np.random.default_rng(seed))
         self.name, self.topic, self.image_type = source.name, source.topic, source.image_type
         self.camera_frame, self.duration_s = source.camera_frame, source.duration_s
-        self.pixel_aspect = source.pixel_aspect
+        self.pixel_aspect, self.window = source.pixel_aspect, source.window
         self.total: int | None = len(self.order)
 
     def frames(self) -> Iterator[Frame]:

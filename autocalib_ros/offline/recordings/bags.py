@@ -41,7 +41,7 @@ class BagSource:
 
     def __init__(self, path: Path, topic: str | None, window: TimeWindow) -> None:
         self.name = str(path)
-        self._path, self._window = path, window
+        self._path, self.window = path, window
         self._ros1 = _is_ros1(path)
         self._types = get_typestore(Stores.ROS1_NOETIC if self._ros1 else Stores.ROS2_JAZZY)
         with _as_input_errors(path), _open_readers(path) as readers:
@@ -98,7 +98,7 @@ class BagSource:
 
     def _messages(self) -> Iterator[_BagMessage]:
         """Yield the messages of the window; a truncated recording yields its readable part and logs a warning."""
-        start_ns, stop_ns = self._window.bounds_ns
+        start_ns, stop_ns = self.window.bounds_ns
         start_ns += self._first_ns
         stop_ns = None if stop_ns is None else stop_ns + self._first_ns
         yielded = 0
@@ -106,7 +106,7 @@ class BagSource:
             with _as_input_errors(self._path):
                 readers = stack.enter_context(_open_readers(self._path))
             try:
-                for stored in self._read(readers, None if self._window.start_s == 0 else start_ns, stop_ns):
+                for stored in self._read(readers, None if self.window.start_s == 0 else start_ns, stop_ns):
                     yielded += 1
                     yield stored
             except AutocalibError:
@@ -116,7 +116,7 @@ class BagSource:
                     raise InputError(f'cannot read {self.name}: {_one_line(error)}') from error
                 LOG.warning('%s ended early, after %d images: %s', self.name, yielded, _one_line(error))
         if not yielded:
-            raise no_image_error(self.name, self._window, None)
+            raise no_image_error(self.name, self.window, None)
 
     def _read(self, readers: list[Any], start_ns: int | None, stop_ns: int | None) -> Iterator[_BagMessage]:
         for reader in readers:

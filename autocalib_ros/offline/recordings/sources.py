@@ -68,6 +68,8 @@ class Source(Protocol):
 
     name: str
     """File or folder name for messages."""
+    window: TimeWindow
+    """The part of it that is read."""
     topic: str
     """Image topic; '' in a video."""
     image_type: str

@@ -18,6 +18,8 @@ PLAUSIBLE_FPS = (0.01, 1000.0)
 FALLBACK_FPS = 25.0
 PLAUSIBLE_PIXEL_ASPECT = (0.2, 5.0)
 """Width of a pixel over its height; the usual squeezes lie between 1/2 and 2, and other values come from damage."""
+RAW_SUFFIXES = ('.h264', '.264', '.h265', '.265', '.hevc', '.mjpg', '.mjpeg')
+"""Videos without a container have no times; FFmpeg says 25 frames/s of them."""
 MIN_DECODED_FRACTION = 0.95
 """Fraction of the frames declared in the header below which a video counts as truncated; some containers estimate
 their number only."""
@@ -28,9 +30,12 @@ class VideoSource:
 
     topic = image_type = camera_frame = ''
 
-    def __init__(self, path: Path, window: TimeWindow) -> None:
-        self.name = str(path)
-        self._path, self._window = path, window
+    def __init__(
+        self, path: Path | str, window: TimeWindow, rate_hz: float | None = None, name: str | None = None
+    ) -> None:
+        """`rate_hz` replaces the times of the file; `name` is that for messages, by default the path."""
+        self.name = str(path) if name is None else name
+        self._path, self.window, self._rate_hz = path, window, rate_hz
         with self._capture() as capture:
             fps, declared_frames = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
             if not capture.grab():
@@ -40,15 +45,26 @@ class VideoSource:
             LOG.warning(
                 '%s says that its pixels are %.4g times as wide as high, which is used', self.name, self.pixel_aspect
             )
-        if not PLAUSIBLE_FPS[0] <= fps <= PLAUSIBLE_FPS[1]:
-            LOG.warning('%s has no valid frame rate; %g frames/s assumed', self.name, FALLBACK_FPS)
-            fps = FALLBACK_FPS
+        fps = self._plausible_rate(fps)
         self._fps = fps
         self._declared_frames = int(declared_frames) if 0 < declared_frames < 1e9 else None
         self.duration_s = self.total = None
         if self._declared_frames:
             self.duration_s = window.overlap_s(self._declared_frames / fps)
             self.total = round(self.duration_s * fps)
+
+    def _plausible_rate(self, fps: float) -> float:
+        """Return the rate that is given, that of the file, or an assumed one with a warning."""
+        if self._rate_hz is not None:
+            return self._rate_hz
+        if not PLAUSIBLE_FPS[0] <= fps <= PLAUSIBLE_FPS[1]:
+            LOG.warning('%s has no valid frame rate; %g frames/s assumed, see --rate', self.name, FALLBACK_FPS)
+            return FALLBACK_FPS
+        if Path(self._path).suffix.lower() in RAW_SUFFIXES:
+            LOG.warning(
+                '%s is a raw stream without times; %g frames/s assumed, give the true rate with --rate', self.name, fps
+            )
+        return fps
 
     def frames(self) -> Iterator[Frame]:
         """Yield the decoded frames of the window; InputError without a frame."""
@@ -63,8 +79,8 @@ class VideoSource:
 
     def _stamped(self) -> Iterator[tuple[int, cv2.VideoCapture]]:
         """Yield the stamp of each frame of the window, and the capture to retrieve the frame from."""
-        start_ns, stop_ns = self._window.bounds_ns
-        clock, yielded = _FrameClock(self._fps), 0
+        start_ns, stop_ns = self.window.bounds_ns
+        clock, yielded = _FrameClock(self._fps, self._rate_hz is not None), 0
         with self._capture() as capture:
             while capture.grab():
                 stamp_ns = clock.next_ns(capture.get(cv2.CAP_PROP_POS_MSEC))
@@ -76,7 +92,7 @@ class VideoSource:
             else:
                 self._warn_if_truncated(clock.ticks)
         if not yielded:
-            raise no_image_error(self.name, self._window, clock.ticks / self._fps)
+            raise no_image_error(self.name, self.window, clock.ticks / self._fps)
 
     def _warn_if_truncated(self, frames: int) -> None:
         if frames and self._declared_frames and frames < MIN_DECODED_FRACTION * self._declared_frames - 2:
@@ -108,15 +124,18 @@ def _pixel_aspect(capture: cv2.VideoCapture) -> float:
 class _FrameClock:
     """Stamps of frames: presentation times if they increase, else multiples of the frame interval."""
 
-    def __init__(self, fps: float) -> None:
-        self._step_ns = 1e9 / fps
+    def __init__(self, fps: float, is_even: bool = False) -> None:
+        """`is_even` says that only the frame interval counts."""
+        self._step_ns, self._is_even = 1e9 / fps, is_even
         self._offset_ms: float | None = None
         self._previous_ns = 0
         self.ticks = 0
 
     def next_ns(self, position_ms: float) -> int:
         """Return the stamp of the next frame; stamps increase strictly."""
-        if self._offset_ms is None:
+        if self._is_even:
+            stamp_ns = round(self.ticks * self._step_ns)
+        elif self._offset_ms is None:
             self._offset_ms, stamp_ns = position_ms, 0
         else:
             stamp_ns = round((position_ms - self._offset_ms) * 1e6)
