@@ -34,10 +34,12 @@ def replay_and_report(
     json: bool = False,
     stop: StopRequest | None = None,
     before: Evidence | None = None,
+    named_after: Sequence[Source] | None = None,
 ) -> ReplayResult:
     """Replay recordings of one camera, write the output files and print the result.
 
-    `stop` is the request that live streams among the sources ask; `before` is evidence of an earlier run.
+    `stop` is the request that live streams among the sources ask; `before` is evidence of an earlier run, then the
+    results are named after all its sources, `named_after`.
     """
     from autocalib_ros.offline.outputs import EvidenceFile, write_outputs
     from autocalib_ros.offline.replay_recording import replay
@@ -65,7 +67,7 @@ def replay_and_report(
         print_stderr(f'{replayed.repeated} of {replayed.frames} images repeat an earlier one and are left out.')
     if not quiet and not replayed.evidence.picture.fills_image:
         print_stderr(replayed.evidence.picture.description)
-    print_result(replayed, out, write_outputs(out, replayed, sources, file), quiet=quiet, json=json)
+    print_result(replayed, out, write_outputs(out, replayed, named_after or sources, file), quiet=quiet, json=json)
     return replayed
 
 

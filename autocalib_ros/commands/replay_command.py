@@ -14,6 +14,7 @@ from autocalib_ros.config import Options
 from autocalib_ros.errors import UsageError
 
 if TYPE_CHECKING:
+    from autocalib_ros.evidence.snapshot import Evidence
     from autocalib_ros.offline.recordings.sources import Source
     from autocalib_ros.results.calibration import Calibration, Refusal
 
@@ -42,6 +43,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='BAG',
         help='write a new rosbag2 with the images, CameraInfo and the ground transform',
     )
+    parser.add_argument(
+        '--resume',
+        action='store_true',
+        help='go on from evidence.npz in the folder for the results: read only what it was not read from yet',
+    )
     parser.add_argument('--start', type=float, default=0.0, metavar='S', help='seconds to skip at the start')
     parser.add_argument('--duration', type=float, metavar='S', help='seconds to use; of a stream, to record')
     parser.add_argument(
@@ -69,6 +75,9 @@ def run(arguments: argparse.Namespace) -> int:
     from autocalib_ros.offline import outputs
 
     outputs.prepare_output_dir(arguments.out, arguments.write_bag)
+    before, named = None, sources
+    if arguments.resume:
+        before, sources = _resumed(arguments, sources)
     replayed = replay_and_report(
         sources,
         options,
@@ -78,10 +87,29 @@ def run(arguments: argparse.Namespace) -> int:
         quiet=arguments.quiet,
         json=arguments.json,
         stop=stop,
+        before=before,
+        named_after=named,
     )
     if arguments.write_bag is not None:
-        _write_bag(arguments.write_bag, replayed.result, sources[0], options)
+        _write_bag(arguments.write_bag, replayed.result, named[0], options)
     return DONE if replayed.result else REFUSED
+
+
+def _resumed(arguments: argparse.Namespace, sources: list[Source]) -> tuple[Evidence | None, list[Source]]:
+    """Return the evidence of the earlier run, None without one, and what is left to read."""
+    from autocalib_ros.offline.outputs import EVIDENCE
+    from autocalib_ros.offline.resume import read_evidence_to_resume, sources_to_read
+
+    if arguments.start > 0 or (arguments.duration is not None and any(source.total for source in sources)):
+        raise UsageError('--resume reads recordings to their end: leave out --start and --duration')
+    before = read_evidence_to_resume(arguments.out / EVIDENCE)
+    if before is None:
+        print_stderr(f'{arguments.out / EVIDENCE} does not exist: nothing to go on from, the replay begins anew.')
+        return None, sources
+    left = sources_to_read(sources, before)
+    if not arguments.quiet:
+        print_stderr(f'Going on from {arguments.out / EVIDENCE}: {len(left)} of {len(sources)} recordings to read.')
+    return before, left
 
 
 def _write_bag(path: Path, result: Calibration | Refusal, source: Source, options: Options) -> None:

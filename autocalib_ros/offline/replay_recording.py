@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -29,6 +30,8 @@ from autocalib_ros.perception.detector.detector import VehicleDetector
 from autocalib_ros.perception.frame_clock import ClockSummary
 from autocalib_ros.report.scene import SolutionSnapshot, append_snapshot
 from autocalib_ros.results.calibration import Calibration, Refusal
+
+LOG = logging.getLogger(__name__)
 
 Recording: TypeAlias = Source | Path | str
 
@@ -135,9 +138,15 @@ def _gather_all(
     within = replace(control, on_checkpoint=None if store is None else lambda part: store(joint.with_part(part)))
     frames = 0
     for source in sources:
-        found = gather_evidence(
-            source, options, within, lens=lens, detector=detector, frames_before=frames, tries_solutions=alone
-        )
+        try:
+            found = gather_evidence(
+                source, options, within, lens=lens, detector=detector, frames_before=frames, tries_solutions=alone
+            )
+        except InputError as error:
+            if len(sources) == 1 and not joint:
+                raise
+            LOG.warning('left out: %s', error)
+            continue
         frames += found.frames
         if joint.add(found.evidence, source.name):
             gathered.append(found)

@@ -17,6 +17,7 @@ from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.recordings.open import open_source
 from autocalib_ros.offline.recordings.sources import Frame, TimeWindow
 from autocalib_ros.offline.replay_recording import replay, solve_evidence
+from autocalib_ros.offline.resume import read_evidence_to_resume, sources_to_read
 from autocalib_ros.results.calibration import Refusal
 
 pytestmark = pytest.mark.render
@@ -176,3 +177,29 @@ def test_stillness_survives_the_file(tmp_path):
     evidence = replay(TwoViews(), Options()).evidence
     evidence.save(tmp_path / 'evidence.npz')
     assert Evidence.load(tmp_path / 'evidence.npz').stillness == evidence.stillness
+
+
+def test_a_stopped_replay_is_resumed_where_it_stopped(tmp_path, write_video):
+    path = write_video(tmp_path / 'clip.avi', count=60, fps=10.0, size=(160, 120))
+    seen = []
+    first = replay(path, Options(), lambda done, _: seen.append(done), should_stop=lambda: len(seen) >= 40)
+    first.evidence.save(tmp_path / 'evidence.npz')
+    before = read_evidence_to_resume(tmp_path / 'evidence.npz')
+    (left,) = sources_to_read([open_source(path)], before)
+    assert [round(frame.stamp_ns * 1e-8) for frame in left.frames()] == list(range(40, 60))
+    # rolled noise is of no view, so that only what was read is the question
+    assert [one.read_s for one in before.recordings] == pytest.approx([3.9])
+
+
+def test_what_was_read_to_its_end_is_not_read_again(tmp_path, write_video):
+    path = write_video(tmp_path / 'clip.avi', count=30, fps=10.0)
+    evidence = replay(path, Options()).evidence
+    other = write_video(tmp_path / 'other.avi')
+    assert [one.name for one in sources_to_read([open_source(path), open_source(other)], evidence)] == [str(other)]
+
+
+def test_evidence_without_landmarks_is_not_resumed(tmp_path):
+    replace(replay(Drive(5), Options()).evidence, recordings=()).save(tmp_path / 'evidence.npz')
+    with pytest.raises(UsageError, match='does not say what it was read from'):
+        read_evidence_to_resume(tmp_path / 'evidence.npz')
+    assert read_evidence_to_resume(tmp_path / 'nowhere.npz') is None

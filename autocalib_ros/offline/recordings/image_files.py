@@ -38,20 +38,23 @@ class ImageFilesSource:
         self._paths, self.window = list(paths), window
         self._stamps_ns, how = _stamps(self._paths, rate_hz)
         LOG.info('%s: times of the images by %s', self.name, how)
-        start_ns, stop_ns = window.bounds_ns
-        since_ns = [stamp - self._stamps_ns[0] for stamp in self._stamps_ns]
-        self._chosen = [
-            index for index, at in enumerate(since_ns) if at >= start_ns and (stop_ns is None or at < stop_ns)
-        ]
-        self._length_s = since_ns[-1] * 1e-9
+        self._length_s = (self._stamps_ns[-1] - self._stamps_ns[0]) * 1e-9
         self.total: int | None = len(self._chosen)
         self.duration_s: float | None = window.overlap_s(self._length_s)
+
+    @property
+    def _chosen(self) -> list[int]:
+        """Indices of the images of the window."""
+        start_ns, stop_ns = self.window.bounds_ns
+        since_ns = (stamp - self._stamps_ns[0] for stamp in self._stamps_ns)
+        return [index for index, at in enumerate(since_ns) if at >= start_ns and (stop_ns is None or at < stop_ns)]
 
     def frames(self) -> Iterator[Frame]:
         """Yield the images of the window; unreadable ones and those of another size are left out and told."""
         size: tuple[int, ...] | None = None
         left_out: list[str] = []
-        for index in self._chosen:
+        chosen = self._chosen
+        for index in chosen:
             image = _read(self._paths[index])
             if image is None or (size is not None and image.shape[:2] != size):
                 left_out.append(self._paths[index].name)
@@ -67,7 +70,7 @@ class ImageFilesSource:
         if left_out:
             LOG.warning(
                 '%d of %d images cannot be read or have another size than %dx%d, and are left out; the first: %s',
-                *(len(left_out), len(self._chosen), size[1], size[0], left_out[0]),
+                *(len(left_out), len(chosen), size[1], size[0], left_out[0]),
             )
 
     def stored(self) -> Iterator[StoredImage]:

@@ -107,7 +107,8 @@ def test_an_rtsp_server_is_read():
     python = next(filter(has_gstreamer, PYTHONS), None)
     if python is None:
         pytest.skip('no GStreamer RTSP server: apt-get install gir1.2-gst-rtsp-server-1.0 python3-gi')
-    pipeline = 'videotestsrc is-live=true ! video/x-raw,format=I420,width=160,height=120,framerate=30/1 ! jpegenc ! rtpjpegpay name=pay0'
+    caps = 'video/x-raw,format=I420,width=160,height=120,framerate=30/1'
+    pipeline = f'videotestsrc is-live=true ! {caps} ! jpegenc ! rtpjpegpay name=pay0'
     server = subprocess.Popen(
         [python, str(RTSP_SERVER), pipeline], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     )
