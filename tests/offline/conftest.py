@@ -185,3 +185,9 @@ def lens_only(full: ReplayResult) -> ReplayResult:
 def jazzy() -> Any:
     """Return the message types of Jazzy."""
     return TYPES
+
+
+@pytest.fixture
+def noetic() -> Any:
+    """Return the message types of Noetic."""
+    return TYPES1

@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import logging
+import shutil
+import weakref
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
+from tempfile import mkdtemp
 from typing import Any
 
-from rosbags.interfaces import Connection
-from rosbags.rosbag1 import Reader as Reader1
-from rosbags.rosbag2 import Reader as Reader2
 from rosbags.typesys import Stores, get_typestore
 
 from autocalib_ros.errors import AutocalibError, InputError, UsageError
+from autocalib_ros.offline.recordings.bag_parts import BagPart, find_parts, one_line, open_parts
+from autocalib_ros.offline.recordings.scanned_files import zstd_decompress
 from autocalib_ros.offline.recordings.sources import Frame, StoredImage, TimeWindow, no_image_error
-from autocalib_ros.offline.recordings.truncated_mcap import is_truncated, readable_path
 from autocalib_ros.perception.header_stamps import HeaderStamps
 from autocalib_ros.perception.images import ImageDecoder
 
@@ -41,22 +41,37 @@ class BagSource:
 
     def __init__(self, path: Path, topic: str | None, window: TimeWindow) -> None:
         self.name = str(path)
-        self._path, self.window = path, window
-        self._ros1 = _is_ros1(path)
-        self._types = get_typestore(Stores.ROS1_NOETIC if self._ros1 else Stores.ROS2_JAZZY)
-        with _as_input_errors(path), _open_readers(path) as readers:
+        self.window = window
+        self._copies: Path | None = None
+        self._parts = find_parts(path, self._temporary)
+        with open_parts(self._parts) as readers:
+            self._parts = readers  # what cannot be read was told
             topics = _Topics(self.name, readers)
             self.topic, self.image_type = topics.choose(topic)
             count = topics.counts[self.topic]
+            self._ros1 = self._is_ros1(readers)
+            self._types = get_typestore(Stores.ROS1_NOETIC if self._ros1 else Stores.ROS2_JAZZY)
             first = self._peek(readers)
             recording_s = (max(reader.end_time for reader in readers) - self._first_ns) * 1e-9
         self.camera_frame = first.header.frame_id.lstrip('/') if first else ''
         self.pixel_aspect = 0.0
         duration_s = window.overlap_s(recording_s)
         self.duration_s: float | None = duration_s
-        if any(is_truncated(part) for part in _recording_files(path)):
-            LOG.warning('%s ended early, its recorder did not close it; complete records are used', self.name)
-        self.total = count if window.is_whole_recording else round(count * duration_s / max(recording_s, 1e-9))
+        self.total: int | None = (
+            count if window.is_whole_recording else round(count * duration_s / max(recording_s, 1e-9))
+        )
+
+    def _temporary(self) -> Path:
+        """Return a folder for copies, which is removed with this source."""
+        if self._copies is None:
+            self._copies = Path(mkdtemp(prefix='autocalib_'))
+            weakref.finalize(self, shutil.rmtree, self._copies, ignore_errors=True)
+        return self._copies
+
+    def _is_ros1(self, readers: list[BagPart]) -> bool:
+        """Return whether the images are serialised as by ROS 1: of a .bag, or of ROS 1 in MCAP."""
+        chosen = [one for reader in readers for one in reader.connections if one.topic == self.topic]
+        return self._parts[0].is_ros1 or any(getattr(one, 'is_ros1', False) for one in chosen)
 
     def frames(self) -> Iterator[Frame]:
         """Yield the decoded images of the window in the order of recording; InputError without an image."""
@@ -102,9 +117,7 @@ class BagSource:
         start_ns += self._first_ns
         stop_ns = None if stop_ns is None else stop_ns + self._first_ns
         yielded = 0
-        with ExitStack() as stack:
-            with _as_input_errors(self._path):
-                readers = stack.enter_context(_open_readers(self._path))
+        with open_parts(self._parts) as readers:
             try:
                 for stored in self._read(readers, None if self.window.start_s == 0 else start_ns, stop_ns):
                     yielded += 1
@@ -113,15 +126,14 @@ class BagSource:
                 raise
             except Exception as error:  # decoders of damaged files raise arbitrary exceptions
                 if not yielded:
-                    raise InputError(f'cannot read {self.name}: {_one_line(error)}') from error
-                LOG.warning('%s ended early, after %d images: %s', self.name, yielded, _one_line(error))
+                    raise InputError(f'cannot read {self.name}: {one_line(error)}') from error
+                LOG.warning('%s ended early, after %d images: %s', self.name, yielded, one_line(error))
         if not yielded:
             raise no_image_error(self.name, self.window, None)
 
-    def _read(self, readers: list[Any], start_ns: int | None, stop_ns: int | None) -> Iterator[_BagMessage]:
+    def _read(self, readers: list[BagPart], start_ns: int | None, stop_ns: int | None) -> Iterator[_BagMessage]:
         for reader in readers:
-            wanted = [c for c in reader.connections if (c.topic, c.msgtype) == (self.topic, self.image_type)]
-            for _, recorded_ns, raw in reader.messages(wanted, start_ns, stop_ns) if wanted else ():
+            for recorded_ns, raw in reader.messages(self.topic, self.image_type, start_ns, stop_ns):
                 raw = _decompressed(raw)
                 yield _BagMessage(recorded_ns, raw, self._message(raw))
 
@@ -133,7 +145,7 @@ class BagSource:
         except Exception:  # a damaged message raises arbitrary exceptions and is skipped
             return None
 
-    def _peek(self, readers: list[Any]) -> Any:
+    def _peek(self, readers: list[BagPart]) -> Any:
         """Note the time of the first image; return its message, None if it is damaged."""
         first = next(self._read(readers, None, None), None)
         if first is None:
@@ -156,7 +168,7 @@ class BagSource:
 class _Topics:
     """The topics of a recording: selection of the image topic and error messages."""
 
-    def __init__(self, name: str, readers: list[Any]) -> None:
+    def __init__(self, name: str, readers: list[BagPart]) -> None:
         self._name = name
         self.counts: dict[str, int] = {}
         self._types: dict[str, str] = {}
@@ -165,7 +177,7 @@ class _Topics:
         if not any(self.counts.values()):
             raise InputError(f'{name} is an empty recording: it has no messages')
 
-    def _add(self, connection: Connection) -> None:
+    def _add(self, connection: Any) -> None:
         self.counts[connection.topic] = self.counts.get(connection.topic, 0) + connection.msgcount
         self._types[connection.topic] = connection.msgtype
 
@@ -191,65 +203,12 @@ class _Topics:
         return ', '.join(f'{topic} ({self._types[topic]}, {self.counts[topic]} messages)' for topic in sorted(topics))
 
 
-@contextmanager
-def _open_readers(path: Path) -> Iterator[list[Any]]:
-    """Open all files of a recording; a killed recorder leaves a folder without metadata.yaml."""
-    with ExitStack() as stack:
-        readers = [
-            stack.enter_context(Reader1(part) if _is_ros1(part) else Reader2(readable_path(part)))
-            for part in _recording_files(path)
-        ]
-        yield sorted(readers, key=lambda reader: reader.start_time)
-
-
-def _is_ros1(path: Path) -> bool:
-    """Return whether the path is a ROS 1 recording: a .bag file, not a rosbag2 folder of such a name."""
-    return path.suffix.lower() == '.bag' and not path.is_dir()
-
-
-def _recording_files(path: Path) -> list[Path]:
-    """Return the paths to open: the recording itself, or the files of a folder without a valid metadata.yaml."""
-    if not path.is_dir():
-        return [path]
-    parts = sorted(part for part in path.iterdir() if part.suffix in ('.mcap', '.db3'))
-    metadata = path / 'metadata.yaml'
-    if metadata.exists() and (not parts or metadata.stat().st_size) and not any(is_truncated(part) for part in parts):
-        return [path]
-    if not parts:
-        raise InputError(f'{path} is not a recording: it has neither a metadata.yaml nor .mcap or .db3 files')
-    if len({part.suffix for part in parts}) > 1:
-        raise InputError(f'{path} has no metadata.yaml but both .mcap and .db3 files: give one file')
-    return parts
-
-
-@contextmanager
-def _as_input_errors(path: Path) -> Iterator[None]:
-    """Convert exceptions that rosbags raises for damaged files into an InputError of one line."""
-    try:
-        yield
-    except AutocalibError:
-        raise
-    except Exception as error:
-        raise InputError(f'cannot read {path}: {_one_line(error)}') from error
-
-
-def _one_line(error: Exception) -> str:
-    text = ' '.join(str(error).split()).rstrip('.')
-    if 'disk image is malformed' in text:
-        text += " (a damaged SQLite file: 'sqlite3 FILE .recover' may save a part)"
-    return text or f'it is damaged ({type(error).__name__})'
-
-
 def _header_ns(header: Any) -> int:
     return header.stamp.sec * 1_000_000_000 + header.stamp.nanosec
 
 
 def _decompressed(raw: bytes | memoryview) -> bytes | memoryview:
-    """Decompress a message of a single file whose missing metadata.yaml announced compressed messages."""
+    """Decompress a message of a file whose metadata.yaml announced compressed messages."""
     if bytes(raw[:4]) != ZSTD_MAGIC:  # a CDR message begins with 00, a ROS 1 image with its counter
         return raw
-    try:
-        from compression import zstd  # type: ignore[import-not-found]  # Python 3.14
-    except ImportError:
-        from backports import zstd  # comes with rosbags
-    return zstd.decompress(raw)
+    return zstd_decompress(raw)

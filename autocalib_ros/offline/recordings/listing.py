@@ -16,6 +16,10 @@ VIDEO_SUFFIXES = (
     *('.3gp', '.ogv', '.h264', '.264', '.h265', '.265', '.hevc', '.mjpg', '.mjpeg', '.y4m', '.dav'),
 )
 """Suffixes of videos that are looked for in a folder; a file that is named is tried whatever its suffix."""
+PART_SUFFIXES = ('.mcap', '.db3')
+"""Of the files of a rosbag2."""
+PACKED_SUFFIXES = ('.zstd', '.zst')
+"""Of files packed as a whole by rosbag2, or by hand."""
 ACTIVE_SUFFIX = '.active'
 """What ROS 1 appends to the name of a recording until it is closed."""
 STREAM_SCHEMES = ('rtsp', 'rtsps', 'rtmp', 'http', 'https', 'udp', 'tcp', 'srt', 'rtp')
@@ -36,8 +40,13 @@ def natural_key(path: Path) -> list[tuple[int, int | str]]:
 
 
 def is_bag(path: Path) -> bool:
-    """Return whether a path is named like a ROS recording."""
-    return path.name.lower().removesuffix(ACTIVE_SUFFIX).endswith(BAG_SUFFIXES)
+    """Return whether a path is named like a ROS recording, packed or not."""
+    return bare(path).name.lower().removesuffix(ACTIVE_SUFFIX).endswith(BAG_SUFFIXES)
+
+
+def bare(path: Path) -> Path:
+    """Return a path without the suffix of packed files."""
+    return path.with_suffix('') if path.suffix in PACKED_SUFFIXES else path
 
 
 def recordings_of(arguments: Sequence[str | Path]) -> list[str | Path | list[Path]]:
@@ -65,7 +74,7 @@ def _in_folder(folder: Path) -> list[str | Path | list[Path]]:
         inside = sorted((one for one in folder.iterdir() if not one.name.startswith('.')), key=natural_key)
     except OSError as error:
         raise InputError(f'cannot read {folder}: {error.strerror or error}') from error
-    if any(one.name == 'metadata.yaml' or one.suffix in ('.mcap', '.db3') for one in inside):
+    if any(one.name == 'metadata.yaml' or bare(one).suffix in PART_SUFFIXES for one in inside):
         return [folder]
     images = [one for one in inside if one.suffix.lower() in STILL_IMAGE_SUFFIXES]
     clips = [one for one in inside if _is_clip(one)]
@@ -87,7 +96,7 @@ def _in_folder(folder: Path) -> list[str | Path | list[Path]]:
 def _is_clip(path: Path) -> bool:
     if path.is_dir():
         return (path / 'metadata.yaml').exists()
-    return path.suffix.lower() in VIDEO_SUFFIXES or path.name.endswith('.bag')
+    return path.suffix.lower() in VIDEO_SUFFIXES or path.name.removesuffix(ACTIVE_SUFFIX).endswith('.bag')
 
 
 def _in_pattern(text: str) -> list[str | Path | list[Path]]:

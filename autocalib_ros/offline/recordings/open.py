@@ -92,11 +92,6 @@ def _open_file(path: Path, topic: str | None, window: TimeWindow, rate_hz: float
 
         _refuse(rate_hz, f'{path} has time stamps: --rate is for images and videos')
         return BagSource(path, topic, window)
-    if path.suffix == '.zstd':
-        raise InputError(
-            f'{path} is a compressed part of a recording: give the folder with its metadata.yaml, or decompress the'
-            ' file first (zstd -d)'
-        )
     _refuse(topic, f'{path} is a video and has no topics')
     from autocalib_ros.offline.recordings.videos import VideoSource
 
@@ -118,7 +113,7 @@ def _check_readable(path: Path) -> None:
         if not path.is_file():
             raise InputError(f'{path} is neither a file nor a folder')
         with path.open('rb') as stream:
-            if not stream.read(1):
+            if not stream.read(1) and not Path(f'{path}-wal').exists():
                 raise InputError(f'{path} is empty (0 bytes)')
     except OSError as error:
         raise InputError(f'cannot read {path}: {error.strerror or error}') from error

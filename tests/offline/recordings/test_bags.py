@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
+import struct
 
 import numpy as np
 import pytest
+import yaml
 
 from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.offline.recordings.open import open_source
@@ -264,11 +266,12 @@ def test_a_torn_mcap_without_a_whole_image_is_an_error(tmp_path, write_bag, imag
     assert not caplog.records
 
 
-def test_a_ros1_bag_that_breaks_off_is_an_error(tmp_path, write_bag1, images, ros1_image):
-    path = write_bag1(tmp_path / 'one.bag', images(6, make_one=ros1_image))
-    path.write_bytes(path.read_bytes()[:-300])
-    with pytest.raises(InputError, match='cannot read'):
-        open_source(path)
+@pytest.mark.parametrize('name', ['one.bag', 'one.bag.active'])
+def test_a_ros1_bag_whose_recorder_was_killed_gives_its_images(tmp_path, write_bag1, images, ros1_image, name):
+    whole = write_bag1(tmp_path / 'whole.bag', images(6, make_one=ros1_image)).read_bytes()
+    begin = whole.index(b'index_pos=') + len(b'index_pos=')
+    (tmp_path / name).write_bytes(whole[:begin] + bytes(8) + whole[begin + 8 : -300])
+    assert brightness(open_source(tmp_path / name)) == [5, 15, 25, 35, 45, 55]
 
 
 @pytest.mark.parametrize('fraction', [0.3, 0.6, 0.9])
@@ -294,7 +297,7 @@ def test_a_text_file_named_as_a_recording_is_one_clear_line(tmp_path, name):
 
 @pytest.mark.parametrize(
     ('yaml', 'message'),
-    [('{', 'cannot read'), ('rosbag2_bagfile_information: {version: 9}', 'cannot read'), ('[]', 'cannot read')],
+    [('{', 'its metadata.yaml lists none'), ('rosbag2_bagfile_information: {relative_file_paths: [a.mcap]}', 'a.mcap')],
 )
 def test_broken_metadata_is_one_clear_line(tmp_path, yaml, message):
     (tmp_path / 'metadata.yaml').write_text(yaml)
@@ -314,3 +317,202 @@ def test_a_missing_and_an_empty_file_are_told_apart(tmp_path):
     (tmp_path / 'nothing.mcap').touch()
     with pytest.raises(InputError, match=r'is empty \(0 bytes\)'):
         open_source(tmp_path / 'nothing.mcap')
+
+
+def to_wal(database, folder, checkpointed):
+    """Write a database as a killed recorder leaves it: the rest of its messages in the write-ahead log."""
+    folder.mkdir()
+    open_copy = folder.parent / 'open.db3'
+    source, copy = sqlite3.connect(database), sqlite3.connect(open_copy)
+    copy.execute('PRAGMA journal_mode=WAL')
+    copy.execute('PRAGMA wal_autocheckpoint=0')
+    for (statement,) in source.execute('SELECT sql FROM sqlite_master WHERE sql IS NOT NULL').fetchall():
+        copy.execute(statement)
+    for table in ('schema', 'metadata', 'topics', 'message_definitions'):
+        for row in source.execute(f'SELECT * FROM {table}').fetchall():
+            copy.execute(f'INSERT INTO {table} VALUES ({",".join("?" * len(row))})', row)
+    rows = source.execute('SELECT * FROM messages').fetchall()
+    for part in (rows[:checkpointed], rows[checkpointed:]):
+        copy.executemany('INSERT INTO messages VALUES (?, ?, ?, ?)', part)
+        copy.commit()
+        if part is rows[:checkpointed] or len(part) == checkpointed:
+            copy.execute('PRAGMA wal_checkpoint(TRUNCATE)')
+    for path in folder.parent.glob('open.db3*'):
+        shutil.copy(path, folder)
+    source.close()
+    copy.close()
+
+
+@pytest.mark.parametrize('checkpointed', [0, 3])
+def test_messages_in_the_log_of_a_killed_recorder_are_read(tmp_path, write_bag, images, caplog, checkpointed):
+    bag = write_bag(tmp_path / 'bag', images(8))
+    to_wal(bag / 'bag.db3', tmp_path / 'killed', checkpointed)
+    before = {path.name: path.read_bytes() for path in (tmp_path / 'killed').iterdir()}
+    assert brightness(open_source(tmp_path / 'killed')) == list(range(5, 85, 10))
+    assert 'was not closed by its recorder: the messages in its log are read too' in caplog.text
+    assert {path.name: path.read_bytes() for path in (tmp_path / 'killed').iterdir()} == before
+
+
+def edit_metadata(bag, edit):
+    document = yaml.safe_load((bag / 'metadata.yaml').read_text())
+    edit(document['rosbag2_bagfile_information'])
+    (bag / 'metadata.yaml').write_text(yaml.safe_dump(document))
+
+
+def other_qos(info):
+    zero = {'sec': 0, 'nsec': 0}
+    info['topics_with_message_count'][0]['topic_metadata']['offered_qos_profiles'] = [
+        {'history': 'keep_last', 'depth': 10, 'reliability': 'reliable', 'durability': 'volatile', 'deadline': zero}
+        | {'lifespan': zero, 'liveliness': 'automatic', 'liveliness_lease_duration': zero}
+        | {'avoid_ros_namespace_conventions': False}
+    ]
+
+
+def counts_of_zero(info):
+    info['message_count'] = 0
+    info['topics_with_message_count'][0]['message_count'] = 0
+
+
+@pytest.mark.parametrize('mcap', [False, True])
+@pytest.mark.parametrize(
+    'edit',
+    [
+        other_qos,
+        counts_of_zero,
+        lambda info: info.update(topics_with_message_count=[]),
+        lambda info: info.update(storage_identifier=''),
+        lambda info: info.update(version=99),
+        lambda info: info['topics_with_message_count'][0]['topic_metadata'].update(serialization_format='json'),
+        lambda info: info.update(starting_time={'nanoseconds_since_epoch': 0}, duration={'nanoseconds': 0}),
+    ],
+)
+def test_metadata_that_says_otherwise_loses_no_image(tmp_path, write_bag, images, caplog, edit, mcap):
+    bag = write_bag(tmp_path / 'bag', images(4), mcap=mcap)
+    edit_metadata(bag, edit)
+    source = open_source(bag)
+    assert (source.total, brightness(source)) == (4, [5, 15, 25, 35])
+    assert not caplog.records
+
+
+@pytest.mark.parametrize('mcap', [False, True])
+@pytest.mark.parametrize('with_metadata', [False, True])
+def test_parts_without_a_byte_and_missing_ones_are_left_out_and_told(
+    tmp_path, write_bag, images, caplog, mcap, with_metadata
+):
+    suffix, folder = '.mcap' if mcap else '.db3', tmp_path / 'split'
+    folder.mkdir()
+    for part in range(2):
+        bag = write_bag(tmp_path / f'p{part}', images(3, begin_ns=(100 + part) * SECOND), mcap=mcap)
+        shutil.copy(bag / f'p{part}{suffix}', folder / f'split_{part}{suffix}')
+    (folder / f'split_2{suffix}').touch()
+    if with_metadata:
+        shutil.copy(bag / 'metadata.yaml', folder)
+        names = [f'split_{part}{suffix}' for part in range(4)]
+        edit_metadata(folder, lambda info: info.update(relative_file_paths=names))
+    assert len(brightness(open_source(folder))) == 6
+    assert f'files without any byte are left out: split_2{suffix}' in caplog.text
+    assert (f'files of the recording are missing: split_3{suffix}' in caplog.text) == with_metadata
+
+
+def test_a_part_that_is_no_recording_is_left_out_and_told(tmp_path, write_bag, images, caplog):
+    bag = write_bag(tmp_path / 'bag', images(3), mcap=True)
+    (bag / 'bag_1.mcap').write_text('only words')
+    assert brightness(open_source(bag)) == [5, 15, 25]
+    assert [record.message for record in caplog.records] == [
+        f'left out: cannot read {bag / "bag_1.mcap"}: File magic is invalid'
+    ]
+
+
+@pytest.mark.parametrize('mcap', [False, True])
+def test_files_packed_as_a_whole_are_read_without_metadata(tmp_path, write_bag, images, mcap):
+    bag = write_bag(tmp_path / 'bag', images(4), mcap=mcap, compression='FILE')
+    (bag / 'metadata.yaml').unlink()
+    (packed,) = bag.iterdir()
+    assert brightness(open_source(packed)) == [5, 15, 25, 35]
+
+
+def record(opcode, content):
+    return struct.pack('<BQ', opcode, len(content)) + content
+
+
+def text(value):
+    return struct.pack('<I', len(value)) + value.encode()
+
+
+class Mcap:
+    """An MCAP file without index, record by record."""
+
+    def __init__(self, profile='ros2', kind='sensor_msgs/msg/Image', encoding='cdr'):
+        self.head = b'\x89MCAP0\r\n' + record(1, text(profile) + text('x'))
+        self.channels = record(3, struct.pack('<H', 1) + text(kind) + text('ros2msg') + text(''))
+        self.channels += record(4, struct.pack('<HH', 1, 1) + text('/cam1/image_raw') + text(encoding) + text(''))
+
+    @staticmethod
+    def message(at, data, channel=1):
+        return record(5, struct.pack('<HIQQ', channel, 0, at, at) + data)
+
+    @staticmethod
+    def chunk(times, records):
+        return record(
+            6,
+            struct.pack('<QQQI', min(times), max(times), len(records), 0)
+            + text('')
+            + struct.pack('<Q', len(records))
+            + records,
+        )
+
+    def write(self, path, body):
+        path.write_bytes(self.head + body + record(15, bytes(4)) + record(2, bytes(20)) + b'\x89MCAP0\r\n')
+        return path
+
+
+def serialised(jazzy, messages):
+    return [(at, bytes(jazzy.serialize_cdr(message, message.__msgtype__))) for _, at, message in messages]
+
+
+def test_a_json_channel_beside_the_images_is_no_hindrance(tmp_path, images, jazzy, caplog):
+    mcap = Mcap()
+    body = mcap.channels + record(3, struct.pack('<H', 2) + text('foxglove.Log') + text('jsonschema') + text('{}'))
+    body += record(4, struct.pack('<HH', 2, 2) + text('/log') + text('json') + text(''))
+    body += b''.join(mcap.message(at, data) for at, data in serialised(jazzy, images(4)))
+    path = mcap.write(tmp_path / 'json.mcap', body + mcap.message(200 * SECOND, b'{"a": 1}', 2))
+    assert brightness(open_source(path)) == [5, 15, 25, 35]
+    assert not caplog.records
+    with pytest.raises(UsageError, match=r'/log has no images but /log .foxglove\.Log in json'):
+        open_source(path, topic='/log')
+
+
+@pytest.mark.parametrize('chunked', [False, True])
+def test_a_merged_file_out_of_order_is_sorted(tmp_path, images, jazzy, caplog, chunked):
+    mcap = Mcap()
+    messages = serialised(jazzy, images(10))
+    messages = messages[5:] + messages[:5]
+    if chunked:
+        groups = [messages[:5], messages[5:]]
+        body = b''.join(
+            mcap.chunk([at for at, _ in group], mcap.channels + b''.join(mcap.message(*one) for one in group))
+            for group in groups
+        )
+    else:
+        body = mcap.channels + b''.join(mcap.message(at, data) for at, data in messages)
+    assert brightness(open_source(mcap.write(tmp_path / 'merged.mcap', body))) == list(range(5, 105, 10))
+    assert not caplog.records
+
+
+def test_a_damaged_chunk_is_left_out_and_told(tmp_path, images, jazzy, caplog):
+    mcap = Mcap()
+    chunks = [mcap.chunk([at], mcap.channels + mcap.message(at, data)) for at, data in serialised(jazzy, images(3))]
+    damaged = chunks[1].replace(struct.pack('<I', 0) + struct.pack('<Q', len(chunks[1]) - 49), text('lz4') + bytes(5))
+    assert damaged != chunks[1]
+    path = mcap.write(tmp_path / 'damaged.mcap', chunks[0] + damaged + chunks[2])
+    assert brightness(open_source(path)) == [5, 25]
+    assert '1 damaged chunks are left out' in caplog.text
+
+
+def test_messages_of_ros1_in_mcap_are_read(tmp_path, write_bag1, images, ros1_image, noetic):
+    mcap = Mcap('ros1', 'sensor_msgs/Image', 'ros1')
+    messages = images(3, make_one=ros1_image)
+    body = mcap.channels + b''.join(
+        mcap.message(at, bytes(noetic.serialize_ros1(message, message.__msgtype__))) for _, at, message in messages
+    )
+    assert brightness(open_source(mcap.write(tmp_path / 'one.mcap', body))) == [5, 15, 25]
