@@ -18,6 +18,8 @@ from autocalib_ros.lens.camera_info import DISTORTION_MODELS, EQUIDISTANT_K1_FLO
 from autocalib_ros.lens.opencv_lens import OpencvLens, fit_kannala_brandt
 from autocalib_ros.util.files import write_atomically
 
+INI_WORDS = (b'[image]', b'camera matrix')
+"""What every camera_info in the INI format of Videre has."""
 MAX_YAML_BYTES = 1_000_000
 """Maximum file size: no camera_info comes near it."""
 MAX_ABS_VALUE = 1e9
@@ -121,6 +123,11 @@ def _fields(path: Path) -> Mapping[str, Any]:
         text = stream.read(MAX_YAML_BYTES + 1)
     if len(text) > MAX_YAML_BYTES:
         raise InputError(f'it is longer than {MAX_YAML_BYTES} bytes, so it is no camera_info; {EXPECTED_INPUT}')
+    if all(word in text for word in INI_WORDS):
+        raise InputError(
+            'it is of the INI format (ost.txt): give the ost.yaml that camera_calibration wrote beside it, or convert '
+            'it by "ros2 run camera_calibration_parsers convert FILE.ini FILE.yaml"'
+        )
     try:
         document = next(yaml.safe_load_all(text), None)
     except Exception as error:  # PyYAML raises errors of any type at unknown tags and malformed numbers

@@ -65,8 +65,11 @@ BT601 = np.array(
     ]
 )
 """ITU-R BT.601, limited range: B, G, R from Y, U, V, 1."""
-JPEG_END_WITHIN = 4096
-"""Bytes at the end of a JPEG that are searched for the end marker; some cameras pad their buffers."""
+CONTAINERS = (b'\xff\xd8\xff', b'\x89PNG\r\n\x1a\n', b'II*\0', b'MM\0*', b'RIFF')
+"""First bytes of JPEG, PNG, TIFF of either byte order, and WebP."""
+VIDEO_STARTS = (b'\0\0\0\x01', b'\0\0\x01')
+"""First bytes of a packet of H.264 or H.265."""
+SCAN_START, JPEG_END = b'\xff\xda', b'\xff\xd9'
 
 
 class ImageDecoder:
@@ -98,6 +101,8 @@ class ImageDecoder:
         if encoding in PACKED_ENCODINGS:
             return self._packed(message, encoding)
         if encoding in YUV422_ENCODINGS:
+            if message.width % 2:
+                raise InputError(f"image of encoding '{encoding}' needs an even width, found {message.width}")
             pixels = image_rows(message, 2 * message.width, 1).reshape(message.height, message.width, 2)
             return cv2.cvtColor(np.ascontiguousarray(pixels), YUV422_ENCODINGS[encoding])
         if encoding in PLANAR_ENCODINGS:
@@ -144,19 +149,20 @@ def image_rows(message: Any, row_bytes: int, planes: float) -> np.ndarray:
 
     `planes` is the number of rows divided by the image height.
     """
-    if message.step < row_bytes:
+    data, rows, step = np.frombuffer(message.data, np.uint8), int(message.height * planes), message.step
+    if step < row_bytes and len(data) == rows * row_bytes:
+        step = row_bytes  # drivers give 0, the width or the bytes of a pixel; the length tells that nothing is missing
+    if step < row_bytes:
         raise InputError(
             f"image of encoding '{message.encoding}' and width {message.width} needs rows of {row_bytes}"
             f' bytes, but its step is {message.step}'
         )
-    data, rows = np.frombuffer(message.data, np.uint8), int(message.height * planes)
-    expected = message.step * rows
+    expected = step * rows
     if len(data) < expected:
         raise InputError(
-            f"image of encoding '{message.encoding}' needs {expected} bytes ({rows} rows of"
-            f' {message.step}), found {len(data)}'
+            f"image of encoding '{message.encoding}' needs {expected} bytes ({rows} rows of {step}), found {len(data)}"
         )
-    return data[:expected].reshape(rows, message.step)[:, :row_bytes]
+    return data[:expected].reshape(rows, step)[:, :row_bytes]
 
 
 def canonical_encoding(encoding: str) -> str:
@@ -232,28 +238,40 @@ class PlanarMessage:
 
 
 def decompress(data: np.ndarray, stated_format: str) -> np.ndarray:
-    """Decode a JPEG or PNG, bytes (n,), with the format stated in its message; InputError or cv2.error if invalid."""
+    """Decode a JPEG, PNG, TIFF or WebP, bytes (n,), with the format stated in its message.
+
+    InputError or cv2.error if it is invalid.
+    """
     _check_container(data, stated_format)
     # keep the pixels as the sensor delivered them: applying the EXIF orientation would change the camera geometry
     image = cv2.imdecode(data, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
         raise InputError(f"compressed image of format '{stated_format}', {len(data)} bytes, cannot be decoded")
+    if image.dtype not in (np.uint8, np.uint16):
+        raise InputError(f"compressed image of format '{stated_format}' holds {image.dtype}, not intensities")
     return image
 
 
 def _check_container(data: np.ndarray, stated_format: str) -> None:
     """Check the signature: `format` is often wrong, and OpenCV fills the missing part of a truncated JPEG with grey."""
     head = data[:8].tobytes()
-    if head.startswith(b'\xff\xd8\xff'):
-        if b'\xff\xd9' not in data[-JPEG_END_WITHIN:].tobytes():
+    if head.startswith(VIDEO_STARTS):
+        raise InputError(
+            f"compressed image of format '{stated_format}' is a packet of H.264 or H.265 video, which needs those "
+            'before it: decode the stream to images first'
+        )
+    if not head.startswith(CONTAINERS):
+        begin = head.hex(' ') or 'nothing'
+        raise InputError(
+            f"compressed image of format '{stated_format}' is no JPEG, PNG, TIFF or WebP, it begins with {begin}"
+        )
+    if head.startswith(CONTAINERS[0]):
+        whole = data.tobytes()
+        # cameras pad their buffers; a thumbnail in front has its own end, so that the last scan counts
+        if whole.rfind(JPEG_END) <= whole.rfind(SCAN_START):
             raise InputError(
                 f"compressed image of format '{stated_format}' is a JPEG truncated after {len(data)} bytes"
             )
-    elif head != b'\x89PNG\r\n\x1a\n':
-        begin = head.hex(' ') or 'nothing'
-        raise InputError(
-            f"compressed image of format '{stated_format}' is neither JPEG nor PNG, it begins with {begin}"
-        )
 
 
 def _stamp_s(message: Any) -> float | None:

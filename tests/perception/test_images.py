@@ -299,6 +299,37 @@ def test_jpeg_is_recognised_by_content_not_by_format():
     assert np.abs(image.astype(int) - scene()).mean() < 4
 
 
+@pytest.mark.parametrize('step', [0, WIDTH, 3])
+def test_a_wrong_step_is_no_hindrance_where_the_data_are_complete(step):
+    msg = message('bgr8', scene())
+    msg.step = step
+    assert np.array_equal(ImageDecoder().decode(msg), scene())
+
+
+def test_an_odd_width_of_pairs_of_pixels_is_refused_in_words():
+    msg = message('bgr8', scene())
+    vars(msg).update(encoding='yuv422_yuy2', width=15)
+    with pytest.raises(InputError, match="'yuv422_yuy2' needs an even width, found 15"):
+        ImageDecoder().decode(msg)
+
+
+def test_tiff_is_exact():
+    data = cv2.imencode('.tiff', scene())[1].tobytes()
+    assert np.array_equal(decoded(compressed(data, 'bgr8; tiff compressed bgr8')), scene())
+
+
+@pytest.mark.parametrize('padding', [0, 10, 8192])
+def test_padding_behind_a_jpeg_is_no_truncation(padding):
+    assert decoded(compressed(JPEG + bytes(padding), 'jpeg')).shape == scene().shape
+
+
+def test_a_truncated_jpeg_with_a_thumbnail_is_truncated():
+    with_thumbnail = JPEG[:2] + b'\xff\xe1' + (len(JPEG) + 2).to_bytes(2, 'big') + JPEG + JPEG[2:]
+    assert decoded(compressed(with_thumbnail, 'jpeg')).shape == scene().shape
+    with pytest.raises(InputError, match='is a JPEG truncated'):
+        ImageDecoder().decode(compressed(with_thumbnail[:-20], 'jpeg'))
+
+
 def test_png_is_exact_and_grey_stays_grey():
     data = cv2.imencode('.png', scene()[:, :, 0])[1].tobytes()
     assert np.array_equal(decoded(compressed(data, 'jpeg')), scene()[:, :, 0])
@@ -322,7 +353,7 @@ def test_a_compressed_bayer_mosaic_is_coloured():
         ({'encoding': ''}, "image encoding '' is not supported"),
         ({'data': b'\0' * 100}, r"'bgr8' needs 576 bytes \(12 rows of 48\), found 100"),
         ({'data': b''}, r"'bgr8' needs 576 bytes \(12 rows of 48\), found 0"),
-        ({'step': 16}, 'needs rows of 48 bytes, but its step is 16'),
+        ({'step': 16, 'data': b'\0' * 575}, 'needs rows of 48 bytes, but its step is 16'),
         ({'width': 0}, "'bgr8' has no pixels: 0 x 12"),
         ({'height': 0}, "'bgr8' has no pixels: 16 x 0"),
     ],
@@ -348,9 +379,11 @@ JPEG = cv2.imencode('.jpg', scene())[1].tobytes()
     [
         (JPEG, '16UC1; compressedDepth png', 'holds depths'),
         (JPEG[: len(JPEG) // 2], 'jpeg', 'is a JPEG truncated after'),
-        (b'GIF89a' + bytes(20), 'jpeg', 'neither JPEG nor PNG, it begins with 47 49 46'),
+        (b'GIF89a' + bytes(20), 'jpeg', 'no JPEG, PNG, TIFF or WebP, it begins with 47 49 46'),
         (b'', 'jpeg', 'it begins with nothing'),
         (b'\x89PNG\r\n\x1a\n' + bytes(50), 'png', 'cannot be decoded'),
+        (b'\0\0\0\x01\x67\x42', 'h264', 'is a packet of H.264 or H.265 video'),
+        (cv2.imencode('.tiff', np.ones((4, 4), np.float32))[1].tobytes(), 'tiff', 'holds float32'),
     ],
 )
 def test_a_broken_compressed_image_is_refused_with_the_reason(data, said, reason):

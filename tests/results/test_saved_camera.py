@@ -118,6 +118,11 @@ def test_images_of_another_shape_are_wrong_usage(ours):
         ),
         ('words.yaml', 'only words', 'holds no names with values'),
         ('empty.yaml', '', 'holds no names with values'),
+        (
+            'ost.txt',
+            '[image]\n\nwidth\n640\n\n[c]\n\ncamera matrix\n1 0 0\n',
+            'it is of the INI format .ost.txt.: give',
+        ),
         ('cut.yaml', yaml.safe_dump(CHECKERBOARD, sort_keys=False)[:200], 'it is not YAML'),
     ],
 )

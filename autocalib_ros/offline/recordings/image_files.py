@@ -23,10 +23,11 @@ SHORTEST_INTERVAL_S = 1e-3
 """Shortest usual interval; files that were copied or unpacked have such times."""
 EXIF_IFD, EXIF_TIME, EXIF_SUBSECOND = 0x8769, 0x9003, 0x9291
 """Tags of EXIF 2.3: where the photographic data are, DateTimeOriginal, SubSecTimeOriginal."""
+EXIF_ORIENTATION, UPRIGHT = 0x0112, 1
 
 
 class ImageFilesSource:
-    """Image files in the order given, as BGR or grey; an orientation in EXIF is not applied, as in recordings."""
+    """Image files in the order given, as BGR or grey, turned as their EXIF says: as videos are, and told."""
 
     topic = image_type = camera_frame = ''
     pixel_aspect = 0.0
@@ -38,6 +39,10 @@ class ImageFilesSource:
         self._paths, self.window = list(paths), window
         self._stamps_ns, how = _stamps(self._paths, rate_hz)
         LOG.info('%s: times of the images by %s', self.name, how)
+        if _orientation(self._paths[0]) > UPRIGHT:
+            LOG.warning(
+                '%s: images are turned as their EXIF says; those of the live camera may come unturned', self.name
+            )
         self._length_s = (self._stamps_ns[-1] - self._stamps_ns[0]) * 1e-9
         self.total: int | None = len(self._chosen)
         self.duration_s: float | None = window.overlap_s(self._length_s)
@@ -80,7 +85,7 @@ class ImageFilesSource:
 
 def _read(path: Path) -> np.ndarray | None:
     """Return an image as grey or BGR uint8; None if it cannot be read."""
-    image = cv2.imread(str(path), cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    image = cv2.imread(str(path), cv2.IMREAD_ANYCOLOR)
     return image if image is not None and image.ndim in (2, 3) else None
 
 
@@ -108,6 +113,17 @@ def _is_plausible(stamps_ns: list[int]) -> bool:
     """Whether stamps rise from image to image, at intervals of video."""
     intervals_s = np.diff(np.array(stamps_ns, np.int64)) * 1e-9
     return bool((intervals_s > 0).all() and SHORTEST_INTERVAL_S <= np.median(intervals_s) <= LONGEST_INTERVAL_S)
+
+
+def _orientation(path: Path) -> int:
+    """Return the orientation in EXIF, `UPRIGHT` without one."""
+    from PIL import Image  # comes with matplotlib
+
+    try:
+        with Image.open(path) as image:
+            return int(image.getexif().get(EXIF_ORIENTATION, UPRIGHT))
+    except (OSError, ValueError, TypeError, SyntaxError):
+        return UPRIGHT
 
 
 def _exif_stamps(paths: list[Path]) -> list[int] | None:

@@ -18,6 +18,8 @@ PLAUSIBLE_FPS = (0.01, 1000.0)
 FALLBACK_FPS = 25.0
 PLAUSIBLE_PIXEL_ASPECT = (0.2, 5.0)
 """Width of a pixel over its height; the usual squeezes lie between 1/2 and 2, and other values come from damage."""
+CODECS = {'av01': 'AV1', 'hev1': 'H.265', 'hvc1': 'H.265', 'vvc1': 'H.266', 'drmi': 'encrypted', 'encv': 'encrypted'}
+"""Names of codecs that builds of OpenCV may lack."""
 RAW_SUFFIXES = ('.h264', '.264', '.h265', '.265', '.hevc', '.mjpg', '.mjpeg')
 """Videos without a container have no times; FFmpeg says 25 frames/s of them."""
 MIN_DECODED_FRACTION = 0.95
@@ -39,8 +41,17 @@ class VideoSource:
         with self._capture() as capture:
             fps, declared_frames = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
             if not capture.grab():
-                raise InputError(f'{self.name} has no frame that can be decoded')
+                raise InputError(
+                    f'{self.name} has no frame that can be decoded; its codec is {_codec(capture)}. Convert it, for '
+                    'example: ffmpeg -i IN -c:v libx264 -crf 16 OUT.mp4'
+                )
             self.pixel_aspect = _pixel_aspect(capture)
+            turned_deg = round(capture.get(cv2.CAP_PROP_ORIENTATION_META)) % 360
+        if turned_deg:
+            LOG.warning(
+                '%s is turned by %d degrees, as the file says; images of the live camera may come unturned',
+                *(self.name, turned_deg),
+            )
         if self.pixel_aspect:
             LOG.warning(
                 '%s says that its pixels are %.4g times as wide as high, which is used', self.name, self.pixel_aspect
@@ -107,6 +118,13 @@ class VideoSource:
             yield capture
         finally:
             capture.release()
+
+
+def _codec(capture: cv2.VideoCapture) -> str:
+    """Return the name of the codec of a video."""
+    code = int(capture.get(cv2.CAP_PROP_FOURCC))
+    name = ''.join(chr(code >> shift & 0xFF) for shift in (0, 8, 16, 24)).strip('\0 ').lower()
+    return f'{name} ({CODECS[name]})' if name in CODECS else (name if name.isprintable() and name else 'unknown')
 
 
 def _pixel_aspect(capture: cv2.VideoCapture) -> float:

@@ -90,10 +90,10 @@ def test_a_video_has_no_topics(tmp_path, write_video):
         open_source(write_video(tmp_path / 'clip.mp4'), topic='/image')
 
 
-def test_a_compressed_part_of_a_recording_is_explained(tmp_path):
+def test_a_packed_part_without_content_is_one_clear_line(tmp_path):
     path = tmp_path / 'bag_0.mcap.zstd'
     path.write_bytes(b'\x28\xb5\x2f\xfd')
-    with pytest.raises(InputError, match=r'give the folder with its metadata\.yaml'):
+    with pytest.raises(InputError, match=r'cannot read .*bag_0\.mcap\.zstd'):
         open_source(path)
 
 
@@ -105,3 +105,40 @@ def test_positions_that_stand_still_give_way_to_the_frame_rate():
 def test_uneven_positions_are_kept():
     clock = _FrameClock(10.0)
     assert [clock.next_ns(ms) for ms in (40.0, 140.0, 340.0)] == [0, 100_000_000, 300_000_000]
+
+
+needs_ffmpeg = pytest.mark.skipif(
+    shutil.which('ffmpeg') is None, reason='no ffmpeg to convert videos: apt-get install ffmpeg'
+)
+
+
+def converted(source, target, *options):
+    subprocess.run(['ffmpeg', '-v', 'error', '-i', source, *options, target], check=True)
+    return target
+
+
+@needs_ffmpeg
+@pytest.mark.parametrize(('suffix', 'codec'), [('.h264', 'libx264'), ('.mjpeg', 'mjpeg')])
+def test_a_raw_stream_has_no_times_unless_a_rate_is_given(tmp_path, write_video, caplog, suffix, codec):
+    raw = converted(write_video(tmp_path / 'clip.avi', count=12), tmp_path / f'raw{suffix}', '-c:v', codec)
+    assert list(open_source(raw).frames())[-1].stamp_ns == 11 * 40_000_000
+    assert 'is a raw stream without times; 25 frames/s assumed, give the true rate with --rate' in caplog.text
+    caplog.clear()
+    assert list(open_source(raw, rate_hz=10.0).frames())[-1].stamp_ns == 1_100_000_000
+    assert not caplog.records
+
+
+@needs_ffmpeg
+def test_a_rotation_in_the_file_is_applied_and_told(tmp_path, write_video, caplog):
+    plain = converted(write_video(tmp_path / 'clip.avi', size=(64, 48)), tmp_path / 'plain.mp4', '-c:v', 'libx264')
+    turned = converted(plain, tmp_path / 'turned.mov', '-c', 'copy', '-metadata:s:v:0', 'rotate=90')
+    if next(iter(open_source(turned).frames())).image.shape[:2] != (64, 48):
+        pytest.skip('this ffmpeg does not write a rotation so')
+    assert 'is turned by' in caplog.text and 'as the file says' in caplog.text
+
+
+def test_the_codec_is_named_where_nothing_can_be_decoded(tmp_path, write_video, monkeypatch):
+    path = write_video(tmp_path / 'clip.mp4')
+    monkeypatch.setattr('autocalib_ros.offline.recordings.videos.cv2.VideoCapture.grab', lambda _: False, raising=False)
+    with pytest.raises(InputError, match='its codec is'):
+        open_source(path)
