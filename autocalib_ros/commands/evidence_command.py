@@ -9,7 +9,12 @@ from typing import TYPE_CHECKING
 
 from autocalib_ros.commands import DONE, REFUSED
 from autocalib_ros.commands.output import print_result, warn_missing_scale
-from autocalib_ros.commands.solve_options import add_solve_options, options_from_arguments, read_known_lens
+from autocalib_ros.commands.solve_options import (
+    add_solve_options,
+    control_points,
+    options_from_arguments,
+    read_known_lens,
+)
 from autocalib_ros.config import Options
 from autocalib_ros.errors import UsageError
 
@@ -57,7 +62,7 @@ def run(arguments: argparse.Namespace) -> int:
     first, more = arguments.files[0], len(arguments.files) - 1
     name = f'{first.name} and {more} more' if more else first.name
     names = [] if out is None else outputs.write_result(out, solved, name)
-    print_result(solved, out, names, quiet=arguments.quiet, json=arguments.json)
+    print_result(solved, out, names, quiet=arguments.quiet, json=arguments.json, points=control_points(arguments))
     return DONE if solved.result else REFUSED
 
 

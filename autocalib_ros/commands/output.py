@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from autocalib_ros.commands.interruption import StopRequest
+from autocalib_ros.commands.map_output import place_result, placement_lines, write_map
 from autocalib_ros.config import Options
 
 if TYPE_CHECKING:
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from autocalib_ros.offline.recordings.sources import Source
     from autocalib_ros.offline.replay_recording import ReplayResult
     from autocalib_ros.perception.detector.detector import VehicleDetector
+    from autocalib_ros.results.control_points import ControlPoints
 
 
 def print_stderr(line: str) -> None:
@@ -35,11 +37,12 @@ def replay_and_report(
     stop: StopRequest | None = None,
     before: Evidence | None = None,
     named_after: Sequence[Source] | None = None,
+    points: ControlPoints | None = None,
 ) -> ReplayResult:
     """Replay recordings of one camera, write the output files and print the result.
 
     `stop` is the request that live streams among the sources ask; `before` is evidence of an earlier run, then the
-    results are named after all its sources, `named_after`.
+    results are named after all its sources, `named_after`. Control `points` give the place in the map.
     """
     from autocalib_ros.offline.outputs import EvidenceFile, write_outputs
     from autocalib_ros.offline.replay_recording import replay
@@ -67,7 +70,8 @@ def replay_and_report(
         print_stderr(f'{replayed.repeated} of {replayed.frames} images repeat an earlier one and are left out.')
     if not quiet and not replayed.evidence.picture.fills_image:
         print_stderr(replayed.evidence.picture.description)
-    print_result(replayed, out, write_outputs(out, replayed, named_after or sources, file), quiet=quiet, json=json)
+    names = write_outputs(out, replayed, named_after or sources, file)
+    print_result(replayed, out, names, quiet=quiet, json=json, points=points)
     return replayed
 
 
@@ -83,8 +87,16 @@ def warn_missing_scale(options: Options, lens: Camera | None) -> None:
         )
 
 
-def print_result(replayed: ReplayResult, out: Path | None, names: list[str], *, quiet: bool, json: bool) -> None:
-    """Print a refusal on stderr, and the summary or calibration.json on stdout."""
+def print_result(
+    replayed: ReplayResult,
+    out: Path | None,
+    names: list[str],
+    *,
+    quiet: bool,
+    json: bool,
+    points: ControlPoints | None = None,
+) -> None:
+    """Print a refusal on stderr, and the summary or calibration.json on stdout; place it in the map of `points`."""
     from autocalib_ros.offline.terminal.style import coloured, is_terminal, state_colour, terminal_width
     from autocalib_ros.offline.terminal.summary import summary_lines
     from autocalib_ros.report.text import remedy, verdict
@@ -93,6 +105,9 @@ def print_result(replayed: ReplayResult, out: Path | None, names: list[str], *, 
     result = replayed.result
     if not result:
         print_stderr(coloured(f'{verdict(result)} {remedy(result)}'.rstrip(), state_colour(result), sys.stderr))
+    placement = None if points is None else place_result(result, points)
+    if placement is not None and points is not None and out is not None:
+        names = [*names, write_map(out, placement, points)]
     if json:
         print(calibration_json(result, accepted_at_s=replayed.accepted_at_s), flush=True)
     if quiet:
@@ -102,5 +117,7 @@ def print_result(replayed: ReplayResult, out: Path | None, names: list[str], *, 
         if result:
             print(coloured(verdict(result), state_colour(result), sys.stdout))
         print('\n'.join(summary_lines(result, replayed.accepted_at_s, columns)))
+    if placement is not None and points is not None:
+        print('\n'.join(placement_lines(placement, points)), file=sys.stderr if json else sys.stdout)
     if names:
         print(f'Written to {out}: {", ".join(names)}', file=sys.stderr if json else sys.stdout)

@@ -9,7 +9,12 @@ from typing import TYPE_CHECKING
 from autocalib_ros.commands import DONE, REFUSED
 from autocalib_ros.commands.interruption import StopRequest
 from autocalib_ros.commands.output import print_stderr, replay_and_report
-from autocalib_ros.commands.solve_options import add_solve_options, options_from_arguments, read_known_lens
+from autocalib_ros.commands.solve_options import (
+    add_solve_options,
+    control_points,
+    options_from_arguments,
+    read_known_lens,
+)
 from autocalib_ros.config import Options
 from autocalib_ros.errors import UsageError
 
@@ -89,6 +94,7 @@ def run(arguments: argparse.Namespace) -> int:
         stop=stop,
         before=before,
         named_after=named,
+        points=control_points(arguments),
     )
     if arguments.write_bag is not None:
         _write_bag(arguments.write_bag, replayed.result, named[0], options)

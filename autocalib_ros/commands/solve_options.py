@@ -6,10 +6,12 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from autocalib_ros.commands.map_output import distance_options
 from autocalib_ros.config import Options
 
 if TYPE_CHECKING:
     from autocalib_ros.lens.camera import Camera
+    from autocalib_ros.results.control_points import ControlPoints
 
 
 def add_solve_options(parser: argparse.ArgumentParser) -> None:
@@ -36,6 +38,12 @@ def add_solve_options(parser: argparse.ArgumentParser) -> None:
     )
     known.add_argument(
         '--scale-speed', type=float, metavar='KM_H', help='mean speed of the moving traffic on the busiest road in km/h'
+    )
+    known.add_argument(
+        '--control-points',
+        type=Path,
+        metavar='FILE',
+        help='points on the road in pixels and in a map: CSV with u_px, v_px and x_m, y_m or lat, lon; or .otrfpts',
     )
     lens = known.add_mutually_exclusive_group()
     lens.add_argument(
@@ -83,11 +91,23 @@ def options_from_arguments(arguments: argparse.Namespace) -> Options:
     values: dict[str, Any] = read_params_file(arguments.params_file) if arguments.params_file else {}
     values.update(parse_assignments(arguments.param))
     values.update(_known_values(arguments))
+    points = control_points(arguments)
+    if points is not None:
+        values.update(distance_options(points, values))
     if arguments.method is not None:
         values['method'] = arguments.method
     if arguments.allow_unit_scale:
         values['allow_unit_scale'] = True
     return override_options(Options(), values)
+
+
+def control_points(arguments: argparse.Namespace) -> ControlPoints | None:
+    """Return the control points of --control-points; None without."""
+    if arguments.control_points is None:
+        return None
+    from autocalib_ros.results.control_points import read_control_points
+
+    return read_control_points(arguments.control_points)
 
 
 def _known_values(arguments: argparse.Namespace) -> dict[str, Any]:
