@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from autocalib_ros.commands import DONE, REFUSED
-from autocalib_ros.commands.output import print_result, warn_missing_scale
+from autocalib_ros.commands.output import print_result, warn_missing_scale, write_ground_tracks
 from autocalib_ros.commands.solve_options import (
     add_solve_options,
     control_points,
@@ -51,8 +51,11 @@ def run(arguments: argparse.Namespace) -> int:
     options = options_from_arguments(arguments)
     lens = read_known_lens(arguments, options)
     from autocalib_ros.offline import outputs
+    from autocalib_ros.offline.ground_tracks import require_tracks_path
     from autocalib_ros.offline.replay_recording import solve_evidence
 
+    if arguments.tracks is not None:
+        require_tracks_path(arguments.tracks)
     evidence, out = _read_evidence(arguments, options), arguments.out
     if out is not None:
         outputs.prepare_output_dir(out)
@@ -63,6 +66,8 @@ def run(arguments: argparse.Namespace) -> int:
     name = f'{first.name} and {more} more' if more else first.name
     names = [] if out is None else outputs.write_result(out, solved, name)
     print_result(solved, out, names, quiet=arguments.quiet, json=arguments.json, points=control_points(arguments))
+    if arguments.tracks is not None:
+        write_ground_tracks(arguments.tracks, solved, quiet=arguments.quiet)
     return DONE if solved.result else REFUSED
 
 

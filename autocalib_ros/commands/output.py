@@ -75,6 +75,21 @@ def replay_and_report(
     return replayed
 
 
+def write_ground_tracks(path: Path, replayed: ReplayResult, *, quiet: bool) -> None:
+    """Write the vehicle tracks of a result; say so, or why there are none."""
+    from autocalib_ros.offline.ground_tracks import ground_tracks, write_tracks
+
+    found = replayed.result.candidate
+    if not replayed.result or found is None or found.ground is None:
+        print_stderr(f'{path} is not written: no calibration with a ground plane')
+        return
+    tracks = ground_tracks(replayed.evidence, found, replayed.options)
+    write_tracks(path, tracks)
+    if not quiet:
+        vehicles = len(set(tracks.vehicle_id.tolist()))
+        print_stderr(f'{path}: {vehicles} road users, {len(tracks.time_s)} rows')
+
+
 def warn_missing_scale(options: Options, lens: Camera | None) -> None:
     """Warn on stderr if no metric scale is given: the result has no metric ground plane."""
     given = options.scale

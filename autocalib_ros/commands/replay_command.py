@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from autocalib_ros.commands import DONE, REFUSED
 from autocalib_ros.commands.interruption import StopRequest
-from autocalib_ros.commands.output import print_stderr, replay_and_report
+from autocalib_ros.commands.output import print_stderr, replay_and_report, write_ground_tracks
 from autocalib_ros.commands.solve_options import (
     add_solve_options,
     control_points,
@@ -71,6 +71,10 @@ def run(arguments: argparse.Namespace) -> int:
     detector = open_detector(options.detector)
     if detector is not None and not arguments.quiet:
         print_stderr(f'Vehicle tracks from a {detector}')
+    if arguments.tracks is not None:
+        from autocalib_ros.offline.ground_tracks import require_tracks_path
+
+        require_tracks_path(arguments.tracks)
     stop = StopRequest()
     sources = open_sources(
         recordings_of(arguments.sources), arguments.topic, arguments.start, arguments.duration, arguments.rate, stop
@@ -96,6 +100,8 @@ def run(arguments: argparse.Namespace) -> int:
         named_after=named,
         points=control_points(arguments),
     )
+    if arguments.tracks is not None:
+        write_ground_tracks(arguments.tracks, replayed, quiet=arguments.quiet)
     if arguments.write_bag is not None:
         _write_bag(arguments.write_bag, replayed.result, named[0], options)
     return DONE if replayed.result else REFUSED

@@ -79,6 +79,9 @@ def add_solve_options(parser: argparse.ArgumentParser) -> None:
         help='any option by its full name, for example joint.noise_px=0.7; repeatable',
     )
     parser.add_argument(
+        '--tracks', type=Path, metavar='FILE', help='write vehicle tracks in metres with speeds (.csv, .parquet)'
+    )
+    parser.add_argument(
         '--quiet', action='store_true', help='print no progress and no summary; refusals still go to stderr'
     )
     parser.add_argument('--json', action='store_true', help='print calibration.json on stdout instead of the summary')
