@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 import autocalib_ros
+from autocalib_ros.calibrator import AutoCalibrator
 from autocalib_ros.cli import main
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.lens.camera_info_yaml import write_camera_info_yaml
-from autocalib_ros.offline.recordings.videos import VideoSource
 
 
 @pytest.fixture
@@ -245,19 +245,20 @@ def test_an_interrupt_ends_quietly(still_video, tmp_path, monkeypatch, capsys):
 
 
 def test_the_first_interrupt_solves_and_the_second_leaves(still_video, tmp_path, monkeypatch, capfd):
-    frames, interrupts = VideoSource.frames, [5]
+    add_image, images, interrupts = AutoCalibrator.add_image, [], [5]
 
-    def interrupted_frames(source):
-        for index, frame in enumerate(frames(source)):
-            for _ in range(interrupts.count(index)):
-                os.kill(os.getpid(), signal.SIGINT)
-            yield frame
+    def interrupted(calibrator, *arguments):
+        images.append(arguments)
+        for _ in range(interrupts.count(len(images))):
+            os.kill(os.getpid(), signal.SIGINT)
+        return add_image(calibrator, *arguments)
 
-    monkeypatch.setattr(VideoSource, 'frames', interrupted_frames)
+    monkeypatch.setattr(AutoCalibrator, 'add_image', interrupted)
     out = tmp_path / 'out'
     assert main(['replay', str(still_video), '--out', str(out)]) == 3
-    assert 'Ctrl-C again leaves at once' in (told := capfd.readouterr().err) and 'Stopped after 6 images' in told
-    assert Evidence.load(out / 'evidence.npz').frames <= 6
+    assert 'Ctrl-C again leaves at once' in (told := capfd.readouterr().err) and 'Stopped after 5 images' in told
+    assert Evidence.load(out / 'evidence.npz').frames <= 5
+    images.clear()
     interrupts.append(5)
     assert main(['replay', str(still_video), '--out', str(out)]) == 130
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

@@ -16,6 +16,7 @@ from autocalib_ros.estimation.estimate import solve
 from autocalib_ros.evidence.read_recording import ReadRecording
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.lens.camera import Camera
+from autocalib_ros.offline.recordings.prefetch import prefetched
 from autocalib_ros.offline.recordings.sources import Source
 from autocalib_ros.perception.detector.detector import VehicleDetector
 from autocalib_ros.perception.frame_clock import ClockSummary
@@ -25,9 +26,13 @@ from autocalib_ros.results.calibration import Calibration, Refusal
 LOG = logging.getLogger(__name__)
 
 SOLVE_AGAIN_GROWTH = 2.0
-"""Growth of the recording after which an accepted calibration is solved again, for the convergence plot of the report.
-
-With twice the evidence a standard deviation falls by a third."""
+"""Growth of the recording after which a refused solution is tried again: with twice the evidence a standard deviation
+falls by a third. A solution is as dear as a minute of images."""
+ACCEPTED_GROWTH = 4.0
+"""The same for an accepted one, which is solved again for the convergence plot of the report alone: the standard
+deviation halves."""
+LAST_SHARE = 0.5
+"""Share of a recording of known length behind which no solution is tried: that of the end tells nearly the same."""
 PROGRESS_EVERY_FRAMES = 15
 """Frames between progress updates."""
 CHECKPOINT_EVERY_S = 120.0
@@ -86,9 +91,9 @@ class _Trials:
             self._part_start_s, self._next_solve_s = start_s, 0.0
             self.latest, self.moments, self.accepted_at_s = None, (), None
 
-    def is_due(self, seconds: float) -> bool:
-        """Whether evidence of this length is worth a solution."""
-        return seconds >= self._next_solve_s
+    def is_due(self, seconds: float, duration_s: float | None) -> bool:
+        """Whether evidence of this length of a recording of that length, None if unknown, is worth a solution."""
+        return seconds >= self._next_solve_s and (duration_s is None or seconds <= LAST_SHARE * duration_s)
 
     def solve(self, evidence: Evidence, lens: Camera | None) -> None:
         """Solve, and decide when to solve again."""
@@ -97,7 +102,7 @@ class _Trials:
         if tried and self.accepted_at_s is None:  # a live node would have accepted it at this time
             self.accepted_at_s = evidence.seconds
         self.latest = tried if tried or self.accepted_at_s is None else self.latest
-        self._next_solve_s = 0.0 if self.accepted_at_s is None else SOLVE_AGAIN_GROWTH * evidence.seconds
+        self._next_solve_s = evidence.seconds * (SOLVE_AGAIN_GROWTH if self.accepted_at_s is None else ACCEPTED_GROWTH)
 
 
 def gather_evidence(
@@ -117,14 +122,14 @@ def gather_evidence(
     """
     calibrator, trials = AutoCalibrator(options, detector), _Trials(options)
     count, note, stopped, checkpoint_s, first_ns = 0, '', False, CHECKPOINT_EVERY_S, None
-    for count, frame in enumerate(source.frames(), start=1):
+    for count, frame in enumerate(prefetched(source.frames()), start=1):
         scaled_lens = scaled(lens, (frame.image.shape[1], frame.image.shape[0]))
         calibrator.add_image(frame.stamp_ns, frame.image)
         first_ns = frame.stamp_ns if first_ns is None else first_ns
         due = _as_recorded(calibrator.snapshot_if_due(), source) if tries_solutions else None
         if due is not None:
             trials.begin_part(due.stillness.start_s)
-            if trials.is_due(due.seconds):
+            if trials.is_due(due.seconds, source.duration_s):
                 control.report(frames_before + count, 'solving')
                 trials.solve(due, scaled_lens)
         if control.on_checkpoint is not None and (frame.stamp_ns - first_ns) * 1e-9 >= checkpoint_s:
