@@ -5,9 +5,11 @@ from __future__ import annotations
 import argparse
 import logging
 import os
+import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from difflib import get_close_matches
 from typing import NoReturn
 
 from autocalib_ros import __version__
@@ -39,6 +41,8 @@ COMMANDS = {
     'benchmark': benchmark,
     'docs': docs,
 }
+COMPLETION = '_ARGCOMPLETE'
+"""Environment variable that argcomplete sets while a shell completes a line."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -51,7 +55,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     _replace_unencodable_characters()
     try:
         with _warnings_on_stderr():
-            arguments = _parse_arguments(sys.argv[1:] if argv is None else list(argv))
+            words = sys.argv[1:] if argv is None else list(argv)
+            if not words and COMPLETION not in os.environ:
+                _parsers(())[0].print_help()
+                return WRONG_USE
+            arguments = _parse_arguments(words)
             return arguments.run(arguments)
     except AutocalibError as error:
         print(f'autocalib: error: {error}', file=sys.stderr)
@@ -94,20 +102,56 @@ class _Parser(argparse.ArgumentParser):
     """Argument parser that raises `UsageError`, so that `main` reports wrong usage in one line."""
 
     def error(self, message: str) -> NoReturn:
-        """Raise UsageError."""
+        """Raise UsageError, with the command that was probably meant."""
+        unknown = re.match(r"argument COMMAND: invalid choice: '([^']*)'", message)
+        if unknown:
+            message = f"there is no command '{unknown[1]}'{_meant(unknown[1], COMMANDS)}"
         raise UsageError(f'{message} (see {self.prog} --help)')
 
 
+def _meant(word: str, known: Iterable[str]) -> str:
+    """Return a question for the nearest of the known words; '' if none is near."""
+    near = get_close_matches(word, list(known), n=1, cutoff=0.6)
+    return f"; did you mean '{near[0]}'?" if near else ''
+
+
 def _parse_arguments(argv: list[str]) -> argparse.Namespace:
+    words = {*argv, *os.environ.get('COMP_LINE', '').split()}  # while a shell completes, the line is there
+    parser, own = _parsers(words)
+    if COMPLETION in os.environ:
+        _complete(parser)
+    arguments, left = parser.parse_known_args(argv)
+    if left:
+        used = own[arguments.command]
+        known = [name for action in used._actions for name in action.option_strings]
+        first = left[0].partition('=')[0]
+        raise UsageError(f'unrecognized arguments: {" ".join(left)}{_meant(first, known)} (see {used.prog} --help)')
+    return arguments
+
+
+def _parsers(words: Collection[str]) -> tuple[_Parser, dict[str, _Parser]]:
+    """Return the parser, and those of the commands by name; only commands among the words get their options."""
     parser = _Parser(prog='autocalib', description='Calibrate a fixed roadside camera from traffic.')
     parser.add_argument('--version', action='version', version=f'autocalib {__version__}')
-    commands = parser.add_subparsers(title='commands', metavar='COMMAND', required=True, parser_class=_Parser)
+    commands = parser.add_subparsers(
+        title='commands', metavar='COMMAND', required=True, parser_class=_Parser, dest='command'
+    )
+    own = {}
     for name, command in COMMANDS.items():
-        own = commands.add_parser(name, help=command.HELP, description=command.DESCRIPTION)
-        own.set_defaults(run=command.run)
-        if name in argv:  # only the command in use: the options of `simulate` are slow to import
-            command.add_arguments(own)
-    return parser.parse_args(argv)
+        own[name] = commands.add_parser(name, help=command.HELP, description=command.DESCRIPTION)
+        own[name].set_defaults(run=command.run)
+        if name in words:  # only the command in use: the options of `simulate` are slow to import
+            command.add_arguments(own[name])
+    return parser, own
+
+
+def _complete(parser: argparse.ArgumentParser) -> None:
+    """Answer the shell that completes a line, and leave; nothing without argcomplete."""
+    try:
+        import argcomplete
+    except ImportError:
+        return
+    argcomplete.autocomplete(parser)
 
 
 if __name__ == '__main__':

@@ -12,6 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import yaml
 
 import autocalib_ros
 from autocalib_ros.calibrator import AutoCalibrator
@@ -66,6 +67,41 @@ def test_help_and_version_end_well(capsys):
     assert main(['demo', '--help']) == 0
 
 
+def test_alone_it_lists_the_commands(capsys):
+    assert main([]) == 2
+    listed = capsys.readouterr().out
+    assert 'calibrate from a recording' in listed and 'write a calibration in the format of another' in listed
+
+
+def test_the_options_in_force_are_printed_as_a_parameter_file(tmp_path, capsys):
+    given = ['--camera-height', '7.5', '--distance', '1', '2', '300', '4', '12', '-p', 'joint.noise_px=0.7']
+    assert main(['replay', '--print-params', *given]) == 0
+    (tmp_path / 'p.yaml').write_text(capsys.readouterr().out)
+    assert main(['evidence', '--print-params', '--params-file', str(tmp_path / 'p.yaml')]) == 0
+    assert capsys.readouterr().out == (tmp_path / 'p.yaml').read_text()
+    values = yaml.safe_load((tmp_path / 'p.yaml').read_text())['/**']['ros__parameters']
+    assert (values['camera_height'], values['joint']['noise_px']) == (7.5, 0.7)
+    assert values['scale']['distances'] == '1 2 300 4 12'
+
+
+def test_shells_complete_commands_and_options(tmp_path):
+    pytest.importorskip('argcomplete', reason='argcomplete completes lines: pip install argcomplete')
+    code = 'from autocalib_ros.cli import main; main([])'
+    for line, expected in (('autocalib rep', 'replay'), ('autocalib replay --camera-he', '--camera-height')):
+        answer = tmp_path / 'answer'
+        python(
+            '-c',
+            code,
+            folder=tmp_path,
+            COMP_LINE=line,
+            COMP_POINT=str(len(line)),
+            _ARGCOMPLETE='1',
+            PYTHONPATH=os.pathsep.join([str(Path(autocalib_ros.__file__).parents[1]), *sys.path]),
+            _ARGCOMPLETE_STDOUT_FILENAME=str(answer),
+        )
+        assert expected in answer.read_text()
+
+
 @pytest.mark.dds
 def test_help_imports_nothing_heavy(tmp_path):
     code = (
@@ -85,9 +121,14 @@ def test_help_imports_nothing_heavy(tmp_path):
 @pytest.mark.parametrize(
     ('arguments', 'message'),
     [
-        ([], 'the following arguments are required: COMMAND'),
         (['replay'], 'the following arguments are required: SOURCE'),
-        (['explode'], "invalid choice: 'explode'"),
+        (['jump'], "there is no command 'jump' (see autocalib --help)"),
+        (['reply', 'x'], "there is no command 'reply'; did you mean 'replay'?"),
+        (['--verson'], 'COMMAND'),
+        (
+            ['replay', 'x', '--camera-hight=8'],
+            "--camera-hight=8; did you mean '--camera-height'? (see autocalib replay",
+        ),
         (['replay', 'x', '--camera-height', 'high'], "invalid float value: 'high'"),
         (['replay', 'x', '--method', 'magic'], "invalid choice: 'magic'"),
         (['replay', 'x', '--unheard-of'], 'unrecognized arguments: --unheard-of'),

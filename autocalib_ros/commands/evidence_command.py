@@ -13,6 +13,7 @@ from autocalib_ros.commands.solve_options import (
     add_solve_options,
     control_points,
     options_from_arguments,
+    printed_params,
     read_known_lens,
 )
 from autocalib_ros.config import Options
@@ -34,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         'files',
         metavar='FILE',
-        nargs='+',
+        nargs='*',
         type=Path,
         help='evidence.npz of a replay, or tracks (.csv, .txt); several evidence.npz of the same view are joined',
     )
@@ -49,6 +50,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Solve saved evidence; return the exit status."""
     options = options_from_arguments(arguments)
+    if printed_params(arguments, options, 'FILE'):
+        return DONE
     lens = read_known_lens(arguments, options)
     from autocalib_ros.offline import outputs
     from autocalib_ros.offline.ground_tracks import require_tracks_path

@@ -13,6 +13,7 @@ from autocalib_ros.commands.solve_options import (
     add_solve_options,
     control_points,
     options_from_arguments,
+    printed_params,
     read_known_lens,
 )
 from autocalib_ros.config import Options
@@ -33,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         'sources',
         metavar='SOURCE',
-        nargs='+',
+        nargs='*',
         help='rosbag2 folder, .mcap, .db3, ROS 1 .bag, video file, images (folder or pattern), folder of clips, stream '
         '(rtsp://, http://) or camera device (/dev/video0); several ones of the same view are joined',
     )
@@ -63,6 +64,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Calibrate from a recording; return the exit status."""
     options = options_from_arguments(arguments)
+    if printed_params(arguments, options, 'SOURCE'):
+        return DONE
     lens = read_known_lens(arguments, options)
     from autocalib_ros.offline.recordings.listing import recordings_of
     from autocalib_ros.offline.recordings.open import open_sources

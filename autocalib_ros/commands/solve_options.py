@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from autocalib_ros.commands.map_output import distance_options
 from autocalib_ros.config import Options
+from autocalib_ros.errors import UsageError
 
 if TYPE_CHECKING:
     from autocalib_ros.lens.camera import Camera
@@ -84,6 +85,9 @@ def add_solve_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--quiet', action='store_true', help='print no progress and no summary; refusals still go to stderr'
     )
+    parser.add_argument(
+        '--print-params', action='store_true', help='print the options in force as a ROS 2 parameter file, and end'
+    )
     parser.add_argument('--json', action='store_true', help='print calibration.json on stdout instead of the summary')
 
 
@@ -102,6 +106,18 @@ def options_from_arguments(arguments: argparse.Namespace) -> Options:
     if arguments.allow_unit_scale:
         values['allow_unit_scale'] = True
     return override_options(Options(), values)
+
+
+def printed_params(arguments: argparse.Namespace, options: Options, needed: str) -> bool:
+    """Print the options if asked to, and return whether that is all; UsageError without the `needed` arguments."""
+    if arguments.print_params:
+        from autocalib_ros.offline.parameter_file import params_yaml
+
+        print(params_yaml(options), end='')
+        return True
+    if not getattr(arguments, f'{needed.lower()}s'):
+        raise UsageError(f'the following arguments are required: {needed} (see autocalib {arguments.command} --help)')
+    return False
 
 
 def control_points(arguments: argparse.Namespace) -> ControlPoints | None:

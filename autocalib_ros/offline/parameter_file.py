@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -100,3 +101,8 @@ def _as_float(value: Any) -> Any:
         return float(value)
     except ValueError:
         return value  # the check of the option gives the better error message
+
+
+def params_yaml(options: Options) -> str:
+    """Return all options as a ROS 2 parameter file, for replays and the node alike."""
+    return str(yaml.safe_dump({'/**': {'ros__parameters': dataclasses.asdict(options)}}, sort_keys=False))
