@@ -100,7 +100,10 @@ def cloud(points_m: np.ndarray, cloud_header: Header) -> PointCloud2:
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the node until it is interrupted."""
+    """Run the node until it is interrupted; print its description for --help."""
+    if {'-h', '--help'} & set((sys.argv if args is None else args)[1:]):
+        print(__doc__)
+        return 0
     stop = stop_on_signals()
     rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     try:
