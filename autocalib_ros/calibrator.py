@@ -17,6 +17,7 @@ from autocalib_ros.perception.detector.detector import VehicleDetector, open_det
 from autocalib_ros.perception.frame_clock import ClockSummary
 from autocalib_ros.perception.image_stream import ImageStream
 from autocalib_ros.perception.image_timing import ImageTiming
+from autocalib_ros.perception.view_watch import KnownView
 
 TRAIL_FRAMES = 16
 """Images over which the trail of a tracked point is drawn: a second at 15 Hz."""
@@ -132,6 +133,15 @@ class AutoCalibrator:
         view = stream.longest_view() if longest_part else stream.observer.view
         evidence = replace(stream.evidence(view), still_lines_px=stream.observer.still_lines(view))
         return evidence.with_landmarks(stream.observer.landmarks(view)) if landmarks else evidence
+
+    def known_view(self) -> KnownView | None:
+        """Return a small image of the present view, in the pose of `snapshot`, for registration; None before one."""
+        return None if self._stream is None else self._stream.observer.known_view(self._stream.observer.view)
+
+    def leave_view(self, moved_ns: int) -> None:
+        """Begin evidence of another view, if the present one began before the stamp at which the camera moved."""
+        if self._stream is not None:
+            self._stream.leave_view(moved_ns)
 
     def progress(self) -> CalibrationProgress:
         """Return how much of the evidence for a solution is there."""

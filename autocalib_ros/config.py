@@ -622,6 +622,13 @@ class NodeOptions(_Validated):
         'when camera_info is published: with each image, or only when it changes',
         choices=('per_image', 'latched_only'),
     )
+    on_move: str = option(
+        'mend',
+        'what is published after the camera has moved, and while the picture says nothing; mend: after a turn the pose '
+        'corrected by what the picture shows, else nothing; withhold: nothing until traffic gives a new calibration; '
+        'keep: the stale calibration. /diagnostics and ~/status tell of it in any case',
+        choices=('mend', 'withhold', 'keep'),
+    )
     debug_rate_hz: float = option(
         5.0,
         'maximum rate of each of debug_image, top_view and image_rect, Hz; drawn only while subscribed',
@@ -664,6 +671,7 @@ RECONFIGURABLE = (
     'scale',
     'gate',
     'camera_info_mode',
+    'on_move',
     'debug_rate_hz',
     'idle_solve_s',
 )

@@ -44,13 +44,21 @@ AUTOCALIB_NODE = (
         '~/camera_info',
         'published',
         'sensor_msgs/CameraInfo',
-        'once calibrated: one message for each image, with the header of that image. Latched',
+        'once calibrated: one message for each image, with the header of that image. While the calibration is '
+        'withheld (see `on_move`) K, R and P are zero and D is empty. Latched',
     ),
     Endpoint(
         '~/ground_transform',
         'published',
         'geometry_msgs/TransformStamped',
         'pose of the camera in `<camera>_ground`; with `tf_parent: camera` the inverse. Latched',
+    ),
+    Endpoint(
+        '~/status',
+        'published',
+        'diagnostic_msgs/DiagnosticStatus',
+        'whether the calibration holds, for programs: state, grade, what is published, from when to when it holds, '
+        'standard deviations, the newest move. On each change, latched',
     ),
     Endpoint(
         '~/markers',
@@ -130,7 +138,7 @@ GROUND_POINTS_NODE = (
 """Interface of `ground_points_node`."""
 
 DIAGNOSTIC_VALUES = {
-    'state': '`WAITING_FOR_IMAGES`, `COLLECTING`, `RESTORED` or `CALIBRATED`',
+    'state': '`WAITING_FOR_IMAGES`, `COLLECTING`, `RESTORED`, `CALIBRATED`, `MOVED`, `MENDED`, `BLIND` or `RECOVERED`',
     'evidence_percent': 'how much of the evidence for a first solution has been collected',
     'missing': 'what is missing for a first solution',
     'outlook': 'estimated time until then, or for how long there was no traffic',
@@ -152,6 +160,17 @@ DIAGNOSTIC_VALUES = {
     'queued': 'images that another followed within half a period (doublets, bursts)',
     'odd_stamps': 'images whose stamp was wrong; they got the time of their place in the sequence',
     'clock_steps': 'times the clock of the stamps was set back while the images went on',
+    'view': 'whether the picture shows the calibrated view: `unknown`, `still`, `swaying`, `moved` or `blind`',
+    'view_checked_s': 'stamp of the image in which that was seen last',
+    'sway_deg': 'amplitude of the sway of the camera',
+    'moved_s': 'stamp of the newest move of the camera',
+    'move': 'its kind: `bump`, `re-aim`, `zoom` or `other view`',
+    'moved_pan_deg': 'by how much the camera turned to the right then',
+    'moved_tilt_deg': 'by how much it turned down',
+    'moved_roll_deg': 'by how much it turned clockwise',
+    'zoom': 'focal length after the move over that before',
+    'pose': 'what is published: `calibrated`, `mended`, `withheld`, or `stale` with `on_move: keep`; empty without a '
+    'calibration',
     'grade': 'grade of the published calibration: `full`, `fair`, `coarse`, `assumed`, `unit_scale` or `lens`',
     'focal_px': 'focal length',
     'focal_sigma_px': 'its standard deviation',
@@ -168,17 +187,17 @@ DIAGNOSTIC_VALUES = {
 """Key-value pairs of the status `<node>: calibration`, in their order."""
 
 DIAGNOSTIC_LEVELS = (
-    ('OK', '`CALIBRATED`'),
+    ('OK', '`CALIBRATED` and `RECOVERED`; `RESTORED` once the picture shows the stored view'),
     (
         'WARN',
-        '`WAITING_FOR_IMAGES`, `COLLECTING` and `RESTORED`; no image for 5 s; images dropped, or without '
+        '`WAITING_FOR_IMAGES`, `COLLECTING`, `RESTORED` and `MENDED`; no image for 5 s; images dropped, or without '
         'advancing stamps; another node publishes the same `camera_info`; two nodes publish the images',
     ),
     (
         'ERROR',
-        'a configuration error that waiting does not fix: images of another type, transport, reliability or '
-        'encoding (the message names the parameter to set); a calibration withdrawn because the image size '
-        'changed',
+        '`MOVED`, also for a minute after the pose was mended, and `BLIND`; a configuration error that waiting does '
+        'not fix: images of another type, transport, reliability or encoding (the message names the parameter to '
+        'set); a calibration withdrawn because the image size changed',
     ),
 )
 """Levels of the status and when they are reported."""

@@ -30,6 +30,8 @@ class CalibrationState(Enum):
     """Stored by an earlier run, not yet verified."""
     VERIFIED = 'verified'
     """From evidence that is gone, of an earlier run or before a time jump, and confirmed by present traffic."""
+    MENDED = 'mended'
+    """Turned with the camera by what the picture shows, not yet verified by traffic."""
     CALIBRATED = 'calibrated'
     """Solved from the present evidence."""
 
@@ -60,25 +62,26 @@ def reconcile(state: CalibrationState, before: Calibration | None, fresh: Calibr
         if before.ground is not None and fresh.ground is None:
             return Decision(state, before, 'keeping the previous calibration: the new one has no ground plane')
         return Decision(state, fresh)
+    origin = 'mended' if state is CalibrationState.MENDED else 'stored'
     differences = [*_lens_differences(before, fresh), *_plane_differences(before, fresh)]
     if differences:
         found = ', '.join(filter(None, differences))
         text = (
-            f'stored calibration is inconsistent with current traffic; replaced: {found}'
+            f'{origin} calibration is inconsistent with current traffic; replaced: {found}'
             if found
-            else 'stored calibration replaced: it cannot be checked without standard deviations'
+            else f'{origin} calibration replaced: it cannot be checked without standard deviations'
         )
         return Decision(CalibrationState.CALIBRATED, fresh, text, contradicted=True)
     if before.ground is not None and fresh.ground is None:
         why = f': {fresh.ground_refusal.message}' if fresh.ground_refusal else ''
-        return Decision(state, before, f'current traffic confirms the stored lens; ground plane not verified{why}')
+        return Decision(state, before, f'current traffic confirms the {origin} lens; ground plane not verified{why}')
     if _at_least_as_precise(fresh, before):
         return Decision(
             CalibrationState.CALIBRATED,
             fresh,
-            'stored calibration confirmed, and replaced by one that is at least as precise',
+            f'{origin} calibration confirmed, and replaced by one that is at least as precise',
         )
-    text = 'current traffic agrees with the stored calibration; keeping it (smaller uncertainty)'
+    text = f'current traffic agrees with the {origin} calibration; keeping it (smaller uncertainty)'
     return Decision(CalibrationState.VERIFIED, before, '' if state is CalibrationState.VERIFIED else text)
 
 

@@ -18,7 +18,7 @@ from autocalib_ros.results.statements import assumption
 from autocalib_ros.revalidation import CalibrationState, reconcile, with_current_options
 from stored_results import SIZE, calibration, lens_only
 
-NONE, RESTORED, VERIFIED, CALIBRATED = CalibrationState
+NONE, RESTORED, VERIFIED, MENDED, CALIBRATED = CalibrationState
 KEPT = calibration()
 VAGUE = calibration(302.0, tilt_deg=12.5, sigmas=3.0)
 """Agrees with the stored calibration, and is less precise."""

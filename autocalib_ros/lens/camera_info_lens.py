@@ -39,6 +39,11 @@ class CameraInfoLens:
         `rectified` gives the lens of image_proc's image_rect: P, without distortion.
         """
         fields = {name: message_field(info, name) for name in LENS_FIELDS}
+        if not any(fields['k']):
+            raise InputError(
+                'its K is zero: the camera is not calibrated now. Either it never was, or it has moved, or its picture '
+                'says nothing: see the topic ~/status of autocalib'
+            )
         if rectified:
             projection = _numbers(message_field(info, 'p'))
             if len(projection) != 12 or not (projection[0] > 0 and projection[5] > 0):

@@ -97,7 +97,7 @@ class DriftMonitor:
         self._unsettled_s: float | None = None
         self._search_due_s = self._due_s = -np.inf
         self._seen_s = -np.inf
-        self._is_away = False
+        self._is_away = self._is_left = False
         self._samples: deque[tuple[float, np.ndarray]] = deque(maxlen=SAMPLES)
         self._numbers = 0
         self._changes: deque[ViewChange] = deque(maxlen=MAX_CHANGES)
@@ -114,6 +114,13 @@ class DriftMonitor:
         """Take a grey image (H, W); say whether it shows the present view, and how far the picture moved."""
         self._newest_s = time_s
         view = self._view
+        if self._is_left and view is not None:
+            self._is_left = False
+            reduced = self._reduced(grey)
+            new = self._new_view(self._next_number(), reduced, time_s)
+            new.position = view.position + view.last.shift
+            self._adopt(new, ViewChange(ViewChangeKind.TURN, time_s, time_s, view.moved_px * self._factor))
+            return ImagePose(new.number, True)
         if view is not None and self._unsettled_s is None and time_s < self._due_s:
             return ImagePose(view.number, True)
         reduced = self._reduced(grey)
@@ -133,6 +140,15 @@ class DriftMonitor:
         if view.still_s < GRACE_S:
             return time_s - max(self._unsettled_s, self._seen_s) >= BLIND_S
         return not self._is_away and time_s - self._unsettled_s < GRACE_S
+
+    def image_of_view(self, number: int) -> tuple[np.ndarray, np.ndarray | None] | None:
+        """Return the reference image (h, w) of a view in memory, in the pose of its evidence, and what to ignore."""
+        view = next((one for one in (self._view, self._kept) if one is not None and one.number == number), None)
+        return None if view is None else (view.image_of_evidence(), view.ignored)
+
+    def leave(self) -> None:
+        """Begin another view with the next image: the camera is known to have moved."""
+        self._is_left = self._view is not None
 
     def change_limits(self, limits: DriftLimits) -> None:
         """Take other limits from the next image on."""

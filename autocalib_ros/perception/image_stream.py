@@ -72,6 +72,12 @@ class ImageStream:
             stillness=stillness,
         ).since(part.start_s)
 
+    def leave_view(self, moved_ns: int) -> None:
+        """Begin another still view if the present one began before a time in nanoseconds, when the camera moved."""
+        part = self.part
+        if self._first_ns + self._offset_ns + round(part.start_s * 1e9) < moved_ns:
+            self.observer.leave_view()
+
     def longest_view(self) -> int:
         """Return the number of the view that was seen and still for the longest time."""
         still_s = self.observer.views

@@ -28,6 +28,7 @@ from autocalib_ros.perception.repeats import RepeatDetector
 from autocalib_ros.perception.segments import Keypoints, find_keypoints, match_segments
 from autocalib_ros.perception.silhouettes import outlines_of
 from autocalib_ros.perception.still_view import warped
+from autocalib_ros.perception.view_watch import KnownView
 
 MOTION_MASK_PERIOD = 2
 """Frames between updates of the motion mask: traffic needs no finer time step."""
@@ -316,6 +317,15 @@ class Observer:
         excluded = union(self._excluded_by_options, scene.picture_area.mask)
         found = find_landmarks(self._tracked_image(median(samples)), excluded)
         return Landmarks(self._to_full_pixels(found.points_px), found.descriptors)
+
+    def known_view(self, view: int) -> KnownView | None:
+        """Return a small image of a view in memory, in the pose of its evidence, for registration; None before one."""
+        found = self._drift_monitor.image_of_view(view)
+        return None if found is None else KnownView(*found)
+
+    def leave_view(self) -> None:
+        """Begin another still view with the next image."""
+        self._drift_monitor.leave()
 
     def picture(self, view: int) -> Picture:
         """Return the picture inside the images of a view in memory, pixels of the full image."""

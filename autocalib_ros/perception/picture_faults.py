@@ -26,6 +26,8 @@ DARK_QUANTILE, BRIGHT_QUANTILE = 0.98, 0.2
 FROZEN_S = 7.0
 """Time for which images are the same before they count as frozen, seconds: sensor noise differs from image to image,
 and encoders send whole images every few seconds; consumers are told within 10 s."""
+MIN_REPEATS = 5
+"""Least number of such images: two that are far apart say nothing about what came between."""
 FINE_SIGMAS_PX, COARSE_SIGMAS_PX = (0.7, 1.4), (2.5, 6.0)
 """Scales of the detail that a blur takes away, and of that which it leaves, pixels of the registered image."""
 BLURRED_RATIO = 0.45
@@ -79,9 +81,12 @@ class FreezeDetector:
     def __init__(self) -> None:
         self._image: np.ndarray | None = None
         self._since_s = 0.0
+        self._repeats = 0
 
     def is_frozen(self, image: np.ndarray, time_s: float) -> bool:
-        """Take an image; return whether all images of the last `FROZEN_S` are equal to it."""
+        """Take an image; return whether `MIN_REPEATS` images or more, over `FROZEN_S` or longer, are equal to it."""
         if self._image is None or self._image.shape != image.shape or not np.array_equal(self._image, image):
-            self._image, self._since_s = image, time_s
-        return time_s - self._since_s >= FROZEN_S
+            self._image, self._since_s, self._repeats = image, time_s, 0
+            return False
+        self._repeats += 1
+        return self._repeats >= MIN_REPEATS and time_s - self._since_s >= FROZEN_S

@@ -240,6 +240,16 @@ class StillView:
         if len(self._samples) == REFERENCE_SAMPLES and (self._first_share == 0.0 or worn):
             self._renew(image, shows, time_s)
 
+    def image_of_evidence(self) -> np.ndarray:
+        """Return the reference image (H, W) in the pose that the evidence of the view is in."""
+        offset = self.base.after(self._anchor.inverse()) if self._anchored else PictureMotion()
+        return warped(self.reference.image, offset) if offset.largest_px(self.size) > 0 else self.reference.image
+
+    @property
+    def ignored(self) -> np.ndarray | None:
+        """Mask (h, w) of pixels where the reference has no corners."""
+        return self._ignored
+
     def replace_reference(self, reference: ReferenceImage, motion: PictureMotion) -> None:
         """Take another reference, which shows a motion since the view began."""
         self.base, self.reference = motion, reference

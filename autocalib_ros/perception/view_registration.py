@@ -288,12 +288,15 @@ def zoomed(camera: Camera, log_zoom: float) -> Camera:
     return camera if log_zoom == 0 else replace(camera, focal_px=camera.focal_px * float(np.exp(log_zoom)))
 
 
-def registered_image(grey: np.ndarray) -> np.ndarray:
-    """Return a grey image (H, W) at most `REGISTERED_WIDTH_PX` wide."""
-    if grey.shape[1] <= REGISTERED_WIDTH_PX:
-        return grey
-    size = (REGISTERED_WIDTH_PX, max(1, round(grey.shape[0] * REGISTERED_WIDTH_PX / grey.shape[1])))
-    return cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+def registered_image(image: np.ndarray, size: tuple[int, int] | None = None) -> np.ndarray:
+    """Return a grey or BGR image (H, W) or (H, W, 3) in grey, of `size` or at most `REGISTERED_WIDTH_PX` wide."""
+    height, width = image.shape[:2]
+    if size is None:
+        scale = min(1.0, REGISTERED_WIDTH_PX / width)
+        size = (round(width * scale), max(1, round(height * scale)))
+    if size != (width, height):
+        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    return cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image
 
 
 def normalised(image: np.ndarray) -> np.ndarray:

@@ -16,6 +16,7 @@ from functools import cached_property
 import cv2
 import numpy as np
 
+from autocalib_ros.errors import UsageError
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.perception.background import median
 from autocalib_ros.perception.picture_faults import (
@@ -184,6 +185,8 @@ class ViewWatch:
 
     def __init__(self) -> None:
         self.report = ViewReport()
+        self.size: tuple[int, int] | None = None
+        """Width and height of the images of the calibration; None without one."""
         self._references: list[_Reference] = []
         self._checks = 0
         self._due_s = -math.inf
@@ -207,21 +210,49 @@ class ViewWatch:
     def begin(self, views: Sequence[KnownView], camera: Camera) -> None:
         """Watch the view of another calibration, of which some images and the lens are known.
 
-        Views of another shape than the lens are not used.
+        Views of another shape than the lens, or with too few outlines to be found again, are not used.
         """
         self._forget()
-        self._references = []
-        for view in views[:MAX_REFERENCES]:
-            height, width = view.image.shape
-            if abs(width * camera.height - height * camera.width) <= max(camera.width, camera.height):
-                self._references.append(_Reference(view, camera.scaled_to(width, height)))
+        self._references = [
+            reference
+            for view in views[:MAX_REFERENCES]
+            if (small := _scaled_lens(camera, view.image.shape)) is not None
+            and (reference := _Reference(view, small)).view.is_registrable
+        ]
+        self.size = (camera.width, camera.height)
         self.report = ViewReport()
         self._due_s = -math.inf
+
+    def succeed(self, view: KnownView, camera: Camera) -> None:
+        """Watch the view of a newer calibration; where the camera stands as before, go on with what is known of it."""
+        small = _scaled_lens(camera, view.image.shape)
+        calm = self.report.condition in (ViewCondition.STILL, ViewCondition.SWAYING)
+        since = None
+        if calm and small is not None and self.camera is not None and self.size == (camera.width, camera.height):
+            since = self._registered(registered_image(view.image, self._registered_size))
+        if since is None or small is None or float(np.linalg.norm(np.degrees(since.turn_rad))) > self._least_move_deg:
+            self.begin([view], camera)
+            return
+        new = _Reference(view, small)
+        if not new.view.is_registrable:
+            return
+        back = _inverse(since.without_zoom())
+        self._references = [
+            new,
+            *(
+                _Reference(replace(one.known, pose=one.known.pose.after(back)), small)
+                for one in self._references
+                if one.known.image.shape == view.image.shape
+            ),
+        ][:MAX_REFERENCES]
+        self._samples.clear()
+        self._images.clear()
+        self._last = self._last.after(back)
 
     def end(self) -> None:
         """Watch no view any more, but for pictures that say nothing."""
         self._forget()
-        self._references, self.report = [], ViewReport()
+        self._references, self.report, self.size = [], ViewReport(), None
 
     @property
     def views(self) -> tuple[KnownView, ...]:
@@ -232,6 +263,11 @@ class ViewWatch:
     def camera(self) -> Camera | None:
         """Lens of the calibration for images of the registered size; None without one."""
         return self._references[0].view.camera if self._references else None
+
+    @property
+    def _registered_size(self) -> tuple[int, int] | None:
+        camera = self.camera
+        return None if camera is None else (camera.width, camera.height)
 
     def rebase(self, move: CameraMove) -> None:
         """Take the pose after a move for that of the calibration, whose pose was mended by it."""
@@ -255,8 +291,8 @@ class ViewWatch:
         """Whether an image of this time is looked at."""
         return time_s >= self._due_s or time_s < self._newest_s
 
-    def update(self, grey: np.ndarray, time_s: float) -> ViewReport:
-        """Take a grey image (H, W) of any size; return what is known now."""
+    def update(self, image: np.ndarray, time_s: float) -> ViewReport:
+        """Take an image, grey (H, W) or BGR (H, W, 3), in the shape of the calibrated ones; return the report."""
         if not self.is_due(time_s):
             return self.report
         if time_s < self._newest_s:  # the clock was set back
@@ -265,7 +301,7 @@ class ViewWatch:
         self._checks += 1
         place = (self._checks * 0.6180339887) % 1.0 - 0.5
         self._due_s, self._newest_s = time_s + CHECK_S * (1.0 + 2.0 * INTERVAL_SPREAD * place), time_s
-        image = registered_image(grey)
+        image = registered_image(image, self._registered_size)
         frozen = self._freeze.is_frozen(image, time_s)
         pose = self._register(image, time_s)
         if pose is not None:
@@ -306,6 +342,16 @@ class ViewWatch:
         self._replaced = all(_correlation(one.view.pattern, pattern) < REPLACED_CORRELATION for one in usable)
         return None
 
+    def _registered(self, image: np.ndarray) -> ViewPose | None:
+        """Return the pose of an image since the calibration, near the last one; None if it is not recognised."""
+        pattern = normalised(image)
+        for reference in self._references:
+            if reference.view.image.shape == image.shape:
+                found = reference.view.near(pattern, self._last.after(_inverse(reference.known.pose)))
+                if found is not None:
+                    return found.after(reference.known.pose)
+        return None
+
     def _found(self, reference: _Reference, pose: ViewPose) -> ViewPose:
         """Go on from a reference that was recognised; return the pose since the calibration."""
         self._references.remove(reference)
@@ -328,7 +374,8 @@ class ViewWatch:
     def _fault_of(self, image: np.ndarray, pose: ViewPose | None) -> PictureFault | None:
         """Return the fault of a single image."""
         if pose is None:
-            return exposure_fault(image) or (None if self._has_outlines(image) else PictureFault.COVERED)
+            is_empty = bool(self._references) and not self._has_outlines(image)
+            return exposure_fault(image) or (PictureFault.COVERED if is_empty else None)
         if self._checks % SHARPNESS_PERIOD == 0:  # and else as before
             first = self._references[0]
             since = pose.after(_inverse(first.known.pose))
@@ -341,11 +388,8 @@ class ViewWatch:
             candidate, _ = self._candidate
             if candidate.image.shape == image.shape and candidate.near(normalised(image), ViewPose.identity()):
                 return True
-        camera = self.camera or Camera.equidistant(image.shape[1], image.shape[0], 0.5 * image.shape[1])
-        if (camera.width, camera.height) != (image.shape[1], image.shape[0]):
-            camera = Camera.equidistant(image.shape[1], image.shape[0], 0.5 * image.shape[1])
-        ignored = self._references[0].known.ignored if self._references else None
-        new = ViewReference(image, camera, ignored if ignored is not None and ignored.shape == image.shape else None)
+        first = self._references[0]
+        new = ViewReference(image, first.view.camera, first.known.ignored)
         self._candidate = (new, self._newest_s)
         return new.is_registrable
 
@@ -538,6 +582,14 @@ class ViewWatch:
     def _add_reference(self, known: KnownView, camera: Camera) -> None:
         """Use another reference first; drop the one that was not used for the longest time."""
         self._references = [_Reference(known, camera), *self._references][:MAX_REFERENCES]
+
+
+def _scaled_lens(camera: Camera, shape: tuple[int, ...]) -> Camera | None:
+    """Return a lens for images of `shape` (height, width); None if the shape is another than that of its images."""
+    try:
+        return camera.scaled_to(shape[1], shape[0])
+    except UsageError:
+        return None
 
 
 def _inverse(pose: ViewPose) -> ViewPose:

@@ -199,6 +199,8 @@ ASSUMPTIONS: dict[str, Wording] = {
     'scale_distance': _scale_distance,
     'scale_speed': _scale_speed,
     'scale_combined': 'scale from {sources} measures together: camera height {height_m:.3f} +- {height_sigma_m:.2g} m',
+    'mended_pose': 'pose turned with the camera, by what the picture shows: pan {pan_deg:+.2f}, tilt {tilt_deg:+.2f}, '
+    'roll {roll_deg:+.2f} degrees (+- {sigma_deg:.2f})',
     'paper_lens': 'equidistant lens with the principal point at the centre of the picture',
     'paper_roads': 'the two roads are perpendicular',
     'paper_uncertainty': 'the published method gives no uncertainty',

@@ -23,6 +23,7 @@ from autocalib_ros.lens.camera_info import camera_info
 from autocalib_ros.lens.camera_info_yaml import read_camera_info
 from autocalib_ros.perception.detector.detector import VehicleDetector, open_detector
 from autocalib_ros.perception.images import ImageDecoder
+from autocalib_ros.perception.view_watch import ViewCondition, ViewReport
 from autocalib_ros.results.calibration import Calibration, Refusal
 from autocalib_ros.results.store import Store, StoredCalibration, resolve_url
 from autocalib_ros.revalidation import CalibrationState, with_current_options
@@ -40,6 +41,7 @@ from autocalib_ros.ros.report_writer import ReportPaths, ReportWriter
 from autocalib_ros.ros.solver_process import SolverProcess
 from autocalib_ros.ros.status import Counts, RateCounter, Situation
 from autocalib_ros.ros.store_writer import StoreWriter
+from autocalib_ros.ros.view_events import ViewEvents
 from autocalib_ros.ros.worker import CalibrationWorker, Result, Solve
 
 PROGRESS_LOG_PERIOD_S = 10.0
@@ -75,6 +77,7 @@ class AutocalibNode(Node):
         )
         self._reports = ReportWriter(lambda text, good: self._log(text, good=good))
         self._upload = DriverUpload(self, self._log) if self.node_options.upload_to_driver else None
+        self._events = ViewEvents()
         # topics
         self._driver = DriverInfo(self, self.node_options)
         self.publication = CalibrationPublisher(
@@ -199,6 +202,9 @@ class AutocalibNode(Node):
             response.success = False
             response.message = f'nothing to save, no calibration yet; {describe_progress(self._worker.progress)}'
             return response
+        if self.publication.withheld:
+            response.success, response.message = False, f'nothing to save: {self.publication.withheld}'
+            return response
         stored = self._to_stored(published)
         error = await self._wrap_future(self.store_writer.run(lambda: store.save(stored, replace_foreign=True)))
         if error is None and self.publication.published is published:
@@ -229,6 +235,7 @@ class AutocalibNode(Node):
         self._worker.reset()
         self._pictures.forget()
         was = self.publication.withdraw()
+        self._worker.watch_nothing()
         self._reports.forget()
         response.success = True
         response.message = (
@@ -263,6 +270,13 @@ class AutocalibNode(Node):
             rates_hz=self._rate_counter.rates_hz(time.monotonic(), counts),
             result=None if published is None else published.result,
             restored=self.publication.state is CalibrationState.RESTORED,
+            mended=self.publication.state is CalibrationState.MENDED,
+            view=self._worker.view,
+            withheld=bool(self.publication.withheld),
+            valid_since_ns=self.publication.valid_since_ns,
+            last_move=self._events.last_move,
+            moved_just_now=self._events.moved_just_now,
+            recovered_just_now=self._events.recovered_just_now,
             progress=self._worker.progress,
             clock=self._worker.clock,
             image_age_s=self._input.age_s,
@@ -322,6 +336,7 @@ class AutocalibNode(Node):
         except AutocalibError as error:
             self.get_logger().warning(f'the calibration in {store.path} is not restored: {error}')
             return
+        self._worker.watch_stored(restored, ())
         self.get_logger().info(f'restored from {store.path}, not yet verified: {describe(restored)}')
 
     def _to_stored(self, published: Published) -> StoredCalibration:
@@ -381,10 +396,32 @@ class AutocalibNode(Node):
         decision = self.publication.solved(result)
         if decision is None:
             return
+        if decision.calibration is result:
+            self._worker.watch_solved(result)
         self._withdrawn = ''
         self._logged_at = {}
         self._log(decision.text, good=not decision.contradicted)
         self.get_logger().info(describe(result))
+
+    def view_changed(self, report: ViewReport, stamp_ns: int) -> Calibration | None:
+        """Publish, withhold or mend the calibration by what the newest image says about the view."""
+        published, mode = self.publication.published, self.node_options.on_move
+        text, good = self._events.told(report, stamp_ns, has_calibration=published is not None)
+        self._log(text, good=good)
+        if report.condition in (ViewCondition.STILL, ViewCondition.SWAYING):
+            self.publication.release()
+        move = report.move
+        if move is not None and mode == 'mend' and move.keeps_lens:
+            turned = self.publication.mend(move, stamp_ns)
+            if turned is not None:
+                self._events.mended()
+                self._log(f'pose mended by what the picture shows: {describe(turned.result)}', good=False)
+                return turned.result
+        if move is not None:
+            self.publication.outdate()
+        if (move is not None or report.fault is not None) and mode != 'keep':
+            self.publication.withhold(text or str(report))
+        return None
 
     def _log(self, text: str, *, good: bool) -> None:
         """Log a line as information or warning; '' logs nothing."""

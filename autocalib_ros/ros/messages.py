@@ -85,6 +85,16 @@ def camera_info_message(
     )
 
 
+def uncalibrated_message(fields: CameraInfoFields, stamp: Time, frame_id: str) -> CameraInfo:
+    """Return the CameraInfo of an image whose camera is not calibrated now: K is zero, as ROS has it."""
+    return CameraInfo(header=header(stamp, frame_id), width=int(fields.width), height=int(fields.height))
+
+
+def is_uncalibrated(info: CameraInfo) -> bool:
+    """Whether a CameraInfo says that its camera is not calibrated, in all its fields."""
+    return not (any(info.k) or any(info.p) or len(info.d))
+
+
 def readout(driver: CameraInfo) -> Readout:
     """Return size, binning and region of interest of a driver's CameraInfo."""
     return Readout(
@@ -170,6 +180,8 @@ def _check_camera_info(info: CameraInfo) -> None:
     path = 'CameraInfo'
     _check_frame(info.header.frame_id, f'{path}.header.frame_id')
     _require(info.width > 0 and info.height > 0, path, f'has the size {info.width}x{info.height}')
+    if is_uncalibrated(info):
+        return
     length = COEFFICIENT_COUNT.get(info.distortion_model)
     _require(length is not None, f'{path}.distortion_model', f'is {info.distortion_model!r}')
     _require(len(info.d) == length, f'{path}.d', f'holds {len(info.d)} numbers, not {length}')

@@ -17,6 +17,8 @@ from autocalib_ros.config import NodeOptions, Options
 from autocalib_ros.errors import InputError
 from autocalib_ros.lens.camera_info import CameraInfo as CameraInfoFields
 from autocalib_ros.results.calibration import Calibration
+from autocalib_ros.results.camera_move import CameraMove
+from autocalib_ros.results.mending import mended
 from autocalib_ros.revalidation import CalibrationState, Decision, reconcile
 from autocalib_ros.ros import messages
 from autocalib_ros.ros.driver_info import DriverInfo
@@ -62,6 +64,12 @@ class CalibrationPublisher:
         self._node, self._driver = node, driver
         self._on_accepted, self._on_withdrawn = on_accepted, on_withdrawn
         self._per_image = node_options.camera_info_mode == 'per_image'
+        self.withheld = ''
+        """Why the calibration is not published for now; '' while it is."""
+        self.valid_since_ns = 0
+        """Stamp from which the calibration holds: that of its newest evidence, or of the move that it was mended by."""
+        self.is_stale = False
+        """Whether the camera has moved since the calibration, which was not mended."""
         self._lock = threading.RLock()
         self.published: Published | None = None
         self.state = CalibrationState.NONE
@@ -99,7 +107,7 @@ class CalibrationPublisher:
             size = (message.width, message.height) if hasattr(message, 'width') else self.image_size
             published = self.published
             if self._per_image and published is not None and size == (published.fields.width, published.fields.height):
-                self._camera_info.publish(self.camera_info(published, message.header.stamp, image_frame))
+                self._camera_info.publish(self._present_info(published, message.header.stamp, image_frame))
         return foreign
 
     def _on_new_frame(self, image_frame: str) -> Published | None:
@@ -123,6 +131,46 @@ class CalibrationPublisher:
             self.withdraw()
         return state, published
 
+    def mend(self, move: CameraMove, stamp_ns: int) -> Published | None:
+        """Publish the pose turned by a move of the camera; return what is published now, None without a calibration."""
+        before = self.published
+        if before is None:
+            return None
+        published = self._make_messages(mended(before.result, move, stamp_ns), before.image_frame)
+        with self._lock:
+            if self.published is not before:
+                return None
+            self.withheld, self.is_stale = '', False
+            self._publish(CalibrationState.MENDED, published)
+            self.valid_since_ns = round(move.time_s * 1e9)
+            self._on_accepted(published, True)
+        return published
+
+    def outdate(self) -> None:
+        """Note that the camera has moved: the next solution replaces the calibration, and is not compared with it."""
+        with self._lock:
+            self.is_stale = True
+
+    def withhold(self, why: str) -> None:
+        """Publish a calibration no longer, but keep it; all CameraInfo say from now on that there is none."""
+        with self._lock:
+            published, was, self.withheld = self.published, self.withheld, why
+            if published is None or was:
+                return
+            stamp = messages.time_message(published.result.newest_stamp_ns)
+            self._camera_info.publish(
+                messages.validated(messages.uncalibrated_message(published.fields, stamp, published.image_frame))
+            )
+            self._markers.publish(no_markers())
+            self._clear_latched()
+
+    def release(self) -> None:
+        """Publish a withheld calibration again: it holds."""
+        with self._lock:
+            was, self.withheld, self.is_stale = self.withheld, '', False
+            if was and self.published is not None:
+                self._publish(self.state, self.published)
+
     def on_evidence_reset(self) -> None:
         """Mark the calibration as verified only: it stays until new evidence gives one as precise or contradicts it."""
         with self._lock:
@@ -133,7 +181,7 @@ class CalibrationPublisher:
         """Let a new solution confirm or replace the calibration; None if the image size has changed since."""
         while True:
             before, state = self.published, self.state
-            decision = reconcile(state, before.result if before else None, result)
+            decision = reconcile(state, before.result if before and not self.is_stale else None, result)
             new = decision.calibration is result
             # outside the lock: this may take a while, and images do not wait for it
             published = (
@@ -149,6 +197,7 @@ class CalibrationPublisher:
     def _apply(self, decision: Decision, published: Published, *, new: bool) -> None:
         confirmed = self.state is not decision.state
         if new:
+            self.withheld, self.is_stale = '', False
             self._publish(decision.state, published)
         self.state = decision.state
         if new or confirmed:
@@ -176,11 +225,18 @@ class CalibrationPublisher:
         """Stop publishing; return the state before."""
         with self._lock:
             was, self.state, self.published = self.state, CalibrationState.NONE, None
+            self.withheld, self.is_stale = '', False
             if was is not CalibrationState.NONE:
                 self._markers.publish(no_markers())
             self._on_withdrawn()
             self._clear_latched()
         return was
+
+    def _present_info(self, published: Published, stamp: Time, image_frame: str) -> CameraInfo:
+        """Return the CameraInfo of an image now, which says so while the calibration is withheld."""
+        if not self.withheld:
+            return self.camera_info(published, stamp, image_frame)
+        return messages.validated(messages.uncalibrated_message(published.fields, stamp, image_frame))
 
     def camera_info(self, published: Published, stamp: Time | None = None, image_frame: str = '') -> CameraInfo:
         """Return the CameraInfo of an image, or of the newest image in the evidence of the calibration.
@@ -227,6 +283,7 @@ class CalibrationPublisher:
             self._transforms.publish(published.transform)
         self._markers.publish(published.markers)
         self.published, self.state = published, state
+        self.valid_since_ns = published.result.newest_stamp_ns
 
     def _clear_latched(self) -> None:
         """Remove obsolete latched messages by renewing their publishers, so that late joiners do not get them.
@@ -241,5 +298,5 @@ class CalibrationPublisher:
             if self.published is None:
                 self._node.destroy_publisher(self._camera_info)
                 self._camera_info = latched_publisher(self._node, CameraInfo, '~/camera_info')
-            if self.published is None or self.published.transform is None:
+            if self.published is None or self.published.transform is None or self.withheld:
                 self._transforms.forget()

@@ -9,9 +9,12 @@ from enum import Enum
 
 from autocalib_ros.calibrator import CalibrationProgress
 from autocalib_ros.perception.frame_clock import ClockSummary
+from autocalib_ros.perception.view_watch import ViewCondition, ViewReport
 from autocalib_ros.results.calibration import Calibration, StandardDeviations
+from autocalib_ros.results.camera_move import CameraMove
 from autocalib_ros.results.verification_table import summarise_verification
 from autocalib_ros.ros.log_text import tilt_deg
+from autocalib_ros.ros.view_events import clock_text
 from autocalib_ros.ros.watchdog import NoImageDiagnosis
 
 OK, WARN, ERROR = 0, 1, 2
@@ -28,14 +31,22 @@ class NodeState(str, Enum):
     WAITING_FOR_IMAGES = 'WAITING_FOR_IMAGES'
     COLLECTING = 'COLLECTING'
     RESTORED = 'RESTORED'
+    MENDED = 'MENDED'
     CALIBRATED = 'CALIBRATED'
+    MOVED = 'MOVED'
+    BLIND = 'BLIND'
+    RECOVERED = 'RECOVERED'
 
 
 LEVELS = {
     NodeState.WAITING_FOR_IMAGES: WARN,
     NodeState.COLLECTING: WARN,
     NodeState.RESTORED: WARN,
+    NodeState.MENDED: WARN,
     NodeState.CALIBRATED: OK,
+    NodeState.MOVED: ERROR,
+    NodeState.BLIND: ERROR,
+    NodeState.RECOVERED: OK,
 }
 
 
@@ -87,6 +98,18 @@ class Situation:
     """The published calibration."""
     restored: bool = False
     """The calibration was stored by an earlier run and is not yet verified by traffic."""
+    mended: bool = False
+    """The pose was turned by what the picture shows and is not yet verified by traffic."""
+    view: ViewReport = field(default_factory=ViewReport)
+    """What the newest image says about the view of the calibration."""
+    withheld: bool = False
+    """The calibration is not published for now."""
+    valid_since_ns: int = 0
+    """Stamp from which the calibration holds."""
+    last_move: CameraMove | None = None
+    moved_just_now: bool = False
+    """The pose was mended less than a minute ago."""
+    recovered_just_now: bool = False
     progress: CalibrationProgress | None = None
     clock: ClockSummary = field(default_factory=ClockSummary)
     """What the frame clock made of the stamps."""
@@ -112,7 +135,15 @@ class Status:
 
 def state_of(situation: Situation) -> NodeState:
     """Return the state of the node."""
+    if situation.view.condition is ViewCondition.BLIND:
+        return NodeState.BLIND
     if situation.result is not None:
+        if situation.view.condition is ViewCondition.MOVED or situation.moved_just_now:
+            return NodeState.MOVED
+        if situation.recovered_just_now:
+            return NodeState.RECOVERED
+        if situation.mended:
+            return NodeState.MENDED
         return NodeState.RESTORED if situation.restored else NodeState.CALIBRATED
     return NodeState.COLLECTING if situation.counts.used else NodeState.WAITING_FOR_IMAGES
 
@@ -120,19 +151,89 @@ def state_of(situation: Situation) -> NodeState:
 def status(situation: Situation) -> Status:
     """Return level, one-line message and values; the message names the gravest problems first."""
     state, problems = state_of(situation), sorted(_problems(situation), key=lambda problem: -problem[0])
-    level = max([LEVELS[state], *(level for level, _ in problems)])
+    level = max([_level(state, situation), *(level for level, _ in problems)])
     message = '; '.join([_headline(state, situation), *(text for _, text in problems)])
     return Status(level, message, tuple(_values(state, situation)))
 
 
+def calibration_status(situation: Situation) -> Status:
+    """Return level, message and values of `~/status`: what a program has to know before it uses the calibration."""
+    state, result, view, move = state_of(situation), situation.result, situation.view, situation.last_move
+    ends_s = view.since_s if view.condition in (ViewCondition.MOVED, ViewCondition.BLIND) else None
+    sigma = StandardDeviations() if result is None else result.stddev
+    values = (
+        ('state', state.value),
+        ('grade', '' if result is None else result.grade),
+        ('pose', _pose_word(situation)),
+        ('valid_since_s', '' if result is None else f'{situation.valid_since_ns * 1e-9:.3f}'),
+        ('valid_until_s', '' if result is None else _number(ends_s, '.3f')),
+        ('focal_sigma_px', _number(sigma.focal_px, '.3g')),
+        ('tilt_sigma_deg', _number(sigma.tilt_deg, '.3g')),
+        ('roll_sigma_deg', _number(sigma.roll_deg, '.3g')),
+        ('height_sigma_m', _number(sigma.height_m, '.3g')),
+        *_move_values(move),
+        ('fault', '' if view.fault is None else view.fault.value),
+    )
+    return Status(_level(state, situation), _headline(state, situation), values)
+
+
+def _pose_word(situation: Situation) -> str:
+    """Return what is published: '', 'calibrated', 'mended', 'withheld', or 'stale' if it is published nevertheless."""
+    if situation.result is None:
+        return ''
+    if situation.withheld:
+        return 'withheld'
+    if situation.view.condition in (ViewCondition.MOVED, ViewCondition.BLIND):
+        return 'stale'
+    return 'mended' if situation.mended else 'calibrated'
+
+
+def _move_values(move: CameraMove | None) -> Iterator[tuple[str, str]]:
+    """Yield the newest move of the camera, '' without one."""
+    measured = move is not None and move.is_measured
+    yield 'moved_s', '' if move is None else f'{move.time_s:.3f}'
+    yield 'move', '' if move is None else move.kind.value
+    for name in ('pan_deg', 'tilt_deg', 'roll_deg'):
+        yield f'moved_{name}', f'{getattr(move, name):.3f}' if measured else ''
+    yield 'zoom', f'{move.zoom:.4f}' if move is not None and measured else ''
+
+
+def _level(state: NodeState, situation: Situation) -> int:
+    """Return the level of a state; a restored calibration is good once the picture shows its view."""
+    verified = situation.view.condition in (ViewCondition.STILL, ViewCondition.SWAYING)
+    return OK if state is NodeState.RESTORED and verified else LEVELS[state]
+
+
 def _headline(state: NodeState, situation: Situation) -> str:
-    result, progress = situation.result, situation.progress
+    result, progress, view = situation.result, situation.progress, situation.view
+    if state is NodeState.BLIND:
+        return f'{state.value}: the picture says nothing since {clock_text(view.since_s)}: {view}'
+    if state is NodeState.MOVED and situation.last_move is not None:
+        return f'{state.value}: the camera moved at {clock_text(situation.last_move.time_s)}: {_move_text(situation)}'
     if result is not None:
-        note = ', not yet verified by traffic' if state is NodeState.RESTORED else ''
+        verified = view.condition in (ViewCondition.STILL, ViewCondition.SWAYING)
+        note = {
+            NodeState.RESTORED: ', view verified by the picture, not yet by traffic'
+            if verified
+            else ', not yet verified by traffic',
+            NodeState.MENDED: ', pose mended by what the picture shows, not yet verified by traffic',
+        }.get(state, '')
         return f'{state.value}: grade {result.grade}, focal length {result.camera.focal_px:.1f} px{note}'
     if state is NodeState.COLLECTING and progress is not None:
         return f'{state.value}: {progress}'
     return f'{state.value}: {situation.topic}' if state is NodeState.WAITING_FOR_IMAGES else state.value
+
+
+def _move_text(situation: Situation) -> str:
+    """Return how the camera moved, and what is published since."""
+    turning = situation.view.condition is ViewCondition.MOVED
+    text = str(situation.view) if turning else str(situation.last_move)
+    published = {
+        'mended': 'the pose is mended by what the picture shows',
+        'withheld': 'the calibration is withheld',
+        'stale': 'the stale calibration is published',
+    }
+    return f'{text}; {published.get(_pose_word(situation), "")}'.rstrip('; ')
 
 
 def _problems(situation: Situation) -> Iterator[tuple[int, str]]:
@@ -169,6 +270,11 @@ def _values(state: NodeState, situation: Situation) -> Iterator[tuple[str, str]]
     for name in Counts.__dataclass_fields__:
         yield name, f'{getattr(counts, name):.0f}'
     yield from _clock_values(situation.clock)
+    yield 'view', situation.view.condition.value
+    yield 'view_checked_s', _number(situation.view.checked_s or None, '.3f')
+    yield 'sway_deg', _number(situation.view.sway_deg or None, '.3f')
+    yield from _move_values(situation.last_move)
+    yield 'pose', _pose_word(situation)
     yield from _result_values(situation.result)
 
 

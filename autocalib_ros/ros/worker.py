@@ -13,7 +13,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -28,7 +28,9 @@ from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.perception.detector.detector import VehicleDetector
 from autocalib_ros.perception.frame_clock import ClockSummary
+from autocalib_ros.perception.view_watch import KnownView, ViewReport, ViewWatch
 from autocalib_ros.results.calibration import Calibration, Refusal
+from autocalib_ros.results.camera_move import MoveKind
 
 IMAGE_QUEUE_SIZE = 8
 """Images waiting for the perception thread: bridges half a second at 15 Hz, 22 MB at 1280x720."""
@@ -76,6 +78,9 @@ class Listener(Protocol):
     def failed(self, error: Exception) -> None:
         """Take a fault of the program; both threads keep running."""
 
+    def view_changed(self, report: ViewReport, stamp_ns: int) -> Calibration | None:
+        """Take what the newest image says about the view; return the calibration if it was mended by its move."""
+
 
 @dataclass
 class Counters:
@@ -102,6 +107,8 @@ class _Job:
     evidence: Evidence
     generation: int
     """Generation of the evidence: the number of resets before it was collected."""
+    view: KnownView | None = None
+    """Image of the view that the evidence is from."""
     waiting: list[Future] = field(default_factory=list)
     """Futures of service calls, resolved with the result of this snapshot or of a newer one that replaced it."""
 
@@ -149,6 +156,16 @@ class CalibrationWorker:
         self.reported_evidence: Evidence | None = None
         """Evidence of the result that the listener is handling; None otherwise."""
         self._refused = ''
+        self._watch = ViewWatch()
+        self._watch_steps: list[Callable[[], None]] = []
+        self._left_ns = 0
+        self.view = ViewReport()
+        """What the newest image says about the view of the calibration."""
+        self.known: tuple[Calibration | None, tuple[KnownView, ...]] = (None, ())
+        """The calibration whose view is watched, with images of that view for the next start."""
+        self._watched: Calibration | None = None
+        self.solved_view: KnownView | None = None
+        """View of the result that the listener is handling; None otherwise."""
         self._threads = [
             threading.Thread(target=run, name=name, daemon=True)
             for run, name in ((self._run_perception, 'perception'), (self._run_solver, 'solver'))
@@ -207,6 +224,30 @@ class CalibrationWorker:
         with self._changed:
             self._options, self._idle_solve_s, self._changing = options, idle_solve_s, True
             self._changed.notify_all()
+
+    def watch_stored(self, calibration: Calibration, views: Sequence[KnownView]) -> None:
+        """Watch the view of a calibration of an earlier run."""
+        self._at_next_image(lambda: self._watch.begin(views, calibration.camera), calibration)
+
+    def watch_solved(self, calibration: Calibration) -> None:
+        """Watch the view of a new calibration; to be called by the listener as it takes that."""
+        view = self.solved_view
+        if view is None:
+            self.watch_stored(calibration, ())
+        else:
+            self._at_next_image(lambda: self._watch.succeed(view, calibration.camera), calibration)
+
+    def watch_nothing(self) -> None:
+        """Watch no view any more: there is no calibration."""
+        self._at_next_image(self._watch.end, None)
+
+    def _at_next_image(self, step: Callable[[], None], calibration: Calibration | None) -> None:
+        def watch() -> None:
+            step()
+            self._watched = calibration
+
+        with self._changed:
+            self._watch_steps.append(watch)
 
     def close(self, timeout_s: float) -> bool:
         """Stop both threads; return whether they ended in time, since not every solver can be interrupted."""
@@ -299,6 +340,7 @@ class CalibrationWorker:
         with self._changed:
             self._unsolved_images += self._generation == self._calibrator_generation
         self._listener.image_accepted(width, height)
+        self._guarded(partial(self._watch_view, stamp_ns, image))
         if self._viewer is not None:
             self._guarded(partial(self._viewer.image_used, message, image, self._calibrator.followed))
         evidence = self._guarded(self._calibrator.snapshot_if_due)
@@ -311,13 +353,36 @@ class CalibrationWorker:
             with self._changed:
                 self.progress = progress if self._generation == self._calibrator_generation else None
 
+    def _watch_view(self, stamp_ns: int, image: np.ndarray) -> None:
+        """Show an image to the watch; tell the listener when the view is another, or the picture says nothing."""
+        with self._changed:
+            steps, self._watch_steps = self._watch_steps, []
+        for step in steps:
+            step()
+        time_s = stamp_ns * 1e-9
+        if self._watch.size not in (None, image.shape[1::-1]) or not (steps or self._watch.is_due(time_s)):
+            return
+        before, report = self.view, self._watch.update(image, time_s)
+        self.view = report
+        if (report.condition, report.move, report.fault) != (before.condition, before.move, before.fault):
+            mended = self._listener.view_changed(report, stamp_ns)
+            move = report.move
+            if move is not None and (move.is_measured or move.kind is MoveKind.OTHER_VIEW):
+                self._left_ns = round(move.time_s * 1e9)
+                self._calibrator.leave_view(self._left_ns)
+                if mended is not None:
+                    self._watch.rebase(move)
+                    self._watched = mended
+        self.known = (self._watched, self._watch.views)
+
     def _submit(self, evidence: Evidence | None, requests: list[Future]) -> None:
         """Hand a snapshot to the solver thread; it replaces a waiting one and takes over its callers."""
         with self._changed:
             self._unsolved_images = 0
             if evidence is not None and not self._closed and self._generation == self._calibrator_generation:
                 waiting = self._job.waiting if self._job else []
-                self._job = _Job(evidence, self._generation, [*waiting, *requests])
+                view = self._guarded(self._calibrator.known_view)
+                self._job = _Job(evidence, self._generation, view, [*waiting, *requests])
                 self._changed.notify_all()
                 return
         self._resolve(requests, None)
@@ -331,9 +396,9 @@ class CalibrationWorker:
             began = time.monotonic()
             result = self._guarded(partial(self._solved, job.evidence))
             if result is not None:
-                self.reported_evidence = job.evidence
+                self.reported_evidence, self.solved_view = job.evidence, job.view
                 result = self._notify(result, job)
-                self.reported_evidence = None
+                self.reported_evidence = self.solved_view = None
             self._rest_until = time.monotonic() + REST_FACTOR * (time.monotonic() - began)
             self._resolve(job.waiting, result)
 
@@ -353,9 +418,9 @@ class CalibrationWorker:
         return self._solve(evidence, self._options, lens=self._lens_for(evidence.image_size))
 
     def _notify(self, result: Result, job: _Job) -> Result | None:
-        """Pass a result to listener and viewer; return None if a reset made it obsolete."""
+        """Pass a result to listener and viewer; return None if a reset or a move of the camera made it obsolete."""
         with self._listener_lock:
-            if job.generation != self._generation:
+            if job.generation != self._generation or job.evidence.first_stamp_ns < self._left_ns:
                 return None
             self._refused = result.message if isinstance(result, Refusal) else ''
             self._guarded(partial(self._listener.solved, result))

@@ -8,7 +8,10 @@ import pytest
 from autocalib_ros.calibrator import CalibrationProgress
 from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.lens.camera import Camera
+from autocalib_ros.perception.picture_faults import PictureFault
+from autocalib_ros.perception.view_watch import ViewCondition, ViewReport
 from autocalib_ros.results.calibration import Calibration, EvidenceSummary, StandardDeviations
+from autocalib_ros.results.camera_move import CameraMove, MoveKind
 from autocalib_ros.results.refusals import Reason
 from autocalib_ros.results.statements import assumption
 from autocalib_ros.ros.status import (
@@ -20,9 +23,11 @@ from autocalib_ros.ros.status import (
     NodeState,
     RateCounter,
     Situation,
+    calibration_status,
     state_of,
     status,
 )
+from autocalib_ros.ros.view_events import ViewEvents
 from autocalib_ros.ros.watchdog import NoImageDiagnosis
 
 TILT_DEG = 30.0
@@ -184,3 +189,53 @@ def test_rates_of_a_node_asked_seldom_still_cover_something():
     recent = RateCounter()
     recent.rates_hz(0.0, Counts())
     assert recent.rates_hz(4 * RATE_WINDOW_S, Counts(received=40)).received == pytest.approx(40 / (4 * RATE_WINDOW_S))
+
+
+BUMP = CameraMove(MoveKind.BUMP, 1_700_000_100.0, 1.0, -0.5, 0.25, sigma_deg=(0.02, 0.02, 0.02))
+
+
+@pytest.mark.parametrize(
+    ('changes', 'state', 'level', 'pose'),
+    [
+        ({'view': ViewReport(ViewCondition.MOVED, move=BUMP), 'withheld': True}, NodeState.MOVED, ERROR, 'withheld'),
+        ({'view': ViewReport(ViewCondition.MOVED, move=BUMP)}, NodeState.MOVED, ERROR, 'stale'),
+        (
+            {'view': ViewReport(ViewCondition.STILL), 'mended': True, 'moved_just_now': True},
+            NodeState.MOVED,
+            ERROR,
+            'mended',
+        ),
+        ({'view': ViewReport(ViewCondition.STILL), 'mended': True}, NodeState.MENDED, WARN, 'mended'),
+        ({'view': ViewReport(ViewCondition.BLIND, fault=PictureFault.BLACK)}, NodeState.BLIND, ERROR, 'stale'),
+        ({'view': ViewReport(ViewCondition.STILL), 'recovered_just_now': True}, NodeState.RECOVERED, OK, 'calibrated'),
+        ({'view': ViewReport(ViewCondition.STILL), 'restored': True}, NodeState.RESTORED, OK, 'calibrated'),
+    ],
+)
+def test_what_happened_to_the_view_is_a_state(changes, state, level, pose):
+    situation = replace(CALIBRATED, last_move=BUMP, **changes)
+    shown = calibration_status(situation)
+    assert (shown.level, dict(shown.values)['state'], dict(shown.values)['pose']) == (level, state.value, pose)
+    assert status(situation).level == level
+    assert dict(status(situation).values)['moved_pan_deg'] == '1.000'
+
+
+def test_degrees_and_time_of_a_move_are_in_the_message():
+    moved = replace(
+        CALIBRATED, last_move=BUMP, view=ViewReport(ViewCondition.MOVED, 1_700_000_100.0, move=BUMP), withheld=True
+    )
+    message = status(moved).message
+    assert 'pan +1.00 ± 0.02, tilt -0.50' in message
+    assert '2023-11-14 22:15:00 UTC' in message
+    assert dict(calibration_status(moved).values)['valid_until_s'] == '1700000100.000'
+
+
+def test_events_are_told_once_and_recovery_after_them():
+    now = [0.0]
+    events = ViewEvents(lambda: now[0])
+    assert events.told(ViewReport(ViewCondition.STILL), 0, has_calibration=True)[0] == ''
+    text, good = events.told(ViewReport(ViewCondition.BLIND, fault=PictureFault.FROZEN), 0, has_calibration=True)
+    assert 'frozen' in text and not good
+    text, good = events.told(ViewReport(ViewCondition.STILL), 0, has_calibration=True)
+    assert 'the calibrated view is back' in text and good and events.recovered_just_now
+    now[0] += 100.0
+    assert not events.recovered_just_now

@@ -4,14 +4,17 @@ import threading
 from concurrent.futures import Future
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
+from drawn_pictures import noisy
 
 from autocalib_ros.config import Options
 from autocalib_ros.errors import InputError
 from autocalib_ros.lens.camera import Camera
+from autocalib_ros.perception.view_watch import KnownView, ViewCondition
 from autocalib_ros.ros.worker import IMAGE_QUEUE_SIZE, CalibrationWorker
-from bench import PATIENCE_S, PIXELS, calibration, refusal, wait_for
+from bench import PATIENCE_S, PIXELS, SIZE, calibration, refusal, wait_for
 
 FRAME_NS = 66_000_000
 NEVER_S = 1e6
@@ -22,6 +25,7 @@ class Heard:
 
     def __init__(self):
         self.sizes, self.unreadable, self.results, self.faults, self.anew = [], [], [], [], []
+        self.reports, self.mend = [], None
 
     def image_accepted(self, width, height):
         self.sizes.append((width, height))
@@ -37,6 +41,10 @@ class Heard:
 
     def failed(self, error):
         self.faults.append(error)
+
+    def view_changed(self, report, stamp_ns):
+        self.reports.append(report)
+        return self.mend if report.move is not None and report.move.keeps_lens else None
 
 
 class Slow:
@@ -357,3 +365,35 @@ def test_progress_of_before_a_reset_is_forgotten(start, heard, monkeypatch):
     feed(worker, heard, 1, first=1)
     wait_for(lambda: worker.progress, 'the progress')
     assert '12 tracks of the 40 needed.' not in worker.progress.missing
+
+
+def test_move_is_told_mended_and_begins_other_evidence(start, heard):
+    """A view of 320x240 that moves 6 px to the right: 1.1 degrees with this lens."""
+    generator = np.random.default_rng(0)
+    road = np.full((SIZE[1], SIZE[0] + 6), 90.0, np.float32)
+    for _ in range(120):
+        x, y = generator.integers(0, (SIZE[0] - 30, SIZE[1] - 20))
+        road[y : y + generator.integers(4, 20), x : x + generator.integers(6, 40)] += generator.uniform(-50, 50)
+    road = cv2.GaussianBlur(np.clip(road, 0, 255), (0, 0), 0.8)
+    before, after = road[:, :-6], road[:, 6:]
+    worker = start(calibration)
+    step_ns = 1_300_000_000
+
+    def show(picture, first: int, count: int) -> None:
+        for number in range(first, first + count):
+            worker.offer(number * step_ns, noisy(np.ascontiguousarray(picture), 2.0, number))
+            wait_for(lambda wanted=number + 1: len(heard.sizes) >= wanted, f'image {number}')
+
+    show(before, 0, 12)
+    result = result_of(worker.solve_now())
+    worker.watch_stored(result, [KnownView(before.astype(np.uint8))])
+    show(before, 12, 4)
+    assert heard.reports[-1].condition is ViewCondition.STILL
+    heard.mend = result
+    show(after, 16, 16)
+    assert not heard.faults
+    move = next(report.move for report in heard.reports if report.move is not None and report.move.is_measured)
+    assert move.pan_deg == pytest.approx(np.degrees(6 / 300.0), abs=0.1)
+    assert worker.view.condition in (ViewCondition.STILL, ViewCondition.SWAYING)
+    assert worker.known[0] is result
+    assert worker._calibrator.snapshot().first_stamp_ns >= 15 * step_ns
