@@ -3,31 +3,35 @@
     NAME.yaml            the lens in the format of camera_info_manager
     NAME.autocalib.json  calibration.json with pose, standard deviations and evidence, and the content of NAME.yaml
     *.bak                the previous pair
+    NAME.view.npz        small images of the calibrated view, to verify it at the next start; see `perception.view_file`
     NAME.report.html     the report, with its figures in NAME.figures; never read back
 
 Each file is replaced atomically, the JSON before the YAML. A crash between the two leaves a YAML that matches the
 previous JSON. So the lens in the YAML identifies the JSON that belongs to it, and a YAML that matches neither was
-written by another program.
+written by another program. A checksum in the JSON covers all that is published from it.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import os
 import re
+import reprlib
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from enum import Enum
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from autocalib_ros.errors import AutocalibError, InputError, UsageError
 from autocalib_ros.lens.camera_info import CameraInfo
 from autocalib_ros.lens.camera_info_yaml import camera_info_yaml, read_camera_info_fields
 from autocalib_ros.results.calibration import Calibration
 from autocalib_ros.results.calibration_json import calibration_from_json, read_json, to_json
+from autocalib_ros.results.grades import rank_of
 from autocalib_ros.util.files import keep_copy, remove_temporaries, write_atomically
 
 DEFAULT_URL = 'file://${ROS_HOME}/camera_info/${NAME}.yaml'
@@ -116,12 +120,13 @@ class Store:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.json_path = path.with_name(f'{path.stem}.autocalib.json')
+        self.views = path.with_name(f'{path.stem}.view.npz')
         self.report = path.with_name(f'{path.stem}.report.html')
         self.figures = path.with_name(f'{path.stem}.figures')
 
     def remove_leftovers(self) -> None:
         """Remove temporary files of a killed writer; not to be called during a write."""
-        for path in (self.path, self.json_path):
+        for path in (self.path, self.json_path, self.views):
             remove_temporaries(path)
             remove_temporaries(_backup(path))
 
@@ -195,7 +200,19 @@ class Store:
 def stored_json(stored: StoredCalibration) -> str:
     """Return the text of the JSON file: calibration.json, and the content of the YAML."""
     kept = {'camera_name': stored.camera_name, 'image_frame': stored.image_frame, 'camera_info': asdict(stored.info)}
-    return json.dumps({**to_json(stored.calibration), 'stored': kept}, indent=1, allow_nan=False) + '\n'
+    document = {**to_json(stored.calibration), 'stored': kept}
+    return json.dumps({**document, 'checksum': document_checksum(document)}, indent=1, allow_nan=False) + '\n'
+
+
+def document_checksum(document: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of all names and values of a document but its own checksum."""
+    rest = {name: value for name, value in document.items() if name != 'checksum'}
+    return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
+
+
+def calibration_checksum(calibration: Calibration) -> str:
+    """Return what identifies a calibration: the SHA-256 of its calibration.json."""
+    return document_checksum(to_json(calibration))
 
 
 def _backup(path: Path) -> Path:
@@ -217,18 +234,41 @@ def _try_read(path: Path, read: Callable[[Path], Content]) -> Content | InputErr
 
 def _read_stored_json(path: Path) -> StoredCalibration:
     whole = read_json(path)
+    if 'checksum' in whole and whole['checksum'] != document_checksum(whole):
+        raise InputError(
+            f'{path}: it was changed by another program, by hand or by a fault of the disk: its checksum differs'
+        )
     try:
         kept = whole['stored']
-        return StoredCalibration(
+        stored = StoredCalibration(
             calibration_from_json(whole),
             CameraInfo(**kept['camera_info']),
             str(kept['camera_name']),
             str(kept['image_frame']),
         )
+        _require_plausible(stored)
+        return stored
     except AutocalibError as error:
         raise InputError(f'{path}: {error}') from error
-    except (KeyError, TypeError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(f'{path}: it was not written by this node ({type(error).__name__}: {error})') from error
+
+
+def _require_plausible(stored: StoredCalibration) -> None:
+    """Raise InputError for a calibration that this node cannot have written: files without a checksum may hold any."""
+    calibration, sigma = stored.calibration, stored.calibration.stddev
+    if not _same_lens(stored.info, calibration.camera_info):
+        raise InputError('its camera is not that of its camera_info')
+    deviations = [sigma.focal_px, sigma.k1, sigma.k2, sigma.tilt_deg, sigma.roll_deg, sigma.height_m]
+    if any(value is not None and not 0 <= value < math.inf for value in deviations):
+        raise InputError('a standard deviation is negative, or no number')
+    if calibration.newest_stamp_ns < 0 or rank_of(calibration.grade) < 0:
+        raise InputError(f'its stamp or its grade {reprlib.repr(calibration.grade)} is none')
+    if not stored.image_frame.isprintable():
+        raise InputError(f'its frame {reprlib.repr(stored.image_frame)} has characters that cannot be printed')
+    ground = calibration.ground
+    if ground is not None and ground.normal_in_camera[1] >= 0 and ground.normal_in_camera[2] >= 0:
+        raise InputError('its camera sees the road above its horizon: the picture is upside down')
 
 
 def _if_consistent(
@@ -237,14 +277,17 @@ def _if_consistent(
     """Return the stored calibration if the lens of the YAML is the one it was published with, else None."""
     if not isinstance(lens, CameraInfo) or not isinstance(stored, StoredCalibration):
         return None
-    ours = stored.info
+    return stored if _same_lens(lens, stored.info) else None
+
+
+def _same_lens(lens: CameraInfo, ours: CameraInfo) -> bool:
+    """Whether two CameraInfo are equal to within what other programs round them to."""
     if (lens.width, lens.height, lens.distortion_model) != (ours.width, ours.height, ours.distortion_model):
-        return None
+        return False
     try:
-        same = all(
+        return all(
             math.isclose(a, b, rel_tol=STORED_LENS_TOLERANCE, abs_tol=STORED_LENS_TOLERANCE)
             for a, b in zip((*lens.k, *lens.d, *lens.r, *lens.p), (*ours.k, *ours.d, *ours.r, *ours.p), strict=True)
         )
-    except (TypeError, ValueError):  # another number of coefficients, or not numbers
-        return None
-    return stored if same else None
+    except (TypeError, ValueError, OverflowError):  # another number of coefficients, or not numbers
+        return False

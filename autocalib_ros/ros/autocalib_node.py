@@ -17,15 +17,16 @@ from rclpy.task import Future
 from std_srvs.srv import Trigger
 
 from autocalib_ros.config import NodeOptions, Options
-from autocalib_ros.errors import AutocalibError
+from autocalib_ros.errors import AutocalibError, InputError
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.lens.camera_info import camera_info
 from autocalib_ros.lens.camera_info_yaml import read_camera_info
 from autocalib_ros.perception.detector.detector import VehicleDetector, open_detector
 from autocalib_ros.perception.images import ImageDecoder
-from autocalib_ros.perception.view_watch import ViewCondition, ViewReport
+from autocalib_ros.perception.view_file import read_views, write_views
+from autocalib_ros.perception.view_watch import KnownView, ViewCondition, ViewReport
 from autocalib_ros.results.calibration import Calibration, Refusal
-from autocalib_ros.results.store import Store, StoredCalibration, resolve_url
+from autocalib_ros.results.store import Store, StoredCalibration, calibration_checksum, resolve_url
 from autocalib_ros.revalidation import CalibrationState, with_current_options
 from autocalib_ros.ros.declared_parameters import declare_parameters
 from autocalib_ros.ros.diagnostics import Diagnostics
@@ -48,6 +49,8 @@ PROGRESS_LOG_PERIOD_S = 10.0
 """Real seconds between two log lines of progress."""
 LOG_REPEAT_PERIOD_S = 60.0
 """Real seconds before an unchanged warning is repeated."""
+VIEWS_PERIOD_S = 5.0
+"""Real seconds between two looks for views to be stored; they change at each calibration, and with the light."""
 SHUTDOWN_S = 4.0
 """Time limit of the shutdown: `ros2 launch` kills a node 5 s after the interrupt."""
 
@@ -78,6 +81,7 @@ class AutocalibNode(Node):
         self._reports = ReportWriter(lambda text, good: self._log(text, good=good))
         self._upload = DriverUpload(self, self._log) if self.node_options.upload_to_driver else None
         self._events = ViewEvents()
+        self._views_stored: tuple[int, ...] = ()
         # topics
         self._driver = DriverInfo(self, self.node_options)
         self.publication = CalibrationPublisher(
@@ -111,6 +115,7 @@ class AutocalibNode(Node):
             self, self._situation, lambda: self._headers.camera_name(self.publication.image_frame or DEFAULT_FRAME)
         )
         self.create_timer(PROGRESS_LOG_PERIOD_S, self._log_progress, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.create_timer(VIEWS_PERIOD_S, self._store_views, clock=Clock(clock_type=ClockType.STEADY_TIME))
         if detector is not None:
             self.get_logger().info(f'vehicle detector: {detector}')
         self.get_logger().info(f'waiting for images on {self._input.topic}')
@@ -209,6 +214,8 @@ class AutocalibNode(Node):
         error = await self._wrap_future(self.store_writer.run(lambda: store.save(stored, replace_foreign=True)))
         if error is None and self.publication.published is published:
             self.store_writer.withdraw()  # already written
+        if error is None:
+            self.store_writer.saved = stored
         response.success = error is None
         response.message = (
             f'not saved: {error}'
@@ -336,8 +343,28 @@ class AutocalibNode(Node):
         except AutocalibError as error:
             self.get_logger().warning(f'the calibration in {store.path} is not restored: {error}')
             return
-        self._worker.watch_stored(restored, ())
+        self._worker.watch_stored(restored, self._stored_views(store, found.stored.calibration))
         self.get_logger().info(f'restored from {store.path}, not yet verified: {describe(restored)}')
+
+    def _stored_views(self, store: Store, calibration: Calibration) -> tuple[KnownView, ...]:
+        """Return the stored views of a calibration, none if they are damaged."""
+        try:
+            views = read_views(store.views, calibration_checksum(calibration))
+        except InputError as error:
+            self.get_logger().warning(f'the view is not verified by the picture: {error}')
+            return ()
+        return views
+
+    def _store_views(self) -> None:
+        """Store the views of the stored calibration when there are others than those stored last."""
+        calibration, views = self._worker.known
+        store, saved = self._store, self.store_writer.saved
+        if store is None or calibration is None or saved is None or saved.calibration is not calibration:
+            return
+        shown = tuple(map(id, (calibration, *views)))
+        if views and shown != self._views_stored:
+            self._views_stored = shown
+            self.store_writer.run(partial(write_views, store.views, calibration_checksum(calibration), views))
 
     def _to_stored(self, published: Published) -> StoredCalibration:
         return StoredCalibration(

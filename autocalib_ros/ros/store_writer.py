@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
+from functools import partial
 from typing import Any
 
 from autocalib_ros.errors import AutocalibError
@@ -29,6 +30,8 @@ class StoreWriter:
         self._pending: Callable[[], None] | None = None
         self._due = time.monotonic()
         self._closed = False
+        self.saved: StoredCalibration | None = None
+        """What this run wrote last; None before that."""
         self.fault = ''
         """Reason why the last automatic write failed; '' if it succeeded."""
         self._thread = threading.Thread(target=self._run, name='store writer', daemon=True)
@@ -37,8 +40,12 @@ class StoreWriter:
     def offer(self, store: Store, stored: StoredCalibration) -> None:
         """Write this at once, or `period_s` after the last write; a newer offer replaces it."""
         with self._changed:
-            self._pending = lambda: store.save(stored)
+            self._pending = partial(self._save, store, stored)
             self._changed.notify_all()
+
+    def _save(self, store: Store, stored: StoredCalibration) -> None:
+        store.save(stored)
+        self.saved = stored
 
     def withdraw(self) -> None:
         """Drop the pending write."""

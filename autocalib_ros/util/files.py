@@ -15,12 +15,17 @@ from autocalib_ros.errors import InputError
 
 def write_atomically(path: Path, text: str) -> None:
     """Replace a file atomically, also across a power cut: readers see the old text or the new, never a part."""
-    with replaced_atomically(path) as stream:
-        stream.write(text.encode('utf-8'))
+    write_bytes_atomically(path, text.encode('utf-8'))
+
+
+def write_bytes_atomically(path: Path, content: bytes, mode: int = 0o644) -> None:
+    """Replace a file as `write_atomically` does."""
+    with replaced_atomically(path, mode) as stream:
+        stream.write(content)
 
 
 @contextlib.contextmanager
-def replaced_atomically(path: Path) -> Iterator[BinaryIO]:
+def replaced_atomically(path: Path, mode: int = 0o644) -> Iterator[BinaryIO]:
     """Yield a stream whose bytes replace a file atomically when the block ends without an exception.
 
     The folder is created. InputError if that fails.
@@ -34,7 +39,7 @@ def replaced_atomically(path: Path) -> Iterator[BinaryIO]:
                 yield stream
                 stream.flush()
                 os.fsync(stream.fileno())
-            os.chmod(temporary, 0o644)
+            os.chmod(temporary, mode)
             os.replace(temporary, path)
         except BaseException:
             os.unlink(temporary)

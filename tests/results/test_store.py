@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import subprocess
@@ -241,3 +242,53 @@ def test_full_disk_leaves_what_was_there(store, monkeypatch):
     monkeypatch.undo()
     assert (store.load().state, number_of(store.load())) == (StoreState.INTACT, 1)
     assert len(list(store.path.parent.iterdir())) == 4
+
+
+@pytest.mark.parametrize(
+    ('path', 'value'),
+    [
+        (('camera', 'focal_px'), 77.0),
+        (('ground_from_camera', 'translation_m'), [0.0, 0.0, 9.0]),
+        (('stddev', 'tilt_deg'), 0.01),
+        (('stored', 'image_frame'), 'another'),
+        (('newest_stamp_ns',), 5),
+    ],
+)
+def test_any_change_of_what_is_published_is_noticed(store, path, value):
+    store.save(FIRST)
+    document = json.loads(store.json_path.read_text())
+    inner = document
+    for name in path[:-1]:
+        inner = inner[name]
+    inner[path[-1]] = value
+    store.json_path.write_text(json.dumps(document))
+    found = store.load()
+    assert found.stored is None
+    assert 'checksum' in found.note
+
+
+@pytest.mark.parametrize(
+    ('path', 'value', 'expected'),
+    [
+        (('camera', 'focal_px'), 77.0, 'its camera is not that of its camera_info'),
+        (('camera', 'principal_point_px'), [1e9, 0.0], 'its camera is not that'),
+        (('stddev', 'focal_px'), -1.0, 'standard deviation is negative'),
+        (('newest_stamp_ns',), -5, 'its stamp or its grade'),
+        (('grade',), '<script>', 'its stamp or its grade'),
+        (('stored', 'image_frame'), 'cam\x00', 'cannot be printed'),
+        (('stored', 'image_frame'), '\ud800', 'cannot be printed'),
+        (('stored', 'camera_info', 'k'), [10**400, 0, 0, 0, 1, 0, 0, 0, 1], 'camera_info'),
+    ],
+)
+def test_nonsense_in_a_file_without_a_checksum_is_not_restored(store, path, value, expected):
+    store.save(FIRST)
+    document = json.loads(store.json_path.read_text())
+    del document['checksum']
+    inner = document
+    for name in path[:-1]:
+        inner = inner[name]
+    inner[path[-1]] = value
+    store.json_path.write_text(json.dumps(document))
+    found = store.load()
+    assert found.stored is None
+    assert expected in found.note
