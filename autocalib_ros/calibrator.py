@@ -23,13 +23,19 @@ TRAIL_FRAMES = 16
 """Images over which the trail of a tracked point is drawn: a second at 15 Hz."""
 
 
+MIN_RESIZED_S, MIN_RESIZED_IMAGES = 3.0, 5
+"""Time by the stamps and number of images in a row for which a new size lasts before it is believed: drivers that
+reconnect send a few odd images, a camera that changes its mode keeps it."""
+
+
 class ImageIntake(Enum):
-    """What happened to an image; every value except `USED` and `LATE` restarts the evidence."""
+    """What happened to an image; `FIRST`, `TIME_JUMPED` and `RESIZED` restart the evidence."""
 
     FIRST = 'the first image'
     USED = 'used, or held until the next images tell its time'
     LATE = 'late: its time stamp is not newer than that of an earlier image'
     TIME_JUMPED = 'the time stamps jumped'
+    ODD_SIZE = 'skipped: its size is another one than before, and has not lasted yet'
     RESIZED = 'the image size changed'
 
 
@@ -59,20 +65,24 @@ class AutoCalibrator:
         self._detector = detector or open_detector(options.detector)
         self._stream: ImageStream | None = None
         self._timing = ImageTiming()
+        self._odd_size: tuple[tuple[int, int], int, int] | None = None
         self._reset_schedule()
 
     def add_image(self, stamp_ns: int, image: np.ndarray) -> ImageIntake:
         """Take one image: grey (H, W) or BGR (H, W, 3), uint8; it is neither kept nor changed.
 
         `perception.frame_clock` gives each image its time: one odd stamp is one image, a clock that is set back goes on
-        with the evidence. A recording that starts again, a clock set by a day or more, or a new image size restarts the
-        evidence. Raises UsageError if a pixel of scale.distance_px lies outside the image, InputError for an array of
-        another kind.
+        with the evidence. A recording that starts again, a clock set by a day or more, or a new image size that lasts
+        restarts the evidence. Raises UsageError if a pixel of scale.distance_px lies outside the image, InputError for
+        an array of another kind.
         """
         if image.dtype != np.uint8 or image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
             raise InputError(f'an image is grey (H, W) or BGR (H, W, 3) in 8 bits, got {image.dtype} {image.shape}')
         size, frames = (image.shape[1], image.shape[0]), 0 if self._stream is None else self._stream.frames
         resized = self._stream is not None and size != self._stream.size
+        if resized and not self._has_lasted(size, stamp_ns):
+            return ImageIntake.ODD_SIZE
+        self._odd_size = None
         if resized:
             self._timing = ImageTiming()
         taken = self._timing.add(stamp_ns, image)
@@ -88,6 +98,14 @@ class AutoCalibrator:
         if taken.restarted and frames > 1:
             return ImageIntake.TIME_JUMPED
         return ImageIntake.LATE if taken.is_late else ImageIntake.USED if frames else ImageIntake.FIRST
+
+    def _has_lasted(self, size: tuple[int, int], stamp_ns: int) -> bool:
+        """Count an image of a new size; return whether that size is to be believed."""
+        before, since_ns, count = self._odd_size or (size, stamp_ns, 0)
+        if before != size or stamp_ns < since_ns:
+            since_ns, count = stamp_ns, 0
+        self._odd_size = (size, since_ns, count + 1)
+        return count + 1 >= MIN_RESIZED_IMAGES and stamp_ns - since_ns >= MIN_RESIZED_S * 1e9
 
     def clock(self) -> ClockSummary:
         """Return what the frame clock made of the stamps since the image size changed last."""

@@ -152,6 +152,7 @@ DIAGNOSTIC_VALUES = {
     'dropped': 'images dropped because they arrived faster than they could be processed',
     'unreadable': 'images that could not be decoded',
     'late': 'images that came late or twice by their stamps: they get their `camera_info` and are not processed',
+    'odd_size': 'images of another size than those before, skipped because that did not last for 3 s',
     'repeated': 'of the processed images, those that repeat an earlier one and so show nothing new',
     'lost': 'images lost by the middleware',
     'frame_period_s': 'frame period of the camera, fitted through the stamps; empty if they show none',

@@ -142,9 +142,21 @@ def test_an_image_that_waits_for_the_next_is_neither_lost_nor_the_buffer_of_the_
 
 def test_a_new_size_restarts_the_evidence() -> None:
     calibrator = fed(30)
-    calibrator.add_image(3_000_000_000, image(0, (240, 320)))
+    intakes = [calibrator.add_image((30 + 10 * i) * 100_000_000, image(i, (240, 320))) for i in range(6)]
+    assert intakes == [*4 * [ImageIntake.ODD_SIZE], ImageIntake.RESIZED, ImageIntake.USED]
     evidence = calibrator.snapshot()
-    assert evidence is not None and (evidence.frames, evidence.image_size) == (1, (320, 240))
+    assert evidence is not None and evidence.image_size == (320, 240)
+
+
+@pytest.mark.parametrize('size', [(1, 1), (90, 160), (2160, 3840)])
+def test_odd_images_leave_the_evidence_alone(size: tuple[int, int]) -> None:
+    calibrator = fed(10)
+    for index in range(10, 20):
+        assert calibrator.add_image(index * 100_000_000, np.zeros(size, np.uint8)) is ImageIntake.ODD_SIZE
+    assert calibrator.add_image(2_000_000_000, image(20)) is ImageIntake.USED
+    evidence = calibrator.snapshot()
+    assert evidence is not None and evidence.image_size == (320, 180)
+    assert evidence.frames >= 10  # the newest one may be held for its time
 
 
 @pytest.mark.parametrize('stamp_ns', [900_000_000, 850_000_000])
@@ -163,7 +175,7 @@ def test_a_repeated_or_late_stamp_is_left_out(stamp_ns: int) -> None:
         (1, (180, 320), ImageIntake.LATE),
         (-100_000_000, (180, 320), ImageIntake.LATE),  # the next image tells whether the stamps start again
         (DAY_NS, (180, 320), ImageIntake.USED),  # held: the next image tells whether the clock was set
-        (1_000_000_000, (240, 320), ImageIntake.RESIZED),
+        (1_000_000_000, (240, 320), ImageIntake.ODD_SIZE),
     ],
 )
 def test_what_became_of_an_image_is_reported(stamp_ns: int, size: tuple[int, int], expected: ImageIntake) -> None:

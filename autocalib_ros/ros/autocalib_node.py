@@ -81,6 +81,8 @@ class AutocalibNode(Node):
         self._reports = ReportWriter(lambda text, good: self._log(text, good=good))
         self._upload = DriverUpload(self, self._log) if self.node_options.upload_to_driver else None
         self._events = ViewEvents()
+        self._set_aside: tuple[Published, tuple[KnownView, ...]] | None = None
+        """Calibration that was withdrawn for another image size, with its views."""
         self._views_stored: tuple[int, ...] = ()
         # topics
         self._driver = DriverInfo(self, self.node_options)
@@ -178,10 +180,15 @@ class AutocalibNode(Node):
         frame_id = self._headers.frame_id(message.header.frame_id)
         self._worker.offer(self._headers.stamp_ns(message.header.stamp), message)
         foreign = self.publication.on_image(message, frame_id)
-        if foreign is not None:
+        if foreign is not None and self.publication.published is None:
             self.get_logger().warning(
                 f"restored calibration withdrawn: its frame is '{foreign.image_frame}', that of the images "
                 f"'{frame_id}'; still collecting evidence"
+            )
+        elif foreign is not None:
+            self.get_logger().warning(
+                f"the frame of the images is now '{frame_id}', before '{foreign.image_frame}': the ground transform is "
+                'published for the new frame; consumers of tf keep the one of before until they restart'
             )
         if self._store is None:
             self._store = store = self._open_store(frame_id)
@@ -242,6 +249,7 @@ class AutocalibNode(Node):
         self._worker.reset()
         self._pictures.forget()
         was = self.publication.withdraw()
+        self._set_aside = None
         self._worker.watch_nothing()
         self._reports.forget()
         response.success = True
@@ -389,15 +397,36 @@ class AutocalibNode(Node):
     def image_accepted(self, width: int, height: int) -> None:
         """Withdraw a calibration of another image size, because its lens is in pixels of that size."""
         self._unreadable = ''
+        views = self._worker.known
         withdrawn = self.publication.on_image_size(width, height)
+        self._take_back(width, height)
         if withdrawn is not None:
             state, published = withdrawn
+            self._set_aside = (published, views[1] if views[0] is published.result else ())
+            self._worker.watch_nothing()
             old_width, old_height = published.result.evidence.image_size
             self._withdrawn = (
                 f'{state.value} calibration withdrawn: its images have {old_width}x{old_height} pixels, the present '
                 f'ones {width}x{height}'
             )
             self.get_logger().warning(f'{self._withdrawn}; collecting new evidence')
+
+    def _take_back(self, width: int, height: int) -> None:
+        """Publish the calibration that was withdrawn for another image size again, now that its size is back."""
+        if self._set_aside is None or self.publication.published is not None:
+            return
+        published, views = self._set_aside
+        if published.result.evidence.image_size != (width, height):
+            return
+        self._set_aside = None
+        try:
+            self.publication.restore(published.result, published.image_frame)
+        except AutocalibError as error:
+            self.get_logger().warning(f'the calibration of images of {width}x{height} is not published again: {error}')
+            return
+        self._worker.watch_stored(published.result, views)
+        self._withdrawn = ''
+        self.get_logger().info(f'images have {width}x{height} pixels again: {describe(published.result)}')
 
     def on_evidence_reset(self, why: str) -> None:
         """Log that the evidence was dropped; the calibration stays until a new one is as precise."""

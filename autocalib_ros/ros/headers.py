@@ -10,6 +10,10 @@ from autocalib_ros.config import NodeOptions
 from autocalib_ros.lens.camera_info_yaml import sanitised_name
 from autocalib_ros.perception.header_stamps import HeaderStamps
 
+MAX_FRAME_LENGTH = 255
+"""Longest frame in characters, as names of files and topics."""
+MAX_WARNINGS = 20
+"""Most warnings in all: a driver with a new frame in each image must not fill memory and log."""
 DEFAULT_FRAME = 'camera_optical_frame'
 
 
@@ -33,6 +37,12 @@ class Headers:
             frame = self._options.camera_frame.lstrip('/') or DEFAULT_FRAME
             self._warn_once(f"images have no frame_id: using '{frame}'")
             return frame
+        if not given.isprintable() or len(given) > MAX_FRAME_LENGTH:
+            clean = ''.join(letter if letter.isprintable() else '_' for letter in given[:MAX_FRAME_LENGTH])
+            self._warn_once(
+                f"images have a frame_id that no consumer can show ({len(given)} characters): using '{clean}'"
+            )
+            given = clean
         if given.startswith('/'):
             self._warn_once(f"images have the frame_id '{given}': the leading '/' is removed, tf2 rejects it")
         return given.lstrip('/') or DEFAULT_FRAME
@@ -53,6 +63,6 @@ class Headers:
         return self._options.ground_frame.lstrip('/') or f'{self.camera_name(image_frame)}_ground'
 
     def _warn_once(self, text: str) -> None:
-        if text not in self._warned:
+        if text not in self._warned and len(self._warned) < MAX_WARNINGS:
             self._warned.add(text)
             self._warn(text)

@@ -27,6 +27,9 @@ from autocalib_ros.ros.markers import markers, no_markers
 from autocalib_ros.ros.qos import latched_publisher
 from autocalib_ros.ros.transforms import GroundTransformPublisher
 
+SAME_FRAMES = 3
+"""Images in a row with another frame_id before that is believed."""
+
 
 @dataclass(frozen=True)
 class Published:
@@ -75,6 +78,7 @@ class CalibrationPublisher:
         self.state = CalibrationState.NONE
         self.image_frame = ''
         """Frame of the newest image; '' before the first."""
+        self._other_frame, self._other_frames = '', 0
         self.image_size: tuple[int, int] | None = None
         """Size of the newest decoded image."""
         self._camera_info = latched_publisher(node, CameraInfo, '~/camera_info')
@@ -98,12 +102,20 @@ class CalibrationPublisher:
         return self._transforms.conflict
 
     def on_image(self, message: Any, image_frame: str) -> Published | None:
-        """Publish the CameraInfo of an image; return a restored calibration withdrawn because its frame differs.
+        """Publish the CameraInfo of an image; return the calibration of before where its frame was another.
 
-        The size of compressed images is unknown until the first is decoded.
+        The size of compressed images is unknown until the first is decoded. A frame is believed after `SAME_FRAMES`
+        images in a row; those before that get no CameraInfo, because the transform does not name their frame.
         """
         with self._lock:
-            foreign = self._on_new_frame(image_frame) if image_frame != self.image_frame else None
+            foreign = None
+            if image_frame != self.image_frame:
+                same = image_frame == self._other_frame
+                self._other_frame, self._other_frames = image_frame, self._other_frames + 1 if same else 1
+                if self.image_frame and self._other_frames < SAME_FRAMES:
+                    return None
+                foreign = self._on_new_frame(image_frame)
+            self._other_frame, self._other_frames = '', 0
             size = (message.width, message.height) if hasattr(message, 'width') else self.image_size
             published = self.published
             if self._per_image and published is not None and size == (published.fields.width, published.fields.height):
@@ -116,9 +128,17 @@ class CalibrationPublisher:
             self._headers.ground_frame(image_frame), self._headers.camera_frame(image_frame)
         )
         published = self.published
-        if self.state is not CalibrationState.RESTORED or published is None or published.image_frame == image_frame:
+        if published is None or published.image_frame == image_frame:
             return None
-        self.withdraw()
+        if self.state is CalibrationState.RESTORED:
+            self.withdraw()
+            return published
+        # this camera by another name: its pose is published under that
+        renamed = self._make_messages(published.result, image_frame)
+        if self.withheld:
+            self.published = renamed
+        else:
+            self._publish(self.state, renamed)
         return published
 
     def on_image_size(self, width: int, height: int) -> tuple[CalibrationState, Published] | None:

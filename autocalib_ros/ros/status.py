@@ -59,6 +59,8 @@ class Counts:
     dropped: float = 0
     unreadable: float = 0
     late: float = 0
+    odd_size: float = 0
+    """Of another size than the ones before, which did not last."""
     repeated: float = 0
     """Of the used ones, repeats of an earlier image."""
     lost: float = 0

@@ -91,6 +91,8 @@ class Counters:
     unreadable: int = 0
     late: int = 0
     """Skipped: the time stamp was not newer than that of an earlier image."""
+    odd_size: int = 0
+    """Skipped: the size was not that of the images before, and did not last."""
     used: int = 0
     repeated: int = 0
     """Of the used ones, repeats of an earlier image, which show nothing new."""
@@ -330,8 +332,9 @@ class CalibrationWorker:
         except Exception as error:  # an unattended camera has to survive a bad frame
             self._listener.failed(error)
             return
-        if intake is ImageIntake.LATE:
-            self.counters.late += 1
+        if intake in (ImageIntake.LATE, ImageIntake.ODD_SIZE):
+            self.counters.late += intake is ImageIntake.LATE
+            self.counters.odd_size += intake is ImageIntake.ODD_SIZE
             return
         if intake in (ImageIntake.TIME_JUMPED, ImageIntake.RESIZED):
             self._refused = ''

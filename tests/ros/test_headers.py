@@ -56,3 +56,18 @@ def test_leading_slash_is_left_out_with_one_warning(warnings):
 )
 def test_ground_frame_holds_the_name_of_the_camera(warnings, namespace, options, ground):
     assert headers(warnings, namespace, **options).ground_frame('cam-1/optical') == ground
+
+
+@pytest.mark.parametrize(('given', 'frame'), [('cam\n\x1b[31m', 'cam__[31m'), (300 * 'x', 255 * 'x')])
+def test_frame_that_cannot_be_shown_is_cleaned_with_one_warning(warnings, given, frame):
+    read = headers(warnings)
+    assert [read.frame_id(given), read.frame_id(given)] == [frame, frame]
+    assert len(warnings) == 1
+    assert warnings[0].isprintable()
+
+
+def test_frames_without_end_do_not_fill_the_log(warnings):
+    read = headers(warnings)
+    for number in range(100):
+        read.frame_id(f'/cam{number}')
+    assert len(warnings) == 20

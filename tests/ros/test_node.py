@@ -17,6 +17,7 @@ from autocalib_ros.estimation.publish import with_requested_model
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.lens.camera_info import camera_info
 from autocalib_ros.lens.camera_info_yaml import write_camera_info_yaml
+from autocalib_ros.revalidation import CalibrationState
 from autocalib_ros.ros.autocalib_node import AutocalibNode
 from autocalib_ros.ros.messages import stamp_ns
 from bench import PATIENCE_S, PIXELS, SIZE, Bench, calibration, image, refusal, wait_for
@@ -274,6 +275,29 @@ def test_calibration_of_another_image_size_is_withdrawn(bench):
         lambda stamp: image(stamp, size=(160, 120)),
     )
     assert not infos
+    # and published again with the first images of its own size that last
+    publish_until(publisher, lambda: infos, 'the calibration again')
+    assert node.publication.state is CalibrationState.RESTORED
+
+
+def test_one_odd_image_costs_nothing(bench):
+    node, publisher = calibrated(bench)
+    before = node.publication.published
+    publisher.publish(image(START_NS + 10**12, size=(1, 1)))
+    wait_for(lambda: node._worker.counters.odd_size, 'the odd image')
+    assert node.publication.published is before
+
+
+def test_another_frame_is_told_and_published_after_some_images(bench):
+    node, publisher = calibrated(bench)
+    infos = bench.collect(CameraInfo, INFO)
+    transforms = bench.collect(TransformStamped, GROUND)
+    bench.listening(INFO)
+    bench.listening(GROUND)
+    publish_until(publisher, lambda: transforms, 'the transform', lambda stamp: image(stamp, frame_id='renamed'))
+    assert 'renamed' in (transforms[-1].header.frame_id, transforms[-1].child_frame_id)
+    wait_for(lambda: [info for info in infos if info.header.frame_id == 'renamed'], 'CameraInfo of the new frame')
+    assert node.publication.published.image_frame == 'renamed'
 
 
 def test_solution_is_tried_when_the_images_end(bench):
