@@ -28,6 +28,10 @@ MIN_RESIZED_S, MIN_RESIZED_IMAGES = 3.0, 5
 reconnect send a few odd images, a camera that changes its mode keeps it."""
 
 
+WORTHWHILE_GROWTH = 1.0 / 0.85**2
+"""Growth of the evidence that cuts a standard deviation by 15 %, since it falls with the root of the tracks."""
+
+
 class ImageIntake(Enum):
     """What happened to an image; `FIRST`, `TIME_JUMPED` and `RESIZED` restart the evidence."""
 
@@ -118,6 +122,7 @@ class AutoCalibrator:
 
     def _reset_schedule(self, part: StillPart | None = None) -> None:
         self._scheduled = part
+        self._accepted: tuple[StillPart, int, int] | None = None
         self._due_s = self._options.first_solve_s + (0.0 if part is None else part.start_s)
         self._due_tracks = float(self._options.gate.min_tracks)
 
@@ -132,12 +137,28 @@ class AutoCalibrator:
         part = stream.part
         if part is not self._scheduled:
             self._reset_schedule(part)
-        if stream.time_s < self._due_s or part.tracks_seen < self._due_tracks:
+        if stream.time_s < self._due_s or part.tracks_seen < self._due_tracks or not self._is_worth_it(part):
             return None
         tracks = max(part.buffer.track_count, self._options.gate.min_tracks)
         self._due_tracks = part.tracks_seen + (self._options.solve_growth - 1.0) * tracks
         self._due_s = stream.time_s + self._options.solve_interval_s
         return self.snapshot()
+
+    def accepted(self, tracks: int) -> None:
+        """Note that evidence of so many tracks gave a calibration: a new solution is due when it can be better.
+
+        That is when the evidence could cut a standard deviation by 15 %, or when all of it is newer, which verifies the
+        calibration by other traffic.
+        """
+        if self._stream is not None:
+            self._accepted = (self._stream.part, tracks, self._stream.part.tracks_seen)
+
+    def _is_worth_it(self, part: StillPart) -> bool:
+        """Whether a new solution can be better than an accepted one, or verify it by other traffic."""
+        accepted_part, tracks, seen = self._accepted or (None, 0, 0)
+        if accepted_part is not part:
+            return True
+        return part.buffer.track_count >= WORTHWHILE_GROWTH * tracks or part.tracks_seen - seen >= tracks
 
     def snapshot(self, *, longest_part: bool = False, landmarks: bool = False) -> Evidence | None:
         """Freeze the evidence so far; None before the first image.

@@ -622,6 +622,11 @@ class NodeOptions(_Validated):
         'when camera_info is published: with each image, or only when it changes',
         choices=('per_image', 'latched_only'),
     )
+    solve_limit_s: float = option(
+        900.0,
+        'longest time of one solution, seconds; a longer one is given up, and the solver started anew',
+        low=1.0,
+    )
     on_move: str = option(
         'mend',
         'what is published after the camera has moved, and while the picture says nothing; mend: after a turn the pose '

@@ -202,6 +202,19 @@ def test_other_options_make_a_solution_due() -> None:
     assert calibrator.snapshot_if_due() is not None
 
 
+def test_an_accepted_calibration_is_solved_again_when_that_can_be_better() -> None:
+    def due_after_acceptance(tracks: int) -> bool:
+        calibrator = fed(150)
+        evidence = calibrator.snapshot_if_due()
+        assert evidence is not None and evidence.track_count > 0
+        calibrator.accepted(tracks or evidence.track_count)
+        calibrator._due_s = calibrator._due_tracks = 0.0  # by the other rules it is due
+        return calibrator.snapshot_if_due() is not None
+
+    assert not due_after_acceptance(0)  # the same evidence
+    assert due_after_acceptance(1)  # so many times the evidence of then
+
+
 @pytest.mark.parametrize(
     'picture', [np.zeros((10, 10), np.uint16), np.zeros((10, 10, 4), np.uint8), np.zeros(10, np.uint8)]
 )

@@ -131,7 +131,7 @@ class AutocalibNode(Node):
         return lens
 
     def _start_worker(self, solve: Solve | None, detector: VehicleDetector | None) -> CalibrationWorker:
-        solver = SolverProcess()
+        solver = SolverProcess(self.node_options.solve_limit_s)
         return CalibrationWorker(
             self.options,
             idle_solve_s=self.node_options.idle_solve_s,
@@ -285,6 +285,7 @@ class AutocalibNode(Node):
             rates_hz=self._rate_counter.rates_hz(time.monotonic(), counts),
             result=None if published is None else published.result,
             restored=self.publication.state is CalibrationState.RESTORED,
+            solver=self._worker.solver.summary(),
             mended=self.publication.state is CalibrationState.MENDED,
             view=self._worker.view,
             withheld=bool(self.publication.withheld),
@@ -440,7 +441,10 @@ class AutocalibNode(Node):
         self._log_throttled('unreadable', f'image skipped: {error} ({self._worker.counters})')
 
     def failed(self, error: Exception) -> None:
-        """Log a fault of the program with its traceback, for a bug report."""
+        """Log a fault of the program with its traceback, for a bug report; one of the machine in a line."""
+        if isinstance(error, AutocalibError):
+            self._log_throttled(f'fault {type(error).__name__}', str(error))
+            return
         self._log_throttled(f'fault {type(error).__name__}', ''.join(traceback.format_exception(error)).rstrip())
 
     def solved(self, result: Result) -> None:

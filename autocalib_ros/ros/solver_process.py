@@ -6,6 +6,9 @@ priority and ends with its parent.
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
+import math
 import multiprocessing
 import os
 import signal
@@ -20,6 +23,8 @@ from autocalib_ros.lens.camera import Camera
 from autocalib_ros.results.calibration import Calibration, Refusal
 
 Result = Calibration | Refusal
+PR_SET_PDEATHSIG = 1
+"""Option of prctl(2): the signal that a process gets when its parent ends."""
 NICENESS = 10
 """Nice value of the child: a solution has minutes, an image milliseconds."""
 PROCESS_EXIT_S = 1.0
@@ -30,6 +35,10 @@ class SolverDied(AutocalibError):
     """The solver process ended before it returned a result."""
 
 
+class SolverTimedOut(AutocalibError):
+    """The solver process did not return a result in time, and was ended."""
+
+
 class _ChildTraceback(Exception):
     """Traceback of the child process, printed above that of the parent."""
 
@@ -37,10 +46,11 @@ class _ChildTraceback(Exception):
 class SolverProcess:
     """Callable like `calibrator.solve`, for one thread and one problem at a time; `close` is thread-safe.
 
-    The first call starts the process.
+    The first call starts the process. A solution that takes longer than `limit_s` (real seconds) is given up.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, limit_s: float = float('inf')) -> None:
+        self.limit_s = limit_s
         self._process: BaseProcess | None = None
 
     def _start(self) -> BaseProcess:
@@ -53,10 +63,19 @@ class SolverProcess:
         return process
 
     def __call__(self, evidence: Evidence, options: Options, /, *, lens: Camera | None) -> Result:
-        """Return the result. Raise what the solver raised, or SolverDied; the next call then starts a new process."""
+        """Return the result. Raise what the solver raised, SolverDied, or SolverTimedOut.
+
+        After the latter two the next call starts a new process.
+        """
         self._process = process = self._process or self._start()
         try:
             self._pipe.send((evidence, options, lens))
+            if not self._pipe.poll(None if math.isinf(self.limit_s) else self.limit_s):
+                self.close()
+                raise SolverTimedOut(
+                    f'a solution took longer than {self.limit_s:g} s and was given up, and the solver starts anew: '
+                    'the machine is too busy, or raise solve_limit_s'
+                )
             result, error, child_traceback = self._pipe.recv()
         except (EOFError, OSError) as lost:
             process.join(PROCESS_EXIT_S)
@@ -77,9 +96,16 @@ class SolverProcess:
             process.join(PROCESS_EXIT_S)
 
 
+def _end_with_parent() -> None:
+    """Let the kernel end this process with its parent, also where that is killed in the middle of a solution."""
+    with contextlib.suppress(OSError, AttributeError):  # Linux has it; elsewhere the closed pipe ends the process later
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, int(signal.SIGKILL))
+
+
 def _run_child(pipe: Connection) -> None:
     """Solve the problems that arrive until the parent closes the pipe."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is handled by the parent
+    _end_with_parent()
     os.nice(NICENESS)
     from autocalib_ros.estimation.estimate import solve  # here alone: the parent starts faster and smaller without it
 

@@ -14,6 +14,7 @@ from autocalib_ros.results.calibration import Calibration, StandardDeviations
 from autocalib_ros.results.camera_move import CameraMove
 from autocalib_ros.results.verification_table import summarise_verification
 from autocalib_ros.ros.log_text import tilt_deg
+from autocalib_ros.ros.solver_activity import SolverState, SolverSummary
 from autocalib_ros.ros.view_events import clock_text
 from autocalib_ros.ros.watchdog import NoImageDiagnosis
 
@@ -100,6 +101,7 @@ class Situation:
     """The published calibration."""
     restored: bool = False
     """The calibration was stored by an earlier run and is not yet verified by traffic."""
+    solver: SolverSummary = field(default_factory=SolverSummary)
     mended: bool = False
     """The pose was turned by what the picture shows and is not yet verified by traffic."""
     view: ViewReport = field(default_factory=ViewReport)
@@ -222,7 +224,8 @@ def _headline(state: NodeState, situation: Situation) -> str:
         }.get(state, '')
         return f'{state.value}: grade {result.grade}, focal length {result.camera.focal_px:.1f} px{note}'
     if state is NodeState.COLLECTING and progress is not None:
-        return f'{state.value}: {progress}'
+        solving = f'; {situation.solver}' if situation.solver.state is SolverState.SOLVING else ''
+        return f'{state.value}: {progress}{solving}'
     return f'{state.value}: {situation.topic}' if state is NodeState.WAITING_FOR_IMAGES else state.value
 
 
@@ -245,6 +248,8 @@ def _problems(situation: Situation) -> Iterator[tuple[int, str]]:
     if situation.no_image is not None:
         yield ERROR if situation.no_image.persistent else WARN, situation.no_image.text
     yield from ((WARN, text) for text in situation.warnings)
+    if situation.solver.fault:
+        yield WARN, f'{situation.solver.state.value}: {situation.solver.fault}'
     rates = situation.rates_hz
     if rates is not None and rates.dropped > MAX_DROPPED_FRACTION * rates.received:
         yield (
@@ -272,6 +277,12 @@ def _values(state: NodeState, situation: Situation) -> Iterator[tuple[str, str]]
     for name in Counts.__dataclass_fields__:
         yield name, f'{getattr(counts, name):.0f}'
     yield from _clock_values(situation.clock)
+    solver = situation.solver
+    yield 'solver', solver.state.value
+    yield 'solving_s', _number(solver.solving_s, '.0f')
+    yield 'usual_solve_s', _number(solver.usual_s, '.1f')
+    yield 'solver_fault', solver.fault
+    yield 'result_age_s', _number(solver.result_age_s, '.0f')
     yield 'view', situation.view.condition.value
     yield 'view_checked_s', _number(situation.view.checked_s or None, '.3f')
     yield 'sway_deg', _number(situation.view.sway_deg or None, '.3f')

@@ -31,6 +31,8 @@ from autocalib_ros.perception.frame_clock import ClockSummary
 from autocalib_ros.perception.view_watch import KnownView, ViewReport, ViewWatch
 from autocalib_ros.results.calibration import Calibration, Refusal
 from autocalib_ros.results.camera_move import MoveKind
+from autocalib_ros.ros.solver_activity import SolverActivity
+from autocalib_ros.ros.solver_process import SolverTimedOut
 
 IMAGE_QUEUE_SIZE = 8
 """Images waiting for the perception thread: bridges half a second at 15 Hz, 22 MB at 1280x720."""
@@ -158,6 +160,8 @@ class CalibrationWorker:
         self.reported_evidence: Evidence | None = None
         """Evidence of the result that the listener is handling; None otherwise."""
         self._refused = ''
+        self.solver = SolverActivity()
+        self._accepted_tracks = 0
         self._watch = ViewWatch()
         self._watch_steps: list[Callable[[], None]] = []
         self._left_ns = 0
@@ -346,6 +350,9 @@ class CalibrationWorker:
         self._guarded(partial(self._watch_view, stamp_ns, image))
         if self._viewer is not None:
             self._guarded(partial(self._viewer.image_used, message, image, self._calibrator.followed))
+        accepted, self._accepted_tracks = self._accepted_tracks, 0
+        if accepted:
+            self._calibrator.accepted(accepted)
         evidence = self._guarded(self._calibrator.snapshot_if_due)
         if evidence is not None:
             self._submit(evidence, [])
@@ -418,7 +425,16 @@ class CalibrationWorker:
         return None
 
     def _solved(self, evidence: Evidence) -> Result:
-        return self._solve(evidence, self._options, lens=self._lens_for(evidence.image_size))
+        self.solver.begin()
+        try:
+            result = self._solve(evidence, self._options, lens=self._lens_for(evidence.image_size))
+        except Exception as error:
+            self.solver.fail(error, timed_out=isinstance(error, SolverTimedOut))
+            raise
+        self.solver.end()
+        if isinstance(result, Calibration):
+            self._accepted_tracks = evidence.track_count
+        return result
 
     def _notify(self, result: Result, job: _Job) -> Result | None:
         """Pass a result to listener and viewer; return None if a reset or a move of the camera made it obsolete."""

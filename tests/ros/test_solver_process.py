@@ -13,7 +13,7 @@ from autocalib_ros.config import Options, ScaleOptions
 from autocalib_ros.errors import UsageError
 from autocalib_ros.estimation.estimate import solve
 from autocalib_ros.results.calibration import Refusal
-from autocalib_ros.ros.solver_process import SolverDied, SolverProcess
+from autocalib_ros.ros.solver_process import SolverDied, SolverProcess, SolverTimedOut
 from bench import PATIENCE_S, PIXELS
 
 pytestmark = pytest.mark.dds
@@ -73,3 +73,15 @@ def test_close_ends_a_solution_that_runs(solver):
         solver.close()
         assert isinstance(answer.exception(PATIENCE_S), SolverDied)
     assert not process.is_alive()
+
+
+def test_solution_that_hangs_is_given_up_and_the_next_one_starts_another_process(solver):
+    assert not solver(snapshot(), OPTIONS, lens=None)
+    stopped = solver._process
+    os.kill(stopped.pid, signal.SIGSTOP)
+    solver.limit_s = 0.3
+    with pytest.raises(SolverTimedOut, match=r'longer than 0\.3 s'):
+        solver(snapshot(), OPTIONS, lens=None)
+    assert not stopped.is_alive()
+    solver.limit_s = float('inf')
+    assert not solver(snapshot(), OPTIONS, lens=None)

@@ -14,6 +14,7 @@ from autocalib_ros.results.calibration import Calibration, EvidenceSummary, Stan
 from autocalib_ros.results.camera_move import CameraMove, MoveKind
 from autocalib_ros.results.refusals import Reason
 from autocalib_ros.results.statements import assumption
+from autocalib_ros.ros.solver_activity import SolverActivity, SolverState
 from autocalib_ros.ros.status import (
     ERROR,
     OK,
@@ -239,3 +240,24 @@ def test_events_are_told_once_and_recovery_after_them():
     assert 'the calibrated view is back' in text and good and events.recovered_just_now
     now[0] += 100.0
     assert not events.recovered_just_now
+
+
+def test_solver_is_seen_while_it_solves_and_after_it_failed():
+    now = [0.0]
+    activity = SolverActivity(lambda: now[0])
+    assert activity.summary().state is SolverState.IDLE
+    activity.begin()
+    now[0] += 30.0
+    activity.end()
+    activity.begin()
+    now[0] += 12.0
+    solving = replace(COLLECTING, solver=activity.summary())
+    assert 'solving for 12 s, usually 30 s' in status(solving).message
+    activity.fail(TimeoutError('took longer than 900 s'), timed_out=True)
+    failed = status(replace(CALIBRATED, solver=activity.summary()))
+    assert failed.level == WARN
+    assert 'TIMED_OUT: took longer than 900 s' in failed.message
+    assert dict(failed.values)['result_age_s'] == '12'
+    activity.begin()
+    activity.end()
+    assert status(replace(CALIBRATED, solver=activity.summary())).level == OK
