@@ -124,14 +124,14 @@ def print_result(
     if placement is not None and points is not None and out is not None:
         names = [*names, write_map(out, placement, points)]
     if json:
-        print(calibration_json(result, accepted_at_s=replayed.accepted_at_s), flush=True)
+        print(calibration_json(result, accepted_at_s=replayed.accepted_at_s, moves=replayed.moves), flush=True)
     if quiet:
         return
     if not json:
         columns = terminal_width(sys.stdout) if is_terminal(sys.stdout) else None
         if result:
             print(coloured(verdict(result), state_colour(result), sys.stdout))
-        print('\n'.join(summary_lines(result, replayed.accepted_at_s, columns)))
+        print('\n'.join(summary_lines(result, replayed.accepted_at_s, columns, replayed.moves)))
     if placement is not None and points is not None:
         print('\n'.join(placement_lines(placement, points)), file=sys.stderr if json else sys.stdout)
     if names:

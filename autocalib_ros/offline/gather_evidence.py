@@ -16,6 +16,7 @@ from autocalib_ros.estimation.estimate import solve
 from autocalib_ros.evidence.read_recording import ReadRecording
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.lens.camera import Camera
+from autocalib_ros.offline.move_log import MoveLog
 from autocalib_ros.offline.recordings.prefetch import prefetched
 from autocalib_ros.offline.recordings.sources import Source
 from autocalib_ros.perception.detector.detector import VehicleDetector
@@ -73,6 +74,8 @@ class GatheredEvidence:
     """The solutions on the way."""
     stopped: bool
     """Whether `ReplayControl.should_stop` ended the reading."""
+    moves: MoveLog
+    """Moves of the camera."""
 
 
 class _Trials:
@@ -120,11 +123,12 @@ def gather_evidence(
     If the view changes, the evidence is of the longest part in which it stands still. `frames_before` are added to the
     frames reported. A recording that is joined with others `tries_solutions` at the end only.
     """
-    calibrator, trials = AutoCalibrator(options, detector), _Trials(options)
+    calibrator, trials, moves = AutoCalibrator(options, detector), _Trials(options), MoveLog()
     count, note, stopped, checkpoint_s, first_ns = 0, '', False, CHECKPOINT_EVERY_S, None
     for count, frame in enumerate(prefetched(source.frames()), start=1):
         scaled_lens = scaled(lens, (frame.image.shape[1], frame.image.shape[0]))
         calibrator.add_image(frame.stamp_ns, frame.image)
+        moves.add(frame.stamp_ns, frame.image, calibrator)
         first_ns = frame.stamp_ns if first_ns is None else first_ns
         due = _as_recorded(calibrator.snapshot_if_due(), source) if tries_solutions else None
         if due is not None:
@@ -158,6 +162,7 @@ def gather_evidence(
         accepted_at_s=trials.accepted_at_s,
         moments=trials.moments,
         stopped=stopped,
+        moves=moves,
     )
 
 

@@ -133,7 +133,7 @@ def write_result(out_dir: Path, replayed: ReplayResult, source_name: str, name_o
         )
     else:
         _remove(out_dir / CAMERA_INFO)
-    write_calibration_json(out_dir / CALIBRATION, result, accepted_at_s=replayed.accepted_at_s)
+    write_calibration_json(out_dir / CALIBRATION, result, accepted_at_s=replayed.accepted_at_s, moves=replayed.moves)
     write_report(
         out_dir / REPORT,
         ReportScene(
@@ -144,6 +144,7 @@ def write_result(out_dir: Path, replayed: ReplayResult, source_name: str, name_o
             source=source_name,
             accepted_at_s=replayed.accepted_at_s,
             moments=replayed.moments,
+            moves=replayed.moves,
         ),
     )
     return ([CAMERA_INFO] if result else []) + [CALIBRATION, REPORT]

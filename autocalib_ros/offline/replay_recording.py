@@ -30,6 +30,7 @@ from autocalib_ros.perception.detector.detector import VehicleDetector
 from autocalib_ros.perception.frame_clock import ClockSummary
 from autocalib_ros.report.scene import SolutionSnapshot, append_snapshot
 from autocalib_ros.results.calibration import Calibration, Refusal
+from autocalib_ros.results.camera_move import CameraMove
 
 LOG = logging.getLogger(__name__)
 
@@ -58,6 +59,9 @@ class ReplayResult:
     """Whether the reading was stopped before the end of the recording."""
     left_out: tuple[str, ...] = ()
     """Recordings that were not joined with the first one, and why."""
+    moves: tuple[CameraMove, ...] = ()
+    """Moves of the camera, in degrees through the lens of the result; not measured without one. The times are those
+    of the recording in which each was."""
 
 
 def replay(
@@ -99,6 +103,7 @@ def replay(
     accepted_at_s = None if alone is None else alone.accepted_at_s
     if result and alone is not None and accepted_at_s is None:
         accepted_at_s = evidence.seconds
+    camera = None if result.candidate is None else result.candidate.camera
     return ReplayResult(
         result=result,
         evidence=evidence,
@@ -111,6 +116,7 @@ def replay(
         clock=gathered[-1].clock if gathered else ClockSummary(),
         stopped=any(one.stopped for one in gathered),
         left_out=tuple(joint.left_out),
+        moves=tuple(move for one in gathered for move in one.moves.moves(camera)),
     )
 
 

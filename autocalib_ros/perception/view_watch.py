@@ -269,6 +269,13 @@ class ViewWatch:
         camera = self.camera
         return None if camera is None else (camera.width, camera.height)
 
+    def newest_view(self, since_s: float) -> KnownView | None:
+        """Return the median of the images seen since a time, such as that of a move; None if there are too few."""
+        images = [image for time_s, image in self._images if time_s > since_s + CHECK_S]
+        if len(images) < VERIFY_SAMPLES or not self._references:
+            return None
+        return KnownView(median(images), self._references[0].known.ignored)
+
     def rebase(self, move: CameraMove) -> None:
         """Take the pose after a move for that of the calibration, whose pose was mended by it."""
         back = ViewPose(move.rotation.T, 0.0, np.zeros((4, 4)))
@@ -280,10 +287,9 @@ class ViewWatch:
             maxlen=self._samples.maxlen,
         )
         self._last = self._last.after(back)
-        images = [image for time_s, image in self._images if time_s > move.time_s + CHECK_S]
-        if move.kind is MoveKind.REAIM and len(images) >= VERIFY_SAMPLES:  # little of the earlier views is seen
-            first = self._references[0]
-            self._add_reference(KnownView(median(images), first.known.ignored), first.view.camera)
+        shown = self.newest_view(move.time_s) if move.kind is MoveKind.REAIM else None
+        if shown is not None:  # little of the earlier views is seen
+            self._add_reference(shown, self._references[0].view.camera)
         self._images.clear()
         self.report = ViewReport(ViewCondition.STILL, self._newest_s, self._newest_s, share=self.report.share)
 

@@ -25,7 +25,16 @@ from autocalib_ros.report import (
 )
 from autocalib_ros.report.canvas import STYLE, jpeg, png, render_bgr
 from autocalib_ros.report.scene import ReportScene
-from autocalib_ros.report.text import contradictions, file_rows, how_sure, needs, next_step, number_rows, verdict
+from autocalib_ros.report.text import (
+    contradictions,
+    file_rows,
+    how_sure,
+    move_rows,
+    needs,
+    next_step,
+    number_rows,
+    verdict,
+)
 from autocalib_ros.results.calibration import Calibration, Refusal
 from autocalib_ros.util.files import write_atomically
 
@@ -271,7 +280,7 @@ def _page(scene: ReportScene, drawn: list[_Drawn]) -> str:
         next_step=next_step(result),
         code=_code(result),
         needs=needs(result, scene.evidence, scene.options.gate),
-        rows=[*number_rows(result, scene.accepted_at_s), *file_rows(result, scene.evidence)],
+        rows=[*number_rows(result, scene.accepted_at_s), *file_rows(result, scene.evidence), *move_rows(scene.moves)],
         assumptions=tuple(map(str, found.assumptions)) if found else (),
         checks=tuple(map(str, found.checks)) if found else (),
         verification=found.verification if found else (),

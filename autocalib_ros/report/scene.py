@@ -11,6 +11,7 @@ from autocalib_ros.config import Options
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.ground_plane import GroundPlane, tilt_and_roll_deg
 from autocalib_ros.results.calibration import Calibration, Refusal
+from autocalib_ros.results.camera_move import CameraMove
 
 NOT_USED, REJECTED = -1, -2
 MAX_SNAPSHOTS = 64
@@ -63,6 +64,8 @@ class ReportScene:
     source: str
     """Name of the recording or the camera."""
     accepted_at_s: float | None = None
+    moves: tuple[CameraMove, ...] = ()
+    """Moves of the camera in the recording."""
     moments: tuple[SolutionSnapshot, ...] = ()
 
     @property

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +13,7 @@ from autocalib_ros.evidence.stillness import drift_limit_px
 from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera, field_of_view_deg
 from autocalib_ros.results.calibration import GROUND_DISTANCES_M, Calibration, Refusal
+from autocalib_ros.results.camera_move import CameraMove
 from autocalib_ros.results.refusals import BY_CODE
 from autocalib_ros.results.statements import SCALE_KINDS
 
@@ -141,6 +142,11 @@ def _paper_rows(result: Calibration) -> list[TableRow]:
         ),
         TableRow('straightness', f'{before:.3g} before, {after:.3g} after, px²', note='mean squared line-fit error'),
     ]
+
+
+def move_rows(moves: Sequence[CameraMove]) -> list[TableRow]:
+    """Return a table row for each move of the camera."""
+    return [TableRow(f'camera moved after {move.time_s:.1f} s', str(move)) for move in moves]
 
 
 def file_rows(result: Calibration | Refusal, evidence: Evidence) -> list[TableRow]:

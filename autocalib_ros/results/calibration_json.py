@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import reprlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -22,6 +22,7 @@ from autocalib_ros.results.calibration import (
     Refusal,
     StandardDeviations,
 )
+from autocalib_ros.results.camera_move import CameraMove
 from autocalib_ros.results.grades import GroundSigma, HelpfulMeasure
 from autocalib_ros.results.refusals import Reason
 from autocalib_ros.results.statements import UNKNOWN_KIND, Statement, Value
@@ -209,7 +210,9 @@ SCALE_OF_VERSION_1 = 'scale_height'
 """Kind of the scale in a file of version 1: the text alone names its source."""
 
 
-def to_json(result: Calibration | Refusal, *, accepted_at_s: float | None = None) -> dict[str, Any]:
+def to_json(
+    result: Calibration | Refusal, *, accepted_at_s: float | None = None, moves: Sequence[CameraMove] = ()
+) -> dict[str, Any]:
     """Return the document of calibration.json."""
     evidence = result.evidence
     document: dict[str, Any] = {
@@ -243,6 +246,7 @@ def to_json(result: Calibration | Refusal, *, accepted_at_s: float | None = None
             'coverage': evidence.coverage,
             'accepted_at_s': accepted_at_s,
         },
+        'moves': [_move_json(move) for move in moves],
     }
     if isinstance(result, Refusal):
         document['refusal'] = _refusal_json(result)
@@ -250,6 +254,17 @@ def to_json(result: Calibration | Refusal, *, accepted_at_s: float | None = None
     else:
         document.update(_calibration_json(result))
     return document
+
+
+def _move_json(move: CameraMove) -> dict[str, Any]:
+    """Return a move of the camera; null for what was not measured."""
+    measured = move.is_measured
+    return {
+        'time_s': move.time_s,
+        'kind': move.kind.value,
+        **{name: getattr(move, name) if measured else None for name in ('pan_deg', 'tilt_deg', 'roll_deg', 'zoom')},
+        'sigma_deg': None if move.sigma_deg is None else list(move.sigma_deg),
+    }
 
 
 def _statement_json(statement: Statement) -> dict[str, Any]:
@@ -333,11 +348,19 @@ def _calibration_json(result: Calibration) -> dict[str, Any]:
     }
 
 
-def calibration_json(result: Calibration | Refusal, *, accepted_at_s: float | None = None) -> str:
+def calibration_json(
+    result: Calibration | Refusal, *, accepted_at_s: float | None = None, moves: Sequence[CameraMove] = ()
+) -> str:
     """Return the text of calibration.json in full precision."""
-    return json.dumps(to_json(result, accepted_at_s=accepted_at_s), indent=1, allow_nan=False)
+    return json.dumps(to_json(result, accepted_at_s=accepted_at_s, moves=moves), indent=1, allow_nan=False)
 
 
-def write_calibration_json(path: Path, result: Calibration | Refusal, *, accepted_at_s: float | None = None) -> None:
+def write_calibration_json(
+    path: Path,
+    result: Calibration | Refusal,
+    *,
+    accepted_at_s: float | None = None,
+    moves: Sequence[CameraMove] = (),
+) -> None:
     """Write calibration.json, atomically."""
-    write_atomically(path, calibration_json(result, accepted_at_s=accepted_at_s) + '\n')
+    write_atomically(path, calibration_json(result, accepted_at_s=accepted_at_s, moves=moves) + '\n')
