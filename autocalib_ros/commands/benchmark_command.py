@@ -101,6 +101,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'status: 0 unless an option makes a result wrong with confidence (3.5 stated standard deviations), 3 '
         'otherwise.',
     )
+    moves = what.add_parser(
+        'moves',
+        help='moves of the camera, applied to recordings: when they are told and how well they are measured',
+        description='Turn and zoom the images of recordings through their lens (truth.json beside them) by known '
+        'amounts, with sway, clouds, noise and a jam. Exit status: 0 if each move is told within 30 s and measured to '
+        '0.3 degrees, and nothing is told without a move, 3 otherwise.',
+    )
+    moves.add_argument('recordings', metavar='RECORDING', nargs='+', type=Path, help='recordings of still cameras')
+    moves.add_argument(
+        '--width', type=int, default=1280, metavar='PX', help='largest width of the images (default: %(default)s)'
+    )
     _add_folder(variants)
     variants.add_argument('--only', nargs='+', default=[], metavar='OPTION', help='options to vary (default: all)')
     variants.add_argument('--pairs', action='store_true', help='also each pair of options')
@@ -225,10 +236,22 @@ def _run_options(arguments: argparse.Namespace) -> int:
     return MOVED if wrong else DONE
 
 
+def _run_moves(arguments: argparse.Namespace) -> int:
+    from autocalib_ros.offline.benchmark import moves
+
+    good = True
+    print(moves.MOVES_HEADER)
+    for each in moves.measure_moves(arguments.recordings, arguments.width):
+        good &= each.is_good
+        print(moves.format_move(each), flush=True)
+    return DONE if good else MOVED
+
+
 BENCHMARK_TABLES = {
     'streams': _run_streams,
     'scenes': _run_scenes,
     'stability': _run_stability,
     'options': _run_options,
+    'moves': _run_moves,
 }
 """Benchmarks that print one row after the other."""

@@ -10,10 +10,13 @@ import numpy as np
 import pytest
 
 from autocalib_ros.errors import UsageError
+from autocalib_ros.lens.camera import Camera
+from autocalib_ros.offline.simulate.camera_motion import CameraMotion
 from autocalib_ros.offline.simulate.lamps import vehicle_lamps
 from autocalib_ros.offline.simulate.options import SimulationOptions
 from autocalib_ros.offline.simulate.simulation import Simulation
 from autocalib_ros.offline.simulate.weather import GroundBuffer, box_corners
+from autocalib_ros.perception.view_registration import ViewPose, ViewReference, normalised
 
 pytestmark = [pytest.mark.render, pytest.mark.usefixtures('shared_backdrops')]
 
@@ -127,3 +130,38 @@ def _mirrored(simulation: Simulation, lamp) -> np.ndarray | None:
 def test_impossible_troubles_are_refused(given, words):
     with pytest.raises(UsageError, match=words):
         replace(SimulationOptions(), **given)
+
+
+def _street() -> np.ndarray:
+    generator = np.random.default_rng(0)
+    image = np.full((SMALL['height_px'], SMALL['width_px']), 90.0, np.float32)
+    for _ in range(120):
+        x, y = generator.integers(0, (290, 160))
+        image[y : y + generator.integers(4, 20), x : x + generator.integers(6, 30)] += generator.uniform(-50, 50)
+    return cv2.GaussianBlur(np.clip(image, 0, 255), (0, 0), 0.8).astype(np.uint8)
+
+
+@pytest.mark.parametrize('given', [{'drift_deg': 4.0}, {'sway_deg': 2.0}, {'zoom_at_s': 1.0, 'zoom': 1.1}])
+def test_camera_moves_through_its_lens(given):
+    options = SimulationOptions(**{**SMALL, **given})
+    motion, street, lens = CameraMotion(options), _street(), options.lens
+    reference = ViewReference(
+        street, Camera(options.width_px, options.height_px, lens.focal_px, lens.centre_px, lens.k)
+    )
+    pose = reference.near(normalised(motion.moved(street, 14.3)), ViewPose.identity())
+    pose = pose or reference.anywhere(normalised(motion.moved(street, 14.3)))
+    assert pose is not None
+    np.testing.assert_allclose(pose.rotation, motion.rotation(14.3).T, atol=2e-3)  # 0.1 degrees
+    assert np.exp(pose.log_zoom) == pytest.approx(motion.zoom(14.3), abs=0.005)
+
+
+def test_night_falls_from_the_first_frame_to_the_last():
+    simulation = _simulation(dusk=True, empty=True)
+    means = [simulation.frame(index).mean() for index in (0, 140, 279)]
+    assert means[0] > 1.7 * means[1] > 2.8 * means[2]
+
+
+@pytest.mark.parametrize('given', [{'zoom_at_s': 99.0}, {'dusk': True, 'night': True}])
+def test_motion_that_makes_no_sense_is_refused(given):
+    with pytest.raises(UsageError, match=r'outside the recording|from day to night'):
+        SimulationOptions(**{**SMALL, **given})

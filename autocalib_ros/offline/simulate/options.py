@@ -77,7 +77,13 @@ class SimulationOptions:
     shake_px: float = _option(0.0, 'standard deviation of the camera shake in the image')
     trouble: str = _option('', 'disturbances that are not traffic, comma-separated: ' + ', '.join(TROUBLES))
     bump_at_s: float | None = _option(None, 'time at which the camera is bumped')
-    bump_deg: float = _option(2.0, 'rotation angle of the bump')
+    bump_deg: float = _option(2.0, 'rotation angle of the bump; 25 is a camera that was aimed elsewhere')
+    sway_deg: float = _option(0.0, 'largest angle of the sway of the mast in gusts of wind')
+    sway_rate_hz: float = _option(0.7, 'swings of the mast per second')
+    drift_deg: float = _option(0.0, 'angle by which the camera turns slowly in the whole recording')
+    zoom_at_s: float | None = _option(None, 'time at which the lens is zoomed')
+    zoom: float = _option(1.2, 'focal length after the zoom over that before')
+    dusk: bool = _option(False, 'from daylight to a night without lamps in the course of the recording')
 
     topic: str = _option('/camera/image_raw', 'image topic')
     truth_topic: str = _option('/camera/truth/camera_info', 'topic of the true CameraInfo')
@@ -140,11 +146,14 @@ class SimulationOptions:
             raise UsageError('trouble wet needs night: it shows lamps reflected by the road')
         if self.one_way and self.scene not in ONE_WAY_SCENES:
             raise UsageError(f'scene {self.scene!r} has no one_way: choose {" or ".join(ONE_WAY_SCENES)}')
-        if self.bump_at_s is not None and not 0.0 < self.bump_at_s < self.duration_s:
-            raise UsageError(
-                f'bump_at_s is {self.bump_at_s:g}, outside the recording: '
-                f'choose a time between 0 and {self.duration_s:g} s'
-            )
+        if self.dusk and (self.night or self.thermal):
+            raise UsageError('dusk is from day to night: leave out night and thermal')
+        for name in ('bump_at_s', 'zoom_at_s'):
+            at_s = getattr(self, name)
+            if at_s is not None and not 0.0 < at_s < self.duration_s:
+                raise UsageError(
+                    f'{name} is {at_s:g}, outside the recording: choose a time between 0 and {self.duration_s:g} s'
+                )
 
     def _check_lens(self) -> None:
         if len(self.k) != 4:
@@ -182,6 +191,10 @@ _RANGES = {
     'shutter_every_s': (2.0, 3600.0),
     'shake_px': (0.0, 20.0),
     'bump_deg': (-30.0, 30.0),
+    'sway_deg': (0.0, 5.0),
+    'sway_rate_hz': (0.05, 5.0),
+    'drift_deg': (-30.0, 30.0),
+    'zoom': (0.5, 2.0),
 }
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from autocalib_ros.offline.simulate import bodies, lamps, sensor
 from autocalib_ros.offline.simulate.backdrop import draw_backdrop
 from autocalib_ros.offline.simulate.bodies import body_faces, shadow_faces
+from autocalib_ros.offline.simulate.camera_motion import CameraMotion
 from autocalib_ros.offline.simulate.cyclist_actors import Cyclist, CyclistState, cyclist_faces
 from autocalib_ros.offline.simulate.faces import NO_MAP, SAMPLES_PER_PIXEL, Canvas, Drawing, Faces, PixelRect
 from autocalib_ros.offline.simulate.ground_surface import paint_ground
@@ -68,6 +69,7 @@ class Renderer:
         self._lens = options.lens
         self._poses = {False: pose, True: bumped}
         self._noise = sensor.SensorNoise(options)
+        self._motion = CameraMotion(options)
         self._microbolometer = Microbolometer(options)
         self._margin = math.ceil(4 * options.shake_px) + 2 if options.shake_px else 0
         self._canvas = Canvas(self._lens, options.width_px, options.height_px)
@@ -100,6 +102,7 @@ class Renderer:
             self._weather.apply_ground_effects(context, scene.bumped)
         noise = self._noise.of(scene.index)
         if self._options.thermal:
+            image = self._motion.moved(image, scene.time_s)
             return self._microbolometer.counts(image, scene.time_s, noise, shutter_closed=scene.shutter_closed)
         if self._options.night:
             image = sensor.darken(image)
@@ -108,6 +111,7 @@ class Renderer:
             context = replace(context, image=image)
             self._weather.add_light_sources(context, scene.bumped)
             image = self._weather.apply_lens_effects(context)
+        image = self._motion.lit(self._motion.moved(image, scene.time_s), scene.time_s)
         return cv2.add(image, noise, dtype=cv2.CV_8U)
 
     def prepare(self) -> None:

@@ -52,6 +52,8 @@ def truth_of(simulation: Simulation) -> dict[str, Any]:
             'camera': _camera(simulation.bumped_pose()),
             'ground_points': _ground_points(simulation, bumped=True),
         }
+    if options.zoom_at_s is not None:
+        truth['zoom'] = {'t': options.zoom_at_s, 'factor': options.zoom}
     return truth
 
 
