@@ -196,8 +196,9 @@ DIAGNOSTIC_LEVELS = (
     ('OK', '`CALIBRATED` and `RECOVERED`; `RESTORED` once the picture shows the stored view'),
     (
         'WARN',
-        '`WAITING_FOR_IMAGES`, `COLLECTING`, `RESTORED` and `MENDED`; no image for 5 s; images dropped, or without '
-        'advancing stamps; another node publishes the same `camera_info`; two nodes publish the images',
+        '`WAITING_FOR_IMAGES`, `COLLECTING`, `RESTORED`, `MENDED` and `DEGRADED`; no image for 5 s; images dropped, or '
+        'without advancing stamps; another node publishes the same `camera_info`; two nodes publish the images; a '
+        'solution that failed',
     ),
     (
         'ERROR',

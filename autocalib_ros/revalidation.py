@@ -32,6 +32,8 @@ class CalibrationState(Enum):
     """From evidence that is gone, of an earlier run or before a time jump, and confirmed by present traffic."""
     MENDED = 'mended'
     """Turned with the camera by what the picture shows, not yet verified by traffic."""
+    DEGRADED = 'degraded'
+    """Solved in this run, and contradicted by the newest traffic; the next solution decides."""
     CALIBRATED = 'calibrated'
     """Solved from the present evidence."""
 
@@ -51,17 +53,18 @@ class Decision:
 def reconcile(state: CalibrationState, before: Calibration | None, fresh: Calibration) -> Decision:
     """Decide between the published calibration and a new solution.
 
-    A calibration of this run is replaced by a newer one, unless that lost the ground plane. One of an earlier run is
+    A calibration of this run is replaced by a newer one that is at least as precise, unless that lost the ground plane;
+    a less precise one that contradicts it degrades it, and a second one in a row replaces it. One of an earlier run is
     confirmed if lens and plane agree, and stays until a solution is at least as precise; it is replaced if either
     disagrees. A solution without a plane confirms the lens only and leaves the state unchanged.
     """
     if before is None or state is CalibrationState.NONE:
         return Decision(CalibrationState.CALIBRATED, fresh)
-    if state is CalibrationState.CALIBRATED:
+    if state in (CalibrationState.CALIBRATED, CalibrationState.DEGRADED):
         # the latched plane would remain with a lens that it does not belong to
         if before.ground is not None and fresh.ground is None:
             return Decision(state, before, 'keeping the previous calibration: the new one has no ground plane')
-        return Decision(state, fresh)
+        return _reconcile_own(state, before, fresh)
     origin = 'mended' if state is CalibrationState.MENDED else 'stored'
     differences = [*_lens_differences(before, fresh), *_plane_differences(before, fresh)]
     if differences:
@@ -83,6 +86,24 @@ def reconcile(state: CalibrationState, before: Calibration | None, fresh: Calibr
         )
     text = f'current traffic agrees with the {origin} calibration; keeping it (smaller uncertainty)'
     return Decision(CalibrationState.VERIFIED, before, '' if state is CalibrationState.VERIFIED else text)
+
+
+def _reconcile_own(state: CalibrationState, before: Calibration, fresh: Calibration) -> Decision:
+    """Decide between a calibration of this run and a newer solution."""
+    found = ', '.join(filter(None, [*_lens_differences(before, fresh), *_plane_differences(before, fresh)]))
+    if _at_least_as_precise(fresh, before):
+        text = f'calibration replaced by one that is at least as precise and differs: {found}' if found else ''
+        return Decision(CalibrationState.CALIBRATED, fresh, text)
+    if not found:
+        return Decision(CalibrationState.CALIBRATED, before)
+    if state is CalibrationState.CALIBRATED:
+        return Decision(
+            CalibrationState.DEGRADED,
+            before,
+            f'the newest traffic contradicts the calibration: {found}; the next solution decides',
+        )
+    text = f'calibration replaced: the traffic contradicted it twice in a row: {found}'
+    return Decision(CalibrationState.CALIBRATED, fresh, text)
 
 
 def _lens_differences(before: Calibration, fresh: Calibration) -> list[str | None]:
@@ -140,7 +161,7 @@ def _differences(before: list[_Estimate], fresh: list[_Estimate]) -> list[str | 
             found.append(None)
         elif difference > AGREEMENT_SIGMAS * math.hypot(old.sigma, new.sigma):
             found.append(
-                f'{old.name} stored {old.value:.4g} +- {old.sigma:.2g}{old.unit}, new {new.value:.4g} +- '
+                f'{old.name} before {old.value:.4g} +- {old.sigma:.2g}{old.unit}, new {new.value:.4g} +- '
                 f'{new.sigma:.2g}{new.unit}'
             )
     return found

@@ -28,6 +28,7 @@ from autocalib_ros.report.scene import ReportScene
 from autocalib_ros.report.text import (
     contradictions,
     file_rows,
+    history_rows,
     how_sure,
     move_rows,
     needs,
@@ -280,7 +281,12 @@ def _page(scene: ReportScene, drawn: list[_Drawn]) -> str:
         next_step=next_step(result),
         code=_code(result),
         needs=needs(result, scene.evidence, scene.options.gate),
-        rows=[*number_rows(result, scene.accepted_at_s), *file_rows(result, scene.evidence), *move_rows(scene.moves)],
+        rows=[
+            *number_rows(result, scene.accepted_at_s),
+            *file_rows(result, scene.evidence),
+            *move_rows(scene.moves),
+            *history_rows(scene.history),
+        ],
         assumptions=tuple(map(str, found.assumptions)) if found else (),
         checks=tuple(map(str, found.checks)) if found else (),
         verification=found.verification if found else (),

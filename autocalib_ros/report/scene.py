@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -66,6 +67,8 @@ class ReportScene:
     accepted_at_s: float | None = None
     moves: tuple[CameraMove, ...] = ()
     """Moves of the camera in the recording."""
+    history: tuple[dict[str, Any], ...] = ()
+    """Versions that a live node accepted, `history.version_entry`, oldest first."""
     moments: tuple[SolutionSnapshot, ...] = ()
 
     @property

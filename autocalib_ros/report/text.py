@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -14,8 +15,12 @@ from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera, field_of_view_deg
 from autocalib_ros.results.calibration import GROUND_DISTANCES_M, Calibration, Refusal
 from autocalib_ros.results.camera_move import CameraMove
+from autocalib_ros.results.history import describe_version
 from autocalib_ros.results.refusals import BY_CODE
 from autocalib_ros.results.statements import SCALE_KINDS
+
+MAX_ROWS = 12
+"""Most versions in the report; the file has all."""
 
 
 @dataclass(frozen=True)
@@ -142,6 +147,11 @@ def _paper_rows(result: Calibration) -> list[TableRow]:
         ),
         TableRow('straightness', f'{before:.3g} before, {after:.3g} after, px²', note='mean squared line-fit error'),
     ]
+
+
+def history_rows(history: Sequence[dict[str, Any]]) -> list[TableRow]:
+    """Return a table row for each version of the calibration, the newest first."""
+    return [TableRow(f'version of {entry["time"]}', describe_version(entry)) for entry in history[:-MAX_ROWS:-1]]
 
 
 def move_rows(moves: Sequence[CameraMove]) -> list[TableRow]:

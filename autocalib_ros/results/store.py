@@ -4,6 +4,7 @@
     NAME.autocalib.json  calibration.json with pose, standard deviations and evidence, and the content of NAME.yaml
     *.bak                the previous pair
     NAME.view.npz        small images of the calibrated view, to verify it at the next start; see `perception.view_file`
+    NAME.history.jsonl   time, cause and numbers of each accepted version
     NAME.report.html     the report, with its figures in NAME.figures; never read back
 
 Each file is replaced atomically, the JSON before the YAML. A crash between the two leaves a YAML that matches the
@@ -121,12 +122,13 @@ class Store:
         self.path = path
         self.json_path = path.with_name(f'{path.stem}.autocalib.json')
         self.views = path.with_name(f'{path.stem}.view.npz')
+        self.history = path.with_name(f'{path.stem}.history.jsonl')
         self.report = path.with_name(f'{path.stem}.report.html')
         self.figures = path.with_name(f'{path.stem}.figures')
 
     def remove_leftovers(self) -> None:
         """Remove temporary files of a killed writer; not to be called during a write."""
-        for path in (self.path, self.json_path, self.views):
+        for path in (self.path, self.json_path, self.views, self.history):
             remove_temporaries(path)
             remove_temporaries(_backup(path))
 

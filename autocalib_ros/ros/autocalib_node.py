@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import concurrent.futures
+import contextlib
 import time
 import traceback
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -26,6 +28,7 @@ from autocalib_ros.perception.images import ImageDecoder
 from autocalib_ros.perception.view_file import read_views, write_views
 from autocalib_ros.perception.view_watch import KnownView, ViewCondition, ViewReport
 from autocalib_ros.results.calibration import Calibration, Refusal
+from autocalib_ros.results.history import append_version, read_history, version_entry
 from autocalib_ros.results.store import Store, StoredCalibration, calibration_checksum, resolve_url
 from autocalib_ros.revalidation import CalibrationState, with_current_options
 from autocalib_ros.ros.declared_parameters import declare_parameters
@@ -240,6 +243,8 @@ class AutocalibNode(Node):
 
         def write(snapshot: concurrent.futures.Future) -> None:
             scene = self._reports.scene(published.result, snapshot.result(), self.options, source)
+            with contextlib.suppress(InputError):  # a report without a history is one
+                scene = replace(scene, history=tuple(read_history(store.history)))
             self._reports.write(ReportPaths(store.report, store.figures), scene)
 
         self._worker.request_snapshot().add_done_callback(write)
@@ -290,6 +295,7 @@ class AutocalibNode(Node):
             view=self._worker.view,
             withheld=bool(self.publication.withheld),
             valid_since_ns=self.publication.valid_since_ns,
+            doubt=self.publication.doubt,
             last_move=self._events.last_move,
             moved_just_now=self._events.moved_just_now,
             recovered_just_now=self._events.recovered_just_now,
@@ -456,12 +462,21 @@ class AutocalibNode(Node):
         decision = self.publication.solved(result)
         if decision is None:
             return
+        if self.publication.doubt:
+            self._worker.doubt()
         if decision.calibration is result:
             self._worker.watch_solved(result)
+            self._remember(result, decision.text or 'solved')
         self._withdrawn = ''
         self._logged_at = {}
-        self._log(decision.text, good=not decision.contradicted)
+        self._log(decision.text, good=not (decision.contradicted or self.publication.doubt))
         self.get_logger().info(describe(result))
+
+    def _remember(self, result: Calibration, cause: str) -> None:
+        """Append a version to the history, beside the stored calibration."""
+        if self._store is not None and self.node_options.autosave:
+            entry = version_entry(result, cause, time.time())
+            self.store_writer.run(partial(append_version, self._store.history, entry))
 
     def view_changed(self, report: ViewReport, stamp_ns: int) -> Calibration | None:
         """Publish, withhold or mend the calibration by what the newest image says about the view."""
@@ -475,6 +490,7 @@ class AutocalibNode(Node):
             turned = self.publication.mend(move, stamp_ns)
             if turned is not None:
                 self._events.mended()
+                self._remember(turned.result, f'pose mended, {move}')
                 self._log(f'pose mended by what the picture shows: {describe(turned.result)}', good=False)
                 return turned.result
         if move is not None:

@@ -71,6 +71,10 @@ class CalibrationPublisher:
         """Why the calibration is not published for now; '' while it is."""
         self.valid_since_ns = 0
         """Stamp from which the calibration holds: that of its newest evidence, or of the move that it was mended by."""
+        self.doubt = ''
+        """Why the newest traffic contradicts the calibration; '' if it does not."""
+        self._is_superseded = False
+        """Whether the options have changed since the calibration."""
         self.is_stale = False
         """Whether the camera has moved since the calibration, which was not mended."""
         self._lock = threading.RLock()
@@ -88,8 +92,11 @@ class CalibrationPublisher:
         )
 
     def change(self, options: Options, node_options: NodeOptions) -> None:
-        """Use other options from now on."""
-        self.options, self._per_image = options, node_options.camera_info_mode == 'per_image'
+        """Use other options from now on; a calibration of this run is replaced by the next solution."""
+        with self._lock:
+            own = self.state in (CalibrationState.CALIBRATED, CalibrationState.DEGRADED)
+            self._is_superseded = own and options != self.options
+            self.options, self._per_image = options, node_options.camera_info_mode == 'per_image'
 
     @property
     def topic(self) -> str:
@@ -194,14 +201,16 @@ class CalibrationPublisher:
     def on_evidence_reset(self) -> None:
         """Mark the calibration as verified only: it stays until new evidence gives one as precise or contradicts it."""
         with self._lock:
-            if self.state is CalibrationState.CALIBRATED:
+            if self.state in (CalibrationState.CALIBRATED, CalibrationState.DEGRADED):
                 self.state = CalibrationState.VERIFIED
+                self.doubt = ''
 
     def solved(self, result: Calibration) -> Decision | None:
         """Let a new solution confirm or replace the calibration; None if the image size has changed since."""
         while True:
             before, state = self.published, self.state
-            decision = reconcile(state, before.result if before and not self.is_stale else None, result)
+            comparable = before is not None and not (self.is_stale or self._is_superseded)
+            decision = reconcile(state, before.result if before and comparable else None, result)
             new = decision.calibration is result
             # outside the lock: this may take a while, and images do not wait for it
             published = (
@@ -217,10 +226,12 @@ class CalibrationPublisher:
     def _apply(self, decision: Decision, published: Published, *, new: bool) -> None:
         confirmed = self.state is not decision.state
         if new:
+            self._is_superseded = False
             self.withheld, self.is_stale = '', False
             self._publish(decision.state, published)
         self.state = decision.state
-        if new or confirmed:
+        self.doubt = decision.text if decision.state is CalibrationState.DEGRADED else ''
+        if new or (confirmed and not self.doubt):
             self._on_accepted(published, new)
         if decision.contradicted:
             self._clear_latched()
@@ -245,6 +256,7 @@ class CalibrationPublisher:
         """Stop publishing; return the state before."""
         with self._lock:
             was, self.state, self.published = self.state, CalibrationState.NONE, None
+            self.doubt = ''
             self.withheld, self.is_stale = '', False
             if was is not CalibrationState.NONE:
                 self._markers.publish(no_markers())

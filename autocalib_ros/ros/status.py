@@ -34,6 +34,7 @@ class NodeState(str, Enum):
     RESTORED = 'RESTORED'
     MENDED = 'MENDED'
     CALIBRATED = 'CALIBRATED'
+    DEGRADED = 'DEGRADED'
     MOVED = 'MOVED'
     BLIND = 'BLIND'
     RECOVERED = 'RECOVERED'
@@ -45,6 +46,7 @@ LEVELS = {
     NodeState.RESTORED: WARN,
     NodeState.MENDED: WARN,
     NodeState.CALIBRATED: OK,
+    NodeState.DEGRADED: WARN,
     NodeState.MOVED: ERROR,
     NodeState.BLIND: ERROR,
     NodeState.RECOVERED: OK,
@@ -110,6 +112,8 @@ class Situation:
     """The calibration is not published for now."""
     valid_since_ns: int = 0
     """Stamp from which the calibration holds."""
+    doubt: str = ''
+    """Why the newest traffic contradicts the calibration; '' if it does not."""
     last_move: CameraMove | None = None
     moved_just_now: bool = False
     """The pose was mended less than a minute ago."""
@@ -146,6 +150,8 @@ def state_of(situation: Situation) -> NodeState:
             return NodeState.MOVED
         if situation.recovered_just_now:
             return NodeState.RECOVERED
+        if situation.doubt:
+            return NodeState.DEGRADED
         if situation.mended:
             return NodeState.MENDED
         return NodeState.RESTORED if situation.restored else NodeState.CALIBRATED
@@ -220,6 +226,7 @@ def _headline(state: NodeState, situation: Situation) -> str:
             NodeState.RESTORED: ', view verified by the picture, not yet by traffic'
             if verified
             else ', not yet verified by traffic',
+            NodeState.DEGRADED: f'; {situation.doubt}',
             NodeState.MENDED: ', pose mended by what the picture shows, not yet verified by traffic',
         }.get(state, '')
         return f'{state.value}: grade {result.grade}, focal length {result.camera.focal_px:.1f} px{note}'

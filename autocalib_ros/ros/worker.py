@@ -161,7 +161,7 @@ class CalibrationWorker:
         """Evidence of the result that the listener is handling; None otherwise."""
         self._refused = ''
         self.solver = SolverActivity()
-        self._accepted_tracks = 0
+        self._accepted_tracks, self._is_in_doubt = 0, False
         self._watch = ViewWatch()
         self._watch_steps: list[Callable[[], None]] = []
         self._left_ns = 0
@@ -242,6 +242,10 @@ class CalibrationWorker:
             self.watch_stored(calibration, ())
         else:
             self._at_next_image(lambda: self._watch.succeed(view, calibration.camera), calibration)
+
+    def doubt(self) -> None:
+        """Ask for another solution soon; to be called by the listener as it takes one that contradicts."""
+        self._is_in_doubt = True
 
     def watch_nothing(self) -> None:
         """Watch no view any more: there is no calibration."""
@@ -432,8 +436,6 @@ class CalibrationWorker:
             self.solver.fail(error, timed_out=isinstance(error, SolverTimedOut))
             raise
         self.solver.end()
-        if isinstance(result, Calibration):
-            self._accepted_tracks = evidence.track_count
         return result
 
     def _notify(self, result: Result, job: _Job) -> Result | None:
@@ -442,7 +444,10 @@ class CalibrationWorker:
             if job.generation != self._generation or job.evidence.first_stamp_ns < self._left_ns:
                 return None
             self._refused = result.message if isinstance(result, Refusal) else ''
+            self._is_in_doubt = False
             self._guarded(partial(self._listener.solved, result))
+            if isinstance(result, Calibration) and not self._is_in_doubt:
+                self._accepted_tracks = job.evidence.track_count
             if self._viewer is not None:
                 self._guarded(partial(self._viewer.solution_found, result, job.evidence))
             return result

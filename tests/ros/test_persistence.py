@@ -21,7 +21,7 @@ from autocalib_ros.ros.messages import stamp_ns
 from bench import PATIENCE_S, SIZE, Bench, calibration, image, refusal, wait_for
 from test_node import GROUND, INFO, START_NS, calibrated, publish_until, used
 
-NONE, RESTORED, VERIFIED, MENDED, CALIBRATED = CalibrationState
+NONE, RESTORED, VERIFIED, MENDED, DEGRADED, CALIBRATED = CalibrationState
 
 
 def never(evidence, options, lens):
