@@ -143,13 +143,16 @@ class Status:
 
 def state_of(situation: Situation) -> NodeState:
     """Return the state of the node."""
-    if situation.view.condition is ViewCondition.BLIND:
+    unverified = situation.withheld and situation.view.condition is ViewCondition.UNKNOWN
+    if situation.view.condition is ViewCondition.BLIND or unverified:
         return NodeState.BLIND
     if situation.result is not None:
-        if situation.view.condition is ViewCondition.MOVED or situation.moved_just_now:
+        if situation.view.condition is ViewCondition.MOVED:
             return NodeState.MOVED
         if situation.recovered_just_now:
             return NodeState.RECOVERED
+        if situation.moved_just_now:
+            return NodeState.MOVED
         if situation.doubt:
             return NodeState.DEGRADED
         if situation.mended:
@@ -216,6 +219,8 @@ def _level(state: NodeState, situation: Situation) -> int:
 
 def _headline(state: NodeState, situation: Situation) -> str:
     result, progress, view = situation.result, situation.progress, situation.view
+    if state is NodeState.BLIND and view.fault is None:
+        return f'{state.value}: the picture is back; the view is not verified yet'
     if state is NodeState.BLIND:
         return f'{state.value}: the picture says nothing since {clock_text(view.since_s)}: {view}'
     if state is NodeState.MOVED and situation.last_move is not None:

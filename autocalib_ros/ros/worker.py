@@ -386,7 +386,7 @@ class CalibrationWorker:
                 self._calibrator.leave_view(self._left_ns)
                 if mended is not None:
                     self._watch.rebase(move)
-                    self._watched = mended
+                    self._watched, self.view = mended, self._watch.report
         self.known = (self._watched, self._watch.views)
 
     def _submit(self, evidence: Evidence | None, requests: list[Future]) -> None:

@@ -208,7 +208,14 @@ BUMP = CameraMove(MoveKind.BUMP, 1_700_000_100.0, 1.0, -0.5, 0.25, sigma_deg=(0.
         ),
         ({'view': ViewReport(ViewCondition.STILL), 'mended': True}, NodeState.MENDED, WARN, 'mended'),
         ({'view': ViewReport(ViewCondition.BLIND, fault=PictureFault.BLACK)}, NodeState.BLIND, ERROR, 'stale'),
+        ({'view': ViewReport(ViewCondition.UNKNOWN), 'withheld': True}, NodeState.BLIND, ERROR, 'withheld'),
         ({'view': ViewReport(ViewCondition.STILL), 'recovered_just_now': True}, NodeState.RECOVERED, OK, 'calibrated'),
+        (
+            {'view': ViewReport(ViewCondition.STILL), 'doubt': 'focal length differs'},
+            NodeState.DEGRADED,
+            WARN,
+            'calibrated',
+        ),
         ({'view': ViewReport(ViewCondition.STILL), 'restored': True}, NodeState.RESTORED, OK, 'calibrated'),
     ],
 )
