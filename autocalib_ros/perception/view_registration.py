@@ -301,11 +301,18 @@ def registered_image(image: np.ndarray, size: tuple[int, int] | None = None) -> 
 
 def normalised(image: np.ndarray) -> np.ndarray:
     """Return a grey image (H, W) with one local mean and contrast, uint8."""
-    side = (CONTRAST_WINDOW_PX, CONTRAST_WINDOW_PX)
     levels = cv2.GaussianBlur(image, (3, 3), 0).astype(np.float32)
-    difference = levels - cv2.blur(levels, side)
-    contrast = cv2.sqrt(cv2.blur(difference * difference, side))
-    return cv2.convertScaleAbs(difference / (contrast + CONTRAST_FLOOR), alpha=45.0, beta=128.0)
+    levels -= _locally_averaged(levels)
+    levels /= cv2.sqrt(_locally_averaged(levels * levels)) + CONTRAST_FLOOR
+    return cv2.convertScaleAbs(levels, alpha=45.0, beta=128.0)
+
+
+def _locally_averaged(levels: np.ndarray) -> np.ndarray:
+    """Return the mean of a float image (H, W) over `CONTRAST_WINDOW_PX`, computed in a quarter of its size."""
+    size = (max(1, levels.shape[1] // 4), max(1, levels.shape[0] // 4))
+    side = max(1, CONTRAST_WINDOW_PX // 4)
+    small = cv2.blur(cv2.resize(levels, size, interpolation=cv2.INTER_AREA), (side, side))
+    return cv2.resize(small, (levels.shape[1], levels.shape[0]), interpolation=cv2.INTER_LINEAR)
 
 
 def outlines(pattern: np.ndarray) -> np.ndarray:
