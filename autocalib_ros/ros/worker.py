@@ -374,6 +374,8 @@ class CalibrationWorker:
         for step in steps:
             step()
         time_s = stamp_ns * 1e-9
+        if stamp_ns < self._left_ns:  # the clock was set back
+            self._left_ns = 0
         if self._watch.size not in (None, image.shape[1::-1]) or not (steps or self._watch.is_due(time_s)):
             return
         before, report = self.view, self._watch.update(image, time_s)

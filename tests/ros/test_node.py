@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import cv2
 import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import TransformStamped
 from rcl_interfaces.srv import GetParameters
 from rclpy.parameter import Parameter
@@ -17,6 +18,9 @@ from autocalib_ros.estimation.publish import with_requested_model
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.lens.camera_info import camera_info
 from autocalib_ros.lens.camera_info_yaml import write_camera_info_yaml
+from autocalib_ros.perception.picture_faults import PictureFault
+from autocalib_ros.perception.view_watch import ViewCondition, ViewReport
+from autocalib_ros.results.camera_move import CameraMove, MoveKind
 from autocalib_ros.revalidation import CalibrationState
 from autocalib_ros.ros.autocalib_node import AutocalibNode
 from autocalib_ros.ros.messages import stamp_ns
@@ -368,3 +372,62 @@ def test_reliability_of_a_publisher_is_overridden_by_a_parameter(bench):
     ]
     assert [profile.reliability for profile in offered] == [ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE]
     assert all(profile.durability is DurabilityPolicy.TRANSIENT_LOCAL for profile in offered)
+
+
+ZOOM = CameraMove(MoveKind.ZOOM, 20.0, zoom=1.1, sigma_deg=(0.01, 0.01, 0.01))
+BUMP = CameraMove(MoveKind.BUMP, 20.0, 1.0, 2.0, 0.0, sigma_deg=(0.01, 0.01, 0.01))
+
+
+def test_calibration_is_withheld_after_a_zoom_and_published_again_when_that_is_undone(bench):
+    node, publisher = calibrated(bench)
+    infos = bench.collect(CameraInfo, INFO)
+    bench.listening(INFO)
+    node.view_changed(ViewReport(ViewCondition.MOVED, move=ZOOM), START_NS)
+    publish_until(publisher, lambda: infos and not any(infos[-1].k), 'a CameraInfo that says not calibrated')
+    assert not any(infos[-1].p) and (infos[-1].width, infos[-1].height) == SIZE
+    answer = bench.ask('save')
+    assert not answer.success and 'zoom' in answer.message
+    late = bench.collect(TransformStamped, GROUND, latched=True)
+    assert not late
+    node.view_changed(ViewReport(ViewCondition.STILL), START_NS)
+    publish_until(publisher, lambda: infos[-1].k[0] == 300.0, 'the calibration again')
+    wait_for(lambda: late, 'the transform again')
+
+
+def test_pose_is_mended_after_a_bump(bench):
+    node, _ = calibrated(bench)
+    transforms = bench.collect(TransformStamped, GROUND, latched=True)
+    wait_for(lambda: transforms, 'the transform')
+    before = node.publication.published.result
+    now = node.view_changed(ViewReport(ViewCondition.MOVED, move=BUMP), START_NS)
+    wait_for(lambda: len(transforms) > 1, 'the mended transform')
+    assert transforms[-1].transform.rotation != transforms[0].transform.rotation
+    assert node.publication.published.result is now
+    assert (now.camera, now.grade, node.publication.state) == (before.camera, 'fair', CalibrationState.MENDED)
+
+
+@pytest.mark.parametrize(('mode', 'withheld'), [('withhold', True), ('keep', False)])
+def test_option_says_what_is_published_after_a_bump(bench, mode, withheld):
+    node, _ = calibrated(bench, on_move=mode)
+    before = node.publication.published
+    assert node.view_changed(ViewReport(ViewCondition.MOVED, move=BUMP), START_NS) is None
+    assert bool(node.publication.withheld) is withheld
+    assert node.publication.published is before and node.publication.is_stale
+    # whatever it says, the next solution takes the place of the stale one
+    assert bench.calibrate().success
+    assert not node.publication.withheld and node.publication.published is not before
+
+
+def test_status_tells_programs_that_the_picture_is_black(bench):
+    node, _ = calibrated(bench)
+    statuses = bench.collect(DiagnosticStatus, '/autocalib/status', latched=True)
+    report = ViewReport(ViewCondition.BLIND, 20.0, fault=PictureFault.BLACK)
+    node._worker.view = report
+    node.view_changed(report, START_NS)
+
+    def values() -> dict[str, str]:
+        return {item.key: item.value for item in statuses[-1].values} if statuses else {}
+
+    wait_for(lambda: values().get('state') == 'BLIND', 'state BLIND')
+    assert (values()['pose'], values()['valid_until_s'], values()['fault']) == ('withheld', '20.000', 'black')
+    assert statuses[-1].level == DiagnosticStatus.ERROR
