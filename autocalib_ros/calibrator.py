@@ -170,8 +170,13 @@ class AutoCalibrator:
         if stream is None:
             return None
         view = stream.longest_view() if longest_part else stream.observer.view
-        evidence = replace(stream.evidence(view), still_lines_px=stream.observer.still_lines(view))
-        return evidence.with_landmarks(stream.observer.landmarks(view)) if landmarks else evidence
+        observer = stream.observer
+        evidence = replace(
+            stream.evidence(view),
+            still_lines_px=observer.still_lines(view),
+            stripes_px=observer.still_stripes(view),
+        )
+        return evidence.with_landmarks(observer.landmarks(view)) if landmarks else evidence
 
     def known_view(self) -> KnownView | None:
         """Return a small image of the present view, in the pose of `snapshot`, for registration; None before one."""

@@ -15,7 +15,7 @@ from autocalib_ros.evidence.npz import evidence_file, write_evidence_file
 from autocalib_ros.evidence.picture import Picture
 from autocalib_ros.evidence.read_recording import ReadRecording, recording_arrays, recordings_of_arrays
 from autocalib_ros.evidence.stillness import Stillness
-from autocalib_ros.evidence.tables import OUTLINE_COLUMNS, TABLES, merged, require_array
+from autocalib_ros.evidence.tables import OUTLINE_COLUMNS, STRIPE_COLUMNS, TABLES, merged, require_array
 from autocalib_ros.results.calibration import EvidenceSummary
 
 COVERAGE_CELLS = (16, 9)
@@ -127,6 +127,9 @@ class Evidence:
     """Shape (outlines,)."""
     still_lines_px: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))
     """Line segments of the static scene, x0, y0, x1, y1, shape (lines, 4)."""
+    stripes_px: np.ndarray = field(default_factory=lambda: np.zeros((0, STRIPE_COLUMNS)))
+    """Bright bars of the static scene, such as dashes of lane lines: x0, y0, x1, y1 of the centre line, and the
+    contrast in grey levels, shape (stripes, STRIPE_COLUMNS)."""
     track_kinds: np.ndarray = field(default_factory=lambda: np.zeros(0, np.uint8))
     """`TrackKind` of each track, uint8, shape (tracks,); all unknown by default."""
     picture: Picture = None  # type: ignore[assignment]  # never None after construction

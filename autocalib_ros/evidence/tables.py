@@ -14,6 +14,8 @@ import numpy as np
 
 OUTLINE_COLUMNS = 17
 """Coordinates of eight extreme points, and the gap."""
+STRIPE_COLUMNS = 5
+"""Coordinates of both ends, and the contrast."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +75,8 @@ OUTLINES = ObservationTable(
 )
 """Collected only without a detector, which recognises cyclists by itself."""
 STILL_LINES = ObservationTable('still_lines_px', saved_if_empty=False)
-TABLES = (SEGMENTS, EDGES, OUTLINES, STILL_LINES)
+STRIPES = ObservationTable('stripes_px', STRIPE_COLUMNS, saved_if_empty=False)
+TABLES = (SEGMENTS, EDGES, OUTLINES, STILL_LINES, STRIPES)
 
 
 def require_array(name: str, array: np.ndarray, shape: tuple[int, ...], *, integer: bool) -> None:

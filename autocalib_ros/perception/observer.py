@@ -28,6 +28,7 @@ from autocalib_ros.perception.repeats import RepeatDetector
 from autocalib_ros.perception.segments import Keypoints, find_keypoints, match_segments
 from autocalib_ros.perception.silhouettes import outlines_of
 from autocalib_ros.perception.still_view import warped
+from autocalib_ros.perception.stripe_detector import StripeDetector
 from autocalib_ros.perception.view_watch import KnownView
 
 MOTION_MASK_PERIOD = 2
@@ -58,6 +59,7 @@ class _Scene:
 
     background: Background
     lines: LineSegmentDetector
+    stripes: StripeDetector
     picture_area: PictureArea
 
 
@@ -142,6 +144,7 @@ class Observer:
         return _Scene(
             Background(),
             LineSegmentDetector(self._excluded_by_options),
+            StripeDetector(self._excluded_by_options),
             PictureArea(self._image_size, self._tracked_size, self._polygons),
         )
 
@@ -326,6 +329,18 @@ class Observer:
     def leave_view(self) -> None:
         """Begin another still view with the next image."""
         self._drift_monitor.leave()
+
+    def still_stripes(self, view: int | None = None) -> np.ndarray:
+        """Return the bright bars of the background, as `Evidence.stripes_px`, in pixels of the full image."""
+        scene = self._scenes[self._view if view is None else view]
+
+        def background() -> np.ndarray | None:
+            grey = scene.background.grey()
+            return None if grey is None else self._tracked_image(grey)
+
+        found = scene.stripes.update(background, scene.background.times_s)
+        ends = self._to_full_pixels(found[:, :4].reshape(-1, 2)).reshape(-1, 4)
+        return np.hstack([ends, found[:, 4:]])
 
     def picture(self, view: int) -> Picture:
         """Return the picture inside the images of a view in memory, pixels of the full image."""

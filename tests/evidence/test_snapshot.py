@@ -12,7 +12,7 @@ from autocalib_ros.config import BufferOptions
 from autocalib_ros.errors import InputError
 from autocalib_ros.evidence.buffer import EvidenceBuffer
 from autocalib_ros.evidence.snapshot import TRACK_KINDS, Edges, Evidence, Outlines, Segments, Track, TrackKind
-from autocalib_ros.evidence.tables import EDGES, OUTLINE_COLUMNS, OUTLINES, STILL_LINES
+from autocalib_ros.evidence.tables import EDGES, OUTLINE_COLUMNS, OUTLINES, STILL_LINES, STRIPE_COLUMNS
 
 
 def track(vehicle: int, end_s: float) -> Track:
@@ -175,6 +175,12 @@ def test_still_lines_survive_their_file_to_the_last_bit(tmp_path: Path) -> None:
     np.testing.assert_array_equal(after.still_lines_px, before.still_lines_px)
     # selecting tracks does not affect the still lines
     np.testing.assert_array_equal(after.select_tracks(np.array([1])).still_lines_px, before.still_lines_px)
+
+
+def test_stripes_survive_their_file_to_the_last_bit(tmp_path: Path) -> None:
+    stripes = np.random.default_rng(1).uniform(0, 360, (5, STRIPE_COLUMNS))
+    replace(with_lines(2), stripes_px=stripes).save(tmp_path / 'evidence.npz')
+    np.testing.assert_array_equal(Evidence.load(tmp_path / 'evidence.npz').stripes_px, stripes)
 
 
 def test_without_still_lines_a_file_has_no_such_array(tmp_path: Path) -> None:
