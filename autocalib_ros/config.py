@@ -438,6 +438,45 @@ class ScaleOptions(_Validated):
 
 
 @dataclass(frozen=True, kw_only=True)
+class LaneOptions(_Validated):
+    """Lane lines of known pattern: lanes of known width, dashes of known period."""
+
+    country: str = option(
+        'none',
+        'country whose standard lane width and dash periods are taken for what is not given as a number',
+        choices=('none', 'us', 'uk', 'de', 'fr', 'cn'),
+    )
+    width_m: float = option(
+        0.0,
+        'width of the lanes, from the middle of one line to that of the next, metres; 0: by lanes.country, else '
+        'unknown',
+        low=0,
+        high=10,
+    )
+    width_sigma_m: float = option(0.0, 'standard deviation of lanes.width_m, metres; 0: 4 % of it', low=0, high=5)
+    dash_period_m: float = option(
+        0.0,
+        'length of a dash and of the gap after it, together, metres; 0: by lanes.country, else unknown',
+        low=0,
+        high=50,
+    )
+    dash_period_sigma_m: float = option(
+        0.0, 'standard deviation of lanes.dash_period_m, metres; 0: 2 % of it', low=0, high=25
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ('width', 'dash_period'):
+            if getattr(self, f'{name}_sigma_m') > 0 and not getattr(self, f'{name}_m') > 0:
+                raise UsageError(f"'lanes.{name}_sigma_m' needs 'lanes.{name}_m': give both or neither")
+
+    @property
+    def given(self) -> bool:
+        """Whether anything is known of the lanes."""
+        return self.country != 'none' or self.width_m > 0 or self.dash_period_m > 0
+
+
+@dataclass(frozen=True, kw_only=True)
 class GateOptions(_Validated):
     """Acceptance limits of a calibration."""
 
@@ -481,8 +520,8 @@ class Options(_Validated):
     )
     scale_from: str = option(
         'all',
-        'source of the metric scale; all: camera height, distances on the road and the mean traffic speed, as many of '
-        'them as are given; the others: only that one may be given',
+        'source of the metric scale; all: camera height, distances on the road, the mean traffic speed and the lanes, '
+        'as many of them as are given; the others: only that one may be given',
         choices=('all', 'height', 'distance', 'speed'),
     )
     camera_height: float = option(0.0, 'height of the camera above the road, metres; 0: unknown', low=0, high=500)
@@ -529,6 +568,7 @@ class Options(_Validated):
     lens: LensOptions = field(default_factory=LensOptions)
     joint: JointOptions = field(default_factory=JointOptions)
     scale: ScaleOptions = field(default_factory=ScaleOptions)
+    lanes: LaneOptions = field(default_factory=LaneOptions)
     gate: GateOptions = field(default_factory=GateOptions)
 
     def __post_init__(self) -> None:
@@ -554,6 +594,11 @@ class Options(_Validated):
                 'scale.distances': bool(scale.distances.strip()),
             },
             'speed': {'scale.speed_km_h': scale.speed_km_h > 0},
+            'lanes': {
+                'lanes.country': self.lanes.country != 'none',
+                'lanes.width_m': self.lanes.width_m > 0,
+                'lanes.dash_period_m': self.lanes.dash_period_m > 0,
+            },
         }
         given = {source: [name for name, there in names.items() if there] for source, names in parts.items()}
         for source, names in given.items():
@@ -674,6 +719,7 @@ RECONFIGURABLE = (
     'lens',
     'joint',
     'scale',
+    'lanes',
     'gate',
     'camera_info_mode',
     'on_move',

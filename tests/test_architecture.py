@@ -27,7 +27,7 @@ LAYERS = (
     ('estimation.straight', 'estimation.vehicle_edges'),
     ('estimation.verification',),
     ('estimation.markings', 'estimation.turning', 'estimation.paper'),
-    ('estimation.single_road',),
+    ('estimation.single_road', 'estimation.lanes'),
     ('estimation',),
     ('report', 'calibrator', 'revalidation'),
     ('offline.terminal',),

@@ -46,6 +46,17 @@ def add_solve_options(parser: argparse.ArgumentParser) -> None:
         metavar='FILE',
         help='points on the road in pixels and in a map: CSV with u_px, v_px and x_m, y_m or lat, lon; or .otrfpts',
     )
+    known.add_argument(
+        '--lanes',
+        choices=('us', 'uk', 'de', 'fr', 'cn'),
+        help='country whose standards give lane width and dash period, as far as dashes of lane lines are seen',
+    )
+    known.add_argument(
+        '--lane-width', type=float, metavar='W', help='width of the lanes in metres, line to line, +- 4 %%'
+    )
+    known.add_argument(
+        '--dash-period', type=float, metavar='P', help='length of a dash and its gap together in metres, +- 2 %%'
+    )
     lens = known.add_mutually_exclusive_group()
     lens.add_argument(
         '--focal-px', type=float, metavar='F', help='focal length from the data sheet in pixels, +- 10 %%'
@@ -135,6 +146,9 @@ def _known_values(arguments: argparse.Namespace) -> dict[str, Any]:
         'camera_height': arguments.camera_height,
         'camera_height_sigma': arguments.camera_height_sigma,
         'scale.speed_km_h': arguments.scale_speed,
+        'lanes.country': arguments.lanes,
+        'lanes.width_m': arguments.lane_width,
+        'lanes.dash_period_m': arguments.dash_period,
         'lens.focal_px': arguments.focal_px,
         'lens.focal_sigma_px': arguments.focal_sigma_px,
         'lens.hfov_deg': arguments.hfov_deg,

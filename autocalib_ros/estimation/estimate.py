@@ -8,7 +8,7 @@ from autocalib_ros.config import Options
 from autocalib_ros.estimation.adjustment.lens_prior import LensPrior, known_lens, lens_priors
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig
 from autocalib_ros.estimation.given_lens import check_principal_point, verify_given_lens
-from autocalib_ros.estimation.known_lengths import adjust_to_lengths
+from autocalib_ros.estimation.known_lengths import adjust_to_lengths, scale_of, with_lanes
 from autocalib_ros.estimation.observations.selection import drop_pedestrians
 from autocalib_ros.estimation.observations.track_set import TrackSet, select_tracks
 from autocalib_ros.estimation.observations.two_frame_windows import ResampledTracks, find_windows
@@ -23,7 +23,6 @@ from autocalib_ros.estimation.publish import (
     count_pedestrians,
     find_pedestrians,
     require_grade,
-    scale_of,
     with_requested_model,
     with_vehicle_size,
 )
@@ -122,7 +121,7 @@ def _estimate_and_scale(
         solution = find_solution(traffic, tracks, options, height_m=height_m, lens=lens)
     if isinstance(solution, Reason):
         return solution
-    solution = adjust_to_lengths(solution, tracks, options)
+    solution = adjust_to_lengths(with_lanes(solution, traffic), tracks, options)
     return draft.calibration(with_solution_rows(solution, options.gate), kept[tracks.indices]), solution.from_markings
 
 

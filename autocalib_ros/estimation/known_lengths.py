@@ -1,25 +1,37 @@
-"""Lens and plane adjusted to several known lengths: heights, distances and speeds that have to agree on one scale.
+"""Lens and plane adjusted to several known lengths: heights, distances, speeds and lanes that agree on one scale.
 
 A single length gives the scale alone. Of two or more, each further one tells how lengths in different places and
 directions compare, and thereby focal length and plane. The solution is the prior, and the differences between the
 logarithms of the camera heights that follow from each length are observations of zero: an iterated Kalman update.
+The dashes of lane lines are a length that nobody needs to know: they are as long far away as they are near.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
 from autocalib_ros.config import Options
 from autocalib_ros.estimation.adjustment.bundle_adjustment import evaluate_at
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentState
+from autocalib_ros.estimation.lanes.lane_dashes import LanePattern, measure_lanes
+from autocalib_ros.estimation.lanes.lane_scales import ToldLanes, lane_scales
 from autocalib_ros.estimation.observations.track_set import TrackSet
 from autocalib_ros.estimation.solution import Solution
-from autocalib_ros.estimation.verification.ground_normal import STEP_RAD
-from autocalib_ros.estimation.verification.scale import MIN_HEIGHT_M, Scale, relative_sigmas, scale_sources
-from autocalib_ros.results.refusals import Reason
-from autocalib_ros.results.verification_table import verified
+from autocalib_ros.estimation.verification.ground_normal import STEP_RAD, PlaneEstimate
+from autocalib_ros.estimation.verification.scale import (
+    MIN_HEIGHT_M,
+    Scale,
+    combined_scale,
+    relative_sigmas,
+    scale_sources,
+)
+from autocalib_ros.evidence.snapshot import Evidence
+from autocalib_ros.results.refusals import Reason, reason
+from autocalib_ros.results.statements import Statement, check
+from autocalib_ros.results.verification_table import VerificationRow, verified
 
 ITERATIONS = 5
 """Iterations of the update; lengths are nearly linear in the logarithms of what they depend on."""
@@ -29,49 +41,170 @@ MAX_STEP_SIGMAS = 5.0
 """Farthest that the update may move a parameter, in its standard deviations."""
 MAX_LENGTH_SIGMAS = 3.0
 """Largest difference between known lengths, in standard deviations for one degree of freedom: 0.3 % of true ones."""
+SOURCE_NAMES = {
+    'scale_height': 'the given camera height',
+    'scale_distance': 'the distance of {distance_m:g} m',
+    'scale_speed': 'the mean speed of {speed_km_h:g} km/h',
+    'scale_lanes': 'the lane width of {width_m:g} m',
+    'scale_dashes': 'the dash period of {period_m:g} m',
+}
+"""Each source of scale in a sentence."""
+
+
+def with_lanes(found: Solution, evidence: Evidence) -> Solution:
+    """Return a solution with the dashes of lane lines, if a plane and dashes are there."""
+    if found.plane_refusal is not None:
+        return found
+    sigma_rad = float(np.radians(found.plane.worst_sigma_deg))
+    lanes = measure_lanes(evidence, *found.plane.lens_and_normal, found.along, sigma_rad)
+    if lanes is None:
+        return found
+    camera, normal = found.plane.lens_and_normal
+    width = lanes.width(camera, normal) if lanes.has_width else None
+    seen = check('lane_dashes', period=lanes.period(camera, normal), spacings=lanes.spacings, width=width)
+    return replace(found, lanes=lanes, checks=(*found.checks, seen))
+
+
+def scale_of(solution: Solution, options: Options) -> Scale | Reason:
+    """Return the scale that the options ask for in a solution, or why there is none."""
+    sources = _sources(solution, options)
+    if not sources and options.lanes.given and not options.allow_unit_scale:
+        return reason('no_height', 'no_dashes')
+    return combined_scale(sources, options, *solution.plane.lens_and_normal)
+
+
+def _sources(solution: Solution, options: Options) -> list[Scale] | Reason:
+    """Return a scale for all that the options give; a reason if one of them gives none."""
+    at = solution.plane.lens_and_normal
+    sources = scale_sources(options, *at, solution.flow)
+    if isinstance(sources, Reason):
+        return sources
+    return [*sources, *lane_scales(solution.lanes, ToldLanes.of(options.lanes), *at, sources)]
+
+
+@dataclass(frozen=True)
+class _Lengths:
+    """What is observed: lengths that agree on one camera height, and dashes that do not change with distance."""
+
+    plane: PlaneEstimate
+    sources: list[Scale]
+    dashes: LanePattern | None
+    """None if their change with distance is not used."""
+
+    def log_heights(self, state: AdjustmentState, turn_rad: float = 0.0) -> np.ndarray:
+        """Return the log of the camera height by each source, and the change of the dashes, shape (n,)."""
+        camera, normal = state.camera, self.plane.normal(state, turn_rad)
+        heights = np.log([max(source.height(camera, normal), MIN_HEIGHT_M) for source in self.sources])
+        change = None if self.dashes is None else self.dashes.change_with_distance(camera, normal)
+        return heights if self.dashes is None else np.append(heights, 0.0 if change is None else change.mean)
+
+    @property
+    def combinations(self) -> np.ndarray:
+        """Matrix that takes `log_heights` to what is observed as zero: differences of heights, and the change."""
+        count = len(self.sources)
+        differ = np.hstack([-np.ones((max(count - 1, 0), min(count, 1))), np.eye(max(count - 1, 0))])
+        if self.dashes is None:
+            return differ
+        below = np.zeros((1, count + 1))
+        below[0, -1] = 1.0
+        return np.vstack([np.hstack([differ, np.zeros((len(differ), 1))]), below])
+
+    @property
+    def noise(self) -> np.ndarray:
+        """Covariance of `log_heights` for exact lens and plane, with the part of an assumed plane."""
+        camera, normal = self.plane.lens_and_normal
+        sigmas = relative_sigmas(self.sources, camera, normal)
+        change = None if self.dashes is None else self.dashes.change_with_distance(camera, normal)
+        covariance = np.diag(np.append(sigmas, [] if change is None else change.sigma) ** 2)
+        if self.plane.assumed is None:
+            return covariance
+        state = self.plane.fit.state
+        turned = self.log_heights(state, STEP_RAD) - self.log_heights(state, -STEP_RAD)
+        turned *= self.plane.assumed.step_sigma_rad / (2 * STEP_RAD)
+        return covariance + np.outer(turned, turned)
 
 
 def adjust_to_lengths(found: Solution, tracks: TrackSet, options: Options) -> Solution:
-    """Return a solution that agrees with all known lengths; itself if fewer than two are given.
+    """Return a solution that agrees with all known lengths; itself if nothing can be compared.
 
-    Lengths that contradict each other through the solution are a failed row of the verification table.
+    Lengths that contradict each other through the solution are a failed row of the verification table, and a check
+    names the two that differ most.
     """
     if found.plane_refusal is not None or not np.isfinite(found.fit.covariance).all():
         return found
-    sources = scale_sources(options, *found.plane.lens_and_normal, found.flow)
-    if isinstance(sources, Reason) or len(sources) < 2:
+    sources = _sources(found, options)
+    if isinstance(sources, Reason):
+        return found
+    at, lanes = found.plane.lens_and_normal, found.lanes
+    # crossing roads and turning vehicles know the plane better than dashes, whose road may sag
+    usable = found.assumed and lanes is not None and lanes.change_with_distance(*at) is not None
+    lengths = _Lengths(found.plane, sources, lanes if usable else None)
+    if not len(lengths.combinations):
         return found
     plane, parameters, covariance = found.plane, found.fit.problem.parameters, found.fit.covariance
-    differ = np.column_stack([-np.ones(len(sources) - 1), np.eye(len(sources) - 1)])
-
-    def differences(state: AdjustmentState, turn_rad: float = 0.0) -> np.ndarray:
-        return differ @ _log_heights(sources, state, plane.normal(state, turn_rad))
-
-    noise = differ @ np.diag(relative_sigmas(sources, *plane.lens_and_normal) ** 2) @ differ.T
-    if plane.assumed is not None:
-        turned = differences(found.fit.state, STEP_RAD) - differences(found.fit.state, -STEP_RAD)
-        turned *= plane.assumed.step_sigma_rad / (2 * STEP_RAD)
-        noise = noise + np.outer(turned, turned)
+    combine, noise = lengths.combinations, lengths.noise
     step, sigmas = np.zeros(parameters.size), np.sqrt(np.maximum(np.diag(covariance), 1e-18))
     probes = LENGTH_STEP * np.eye(parameters.size)
-    contradiction = 0.0
+    rows: tuple[VerificationRow, ...] = ()
+    differing: tuple[Statement, ...] = ()
     for iteration in range(ITERATIONS):
-        here = differences(parameters.state(step))
-        changes = [differences(parameters.state(step + probe)) - here for probe in probes]
-        jacobian = np.array(changes).T / LENGTH_STEP
-        innovation = jacobian @ covariance @ jacobian.T + noise
+        here = lengths.log_heights(parameters.state(step))
+        changes = [lengths.log_heights(parameters.state(step + probe)) - here for probe in probes]
+        slopes = np.array(changes).T / LENGTH_STEP
+        spread = slopes @ covariance @ slopes.T + noise
+        innovation = combine @ spread @ combine.T
         if not (np.isfinite(innovation).all() and np.isfinite(here).all()):
             return found
-        gain = covariance @ jacobian.T @ np.linalg.inv(innovation)
         if iteration == 0:
-            contradiction = float(np.sqrt(here @ np.linalg.solve(innovation, here) / len(here)))
-        step = np.clip(gain @ (jacobian @ step - here), -MAX_STEP_SIGMAS * sigmas, MAX_STEP_SIGMAS * sigmas)
-    found = found.compared(verified('known_lengths', contradiction, MAX_LENGTH_SIGMAS))
-    updated = covariance - gain @ jacobian @ covariance
+            rows, differing = _compared(lengths, here, spread)
+        gain = covariance @ (combine @ slopes).T @ np.linalg.inv(innovation)
+        step = gain @ (combine @ (slopes @ step - here))
+        step = np.clip(step, -MAX_STEP_SIGMAS * sigmas, MAX_STEP_SIGMAS * sigmas)
+    found = replace(found.compared(*rows), checks=(*found.checks, *differing))
+    updated = covariance - gain @ combine @ slopes @ covariance
     fit = evaluate_at(parameters.state(step), tracks, parameters.config, 0.5 * (updated + updated.T))
     return replace(found, fit=fit, plane=replace(plane, fit=fit))
 
 
-def _log_heights(sources: list[Scale], state: AdjustmentState, normal: np.ndarray) -> np.ndarray:
-    """Log of the camera height by each source, shape (sources,)."""
-    return np.log([max(source.height(state.camera, normal), MIN_HEIGHT_M) for source in sources])
+def _compared(
+    lengths: _Lengths, here: np.ndarray, spread: np.ndarray
+) -> tuple[tuple[VerificationRow, ...], tuple[Statement, ...]]:
+    """Return rows of the comparisons before the update, and in words the two lengths that contradict each other most.
+
+    `here` (n,) are the log heights and the change of the dashes, `spread` (n, n) is their covariance.
+    """
+    rows, count = [], len(lengths.sources)
+    if lengths.dashes is not None:
+        rows.append(verified('dash_period', abs(here[-1]) / spread[-1, -1] ** 0.5, MAX_LENGTH_SIGMAS))
+    if count < 2:
+        return tuple(rows), ()
+    heights, covariance = here[:count], spread[:count, :count]
+    combine = np.hstack([-np.ones((count - 1, 1)), np.eye(count - 1)])
+    apart = combine @ heights
+    squared = apart @ np.linalg.solve(combine @ covariance @ combine.T, apart)
+    rows.append(verified('known_lengths', float(np.sqrt(squared / (count - 1))), MAX_LENGTH_SIGMAS))
+    if rows[-1].passed:
+        return tuple(rows), ()
+
+    def difference(pair: tuple[int, int]) -> float:
+        one, other = pair
+        variance = covariance[one, one] + covariance[other, other] - 2.0 * covariance[one, other]
+        return float(abs(heights[one] - heights[other]) / max(variance, 1e-18) ** 0.5)
+
+    first, second = max(combinations(range(count), 2), key=difference)
+    metres, own = np.exp(heights), np.sqrt(np.diag(covariance))
+    statement = check(
+        'known_lengths',
+        first=_name(lengths.sources[first]),
+        first_m=metres[first],
+        first_sigma_m=metres[first] * own[first],
+        second=_name(lengths.sources[second]),
+        second_m=metres[second],
+        second_sigma_m=metres[second] * own[second],
+        sigmas=difference((first, second)),
+    )
+    return tuple(rows), (statement,)
+
+
+def _name(source: Scale) -> str:
+    return SOURCE_NAMES[source.kind].format(**source.values)

@@ -11,13 +11,14 @@ from autocalib_ros.estimation.adjustment.noise_model import DEFAULT_CAMERA_HEIGH
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentState
 from autocalib_ros.estimation.adjustment.residuals import collect_residuals
 from autocalib_ros.estimation.certainty import certainty_of_lengths
+from autocalib_ros.estimation.known_lengths import scale_of
 from autocalib_ros.estimation.paper.intrinsics import PaperIntrinsics
 from autocalib_ros.estimation.paper.vanishing_point_voting import segment_orientations
 from autocalib_ros.estimation.people.pedestrians import people
 from autocalib_ros.estimation.solution import Solution
 from autocalib_ros.estimation.verification.ground_normal import PlaneEstimate
 from autocalib_ros.estimation.verification.readiness import stillness_checks
-from autocalib_ros.estimation.verification.scale import Scale, check_scale, known_scale
+from autocalib_ros.estimation.verification.scale import Scale, check_scale
 from autocalib_ros.estimation.verification.vehicle_size import measure_vehicle_size
 from autocalib_ros.evidence.snapshot import Evidence, TrackKind
 from autocalib_ros.geometry.ground_plane import ground_plane, ground_points, pixels_ahead, tilt_and_roll_deg
@@ -95,11 +96,6 @@ class ResultDraft:
             orientation_peaks_deg=found.peaks_deg,
             residuals=collect_residuals(solution.fit),
         )
-
-
-def scale_of(solution: Solution, options: Options) -> Scale | Reason:
-    """Return the scale that the options ask for in a solution, or why there is none."""
-    return known_scale(options, *solution.plane.lens_and_normal, solution.flow)
 
 
 def with_requested_model(result: Calibration, options: Options) -> Calibration | Refusal:

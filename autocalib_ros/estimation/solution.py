@@ -9,6 +9,7 @@ import numpy as np
 from autocalib_ros.config import GateOptions
 from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment
 from autocalib_ros.estimation.adjustment.lens_prior import LensPrior
+from autocalib_ros.estimation.lanes.lane_dashes import LanePattern
 from autocalib_ros.estimation.observations.track_set import TrackSet, evenly_spaced
 from autocalib_ros.estimation.observations.two_frame_windows import ResampledTracks, TwoFrameWindows
 from autocalib_ros.estimation.verification.ground_normal import PlaneEstimate
@@ -69,6 +70,8 @@ class Solution:
     """Whether lens and plane come from the lane markings."""
     of_traffic: Adjustment | None = None
     """The adjustment of the traffic that lane markings replaced; None if `fit` is it, or there is none."""
+    lanes: LanePattern | None = None
+    """The dashes of lane lines on the road; None if they show no period."""
     comparisons: tuple[VerificationRow, ...] = ()
     """Comparisons between sources that speak of the same thing, as rows of the verification table."""
 

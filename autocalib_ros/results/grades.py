@@ -51,8 +51,8 @@ class HelpfulMeasure:
 MEASURES = {
     'focal': 'the focal length or field of view of the lens to 5 % (--focal-px, --hfov-deg)',
     'height': 'the camera height to 2 % (--camera-height)',
-    'length_along': 'a length of some metres along the view on the road, as of a lane dash, to 2 % (--distance)',
-    'length_across': 'a length of some metres across the view on the road, as a lane width, to 2 % (--distance)',
+    'length_along': 'a length of some metres along the view on the road to 2 % (--distance, or --dash-period)',
+    'length_across': 'a length of some metres across the view on the road to 2 % (--distance, or --lane-width)',
     'roll': 'the roll of the camera to 1 degree (--roll-sigma-deg 1 for a level camera)',
 }
 """Measures that a person can give, in words, by their kind."""

@@ -407,6 +407,13 @@ REFUSALS = (
         'allow_unit_scale for a plane in units of the height',
         missing='a scale',
         message='the ground plane needs the height of the camera above the road, which was not given',
+        variants={
+            'no_dashes': (
+                'the ground plane needs a scale: lane width or dash period are given, but not enough dashes of lane '
+                'lines are seen',
+                'give camera_height in metres, or a distance on the road (scale.distances)',
+            ),
+        },
     ),
     RefusalCode(
         code='scale_off_road',

@@ -159,6 +159,43 @@ def _scale_speed(
     )
 
 
+def _told(source: str) -> str:
+    return source if source == 'given' else f'standard of {source}'
+
+
+def _scale_lanes(
+    width_m: float,
+    width_sigma_m: float,
+    places: int,
+    source: str,
+    height_m: float | None = None,
+    height_sigma_m: float | None = None,
+) -> str:
+    return (
+        f'scale from lanes {width_m:g} +- {width_sigma_m:.2g} m wide ({_told(source)}), seen in {places} places'
+        f'{_height_note(height_m, height_sigma_m)}'
+    )
+
+
+def _scale_dashes(
+    period_m: float,
+    period_sigma_m: float,
+    spacings: int,
+    source: str,
+    height_m: float | None = None,
+    height_sigma_m: float | None = None,
+) -> str:
+    return (
+        f'scale from dashes of lane lines every {period_m:g} +- {period_sigma_m:.2g} m ({_told(source)}), {spacings} '
+        f'spacings seen{_height_note(height_m, height_sigma_m)}'
+    )
+
+
+def _lane_dashes(period: float, spacings: int, width: float | None) -> str:
+    lanes = '' if width is None else f', between lanes {width:.2f} camera heights wide'
+    return f'dashes of lane lines repeat every {period:.2f} camera heights ({spacings} spacings){lanes}'
+
+
 def _still_part(start_s: float, end_s: float, recorded_s: float, cuts: int, zooms: int, moves: int) -> str:
     counts = ((cuts, 'cuts to another view'), (zooms, 'zooms'), (moves, 'motions of the camera'))
     changes = ', '.join(f'{what}: {count}' for count, what in counts if count)
@@ -198,6 +235,8 @@ ASSUMPTIONS: dict[str, Wording] = {
     'scale_height': _scale_height,
     'scale_distance': _scale_distance,
     'scale_speed': _scale_speed,
+    'scale_lanes': _scale_lanes,
+    'scale_dashes': _scale_dashes,
     'scale_combined': 'scale from {sources} measures together: camera height {height_m:.3f} +- {height_sigma_m:.2g} m',
     'mended_pose': 'pose turned with the camera, by what the picture shows: pan {pan_deg:+.2f}, tilt {tilt_deg:+.2f}, '
     'roll {roll_deg:+.2f} degrees (+- {sigma_deg:.2f})',
@@ -207,7 +246,14 @@ ASSUMPTIONS: dict[str, Wording] = {
 }
 """Wording of every assumption, by its kind."""
 
-SCALE_KINDS = ('scale_height', 'scale_distance', 'scale_speed', 'scale_combined')
+SCALE_KINDS = (
+    'scale_height',
+    'scale_distance',
+    'scale_speed',
+    'scale_lanes',
+    'scale_dashes',
+    'scale_combined',
+)
 """Kinds that say where the scale comes from: one, or several and that of their combination."""
 
 CHECKS: dict[str, Wording] = {
@@ -224,6 +270,10 @@ CHECKS: dict[str, Wording] = {
     '{difference_deg:.1f} degrees from the assumed plane',
     'vehicle_size': '{vehicles} vehicles are {ratio:.2f} times as large as usual at a camera height of {height_m:.3g} '
     'm; {usual_height_m:.3g} +- {usual_height_sigma_m:.2g} m would make them usual',
+    'known_lengths': '{first} means a camera height of {first_m:.3g} +- {first_sigma_m:.2g} m, {second} one of '
+    '{second_m:.3g} +- {second_sigma_m:.2g} m: they differ by {sigmas:.1f} standard deviations of what the traffic '
+    'leaves open',
+    'lane_dashes': _lane_dashes,
     'lane_markings': _lane_markings_difference,
     'markings_and_traffic_normal': 'ground normals from traffic and lane markings differ by {difference_deg:.1f} '
     'degrees ({sigma_deg:.1f} expected)',

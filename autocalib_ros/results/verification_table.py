@@ -39,6 +39,7 @@ VERIFIED_QUANTITIES: dict[str, VerifiedQuantity] = {
         'given focal length or field of view against what the road shows', 'sigma', CONTRADICTED
     ),
     'known_lengths': VerifiedQuantity('known lengths against each other', 'sigma', CONTRADICTED),
+    'dash_period': VerifiedQuantity('period of dashes far away against near ones', 'sigma', CONTRADICTED),
     'vehicle_size': VerifiedQuantity('size of the vehicles against the usual one', '%', CONTRADICTED),
     'below_horizon': VerifiedQuantity('tracked points below the horizon', '%', REFUSED, at_least=True),
     'straight_share': VerifiedQuantity('vehicles that follow the roads', '%', REFUSED, at_least=True),

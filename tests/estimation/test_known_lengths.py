@@ -1,14 +1,22 @@
 """Several known lengths together: they agree, or they contradict each other."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
+from dashed_road import dashes
 from pinhole_road import PINHOLE, ROAD
 
-from autocalib_ros.config import GateOptions, LensOptions, Options, ScaleOptions
+from autocalib_ros.config import GateOptions, LaneOptions, LensOptions, Options, ScaleOptions
+from autocalib_ros.estimation.estimate import find_solution
+from autocalib_ros.estimation.known_lengths import adjust_to_lengths, scale_of, with_lanes
+from autocalib_ros.estimation.observations.track_set import TrackSet, select_tracks
+from autocalib_ros.estimation.solution import Solution
+from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
 from autocalib_ros.offline.synthetic.junction import synthetic_evidence
 from autocalib_ros.results.calibration import Calibration
+from autocalib_ros.results.refusals import Reason
 from solved_once import solve_once
 
 pytestmark = pytest.mark.solve
@@ -56,3 +64,54 @@ def test_a_height_and_a_length_that_agree_leave_the_height() -> None:
     assert result.ground.height_m == pytest.approx(ROAD.height_m, rel=0.01)
     without = replace(result, verification=())
     assert without.ground == result.ground and any(row.kind == 'known_lengths' for row in result.verification)
+
+
+@cache
+def unscaled() -> tuple[Solution, TrackSet]:
+    """The road by its traffic alone, with dashes on it."""
+    generator = np.random.default_rng(0)
+    evidence = replace(synthetic_evidence(ROAD, generator), stripes_px=dashes(ROAD, np.random.default_rng(1)))
+    tracks = select_tracks(evidence, 300)
+    found = find_solution(evidence, tracks, Options(lens=LensOptions(pixel_aspect=1.0)), height_m=ROAD.height_m)
+    assert isinstance(found, Solution)
+    return with_lanes(found, evidence), tracks
+
+
+def told(height: float = 0.0, **lanes: float) -> Solution:
+    found, tracks = unscaled()
+    return adjust_to_lengths(found, tracks, Options(camera_height=height, lanes=LaneOptions(**lanes)))
+
+
+def test_dashes_alone_show_the_horizon() -> None:
+    before, after = unscaled()[0], told()
+    tilt, sigma = (
+        [tilt_and_roll_deg(each.plane.normal(each.fit.state))[0] for each in (before, after)],
+        [each.plane.sigma(lambda _, normal: tilt_and_roll_deg(normal))[0] for each in (before, after)],
+    )
+    assert sigma[1] < 0.8 * sigma[0]
+    assert abs(tilt[1] - tilt_and_roll_deg(ROAD.normal_in_camera)[0]) < 2.5 * sigma[1]
+    assert [row.kind for row in after.comparisons if row.kind == 'dash_period' and row.passed]
+
+
+def test_dashes_and_lanes_of_known_size_give_scale_and_focal_length() -> None:
+    before, after = unscaled()[0], told(width_m=3.5, dash_period_m=12.0)
+    assert after.fit.focal_sigma < 0.6 * before.fit.focal_sigma
+    assert abs(np.log(after.fit.state.camera.focal_px / PINHOLE.focal_px)) < 2.5 * after.fit.focal_sigma
+    scale = scale_of(after, Options(lanes=LaneOptions(width_m=3.5, dash_period_m=12.0)))
+    # 4 % of the width that is told, and 2 % of the period
+    assert scale.height(*after.plane.lens_and_normal) == pytest.approx(ROAD.height_m, rel=0.1)
+    assert [source.kind for source in scale.sources] == ['scale_lanes', 'scale_dashes']
+
+
+def test_dashes_that_contradict_the_height_are_named_with_both_numbers() -> None:
+    result = told(5.0 * ROAD.height_m, width_m=3.5, dash_period_m=12.0)
+    row = next(row for row in result.comparisons if row.kind == 'known_lengths')
+    text = next(statement.text for statement in result.checks if statement.kind == 'known_lengths')
+    assert not row.passed
+    assert text.startswith('the given camera height means a camera height of 40 +- 0.04 m, the ')
+    assert not [each for each in told(ROAD.height_m, dash_period_m=12.0).checks if each.kind == 'known_lengths']
+
+
+def test_lanes_are_told_and_no_dash_is_seen() -> None:
+    why = scale_of(replace(unscaled()[0], lanes=None), Options(lanes=LaneOptions(country='us')))
+    assert isinstance(why, Reason) and 'not enough dashes' in why.message and 'camera_height' in why.remedy

@@ -79,7 +79,13 @@ def known_scale(options: Options, camera: Camera, normal: np.ndarray, flow: Trac
 
     `flow` holds straight tracks along the busiest road, for the scale from their speed.
     """
-    sources = scale_sources(options, camera, normal, flow)
+    return combined_scale(scale_sources(options, camera, normal, flow), options, camera, normal)
+
+
+def combined_scale(
+    sources: list[Scale] | Reason, options: Options, camera: Camera, normal: np.ndarray
+) -> Scale | Reason:
+    """Return the scale of all sources together; without any the unit scale if the options allow it, or a reason."""
     if isinstance(sources, Reason):
         return sources
     if sources:

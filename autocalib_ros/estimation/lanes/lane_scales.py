@@ -1,0 +1,113 @@
+"""Sources of scale from the pattern of lane lines, for a width and a period that are told."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from autocalib_ros.config import LaneOptions
+from autocalib_ros.estimation.lanes.lane_dashes import LanePattern
+from autocalib_ros.estimation.lanes.lane_standards import LANE_STANDARDS
+from autocalib_ros.estimation.verification.scale import HeightFunction, Scale
+from autocalib_ros.lens.camera import Camera
+from autocalib_ros.results.statements import Value
+
+TOLD_WIDTH_SIGMA, TOLD_PERIOD_SIGMA = 0.04, 0.02
+"""Relative standard deviations of a lane width and of a dash period that are told without one, and of the periods that
+countries prescribe: what is painted differs from what is ordered. Judgement."""
+MIN_PERIOD_RATIO = 1.15
+"""The prescribed period that fits best has to be nearer than the next one by this factor, or none is taken."""
+
+
+@dataclass(frozen=True)
+class ToldLanes:
+    """What is known of the lanes: by the user, or by his country."""
+
+    width_m: float
+    """0 if nothing is known."""
+    width_sigma_m: float
+    periods_m: tuple[float, ...]
+    """Periods that may be; empty if nothing is known."""
+    period_sigma: float
+    """Relative standard deviation."""
+    source: str
+    """'given', or the country."""
+
+    @classmethod
+    def of(cls, options: LaneOptions) -> ToldLanes:
+        """Return what the options say; what is given as a number replaces what the country prescribes."""
+        standard = LANE_STANDARDS.get(options.country)
+        width, sigma = options.width_m, options.width_sigma_m or TOLD_WIDTH_SIGMA * options.width_m
+        if width <= 0 and standard is not None:
+            width, sigma = standard.width_m, standard.width_sigma_m
+        periods = () if standard is None else standard.periods_m
+        relative = TOLD_PERIOD_SIGMA
+        if options.dash_period_m > 0:
+            periods = (options.dash_period_m,)
+            relative = options.dash_period_sigma_m / options.dash_period_m or TOLD_PERIOD_SIGMA
+        numbers = options.width_m > 0 or options.dash_period_m > 0
+        return cls(width, sigma, periods, relative, 'given' if numbers else options.country)
+
+
+def lane_scales(
+    pattern: LanePattern | None, told: ToldLanes, camera: Camera, normal: np.ndarray, others: list[Scale]
+) -> list[Scale]:
+    """Return the scales that follow from the lanes; none without a pattern, or where nothing is told.
+
+    Of several prescribed periods the one is taken that fits the `others` best, or else the width of the lanes.
+    """
+    if pattern is None:
+        return []
+    found = [_of_width(pattern, told, camera, normal)] if pattern.has_width and told.width_m > 0 else []
+    expected = [source.height(camera, normal) for source in (others or found)]
+    period_m = _fitting(told.periods_m, pattern.period(camera, normal), expected)
+    return found if period_m is None else [*found, _of_period(pattern, told, period_m, camera, normal)]
+
+
+def _fitting(periods_m: tuple[float, ...], measured: float, heights: list[float]) -> float | None:
+    """Return the period that fits one measured in camera heights best; None if another one fits about as well."""
+    if len(periods_m) < 2:
+        return periods_m[0] if periods_m else None
+    if not heights:
+        return None
+    expected = measured * float(np.exp(np.mean(np.log(heights))))
+    first, second = sorted(periods_m, key=lambda period: abs(np.log(period / expected)))[:2]
+    far, near = abs(np.log(second / expected)), abs(np.log(first / expected))
+    return first if far - near > np.log(MIN_PERIOD_RATIO) else None
+
+
+def _of_width(pattern: LanePattern, told: ToldLanes, camera: Camera, normal: np.ndarray) -> Scale:
+    return _scale(
+        'scale_lanes',
+        lambda lens, up: told.width_m / pattern.width(lens, up),
+        float(np.hypot(told.width_sigma_m / told.width_m, pattern.width_sigma)),
+        (camera, normal),
+        {
+            'width_m': told.width_m,
+            'width_sigma_m': told.width_sigma_m,
+            'places': len(pattern.beside),
+            'source': told.source,
+        },
+    )
+
+
+def _of_period(pattern: LanePattern, told: ToldLanes, period_m: float, camera: Camera, normal: np.ndarray) -> Scale:
+    return _scale(
+        'scale_dashes',
+        lambda lens, up: period_m / pattern.period(lens, up),
+        float(np.hypot(told.period_sigma, pattern.period_sigma)),
+        (camera, normal),
+        {
+            'period_m': period_m,
+            'period_sigma_m': told.period_sigma * period_m,
+            'spacings': pattern.spacings,
+            'source': told.source,
+        },
+    )
+
+
+def _scale(
+    kind: str, height: HeightFunction, relative: float, at: tuple[Camera, np.ndarray], values: dict[str, Value]
+) -> Scale:
+    return Scale(height, relative * height(*at), True, kind, values, derived=True)
