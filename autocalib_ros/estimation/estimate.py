@@ -8,7 +8,7 @@ from autocalib_ros.config import Options
 from autocalib_ros.estimation.adjustment.lens_prior import LensPrior, known_lens, lens_priors
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig
 from autocalib_ros.estimation.given_lens import check_principal_point, verify_given_lens
-from autocalib_ros.estimation.known_lengths import adjust_to_lengths, scale_of, with_lanes
+from autocalib_ros.estimation.known_lengths import adjust_to_lengths, scale_of, with_seen_lengths
 from autocalib_ros.estimation.observations.selection import drop_pedestrians
 from autocalib_ros.estimation.observations.track_set import TrackSet, select_tracks
 from autocalib_ros.estimation.observations.two_frame_windows import ResampledTracks, find_windows
@@ -17,6 +17,7 @@ from autocalib_ros.estimation.paper.published_method import solve_paper
 from autocalib_ros.estimation.pixels.aspect_hypotheses import AspectHypotheses
 from autocalib_ros.estimation.pixels.aspect_test import choose_aspect, with_stated_aspect
 from autocalib_ros.estimation.pixels.square_pixels import with_square_pixels
+from autocalib_ros.estimation.plausibility import with_usual_vehicles
 from autocalib_ros.estimation.publish import (
     ResultDraft,
     choose_solution,
@@ -24,7 +25,6 @@ from autocalib_ros.estimation.publish import (
     find_pedestrians,
     require_grade,
     with_requested_model,
-    with_vehicle_size,
 )
 from autocalib_ros.estimation.solution import (
     Observations,
@@ -105,8 +105,8 @@ def _solve_joint(traffic: Evidence, kept: np.ndarray, draft: ResultDraft, lens: 
         driving = kept[~np.isin(traffic.track_vehicles, pedestrians)]
         again = check_readiness(vehicles, draft.options.gate) or _estimate_and_scale(vehicles, driving, draft, lens)
         result = choose_solution(result, again if isinstance(again, Reason) else again[0])
-    # The size of the vehicles tests the scale.
-    return count_pedestrians(with_vehicle_size(result, vehicles), len(pedestrians))
+    # Size and speed of the vehicles test scale and plane.
+    return count_pedestrians(with_usual_vehicles(result, vehicles), len(pedestrians))
 
 
 def _estimate_and_scale(
@@ -115,13 +115,18 @@ def _estimate_and_scale(
     """Estimate, then add scale, sigmas and grade; and whether lens and plane come from lane markings."""
     options = draft.options
     tracks = select_tracks(traffic, options.joint.max_tracks)
-    solution = find_solution(traffic, tracks, options, height_m=options.camera_height, lens=lens)
+
+    def found_at(height_m: float) -> Solution | Reason:
+        found = find_solution(traffic, tracks, options, height_m=height_m, lens=lens)
+        return found if isinstance(found, Reason) else with_seen_lengths(found, traffic, options)
+
+    solution = found_at(options.camera_height)
     height_m = _unusual_height_m(solution, options)
     if height_m is not None:
-        solution = find_solution(traffic, tracks, options, height_m=height_m, lens=lens)
+        solution = found_at(height_m)
     if isinstance(solution, Reason):
         return solution
-    solution = adjust_to_lengths(with_lanes(solution, traffic), tracks, options)
+    solution = adjust_to_lengths(solution, tracks, options)
     return draft.calibration(with_solution_rows(solution, options.gate), kept[tracks.indices]), solution.from_markings
 
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from autocalib_ros.config import Options
 from autocalib_ros.estimation.adjustment.bundle_adjustment import evaluate_at
+from autocalib_ros.estimation.adjustment.noise_model import DEFAULT_CAMERA_HEIGHT_M
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentState
 from autocalib_ros.estimation.lanes.lane_dashes import LanePattern, measure_lanes
 from autocalib_ros.estimation.lanes.lane_scales import ToldLanes, lane_scales
@@ -28,6 +29,7 @@ from autocalib_ros.estimation.verification.scale import (
     relative_sigmas,
     scale_sources,
 )
+from autocalib_ros.estimation.verification.vehicle_size import measure_vehicle_size
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.results.refusals import Reason, reason
 from autocalib_ros.results.statements import Statement, check
@@ -51,10 +53,19 @@ SOURCE_NAMES = {
 """Each source of scale in a sentence."""
 
 
-def with_lanes(found: Solution, evidence: Evidence) -> Solution:
-    """Return a solution with the dashes of lane lines, if a plane and dashes are there."""
+def with_seen_lengths(found: Solution, evidence: Evidence, options: Options) -> Solution:
+    """Return a solution with what shows lengths on the road: dashes, and vehicles where no length is told."""
     if found.plane_refusal is not None:
         return found
+    found = _with_lanes(found, evidence)
+    if options.allow_unit_scale or _sources(found, options):
+        return found
+    at = (*found.plane.lens_and_normal, DEFAULT_CAMERA_HEIGHT_M)
+    size = measure_vehicle_size(evidence, *at)
+    return found if size is None else replace(found, vehicles=size.scale(*at))
+
+
+def _with_lanes(found: Solution, evidence: Evidence) -> Solution:
     sigma_rad = float(np.radians(found.plane.worst_sigma_deg))
     lanes = measure_lanes(evidence, *found.plane.lens_and_normal, found.along, sigma_rad)
     if lanes is None:
@@ -68,6 +79,8 @@ def with_lanes(found: Solution, evidence: Evidence) -> Solution:
 def scale_of(solution: Solution, options: Options) -> Scale | Reason:
     """Return the scale that the options ask for in a solution, or why there is none."""
     sources = _sources(solution, options)
+    if not sources and solution.vehicles is not None:
+        return solution.vehicles
     if not sources and options.lanes.given and not options.allow_unit_scale:
         return reason('no_height', 'no_dashes')
     return combined_scale(sources, options, *solution.plane.lens_and_normal)

@@ -15,11 +15,11 @@ from autocalib_ros.estimation.known_lengths import scale_of
 from autocalib_ros.estimation.paper.intrinsics import PaperIntrinsics
 from autocalib_ros.estimation.paper.vanishing_point_voting import segment_orientations
 from autocalib_ros.estimation.people.pedestrians import people
+from autocalib_ros.estimation.plausibility import why_implausible, with_usual_lanes
 from autocalib_ros.estimation.solution import Solution
 from autocalib_ros.estimation.verification.ground_normal import PlaneEstimate
 from autocalib_ros.estimation.verification.readiness import stillness_checks
 from autocalib_ros.estimation.verification.scale import Scale, check_scale
-from autocalib_ros.estimation.verification.vehicle_size import measure_vehicle_size
 from autocalib_ros.evidence.snapshot import Evidence, TrackKind
 from autocalib_ros.geometry.ground_plane import ground_plane, ground_points, pixels_ahead, tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera
@@ -34,7 +34,7 @@ from autocalib_ros.results.calibration import (
 from autocalib_ros.results.grades import GRADE_LIMITS, GroundSigma, rank_of
 from autocalib_ros.results.refusals import WAIT, Reason, reason
 from autocalib_ros.results.statements import check
-from autocalib_ros.results.verification_table import VerificationRow, verified
+from autocalib_ros.results.verification_table import verified
 
 MAX_CERTAINTY_LOST = 2.0
 """Factor by which lengths may be less certain without pedestrians; half of the tracks make 1.4. Judgement."""
@@ -82,7 +82,7 @@ class ResultDraft:
             newest_stamp_ns=self.evidence.newest_stamp_ns,
             figures=self._figures(solution, tracks),
         )
-        return _with_ground(lens, solution, self.options)
+        return with_usual_lanes(_with_ground(lens, solution, self.options), solution.lanes)
 
     def _figures(self, solution: Solution, tracks: np.ndarray) -> Figures:
         """Add the label of each track, the residuals, and the orientations of the segments in the estimated lens."""
@@ -140,24 +140,6 @@ def choose_solution(of_all: Calibration, of_vehicles: Calibration | Reason) -> C
     else:
         return of_vehicles
     return replace(of_all, checks=(*of_all.checks, check('pedestrians_kept', without=without)))
-
-
-def with_vehicle_size(result: Calibration, vehicles: Evidence) -> Calibration:
-    """Add the comparison of the vehicles with usual ones, which tests the scale; contradiction lowers the grade."""
-    ground = result.ground
-    if ground is None or not ground.metric:
-        return result
-    size = measure_vehicle_size(vehicles, result.camera, ground.normal_in_camera, ground.height_m)
-    if size is None:
-        return result
-    compared = _with_rows(result, size.row)
-    return replace(compared, checks=(*compared.checks, size.statement(ground.height_m)))
-
-
-def _with_rows(result: Calibration, *rows: VerificationRow) -> Calibration:
-    """Add rows to the verification table; one that failed lowers grade full, if that is what it costs."""
-    lowered = result.grade == 'full' and any(row.lowers_grade for row in rows)
-    return replace(result, grade='fair' if lowered else result.grade, verification=(*result.verification, *rows))
 
 
 def _certainty_lost(of_all: Calibration, of_vehicles: Calibration) -> float:
@@ -220,8 +202,12 @@ def _grade(sigma: GroundSigma | None, solution: Solution) -> str:
 def require_grade(result: Calibration, least: str) -> Calibration | Refusal:
     """Return the result; if its grade is below `least`, the lens alone if that is certain, else a refusal.
 
-    The refusal has the result as its candidate.
+    The refusal has the result as its candidate. An implausible result is refused whatever its grade.
     """
+    implausible = why_implausible(result)
+    if implausible:
+        refused = Refusal.from_reason(implausible, result.method, result.evidence, result.figures)
+        return replace(refused, candidate=result)
     sigma, helpful = result.stddev.ground, result.helpful
     ungraded = result.method == 'paper' or (result.grade == 'unit_scale' and sigma is None)
     grade = sigma.grade if result.grade == 'unit_scale' and sigma else result.grade

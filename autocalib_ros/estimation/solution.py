@@ -13,6 +13,7 @@ from autocalib_ros.estimation.lanes.lane_dashes import LanePattern
 from autocalib_ros.estimation.observations.track_set import TrackSet, evenly_spaced
 from autocalib_ros.estimation.observations.two_frame_windows import ResampledTracks, TwoFrameWindows
 from autocalib_ros.estimation.verification.ground_normal import PlaneEstimate
+from autocalib_ros.estimation.verification.scale import Scale
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.results.refusals import Reason
 from autocalib_ros.results.statements import Statement
@@ -72,6 +73,8 @@ class Solution:
     """The adjustment of the traffic that lane markings replaced; None if `fit` is it, or there is none."""
     lanes: LanePattern | None = None
     """The dashes of lane lines on the road; None if they show no period."""
+    vehicles: Scale | None = None
+    """The scale by the size of the vehicles; None if it is not needed, or too few are seen whole."""
     comparisons: tuple[VerificationRow, ...] = ()
     """Comparisons between sources that speak of the same thing, as rows of the verification table."""
 

@@ -416,6 +416,16 @@ REFUSALS = (
         },
     ),
     RefusalCode(
+        code='implausible',
+        cause='Vehicles, speeds, lanes or dashes of lane lines are half as large again as usual ones, or more, or half '
+        'as large: the scale, the focal length that is given or the plane is wrong.',
+        limit='3.5 standard deviations of the usual size of vehicles (64 %), and 48 % beyond usual speeds, lanes and '
+        'dashes',
+        remedy='check the camera height, lengths and speed that are given, and the focal length',
+        missing='usual sizes and speeds',
+        message='{said}',
+    ),
+    RefusalCode(
         code='scale_off_road',
         cause='A pixel of scale.distance_px is not on the road, or the lens images nothing there.',
         limit='at least 1.7 degrees below the horizon (33 camera heights away)',

@@ -191,9 +191,34 @@ def _scale_dashes(
     )
 
 
+def _vehicle_size(
+    vehicles: int,
+    ratio: float,
+    height_m: float,
+    usual_height_m: float,
+    usual_height_sigma_m: float,
+    width_m: float | None = None,
+    usual_width_m: float | None = None,
+) -> str:
+    cars = '' if width_m is None else f' (cars {width_m:.2g} m wide, {usual_width_m:g} m is usual)'
+    return (
+        f'{vehicles} vehicles are {ratio:.2f} times as large as usual at a camera height of {height_m:.3g} m{cars}; '
+        f'{usual_height_m:.3g} +- {usual_height_sigma_m:.2g} m would make them usual'
+    )
+
+
 def _lane_dashes(period: float, spacings: int, width: float | None) -> str:
     lanes = '' if width is None else f', between lanes {width:.2f} camera heights wide'
     return f'dashes of lane lines repeat every {period:.2f} camera heights ({spacings} spacings){lanes}'
+
+
+def _scale_vehicles(
+    vehicles: int, car_m: float, sigma: float, height_m: float | None = None, height_sigma_m: float | None = None
+) -> str:
+    return (
+        f'scale from the size of {vehicles} vehicles, as no length is given: cars {car_m:g} m wide in the mean, '
+        f'+- {sigma:.0%}{_height_note(height_m, height_sigma_m)}'
+    )
 
 
 def _still_part(start_s: float, end_s: float, recorded_s: float, cuts: int, zooms: int, moves: int) -> str:
@@ -237,6 +262,7 @@ ASSUMPTIONS: dict[str, Wording] = {
     'scale_speed': _scale_speed,
     'scale_lanes': _scale_lanes,
     'scale_dashes': _scale_dashes,
+    'scale_vehicles': _scale_vehicles,
     'scale_combined': 'scale from {sources} measures together: camera height {height_m:.3f} +- {height_sigma_m:.2g} m',
     'mended_pose': 'pose turned with the camera, by what the picture shows: pan {pan_deg:+.2f}, tilt {tilt_deg:+.2f}, '
     'roll {roll_deg:+.2f} degrees (+- {sigma_deg:.2f})',
@@ -252,6 +278,7 @@ SCALE_KINDS = (
     'scale_speed',
     'scale_lanes',
     'scale_dashes',
+    'scale_vehicles',
     'scale_combined',
 )
 """Kinds that say where the scale comes from: one, or several and that of their combination."""
@@ -268,8 +295,12 @@ CHECKS: dict[str, Wording] = {
     'edges_and_level': 'edges of vehicles and a level camera differ by {difference_deg:.1f} degrees about the road',
     'lane_changes': '{vehicles} vehicles that change lanes (+- {sigma_deg:.1f} degrees about the road) differ by '
     '{difference_deg:.1f} degrees from the assumed plane',
-    'vehicle_size': '{vehicles} vehicles are {ratio:.2f} times as large as usual at a camera height of {height_m:.3g} '
-    'm; {usual_height_m:.3g} +- {usual_height_sigma_m:.2g} m would make them usual',
+    'vehicle_size': _vehicle_size,
+    'usual_speed': 'at this scale half of the vehicles drive faster than {speed_km_h:.0f} km/h; up to {usual_km_h:.0f} '
+    'km/h are usual: the scale or the focal length is wrong',
+    'usual_lanes': 'at this scale lanes are {width_m:.2g} m wide; {low_m:.3g} to {high_m:.3g} m are usual',
+    'usual_dashes': 'at this scale dashes of lane lines repeat every {period_m:.3g} m; {low_m:.3g} to {high_m:.3g} m '
+    'are usual: the scale or the focal length is wrong',
     'known_lengths': '{first} means a camera height of {first_m:.3g} +- {first_sigma_m:.2g} m, {second} one of '
     '{second_m:.3g} +- {second_sigma_m:.2g} m: they differ by {sigmas:.1f} standard deviations of what the traffic '
     'leaves open',
@@ -279,6 +310,8 @@ CHECKS: dict[str, Wording] = {
     'degrees ({sigma_deg:.1f} expected)',
     'markings_and_traffic_road': 'road of the traffic and the markings along it differ by {difference_deg:.1f} degrees '
     '({sigma_deg:.1f} expected)',
+    'given_focal': 'the road alone shows a focal length of {road_px:.0f} +- {road_sigma_px:.0f} px; {given_px:.0f} px '
+    'are given, and believed with a probability of {believed:.0%}',
     'given_lens': 'traffic gives a focal length of {traffic_px:.1f} +- {sigma_px:.1f} px, the given lens has '
     '{given_px:.1f} px',
     'pixel_aspect': 'traffic measures pixels {measured:.3f} +- {sigma:.3f} times as wide as high, '

@@ -29,6 +29,7 @@ REFUSED = 'no calibration'
 NO_PLANE = 'no ground plane'
 CONTRADICTED = 'grade fair at most'
 UNTESTED = 'no grade full'
+DOUBTED = 'grade coarse at most'
 WIDENED = 'wider standard deviations'
 
 VERIFIED_QUANTITIES: dict[str, VerifiedQuantity] = {
@@ -40,7 +41,10 @@ VERIFIED_QUANTITIES: dict[str, VerifiedQuantity] = {
     ),
     'known_lengths': VerifiedQuantity('known lengths against each other', 'sigma', CONTRADICTED),
     'dash_period': VerifiedQuantity('period of dashes far away against near ones', 'sigma', CONTRADICTED),
-    'vehicle_size': VerifiedQuantity('size of the vehicles against the usual one', '%', CONTRADICTED),
+    'vehicle_size': VerifiedQuantity('size of the vehicles against the usual one', '%', DOUBTED),
+    'usual_speed': VerifiedQuantity('median speed against the fastest usual one', '%', DOUBTED),
+    'usual_lanes': VerifiedQuantity('width of the lanes beyond usual ones', '%', DOUBTED),
+    'usual_dashes': VerifiedQuantity('period of dashes beyond usual ones', '%', DOUBTED),
     'below_horizon': VerifiedQuantity('tracked points below the horizon', '%', REFUSED, at_least=True),
     'straight_share': VerifiedQuantity('vehicles that follow the roads', '%', REFUSED, at_least=True),
     'k1_prior': VerifiedQuantity('k1 against its lens family', 'sigma', REFUSED),
@@ -110,12 +114,19 @@ class VerificationRow:
     @property
     def lowers_grade(self) -> bool:
         """Whether the check failed and thereby costs grade full."""
-        return not self.passed and self._quantity.cost in (CONTRADICTED, UNTESTED)
+        return not self.passed and self._quantity.cost in (CONTRADICTED, UNTESTED, DOUBTED)
+
+    @property
+    def highest_grade(self) -> str:
+        """The highest grade that the check leaves."""
+        if not self.lowers_grade:
+            return 'full'
+        return 'coarse' if self._quantity.cost == DOUBTED else 'fair'
 
     @property
     def contradicts(self) -> bool:
         """Whether the check failed because two sources, or a source and its prior, contradict each other."""
-        return not self.passed and self._quantity.cost == CONTRADICTED
+        return not self.passed and self._quantity.cost in (CONTRADICTED, DOUBTED)
 
     @property
     def outcome(self) -> str:

@@ -10,7 +10,7 @@ from pinhole_road import PINHOLE, ROAD
 
 from autocalib_ros.config import GateOptions, LaneOptions, LensOptions, Options, ScaleOptions
 from autocalib_ros.estimation.estimate import find_solution
-from autocalib_ros.estimation.known_lengths import adjust_to_lengths, scale_of, with_lanes
+from autocalib_ros.estimation.known_lengths import adjust_to_lengths, scale_of, with_seen_lengths
 from autocalib_ros.estimation.observations.track_set import TrackSet, select_tracks
 from autocalib_ros.estimation.solution import Solution
 from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
@@ -74,7 +74,7 @@ def unscaled() -> tuple[Solution, TrackSet]:
     tracks = select_tracks(evidence, 300)
     found = find_solution(evidence, tracks, Options(lens=LensOptions(pixel_aspect=1.0)), height_m=ROAD.height_m)
     assert isinstance(found, Solution)
-    return with_lanes(found, evidence), tracks
+    return with_seen_lengths(found, evidence, Options()), tracks
 
 
 def told(height: float = 0.0, **lanes: float) -> Solution:

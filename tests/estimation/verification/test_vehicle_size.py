@@ -40,6 +40,10 @@ def test_vehicle_size_is_proportional_to_the_given_height(height_ratio: float) -
     assert size.ratio == pytest.approx(height_ratio, rel=0.15)
     assert size.row.passed is (height_ratio == 1.0)
     values = size.statement(given_m).values
+    assert (
+        values['width_m'] == pytest.approx(1.8 * size.ratio)
+        and 'm wide, 1.8 m is usual' in size.statement(given_m).text
+    )
     assert values['usual_height_m'] == pytest.approx(JUNCTION.height_m, abs=2.0 * values['usual_height_sigma_m'])
 
 
@@ -49,12 +53,29 @@ def test_few_vehicles_or_no_silhouettes_measure_nothing() -> None:
 
 
 @pytest.mark.solve
-@pytest.mark.parametrize(('height_ratio', 'grade'), [(1.0, 'full'), (1.7, 'fair')])
-def test_a_wrong_height_costs_grade_full(height_ratio: float, grade: str) -> None:
+@pytest.mark.parametrize(('height_ratio', 'grade'), [(1.0, 'full'), (1.5, 'coarse')])
+def test_a_wrong_height_costs_the_grade(height_ratio: float, grade: str) -> None:
     result = solve_once(cars(30), Options(camera_height=height_ratio * JUNCTION.height_m, joint=ONE_FAMILY))
     assert isinstance(result, Calibration) and result.grade == grade
     (row,) = [row for row in result.verification if row.kind == 'vehicle_size']
     assert row.passed is (grade == 'full')
     assert ('Check the camera height' in next_step(result)) is not row.passed
-    doubt = '' if row.passed else ' (grade fair, but a check contradicts it)'
+    doubt = '' if row.passed else ' (grade coarse, but a check contradicts it)'
     assert verdict(result).startswith(f'Calibrated{doubt}:')
+
+
+def test_the_usual_size_gives_the_height_where_no_length_is_told() -> None:
+    at = JUNCTION.camera, JUNCTION.normal_in_camera
+    scale = measure_vehicle_size(cars(30), *at, 5.0).scale(*at, 5.0)
+    assert scale.height(*at) == pytest.approx(JUNCTION.height_m, rel=0.15)
+    assert 0.13 < scale.sigma / scale.height(*at) < 0.17 and scale.kind == 'scale_vehicles'
+
+
+@pytest.mark.solve
+def test_without_a_length_the_plane_is_coarse_and_names_the_vehicles() -> None:
+    result = solve_once(cars(30), Options(joint=ONE_FAMILY))
+    assert isinstance(result, Calibration) and result.grade == 'coarse'
+    assert result.ground.height_m == pytest.approx(JUNCTION.height_m, abs=2.0 * result.stddev.height_m)
+    (said,) = [statement.text for statement in result.assumptions if statement.kind == 'scale_vehicles']
+    assert said.startswith('scale from the size of') and 'as no length is given' in said
+    assert all(row.kind != 'vehicle_size' for row in result.verification)  # it would test itself
