@@ -89,7 +89,7 @@ def estimate_from_single_road(observations: Observations, config: AdjustmentConf
     if isinstance(found, Reason):
         return found
     if prior.focal_known and len(prior.free) and prior.sigma[0] > 0:
-        found = found.compared_with_given(solve_under(prior.with_unknown_focal()))
+        found = found.compared_with_given(solve_under(prior.with_unknown_focal()), tracks)
     fit, plane = found.fit, PlaneEstimate.of(found.fit, tracks)
     above = check_below_horizon(plane.fraction_below_horizon)
     if above:

@@ -15,6 +15,7 @@ from autocalib_ros.estimation.observations.track_set import TrackSet, evenly_spa
 from autocalib_ros.estimation.single_road.barrel_lens import USUAL_VIEW_DEG, USUAL_VIEW_FACTOR, LensChoice
 from autocalib_ros.estimation.single_road.direction_mixture import STILL_SEGMENTS, VEHICLE_EDGES, DirectionMixture
 from autocalib_ros.estimation.single_road.posterior import road_posterior
+from autocalib_ros.estimation.single_road.told_focal import mixed, probability_of_told
 from autocalib_ros.estimation.straight.initialisation import solve_from_consensus
 from autocalib_ros.estimation.vehicle_edges.edge_mixture import EDGE_CORRELATION
 from autocalib_ros.estimation.vehicle_edges.transverse_edges import select_vehicle_edges
@@ -63,15 +64,25 @@ class SingleRoad:
     checks: tuple[Statement, ...]
     rows: tuple[VerificationRow, ...]
 
-    def compared_with_given(self, free: SingleRoad | Reason) -> SingleRoad:
-        """Return the solution with a given focal length compared with that of a solution without it."""
+    def compared_with_given(self, free: SingleRoad | Reason, tracks: TrackSet) -> SingleRoad:
+        """Return the solution with a given focal length compared, and mixed, with that of a solution without it."""
         if isinstance(free, Reason):
             return self
-        camera = free.fit.state.camera
+        camera, told_sigma = free.fit.state.camera, float(self.choice.prior.sigma[0])
         given_px = self.choice.expected_focal_px(camera.k[0] / DISTORTION_FREE[0])
-        sigma = float(np.hypot(free.fit.focal_sigma, self.choice.prior.sigma[0]))
-        row = verified('given_focal', abs(float(np.log(camera.focal_px / given_px))) / sigma, MAX_GIVEN_SIGMAS)
-        return replace(self, rows=(*self.rows, row))
+        difference = float(np.log(given_px / camera.focal_px))
+        sigma = float(np.hypot(free.fit.focal_sigma, told_sigma))
+        row = verified('given_focal', abs(difference) / sigma, MAX_GIVEN_SIGMAS)
+        believed = probability_of_told(difference, free.fit.focal_sigma, told_sigma)
+        statement = check(
+            'given_focal',
+            given_px=given_px,
+            road_px=camera.focal_px,
+            road_sigma_px=free.fit.focal_sigma * camera.focal_px,
+            believed=believed,
+        )
+        fit = mixed(self.fit, free.fit, difference, believed, tracks)
+        return replace(self, fit=fit, checks=(*self.checks, statement), rows=(*self.rows, row))
 
 
 def solve_single_road(
