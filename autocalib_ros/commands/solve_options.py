@@ -22,7 +22,8 @@ def add_solve_options(parser: argparse.ArgumentParser) -> None:
         '--camera-height',
         type=float,
         metavar='H',
-        help='height of the camera above the road in metres; without a metric scale only the lens is calibrated',
+        help='height of the camera above the road in metres; without any metric scale the size of the vehicles gives '
+        'it, to 14 %%',
     )
     known.add_argument(
         '--camera-height-sigma', type=float, metavar='S', help='standard deviation of the height (default: exact)'

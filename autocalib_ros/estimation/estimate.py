@@ -223,7 +223,9 @@ def _with_lane_markings(
 
 def _leaves_a_road_open(found: Solution | Reason) -> bool:
     """Whether a road may be there, but lens or plane about it are open."""
-    missing = found if isinstance(found, Reason) else found.plane_refusal
-    if missing is None:
-        return isinstance(found, Solution) and not found.from_markings and not (found.fit.plane_known and found.sharp)
-    return missing.code in SINGLE_ROAD_CODES
+    if isinstance(found, Reason):
+        return found.code in SINGLE_ROAD_CODES
+    if found.plane_refusal:
+        return found.plane_refusal.code in SINGLE_ROAD_CODES
+    sharp = found.from_markings or (found.fit.plane_known and found.sharp)
+    return not sharp or found.rests_on_told_focal

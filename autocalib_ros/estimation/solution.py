@@ -25,6 +25,8 @@ uses every track."""
 SHARP_FOCAL_SIGMA, SHARP_PLANE_SIGMA_DEG = 0.05, 1.5
 """Standard deviations of the focal length (relative) and of tilt or roll up to which a solution is not completed by
 further strategies. Judgement."""
+MIN_MEASURED_SHARE = 0.8
+"""Standard deviation of a focal length over that with which it was told, above which nothing has measured it."""
 
 
 @dataclass(frozen=True)
@@ -87,6 +89,13 @@ class Solution:
     def assumed(self) -> bool:
         """Whether the plane rests on one of the assumptions."""
         return self.plane.assumed is not None or self.reduced
+
+    @property
+    def rests_on_told_focal(self) -> bool:
+        """Whether lane markings give the plane for a focal length that was told and that they hardly measure."""
+        prior = self.fit.problem.config.prior
+        told = prior.focal_known and prior.sigma[0] > 0
+        return bool(self.from_markings and told and self.fit.focal_sigma > MIN_MEASURED_SHARE * prior.sigma[0])
 
     @property
     def full(self) -> bool:

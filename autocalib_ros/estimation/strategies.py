@@ -112,13 +112,13 @@ def with_single_road(found: Solution | Reason, single: Solution | Reason) -> Sol
     """Return a solution of a single road, or what was found if that is more certain by other traffic than straight one.
 
     Straight traffic on one road shows how much the lens curves, and no focal length but for an assumed lens family: a
-    solution by that assumption stands and falls with that of the wider family. Where both have a plane they are
-    compared.
+    solution by that assumption stands and falls with that of the wider family. Lane markings that take a told focal
+    length for granted are replaced, too: a single road doubts it. Where both have a plane they are compared.
     """
     if isinstance(single, Reason):
         assumed = isinstance(found, Solution) and not found.fit.plane_known and len(found.fit.problem.config.prior.free)
         return single if assumed else append_reason(found, single)
-    if isinstance(found, Reason) or found.plane_refusal:
+    if isinstance(found, Reason) or found.plane_refusal or found.rests_on_told_focal:
         return single
     difference_deg = unsigned_angle_deg(found.plane.normal(found.fit.state), single.plane.normal(single.fit.state))
     limit_deg = AGREEMENT_SIGMAS * float(np.hypot(found.plane.worst_sigma_deg, single.plane.worst_sigma_deg))
