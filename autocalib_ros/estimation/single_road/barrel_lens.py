@@ -25,6 +25,8 @@ USUAL_VIEW_DEG, USUAL_VIEW_FACTOR = 45.0, 1.65
 86 degrees, median 38, on 18 measured ones (BrnoCompSpeed, Sochor et al. 2018), and wide-angle lenses besides."""
 MIN_VIEW_DEG, MAX_VIEW_DEG = 18.0, 180.0
 """Fields of view that are tried: two standard deviations of the prior to the narrow side, and a fisheye's."""
+LEAST_VIEW_DEG = 4.0
+"""Least field of view that is tried where narrow ones are probable: long lenses over roads far away."""
 TRIAL_KAPPAS, TRIAL_VIEWS_DEG = (1.0, 0.6, 0.3, 0.0), (50.0, 75.0, 100.0, 125.0, 150.0)
 """Curvatures with a given focal length, and fields of view of equidistant lenses, at which roads are looked for."""
 FOCAL_NODES, KNOWN_FOCAL_NODES, KNOWN_FOCAL_SIGMAS = 32, 15, 2.8
@@ -66,6 +68,15 @@ class LensChoice:
         half = self._half_width
         shortest, longest = half / np.radians(MAX_VIEW_DEG / 2), half / np.tan(np.radians(MIN_VIEW_DEG / 2))
         return np.geomspace(shortest, longest, FOCAL_NODES)
+
+    def longer_than(self, focals: np.ndarray) -> np.ndarray:
+        """Return further focal lengths (m,) as far apart as `focals` (n,), up to those of the least field of view."""
+        if self.prior.focal_known or len(focals) < 2:
+            return focals[:0]
+        longest = self._half_width / np.tan(np.radians(LEAST_VIEW_DEG / 2))
+        ratio = focals[-1] / focals[-2]
+        steps = int(np.ceil(np.log(max(longest / focals[-1], 1.0)) / np.log(ratio)))
+        return np.asarray(focals[-1] * ratio ** np.arange(1.0, steps + 1.0))
 
     def trials(self) -> list[Camera]:
         """Return lenses through one of which a straight road looks about straight, in the order of their barrel."""

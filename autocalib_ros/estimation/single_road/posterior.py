@@ -46,6 +46,8 @@ KAPPA_NODES = 4
 MIN_SPACINGS, FINER_SHIFTS = 1.5, np.linspace(-2.5, 2.5, 16)
 """Standard deviation of the focal length, in spacings of the grid, below which a finer grid is solved; and the
 shifts of that grid from the mean, in spacings of the first."""
+MAX_END_WEIGHT = 0.02
+"""Probability of the longest focal length above which longer ones are tried: the prior alone leaves 1 % there."""
 KAPPA_TRIALS = 7
 """Curvatures at each focal length by which straight tracks measure it."""
 MAX_NATS_BEHIND = 15.0
@@ -165,6 +167,9 @@ def road_posterior(
     scene, solve = _RoadScene(segments, roll_sigma_rad), RoadThrough(fit, tracks)
     focals = choice.focal_lengths()
     fitted, nodes = _solve_grid(scene, solve, choice, focals)
+    longer = choice.longer_than(focals)
+    if len(longer) and _weights(nodes) @ [node.camera.focal_px > 0.999 * focals[-1] for node in nodes] > MAX_END_WEIGHT:
+        fitted, nodes = _solve_grid(scene, solve, choice, np.concatenate([focals, longer]))
     mean, sigma = _focal_moments(nodes)
     spacing = float(np.log(focals[1] / focals[0])) if len(focals) > 1 else 0.0
     if sigma < MIN_SPACINGS * spacing:

@@ -15,7 +15,13 @@ import numpy as np
 
 from autocalib_ros.evidence.snapshot import Evidence, Track
 from autocalib_ros.lens.camera import Camera, image_centre
-from autocalib_ros.offline.benchmark.road_families import single_road, single_road_bend, single_road_jam
+from autocalib_ros.offline.benchmark.road_families import (
+    single_road,
+    single_road_bend,
+    single_road_crossing,
+    single_road_jam,
+    single_road_telephoto,
+)
 from autocalib_ros.offline.simulate.junctions import junction as crossing
 from autocalib_ros.offline.simulate.motorway import highway
 from autocalib_ros.offline.simulate.network import Network
@@ -322,6 +328,8 @@ UNDERDETERMINED: dict[str, Family] = {
     'waved': family_of(swaying_camera),
     'waved_unseen': undetected_sway,
     'single_road_bend': single_road_bend,
+    'single_road_telephoto': single_road_telephoto,
+    'single_road_crossing': single_road_crossing,
     'short_piece': family_of(short_piece),
     'distortion_free_skew': family_of(distortion_free_skew),
 }

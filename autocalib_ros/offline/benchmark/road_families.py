@@ -20,6 +20,12 @@ from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_e
 SIZE = (1280, 720)
 VIEW_DEG, TILT_DEG, YAW_DEG = (25.0, 110.0), (6.0, 35.0), (0.0, 70.0)
 """Ranges of the horizontal field of view, of the tilt, and of the angle between road and view."""
+TELEPHOTO_VIEW_DEG, TELEPHOTO_YAW_DEG, TELEPHOTO_DISTANCE_M = (9.0, 18.0), (0.0, 15.0), (42.0, 55.0)
+"""The same of long lenses, and the distance at which they look at the road: it seems straight, and a gentle bend like a
+lens with distortion."""
+TELEPHOTO_RADIUS_M = (150.0, 800.0)
+CROSSING_YAW_DEG = (60.0, 88.0)
+"""Of roads that cross the view: the turn about the road is then the tilt, and a level camera says nothing about it."""
 VEHICLES = (20, 200)
 ROLL_SIGMA_DEG = 2.0
 COMMON_ACROSS_DEG, COMMON_UPRIGHT_DEG, GROUND_DEG = 0.75, 1.5, 1.2
@@ -35,9 +41,9 @@ END_PX = 0.5
 MIN_SEGMENT_PX = 10.0
 
 
-def draw_lens(generator: np.random.Generator) -> Camera:
+def draw_lens(generator: np.random.Generator, view_deg: tuple[float, float] = VIEW_DEG) -> Camera:
     """Draw a lens: half of them nearly distortion-free, where the field of view allows it, the others anything."""
-    view = np.radians(np.exp(generator.uniform(*np.log(VIEW_DEG))))
+    view = np.radians(np.exp(generator.uniform(*np.log(view_deg))))
     narrow = generator.uniform() < 0.5 and view < np.radians(90.0)
     kappa = float(np.clip(generator.normal(0.95, 0.1), 0.6, 1.05) if narrow else generator.uniform(0.0, 1.0))
     kappa = min(kappa, float((0.8 * np.pi / view) ** 2))  # the picture stays inside the lens
@@ -71,13 +77,41 @@ def single_road_bend(generator: np.random.Generator) -> tuple[Junction, Evidence
     return junction, _with_segments(junction, evidence, generator, middle_m)
 
 
-def _road(generator: np.random.Generator) -> Junction:
-    tilt, yaw = generator.uniform(*TILT_DEG), generator.choice([-1.0, 1.0]) * generator.uniform(*YAW_DEG)
+def single_road_telephoto(generator: np.random.Generator) -> tuple[Junction, Evidence]:
+    """Draw a long lens that looks along a road: straight in half of the draws, a gentle bend in the others."""
+    drawn, distance = _road(generator, view_deg=TELEPHOTO_VIEW_DEG), float(generator.uniform(*TELEPHOTO_DISTANCE_M))
+    yaw = float(generator.choice([-1.0, 1.0]) * generator.uniform(*TELEPHOTO_YAW_DEG))
+    tilt, roll = np.degrees(np.arctan2(drawn.height_m, distance)), generator.normal(0.0, ROLL_SIGMA_DEG)
+    ahead = distance * np.array([np.cos(np.radians(yaw)), -np.sin(np.radians(yaw))])
+    junction = replace(
+        drawn, camera_from_ground=pose(float(tilt), float(roll), yaw), centre_m=(float(ahead[0]), float(ahead[1]))
+    )
+    radius_m, towards_rad = generator.uniform(*TELEPHOTO_RADIUS_M), generator.choice([-1.0, 1.0]) * np.pi / 2
+    if generator.uniform() < 0.5:
+        curve = partial(drive_bend, radius_m=float(radius_m), towards_rad=float(towards_rad))
+        junction = replace(junction, drive=curve)
+    evidence = synthetic_evidence(junction, generator)
+    return junction, _with_segments(junction, evidence, generator)
+
+
+def single_road_crossing(generator: np.random.Generator) -> tuple[Junction, Evidence]:
+    """Draw a straight road that crosses the view."""
+    junction = _road(generator, yaw_deg=CROSSING_YAW_DEG)
+    evidence = synthetic_evidence(junction, generator)
+    return junction, _with_segments(junction, evidence, generator)
+
+
+def _road(
+    generator: np.random.Generator,
+    view_deg: tuple[float, float] = VIEW_DEG,
+    yaw_deg: tuple[float, float] = YAW_DEG,
+) -> Junction:
+    tilt, yaw = generator.uniform(*TILT_DEG), generator.choice([-1.0, 1.0]) * generator.uniform(*yaw_deg)
     height = generator.uniform(5.0, 12.0)
     reach = min(1.3 * height / np.tan(np.radians(tilt)), 40.0)
     beside = np.radians(-yaw)
     return Junction(
-        camera=draw_lens(generator),
+        camera=draw_lens(generator, view_deg),
         camera_from_ground=pose(float(tilt), float(generator.normal(0.0, ROLL_SIGMA_DEG)), float(yaw)),
         height_m=float(height),
         road_angles_deg=(0.0,),

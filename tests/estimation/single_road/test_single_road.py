@@ -16,6 +16,7 @@ from autocalib_ros.estimation.single_road.direction_mixture import (
 )
 from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera
+from autocalib_ros.offline.benchmark.monte_carlo import draw_evidence
 from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration
 from solved_once import solve_once
@@ -56,6 +57,26 @@ def test_a_given_focal_length_limits_those_that_are_tried() -> None:
     assert free.focal_lengths().min() < 410 and free.focal_lengths().max() > 4000
     # usual fields of view are the more probable ones
     assert free.log_prior(1400.0, 1.0) > free.log_prior(4000.0, 1.0) + 1.0
+
+
+def test_longer_lenses_go_on_from_the_longest_to_a_field_of_view_of_four_degrees() -> None:
+    prior = lens_priors(SIZE, JointOptions())[0]
+    choice = LensChoice(prior.with_unknown_focal(), JointOptions())
+    usual = choice.focal_lengths()
+    longer = choice.longer_than(usual)
+    np.testing.assert_allclose(np.diff(np.log(np.append(usual, longer))), np.log(usual[1] / usual[0]), rtol=1e-6)
+    assert longer[-2] < 640.0 / np.tan(np.radians(2.0)) <= longer[-1]
+    told = lens_priors(SIZE, JointOptions(focal_prior_px=900.0, focal_sigma_px=90.0))[0]
+    told_choice = LensChoice(told, JointOptions())
+    assert not len(told_choice.longer_than(told_choice.focal_lengths()))
+
+
+@pytest.mark.solve
+def test_a_telephoto_lens_is_not_taken_for_the_longest_of_usual_ones() -> None:
+    junction, evidence = draw_evidence('single_road_telephoto', 1, 0)  # 12 degrees across
+    found = solve_once(evidence, Options(camera_height=junction.height_m, lens=SQUARE)).candidate
+    sigma = found.stddev.focal_px / found.camera.focal_px
+    assert abs(np.log(found.camera.focal_px / junction.camera.focal_px)) < 2.0 * sigma
 
 
 def test_directions_about_a_road_are_level_without_a_turn() -> None:
