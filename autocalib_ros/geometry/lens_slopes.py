@@ -32,6 +32,30 @@ class _RayChange:
     """Of the log of the slope of the angle by the radius."""
 
 
+@dataclass(frozen=True)
+class _PixelGradient:
+    """Gradients by the pixel of scalar products of rays with normals, each of shape (...)."""
+
+    lever: np.ndarray
+    """The normal along the radius, at right angles to the bearing."""
+    around: np.ndarray
+    """The normal around the axis."""
+    radial: np.ndarray
+    """Derivative along the radius in the image plane."""
+    tangential: np.ndarray
+    """Derivative around the principal point in the image plane."""
+    to_radial: np.ndarray
+    """Derivative of half the squared norm by `radial`; that is `radial` itself where pixels are square."""
+    to_tangential: np.ndarray
+    """Derivative of half the squared norm by `tangential`."""
+    spin: np.ndarray | float
+    """Derivative of half the squared norm by the angle around the axis: 0 where pixels are square."""
+    by_u: np.ndarray
+    """Derivative by u."""
+    norm2: np.ndarray
+    """Squared norm of the derivatives by u and v."""
+
+
 class PolarRays:
     """Rays of pixels (..., 2), with their bearings (..., 3), in polar coordinates about the axis of the lens."""
 
@@ -51,29 +75,97 @@ class PolarRays:
 
     def distance_slopes(self, normals: np.ndarray, parameters: np.ndarray) -> Iterator[np.ndarray]:
         """Yield the derivatives (...) of `Rays.distance_px` by each parameter, for fixed normals (..., 3)."""
-        x, y, sine, cosine, radius, slope = self._x, self._y, self._sine, self._cosine, self._radius, self._slope
-        aspect, skew = self._camera.pixel_aspect, self._camera.skew
+        x, y, sine, cosine = self._x, self._y, self._sine, self._cosine
         # the normal along the radius and around the axis
         outwards, around = normals[..., 0] * x + normals[..., 1] * y, normals[..., 1] * x - normals[..., 0] * y
         product, lever = sine * outwards + cosine * normals[..., 2], cosine * outwards - sine * normals[..., 2]
-        # derivatives of the product: along the radius and around the axis, by x and y, and by the pixel
-        radial, tangential = slope * lever, sine * around / radius
+        gradient = self._gradient(lever, around)
+        norm2 = np.maximum(gradient.norm2, 1e-18)
+        scale = 1.0 / np.sqrt(norm2)
+        for slope in self._whitened_slopes(product, gradient, (lever, around), product / norm2, parameters):
+            yield scale * slope
+
+    def normal_along(self, by_u: np.ndarray, by_v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return components of a vector along the radius and around the axis, from its products with `Rays`.
+
+        `by_u` and `by_v` (...) are the scalar products of the vector with `Rays.radial` and `Rays.tangential`.
+        """
+        if not self._camera.has_square_pixels:
+            by_x = by_u / self._camera.pixel_aspect
+            by_y = by_v + self._camera.skew * by_x
+            by_u, by_v = self._x * by_x + self._y * by_y, self._x * by_y - self._y * by_x
+        return by_u / self._slope, by_v * self._radius / np.maximum(self._sine, 1e-12)
+
+    def epipolar_slopes(
+        self,
+        error: np.ndarray,
+        lines: tuple[np.ndarray, np.ndarray],
+        pulls: tuple[np.ndarray, np.ndarray],
+        ratio: np.ndarray,
+        parameters: np.ndarray,
+    ) -> Iterator[np.ndarray]:
+        """Yield the derivatives (...) of an epipolar error, less `ratio` times those of half its squared gradient.
+
+        Rays are of both ends, shape (2, ...), and so are the results, of which the sum over the ends is the whole:
+        `lines` is the normal at each end, along the radius and around the axis, and `pulls` the derivative by the
+        bearing of each end of all that is not the ray's own gradient.
+        """
+        return self._whitened_slopes(error, self._gradient(*lines), pulls, ratio, parameters)
+
+    def _gradient(self, lever: np.ndarray, around: np.ndarray) -> _PixelGradient:
+        """Return the gradient by the pixel of products with normals, given along the radius and around the axis."""
+        radial, tangential = self._slope * lever, self._sine * around / self._radius
+        if self._camera.has_square_pixels:
+            norm2 = radial * radial + tangential * tangential
+            # the derivative by u is needed squared, and by the pixel aspect alone
+            by_u = self._x * radial - self._y * tangential
+            return _PixelGradient(lever, around, radial, tangential, radial, tangential, 0.0, by_u, norm2)
+        x, y, aspect, skew = self._x, self._y, self._camera.pixel_aspect, self._camera.skew
         by_x, by_y = x * radial - y * tangential, y * radial + x * tangential
         by_u, by_v = aspect * by_x, by_y - skew * by_x
-        norm2 = np.maximum(by_u * by_u + by_v * by_v, 1e-18)
-        scale = 1.0 / np.sqrt(norm2)
+        by_u_x = aspect * by_u - skew * by_v
+        return _PixelGradient(
+            lever,
+            around,
+            radial,
+            tangential,
+            x * by_u_x + y * by_v,
+            x * by_v - y * by_u_x,
+            by_v * by_x - by_u_x * by_y,
+            by_u,
+            by_u * by_u + by_v * by_v,
+        )
+
+    def _whitened_slopes(
+        self,
+        product: np.ndarray,
+        gradient: _PixelGradient,
+        pulls: tuple[np.ndarray, np.ndarray],
+        ratio: np.ndarray,
+        parameters: np.ndarray,
+    ) -> Iterator[np.ndarray]:
+        """Yield the derivatives (...) of products, less `ratio` times those of half their squared gradients.
+
+        `pulls` are the derivatives by the bearing along the radius and around the axis. All is linear in the change of
+        the rays, so that one parameter more costs little.
+        """
+        lever, around, sine, cosine = gradient.lever, gradient.around, self._sine, self._cosine
+        radial, tangential = ratio * gradient.to_radial, ratio * gradient.to_tangential
+        by_angle = pulls[0] + self._slope * product * radial - around * cosine / self._radius * tangential
+        by_turn = (
+            sine * pulls[1]
+            - self._slope * cosine * around * radial
+            + sine / self._radius * (sine * product + cosine * lever) * tangential
+            - ratio * gradient.spin
+        )
+        by_length, by_steepness = gradient.tangential * tangential, -gradient.radial * radial
         for parameter, change in zip(parameters, self._changes(parameters), strict=True):
-            swing = around * change.turned
-            more_radial = radial * change.steeper + slope * (cosine * swing - product * change.wider)
-            more_tangential = (
-                around * cosine * change.wider - sine * outwards * change.turned
-            ) / radius - tangential * change.longer
-            more_x = x * more_radial - y * more_tangential - by_y * change.turned
-            more_y = y * more_radial + x * more_tangential + by_x * change.turned
-            half_norm2 = by_u * aspect * more_x + by_v * (more_y - skew * more_x)
+            slope = by_angle * change.wider + by_steepness * change.steeper
+            if parameter not in (LOG_FOCAL, K1, K2):
+                slope += by_turn * change.turned + by_length * change.longer
             if parameter == LOG_ASPECT:
-                half_norm2 = half_norm2 + by_u * by_u
-            yield scale * (lever * change.wider + sine * swing - product * half_norm2 / norm2)
+                slope -= ratio * gradient.by_u * gradient.by_u
+            yield slope
 
     def heading_slopes(
         self, ways_px: np.ndarray, directions: np.ndarray, parameters: np.ndarray

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from moved_lenses import moved_lens
 
 from autocalib_ros.estimation.markings.road_segments import ProjectedSegments
 from autocalib_ros.geometry.great_circles import unproject_rays
@@ -19,18 +20,6 @@ BARREL = replace(EQUIDISTANT, k=(0.05, -0.01, 0.002, 0.0))
 SQUEEZED = replace(BARREL, pixel_aspect=1.3, skew=0.05)
 NARROW = replace(EQUIDISTANT, k=(-0.3, 0.01, 0.0, 0.0))
 """The corners of the image lie beyond its range."""
-
-
-def moved(camera: Camera, parameter: int, step: float) -> Camera:
-    (cx, cy), (k1, k2, *rest) = camera.principal_point_px, camera.k
-    if parameter in (CENTRE_X, CENTRE_Y):
-        point = (cx + step, cy) if parameter == CENTRE_X else (cx, cy + step)
-        return replace(camera, principal_point_px=point)
-    if parameter in (K1, K2):
-        return replace(camera, k=(k1 + step, k2, *rest) if parameter == K1 else (k1, k2 + step, *rest))
-    if parameter == LOG_FOCAL:
-        return replace(camera, focal_px=camera.focal_px * np.exp(step))
-    return replace(camera, pixel_aspect=camera.pixel_aspect * np.exp(step))
 
 
 each_lens = pytest.mark.parametrize(
@@ -47,7 +36,7 @@ def test_slopes_of_distances_are_those_of_small_steps(camera: Camera, parameter:
     normals = generator.normal(size=(40, 1, 3))
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     ahead, behind = (
-        unproject_rays(moved(camera, parameter, step), pixels).distance_px(normals) for step in (STEP, -STEP)
+        unproject_rays(moved_lens(camera, parameter, step), pixels).distance_px(normals) for step in (STEP, -STEP)
     )
     (slope,) = PolarRays(camera, pixels, unproject_rays(camera, pixels).bearings).distance_slopes(
         normals, np.array([parameter])
@@ -65,7 +54,7 @@ def test_slopes_of_headings_are_those_of_small_steps(camera: Camera, parameter: 
     ends = np.concatenate([middles - ways / 2, middles + ways / 2], axis=1)
     directions = np.linalg.qr(generator.normal(size=(3, 3)))[0]
     ahead, behind = (
-        ProjectedSegments.from_camera(moved(camera, parameter, step), ends).residuals(directions)
+        ProjectedSegments.from_camera(moved_lens(camera, parameter, step), ends).residuals(directions)
         for step in (STEP, -STEP)
     )
     rays = PolarRays(camera, middles, unproject_rays(camera, middles).bearings)

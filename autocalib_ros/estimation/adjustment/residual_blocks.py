@@ -27,10 +27,6 @@ from autocalib_ros.geometry.great_circles import Rays, fit_circles_through, unpr
 from autocalib_ros.geometry.lens_slopes import PolarRays
 from autocalib_ros.geometry.small_matrices import cross, dot
 
-DIFFERENTIATION_STEP = 1e-6
-"""Step of forward differences, in units of the parameters, where no closed form is used: balances truncation against
-double-precision rounding."""
-
 
 @dataclass(frozen=True)
 class LinearisedRows:
@@ -216,13 +212,16 @@ class PlanarMotionBlock:
         return motion, ((self._root * view.distances(motion)) ** 2).sum(axis=1) / self.dof
 
     def linearise(self) -> LinearisedRows:
-        """Return the rows at the base, by forward differences; the motion of each window is projected out."""
+        """Return the rows at the base, with closed derivatives; the motion of each window is projected out."""
         parameters = self._parameters
         if not len(self.dof):  # as in most adjustments
             return LinearisedRows.none(parameters.size)
-        columns = [
-            (self._distances_at(unit) - self._distances) / DIFFERENTIATION_STEP for unit in np.eye(parameters.size)
-        ]
+        prior, base, lens = parameters.config.prior, parameters.base, parameters.lens
+        polar = PolarRays(base.camera, self._windows.ends_px, self._base.rays.bearings)
+        columns = self._base.shared_slopes(self.warm_start, polar, prior.free, parameters.axes)
+        columns[:lens] = [slope * unit for slope, unit in zip(columns, prior.units, strict=False)]
+        # windows do not depend on road angles
+        columns += [np.zeros(self._distances.shape)] * len(parameters.free_angles)
         jacobian = self._root[..., None] * np.stack(columns, axis=-1)
         own = self._root[..., None] * self._slopes
         matrix = own.transpose(0, 2, 1) @ own + 1e-9 * np.eye(2)
@@ -236,18 +235,6 @@ class PlanarMotionBlock:
         window, point = np.nonzero(self._base.mask)
         distance = np.abs(self._distances * self._base.sigma_px)
         return self._windows.second_px[window, point], distance[window, point]
-
-    def _distances_at(self, unit: np.ndarray) -> np.ndarray:
-        """Return the distances one differentiation step along a unit parameter vector, with motions fixed."""
-        lens, turns = self._parameters.lens, self._parameters.lens + len(self._parameters.axes)
-        if unit[turns:].any():
-            return self._distances  # windows do not depend on road angles
-        view = (
-            self._base.turned(self._parameters.turned(DIFFERENTIATION_STEP * unit[lens:turns]))
-            if unit[lens:].any()
-            else (self._view(self._parameters.state(DIFFERENTIATION_STEP * unit)))
-        )
-        return view.distances(self.warm_start)
 
 
 class RigidBodyBlock:
@@ -287,11 +274,9 @@ class RigidBodyBlock:
         """Return the rows at the base; shape and motion of each tracklet are projected out."""
         parameters, bundle, base = self._parameters, self._bundle, self._parameters.base
         jacobian, by_place = bundle.jacobian(base.camera, base.rotation, self.warm_start)
-        lenses = [parameters.camera(DIFFERENTIATION_STEP * unit) for unit in np.eye(parameters.lens)]
-        columns = [
-            change / DIFFERENTIATION_STEP
-            for change in bundle.residual_changes(lenses, base.camera, base.rotation, self.warm_start)
-        ]
+        prior = parameters.config.prior
+        slopes = bundle.lens_jacobian(prior.free, base.camera, base.rotation, self.warm_start)
+        columns = [slope * unit for slope, unit in zip(slopes, prior.units, strict=True)]
         columns += [bundle.rotation_jacobian(axis, by_place, self.warm_start) for axis in parameters.axes]
         columns += [np.zeros(self._residuals.shape)] * len(parameters.free_angles)
         own, residuals = bundle.weighted_system(jacobian, self._residuals)

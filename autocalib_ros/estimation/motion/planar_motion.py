@@ -15,7 +15,8 @@ import numpy as np
 
 from autocalib_ros.config import JointOptions
 from autocalib_ros.estimation.observations.two_frame_windows import TwoFrameWindows
-from autocalib_ros.geometry.great_circles import unproject_rays
+from autocalib_ros.geometry.great_circles import Rays, unproject_rays
+from autocalib_ros.geometry.lens_slopes import PolarRays
 from autocalib_ros.geometry.robust_kernels import cauchy_loss, cauchy_weight
 from autocalib_ros.lens.camera import Camera
 
@@ -70,6 +71,8 @@ class WindowRays:
     mask: np.ndarray
     sigma_px: np.ndarray
     """Standard deviation of a tracked point over the window, shape (windows, points)."""
+    rays: Rays
+    """The same in the frame of the camera, of shape (2, windows, points)."""
 
     @classmethod
     def of(
@@ -82,12 +85,7 @@ class WindowRays:
             np.matmul(camera_from_plane.T, vectors.reshape(-1, 3).T, out=components[kind].reshape(3, -1))
         # a tracked point drifts as a random walk; each end gets half of the variance
         sigma = np.sqrt(options.noise_px**2 + 0.5 * options.drift_px**2 * windows.lengths_px)
-        return cls(components, windows.mask, sigma)
-
-    def turned(self, rotation: np.ndarray) -> WindowRays:
-        """Return the rays in a rotated frame, old_from_new (3, 3)."""
-        turned = (rotation.T @ self.components.reshape(3, 3, -1)).reshape(self.components.shape)
-        return WindowRays(turned, self.mask, self.sigma_px)
+        return cls(components, windows.mask, sigma, rays)
 
     @property
     def first(self) -> np.ndarray:
@@ -114,6 +112,22 @@ class WindowRays:
         )
         return scale * lines.error, by_turn, by_heading
 
+    def shared_slopes(
+        self, motion: PlanarMotion, polar: PolarRays, lens: np.ndarray, axes: np.ndarray
+    ) -> list[np.ndarray]:
+        """Return the derivatives (windows, points) of the distances by what all windows share, with fixed motions.
+
+        By each parameter in `lens` (see `geometry.lens_slopes`), then by rotations of the plane about `axes` (n, 3) in
+        its own frame. `polar` are the rays of both ends, of shape (2, windows, points).
+        """
+        lines = _EpipolarLines.of(self, motion)
+        scale = self._masked_weight / np.sqrt(lines.gradient2)
+        columns = [scale * slope for slope in lines.lens_slopes(self, motion, polar, lens)]
+        if len(axes):
+            levers = lines.rotation_levers(self, motion)
+            columns += [scale * _dot_components(levers, tuple(axis)) for axis in axes.tolist()]
+        return columns
+
     @cached_property
     def _masked_weight(self) -> np.ndarray:
         """One over the standard deviation, 0 outside the mask, shape (windows, points)."""
@@ -126,6 +140,8 @@ class _EpipolarLines:
 
     turned: tuple[np.ndarray, ...]
     """x and y of the first bearing after the turn."""
+    line: tuple[np.ndarray, ...]
+    """Line of the first point in the frame of the second, t x R a."""
     back: tuple[np.ndarray, ...]
     """Line of the second point in the frame of the first, R^T (b x t)."""
     error: np.ndarray
@@ -136,14 +152,9 @@ class _EpipolarLines:
 
     @classmethod
     def of(cls, view: WindowRays, motion: PlanarMotion) -> _EpipolarLines:
-        (cosine, sine), (along, across) = _cosine_sine(motion.turn_rad), _cosine_sine(motion.heading_rad)
-        ((x, y, z), radial, tangential), ((u, v, w), radial_second, tangential_second) = view.first, view.second
-        turned = (cosine * x - sine * y, sine * x + cosine * y)
-        # the epipolar line of the first point, t x R a, and that of the second, R^T (b x t)
-        line = (across * z, -along * z, along * turned[1] - across * turned[0])
-        # R^T turns the heading back: the line of the second point is b x t in the frame of the first
-        along_back, across_back = cosine * along + sine * across, cosine * across - sine * along
-        back = (-w * across_back, w * along_back, u * across - v * along)
+        (first, radial, tangential), (second, radial_second, tangential_second) = view.first, view.second
+        turned, line = _line_ahead(first, motion)
+        back = _line_back(second, motion)
         slopes = (
             _dot_components(radial_second, line),
             _dot_components(tangential_second, line),
@@ -151,7 +162,55 @@ class _EpipolarLines:
             _dot_components(tangential, back),
         )
         gradient2 = np.maximum(_dot_components(slopes, slopes) + slopes[3] ** 2, 1e-18)
-        return cls(turned, back, u * line[0] + v * line[1] + w * line[2], gradient2, slopes)
+        return cls(turned, line, back, _dot_components(second, line), gradient2, slopes)
+
+    def lens_slopes(
+        self, view: WindowRays, motion: PlanarMotion, polar: PolarRays, parameters: np.ndarray
+    ) -> Iterator[np.ndarray]:
+        """Yield the derivatives by the lens of the error, less those of half the squared gradient times the ratio."""
+        ratio, (far_first, far_second) = self.ratio, self._far_lines(view, motion)
+        (_, radial, tangential), (_, radial_second, tangential_second) = view.first, view.second
+        by_u, by_v = np.stack([self.slopes[2], self.slopes[0]]), np.stack([self.slopes[3], self.slopes[1]])
+        far_u = np.stack([_dot_components(radial, far_first), _dot_components(radial_second, far_second)])
+        far_v = np.stack([_dot_components(tangential, far_first), _dot_components(tangential_second, far_second)])
+        for both_ends in polar.epipolar_slopes(
+            self.error,
+            polar.normal_along(by_u, by_v),
+            polar.normal_along(by_u - ratio * far_u, by_v - ratio * far_v),
+            ratio,
+            parameters,
+        ):
+            yield both_ends[0] + both_ends[1]
+
+    def rotation_levers(self, view: WindowRays, motion: PlanarMotion) -> np.ndarray:
+        """Return the same derivatives by the three rotations of the plane, shape (3, windows, points)."""
+        ratio, (far_first, far_second) = self.ratio, self._far_lines(view, motion)
+        pull_first, pull_second = self._pulls(view)
+        (first, _, _), (second, _, _) = view.first, view.second
+        line, back = np.stack(self.line), np.stack(self.back)
+        # every ray turns the other way; the line of the other end turns with it
+        levers = _cross_components(second - ratio * pull_second, line) - ratio * _cross_components(second, far_second)
+        levers += _cross_components(first, back - ratio * far_first) - ratio * _cross_components(pull_first, back)
+        return -levers
+
+    @property
+    def ratio(self) -> np.ndarray:
+        """Error over its squared gradient: how much the change of the gradient counts."""
+        return self.error / self.gradient2
+
+    def _pulls(self, view: WindowRays) -> tuple[np.ndarray, np.ndarray]:
+        """Sum of the directions of both ends times their slopes, shape (3, windows, points) each, first end first."""
+        (_, radial, tangential), (_, radial_second, tangential_second) = view.first, view.second
+        by_second, around_second, by_first, around_first = self.slopes
+        return (
+            by_first * radial + around_first * tangential,
+            by_second * radial_second + around_second * tangential_second,
+        )
+
+    def _far_lines(self, view: WindowRays, motion: PlanarMotion) -> tuple[np.ndarray, np.ndarray]:
+        """Derivative of half the squared slopes of the other end by the bearing of each end, first end first."""
+        pull_first, pull_second = self._pulls(view)
+        return np.stack(_line_back(pull_second, motion)), np.stack(_line_ahead(pull_first, motion)[1])
 
     def derivatives(self, view: WindowRays, motion: PlanarMotion) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Yield the derivatives of the error and of half the squared gradient, by the turn and by the heading."""
@@ -178,6 +237,31 @@ class _EpipolarLines:
             u * line[0] + v * line[1] + w * line[2],
             _dot_components(slopes, by_heading) + slopes[3] * by_heading[3],
         )
+
+
+def _line_ahead(
+    vectors: np.ndarray, motion: PlanarMotion
+) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, ...]]:
+    """Turn vectors a (3, windows, points) of the first end: x and y of R a, and the epipolar line t x R a."""
+    (cosine, sine), (along, across) = _cosine_sine(motion.turn_rad), _cosine_sine(motion.heading_rad)
+    x, y, z = vectors
+    turned = (cosine * x - sine * y, sine * x + cosine * y)
+    return turned, (across * z, -along * z, along * turned[1] - across * turned[0])
+
+
+def _line_back(vectors: np.ndarray, motion: PlanarMotion) -> tuple[np.ndarray, ...]:
+    """Return the epipolar line R^T (b x t) of vectors b (3, windows, points) of the second end."""
+    (cosine, sine), (along, across) = _cosine_sine(motion.turn_rad), _cosine_sine(motion.heading_rad)
+    u, v, w = vectors
+    # R^T turns the heading back: the line of the second point is b x t in the frame of the first
+    along_back, across_back = cosine * along + sine * across, cosine * across - sine * along
+    return -w * across_back, w * along_back, u * across - v * along
+
+
+def _cross_components(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Cross product of vectors that are given by component, (3, ...)."""
+    (x, y, z), (u, v, w) = first, second
+    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u])
 
 
 def _cosine_sine(angle_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -15,11 +15,10 @@ import numpy as np
 from autocalib_ros.estimation.observations.point_drift import drift_covariance, tracked_path_px
 from autocalib_ros.estimation.observations.tracklets import Tracklets
 from autocalib_ros.geometry.great_circles import unproject_rays
+from autocalib_ros.geometry.projection_slopes import ProjectedPoints
 from autocalib_ros.geometry.robust_kernels import cauchy_loss, cauchy_weight
 from autocalib_ros.lens.camera import Camera
 
-DERIVATIVE_STEP = 1e-6
-"""Step of the numerical derivatives, in camera heights."""
 START_DAMPING = 1e-4
 """Damping of the first iteration, as a fraction of the diagonal."""
 CAUCHY_SCALE, START_CAUCHY_SCALE = 2.0, 50.0
@@ -182,16 +181,8 @@ class TrackletBundle:
         Shapes (tracklets, points, instants, 2, 3 points + 3 instants) and (tracklets, points, instants, 2, 3).
         """
         placed = self._positions(unknowns)
-        in_camera = placed @ camera_from_plane.T
-        here, _ = camera.project(in_camera)
-        # lengths are in camera heights, so one step suits bodies of any size
-        by_place = (
-            np.stack(
-                [camera.project(in_camera + DERIVATIVE_STEP * axis)[0] - here for axis in camera_from_plane.T], axis=-1
-            )
-            / DERIVATIVE_STEP
-            * self.mask[..., None, None]
-        )
+        slopes = ProjectedPoints(camera, placed @ camera_from_plane.T).place_slopes()
+        by_place = (slopes * self.mask[..., None, None]) @ camera_from_plane
         cosine, sine = (part[:, None, :, None] for part in (np.cos(unknowns.turns_rad), np.sin(unknowns.turns_rad)))
         x, y, z = np.moveaxis(by_place, -1, 0)
         by_point = self._whitened(np.stack([x * cosine + y * sine, y * cosine - x * sine, z], axis=-1))
@@ -212,13 +203,12 @@ class TrackletBundle:
         tracklets, points, instants = self.mask.shape
         return (self.whiten @ jacobian.reshape(tracklets, points, instants, -1)).reshape(jacobian.shape)
 
-    def residual_changes(
-        self, cameras: list[Camera], camera: Camera, camera_from_plane: np.ndarray, unknowns: StructureAndMotion
+    def lens_jacobian(
+        self, parameters: np.ndarray, camera: Camera, camera_from_plane: np.ndarray, unknowns: StructureAndMotion
     ) -> list[np.ndarray]:
-        """Whitened changes (tracklets, points, instants, 2) of the residuals from one camera to each of the others."""
-        in_camera = self._positions(unknowns) @ camera_from_plane.T
-        here, _ = camera.project(in_camera)
-        return [self.whiten @ ((other.project(in_camera)[0] - here) * self.mask[..., None]) for other in cameras]
+        """Whitened derivatives (tracklets, points, instants, 2) by lens parameters, see `geometry.lens_slopes`."""
+        projected = ProjectedPoints(camera, self._positions(unknowns) @ camera_from_plane.T)
+        return [self.whiten @ (slope * self.mask[..., None]) for slope in projected.lens_slopes(parameters)]
 
     def rotation_jacobian(self, axis: np.ndarray, by_place: np.ndarray, unknowns: StructureAndMotion) -> np.ndarray:
         """Whitened derivative (tracklets, points, instants, 2) by rotation of the plane about its axis (3,)."""

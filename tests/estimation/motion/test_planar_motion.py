@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from moved_lenses import moved_lens
 
 from autocalib_ros.config import JointOptions
 from autocalib_ros.estimation.adjustment.lens_prior import lens_priors
@@ -17,6 +20,8 @@ from autocalib_ros.estimation.motion.planar_motion import (
     without_side_slip,
 )
 from autocalib_ros.estimation.observations.two_frame_windows import TwoFrameWindows
+from autocalib_ros.geometry.lens_slopes import PolarRays
+from autocalib_ros.geometry.small_matrices import rotation_matrix
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.synthetic.junction import pose
 
@@ -167,6 +172,36 @@ def test_derivatives_match_finite_differences() -> None:
     changed = rows.dof * (there - here.squared)
     foretold = 2 * here.gradient @ step + np.einsum('p,rpq,q->r', step, here.curvature, step)
     assert changed == pytest.approx(foretold, rel=0.03)
+
+
+@pytest.mark.parametrize(
+    'camera',
+    [replace(CAMERA, k=(0.05, -0.01, 0.002, 0.0)), replace(CAMERA, pixel_aspect=1.3, skew=0.05)],
+    ids=['square', 'squeezed'],
+)
+def test_shared_slopes_are_those_of_small_steps(camera: Camera) -> None:
+    generator = np.random.default_rng(7)
+    pixels = np.stack([turning(generator, turn) for turn in (15.0, -30.0, 40.0, 3.0)])
+    windows = windows_of(pixels + generator.normal(scale=1.0, size=pixels.shape))
+
+    def view_through(lens: Camera, pose_after: np.ndarray) -> WindowRays:
+        return WindowRays.of(windows, lens, pose_after, JointOptions())
+
+    def difference(ahead: WindowRays, behind: WindowRays) -> np.ndarray:
+        return (ahead.distances(motion) - behind.distances(motion)) / (2 * step)
+
+    view, step, axes = view_through(camera, POSE), 1e-6, np.eye(3)
+    motion = initial_motion(view)
+    differences = [
+        difference(*(view_through(moved_lens(camera, parameter, sign * step), POSE) for sign in (1, -1)))
+        for parameter in range(6)
+    ] + [
+        difference(*(view_through(camera, POSE @ rotation_matrix(sign * step * axis)) for sign in (1, -1)))
+        for axis in axes
+    ]
+    slopes = view.shared_slopes(motion, PolarRays(camera, windows.ends_px, view.rays.bearings), np.arange(6), axes)
+    for slope, expected in zip(slopes, differences, strict=True):
+        np.testing.assert_allclose(slope, expected, atol=1e-6 * np.abs(expected).max())
 
 
 def test_a_subset_of_motions_keeps_its_order() -> None:
