@@ -17,7 +17,7 @@ from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
 from autocalib_ros.offline.synthetic.junction import synthetic_evidence
 from autocalib_ros.results.calibration import Calibration
 from autocalib_ros.results.refusals import Reason
-from solved_once import solve_once
+from solved_once import evidence_once, find_once, solve_once
 
 pytestmark = pytest.mark.solve
 
@@ -31,11 +31,14 @@ def distance(ends: tuple[tuple[float, float], ...], factor: float = 1.0) -> str:
     return ' '.join(f'{value:.3f}' for value in (*pixels.ravel(), factor * np.hypot(*np.subtract(*ends))))
 
 
-def found(*distances: str, height: float = 0.0) -> Calibration:
+def options_with(*distances: str, height: float = 0.0) -> Options:
     scale = ScaleOptions(distances='; '.join(distances), distance_sigma_m=0.1)
     gate = GateOptions(least_grade='assumed')
-    options = Options(camera_height=height, scale=scale, lens=LensOptions(pixel_aspect=1.0), gate=gate)
-    return solve_once(synthetic_evidence(ROAD, np.random.default_rng(0)), options).candidate
+    return Options(camera_height=height, scale=scale, lens=LensOptions(pixel_aspect=1.0), gate=gate)
+
+
+def found(*distances: str, height: float = 0.0) -> Calibration:
+    return solve_once(evidence_once(ROAD), options_with(*distances, height=height)).candidate
 
 
 def test_a_length_along_and_one_across_make_the_other_lengths_certain() -> None:
@@ -53,8 +56,12 @@ def test_a_length_along_and_one_across_make_the_other_lengths_certain() -> None:
 
 
 def test_lengths_that_contradict_each_other_are_named() -> None:
-    right, wrong = (found(distance(ALONG), distance(((16.0, 1.0), (22.0, 1.0)), factor)) for factor in (1.0, 1.5))
-    rows = [next(row for row in each.verification if row.kind == 'known_lengths') for each in (right, wrong)]
+    evidence, rows = evidence_once(ROAD), []
+    for factor in (1.0, 1.5):
+        options = options_with(distance(ALONG), distance(((16.0, 1.0), (22.0, 1.0)), factor))
+        tracks = select_tracks(evidence, options.joint.max_tracks)
+        adjusted = adjust_to_lengths(find_once(evidence, tracks, options), tracks, options)
+        rows.append(next(row for row in adjusted.comparisons if row.kind == 'known_lengths'))
     assert rows[0].passed and not rows[1].passed and rows[1].contradicts
     assert 'known lengths against each other' in str(rows[1])
 

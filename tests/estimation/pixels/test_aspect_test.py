@@ -16,7 +16,7 @@ from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.offline.benchmark.monte_carlo import draw_evidence
 from autocalib_ros.offline.synthetic.junction import Junction
 from autocalib_ros.results.calibration import Calibration, Refusal
-from solved_once import evidence_once, solve_once
+from solved_once import ONE_FAMILY, evidence_once, solve_once
 
 GOLDEN = Path(__file__).parents[2] / 'golden'
 OPTIONS = Options(camera_height=8.0)
@@ -42,7 +42,7 @@ def test_square_pixels_are_not_called_squeezed(two_roads: Evidence) -> None:
 
 def test_a_squeezed_picture_is_found_by_its_traffic_and_said() -> None:
     junction = Junction(vehicles=120)
-    result = solve_once(squeezed(evidence_once(junction), 720, 576), OPTIONS)
+    result = solve_once(squeezed(evidence_once(junction), 720, 576), replace(OPTIONS, joint=ONE_FAMILY))
     assert 'squeezed_pixels' in kinds(result)
     camera, sigma = result.camera, result.stddev.focal_px
     # CameraInfo is of the images as they are delivered
@@ -112,7 +112,7 @@ def test_a_squeeze_that_the_traffic_hints_at_is_not_answered_with_confidence(run
 
 def test_an_undecided_aspect_of_a_squeezed_size_is_refused_with_the_option_to_set() -> None:
     skew = Evidence.load(GOLDEN / 'skew.npz')
-    result = solve_once(squeezed(skew, 720, 576), OPTIONS)
+    result = solve_once(squeezed(skew, 720, 576), replace(OPTIONS, joint=ONE_FAMILY))
     assert isinstance(result, Refusal)
     assert result.code == 'pixel_aspect'
     assert 'lens.pixel_aspect' in result.remedy

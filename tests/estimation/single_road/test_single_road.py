@@ -7,21 +7,25 @@ import pytest
 from pinhole_road import PINHOLE, ROAD, SIZE
 
 from autocalib_ros.config import JointOptions, LensOptions, Options
+from autocalib_ros.estimation.adjustment.bundle_adjustment import evaluate_at
 from autocalib_ros.estimation.adjustment.lens_prior import lens_priors
+from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig, AdjustmentState, Parameterisation
+from autocalib_ros.estimation.observations.track_set import select_tracks
 from autocalib_ros.estimation.single_road.barrel_lens import LensChoice, barrel_coefficients
 from autocalib_ros.estimation.single_road.bent_road import across_and_up
 from autocalib_ros.estimation.single_road.direction_mixture import (
     STILL_SEGMENTS,
     DirectionMixture,
 )
+from autocalib_ros.estimation.single_road.road_solution import SingleRoad
+from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.benchmark.monte_carlo import draw_evidence
 from autocalib_ros.offline.synthetic.junction import Junction, pose, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration
+from autocalib_ros.results.refusals import reason
 from solved_once import solve_once
-
-SQUARE = LensOptions(pixel_aspect=1.0)
 
 
 def scenery(junction: Junction, generator: np.random.Generator, count: int = 40) -> np.ndarray:
@@ -74,7 +78,7 @@ def test_longer_lenses_go_on_from_the_longest_to_a_field_of_view_of_four_degrees
 @pytest.mark.solve
 def test_a_telephoto_lens_is_not_taken_for_the_longest_of_usual_ones() -> None:
     junction, evidence = draw_evidence('single_road_telephoto', 1, 0)  # 12 degrees across
-    found = solve_once(evidence, Options(camera_height=junction.height_m, lens=SQUARE)).candidate
+    found = solve_once(evidence, Options(camera_height=junction.height_m, lens=LensOptions(pixel_aspect=1.0))).candidate
     sigma = found.stddev.focal_px / found.camera.focal_px
     assert abs(np.log(found.camera.focal_px / junction.camera.focal_px)) < 2.0 * sigma
 
@@ -106,28 +110,36 @@ def test_the_likelihood_of_the_scenery_is_highest_at_the_true_turn_and_lens() ->
     assert by_lens[1.0].max() > max(by_lens[0.7].max(), by_lens[1.4].max()) + 5.0
 
 
-@pytest.mark.solve
-@pytest.mark.parametrize('given', [False, True])
-def test_a_road_without_curvature_gives_what_its_scenery_shows(given: bool) -> None:
+@pytest.fixture(scope='module')
+def seen_road() -> Evidence:
+    """Traffic of the road, and its scenery."""
     generator = np.random.default_rng(1)
-    evidence = replace(synthetic_evidence(ROAD, generator), still_lines_px=scenery(ROAD, generator))
-    joint = JointOptions(focal_prior_px=1050.0, focal_sigma_px=105.0) if given else JointOptions()
-    result = solve_once(evidence, Options(camera_height=ROAD.height_m, joint=joint, lens=SQUARE))
-    found = result.candidate
+    return replace(synthetic_evidence(ROAD, generator), still_lines_px=scenery(ROAD, generator))
+
+
+def found_with(evidence: Evidence, joint: JointOptions | None = None, **lens: float) -> Calibration:
+    lens_options = LensOptions(pixel_aspect=1.0, **lens)
+    options = Options(camera_height=ROAD.height_m, joint=joint or JointOptions(), lens=lens_options)
+    found = solve_once(evidence, options).candidate
     assert found is not None and found.ground is not None
+    return found
+
+
+@pytest.mark.solve
+@pytest.mark.parametrize(('focal_px', 'kind'), [(0.0, 'field_of_view'), (1050.0, 'focal_given')])
+def test_a_road_without_curvature_gives_what_its_scenery_shows(seen_road: Evidence, focal_px: float, kind: str) -> None:
+    found = found_with(seen_road, focal_px=focal_px)
     sigma = found.stddev.focal_px / found.camera.focal_px
     assert abs(np.log(found.camera.focal_px / PINHOLE.focal_px)) < 2.5 * sigma < 0.5
     error = np.subtract(tilt_and_roll_deg(found.ground.normal_in_camera), tilt_and_roll_deg(ROAD.normal_in_camera))
     assert (np.abs(error) < 2.5 * np.array([found.stddev.tilt_deg, found.stddev.roll_deg])).all()
-    kinds = {statement.kind for statement in found.assumptions}
-    assert 'level_camera' in kinds and ('focal_given' if given else 'field_of_view') in kinds
+    assert {'level_camera', kind} <= {statement.kind for statement in found.assumptions}
 
 
 @pytest.mark.solve
 def test_a_field_of_view_is_as_good_as_the_focal_length() -> None:
     evidence = synthetic_evidence(ROAD, np.random.default_rng(2))
-    lens = LensOptions(pixel_aspect=1.0, hfov_deg=2 * float(np.degrees(np.arctan(640 / PINHOLE.focal_px))))
-    found = solve_once(evidence, Options(camera_height=ROAD.height_m, lens=lens)).candidate
+    found = found_with(evidence, hfov_deg=2 * float(np.degrees(np.arctan(640 / PINHOLE.focal_px))))
     assert abs(np.log(found.camera.focal_px / PINHOLE.focal_px)) < 2 * found.stddev.focal_px / found.camera.focal_px
     # 10 %, and one in five that it is another one
     assert found.stddev.focal_px < 0.2 * found.camera.focal_px and found.grade == 'coarse'
@@ -136,34 +148,47 @@ def test_a_field_of_view_is_as_good_as_the_focal_length() -> None:
 
 
 @pytest.mark.solve
-def test_a_wider_uncertainty_of_the_focal_length_makes_lengths_less_certain() -> None:
-    evidence = synthetic_evidence(ROAD, np.random.default_rng(2))
-    sigmas = []
-    for sigma_px in (20.0, 200.0):
-        joint = JointOptions(focal_prior_px=1000.0, focal_sigma_px=sigma_px)
-        found = solve_once(evidence, Options(camera_height=ROAD.height_m, joint=joint, lens=SQUARE)).candidate
-        sigmas.append(found.stddev.ground.worst)
-    assert sigmas[0] < sigmas[1]
+def test_a_wider_uncertainty_of_the_focal_length_makes_lengths_less_certain(seen_road: Evidence) -> None:
+    sure = found_with(seen_road, JointOptions(focal_prior_px=1000.0, focal_sigma_px=20.0))
+    unsure = found_with(seen_road, focal_px=1050.0)  # to a tenth
+    assert sure.stddev.ground.worst < unsure.stddev.ground.worst
+    assert 'focal_given' in {statement.kind for statement in sure.assumptions}
 
 
 @pytest.mark.solve
-@pytest.mark.parametrize(('factor', 'passed'), [(1.05, True), (2.5, False)])
-def test_a_focal_length_that_the_road_contradicts_is_doubted(factor: float, passed: bool) -> None:
-    generator = np.random.default_rng(1)
-    evidence = replace(synthetic_evidence(ROAD, generator), still_lines_px=scenery(ROAD, generator))
-    lens = LensOptions(pixel_aspect=1.0, focal_px=factor * PINHOLE.focal_px)
-    found = solve_once(evidence, Options(camera_height=ROAD.height_m, lens=lens)).candidate
-    (row,) = [row for row in found.verification if row.kind == 'given_focal']
-    assert row.passed is passed and row.contradicts is not passed
-    (said,) = [statement.values for statement in found.checks if statement.kind == 'given_focal']
-    assert said['given_px'] == pytest.approx(factor * PINHOLE.focal_px) and (said['believed'] > 0.5) is passed
-    # the standard deviation covers a wrong number
-    sigma = found.stddev.focal_px / found.camera.focal_px
-    assert abs(np.log(found.camera.focal_px / PINHOLE.focal_px)) < 2.0 * sigma
+def test_a_focal_length_that_the_road_shows_is_not_doubted(seen_road: Evidence) -> None:
+    (row,) = [row for row in found_with(seen_road, focal_px=1050.0).verification if row.kind == 'given_focal']
+    assert row.passed and not row.contradicts
+
+
+def test_a_focal_length_that_the_road_contradicts_is_doubted() -> None:
+    state = AdjustmentState(PINHOLE, ROAD.camera_from_ground, np.zeros(1))
+    tracks = select_tracks(synthetic_evidence(ROAD, np.random.default_rng(1)), 20)
+
+    def road(sheet: LensOptions, sigma: float) -> SingleRoad:
+        """A road of which a solution gave the focal length of the truth."""
+        prior = lens_priors(SIZE, JointOptions(), known=sheet)[0]
+        config = AdjustmentConfig(prior, JointOptions())
+        fit = evaluate_at(state, tracks, config, sigma**2 * np.eye(Parameterisation(state, config).size))
+        return SingleRoad(fit, LensChoice(prior, JointOptions()), (), (), ())
+
+    free = road(LensOptions(), 0.15)
+    for factor, passed in ((1.05, True), (2.5, False)):
+        given = road(LensOptions(focal_px=factor * PINHOLE.focal_px), 0.1)
+        compared = given.compared_with_given(free, tracks)
+        (row,) = compared.rows
+        assert row.kind == 'given_focal' and row.passed is passed and row.contradicts is not passed
+        (said,) = [statement.values for statement in compared.checks]
+        assert said['given_px'] == pytest.approx(factor * PINHOLE.focal_px) and (said['believed'] > 0.5) is passed
+        # the standard deviation covers a wrong number
+        mixed_px = compared.fit.state.camera.focal_px
+        assert abs(np.log(mixed_px / PINHOLE.focal_px)) < 2.0 * compared.fit.focal_sigma
+    assert given.compared_with_given(reason('no_direction', tracks=20), tracks) is given
 
 
 @pytest.mark.solve
 def test_the_option_switches_it_off() -> None:
     evidence = synthetic_evidence(ROAD, np.random.default_rng(2))
-    result = solve_once(evidence, Options(camera_height=ROAD.height_m, joint=JointOptions(single_road=False)))
+    joint = JointOptions(single_road=False)
+    result = solve_once(evidence, Options(camera_height=ROAD.height_m, joint=joint, lens=LensOptions(pixel_aspect=1.0)))
     assert not isinstance(result, Calibration) and result.candidate is None

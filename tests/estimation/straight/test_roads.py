@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from autocalib_ros.config import GateOptions, JointOptions, Options
+from autocalib_ros.config import GateOptions, JointOptions, LensOptions, Options
 from autocalib_ros.estimation.adjustment.bundle_adjustment import adjust
 from autocalib_ros.estimation.adjustment.lens_prior import lens_priors
 from autocalib_ros.estimation.adjustment.parameters import RIGHT_ANGLE_SIGMA_RAD, AdjustmentConfig, AdjustmentState
@@ -23,7 +23,7 @@ from solved_once import solved_junction
 
 pytestmark = pytest.mark.solve
 
-OPTIONS = Options(camera_height=8.0)
+OPTIONS = Options(camera_height=8.0, lens=LensOptions(pixel_aspect=1.0))
 ONE_FAMILY = replace(OPTIONS, joint=JointOptions(lens_prior='equidistant', single_road=False))
 """For questions that do not depend on how the family of the lens is chosen: the others take half as long again."""
 ONE_ROAD = Junction(
@@ -245,7 +245,7 @@ def test_too_few_tracks_are_refused_with_both_numbers() -> None:
 
 
 def test_without_a_height_the_lens_is_still_given() -> None:
-    result = solved(Junction(), options=Options())
+    result = solved(Junction(), options=replace(OPTIONS, camera_height=0.0))
     assert isinstance(result, Calibration)
     assert result.ground is None
     assert result.grade == 'lens'
@@ -254,7 +254,7 @@ def test_without_a_height_the_lens_is_still_given() -> None:
 
 
 def test_unit_scale_needs_its_option() -> None:
-    result = solved(Junction(), options=Options(allow_unit_scale=True))
+    result = solved(Junction(), options=replace(OPTIONS, camera_height=0.0, allow_unit_scale=True))
     assert isinstance(result, Calibration)
     assert result.ground is not None
     assert (result.grade, result.ground.metric, result.ground.height_m) == ('unit_scale', False, 1.0)
