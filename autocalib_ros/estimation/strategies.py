@@ -50,11 +50,13 @@ lowered."""
 def estimate_from_straight_traffic(observations: Observations, config: AdjustmentConfig) -> Solution | Reason:
     """Estimate from the vanishing points of straight tracks: multi-start, adjustment, refinement, verification."""
     tracks, gate = observations.tracks, observations.gate
-    initial = solve_from_consensus(observations.subsample, config, observations.generator)
+    subsample = observations.subsample
+    initial = solve_from_consensus(subsample, config, observations.generator)
     if initial is None:
         return reason('no_direction', tracks=len(tracks))
-    best, contrast = initial
-    fit = adjust(best.state, tracks, best.problem.config)
+    fit, contrast = initial
+    if len(subsample) < len(tracks):
+        fit = adjust(fit.state, tracks, fit.problem.config)
     support = road_support(fit, tracks)
     second = sorted(int(mask.sum()) for mask in support)[:-1]
     crossing = CrossTraffic(min([gate.min_tracks_per_road, *(second or [0])]), gate.min_tracks_per_road)

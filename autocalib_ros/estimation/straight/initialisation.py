@@ -96,11 +96,14 @@ def select_lens_family(fit: Adjustment, priors: list[LensPrior], subsample: Trac
     """
     if not fit.plane_known or not priors:
         return fit
-    default = adjust(fit.state, subsample, fit.problem.config, refine=True)
+    part = len(subsample) < len(tracks)
+    default = adjust(fit.state, subsample, fit.problem.config, refine=True) if part else fit
     best = select_model(
         [default, *(_solve_in_family(default, prior, subsample) for prior in priors)], subsample, MODEL_SELECTION_MARGIN
     )
-    return fit if best is default else adjust(best.state, tracks, best.problem.config)
+    if best is default:
+        return fit
+    return adjust(best.state, tracks, best.problem.config) if part else best
 
 
 def _solve_in_family(fit: Adjustment, prior: LensPrior, subsample: TrackSet) -> Adjustment:
