@@ -119,7 +119,7 @@ def wanders(grid: FrameGrid, images: int, least: float = MIN_INDEPENDENCE) -> bo
 def _candidates(since_ns: np.ndarray) -> list[float]:
     """Return possible periods, longest first."""
     count = len(since_ns)
-    periods = [float(np.median(since_ns[lag:] - since_ns[:-lag])) / lag for lag in LAGS if lag <= count // 2]
+    periods = [_median(since_ns[lag:] - since_ns[:-lag]) / lag for lag in LAGS if lag <= count // 2]
     periods.append(float(np.quantile(np.diff(since_ns), 0.2)))  # with many images lost the shorter intervals are single
     return sorted({round(period) for period in periods if period >= 1.0}, reverse=True)
 
@@ -206,4 +206,11 @@ def _robust_line(
 
 def _spread(values: np.ndarray) -> float:
     """Return the robust standard deviation around 0, 1.4826 times the median absolute value."""
-    return MAD_TO_SIGMA * float(np.median(np.abs(values)))
+    return MAD_TO_SIGMA * _median(np.abs(values))
+
+
+def _median(values: np.ndarray) -> float:
+    """Return the median of values (n,), n at least 1: `np.median` takes five times as long for so few."""
+    lower, upper = (len(values) - 1) // 2, len(values) // 2
+    ordered = np.partition(values, (lower, upper))
+    return float(0.5 * (ordered[lower] + ordered[upper]))
