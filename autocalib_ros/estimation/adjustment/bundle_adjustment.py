@@ -125,13 +125,13 @@ class Adjustment:
     def sigma(self, function: Callable[[AdjustmentState], np.ndarray]) -> np.ndarray:
         """Return the standard deviation of a function of the state, shape of its result."""
         return propagate_sigma(
-            lambda step: function(self.problem.parameters.state(step)), self.problem.parameters.size, self.covariance
+            lambda step: function(self.problem.parameters.probed(step)), self.problem.parameters.size, self.covariance
         )
 
     def covariance_of(self, function: Callable[[AdjustmentState], np.ndarray]) -> np.ndarray:
         """Return the covariance (n, n) of a function of the state with n results."""
         return propagate_covariance(
-            lambda step: function(self.problem.parameters.state(step)), self.problem.parameters.size, self.covariance
+            lambda step: function(self.problem.parameters.probed(step)), self.problem.parameters.size, self.covariance
         )
 
 

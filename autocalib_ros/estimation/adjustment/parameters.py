@@ -126,6 +126,18 @@ class Parameterisation:
             self.camera(step[: self.lens]), self.base.rotation @ self.turned(step[self.lens : turns]), angles
         )
 
+    def probed(self, step: np.ndarray) -> AdjustmentState:
+        """Return `state` of a step that is asked for again and again, as those of numerical derivatives."""
+        key = step.tobytes()
+        if key not in self._probes:
+            self._probes[key] = self.state(step)
+        return self._probes[key]
+
+    @cached_property
+    def _probes(self) -> dict[bytes, AdjustmentState]:
+        """States of `probed` by the bytes of their steps."""
+        return {}
+
     def step_to(self, state: AdjustmentState) -> np.ndarray:
         """Return the step (parameters,) from the base to a nearby state, projected on the free parameters."""
         turn = Rotation.from_matrix(self.base.rotation.T @ state.rotation).as_rotvec()

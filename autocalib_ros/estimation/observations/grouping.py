@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
@@ -18,8 +20,8 @@ def component_labels(edges: np.ndarray, count: int) -> np.ndarray:
 def group_indices(labels: np.ndarray, min_size: int = 1) -> list[np.ndarray]:
     """Indices of the members of each label (n,) that has at least `min_size`, by ascending label."""
     order = np.argsort(labels, kind='stable')
-    parts = np.split(order, np.flatnonzero(np.diff(labels[order])) + 1)
-    return [part for part in parts if len(part) >= min_size]
+    bounds = [0, *(np.flatnonzero(np.diff(labels[order])) + 1).tolist(), len(order)]
+    return [order[begin:end] for begin, end in pairwise(bounds) if end - begin >= min_size]
 
 
 def round_robin(groups: np.ndarray, best_first: np.ndarray) -> np.ndarray:

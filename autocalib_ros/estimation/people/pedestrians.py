@@ -88,12 +88,21 @@ def _measure(ground: GroundPositions, paths: list[np.ndarray]) -> MovingObject:
             speed = max(speed, float((steps / (instants[after] - instants[before])).max()) / RESAMPLING_INTERVAL_S)
             length = max(length, float(np.hypot(*(positions[path[-1]] - positions[path[0]]))))
     own = np.concatenate(paths)
-    widths = [_width_across(positions[own[together]]) for together in group_indices(instants[own], 2)]
-    return MovingObject(speed, float(np.median(widths)) if widths else 0.0, length)
+    widths = _widths_across(positions[own], instants[own])
+    return MovingObject(speed, float(np.median(widths)) if len(widths) else 0.0, length)
 
 
-def _width_across(positions: np.ndarray) -> float:
-    """Width in metres, across the line of sight, of positions (n, 2) on the road relative to the camera's foot."""
-    middle = positions.mean(axis=0)
-    across = np.array([-middle[1], middle[0]]) / max(float(np.hypot(*middle)), 1e-9)
-    return float(np.ptp(positions @ across))
+def _widths_across(positions: np.ndarray, instants: np.ndarray) -> np.ndarray:
+    """Widths in metres, across the line of sight, at each instant that several positions show.
+
+    Positions (n, 2) are on the road relative to the camera's foot, at instants (n,).
+    """
+    order = np.argsort(instants, kind='stable')
+    starts = np.flatnonzero(np.diff(instants[order], prepend=np.nan))
+    if not len(starts):
+        return np.zeros(0)
+    positions, counts = positions[order], np.diff(starts, append=len(order))
+    middles = np.add.reduceat(positions, starts) / counts[:, None]
+    across = np.column_stack([-middles[:, 1], middles[:, 0]]) / np.maximum(np.hypot(*middles.T), 1e-9)[:, None]
+    places = (positions * np.repeat(across, counts, axis=0)).sum(axis=1)
+    return (np.maximum.reduceat(places, starts) - np.minimum.reduceat(places, starts))[counts > 1]
