@@ -20,7 +20,7 @@ from autocalib_ros.estimation.motion.planar_motion import (
     refined,
     robust_weight,
 )
-from autocalib_ros.estimation.motion.rigid_bodies import StructureAndMotion, TrackletBundle, damped
+from autocalib_ros.estimation.motion.rigid_bodies import StructureAndMotion, TrackletBundle, flat_unknowns
 from autocalib_ros.estimation.observations.track_set import TrackSet, UnprojectedTracks
 from autocalib_ros.estimation.observations.vehicle_grouping import corroboration_weights, heading_error_deg
 from autocalib_ros.geometry.great_circles import Rays, fit_circles_through, unproject_rays
@@ -258,7 +258,7 @@ class RigidBodyBlock:
             else bundle.refined(base.camera, base.rotation, unknowns)
         )
         self._residuals = bundle.residuals(base.camera, base.rotation, self.warm_start)
-        self._root = np.sqrt(bundle.robust_weight(self._residuals))[:, :, None, None]
+        self._root = np.sqrt(bundle.robust_weight(self._residuals))
         self._follow: np.ndarray | None = None
         """Derivative of the unknowns of each tracklet by the parameters, shape (tracklets, unknowns, parameters)."""
 
@@ -267,7 +267,7 @@ class RigidBodyBlock:
         state = self._parameters.state(step)
         near = self.warm_start if self._follow is None else self.warm_start.stepped(-(self._follow @ step))
         unknowns = self._bundle.refined(state.camera, state.rotation, near)
-        residuals = self._root * self._bundle.residuals(state.camera, state.rotation, unknowns)
+        residuals = self._root[..., None, None] * self._bundle.residuals(state.camera, state.rotation, unknowns)
         return unknowns, (residuals**2).sum(axis=(1, 2, 3)) / self.dof
 
     def linearise(self) -> LinearisedRows:
@@ -279,11 +279,17 @@ class RigidBodyBlock:
         columns = [slope * unit for slope, unit in zip(slopes, prior.units, strict=True)]
         columns += [bundle.rotation_jacobian(axis, by_place, self.warm_start) for axis in parameters.axes]
         columns += [np.zeros(self._residuals.shape)] * len(parameters.free_angles)
-        own, residuals = bundle.weighted_system(jacobian, self._residuals)
-        shared = (self._root[..., None] * np.stack(columns, axis=-1)).reshape(len(own), -1, parameters.size)
-        matrix = damped(own.transpose(0, 2, 1) @ own, np.zeros(len(own)))
-        self._follow = np.linalg.solve(matrix, own.transpose(0, 2, 1) @ shared)
-        return LinearisedRows.of(residuals, shared - own @ self._follow, self.dof, np.ones(len(own)))
+        own, count = jacobian.weighted(self._root), len(self._root)
+        columns = [bundle.rows_of(column, self._root) for column in columns]
+        shared = np.concatenate(columns, axis=-1)
+        follow = own.equations().damped(np.zeros(count)).solve(*own.pulled(shared))
+        self._follow = flat_unknowns(*follow)
+        return LinearisedRows.of(
+            bundle.rows_of(self._residuals, self._root).reshape(count, -1),
+            (shared - own.times(*follow)).reshape(count, -1, parameters.size),
+            self.dof,
+            np.ones(count),
+        )
 
     def distances_px(self) -> tuple[np.ndarray, np.ndarray]:
         """Return observed pixels (n, 2) and their reprojection errors (n,), at the base."""

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from autocalib_ros.estimation.motion.tracklet_equations import TrackletJacobian
 from autocalib_ros.estimation.observations.point_drift import drift_covariance, tracked_path_px
 from autocalib_ros.estimation.observations.tracklets import Tracklets
 from autocalib_ros.geometry.great_circles import unproject_rays
@@ -108,8 +109,7 @@ class TrackletBundle:
         diagonal = np.diagonal(self.whiten, axis1=-2, axis2=-1)
         density = 2.0 * np.log(np.where(self.mask, diagonal, 1.0)).sum(axis=(1, 2))
         jacobian, _ = self.jacobian(camera, camera_from_plane, unknowns)
-        jacobian = jacobian.reshape(len(self.tracklets), -1, jacobian.shape[-1])
-        eigenvalues = np.linalg.eigvalsh(jacobian.transpose(0, 2, 1) @ jacobian)
+        eigenvalues = np.linalg.eigvalsh(jacobian.equations().matrix)
         volume = np.log(np.where(eigenvalues > MIN_EIGENVALUE_FRACTION * eigenvalues[:, -1:], eigenvalues, 1.0)).sum(
             axis=1
         )
@@ -175,33 +175,26 @@ class TrackletBundle:
 
     def jacobian(
         self, camera: Camera, camera_from_plane: np.ndarray, unknowns: StructureAndMotion
-    ) -> tuple[np.ndarray, np.ndarray]:
+    ) -> tuple[TrackletJacobian, np.ndarray]:
         """Derivatives of the residuals by the unknowns of each tracklet, and of the pixels by the positions.
 
-        Shapes (tracklets, points, instants, 2, 3 points + 3 instants) and (tracklets, points, instants, 2, 3).
+        The latter have the shape (tracklets, points, instants, 2, 3).
         """
         placed = self._positions(unknowns)
         slopes = ProjectedPoints(camera, placed @ camera_from_plane.T).place_slopes()
         by_place = (slopes * self.mask[..., None, None]) @ camera_from_plane
         cosine, sine = (part[:, None, :, None] for part in (np.cos(unknowns.turns_rad), np.sin(unknowns.turns_rad)))
         x, y, z = np.moveaxis(by_place, -1, 0)
-        by_point = self._whitened(np.stack([x * cosine + y * sine, y * cosine - x * sine, z], axis=-1))
+        tracklets, points, instants = self.mask.shape
+        by_point = np.stack([x * cosine + y * sine, y * cosine - x * sine, z], axis=-1)
+        by_point = self.whiten @ by_point.reshape(tracklets, points, instants, -1)
         about = placed[..., :2] - unknowns.translations[:, None]
         by_pose = np.stack([x, y, y * about[..., :1] - x * about[..., 1:]], axis=-1)
-        tracklets, points, instants = self.mask.shape
-        jacobian = np.zeros((tracklets, points, instants, 2, 3 * points + 3 * instants))
-        for point in range(points):
-            jacobian[:, point, ..., 3 * point : 3 * point + 3] = by_point[:, point]
-        poses = self.whiten[..., None, None] * by_pose[:, :, None]
         # the pose at the reference instant is fixed
-        poses[np.arange(tracklets), :, :, self.reference] = 0.0
-        jacobian[..., 3 * points :] = np.moveaxis(poses, 3, 4).reshape(tracklets, points, instants, 2, -1)
-        return jacobian, by_place
-
-    def _whitened(self, jacobian: np.ndarray) -> np.ndarray:
-        """Whiten derivatives (tracklets, points, instants, 2, n) along the instants."""
-        tracklets, points, instants = self.mask.shape
-        return (self.whiten @ jacobian.reshape(tracklets, points, instants, -1)).reshape(jacobian.shape)
+        by_pose[np.arange(tracklets), :, self.reference] = 0.0
+        poses = self.whiten[:, :, :, None, :, None] * by_pose.transpose(0, 1, 3, 2, 4)[:, :, None]
+        rows = (tracklets, points, 2 * instants)
+        return TrackletJacobian(by_point.reshape(*rows, 3), poses.reshape(*rows, 3 * instants)), by_place
 
     def lens_jacobian(
         self, parameters: np.ndarray, camera: Camera, camera_from_plane: np.ndarray, unknowns: StructureAndMotion
@@ -236,9 +229,10 @@ class TrackletBundle:
         cost = self.cost(here, cauchy_scale)
         for _ in range(rounds):
             jacobian, _ = self.jacobian(camera, camera_from_plane, unknowns)
-            own, weighted = self.weighted_system(jacobian, here, cauchy_scale)
-            matrix, gradient = own.transpose(0, 2, 1) @ own, own.transpose(0, 2, 1) @ weighted[..., None]
-            trial = unknowns.stepped(-np.linalg.solve(damped(matrix, damping), gradient)[..., 0])
+            root = np.sqrt(self.robust_weight(here, cauchy_scale))
+            own = jacobian.weighted(root)
+            step = own.equations().damped(damping).solve(*own.pulled(self.rows_of(here, root)))
+            trial = unknowns.stepped(-flat_unknowns(*step)[..., 0])
             there = self.residuals(camera, camera_from_plane, trial)
             cost_there = self.cost(there, cauchy_scale)
             better = cost_there <= cost
@@ -251,23 +245,18 @@ class TrackletBundle:
                 break
         return unknowns
 
-    def weighted_system(
-        self, jacobian: np.ndarray, residuals: np.ndarray, cauchy_scale: float = CAUCHY_SCALE
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Jacobian (tracklets, residuals, n) and residuals (tracklets, residuals), times root weights."""
-        root = np.sqrt(self.robust_weight(residuals, cauchy_scale))[:, :, None, None]
-        count = len(self.tracklets)
-        return (
-            (jacobian * root[..., None]).reshape(count, -1, jacobian.shape[-1]),
-            (residuals * root).reshape(count, -1),
-        )
+    def rows_of(self, residuals: np.ndarray, root: np.ndarray) -> np.ndarray:
+        """Return residuals (tracklets, points, instants, 2) times a factor of each point, as rows of the equations.
+
+        The shape is that of `TrackletJacobian.pulled`, (tracklets, points, 2 instants, 1).
+        """
+        return (residuals * root[:, :, None, None]).reshape(*self.mask.shape[:2], -1, 1)
 
 
-def damped(matrix: np.ndarray, damping: np.ndarray) -> np.ndarray:
-    """Damp the diagonal of matrices (tracklets, n, n); unseen points and the size of a body stay as they are."""
-    diagonal = np.einsum('lii->li', matrix)
-    lift = damping[:, None] * diagonal + 1e-9 * diagonal.max(axis=1, keepdims=True, initial=0.0) + 1e-9
-    return matrix + lift[:, :, None] * np.eye(matrix.shape[1])
+def flat_unknowns(by_points: np.ndarray, by_poses: np.ndarray) -> np.ndarray:
+    """Return unknowns as those of `TrackletEquations.solve` in one row, shape (tracklets, 3 points + poses, k)."""
+    count, columns = len(by_poses), by_poses.shape[-1]
+    return np.concatenate([by_points.reshape(count, -1, columns), by_poses], axis=1)
 
 
 def _rotation(angle_rad: float) -> np.ndarray:
