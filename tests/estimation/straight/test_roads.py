@@ -30,6 +30,7 @@ ONE_ROAD = Junction(
     road_angles_deg=(0.0,),
     turning_fraction=0.0,
     vehicles=120,
+    points_per_vehicle=2,
     camera_from_ground=pose(35.0, 1.0, 60.0),
     centre_m=(6.0, -10.0),
 )
@@ -67,7 +68,7 @@ def test_real_driving_is_solved_within_two_per_cent_and_half_a_degree(seed: int)
 @pytest.mark.parametrize(('k1', 'shift'), [(0.04, (12.0, -8.0)), (-0.03, (-15.0, 5.0))])
 def test_a_lens_that_is_not_quite_equidistant_is_found(k1: float, shift: tuple[float, float]) -> None:
     camera = Camera(1280, 720, 560.0, (639.5 + shift[0], 359.5 + shift[1]), (k1, 0.0, 0.0, 0.0))
-    junction = Junction(camera=camera, vehicles=120)
+    junction = Junction(camera=camera, vehicles=120, points_per_vehicle=2)
     result = solved(junction)
     assert isinstance(result, Calibration)
     assert result.camera.focal_px == pytest.approx(560.0, rel=0.03)
@@ -75,14 +76,14 @@ def test_a_lens_that_is_not_quite_equidistant_is_found(k1: float, shift: tuple[f
 
 
 def test_turning_vehicles_do_not_pull_the_solution() -> None:
-    junction = Junction(turning_fraction=0.5, vehicles=120)
+    junction = Junction(turning_fraction=0.5, vehicles=120, points_per_vehicle=2)
     result = solved(junction, options=ONE_FAMILY)
     assert isinstance(result, Calibration)
     assert result.camera.focal_px == pytest.approx(560.0, rel=0.03)
 
 
 def test_skewed_roads_are_measured_not_squared() -> None:
-    junction = Junction(road_angles_deg=(0.0, 70.0), vehicles=120)
+    junction = Junction(road_angles_deg=(0.0, 70.0), vehicles=120, points_per_vehicle=2)
     result = solved(junction)
     assert isinstance(result, Calibration)
     assert [check.values['source'] for check in result.checks if check.kind == 'crossing_angle'] == ['measured']
@@ -103,7 +104,7 @@ def test_perpendicularity_can_be_asserted() -> None:
 
 
 def test_an_asserted_angle_other_than_90_degrees_is_fixed() -> None:
-    junction = Junction(road_angles_deg=(0.0, 70.0), vehicles=120)
+    junction = Junction(road_angles_deg=(0.0, 70.0), vehicles=120, points_per_vehicle=2)
     result = solved(junction, options=replace(OPTIONS, joint=JointOptions(road_angle='70')))
     assert isinstance(result, Calibration)
     assert 'roads cross at 70 degrees (given)' in map(str, result.assumptions)
@@ -113,7 +114,7 @@ def test_an_asserted_angle_other_than_90_degrees_is_fixed() -> None:
 
 
 def test_three_roads_are_found_and_agree_with_the_truth() -> None:
-    junction = Junction(road_angles_deg=(0.0, 60.0, 120.0), vehicles=150)
+    junction = Junction(road_angles_deg=(0.0, 60.0, 120.0), vehicles=150, points_per_vehicle=2)
     result = solved(junction, options=ONE_FAMILY)
     assert isinstance(result, Calibration)
     assert len(result.road_directions) == 3
@@ -148,7 +149,7 @@ def test_a_focal_length_with_a_sigma_is_a_prior() -> None:
 
 def test_a_distortion_free_lens_is_found_when_the_angle_of_the_roads_is_given() -> None:
     camera = Camera(1280, 720, 900.0, (639.5, 359.5), (1 / 3, 2 / 15, 17 / 315, 62 / 2835))
-    junction = Junction(camera=camera, vehicles=150, camera_from_ground=pose(25.0, 0.0, 35.0))
+    junction = Junction(camera=camera, vehicles=150, points_per_vehicle=2, camera_from_ground=pose(25.0, 0.0, 35.0))
     options = replace(OPTIONS, joint=JointOptions(road_angle='90', lens_prior='distortion_free', k1_sigma=0.0))
     result = solved(junction, options=options)
     assert isinstance(result, Calibration)
@@ -209,7 +210,7 @@ def test_traffic_that_only_turns_is_refused() -> None:
 
 
 def test_a_road_on_which_many_change_lanes_still_gives_the_lens() -> None:
-    junction = replace(ONE_ROAD, lane_change_fraction=0.4)
+    junction = replace(ONE_ROAD, lane_change_fraction=0.4, points_per_vehicle=4)
     result = solved(junction, options=ONE_FAMILY)
     assert isinstance(result, Calibration)
     assert abs(result.camera.focal_px - 560.0) < 3 * result.stddev.focal_px
