@@ -269,7 +269,9 @@ def _cosine_sine(angle_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.cos(angle_rad)[:, None], np.sin(angle_rad)[:, None]
 
 
-def _dot_components(vectors: np.ndarray | tuple[np.ndarray, ...], other: tuple[np.ndarray, ...]) -> np.ndarray:
+def _dot_components(
+    vectors: np.ndarray | tuple[np.ndarray, ...], other: np.ndarray | tuple[np.ndarray, ...]
+) -> np.ndarray:
     """Scalar product of vectors that are given by component, (3, ...)."""
     total = vectors[0] * other[0]
     total += vectors[1] * other[1]
