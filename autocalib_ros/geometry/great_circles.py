@@ -8,6 +8,7 @@ shrinks with the focal length and would bias the estimate.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -157,10 +158,24 @@ def circle_pixel_scale(rays: Rays, weights: np.ndarray) -> np.ndarray:
 
 def orthonormal_basis(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return two unit vectors (..., 3) that span the plane perpendicular to unit vectors (..., 3)."""
+    if directions.ndim == 1:  # in searches about one direction: arrays of three cost thirty times as much as floats
+        return _basis_of_one(directions)
     helper = np.eye(3)[np.argmin(np.abs(directions), axis=-1)]
     first = cross(directions, helper)
     first /= np.sqrt(dot(first, first))[..., None]
     return first, cross(directions, first)
+
+
+def _basis_of_one(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return what `orthonormal_basis` returns for one unit vector (3,)."""
+    x, y, z = vector = direction.tolist()
+    axis = min(range(3), key=lambda index: abs(vector[index]))
+    after, before = NEXT[axis], LAST[axis]
+    length = math.hypot(vector[before], vector[after])
+    first = [0.0, 0.0, 0.0]
+    first[after], first[before] = vector[before] / length, -vector[after] / length
+    u, v, w = first
+    return np.array(first), np.array([y * w - z * v, z * u - x * w, x * v - y * u])
 
 
 def fit_circles_through(matrix: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -114,3 +114,10 @@ def test_selection_respects_its_limit_and_spreads_over_vehicles() -> None:
 def test_selection_weights_sum_to_one() -> None:
     tracks = select_tracks(synthetic_evidence(Junction(), np.random.default_rng(0)), 100)
     np.testing.assert_allclose(tracks.weights.sum(axis=1), 1.0)
+
+
+def test_the_basis_of_one_direction_is_that_of_many() -> None:
+    directions = np.concatenate([np.random.default_rng(0).normal(size=(20, 3)), np.eye(3)])
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    for number, basis in enumerate(zip(*orthonormal_basis(directions), strict=True)):
+        np.testing.assert_allclose(orthonormal_basis(directions[number]), basis, atol=1e-15)
