@@ -1,5 +1,6 @@
-"""Draw the figures of method.md: python docs/explanation/draw_figures.py."""
+"""Draw the figures of these pages: python docs/explanation/draw_figures.py."""
 
+import csv
 from pathlib import Path
 
 import matplotlib
@@ -94,6 +95,27 @@ def loss() -> None:
     save(figure, 'loss.svg')
 
 
+def grades() -> None:
+    """Draw the grades of single roads by tilt and by the angle between road and view.
+
+    From grades.csv, columns of `autocalib benchmark accuracy --family single_road --out`, where the candidate of a
+    refusal has its grade too.
+    """
+    figure, axes = plt.subplots(figsize=(7.2, 3.6))
+    with (FOLDER / 'grades.csv').open(encoding='utf-8') as stream:
+        draws = list(csv.DictReader(stream))
+    kinds = {'full': ('full', 'fair'), 'coarse': ('coarse',), 'less, or no result': ('assumed', 'lens', '')}
+    marks = {'full': ('o', ROADS[0], 'full or fair'), 'coarse': ('s', ROADS[1], 'coarse')}
+    for kind, of_kind in kinds.items():
+        mark, colour, label = marks.get(kind, ('x', GREY, kind))
+        of_this = [draw for draw in draws if draw['grade'] in of_kind]
+        places = np.array([[float(draw['road_yaw_deg']), float(draw['true_tilt_deg'])] for draw in of_this])
+        axes.plot(*places.reshape(-1, 2).T, mark, color=colour, markersize=6, label=f'{label}: {len(of_this)}')
+    axes.set(xlim=(0, 90), ylim=(0, 40), xlabel='angle between road and view, degrees', ylabel='tilt, degrees')
+    axes.legend(loc='upper right', fontsize=9)
+    save(figure, 'grades.svg')
+
+
 def save(figure: plt.Figure, name: str) -> None:
     """Write a figure without a date, so that it changes only when it is drawn differently."""
     figure.tight_layout()
@@ -106,3 +128,4 @@ if __name__ == '__main__':
     straight()
     turning()
     loss()
+    grades()

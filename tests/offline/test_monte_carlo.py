@@ -132,7 +132,15 @@ def test_a_lens_alone_has_no_error_of_the_plane() -> None:
 def test_a_refusal_keeps_its_code() -> None:
     refusal = Refusal.from_reason(Reason('no_motion', '', ''), 'joint', SUMMARY, Figures())
     found = compare_calibrations(TASK, 'joint', refusal, JUNCTION, 2.0)
-    assert (found.accepted, found.code, found.cpu_s) == (False, 'no_motion', 2.0)
+    assert (found.accepted, found.code, found.cpu_s, found.grade) == (False, 'no_motion', 2.0, '')
+
+
+def test_a_refusal_has_the_grade_of_its_candidate_and_the_view_of_the_draw() -> None:
+    candidate = replace(calibration(JUNCTION.camera, plane(), StandardDeviations()), grade='assumed')
+    refusal = Refusal.from_reason(Reason('grade_too_low', '', ''), 'joint', SUMMARY, Figures())
+    found = compare_calibrations(TASK, 'joint', replace(refusal, candidate=candidate), JUNCTION, 2.0)
+    assert found.grade == 'assumed'
+    assert found.true_tilt_deg == pytest.approx(32.0) and found.road_yaw_deg == pytest.approx(35.0)
 
 
 @pytest.mark.solve

@@ -55,6 +55,10 @@ class Run:
     code: str
     """Refusal code, or '' if accepted."""
     grade: str = ''
+    """Grade of the result, or of the candidate of a refusal; '' without either."""
+    true_tilt_deg: float = NAN
+    road_yaw_deg: float = NAN
+    """Angle between the viewing direction and the first road, seen from above, 0 to 90 degrees."""
     focal_error: float = NAN
     """Focal length error relative to the true value; `focal_sigma` likewise."""
     focal_sigma: float = NAN
@@ -160,8 +164,22 @@ def compare_calibrations(
     task: Task, method: str, result: Calibration | Refusal, junction: Junction, cpu_s: float
 ) -> Run:
     """Return the errors of a result against the ground truth."""
+    view = {
+        'true_tilt_deg': float(tilt_and_roll_deg(junction.normal_in_camera)[0]),
+        'road_yaw_deg': road_yaw_deg(junction),
+    }
     if isinstance(result, Refusal):
-        return Run(family=task.family, method=method, run=task.run, accepted=False, code=result.code, cpu_s=cpu_s)
+        grade = '' if result.candidate is None else result.candidate.grade
+        return Run(
+            family=task.family,
+            method=method,
+            run=task.run,
+            accepted=False,
+            code=result.code,
+            grade=grade,
+            cpu_s=cpu_s,
+            **view,
+        )
     true, sigma = junction.camera, result.stddev
     tilt, roll, normal = pose_errors_deg(result.ground, junction.normal_in_camera)
     return Run(
@@ -181,7 +199,15 @@ def compare_calibrations(
         roll_sigma_deg=nan_if_none(sigma.roll_deg),
         distance_error=distance_error(result.camera, result.ground, junction),
         cpu_s=cpu_s,
+        **view,
     )
+
+
+def road_yaw_deg(junction: Junction) -> float:
+    """Return the angle between the viewing direction and the first road, seen from above, 0 to 90 degrees."""
+    ahead = junction.camera_from_ground[2]
+    turned = np.degrees(np.arctan2(ahead[1], ahead[0])) - junction.road_angles_deg[0]
+    return float(abs((turned + 90.0) % 180.0 - 90.0))
 
 
 def nan_if_none(value: float | None) -> float:
