@@ -51,6 +51,12 @@ class Background:
         self._next_s = self._next_early_s = 0.0
         self._width = 0
 
+    def copy(self) -> Background:
+        """Return the same samples, for another thread; an encoded sample is never changed."""
+        other = Background()
+        other._regular, other._early, other._width = list(self._regular), list(self._early), self._width
+        return other
+
     def update(self, image: np.ndarray, time_s: float) -> None:
         """Add a grey or BGR uint8 image if the sampling interval has passed."""
         if not self.is_due(time_s):

@@ -80,6 +80,10 @@ class LineSegmentDetector:
             return np.zeros(len(lines), bool)
         return _shares_inside(lines, self._ignored) > 0
 
+    def fresh(self) -> LineSegmentDetector:
+        """Return a detector with the same ignored regions that has not found anything."""
+        return LineSegmentDetector(self._ignored)
+
     @property
     def lines_px(self) -> np.ndarray:
         """Segments x0, y0, x1, y1 in pixels of the background passed to `find`, longest first, shape (n, 4)."""

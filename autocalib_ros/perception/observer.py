@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -303,13 +304,33 @@ class Observer:
     def still_lines(self, view: int | None = None) -> np.ndarray:
         """Return the line segments of the background, x0, y0, x1, y1 in pixels of the full image, shape (n, 4)."""
         scene = self._scenes[self._view if view is None else view]
-        times = scene.background.times_s
-        if not scene.lines.is_current(times):
-            samples = scene.background.grey_samples()
-            grey = self._tracked_image(median(samples)) if samples else None
-            tracked = [self._tracked_image(sample) for sample in samples]
-            scene.lines.find(grey, times, scene.picture_area.mask, tracked)
-        return self._to_full_pixels(scene.lines.lines_px.reshape(-1, 2)).reshape(-1, 4)
+        if not scene.lines.is_current(scene.background.times_s):
+            self._find_lines(scene.lines, scene.background, scene.picture_area.mask)
+        return self._lines_in_full_size(scene.lines)
+
+    def search_for_lines(self) -> Callable[[], np.ndarray]:
+        """Return a function that gives `still_lines` of the present view as they are now, for another thread."""
+        scene = self._scene
+        if scene.lines.is_current(scene.background.times_s):
+            lines = self._lines_in_full_size(scene.lines)
+            return lambda: lines
+        background, mask, detector = scene.background.copy(), scene.picture_area.mask, scene.lines.fresh()
+
+        def search() -> np.ndarray:
+            self._find_lines(detector, background, mask)
+            return self._lines_in_full_size(detector)
+
+        return search
+
+    def _find_lines(self, lines: LineSegmentDetector, background: Background, no_picture: np.ndarray | None) -> None:
+        """Find the segments of a background; uses nothing that later images change."""
+        samples = background.grey_samples()
+        grey = self._tracked_image(median(samples)) if samples else None
+        tracked = [self._tracked_image(sample) for sample in samples]
+        lines.find(grey, background.times_s, no_picture, tracked)
+
+    def _lines_in_full_size(self, lines: LineSegmentDetector) -> np.ndarray:
+        return self._to_full_pixels(lines.lines_px.reshape(-1, 2)).reshape(-1, 4)
 
     def landmarks(self, view: int) -> Landmarks:
         """Return the landmarks of the background of a view in memory, pixels of the full image; none without one."""

@@ -113,6 +113,8 @@ class _Job:
     """Generation of the evidence: the number of resets before it was collected."""
     view: KnownView | None = None
     """Image of the view that the evidence is from."""
+    search_for_lines: Callable[[], np.ndarray] | None = None
+    """Gives the lines of the still scene; runs in the solver thread, so that the images do not wait for it."""
     waiting: list[Future] = field(default_factory=list)
     """Futures of service calls, resolved with the result of this snapshot or of a newer one that replaced it."""
 
@@ -316,7 +318,7 @@ class CalibrationWorker:
                     self._guarded(lambda: (self._calibrator.snapshot(), self._calibrator.background())) or (None, None),
                 )
             if requests or (image is None and self._until_idle() == 0.0):
-                self._submit(self._guarded(self._calibrator.snapshot), requests)
+                self._submit(self._guarded(partial(self._calibrator.snapshot, with_lines=False)), requests)
 
     def _until_idle(self) -> float | None:
         """Return the seconds until the stream counts as idle; None if all images are solved."""
@@ -357,7 +359,7 @@ class CalibrationWorker:
         accepted, self._accepted_tracks = self._accepted_tracks, 0
         if accepted:
             self._calibrator.accepted(accepted)
-        evidence = self._guarded(self._calibrator.snapshot_if_due)
+        evidence = self._guarded(partial(self._calibrator.snapshot_if_due, with_lines=False))
         if evidence is not None:
             self._submit(evidence, [])
         if time.monotonic() >= self._progress_at + PROGRESS_PERIOD_S:
@@ -398,7 +400,8 @@ class CalibrationWorker:
             if evidence is not None and not self._closed and self._generation == self._calibrator_generation:
                 waiting = self._job.waiting if self._job else []
                 view = self._guarded(self._calibrator.known_view)
-                self._job = _Job(evidence, self._generation, view, [*waiting, *requests])
+                search = self._guarded(self._calibrator.search_for_lines)
+                self._job = _Job(evidence, self._generation, view, search, [*waiting, *requests])
                 self._changed.notify_all()
                 return
         self._resolve(requests, None)
@@ -410,6 +413,10 @@ class CalibrationWorker:
             if job is None:
                 return
             began = time.monotonic()
+            if job.search_for_lines is not None:
+                lines = self._guarded(job.search_for_lines)
+                if lines is not None:
+                    job.evidence = replace(job.evidence, still_lines_px=lines)
             result = self._guarded(partial(self._solved, job.evidence))
             if result is not None:
                 self.reported_evidence, self.solved_view = job.evidence, job.view

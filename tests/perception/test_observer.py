@@ -219,3 +219,19 @@ def test_edges_of_the_background_do_not_move_in_the_wind(watched_in_wind: tuple[
     rows = np.concatenate([track.points_px[:, 1] for track in tracks])
     on_a_car = ((rows > 70) & (rows < 150)) | ((rows > 210) & (rows < 280))
     assert on_a_car.mean() > 0.97
+
+
+def test_lines_that_are_searched_later_are_those_of_the_moment_of_the_question() -> None:
+    """Another thread searches while further images change the background."""
+    observer = Observer(Options(), (SIZE[1], SIZE[0]))
+    striped, plain = ROAD.copy(), ROAD.copy()
+    striped[100:106, 40:600] += 90
+    for index in range(12):
+        observer.observe(noisy(striped, 1.5, index), 0.5 * index)
+    search = observer.search_for_lines()
+    expected = observer.still_lines()
+    for index in range(12, 60):
+        observer.observe(noisy(plain, 1.5, index), 0.5 * index)
+    assert len(expected)
+    np.testing.assert_array_equal(search(), expected)
+    assert not np.array_equal(observer.still_lines(), expected)
