@@ -250,12 +250,16 @@ def spread_corners(image: np.ndarray, ignored: np.ndarray | None = None) -> np.n
 
 def _noise_energy(image: np.ndarray) -> float:
     """Return what cv2.cornerMinEigenVal makes of the noise of a grey image (H, W), with a block of 3 pixels."""
+    # nine pixels of a Sobel derivative of variance 12 sigma^2, in the scale of OpenCV: 1 / (4 * 3 * 255)
+    return 9.0 * 12.0 * noise_sigma(image) ** 2 / (4.0 * 3.0 * 255.0) ** 2
+
+
+def noise_sigma(image: np.ndarray) -> float:
+    """Return the standard deviation of the noise of a grey image (H, W), grey levels."""
     # whole numbers: to count them is faster than to sort them
     steps = np.bincount(np.abs(cv2.filter2D(image, cv2.CV_16S, NOISE_KERNEL)).ravel())
     middle = np.searchsorted(np.cumsum(steps), [(image.size - 1) // 2, image.size // 2], side='right').mean()
-    sigma = float(middle) / (6.0 * 0.6745)
-    # nine pixels of a Sobel derivative of variance 12 sigma^2, in the scale of OpenCV: 1 / (4 * 3 * 255)
-    return 9.0 * 12.0 * sigma**2 / (4.0 * 3.0 * 255.0) ** 2
+    return float(middle) / (6.0 * 0.6745)
 
 
 def _windows(image: np.ndarray, points_px: np.ndarray) -> np.ndarray:

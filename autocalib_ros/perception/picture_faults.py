@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from enum import Enum
+from functools import cache
 
 import cv2
 import numpy as np
+
+from autocalib_ros.perception.background_motion import noise_sigma
 
 
 class PictureFault(str, Enum):
@@ -30,10 +33,18 @@ MIN_REPEATS = 5
 """Least number of such images: two that are far apart say nothing about what came between."""
 FINE_SIGMAS_PX, COARSE_SIGMAS_PX = (0.7, 1.4), (2.5, 6.0)
 """Scales of the detail that a blur takes away, and of that which it leaves, pixels of the registered image."""
-BLURRED_RATIO = 0.45
-"""What is left of fine detail, compared with what is left of coarse detail, below which a picture is blurred. A blur of
-two pixels (sigma) leaves 0.35, compression by night 0.7."""
+BLURRED_RATIO = 0.3
+"""What is left of fine detail over what is left of coarse detail, below which a picture is blurred. Sharp pictures
+leave 0.7 or more, compressed, by night and in sway too; a blur of two pixels (sigma) leaves 0.22."""
 
+BLOCKS = (20, 12)
+"""Columns and rows of blocks in which the detail is compared."""
+MIN_RICH_BLOCKS = 12
+"""Least blocks with fine detail from which sharpness is judged. Judgement: a twentieth of the picture."""
+MIN_DETAIL_OVER_NOISE = 10.0
+"""Least energy of the fine detail of a block over that of the noise of the reference, which is known to a tenth."""
+SHOWN_QUANTILE = 0.75
+"""Quantile of the blocks that stands for those that nothing hides; blocks with half of their coarse detail count."""
 LEAST_DETAIL = 0.02
 """Part of the coarse detail below which nothing is left: thick fog leaves 0.04."""
 
@@ -51,18 +62,47 @@ class Detail:
 
     def __init__(self, reference: np.ndarray) -> None:
         self._bands = _bands(reference)
-        self._energies = [float(np.vdot(band, band)) for band in self._bands]
+        noise = noise_sigma(reference)
+        # the energy of a band has that of its noise in it, which later images do not show
+        fine, coarse = (
+            _over_blocks(band * band) - noise**2 * of_noise
+            for band, of_noise in zip(self._bands, _bands_of_noise(), strict=True)
+        )
+        self._energies = (fine, coarse)
+        least = MIN_DETAIL_OVER_NOISE * noise**2 * _bands_of_noise()[0]
+        self._rich = (fine >= np.median(fine)) & (fine > least) & (coarse >= np.median(coarse)) & (coarse > 0)
 
     def sharpness(self, image: np.ndarray) -> float:
         """Return what an image (H, W) of the same pose leaves of the fine detail over what it leaves of the coarse.
 
-        Noise does not count, since it is not that of the reference; neither do contrast and traffic, which lower both.
+        The median of the blocks of the picture that show the reference. Noise does not count, since it is not that of
+        the reference, and neither does contrast, which lowers both; blocks with traffic show something else. 1 if the
+        reference has too little fine detail, as by night.
         """
+        if self._rich.sum() < MIN_RICH_BLOCKS:
+            return 1.0
         fine, coarse = (
-            float(np.vdot(own, other)) / max(energy, 1e-6)
+            _over_blocks(own * other)[self._rich] / energy[self._rich]
             for own, other, energy in zip(self._bands, _bands(image), self._energies, strict=True)
         )
-        return fine / coarse if coarse > LEAST_DETAIL else 0.0
+        if np.quantile(coarse, SHOWN_QUANTILE) < LEAST_DETAIL:
+            return 0.0
+        shown = coarse >= 0.5 * np.quantile(coarse, SHOWN_QUANTILE)
+        return float(np.median(fine[shown] / coarse[shown]))
+
+
+@cache
+def _bands_of_noise() -> tuple[float, float]:
+    """Return the energy per pixel of both bands of white noise of one grey level."""
+    impulse = np.zeros((64, 64), np.float32)
+    impulse[32, 32] = 1.0
+    fine, coarse = (float((band**2).sum()) for band in _bands(impulse))
+    return fine, 4.0 * coarse  # its mean over four places in the half size
+
+
+def _over_blocks(values: np.ndarray) -> np.ndarray:
+    """Return the means of an image (H, W) over `BLOCKS`, flat."""
+    return cv2.resize(values, BLOCKS, interpolation=cv2.INTER_AREA).ravel()
 
 
 def _bands(image: np.ndarray) -> list[np.ndarray]:

@@ -339,7 +339,9 @@ class ViewWatch:
         if time_s < self._search_due_s:
             return None
         lost_s = time_s - (self._begun_s if math.isinf(self._near_s) else self._near_s)
-        self._search_due_s = time_s + SEARCHES_S[(lost_s > 10.0) + (lost_s > 60.0)]
+        # a move is measured from several searches, where the reference is out of reach
+        turning = self.report.move is not None and not self.report.move.is_measured
+        self._search_due_s = time_s + SEARCHES_S[(lost_s > 10.0 and not turning) + (lost_s > 60.0)]
         for reference in usable[:2]:
             since = self._last.after(_inverse(reference.known.pose))
             found = reference.view.near_by_outlines(pattern, since) or reference.view.anywhere(pattern)
