@@ -24,6 +24,7 @@ from autocalib_ros.report import (
     traffic_figures,
 )
 from autocalib_ros.report.canvas import STYLE, jpeg, png, render_bgr
+from autocalib_ros.report.ruler import ruler_data
 from autocalib_ros.report.scene import ReportScene
 from autocalib_ros.report.text import (
     contradictions,
@@ -266,9 +267,7 @@ def _write_figures(folder: Path, pictures: dict[str, bytes]) -> None:
 
 def _page(scene: ReportScene, drawn: list[_Drawn]) -> str:
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    template = environment.from_string(
-        (files('autocalib_ros.report') / 'templates' / 'report.html.j2').read_text(encoding='utf-8')
-    )
+    template = environment.from_string(_template('report.html.j2'))
     result, found = scene.result, scene.calibration
     chapters = [(chapter, [one for one in drawn if one.entry.chapter == chapter]) for chapter in CHAPTERS]
     return template.render(
@@ -291,7 +290,13 @@ def _page(scene: ReportScene, drawn: list[_Drawn]) -> str:
         checks=tuple(map(str, found.checks)) if found else (),
         verification=found.verification if found else (),
         chapters=[(chapter, figures) for chapter, figures in chapters if figures],
+        ruler=ruler_data(scene),
+        ruler_script=_template('ruler.js'),
     )
+
+
+def _template(name: str) -> str:
+    return (files('autocalib_ros.report') / 'templates' / name).read_text(encoding='utf-8')
 
 
 def _state(result: Calibration | Refusal) -> str:

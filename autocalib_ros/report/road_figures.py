@@ -44,6 +44,8 @@ TOP_VIEW_PX = 1100
 """Longer side of the top view, pixels."""
 CONTOURS_M = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 """Candidate levels of the contours of position uncertainty, metres."""
+MAX_SHOWN_SIGMA_M = 2.0
+"""Largest standard deviation of a position that the top view shows, metres: half a lane and more."""
 MAX_CONTOURS = 5
 """Most contours, the largest levels first."""
 CONTOUR_SAMPLES = 90
@@ -115,9 +117,7 @@ def top_view(scene: ReportScene) -> Figure | None:
     if not scene.has_ground:
         return None
     camera, ground = scene.calibrated.camera, scene.ground
-    view = TopView.around(tracked_road_points(scene), ground, TOP_VIEW_PX) or TopView.of_image(
-        camera, ground, TOP_VIEW_PX
-    )
+    view = top_view_extent(scene, TOP_VIEW_PX)
     if view is None:
         return None
     figure, axes = ground_axes(view, ground)
@@ -137,6 +137,17 @@ def top_view(scene: ReportScene) -> Figure | None:
         axes.plot(0, 0, '^', color=X_AXIS, markersize=10, markeredgecolor=WHITE, linestyle='none', label='camera')
     draw_legend(axes)
     return figure
+
+
+def top_view_extent(scene: ReportScene, longest_px: int) -> TopView | None:
+    """Return the part of the road for a top view: where there was traffic, and positions are sure to 2 m."""
+    points = tracked_road_points(scene)
+    sigma = position_sigma_m(scene, points) if len(points) else None
+    if sigma is not None and (sigma <= MAX_SHOWN_SIGMA_M).any():
+        points = points[sigma <= MAX_SHOWN_SIGMA_M]
+    return TopView.around(points, scene.ground, longest_px) or TopView.of_image(
+        scene.calibrated.camera, scene.ground, longest_px
+    )
 
 
 def ground_axes(view: TopView, ground: GroundPlane, below_in: float = 0.0) -> tuple[Figure, Axes]:
@@ -171,7 +182,10 @@ def position_sigma_m(scene: ReportScene, points_m: np.ndarray) -> np.ndarray | N
 def accuracy_note(scene: ReportScene) -> str:
     """Describe the contours of the top view, or say that there are none."""
     if scene.ground.metric and scene.calibrated.covariance is not None:
-        return 'Dashed lines: one sigma of the position of a road point, from lens, pose and scale.'
+        return (
+            'Dashed lines: one sigma of the position of a road point, from lens, pose and scale. The view ends where '
+            f'it exceeds {MAX_SHOWN_SIGMA_M:g} m.'
+        )
     return 'The position uncertainty of this result is unknown.'
 
 
