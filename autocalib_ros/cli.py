@@ -20,6 +20,7 @@ from autocalib_ros.commands import demo_command as demo
 from autocalib_ros.commands import docs_command as docs
 from autocalib_ros.commands import evidence_command as evidence
 from autocalib_ros.commands import export_command as export
+from autocalib_ros.commands import index_command as index
 from autocalib_ros.commands import picture_command as picture
 from autocalib_ros.commands import rectify_command as rectify
 from autocalib_ros.commands import replay_command as replay
@@ -33,6 +34,7 @@ COMMANDS = {
     'evidence': evidence,
     'compare': compare,
     'export': export,
+    'index': index,
     'rectify': rectify,
     'topview': topview,
     'picture': picture,

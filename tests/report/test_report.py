@@ -163,7 +163,7 @@ def test_the_page_is_self_contained_and_holds_the_figures(written):
     assert 'http' not in re.sub('base64,[^"]+', '', text)
     shown = [
         cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)
-        for data in re.findall('base64,([^"]+)"', text)
+        for data in re.findall('src="data:image/[a-z]+;base64,([^"]+)"', text)
     ]
     for one, entry in zip(shown, ENTRIES, strict=True):
         other = cv2.imread(str(written('full').parent / 'figures' / f'{entry.name}.png'))

@@ -1,0 +1,124 @@
+"""One page over the reports of many cameras."""
+
+from __future__ import annotations
+
+import base64
+import os
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import cv2
+from jinja2 import Environment, StrictUndefined
+
+from autocalib_ros import __version__
+from autocalib_ros.errors import AutocalibError, InputError
+from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
+from autocalib_ros.report.canvas import jpeg
+from autocalib_ros.results.calibration import Calibration
+from autocalib_ros.results.calibration_json import calibration_from_json, read_json
+from autocalib_ros.util.files import write_atomically
+
+RESULT, REPORT_PAGE = 'calibration.json', 'report.html'
+THUMBNAILS = ('ground_grid', 'coverage', 'all_tracks')
+"""Figures of a report of which the first one that exists is shown."""
+THUMBNAIL_PX = 320
+MAX_CAMERAS = 1000
+ORDER = ('refused', 'unreadable', 'partial', 'calibrated')
+"""What needs attention comes first."""
+
+
+@dataclass(frozen=True)
+class CameraEntry:
+    """One camera of the page."""
+
+    name: str
+    state: str
+    """One of `ORDER`."""
+    grade: str
+    focal: str
+    tilt: str
+    height: str
+    lengths: str
+    note: str
+    """What is wrong, or what would help."""
+    when: str
+    report: str
+    """Address of its report relative to the page; '' without one."""
+    thumbnail: str
+    """Data address of a picture; '' without one."""
+
+
+def write_index(folder: Path) -> tuple[Path, int]:
+    """Write index.html over all calibration.json below a folder; return its path and the number of cameras.
+
+    InputError if there is none, or if it cannot be written.
+    """
+    found = sorted(folder.rglob(RESULT))[:MAX_CAMERAS]
+    if not found:
+        raise InputError(f'there is no {RESULT} in {folder} or below it')
+    entries = sorted((_entry(path, folder) for path in found), key=lambda one: (ORDER.index(one.state), one.name))
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    template = (files('autocalib_ros.report') / 'templates' / 'index.html.j2').read_text(encoding='utf-8')
+    counts = [(state, sum(one.state == state for one in entries)) for state in ORDER]
+    page = environment.from_string(template).render(
+        entries=entries, counts=[(state, count) for state, count in counts if count], version=__version__
+    )
+    path = folder / 'index.html'
+    write_atomically(path, page)
+    return path, len(entries)
+
+
+def _entry(path: Path, folder: Path) -> CameraEntry:
+    name = str(path.parent.relative_to(folder)) if path.parent != folder else path.resolve().parent.name
+    when = datetime.fromtimestamp(path.stat().st_mtime, timezone.utc).strftime('%Y-%m-%d %H:%M UTC')
+    report = path.with_name(REPORT_PAGE)
+    address = quote(os.path.relpath(report, folder)) if report.exists() else ''
+    common = {'name': name, 'when': when, 'report': address, 'thumbnail': _thumbnail(path.parent / 'figures')}
+    nothing = dict.fromkeys(('grade', 'focal', 'tilt', 'height', 'lengths'), '')
+    try:
+        document = read_json(path)
+        if document.get('state') == 'refused':
+            return CameraEntry(**common, **nothing, state='refused', note=str(document['refusal']['message']))
+        return CameraEntry(**common, **_numbers(calibration_from_json(document)))
+    except (AutocalibError, LookupError, TypeError) as error:
+        return CameraEntry(**common, **nothing, state='unreadable', note=str(error))
+
+
+def _numbers(result: Calibration) -> dict[str, Any]:
+    sigma, ground = result.stddev, result.ground
+    metric = ground is not None and ground.metric
+    lengths = '' if sigma.ground is None else f'± {100 * sigma.ground.worst:.1f} %'
+    return {
+        'state': 'calibrated' if result.grade == 'full' else 'partial',
+        'grade': result.grade,
+        'focal': _with_sigma(result.camera.focal_px, sigma.focal_px, 'px', 0),
+        'tilt': '' if ground is None else _with_sigma(_tilt_deg(result), sigma.tilt_deg, '°', 1),
+        'height': _with_sigma(ground.height_m, sigma.height_m, 'm', 2) if ground is not None and metric else '',
+        'lengths': lengths,
+        'note': result.helpful.text if result.helpful else '',
+    }
+
+
+def _tilt_deg(result: Calibration) -> float:
+    if result.ground is None:
+        raise ValueError('the result has no ground plane')
+    return float(tilt_and_roll_deg(result.ground.normal_in_camera)[0])
+
+
+def _with_sigma(value: float, sigma: float | None, unit: str, digits: int) -> str:
+    return f'{value:.{digits}f} {unit}' + (f' ± {sigma:.{max(digits, 1)}f}' if sigma else '')
+
+
+def _thumbnail(figures: Path) -> str:
+    """Return a small picture of a report as a data address; '' if it has none."""
+    found = next((path for name in THUMBNAILS if (path := figures / f'{name}.png').exists()), None)
+    picture = None if found is None else cv2.imread(str(found))
+    if picture is None:
+        return ''
+    size = (THUMBNAIL_PX, max(1, picture.shape[0] * THUMBNAIL_PX // picture.shape[1]))
+    small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+    return 'data:image/jpeg;base64,' + base64.b64encode(jpeg(small)).decode()
