@@ -70,3 +70,14 @@ def test_a_dumb_terminal_gets_plain_lines(monkeypatch):
 
 def test_quiet_is_quiet():
     assert run(Terminal(), quiet=True) == ''
+
+
+def test_no_time_is_told_before_it_is_known():
+    stream = Terminal()
+    with progress_bar(1000, 'images', 'replay', stream=stream) as progress:
+        progress.update_to(1, 'collecting')
+        progress.update_to(2, 'solving')
+        assert 'left' not in stream.getvalue()
+        progress.update_to(500, 'collecting again')
+        progress.update_to(501, 'solving')
+    assert ' left, ' in stream.getvalue()

@@ -14,7 +14,10 @@ LINE_EVERY_S = 5.0
 LINE_EVERY_FRACTION = 0.1
 MIN_INTERVAL_S = 1.0
 """Shortest time between two lines, seconds: a short run does not need a line for every tenth of it."""
+KNOWN_FRACTION = 0.05
+"""Fraction of the work after which the time left is told: before, the start of libraries and the first images count."""
 BAR = '{desc} {percentage:3.0f} %|{bar:8}| {remaining} left{postfix}'
+BEGINNING_BAR = '{desc} {percentage:3.0f} %|{bar:8}|{postfix}'
 OPEN_BAR = '{desc} {n_fmt}{unit}, {elapsed}{postfix}'
 
 
@@ -66,8 +69,9 @@ class _ProgressBar:
             leave=True,
             nrows=2,
             ncols=terminal_width(stream) - 1,
-            bar_format=BAR if total else OPEN_BAR,
+            bar_format=BEGINNING_BAR if total else OPEN_BAR,
         )
+        self._total = total
         self._note = ''
 
     def __enter__(self) -> _ProgressBar:
@@ -81,6 +85,8 @@ class _ProgressBar:
         """Move the bar to `done`; show a new state immediately, because it may last."""
         changed, self._note = _state(note) != _state(self._note), note
         self._bar.ncols = terminal_width(self._stream) - 1  # the window may have been resized
+        if self._total and done >= KNOWN_FRACTION * self._total:
+            self._bar.bar_format = BAR
         fixed = {**self._bar.format_dict, 'n': done, 'postfix': '', 'ncols': None}
         room = self._bar.ncols - len(self._bar.format_meter(**fixed)) - len(', ')
         self._bar.set_postfix_str(truncate(note, room), refresh=False)
@@ -121,9 +127,14 @@ class _ProgressLines:
         if self._total:
             parts = [f'{self._done:g} of {self._total:g} {self._unit} ({100 * self._done / self._total:.0f} %)']
             left_s = elapsed * (self._total - self._done) / max(self._done, 1e-9)
-            parts += [f'{left_s:.0f} s left'] if 0 < self._done < self._total else []
+            parts += [f'{left_s:.0f} s left'] if _knows_time_left(self._done, self._total) else []
         parts += [f'{self._done / elapsed:.1f} {self._unit}/s'] + ([self._note] if self._note else [])
         print(f'{self._label}: ' + ', '.join(parts), file=self._stream, flush=True)
+
+
+def _knows_time_left(done: float, total: float) -> bool:
+    """Whether enough is done to say how long the rest takes."""
+    return KNOWN_FRACTION * total <= done < total
 
 
 def _state(note: str) -> str:
