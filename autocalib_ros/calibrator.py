@@ -127,7 +127,7 @@ class AutoCalibrator:
         self._due_s = self._options.first_solve_s + (0.0 if part is None else part.start_s)
         self._due_tracks = float(self._options.gate.min_tracks)
 
-    def snapshot_if_due(self, *, with_lines: bool = True) -> Evidence | None:
+    def snapshot_if_due(self, *, with_segments: bool = True) -> Evidence | None:
         """Return a snapshot if a new solution is worth trying now, else None.
 
         Depends on the images and their stamps alone, so that a live run and a replay solve the same evidence.
@@ -143,7 +143,7 @@ class AutoCalibrator:
         tracks = max(part.buffer.track_count, self._options.gate.min_tracks)
         self._due_tracks = part.tracks_seen + (self._options.solve_growth - 1.0) * tracks
         self._due_s = stream.time_s + self._options.solve_interval_s
-        return self.snapshot(with_lines=with_lines)
+        return self.snapshot(with_segments=with_segments)
 
     def accepted(self, tracks: int) -> None:
         """Note that evidence of so many tracks gave a calibration: a new solution is due when it can be better.
@@ -162,27 +162,28 @@ class AutoCalibrator:
         return part.buffer.track_count >= WORTHWHILE_GROWTH * tracks or part.tracks_seen - seen >= tracks
 
     def snapshot(
-        self, *, longest_part: bool = False, landmarks: bool = False, with_lines: bool = True
+        self, *, longest_part: bool = False, landmarks: bool = False, with_segments: bool = True
     ) -> Evidence | None:
         """Freeze the evidence so far; None before the first image.
 
         Evidence is of the present view of the camera, or of the one that was still for the longest time; `landmarks`
-        says whether it holds those of the background, by which evidence of other recordings can be joined. The lines of
-        the still scene take longest to find: without them `search_for_lines` says how to.
+        says whether it holds those of the background, by which evidence of other recordings can be joined. Segments of
+        the still scene take longest to find: without them `search_for_segments` says how to.
         """
         stream = self._stream
         if stream is None:
             return None
         view = stream.longest_view() if longest_part else stream.observer.view
         observer = stream.observer
-        evidence = replace(stream.evidence(view), stripes_px=observer.still_stripes(view))
-        if with_lines:
-            evidence = replace(evidence, still_lines_px=observer.still_lines(view))
+        evidence = stream.evidence(view)
+        if with_segments:
+            lines, stripes = observer.still_lines(view), observer.still_stripes(view)
+            evidence = replace(evidence, still_lines_px=lines, stripes_px=stripes)
         return evidence.with_landmarks(observer.landmarks(view)) if landmarks else evidence
 
-    def search_for_lines(self) -> Callable[[], np.ndarray] | None:
-        """Return a function for another thread that gives the lines of `snapshot` as of now; None before an image."""
-        return None if self._stream is None else self._stream.observer.search_for_lines()
+    def search_for_segments(self) -> Callable[[], tuple[np.ndarray, np.ndarray]] | None:
+        """Return a function for another thread: the lines and bars of `snapshot` as of now; None before an image."""
+        return None if self._stream is None else self._stream.observer.search_for_segments()
 
     def known_view(self) -> KnownView | None:
         """Return a small image of the present view, in the pose of `snapshot`, for registration; None before one."""

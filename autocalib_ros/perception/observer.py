@@ -308,17 +308,20 @@ class Observer:
             self._find_lines(scene.lines, scene.background, scene.picture_area.mask)
         return self._lines_in_full_size(scene.lines)
 
-    def search_for_lines(self) -> Callable[[], np.ndarray]:
-        """Return a function that gives `still_lines` of the present view as they are now, for another thread."""
+    def search_for_segments(self) -> Callable[[], tuple[np.ndarray, np.ndarray]]:
+        """Return a function that gives `still_lines` and `still_stripes` as they are now, for another thread."""
         scene = self._scene
-        if scene.lines.is_current(scene.background.times_s):
-            lines = self._lines_in_full_size(scene.lines)
-            return lambda: lines
-        background, mask, detector = scene.background.copy(), scene.picture_area.mask, scene.lines.fresh()
+        times_s = scene.background.times_s
+        if scene.lines.is_current(times_s) and scene.stripes.is_current(times_s):
+            found = self._lines_in_full_size(scene.lines), self._stripes_in_full_size(scene.stripes)
+            return lambda: found
+        background, mask = scene.background.copy(), scene.picture_area.mask
+        lines, stripes = scene.lines.fresh(), scene.stripes.fresh()
 
-        def search() -> np.ndarray:
-            self._find_lines(detector, background, mask)
-            return self._lines_in_full_size(detector)
+        def search() -> tuple[np.ndarray, np.ndarray]:
+            self._find_lines(lines, background, mask)
+            self._find_stripes(stripes, background)
+            return self._lines_in_full_size(lines), self._stripes_in_full_size(stripes)
 
         return search
 
@@ -354,14 +357,18 @@ class Observer:
     def still_stripes(self, view: int | None = None) -> np.ndarray:
         """Return the bright bars of the background, as `Evidence.stripes_px`, in pixels of the full image."""
         scene = self._scenes[self._view if view is None else view]
+        if not scene.stripes.is_current(scene.background.times_s):
+            self._find_stripes(scene.stripes, scene.background)
+        return self._stripes_in_full_size(scene.stripes)
 
-        def background() -> np.ndarray | None:
-            grey = scene.background.grey()
-            return None if grey is None else self._tracked_image(grey)
+    def _find_stripes(self, stripes: StripeDetector, background: Background) -> None:
+        """Find the bars of a background; uses nothing that later images change."""
+        grey = background.grey()
+        stripes.find(None if grey is None else self._tracked_image(grey), background.times_s)
 
-        found = scene.stripes.update(background, scene.background.times_s)
-        ends = self._to_full_pixels(found[:, :4].reshape(-1, 2)).reshape(-1, 4)
-        return np.hstack([ends, found[:, 4:]])
+    def _stripes_in_full_size(self, stripes: StripeDetector) -> np.ndarray:
+        found = stripes.stripes_px
+        return np.hstack([self._to_full_pixels(found[:, :4].reshape(-1, 2)).reshape(-1, 4), found[:, 4:]])
 
     def picture(self, view: int) -> Picture:
         """Return the picture inside the images of a view in memory, pixels of the full image."""

@@ -6,8 +6,6 @@ A bar ends where it falls to about half of its own peak, so that neither its con
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import cv2
 import numpy as np
 
@@ -41,12 +39,22 @@ class StripeDetector:
         self._source_times_s: tuple[float, ...] | None = None
         self._stripes = np.zeros((0, STRIPE_COLUMNS))
 
-    def update(self, background: Callable[[], np.ndarray | None], times_s: tuple[float, ...]) -> np.ndarray:
-        """Return the bars (n, STRIPE_COLUMNS) of a background (H, W) computed from images of these times."""
-        if times_s != self._source_times_s:
-            grey = background()
-            self._stripes = np.zeros((0, STRIPE_COLUMNS)) if grey is None else find_stripes(grey, self._ignored)
-            self._source_times_s = times_s
+    def is_current(self, times_s: tuple[float, ...]) -> bool:
+        """Whether the cached bars belong to the background computed from images of these times."""
+        return times_s == self._source_times_s
+
+    def find(self, grey: np.ndarray | None, times_s: tuple[float, ...]) -> None:
+        """Find the bars of a background (H, W) computed from images of these times; None if there is none yet."""
+        self._stripes = np.zeros((0, STRIPE_COLUMNS)) if grey is None else find_stripes(grey, self._ignored)
+        self._source_times_s = times_s
+
+    def fresh(self) -> StripeDetector:
+        """Return a detector with the same ignored regions that has not found anything."""
+        return StripeDetector(self._ignored)
+
+    @property
+    def stripes_px(self) -> np.ndarray:
+        """The bars of the background passed to `find`, shape (n, STRIPE_COLUMNS)."""
         return self._stripes
 
 

@@ -113,8 +113,8 @@ class _Job:
     """Generation of the evidence: the number of resets before it was collected."""
     view: KnownView | None = None
     """Image of the view that the evidence is from."""
-    search_for_lines: Callable[[], np.ndarray] | None = None
-    """Gives the lines of the still scene; runs in the solver thread, so that the images do not wait for it."""
+    search_for_segments: Callable[[], tuple[np.ndarray, np.ndarray]] | None = None
+    """Gives lines and bars of the still scene; runs in the solver thread, so that the images do not wait for it."""
     waiting: list[Future] = field(default_factory=list)
     """Futures of service calls, resolved with the result of this snapshot or of a newer one that replaced it."""
 
@@ -318,7 +318,7 @@ class CalibrationWorker:
                     self._guarded(lambda: (self._calibrator.snapshot(), self._calibrator.background())) or (None, None),
                 )
             if requests or (image is None and self._until_idle() == 0.0):
-                self._submit(self._guarded(partial(self._calibrator.snapshot, with_lines=False)), requests)
+                self._submit(self._guarded(partial(self._calibrator.snapshot, with_segments=False)), requests)
 
     def _until_idle(self) -> float | None:
         """Return the seconds until the stream counts as idle; None if all images are solved."""
@@ -359,7 +359,7 @@ class CalibrationWorker:
         accepted, self._accepted_tracks = self._accepted_tracks, 0
         if accepted:
             self._calibrator.accepted(accepted)
-        evidence = self._guarded(partial(self._calibrator.snapshot_if_due, with_lines=False))
+        evidence = self._guarded(partial(self._calibrator.snapshot_if_due, with_segments=False))
         if evidence is not None:
             self._submit(evidence, [])
         if time.monotonic() >= self._progress_at + PROGRESS_PERIOD_S:
@@ -400,7 +400,7 @@ class CalibrationWorker:
             if evidence is not None and not self._closed and self._generation == self._calibrator_generation:
                 waiting = self._job.waiting if self._job else []
                 view = self._guarded(self._calibrator.known_view)
-                search = self._guarded(self._calibrator.search_for_lines)
+                search = self._guarded(self._calibrator.search_for_segments)
                 self._job = _Job(evidence, self._generation, view, search, [*waiting, *requests])
                 self._changed.notify_all()
                 return
@@ -413,10 +413,10 @@ class CalibrationWorker:
             if job is None:
                 return
             began = time.monotonic()
-            if job.search_for_lines is not None:
-                lines = self._guarded(job.search_for_lines)
-                if lines is not None:
-                    job.evidence = replace(job.evidence, still_lines_px=lines)
+            if job.search_for_segments is not None:
+                segments = self._guarded(job.search_for_segments)
+                if segments is not None:
+                    job.evidence = replace(job.evidence, still_lines_px=segments[0], stripes_px=segments[1])
             result = self._guarded(partial(self._solved, job.evidence))
             if result is not None:
                 self.reported_evidence, self.solved_view = job.evidence, job.view

@@ -228,10 +228,12 @@ def test_lines_that_are_searched_later_are_those_of_the_moment_of_the_question()
     striped[100:106, 40:600] += 90
     for index in range(12):
         observer.observe(noisy(striped, 1.5, index), 0.5 * index)
-    search = observer.search_for_lines()
-    expected = observer.still_lines()
+    search = observer.search_for_segments()
+    expected, expected_stripes = observer.still_lines(), observer.still_stripes()
     for index in range(12, 60):
         observer.observe(noisy(plain, 1.5, index), 0.5 * index)
-    assert len(expected)
-    np.testing.assert_array_equal(search(), expected)
+    assert len(expected) and len(expected_stripes)
+    lines, stripes = search()
+    np.testing.assert_array_equal(lines, expected)
+    np.testing.assert_array_equal(stripes, expected_stripes)
     assert not np.array_equal(observer.still_lines(), expected)

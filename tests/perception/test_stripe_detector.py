@@ -56,17 +56,14 @@ def test_bars_under_the_mask_are_left_out() -> None:
     assert len(found) == 2 and (found[:, [0, 2]] < 380).all()
 
 
-def test_the_bars_of_one_background_are_found_once() -> None:
-    asked = []
-
-    def background() -> np.ndarray:
-        asked.append(1)
-        return road(DASHES, 3.0)
-
+def test_bars_belong_to_the_images_of_their_background() -> None:
     detector = StripeDetector(None)
-    found = [detector.update(background, times) for times in ((0.0, 1.0), (0.0, 1.0), (0.0, 1.0, 2.0))]
-    assert len(asked) == 2 and len(found[1]) == 3
-    assert detector.update(lambda: None, ()).shape == (0, 5)
+    assert not detector.is_current((0.0, 1.0)) and detector.stripes_px.shape == (0, 5)
+    detector.find(road(DASHES, 3.0), (0.0, 1.0))
+    assert detector.is_current((0.0, 1.0)) and not detector.is_current((0.0, 1.0, 2.0))
+    assert len(detector.stripes_px) == 3 and not len(detector.fresh().stripes_px)
+    detector.find(None, ())
+    assert detector.stripes_px.shape == (0, 5)
 
 
 def test_the_snapshot_brings_the_bars_of_a_reduced_image_in_full_size() -> None:
