@@ -95,7 +95,8 @@ def test_size_that_changes_is_an_error_until_there_is_a_new_calibration(bench, s
     node, publisher = fed(bench, camera_height=8.0)
     wait_for(lambda: node.publication.published, 'the calibration')
     node._worker.change(node.options, 1000.0)  # no solution for now
-    publisher.publish(image(START_NS + 10 * FRAME_NS, size=(160, 120)))
+    for number in range(1, 7):  # a size counts when it has lasted for 3 s
+        publisher.publish(image(START_NS + 10 * number * FRAME_NS, size=(160, 120)))
     wait_for(lambda: 'the present ones 160x120' in message(statuses), 'the error')
     assert (statuses[-1].status[0].level, values(statuses)['state']) == (b'\x02', 'COLLECTING')
     node._worker.change(node.options, 0.1)
