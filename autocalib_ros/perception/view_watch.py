@@ -125,6 +125,8 @@ class ViewReport:
     """Amplitude of the sway."""
     share: float = 0.0
     """Fraction of the corners of the reference that agree."""
+    is_watched: bool = False
+    """Whether there is a view to be compared with; without one only pictures that say nothing are told."""
 
     def __str__(self) -> str:
         if self.condition is ViewCondition.MOVED and self.move is not None:
@@ -318,7 +320,7 @@ class ViewWatch:
         elif self._unseen_s is None:
             self._unseen_s = time_s
         self._judge_fault(image, pose, frozen, time_s)
-        self.report = self._judged(image, pose, time_s)
+        self.report = replace(self._judged(image, pose, time_s), is_watched=bool(self._references))
         if pose is not None:
             self._renew(image, pose, time_s)
         return self.report

@@ -483,7 +483,8 @@ class AutocalibNode(Node):
         published, mode = self.publication.published, self.node_options.on_move
         text, good = self._events.told(report, stamp_ns, has_calibration=published is not None)
         self._log(text, good=good)
-        if report.condition in (ViewCondition.STILL, ViewCondition.SWAYING):
+        unwatched = report.condition is ViewCondition.UNKNOWN and not report.is_watched
+        if unwatched or report.condition in (ViewCondition.STILL, ViewCondition.SWAYING):
             self.publication.release()
         move = report.move
         if move is not None and mode == 'mend' and move.keeps_lens:

@@ -42,7 +42,7 @@ class ViewEvents:
             self._recovered_at = self._clock()
             held = 'the calibrated view is back' if has_calibration else 'the picture is back'
             return f'recovered at {clock_text(stamp_ns * 1e-9)}: {held}', True
-        if report.condition is ViewCondition.UNKNOWN and was is ViewCondition.BLIND and not has_calibration:
+        if report.condition is ViewCondition.UNKNOWN and was is ViewCondition.BLIND and not report.is_watched:
             self._lost = False
             self._recovered_at = self._clock()
             return f'recovered at {clock_text(stamp_ns * 1e-9)}: the picture is back', True

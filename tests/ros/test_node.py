@@ -418,6 +418,16 @@ def test_option_says_what_is_published_after_a_bump(bench, mode, withheld):
     assert not node.publication.withheld and node.publication.published is not before
 
 
+def test_calibration_without_a_stored_view_is_published_again_after_a_black_picture(bench):
+    node, _ = calibrated(bench)
+    node.view_changed(ViewReport(ViewCondition.BLIND, 20.0, fault=PictureFault.BLACK), START_NS)
+    assert node.publication.withheld
+    node.view_changed(ViewReport(ViewCondition.UNKNOWN, 30.0, is_watched=True), START_NS)
+    assert node.publication.withheld  # until the view is verified
+    node.view_changed(ViewReport(ViewCondition.UNKNOWN, 30.0), START_NS)
+    assert not node.publication.withheld  # which it cannot be
+
+
 def test_status_tells_programs_that_the_picture_is_black(bench):
     node, _ = calibrated(bench)
     statuses = bench.collect(DiagnosticStatus, '/autocalib/status', latched=True)

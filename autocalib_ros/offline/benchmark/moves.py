@@ -196,6 +196,6 @@ def format_move(run: MoveRun) -> str:
     mended = '-' if run.zoom != 1.0 else f'{run.rest_deg:.3f}'
     flags = f'  {run.false_flags} false flags' if run.false_flags else ''
     return (
-        f'{run.recording:<28}{run.name:<11}{told:>11}{true:>24}{measured:>26}{zoom:>8}{run.error_deg:>8.3f}{mended:>9}'
+        f'{run.recording[-27:]:<28}{run.name:<11}{told:>11}{true:>24}{measured:>26}{zoom:>8}{run.error_deg:>8.3f}{mended:>9}'
         f'{flags}'
     )
