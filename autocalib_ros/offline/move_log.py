@@ -45,10 +45,10 @@ class MoveLog:
             self._first_ns = self._part_ns = stamp_ns
         time_s = (stamp_ns - self._first_ns) * 1e-9
         height, width = image.shape[:2]
-        if self._watch.size != (width, height):
+        if self._watch.size != (width, height) or not self._watch.views:
             self._begin(stamp_ns, (width, height), calibrator)
             return
-        if not self._watch.is_due(time_s) or not self._watch.views:
+        if not self._watch.is_due(time_s):
             return
         report = self._watch.update(image, time_s)
         move = report.move
@@ -66,8 +66,11 @@ class MoveLog:
 
     def _begin(self, stamp_ns: int, size: tuple[int, int], calibrator: AutoCalibrator) -> None:
         """Watch the view of the present part, once it is known."""
+        if (stamp_ns - self._part_ns) * 1e-9 < FIRST_VIEW_S:
+            return
+        self._part_ns = stamp_ns  # for another try, where this view has too few outlines
         view = calibrator.known_view()
-        if view is not None and (stamp_ns - self._part_ns) * 1e-9 >= FIRST_VIEW_S:
+        if view is not None:
             self._watch.begin([view], Camera.equidistant(*size, GUESSED_FOCAL_WIDTHS * size[0]))
 
     def moves(self, camera: Camera | None) -> tuple[CameraMove, ...]:

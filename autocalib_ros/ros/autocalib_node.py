@@ -358,6 +358,7 @@ class AutocalibNode(Node):
         except AutocalibError as error:
             self.get_logger().warning(f'the calibration in {store.path} is not restored: {error}')
             return
+        self.store_writer.saved = found.stored
         self._worker.watch_stored(restored, self._stored_views(store, found.stored.calibration))
         self.get_logger().info(f'restored from {store.path}, not yet verified: {describe(restored)}')
 
