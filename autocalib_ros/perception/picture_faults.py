@@ -43,7 +43,7 @@ MIN_RICH_BLOCKS = 12
 """Least blocks with fine detail from which sharpness is judged. Judgement: a twentieth of the picture."""
 MIN_DETAIL_OVER_NOISE = 10.0
 """Least energy of the fine detail of a block over that of the noise of the reference, which is known to a tenth."""
-SHOWN_QUANTILE = 0.75
+UNHIDDEN_QUANTILE = 0.75
 """Quantile of the blocks that stands for those that nothing hides; blocks with half of their coarse detail count."""
 LEAST_DETAIL = 0.02
 """Part of the coarse detail below which nothing is left: thick fog leaves 0.04."""
@@ -85,9 +85,9 @@ class Detail:
             _over_blocks(own * other)[self._rich] / energy[self._rich]
             for own, other, energy in zip(self._bands, _bands(image), self._energies, strict=True)
         )
-        if np.quantile(coarse, SHOWN_QUANTILE) < LEAST_DETAIL:
+        if np.quantile(coarse, UNHIDDEN_QUANTILE) < LEAST_DETAIL:
             return 0.0
-        shown = coarse >= 0.5 * np.quantile(coarse, SHOWN_QUANTILE)
+        shown = coarse >= 0.5 * np.quantile(coarse, UNHIDDEN_QUANTILE)
         return float(np.median(fine[shown] / coarse[shown]))
 
 
