@@ -645,6 +645,11 @@ class NodeOptions(_Validated):
         'path of a known lens in the format of camera_info_manager, then only the pose is estimated; empty: the '
         'lens is estimated too',
     )
+    control_points: str = option(
+        '',
+        'path of control points (CSV or .otrfpts): ~/map_transform places the ground frame in their map; empty: none',
+    )
+    map_frame: str = option('map', 'frame of that map, the parent of the ground frame')
     publish_tf: bool = option(True, 'also publish the ground transform on /tf_static, if tf2_msgs is installed')
     camera_info_url: str = option(
         '',

@@ -61,6 +61,12 @@ AUTOCALIB_NODE = (
         'standard deviations, the newest move. On each change, latched',
     ),
     Endpoint(
+        '~/map_transform',
+        'published',
+        'geometry_msgs/TransformStamped',
+        'with `control_points`: pose of `<camera>_ground` in `map_frame`, for each new calibration. Latched',
+    ),
+    Endpoint(
         '~/markers',
         'published',
         'visualization_msgs/MarkerArray',

@@ -23,6 +23,7 @@ from autocalib_ros.revalidation import CalibrationState, Decision, reconcile
 from autocalib_ros.ros import messages
 from autocalib_ros.ros.driver_info import DriverInfo
 from autocalib_ros.ros.headers import DEFAULT_FRAME, Headers
+from autocalib_ros.ros.map_transform import MapTransformPublisher
 from autocalib_ros.ros.markers import markers, no_markers
 from autocalib_ros.ros.qos import latched_publisher
 from autocalib_ros.ros.transforms import GroundTransformPublisher
@@ -89,6 +90,17 @@ class CalibrationPublisher:
         self._markers = latched_publisher(node, MarkerArray, '~/markers')
         self._transforms = GroundTransformPublisher(
             node, tf_parent=options.tf_parent, publish_tf=node_options.publish_tf
+        )
+        self._map = (
+            MapTransformPublisher(
+                node,
+                node_options.control_points,
+                map_frame=node_options.map_frame,
+                tf_parent=options.tf_parent,
+                publish_tf=node_options.publish_tf,
+            )
+            if node_options.control_points
+            else None
         )
 
     def change(self, options: Options, node_options: NodeOptions) -> None:
@@ -313,6 +325,9 @@ class CalibrationPublisher:
         self._camera_info.publish(self.camera_info(published))
         if published.transform is not None:
             self._transforms.publish(published.transform)
+            if self._map is not None:
+                ground_frame = self._headers.ground_frame(published.image_frame)
+                self._map.publish(published.result, published.transform.header.stamp, ground_frame)
         self._markers.publish(published.markers)
         self.published, self.state = published, state
         self.valid_since_ns = published.result.newest_stamp_ns
