@@ -84,6 +84,8 @@ class CalibrationPublisher:
         self.image_frame = ''
         """Frame of the newest image; '' before the first."""
         self._other_frame, self._other_frames = '', 0
+        self._image_stamp: Time | None = None
+        """Stamp of the newest image."""
         self.image_size: tuple[int, int] | None = None
         """Size of the newest decoded image."""
         self._camera_info = latched_publisher(node, CameraInfo, '~/camera_info')
@@ -137,6 +139,7 @@ class CalibrationPublisher:
             self._other_frame, self._other_frames = '', 0
             size = (message.width, message.height) if hasattr(message, 'width') else self.image_size
             published = self.published
+            self._image_stamp = message.header.stamp
             if self._per_image and published is not None and size == (published.fields.width, published.fields.height):
                 self._camera_info.publish(self._present_info(published, message.header.stamp, image_frame))
         return foreign
@@ -322,7 +325,7 @@ class CalibrationPublisher:
         )
 
     def _publish(self, state: CalibrationState, published: Published) -> None:
-        self._camera_info.publish(self.camera_info(published))
+        self._camera_info.publish(self.camera_info(published, self._later_stamp(published)))
         if published.transform is not None:
             self._transforms.publish(published.transform)
             if self._map is not None:
@@ -331,6 +334,12 @@ class CalibrationPublisher:
         self._markers.publish(published.markers)
         self.published, self.state = published, state
         self.valid_since_ns = published.result.newest_stamp_ns
+
+    def _later_stamp(self, published: Published) -> Time | None:
+        """Return the stamp of the newest image if it is later than the evidence of a calibration: none steps back."""
+        stamp = self._image_stamp if self._per_image else None
+        later = stamp is not None and messages.stamp_ns(stamp) > published.result.newest_stamp_ns
+        return stamp if later else None
 
     def _clear_latched(self) -> None:
         """Remove obsolete latched messages by renewing their publishers, so that late joiners do not get them.
