@@ -161,7 +161,8 @@ class AutocalibNode(Node):
         deadline = time.monotonic() + SHUTDOWN_S
         if not self.store_writer.close(SHUTDOWN_S / 2):
             self.get_logger().warning('shutdown: a calibration was still being written and is lost')
-        self._reports.close()
+        if not self._reports.close():
+            self.get_logger().warning('shutdown: a report was still being drawn and is given up; an earlier one stays')
         if not self._worker.close(deadline - time.monotonic()):
             self.get_logger().warning('shutdown: a solution was still running and is lost')
         self._pictures.close(max(0.0, deadline - time.monotonic()))

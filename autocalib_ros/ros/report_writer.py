@@ -87,16 +87,21 @@ class ReportWriter:
                 self._thread.start()
             self._changed.notify_all()
 
-    def close(self) -> None:
-        """Abort the report that is being written and drop the pending one; the previous report stays."""
+    def close(self) -> bool:
+        """Abort the report that is being written and drop the pending one; the previous report stays.
+
+        Return whether there was nothing to give up.
+        """
         with self._changed:
-            self._closed, self._next = True, None
+            pending, self._closed, self._next = self._next is not None, True, None
             process = self._process
             self._changed.notify_all()
+        drawing = process is not None and process.is_alive()
         if process is not None:
             process.kill()
         if self._thread is not None:
             self._thread.join(PROCESS_EXIT_S)
+        return not (pending or drawing)
 
     def _run(self) -> None:
         while True:
