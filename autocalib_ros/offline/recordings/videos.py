@@ -41,9 +41,13 @@ class VideoSource:
         with self._capture() as capture:
             fps, declared_frames = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
             if not capture.grab():
+                remedy = (
+                    'Download it first: not every server lets parts of a file be read'
+                    if '://' in str(path)
+                    else 'Convert it, for example: ffmpeg -i IN -c:v libx264 -crf 16 OUT.mp4'
+                )
                 raise InputError(
-                    f'{self.name} has no frame that can be decoded; its codec is {_codec(capture)}. Convert it, for '
-                    'example: ffmpeg -i IN -c:v libx264 -crf 16 OUT.mp4'
+                    f'{self.name} has no frame that can be decoded; its codec is {_codec(capture)}. {remedy}'
                 )
             self.pixel_aspect = _pixel_aspect(capture)
             turned_deg = round(capture.get(cv2.CAP_PROP_ORIENTATION_META)) % 360
