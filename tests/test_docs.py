@@ -9,6 +9,7 @@ import json
 import pkgutil
 import re
 import shlex
+import shutil
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from dataclasses import replace
@@ -186,7 +187,8 @@ def test_figures_of_the_method_are_drawn(tmp_path):
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     module.FOLDER = tmp_path
-    for draw in (module.straight, module.turning, module.loss):
+    shutil.copy(DOCS / 'explanation' / 'grades.csv', tmp_path)
+    for draw in (module.straight, module.turning, module.loss, module.grades):
         draw()
         name = f'{draw.__name__}.svg'
         sizes = [

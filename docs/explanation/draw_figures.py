@@ -111,7 +111,7 @@ def grades() -> None:
         of_this = [draw for draw in draws if draw['grade'] in of_kind]
         places = np.array([[float(draw['road_yaw_deg']), float(draw['true_tilt_deg'])] for draw in of_this])
         axes.plot(*places.reshape(-1, 2).T, mark, color=colour, markersize=6, label=f'{label}: {len(of_this)}')
-    axes.set(xlim=(0, 90), ylim=(0, 40), xlabel='angle between road and view, degrees', ylabel='tilt, degrees')
+    axes.set(xlim=(0, 90), ylim=(0, 48), xlabel='angle between road and view, degrees', ylabel='tilt, degrees')
     axes.legend(loc='upper right', fontsize=9)
     save(figure, 'grades.svg')
 
