@@ -54,7 +54,7 @@ MIN_PERIODIC_SPACINGS = 6
 """Fewest spacings that are one period. Judgement."""
 PERIOD_PAINT_SIGMA = 0.03
 """Standard deviation of the logarithm of a period that no spread shows: crews lay out dashes by the machine's wheel.
-Judgement; four views with known periods were 1 % to 2 % off."""
+Judgement; two rendered highways were 1 % off, four real recordings 2 to 6 % at camera heights by hand."""
 SLOPE_SIGMA = 0.03
 """Standard deviation of the change of a period by the logarithm of the distance that no spread shows: sag and crest of
 the road. Judgement."""
