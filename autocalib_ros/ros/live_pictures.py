@@ -137,12 +137,15 @@ class LivePictures:
         image = black_out(pending.image, self._ignored)  # the only source of all pictures
         height, width = image.shape[:2]
         published, state = self._publication.published, self._publication.state
-        if published is not None and published.result.evidence.image_size != (width, height):
+        withheld = self._publication.withheld
+        if published is not None and (withheld or published.result.evidence.image_size != (width, height)):
             published = None
         result = None if published is None else published.result
         if pending.followed_px is not None:
             picture = self._debug.of((width, height), result, self._labelled_tracks)
             caption = caption_of(state, result, self._progress())
+            if withheld:
+                caption = Caption('WITHHELD', withheld, WAITING_COLOUR)
             self._publish(self._debug_image, picture.draw(image, pending.followed_px, caption), pending.header)
         if published is None:
             return
