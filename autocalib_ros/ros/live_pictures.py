@@ -188,10 +188,10 @@ def caption_of(state: CalibrationState, result: Calibration | None, progress: Ca
     if result is None or state is CalibrationState.NONE:
         return Caption(*_collecting(progress), WAITING_COLOUR)
     numbers = ', '.join(describe_numbers(result))
-    if state is CalibrationState.RESTORED:
+    if state in (CalibrationState.RESTORED, CalibrationState.MENDED):
         title, missing = _collecting(progress)
         return Caption(
-            f'RESTORED, not yet verified, grade {result.grade}', f'{numbers}; {title}: {missing}', WAITING_COLOUR
+            f'{state.name}, not yet verified, grade {result.grade}', f'{numbers}; {title}: {missing}', WAITING_COLOUR
         )
     return Caption(f'CALIBRATED, grade {result.grade}', numbers, VERIFIED_COLOUR)
 
