@@ -66,6 +66,11 @@ def replay_and_report(
         )
     if replayed.stopped:
         print_stderr(f'Stopped after {replayed.frames} images; the result is of these.')
+    if replayed.displacements_px and not quiet:
+        print_stderr(
+            f'{1 + len(replayed.displacements_px)} recordings are joined; their views were displaced by up to '
+            f'{max(replayed.displacements_px):.2f} px, which is undone.'
+        )
     if replayed.repeated and not quiet:
         print_stderr(f'{replayed.repeated} of {replayed.frames} images repeat an earlier one and are left out.')
     if not quiet and not replayed.evidence.picture.fills_image:

@@ -22,8 +22,11 @@ class JoinedEvidence:
     def __init__(self, gate: GateOptions, before: Evidence | None = None) -> None:
         """`before` is evidence of earlier runs, to which all is registered."""
         self._gate = gate
+        self._last_displacement_px = 0.0
         self._parts = [] if before is None else [before]
         self._first_name = '' if before is None else 'the evidence of before'
+        self.displacements_px: list[float] = []
+        """Root mean square displacement of each recording that was registered to the first."""
         self.left_out: list[str] = []
         """Why recordings were left out, one line each."""
 
@@ -37,6 +40,8 @@ class JoinedEvidence:
         if isinstance(registered, str):
             self._leave_out(name, registered)
             return False
+        if self._parts:
+            self.displacements_px.append(self._last_displacement_px)
         self._parts.append(registered)
         self._first_name = self._first_name or name
         return True
@@ -83,7 +88,7 @@ class JoinedEvidence:
                 f'its view is displaced by {found.displacement_px:.1f} px from that of the first recording, more than '
                 f'the {limit_px:.1f} px that are compensated: the camera was turned in between'
             )
-        LOG.info('registered with %d landmarks, %.2f px', found.matches, found.displacement_px)
+        self._last_displacement_px = found.displacement_px
         return moved(evidence, found.matrix)
 
     @staticmethod

@@ -62,6 +62,8 @@ class ReplayResult:
     moves: tuple[CameraMove, ...] = ()
     """Moves of the camera, in degrees through the lens of the result; not measured without one. The times are those
     of the recording in which each was."""
+    displacements_px: tuple[float, ...] = ()
+    """Root mean square displacement of the view of each further recording, which is undone."""
 
 
 def replay(
@@ -117,6 +119,7 @@ def replay(
         stopped=any(one.stopped for one in gathered),
         left_out=tuple(joint.left_out),
         moves=tuple(move for one in gathered for move in one.moves.moves(camera)),
+        displacements_px=tuple(joint.displacements_px),
     )
 
 

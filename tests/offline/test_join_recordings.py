@@ -46,7 +46,7 @@ def test_recordings_are_registered_to_the_first(clip):
     assert joint.add(first, 'a') and joint.add(later, 'b')
     points = joint.all().points_px
     assert np.abs(points[len(first.points_px) :] - first.points_px).max() < 0.15
-    assert not joint.left_out
+    assert not joint.left_out and joint.displacements_px == pytest.approx([1.5], abs=0.1)
 
 
 @pytest.mark.parametrize(
@@ -101,4 +101,5 @@ def test_clips_of_one_view_are_replayed_as_one_and_another_view_is_left_out():
     assert replayed.frames == 100 and replayed.evidence.frames == 100
     assert [line.split(' is left out')[0] for line in replayed.left_out] == ['b']
     assert [one.name.split('#')[0] for one in replayed.evidence.recordings] == ['a', 'c']
+    assert len(replayed.displacements_px) == 1 and replayed.displacements_px[0] < 0.1
     assert stored[-1] is replayed.evidence and replayed.accepted_at_s is None
