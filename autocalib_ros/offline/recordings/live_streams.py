@@ -204,7 +204,10 @@ def _require_device(device: Path) -> None:
 def _hint(address: str) -> str:
     if DEVICE.fullmatch(address):
         return 'another program may use the camera'
-    return 'check address, port, user and password; ffplay or VLC should show it'
+    return (
+        'check address, port, user and password: it is that of the video itself, not of a page that shows it; ffplay '
+        'or VLC should play it'
+    )
 
 
 def public_name(address: str) -> str:

@@ -9,10 +9,22 @@ from pathlib import Path
 from typing import Any
 
 from autocalib_ros.errors import InputError, UsageError
-from autocalib_ros.offline.recordings.listing import is_bag, is_stream, recordings_of
+from autocalib_ros.offline.recordings.listing import STREAM_SCHEMES, is_bag, is_stream, recordings_of
 from autocalib_ros.offline.recordings.sources import Source, TimeWindow
 
 LOG = logging.getLogger(__name__)
+
+UNPACK = 'unpack it, and give the folder'
+TRACKS = 'it may hold evidence or tracks, which autocalib evidence solves'
+INSTEAD = {
+    **dict.fromkeys(('.zip', '.tar', '.gz', '.tgz', '.xz', '.bz2', '.7z', '.rar'), UNPACK),
+    **dict.fromkeys(('.npz', '.csv', '.txt'), TRACKS),
+    '.json': 'give the recording that it was calibrated from',
+    '.yaml': 'give the folder of the rosbag2; parameters go to --params-file, a lens to --camera-info',
+    '.pcap': 'record the stream of the camera itself, for example with its rtsp:// address',
+    '.m3u8': 'give its http:// address',
+}
+"""What to do with files that are often given instead of recordings, by suffix."""
 
 
 def open_sources(
@@ -87,6 +99,9 @@ def _open_images(paths: list[Path], topic: str | None, window: TimeWindow, rate_
 
 def _open_file(path: Path, topic: str | None, window: TimeWindow, rate_hz: float | None) -> Source:
     _check_readable(path)
+    instead = INSTEAD.get(path.suffix.lower()) if path.is_file() else None
+    if instead is not None:
+        raise InputError(f'{path} is no recording: {instead}')
     if path.is_dir() or is_bag(path):
         from autocalib_ros.offline.recordings.bags import BagSource  # lazy import: videos do not need rosbags
 
@@ -104,10 +119,20 @@ def _refuse(given: object, message: str) -> None:
         raise UsageError(message)
 
 
+def _meant_instead(text: str) -> str:
+    """Return what was probably meant by a path that does not exist; '' if nothing is near."""
+    if text.isdigit():
+        return f': a camera device is /dev/video{text}'
+    scheme, colon, _ = text.partition(':')
+    if colon and scheme.isalpha() and len(scheme) > 1:
+        return f': addresses begin with {", ".join(f"{one}://" for one in STREAM_SCHEMES[:5])}'
+    return ''
+
+
 def _check_readable(path: Path) -> None:
     try:
         if not path.exists():
-            raise InputError(f'{path} does not exist')
+            raise InputError(f'{path} does not exist{_meant_instead(str(path))}')
         if path.is_dir():
             return
         if not path.is_file():

@@ -6,6 +6,7 @@ import pytest
 
 from autocalib_ros.errors import InputError
 from autocalib_ros.offline.recordings.listing import is_stream, recordings_of
+from autocalib_ros.offline.recordings.open import open_source
 
 
 @pytest.fixture
@@ -80,3 +81,28 @@ def test_several_arguments_are_several_recordings(folder):
 def test_what_is_no_recording_is_one_clear_line(folder, made, asked, message):
     with pytest.raises(InputError, match=message):
         recordings_of([f'{folder(*made)}{asked}'])
+
+
+@pytest.mark.parametrize(
+    ('name', 'message'),
+    [
+        ('clips.zip', 'unpack it, and give the folder'),
+        ('evidence.npz', 'autocalib evidence solves'),
+        ('calibration.json', 'give the recording that it was calibrated from'),
+        ('metadata.yaml', 'give the folder of the rosbag2'),
+    ],
+)
+def test_a_file_of_another_kind_is_answered_with_what_to_do(tmp_path, name, message):
+    (tmp_path / name).write_text('words')
+    with pytest.raises(InputError, match=message):
+        open_source(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ('text', 'message'),
+    [('0', '0 does not exist: a camera device is /dev/video0'), ('rtsp:/cam', 'addresses begin with rtsp://')],
+)
+def test_what_does_not_exist_is_answered_with_what_was_meant(tmp_path, monkeypatch, text, message):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match=message):
+        open_source(text)
