@@ -23,7 +23,7 @@ from autocalib_ros.errors import InputError
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.lens.camera_info_lens import CameraInfoLens, message_field
 from autocalib_ros.results.calibration import Calibration
-from autocalib_ros.results.calibration_json import calibration_from_json, read_json
+from autocalib_ros.results.calibration_json import calibration_from_json, read_json_object
 
 MIN_HORIZON_DISTANCE_PX = 1.0
 """Minimum distance in pixels from the horizon of the requested plane: closer pixels are invalid, since the next one
@@ -117,7 +117,7 @@ class Ground:
     def from_file(cls, path: Path | str) -> Ground:
         """Return the ground of a calibration.json, with its covariance; InputError if it has no ground plane."""
         path = Path(path).expanduser()
-        document = read_json(path)
+        document = read_json_object(path)
         try:
             return cls.from_document(document)
         except InputError as error:

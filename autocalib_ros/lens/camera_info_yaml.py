@@ -16,12 +16,12 @@ from autocalib_ros.errors import AutocalibError, InputError
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.lens.camera_info import DISTORTION_MODELS, EQUIDISTANT_K1_FLOOR, CameraInfo, camera_info
 from autocalib_ros.lens.opencv_lens import OpencvLens, fit_kannala_brandt
+from autocalib_ros.util.documents import parse_yaml
 from autocalib_ros.util.files import write_atomically
+from autocalib_ros.util.input_limits import MAX_DOCUMENT_BYTES
 
 INI_WORDS = (b'[image]', b'camera matrix')
 """What every camera_info in the INI format of Videre has."""
-MAX_YAML_BYTES = 1_000_000
-"""Maximum file size: no camera_info comes near it."""
 MAX_ABS_VALUE = 1e9
 """Maximum absolute value of a number: larger ones are errors, and their powers would overflow."""
 Parsed = TypeVar('Parsed')
@@ -120,19 +120,18 @@ def _read(path: Path | str, parse: Callable[[Mapping[str, Any]], Parsed]) -> Par
 def _fields(path: Path) -> Mapping[str, Any]:
     """Return the first YAML document of a file, keys in lower case: ROS 1 prints K, D, R, P."""
     with path.open('rb') as stream:
-        text = stream.read(MAX_YAML_BYTES + 1)
-    if len(text) > MAX_YAML_BYTES:
-        raise InputError(f'it is longer than {MAX_YAML_BYTES} bytes, so it is no camera_info; {EXPECTED_INPUT}')
+        text = stream.read(MAX_DOCUMENT_BYTES + 1)
+    if len(text) > MAX_DOCUMENT_BYTES:
+        raise InputError(f'it is longer than {MAX_DOCUMENT_BYTES} bytes, so it is no camera_info; {EXPECTED_INPUT}')
     if all(word in text for word in INI_WORDS):
         raise InputError(
             'it is of the INI format (ost.txt): give the ost.yaml that camera_calibration wrote beside it, or convert '
             'it by "ros2 run camera_calibration_parsers convert FILE.ini FILE.yaml"'
         )
     try:
-        document = next(yaml.safe_load_all(text), None)
-    except Exception as error:  # PyYAML raises errors of any type at unknown tags and malformed numbers
-        reason = ' '.join(str(error).split())[:200]
-        raise InputError(f'it is not YAML ({reason or type(error).__name__}); {EXPECTED_INPUT}') from error
+        document = parse_yaml(text, first=True)
+    except InputError as error:
+        raise InputError(f'it {error}; {EXPECTED_INPUT}') from error
     if not isinstance(document, Mapping):
         raise InputError(f'it holds no names with values; {EXPECTED_INPUT}')
     return {str(key).lower(): value for key, value in document.items() if isinstance(key, str)}

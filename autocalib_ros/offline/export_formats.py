@@ -17,7 +17,7 @@ import yaml
 from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.ground import Ground
 from autocalib_ros.results.calibration import Calibration
-from autocalib_ros.results.calibration_json import calibration_from_json, read_json
+from autocalib_ros.results.calibration_json import calibration_from_json, read_json_object
 from autocalib_ros.results.control_points import MapPlacement, to_lon_lat
 
 AREA_GRID = (64, 36)
@@ -55,7 +55,7 @@ class ExportedCamera:
         """Read calibration.json or NAME.autocalib.json; InputError without a ground plane in metres."""
         if not 1.0 <= range_m <= 1000.0:
             raise UsageError(f'the range must lie between 1 and 1000 metres, got {range_m:g}')
-        document = read_json(path)
+        document = read_json_object(path)
         try:
             self.calibration: Calibration = calibration_from_json(document)
             self.ground = Ground.of(self.calibration)
@@ -242,7 +242,7 @@ def export(camera: ExportedCamera, kind: str, placement: MapPlacement | None, ma
 
 def read_placement(path: Path) -> MapPlacement:
     """Read map.json; InputError if it is none."""
-    document = read_json(path)
+    document = read_json_object(path)
     try:
         return MapPlacement.from_document(document)
     except InputError as error:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import Any, cast
@@ -15,6 +14,8 @@ from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.pictures.views import image_to_ground
 from autocalib_ros.results.saved_camera import SavedCamera
+from autocalib_ros.util.documents import read_json
+from autocalib_ros.util.input_limits import MAX_METADATA_BYTES
 
 MAX_COMPARED_RANGE_M = 40.0
 """Largest distance from the camera of the road points between which distances are compared."""
@@ -37,12 +38,10 @@ def median_distance_error(true_m: np.ndarray, found_m: np.ndarray) -> float:
 
 def read_truth(path: Path) -> dict[str, Any]:
     """Read a truth.json, or raise InputError."""
-    try:
-        return json.loads(path.read_text(encoding='utf-8'))
-    except OSError as error:
-        raise InputError(f'cannot read {path}: {error.strerror or error}') from error
-    except ValueError as error:
-        raise InputError(f'{path} is not a truth.json: {error}') from error
+    truth = read_json(path, 'truth.json', MAX_METADATA_BYTES)
+    if not isinstance(truth, dict):
+        raise InputError(f'{path}: it holds no names with values, so it is no truth.json')
+    return truth
 
 
 def nearby_road_points(truth: dict[str, Any]) -> np.ndarray:

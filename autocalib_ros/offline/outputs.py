@@ -14,7 +14,7 @@ from autocalib_ros.offline.recordings.sources import Source, camera_name
 from autocalib_ros.offline.replay_recording import ReplayResult
 from autocalib_ros.report.scene import ReportScene
 from autocalib_ros.results.calibration import Calibration
-from autocalib_ros.results.calibration_json import read_json, write_calibration_json
+from autocalib_ros.results.calibration_json import read_json_object, write_calibration_json
 
 LOG = logging.getLogger(__name__)
 
@@ -91,7 +91,7 @@ def write_outputs(
 def is_accepted(calibration: Path) -> bool:
     """Return whether a calibration.json holds an accepted calibration; False if it cannot be read."""
     try:
-        return read_json(calibration).get('state') == ACCEPTED_STATE
+        return read_json_object(calibration).get('state') == ACCEPTED_STATE
     except AutocalibError:
         return False
 

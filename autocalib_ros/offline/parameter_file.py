@@ -11,6 +11,7 @@ import yaml
 
 from autocalib_ros.config import NodeOptions, Options, flatten, walk_options, with_overrides
 from autocalib_ros.errors import InputError, UsageError
+from autocalib_ros.util.documents import parse_yaml, printable, read_yaml
 
 WILDCARDS = ('*', '**')
 ROS_PARAMETERS = ('use_sim_time', 'start_type_description_service')
@@ -31,12 +32,7 @@ def camera_info_file(path: Path) -> str:
 
 
 def _read_values(path: Path) -> dict[str, Any]:
-    try:
-        tree = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
-    except OSError as error:
-        raise InputError(f'cannot read {path}: {error.strerror or error}') from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise InputError(f'{path} is not YAML: {" ".join(str(error).split())}') from error
+    tree = read_yaml(Path(path), 'parameter file')
     values: dict[str, Any] = {}
     for section in _applicable_sections(path, _sections(tree)):
         values.update(flatten(section))
@@ -80,9 +76,9 @@ def parse_assignments(assignments: list[str]) -> dict[str, Any]:
         if not name.strip() or not equals:
             raise UsageError(f"'-p {text}' does not have the form name=value")
         try:
-            values[name.strip()] = yaml.safe_load(value)
-        except yaml.YAMLError as error:
-            raise UsageError(f"'-p {text}' has an invalid YAML value") from error
+            values[name.strip()] = parse_yaml(value)
+        except InputError as error:
+            raise UsageError(f"the value of '-p {printable(text)}' {error}") from error
     return values
 
 

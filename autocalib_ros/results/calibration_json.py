@@ -6,7 +6,7 @@ import json
 import reprlib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 
@@ -27,27 +27,16 @@ from autocalib_ros.results.grades import GroundSigma, HelpfulMeasure
 from autocalib_ros.results.refusals import Reason
 from autocalib_ros.results.statements import UNKNOWN_KIND, Statement, Value
 from autocalib_ros.results.verification_table import VerificationRow
+from autocalib_ros.util.documents import read_json
 from autocalib_ros.util.files import write_atomically
 
-MAX_JSON_BYTES = 1_000_000
-"""A calibration takes a few thousand bytes."""
 ROTATION_TOLERANCE = 1e-6
 """How far the columns of a rotation may be from unit length and right angles."""
 
 
-def read_json(path: Path) -> Mapping[str, Any]:
+def read_json_object(path: Path) -> Mapping[str, Any]:
     """Return the document in a file; InputError where it is not there, too long, or no JSON object."""
-    try:
-        with path.open('rb') as stream:
-            text = stream.read(MAX_JSON_BYTES + 1)
-    except OSError as error:
-        raise InputError(f'cannot read {path}: {error.strerror or error}') from error
-    if len(text) > MAX_JSON_BYTES:
-        raise InputError(f'{path}: it is longer than {MAX_JSON_BYTES} bytes, so it is no calibration')
-    try:
-        document = json.loads(text, parse_constant=_reject_constant)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f'{path}: it is not JSON ({error})') from error
+    document = read_json(path, 'calibration')
     if not isinstance(document, Mapping):
         raise InputError(f'{path}: it holds no names with values')
     return document
@@ -196,10 +185,6 @@ def _numbers(values: Any, kind: Callable[[Any], Any], count: int) -> tuple[Any, 
     if not isinstance(values, list) or len(values) != count:
         raise ValueError(f'{reprlib.repr(values)} are not {count} numbers')
     return tuple(kind(value) for value in values)
-
-
-def _reject_constant(name: str) -> NoReturn:
-    raise ValueError(f'{name} is no number')
 
 
 JSON_VERSION = 3

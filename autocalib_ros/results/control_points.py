@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from autocalib_ros.errors import InputError, UsageError
+from autocalib_ros.util.documents import parse_json, read_text
 
 LOCAL = 'local'
 """Name of a map that is just metres."""
@@ -171,15 +171,10 @@ def _turn(points_m: np.ndarray, angle: float) -> np.ndarray:
 
 def read_control_points(path: Path) -> ControlPoints:
     """Read a CSV file or OTVision's reference points; InputError says what is wrong and what was expected."""
-    try:
-        text = path.read_text(encoding='utf-8-sig')
-    except OSError as error:
-        raise InputError(f'cannot read {path}: {error.strerror or error}') from error
-    except UnicodeDecodeError as error:
-        raise InputError(f'{path} is no text; {EXPECTED_FILE}') from error
+    text = read_text(path, f'file of control points; {EXPECTED_FILE}')
     try:
         points = _read_otvision(text) if path.suffix == OTVISION_SUFFIX else _read_csv(text)
-    except (LookupError, TypeError, ValueError, csv.Error) as error:
+    except (InputError, LookupError, TypeError, ValueError, AttributeError, csv.Error) as error:
         raise InputError(f'{path}: {error or type(error).__name__}; {EXPECTED_FILE}') from error
     if not 2 <= len(points.pixels) <= MAX_CONTROL_POINTS:
         raise InputError(f'{path} has {len(points.pixels)} control points, 2 to {MAX_CONTROL_POINTS} are needed')
@@ -217,7 +212,7 @@ def _numbers(rows: Sequence[Mapping[str, str]], columns: Sequence[str]) -> np.nd
 
 
 def _read_otvision(text: str) -> ControlPoints:
-    document = json.loads(text)
+    document = parse_json(text)
     points = list(document.values())
     zones = {(int(point['zone_utm']), str(point['hemisphere']).upper()) for point in points}
     if len(zones) != 1:

@@ -10,12 +10,11 @@ from typing import Any
 from autocalib_ros.errors import InputError
 from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
 from autocalib_ros.results.calibration import Calibration
+from autocalib_ros.util.documents import parse_json, read_text
 from autocalib_ros.util.files import write_atomically
 
 MAX_VERSIONS = 200
 """Most versions in the file: years of a camera that is bumped now and then, and less than 100 kB."""
-MAX_HISTORY_BYTES = 1_000_000
-"""Size above which a file is no history of this program."""
 
 
 def version_entry(result: Calibration, cause: str, time_s: float) -> dict[str, Any]:
@@ -41,14 +40,9 @@ def version_entry(result: Calibration, cause: str, time_s: float) -> dict[str, A
 
 def read_history(path: Path) -> list[dict[str, Any]]:
     """Return the versions in a file, oldest first; none without one. Lines that are no version are left out."""
-    try:
-        if path.stat().st_size > MAX_HISTORY_BYTES:
-            raise InputError(f'{path}: it is longer than {MAX_HISTORY_BYTES} bytes, so it is no history')
-        text = path.read_text(encoding='utf-8')
-    except FileNotFoundError:
+    if not path.exists():
         return []
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f'cannot read {path}: {error}') from error
+    text = read_text(path, 'history')
     return [entry for line in text.splitlines() if (entry := _parsed(line)) is not None]
 
 
@@ -71,7 +65,7 @@ def describe_version(entry: dict[str, Any]) -> str:
 
 def _parsed(line: str) -> dict[str, Any] | None:
     try:
-        entry = json.loads(line)
-    except (ValueError, RecursionError):
+        entry = parse_json(line)
+    except InputError:
         return None
     return entry if isinstance(entry, dict) and isinstance(entry.get('time'), str) else None

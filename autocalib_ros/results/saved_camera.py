@@ -19,7 +19,7 @@ from autocalib_ros.lens.camera_info_lens import CameraInfoLens
 from autocalib_ros.lens.camera_info_yaml import read_exact_lens
 from autocalib_ros.lens.opencv_lens import OpencvLens, fit_kannala_brandt
 from autocalib_ros.results.calibration import Calibration, StandardDeviations
-from autocalib_ros.results.calibration_json import calibration_from_json, read_json
+from autocalib_ros.results.calibration_json import calibration_from_json, read_json_object
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,7 +129,7 @@ def read_saved_camera(path: Path) -> SavedCamera:
     """Return the camera of any of the files; InputError names the fault and what was expected."""
     if path.suffix.lower() != '.json':
         return SavedCamera.from_opencv_lens(*read_exact_lens(path))
-    document = read_json(path)
+    document = read_json_object(path)
     try:
         return SavedCamera.of(calibration_from_json(document), _rectified_projection(document))
     except InputError as error:

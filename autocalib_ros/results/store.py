@@ -31,7 +31,7 @@ from autocalib_ros.errors import AutocalibError, InputError, UsageError
 from autocalib_ros.lens.camera_info import CameraInfo
 from autocalib_ros.lens.camera_info_yaml import camera_info_yaml, read_camera_info_fields
 from autocalib_ros.results.calibration import Calibration
-from autocalib_ros.results.calibration_json import calibration_from_json, read_json, to_json
+from autocalib_ros.results.calibration_json import calibration_from_json, read_json_object, to_json
 from autocalib_ros.results.grades import rank_of
 from autocalib_ros.util.files import keep_copy, remove_temporaries, write_atomically
 
@@ -235,7 +235,7 @@ def _try_read(path: Path, read: Callable[[Path], Content]) -> Content | InputErr
 
 
 def _read_stored_json(path: Path) -> StoredCalibration:
-    whole = read_json(path)
+    whole = read_json_object(path)
     if 'checksum' in whole and whole['checksum'] != document_checksum(whole):
         raise InputError(
             f'{path}: it was changed by another program, by hand or by a fault of the disk: its checksum differs'

@@ -7,21 +7,22 @@ optionally the other `CAMERA_KEYS`.
 from __future__ import annotations
 
 import re
+import reprlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from autocalib_ros.config import NodeOptions, Options, flatten, walk_options
-from autocalib_ros.errors import InputError, UsageError
+from autocalib_ros.errors import UsageError
 from autocalib_ros.lens.camera_info_yaml import sanitised_name
+from autocalib_ros.util.documents import read_yaml
 
 CAMERA_KEYS = ('namespace', 'image', 'camera_height', 'camera_info', 'params_file', 'parameters')
 """Entries of a camera. `image`: image topic, default `image_raw`. `camera_info`: topic to publish CameraInfo on, if the
 driver publishes none. `params_file`: path relative to this file. `parameters`: options by name."""
+TEXT_KEYS = ('namespace', 'image', 'camera_info', 'params_file')
 NODE_NAME = 'autocalib'
 NAMESPACE = re.compile(r'/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*', re.ASCII)
 
@@ -38,12 +39,7 @@ class CameraNode:
 def read_cameras(path: Path | str) -> list[CameraNode]:
     """Return the nodes that a file describes; UsageError or InputError with the reason."""
     path = Path(path)
-    try:
-        tree = yaml.safe_load(path.read_text(encoding='utf-8'))
-    except OSError as error:
-        raise InputError(f'cannot read {path}: {error.strerror or error}') from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise InputError(f'{path} is not YAML: {" ".join(str(error).split())}') from error
+    tree = read_yaml(path, 'file of cameras')
     try:
         return camera_nodes(tree, path.parent)
     except UsageError as error:
@@ -64,7 +60,7 @@ def camera_nodes(tree: Any, folder: Path) -> list[CameraNode]:
         name = camera.get('namespace')
         if not isinstance(name, str) or not NAMESPACE.fullmatch(name):
             raise UsageError(
-                f"camera {number} has the namespace {name!r}: give it a unique name, such as 'cam{number}'"
+                f"camera {number} has the namespace {reprlib.repr(name)}: give it a unique name, such as 'cam{number}'"
             )
     _require_unique(cameras)
     return [_node(camera, folder) for camera in cameras]
@@ -73,11 +69,14 @@ def camera_nodes(tree: Any, folder: Path) -> list[CameraNode]:
 def _camera(given: Any, where: str) -> dict[str, Any]:
     """Return the entries of one camera, its parameters by full name."""
     if not isinstance(given, Mapping):
-        raise UsageError(f'{where} is {given!r}, expected names with values such as namespace: cam1')
+        raise UsageError(f'{where} is {reprlib.repr(given)}, expected names with values such as namespace: cam1')
     _require_known(given, CAMERA_KEYS)
+    for name in TEXT_KEYS:
+        if name in given and not (isinstance(given[name], str) and given[name]):
+            raise UsageError(f"'{name}' of {where} is {reprlib.repr(given[name])}: give a text, or leave it out")
     parameters = given.get('parameters') or {}
     if not isinstance(parameters, Mapping):
-        raise UsageError(f"'parameters' of {where} are {parameters!r}, expected names with values")
+        raise UsageError(f"'parameters' of {where} are {reprlib.repr(parameters)}, expected names with values")
     return {**given, 'parameters': flatten(parameters)}
 
 
@@ -104,7 +103,7 @@ def _require_unique(cameras: list[dict[str, Any]]) -> None:
 
 
 def _name(camera: dict[str, Any]) -> str:
-    return sanitised_name(camera['parameters'].get('camera_name') or camera['namespace'].strip('/'))
+    return sanitised_name(str(camera['parameters'].get('camera_name') or camera['namespace'].strip('/')))
 
 
 def _resolved(camera: dict[str, Any], topic: str) -> str:
@@ -114,7 +113,7 @@ def _resolved(camera: dict[str, Any], topic: str) -> str:
 UNIQUE_BY = {
     'namespace': lambda camera: camera['namespace'].strip('/'),
     'name for frames and files': _name,
-    'ground frame': lambda camera: camera['parameters'].get('ground_frame') or f'{_name(camera)}_ground',
+    'ground frame': lambda camera: str(camera['parameters'].get('ground_frame') or '') or f'{_name(camera)}_ground',
     'image topic': lambda camera: _resolved(camera, camera.get('image', 'image_raw')),
     'camera_info topic': lambda camera: _resolved(camera, camera.get('camera_info') or f'{NODE_NAME}/camera_info'),
 }

@@ -8,9 +8,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from autocalib_ros.config import Options
+from autocalib_ros.errors import InputError
+from autocalib_ros.util.documents import read_yaml
 
 PARAMS_FORM = "a parameter file has the form '/**: {ros__parameters: {camera_height: 8.0}}', with two underscores"
 HINTS = (
@@ -58,8 +58,8 @@ def unused_params_files(arguments: Sequence[str], node_name: str) -> list[str]:
 def _node_names(file: Path) -> list[str]:
     """Return the nodes that a parameter file has sections for; none if it cannot be read, which rcl tells."""
     try:
-        return list(_sections(yaml.safe_load(file.read_text(encoding='utf-8'))))
-    except (OSError, ValueError, yaml.YAMLError, RecursionError):
+        return list(_sections(read_yaml(file, 'parameter file')))
+    except InputError:
         return []
 
 

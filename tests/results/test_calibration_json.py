@@ -10,7 +10,7 @@ import pytest
 
 from autocalib_ros.errors import InputError
 from autocalib_ros.results.calibration import Refusal
-from autocalib_ros.results.calibration_json import calibration_from_json, calibration_json, read_json, to_json
+from autocalib_ros.results.calibration_json import calibration_from_json, calibration_json, read_json_object, to_json
 from autocalib_ros.results.grades import HelpfulMeasure
 from autocalib_ros.results.refusals import Reason
 from autocalib_ros.results.statements import SCALE_KINDS
@@ -124,4 +124,4 @@ def test_file_that_is_no_calibration_gives_the_reason(tmp_path, text, expected):
     path = tmp_path / 'c.json'
     path.write_bytes(text.encode('latin-1'))
     with pytest.raises(InputError, match=expected):
-        read_json(path)
+        read_json_object(path)

@@ -72,6 +72,10 @@ def test_defaults_hold_where_a_camera_says_nothing():
         ([{'namespace': 'a', 'camera_hight': 8.0}], "unknown entry 'camera_hight': did you mean 'camera_height'?"),
         ([{'namespace': 'a', 'parameters': [1]}], "'parameters' of camera 1"),
         (['cam1'], "camera 1 is 'cam1'"),
+        ([{'namespace': 'a', 'image': None}], "'image' of camera 1 is None: give a text, or leave it out"),
+        ([{'namespace': 'a', 'image': 5}], "'image' of camera 1 is 5"),
+        ([{'namespace': 'a', 'camera_info': ['x']}], "'camera_info' of camera 1"),
+        ([{'namespace': 'a', 'params_file': 2.5}], "'params_file' of camera 1"),
         ([], 'at least one camera'),
     ],
 )
@@ -80,7 +84,9 @@ def test_file_that_cannot_be_used_is_refused_with_the_reason(cameras, expected):
         nodes(*cameras)
 
 
-@pytest.mark.parametrize(('content', 'expected'), [(None, 'cannot read'), ('a: [', 'is not YAML')])
+@pytest.mark.parametrize(
+    ('content', 'expected'), [(None, 'cannot read'), ('a: [', 'is not YAML'), ('&a [*a]', 'contains itself')]
+)
 def test_file_that_cannot_be_read_is_reported(tmp_path, content, expected):
     if content is not None:
         (tmp_path / 'cameras.yaml').write_text(content)

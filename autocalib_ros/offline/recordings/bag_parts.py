@@ -10,13 +10,14 @@ from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any
 
-import yaml
 from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag2 import Reader as Reader2
 
 from autocalib_ros.errors import AutocalibError, InputError
 from autocalib_ros.offline.recordings.listing import ACTIVE_SUFFIX, PACKED_SUFFIXES, PART_SUFFIXES, bare
 from autocalib_ros.offline.recordings.scanned_files import ScannedFile, zstd_module
+from autocalib_ros.util.documents import read_yaml
+from autocalib_ros.util.input_limits import MAX_METADATA_BYTES
 
 LOG = logging.getLogger(__name__)
 
@@ -152,9 +153,9 @@ def find_parts(path: Path, temporary: Callable[[], Path]) -> list[BagPart]:
 def _listed_names(folder: Path) -> list[str]:
     """Return the names of the files in metadata.yaml; none if it says nothing that can be read."""
     try:
-        document = yaml.safe_load((folder / 'metadata.yaml').read_text(encoding='utf-8'))
+        document = read_yaml(folder / 'metadata.yaml', 'metadata.yaml', MAX_METADATA_BYTES)
         return [Path(str(name)).name for name in document['rosbag2_bagfile_information']['relative_file_paths']]
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, LookupError, TypeError, ValueError, RecursionError):
+    except (InputError, LookupError, TypeError, ValueError):
         return []
 
 
