@@ -13,6 +13,8 @@ import numpy as np
 
 from autocalib_ros.errors import InputError
 from autocalib_ros.util.files import replaced_atomically
+from autocalib_ros.util.input_limits import MAX_EVIDENCE_BYTES
+from autocalib_ros.util.packed_arrays import packed_arrays
 
 FORMAT = 1
 """Version of the layout; other versions are refused."""
@@ -67,7 +69,7 @@ def evidence_file(path: Path, required: Iterable[str], optional: Iterable[str]) 
     """
     path = Path(path)
     try:
-        with path.open('rb') as stream, np.load(stream, allow_pickle=False) as data:
+        with packed_arrays(path, MAX_EVIDENCE_BYTES) as data:
             if int(data['format']) != FORMAT:
                 raise InputError(f'{path} holds evidence of format {int(data["format"])}, not {FORMAT}')
             first, newest = (int(stamp) for stamp in data['stamps_ns'])

@@ -8,6 +8,7 @@ the lower side of a box is its point, as it is nearest to the road.
 from __future__ import annotations
 
 import csv
+import io
 import math
 from collections import defaultdict
 from collections.abc import Iterator
@@ -20,6 +21,8 @@ from autocalib_ros.config import BufferOptions
 from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.evidence.buffer import EvidenceBuffer
 from autocalib_ros.evidence.snapshot import Evidence, Track
+from autocalib_ros.util.documents import read_text
+from autocalib_ros.util.input_limits import MAX_TABLE_BYTES
 
 COLUMNS = ('time_s', 'vehicle_id', 'track_id', 'x_px', 'y_px')
 MOT_COLUMNS = 6
@@ -70,9 +73,8 @@ def evidence_from_file(path: Path, image_size: tuple[int, int], fps: float | Non
 def _points(path: Path, fps: float | None) -> Iterator[_Point]:
     """Read the points of a file, times counted from the first one; InputError with the line that cannot be read."""
     try:
-        with path.open(newline='', encoding='utf-8-sig') as file:
-            lines = list(csv.reader(file))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        lines = list(csv.reader(io.StringIO(read_text(path, 'file of tracks', MAX_TABLE_BYTES), newline='')))
+    except csv.Error as error:
         raise InputError(f'cannot read {path}: {error}') from error
     header = [cell.strip() for cell in lines[0]] if lines else []
     if set(COLUMNS) <= set(header):

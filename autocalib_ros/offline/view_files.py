@@ -16,6 +16,7 @@ from autocalib_ros.offline.recordings.open import open_source
 from autocalib_ros.offline.recordings.sources import Source
 from autocalib_ros.offline.recordings.videos import FALLBACK_FPS
 from autocalib_ros.offline.terminal.progress import progress_bar
+from autocalib_ros.util.picture_size import check_picture
 
 PICTURE_SUFFIXES = ('.png', '.jpg', '.jpeg')
 VIDEO_CODECS = {'.mp4': 'mp4v', '.avi': 'MJPG'}
@@ -81,7 +82,11 @@ def read_image(path: Path) -> np.ndarray:
         data = np.fromfile(path, np.uint8)
     except OSError as error:
         raise InputError(f'cannot read {path}: {error.strerror or error}') from error
-    image = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
+    try:
+        check_picture(data.data)
+        image = cv2.imdecode(data, cv2.IMREAD_COLOR)
+    except (InputError, cv2.error) as error:
+        raise InputError(f'{path} is not a readable image: {" ".join(str(error).split())}') from error
     if image is None:
         raise InputError(f'{path} is not a readable image: damaged, truncated or unsupported')
     return image

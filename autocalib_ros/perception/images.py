@@ -15,6 +15,7 @@ import numpy as np
 
 from autocalib_ros.errors import InputError
 from autocalib_ros.perception.intensity_normalisation import IntensityNormaliser
+from autocalib_ros.util.picture_size import check_picture
 
 LOG = logging.getLogger(__name__)
 
@@ -243,6 +244,12 @@ def decompress(data: np.ndarray, stated_format: str) -> np.ndarray:
     InputError or cv2.error if it is invalid.
     """
     _check_container(data, stated_format)
+    try:
+        check_picture(data.data)
+    except InputError as error:
+        raise InputError(
+            f"compressed image of format '{stated_format}', {len(data)} bytes, cannot be decoded: {error}"
+        ) from error
     # keep the pixels as the sensor delivered them: applying the EXIF orientation would change the camera geometry
     image = cv2.imdecode(data, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:

@@ -7,7 +7,6 @@ the file may read it.
 from __future__ import annotations
 
 import io
-import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from autocalib_ros.evidence.npz import LOAD_ERRORS
 from autocalib_ros.perception.view_registration import REGISTERED_WIDTH_PX, ViewPose
 from autocalib_ros.perception.view_watch import MAX_REFERENCES, KnownView
 from autocalib_ros.util.files import write_bytes_atomically
+from autocalib_ros.util.packed_arrays import packed_arrays
 
 OWNER_ONLY = 0o600
 """Mode of the file: it shows a street."""
@@ -48,10 +48,7 @@ def read_views(path: Path, belongs_to: str) -> tuple[KnownView, ...]:
     InputError if it is damaged.
     """
     try:
-        with zipfile.ZipFile(path) as archive:
-            if sum(item.file_size for item in archive.infolist()) > MAX_VIEW_BYTES:
-                raise InputError(f'{path}: it unpacks to more than {MAX_VIEW_BYTES} bytes, so it holds no views')
-        with np.load(path, allow_pickle=False) as saved:
+        with packed_arrays(path, MAX_VIEW_BYTES) as saved:
             if str(saved['belongs_to']) != belongs_to:
                 return ()
             images, ignored = saved['images'], saved['ignored']

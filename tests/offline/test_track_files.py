@@ -87,8 +87,8 @@ def test_what_is_wrong_with_a_file_is_said(tmp_path: Path, text: str, says: str)
 
 def test_bytes_and_missing_files_are_no_tracks(tmp_path: Path) -> None:
     (tmp_path / 'bytes.csv').write_bytes(bytes(range(128, 256)))
-    for name in ('bytes.csv', 'none.csv'):
-        with pytest.raises(InputError, match='cannot read'):
+    for name, expected in (('bytes.csv', 'is no text'), ('none.csv', 'cannot read')):
+        with pytest.raises(InputError, match=expected):
             read(tmp_path / name)
 
 

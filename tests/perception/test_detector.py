@@ -12,8 +12,9 @@ import pytest
 import onnx_models
 from autocalib_ros.config import DetectorOptions
 from autocalib_ros.errors import InputError, UsageError
-from autocalib_ros.perception.detector.detector import VehicleDetector, open_detector
+from autocalib_ros.perception.detector.detector import VehicleDetector, _names, open_detector
 from autocalib_ros.perception.detector.layouts import LAYOUTS
+from autocalib_ros.util.input_limits import MAX_CLASS_TEXT, MAX_CLASSES
 from onnx_models import CAR, PERSON, SCORE, SeeingModel, picture
 
 BGR_255 = {'order': 'bgr', 'white': 255.0}
@@ -248,3 +249,35 @@ def test_class_ids_that_are_no_numbers_are_wrong_usage(text: str) -> None:
 def test_class_ids_may_be_a_number_or_two_lists() -> None:
     assert DetectorOptions(class_ids=2).chosen_classes == ((2,), ())
     assert DetectorOptions(class_ids='2, 3 5 / 0 1').chosen_classes == ((2, 3, 5), (0, 1))
+
+
+@pytest.mark.parametrize(
+    'names',
+    [
+        '(' * 100_000,
+        '-' * 100_000 + '1',
+        str({10**9: 'car'}),
+        str({-1: 'car'}),
+        str(['car'] * (MAX_CLASSES + 1)),
+        "{0: 'car'} ".ljust(MAX_CLASS_TEXT + 1),
+        "{1e999: 'car'}",
+        "__import__('os').getcwd()",
+        '5',
+        '',
+    ],
+    ids=lambda text: text[:8],
+)
+def test_hostile_class_names_are_as_good_as_none(names):
+    assert _names({'names': names}) == {}
+
+
+def test_half_characters_in_class_names_can_be_printed():
+    assert _names({'names': repr(['car', 'x']).replace('x', r'\ud800')}) == {0: 'car', 1: r'\ud800'}
+
+
+def test_a_model_with_an_absurd_input_is_refused() -> None:
+    session = SimpleNamespace(
+        get_inputs=lambda: [SimpleNamespace(name='images', shape=[1, 3, 640, 10**9], type='tensor(float)')]
+    )
+    with pytest.raises(UsageError, match='takes images of 1000000000x640 pixels; sides up to 8192'):
+        VehicleDetector(session, DetectorOptions())

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
+from hostile_files import jpeg_of, png_of
 
 from autocalib_ros.errors import InputError
 from autocalib_ros.perception.images import ImageDecoder
@@ -398,3 +399,9 @@ def test_an_encoding_without_colours_is_warned_of_once(caplog):
     assert [record.message for record in caplog.records] == [
         "image encoding '8UC3' has no channel order; interpreted as bgr8"
     ]
+
+
+@pytest.mark.parametrize('bomb', [png_of(30000, 30000), jpeg_of(20000, 20000)])
+def test_a_compressed_image_that_would_fill_the_memory_is_not_decoded(bomb):
+    with pytest.raises(InputError, match=r'cannot be decoded: the picture has \d+x\d+ pixels, more than 100 million'):
+        ImageDecoder().decode(compressed(bomb, 'png'))

@@ -15,12 +15,14 @@ from rosbags.rosbag2 import Reader as Reader2
 
 from autocalib_ros.errors import AutocalibError, InputError
 from autocalib_ros.offline.recordings.listing import ACTIVE_SUFFIX, PACKED_SUFFIXES, PART_SUFFIXES, bare
-from autocalib_ros.offline.recordings.scanned_files import ScannedFile, zstd_module
+from autocalib_ros.offline.recordings.scanned_files import ScannedFile
+from autocalib_ros.offline.recordings.unpacking import limit_readers, zstd_module
 from autocalib_ros.util.documents import read_yaml
 from autocalib_ros.util.input_limits import MAX_METADATA_BYTES
 
 LOG = logging.getLogger(__name__)
 
+limit_readers()
 LOG_SUFFIXES = ('-wal', '-journal')
 """What SQLite keeps beside a database until it is closed."""
 COPY_BYTES = 1 << 20

@@ -16,8 +16,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from autocalib_ros.errors import AutocalibError, InputError, UsageError
 from autocalib_ros.offline.recordings.bag_parts import BagPart, find_parts, one_line, open_parts
-from autocalib_ros.offline.recordings.scanned_files import zstd_decompress
 from autocalib_ros.offline.recordings.sources import Frame, StoredImage, TimeWindow, no_image_error
+from autocalib_ros.offline.recordings.unpacking import unpack
 from autocalib_ros.perception.header_stamps import HeaderStamps
 from autocalib_ros.perception.images import ImageDecoder
 
@@ -134,7 +134,11 @@ class BagSource:
     def _read(self, readers: list[BagPart], start_ns: int | None, stop_ns: int | None) -> Iterator[_BagMessage]:
         for reader in readers:
             for recorded_ns, raw in reader.messages(self.topic, self.image_type, start_ns, stop_ns):
-                raw = _decompressed(raw)
+                try:
+                    raw = _decompressed(raw)
+                except Exception:  # a damaged message raises arbitrary exceptions and is skipped
+                    yield _BagMessage(recorded_ns, raw, None)
+                    continue
                 yield _BagMessage(recorded_ns, raw, self._message(raw))
 
     def _message(self, raw: bytes | memoryview) -> Any:
@@ -211,4 +215,4 @@ def _decompressed(raw: bytes | memoryview) -> bytes | memoryview:
     """Decompress a message of a file whose metadata.yaml announced compressed messages."""
     if bytes(raw[:4]) != ZSTD_MAGIC:  # a CDR message begins with 00, a ROS 1 image with its counter
         return raw
-    return zstd_decompress(raw)
+    return unpack('zstd', raw)

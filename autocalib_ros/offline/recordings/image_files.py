@@ -13,6 +13,7 @@ import numpy as np
 
 from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.offline.recordings.sources import Frame, StoredImage, TimeWindow, no_image_error
+from autocalib_ros.util.picture_size import check_picture_file
 
 LOG = logging.getLogger(__name__)
 
@@ -60,15 +61,18 @@ class ImageFilesSource:
         left_out: list[str] = []
         chosen = self._chosen
         for index in chosen:
-            image = _read(self._paths[index])
-            if image is None or (size is not None and image.shape[:2] != size):
-                left_out.append(self._paths[index].name)
+            try:
+                image = _read(self._paths[index])
+                if size is not None and image.shape[:2] != size:
+                    raise InputError(f'it has {image.shape[1]}x{image.shape[0]} pixels')
+            except InputError as error:
+                left_out.append(f'{self._paths[index].name} ({error})')
                 continue
             size = (image.shape[0], image.shape[1])
             yield Frame(self._stamps_ns[index], image)
         if size is None:
             raise (
-                InputError(f'none of the {len(left_out)} images of {self.name} can be read')
+                InputError(f'none of the {len(left_out)} images of {self.name} can be read; the first: {left_out[0]}')
                 if left_out
                 else no_image_error(self.name, self.window, self._length_s)
             )
@@ -83,10 +87,16 @@ class ImageFilesSource:
         return (StoredImage(self._stamps_ns[index], self._stamps_ns[index], '') for index in self._chosen)
 
 
-def _read(path: Path) -> np.ndarray | None:
-    """Return an image as grey or BGR uint8; None if it cannot be read."""
-    image = cv2.imread(str(path), cv2.IMREAD_ANYCOLOR)
-    return image if image is not None and image.ndim in (2, 3) else None
+def _read(path: Path) -> np.ndarray:
+    """Return an image as grey or BGR uint8; InputError if it cannot be read."""
+    try:
+        check_picture_file(path)
+        image = cv2.imread(str(path), cv2.IMREAD_ANYCOLOR)
+    except cv2.error as error:
+        raise InputError('it is damaged') from error
+    if image is None or image.ndim not in (2, 3):
+        raise InputError('it is damaged, or of a format that OpenCV cannot read')
+    return image
 
 
 def _stamps(paths: list[Path], rate_hz: float | None) -> tuple[list[int], str]:

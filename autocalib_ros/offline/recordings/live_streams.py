@@ -17,7 +17,7 @@ import cv2
 from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.offline.recordings.listing import DEVICE
 from autocalib_ros.offline.recordings.sources import Frame, StoredImage, TimeWindow
-from autocalib_ros.offline.recordings.videos import VideoSource
+from autocalib_ros.offline.recordings.videos import VideoSource, require_usual_size
 
 LOG = logging.getLogger(__name__)
 
@@ -115,6 +115,11 @@ class _Reader:
         try:
             if not capture.isOpened():
                 self.problem = self.problem or f'{self._name} cannot be opened: {_hint(self._address)}'
+                return 0
+            try:
+                require_usual_size(capture, self._name)
+            except InputError as error:
+                self.problem = str(error)
                 return 0
             while not self._stop.is_set() and capture.grab():
                 stamp_ns = time.time_ns()

@@ -6,7 +6,6 @@ messages come in the order of time. https://mcap.dev/spec, https://wiki.ros.org/
 
 from __future__ import annotations
 
-import bz2
 import io
 import struct
 from collections import Counter
@@ -14,11 +13,11 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
-
-import lz4.frame  # type: ignore[import-untyped]  # comes with rosbags, as that for zstd
+from typing import BinaryIO, NamedTuple
 
 from autocalib_ros.errors import InputError
+from autocalib_ros.offline.recordings.unpacking import unpack
+from autocalib_ros.util.input_limits import MAX_CHUNK_BYTES
 
 MCAP_MAGIC, ROSBAG1_MAGIC = b'\x89MCAP0\r\n', b'#ROSBAG V2.0\n'
 SCHEMA, CHANNEL, MESSAGE, CHUNK, DATA_END = 0x03, 0x04, 0x05, 0x06, 0x0F
@@ -271,33 +270,10 @@ class _Rosbag1Format:
 
 def _decompress(compression: str, packed: bytes, size: int | None) -> bytes:
     """Return unpacked data; InputError for another compression or another size than stated."""
-    if compression in ('', 'none'):
-        data = packed
-    elif compression == 'lz4':
-        data = lz4.frame.decompress(packed)
-    elif compression == 'bz2':
-        data = bz2.decompress(packed)
-    elif compression == 'zstd':
-        data = zstd_decompress(packed)
-    else:
-        raise InputError(f'compression {compression} is not supported')
+    data = unpack(compression, packed, MAX_CHUNK_BYTES if size is None else min(size, MAX_CHUNK_BYTES))
     if size is not None and len(data) != size:
         raise InputError('a chunk has another size than it states')
     return data
-
-
-def zstd_decompress(data: bytes | memoryview) -> bytes:
-    """Return data unpacked with Zstandard."""
-    return bytes(zstd_module().decompress(data))
-
-
-def zstd_module() -> Any:
-    """Return the module for Zstandard: of Python 3.14, or that which comes with rosbags."""
-    try:
-        from compression import zstd  # type: ignore[import-not-found]
-    except ImportError:
-        from backports import zstd
-    return zstd
 
 
 def _ros2_name(kind: str) -> str:

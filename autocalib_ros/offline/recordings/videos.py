@@ -11,6 +11,7 @@ import cv2
 
 from autocalib_ros.errors import InputError
 from autocalib_ros.offline.recordings.sources import Frame, StoredImage, TimeWindow, no_image_error
+from autocalib_ros.util.input_limits import MAX_IMAGE_PIXELS
 
 LOG = logging.getLogger(__name__)
 
@@ -40,6 +41,7 @@ class VideoSource:
         self._path, self.window, self._rate_hz = path, window, rate_hz
         with self._capture() as capture:
             fps, declared_frames = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
+            require_usual_size(capture, self.name)
             if not capture.grab():
                 remedy = (
                     'Download it first: not every server lets parts of a file be read'
@@ -122,6 +124,16 @@ class VideoSource:
             yield capture
         finally:
             capture.release()
+
+
+def require_usual_size(capture: cv2.VideoCapture, name: str) -> None:
+    """Raise InputError if a video or stream states images of more than `MAX_IMAGE_PIXELS`."""
+    width, height = (round(capture.get(side)) for side in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+    if width * height > MAX_IMAGE_PIXELS:
+        raise InputError(
+            f'{name} states images of {width}x{height} pixels, more than {MAX_IMAGE_PIXELS // 1_000_000} million: its '
+            'header is damaged, or the images have to be made smaller'
+        )
 
 
 def _codec(capture: cv2.VideoCapture) -> str:

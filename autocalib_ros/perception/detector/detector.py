@@ -16,6 +16,8 @@ from autocalib_ros.perception.detector.decoding import non_maximum_suppression
 from autocalib_ros.perception.detector.layouts import LAYOUTS, ModelProbe, count_classes, detect_layout
 from autocalib_ros.perception.detector.preprocessing import PAD_LEVEL, ColourFormat, Placement, place_in_input, tensor
 from autocalib_ros.perception.detector.session import open_session
+from autocalib_ros.util.documents import printable
+from autocalib_ros.util.input_limits import MAX_CLASS_TEXT, MAX_CLASSES, MAX_MODEL_SIDE_PX
 
 MAX_INPUT_PX = 1280
 """Longest side of the input of a model with dynamic size: larger inputs take more time and find little more."""
@@ -55,6 +57,11 @@ class VehicleDetector:
         self._channels_last = shape[-1] == 3 and shape[1] != 3
         height, width = shape[1:3] if self._channels_last else shape[2:]
         self._model_size = _fixed_side(width), _fixed_side(height)
+        if max(side or 0 for side in self._model_size) > MAX_MODEL_SIDE_PX:
+            raise UsageError(
+                f'the model takes images of {self._model_size[0]}x{self._model_size[1]} pixels; sides up to '
+                f'{MAX_MODEL_SIDE_PX} are possible: give a detector with a smaller input'
+            )
         if options.input_size and None not in self._model_size:
             raise UsageError(
                 f"'detector.input_size' is for a model with dynamic input size; this one takes "
@@ -175,14 +182,20 @@ def _inputs(session: Any) -> tuple[Any, Any]:
 
 
 def _names(meta: Mapping[str, str]) -> dict[int, str]:
-    """Return the class names by id from the metadata of a model, a dictionary or a list as text; empty if absent."""
+    """Return the class names by id from the metadata of a model, a dictionary or a list as text.
+
+    Empty if they are absent, damaged, or more than `MAX_CLASSES`.
+    """
     try:
-        names = ast.literal_eval(meta['names'])
-        return {
-            int(number): str(name) for number, name in (names.items() if isinstance(names, dict) else enumerate(names))
+        text = meta['names']
+        names = ast.literal_eval(text) if len(text) <= MAX_CLASS_TEXT else {}
+        found = {
+            int(number): printable(str(name))
+            for number, name in (names.items() if isinstance(names, dict) else enumerate(names))
         }
-    except (LookupError, ValueError, SyntaxError, TypeError):
+    except (LookupError, ValueError, SyntaxError, TypeError, OverflowError, RecursionError, MemoryError):
         return {}
+    return found if all(0 <= number < MAX_CLASSES for number in found) else {}
 
 
 def _listed(numbers: tuple[int, ...]) -> str:

@@ -7,6 +7,7 @@ import os
 import cv2
 import numpy as np
 import pytest
+from hostile_files import png_of
 from PIL import Image
 
 from autocalib_ros.errors import InputError, UsageError
@@ -92,3 +93,10 @@ def test_nothing_readable_is_an_error(images):
 def test_a_rate_is_positive(images, rate):
     with pytest.raises(UsageError, match='the rate must be a positive number'):
         open_source(images(), rate_hz=rate)
+
+
+def test_an_image_that_would_fill_the_memory_is_left_out_and_told(images, caplog):
+    folder = images(4, suffix='.png')
+    (folder / 'image1.png').write_bytes(png_of(30000, 30000))
+    assert len(list(open_source(folder, rate_hz=5.0).frames())) == 3
+    assert 'the first: image1.png (the picture has 30000x30000 pixels, more than 100 million' in caplog.text
