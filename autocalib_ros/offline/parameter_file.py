@@ -11,7 +11,7 @@ import yaml
 
 from autocalib_ros.config import NodeOptions, Options, flatten, walk_options, with_overrides
 from autocalib_ros.errors import InputError, UsageError
-from autocalib_ros.util.documents import parse_yaml, printable, read_yaml
+from autocalib_ros.util.documents import parse_yaml, read_yaml
 
 WILDCARDS = ('*', '**')
 ROS_PARAMETERS = ('use_sim_time', 'start_type_description_service')
@@ -74,11 +74,11 @@ def parse_assignments(assignments: list[str]) -> dict[str, Any]:
     for text in assignments:
         name, equals, value = text.replace(':=', '=', 1).partition('=')
         if not name.strip() or not equals:
-            raise UsageError(f"'-p {text}' does not have the form name=value")
+            raise UsageError(f"'-p {text[:100]}' does not have the form name=value")
         try:
             values[name.strip()] = parse_yaml(value)
         except InputError as error:
-            raise UsageError(f"the value of '-p {printable(text)}' {error}") from error
+            raise UsageError(f"the value of '-p {text[:100]}' {error}") from error
     return values
 
 

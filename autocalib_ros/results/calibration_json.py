@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import reprlib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -75,11 +76,11 @@ def _parse_calibration(document: Mapping[str, Any]) -> Calibration:
     camera = Camera(
         width,
         height,
-        float(lens['focal_px']),
-        _numbers(lens['principal_point_px'], float, 2),
-        _numbers(lens['k'], float, 4),
-        float(lens.get('pixel_aspect', 1.0)),
-        float(lens.get('skew', 0.0)),
+        _number(lens['focal_px']),
+        _numbers(lens['principal_point_px'], _number, 2),
+        _numbers(lens['k'], _number, 4),
+        _number(lens.get('pixel_aspect', 1.0)),
+        _number(lens.get('skew', 0.0)),
     )
     grade, pose, reason = str(document['grade']), document['ground_from_camera'], document['refusal']
     return Calibration(
@@ -91,17 +92,17 @@ def _parse_calibration(document: Mapping[str, Any]) -> Calibration:
         camera=camera,
         ground=None if pose is None else _parse_ground(pose, metric=grade != 'unit_scale'),
         ground_refusal=None if reason is None else _parse_reason(reason),
-        road_directions=np.array(document['road_directions_in_camera'], float).reshape(-1, 3),
+        road_directions=_array(document['road_directions_in_camera']).reshape(-1, 3),
         stddev=_parse_stddev(document['stddev'], document.get('ground_sigma_rel')),
         paper=None if paper is None else _parse_paper(paper),
         evidence=EvidenceSummary(
             image_size=(width, height),
-            seconds=float(evidence['seconds']),
+            seconds=_number(evidence['seconds']),
             frames=int(evidence['frames']),
             tracks=int(evidence['tracks']),
             segments=int(evidence['segments']),
             vehicles=int(evidence['vehicles']),
-            coverage=float(evidence['coverage']),
+            coverage=_number(evidence['coverage']),
             people=int(evidence.get('people', 0)),
         ),
         newest_stamp_ns=int(document['newest_stamp_ns']),
@@ -121,7 +122,7 @@ def _parse_row(entry: Mapping[str, Any]) -> VerificationRow:
     value, passed = _optional_float(entry['value']), entry['passed']
     if not isinstance(passed, bool):
         raise InputError(f'true or false was expected for passed, got {reprlib.repr(passed)}')
-    return VerificationRow(str(entry['check']), value, float(entry['limit']), passed)
+    return VerificationRow(str(entry['check']), value, _number(entry['limit']), passed)
 
 
 def _parse_reason(entry: Mapping[str, Any]) -> Reason:
@@ -137,8 +138,8 @@ def _parse_values(values: Any) -> dict[str, Value]:
 
 
 def _parse_ground(pose: Mapping[str, Any], *, metric: bool) -> GroundPlane:
-    rotation = np.array(pose['rotation'], float).reshape(3, 3)
-    height = _numbers(pose['translation_m'], float, 3)[2]
+    rotation = _array(pose['rotation']).reshape(3, 3)
+    height = _numbers(pose['translation_m'], _number, 3)[2]
     if not np.abs(rotation @ rotation.T - np.eye(3)).max() <= ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
         raise InputError('its rotation is none: its rows are not of unit length at right angles')
     if not 0 < height < np.inf:
@@ -150,35 +151,50 @@ def _parse_stddev(sigma: Mapping[str, Any], ground: Mapping[str, Any] | None) ->
     point = sigma['principal_point_px']
     return StandardDeviations(
         **{name: _optional_float(sigma[name]) for name in ('focal_px', 'k1', 'k2', 'tilt_deg', 'roll_deg', 'height_m')},
-        principal_point_px=None if point is None else _numbers(point, float, 2),
+        principal_point_px=None if point is None else _numbers(point, _number, 2),
         ground_point_m=tuple(_optional_float(value) for value in sigma['ground_point_m'].values()),
-        ground=None if ground is None else GroundSigma(float(ground['along']), float(ground['across'])),
+        ground=None if ground is None else GroundSigma(_number(ground['along']), _number(ground['across'])),
     )
 
 
 def _parse_helpful(entry: Mapping[str, Any] | None) -> HelpfulMeasure | None:
-    return None if entry is None else HelpfulMeasure(str(entry['kind']), float(entry['expected_sigma_rel']))
+    return None if entry is None else HelpfulMeasure(str(entry['kind']), _number(entry['expected_sigma_rel']))
 
 
 def _parse_covariance(entry: Mapping[str, Any] | None) -> np.ndarray | None:
     if entry is None or entry['of'] != list(COVARIANCE_PARAMETERS):
         return None
-    return np.array(entry['matrix'], float).reshape(2 * (len(COVARIANCE_PARAMETERS),))
+    return _array(entry['matrix']).reshape(2 * (len(COVARIANCE_PARAMETERS),))
 
 
 def _parse_paper(paper: Mapping[str, Any]) -> PaperReport:
     straightness, translation = paper['straightness_px2'], paper['translation_m']
     return PaperReport(
-        focal_px=float(paper['focal_px']),
-        polynomial_k=_numbers(paper['polynomial_k'], float, 3),
-        straightness_px2=(float(straightness['before']), float(straightness['after'])),
+        focal_px=_number(paper['focal_px']),
+        polynomial_k=_numbers(paper['polynomial_k'], _number, 3),
+        straightness_px2=(_number(straightness['before']), _number(straightness['after'])),
         focal_from_vanishing_points_px=_optional_float(paper['focal_from_vanishing_points_px']),
-        translation_m=None if translation is None else _numbers(translation, float, 3),
+        translation_m=None if translation is None else _numbers(translation, _number, 3),
     )
 
 
 def _optional_float(value: Any) -> float | None:
-    return None if value is None else float(value)
+    return None if value is None else _number(value)
+
+
+def _number(value: Any) -> float:
+    """Return a finite number; ValueError for anything else: `float` takes the texts 'nan' and 'inf' too."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        raise ValueError(f'{reprlib.repr(value)} is no finite number')
+    return float(value)
+
+
+def _array(values: Any) -> np.ndarray:
+    """Return finite numbers as an array of any shape; ValueError for anything else."""
+    array = np.array(values)
+    if array.size and (array.dtype.kind not in 'if' or not np.isfinite(array).all()):
+        raise ValueError(f'{reprlib.repr(values)} are no finite numbers')
+    return array.astype(float)
 
 
 def _numbers(values: Any, kind: Callable[[Any], Any], count: int) -> tuple[Any, ...]:

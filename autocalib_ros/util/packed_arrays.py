@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tokenize
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -36,7 +37,10 @@ def _array_bytes(archive: zipfile.ZipFile, item: zipfile.ZipInfo) -> int:
     with archive.open(item) as member:
         version = np.lib.format.read_magic(member)
         read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, _, kind = read(member)
+        try:
+            shape, _, kind = read(member)
+        except (SyntaxError, tokenize.TokenError) as error:  # NumPy reads the header as an expression
+            raise ValueError(f'the header of {item.filename} is damaged') from error
     size = kind.itemsize
     for side in shape:
         if side < 0:

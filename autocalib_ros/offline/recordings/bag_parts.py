@@ -74,7 +74,7 @@ class BagPart:
             return self._scanned
         try:
             scanned = ScannedFile(self._readable)
-        except (InputError, OSError) as wrong:
+        except Exception as wrong:  # damaged records raise arbitrary exceptions
             raise InputError(f'cannot read {self.path}: {one_line(error or wrong)}') from wrong
         if not scanned.is_complete and scanned.end_time:
             LOG.warning('%s ended early, its recorder did not close it; complete records are used', self.path)

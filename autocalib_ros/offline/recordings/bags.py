@@ -151,7 +151,12 @@ class BagSource:
 
     def _peek(self, readers: list[BagPart]) -> Any:
         """Note the time of the first image; return its message, None if it is damaged."""
-        first = next(self._read(readers, None, None), None)
+        try:
+            first = next(self._read(readers, None, None), None)
+        except AutocalibError:
+            raise
+        except Exception as error:  # decoders of damaged files raise arbitrary exceptions
+            raise InputError(f'cannot read {self.name}: {one_line(error)}') from error
         if first is None:
             raise InputError(f'{self.name} has no images on {self.topic}')
         self._first_ns = first.recorded_ns

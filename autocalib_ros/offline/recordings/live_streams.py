@@ -124,7 +124,7 @@ class _Reader:
             while not self._stop.is_set() and capture.grab():
                 stamp_ns = time.time_ns()
                 decoded, image = capture.retrieve()
-                if decoded:
+                if decoded and image is not None:
                     self._put(Frame(stamp_ns, image))
                     count += 1
         finally:

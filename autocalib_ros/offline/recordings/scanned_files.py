@@ -128,9 +128,19 @@ class ScannedFile:
                 return False
             if record.opcode == DATA_END and isinstance(self._format, _McapFormat):
                 return chunk >= 0 or _ends_well(stream)
-            self._note(stream, record, chunk)
+            if chunk >= 0:
+                self._note(stream, record, chunk)
+            else:
+                self._note_or_count(stream, record)
             position = record.position + record.size
         return isinstance(self._format, _Rosbag1Format) or chunk >= 0
+
+    def _note_or_count(self, stream: BinaryIO, record: _Record) -> None:
+        """Note a record of the file itself; a damaged one is left out and counted."""
+        try:
+            self._note(stream, record, -1)
+        except Exception:  # damaged records raise arbitrary exceptions
+            self.damaged_chunks += 1
 
     def _note(self, stream: BinaryIO, record: _Record, chunk: int) -> None:
         stream.seek(record.position)

@@ -87,7 +87,7 @@ class VideoSource:
         """Yield the decoded frames of the window; InputError without a frame."""
         for stamp_ns, capture in self._stamped():
             decoded, image = capture.retrieve()
-            if decoded:
+            if decoded and image is not None:
                 yield Frame(stamp_ns, image)
 
     def stored(self) -> Iterator[StoredImage]:
