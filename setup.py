@@ -13,6 +13,7 @@ setup(
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
         (f'share/{NAME}/config', glob('config/*')),
+        (f'share/{NAME}/policies', glob('policies/*')),
         (f'share/{NAME}/launch', glob('launch/*.launch.py')),
     ],
 )

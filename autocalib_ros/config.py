@@ -677,6 +677,10 @@ class NodeOptions(_Validated):
         'longest time of one solution, seconds; a longer one is given up, and the solver started anew',
         low=1.0,
     )
+    services: bool = option(
+        True,
+        'offer ~/calibrate, ~/save and ~/reset; false: nobody on the network can withdraw or store a calibration',
+    )
     on_move: str = option(
         'mend',
         'what is published after the camera has moved, and while the picture says nothing; mend: after a turn the pose '

@@ -16,6 +16,7 @@ from autocalib_ros.offline.recordings.open import open_source
 from autocalib_ros.offline.recordings.sources import Source
 from autocalib_ros.offline.recordings.videos import FALLBACK_FPS
 from autocalib_ros.offline.terminal.progress import progress_bar
+from autocalib_ros.util.files import create_for_picture
 from autocalib_ros.util.picture_size import check_picture
 
 PICTURE_SUFFIXES = ('.png', '.jpg', '.jpeg')
@@ -155,6 +156,7 @@ def _atomic_output(out: Path) -> Iterator[Path]:
     unfinished = out.with_name(f'.{out.stem}~{os.getpid()}{out.suffix}')
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
+        create_for_picture(unfinished)
         yield unfinished
         os.replace(unfinished, out)
     except OSError as error:

@@ -16,11 +16,9 @@ from autocalib_ros.errors import InputError
 from autocalib_ros.evidence.npz import LOAD_ERRORS
 from autocalib_ros.perception.view_registration import REGISTERED_WIDTH_PX, ViewPose
 from autocalib_ros.perception.view_watch import MAX_REFERENCES, KnownView
-from autocalib_ros.util.files import write_bytes_atomically
+from autocalib_ros.util.files import OWNER_ONLY, write_bytes_atomically
 from autocalib_ros.util.packed_arrays import packed_arrays
 
-OWNER_ONLY = 0o600
-"""Mode of the file: it shows a street."""
 MAX_VIEW_BYTES = 4 * MAX_REFERENCES * REGISTERED_WIDTH_PX**2
 """Largest size of the unpacked file: images and masks of twice the height of a square one."""
 

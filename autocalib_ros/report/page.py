@@ -38,7 +38,7 @@ from autocalib_ros.report.text import (
     verdict,
 )
 from autocalib_ros.results.calibration import Calibration, Refusal
-from autocalib_ros.util.files import write_atomically
+from autocalib_ros.util.files import NOT_FOR_OTHERS, write_atomically, write_picture_bytes
 
 JPEG_SAVES = 1.5
 """Least saving in size for which a figure is embedded as JPEG: diagrams are sharper as PNG and hardly larger."""
@@ -234,7 +234,7 @@ def write_report(path: Path, scene: ReportScene, figures: Path | None = None) ->
     with rc_context(STYLE):
         drawn = [one for entry in ENTRIES if (one := _drawn(entry, scene)) is not None]
     _write_figures(folder, {one.entry.name: one.png for one in drawn})
-    write_atomically(path, _page(scene, drawn))
+    write_atomically(path, _page(scene, drawn), NOT_FOR_OTHERS)
 
 
 def _drawn(entry: _Entry, scene: ReportScene) -> _Drawn | None:
@@ -260,7 +260,7 @@ def _clear(folder: Path) -> None:
 def _write_figures(folder: Path, pictures: dict[str, bytes]) -> None:
     try:
         for name, data in pictures.items():
-            (folder / f'{name}.png').write_bytes(data)
+            write_picture_bytes(folder / f'{name}.png', data)
     except OSError as error:
         raise InputError(f'cannot write {folder}: {error.strerror or error}') from error
 

@@ -149,6 +149,8 @@ class AutocalibNode(Node):
 
     def _create_services(self) -> None:
         """Create the services, each in a callback group of its own: a caller that waits blocks no other callback."""
+        if not self.node_options.services:
+            return
         for name, callback in (
             ('~/calibrate', self._on_calibrate),
             ('~/save', self._on_save),

@@ -5,41 +5,60 @@ from __future__ import annotations
 import contextlib
 import glob
 import os
-import tempfile
+import secrets
 from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
 from autocalib_ros.errors import InputError
 
+READABLE, NOT_FOR_OTHERS, OWNER_ONLY = 0o666, 0o640, 0o600
+"""Modes of files, from which the umask takes: of numbers, of what shows the street, of what shows it and nobody has to
+look at."""
 
-def write_atomically(path: Path, text: str) -> None:
-    """Replace a file atomically, also across a power cut: readers see the old text or the new, never a part."""
-    write_bytes_atomically(path, text.encode('utf-8'))
+
+def write_atomically(path: Path, text: str, mode: int = READABLE) -> None:
+    """Replace a file atomically, also across a power cut: readers see the old text or the new, never a part.
+
+    The umask takes from `mode`.
+    """
+    write_bytes_atomically(path, text.encode('utf-8'), mode)
 
 
-def write_bytes_atomically(path: Path, content: bytes, mode: int = 0o644) -> None:
-    """Replace a file as `write_atomically` does."""
+def write_picture_bytes(path: Path, content: bytes) -> None:
+    """Write a file that shows the street, which other users cannot read. OSError if that fails."""
+    create_for_picture(path)
+    path.write_bytes(content)
+
+
+def create_for_picture(path: Path) -> None:
+    """Create an empty file that other users cannot read, for a library to write to; one that exists is replaced."""
+    path.unlink(missing_ok=True)
+    os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, NOT_FOR_OTHERS))
+
+
+def write_bytes_atomically(path: Path, content: bytes, mode: int = READABLE) -> None:
+    """Replace a file as `write_atomically` does; the umask takes from `mode`."""
     with replaced_atomically(path, mode) as stream:
         stream.write(content)
 
 
 @contextlib.contextmanager
-def replaced_atomically(path: Path, mode: int = 0o644) -> Iterator[BinaryIO]:
+def replaced_atomically(path: Path, mode: int = READABLE) -> Iterator[BinaryIO]:
     """Yield a stream whose bytes replace a file atomically when the block ends without an exception.
 
-    The folder is created. InputError if that fails.
+    The folder is created. The umask takes from `mode`. InputError if that fails.
     """
     path = Path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=_prefix(path))
+        temporary = path.parent / f'{_prefix(path)}{os.getpid()}{secrets.token_hex(4)}'
+        handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
         try:
             with os.fdopen(handle, 'wb') as stream:
                 yield stream
                 stream.flush()
                 os.fsync(stream.fileno())
-            os.chmod(temporary, mode)
             os.replace(temporary, path)
         except BaseException:
             os.unlink(temporary)

@@ -77,6 +77,11 @@ def test_a_calibration_shows_everything(full, written):
     assert all(entry.title in text for entry in ENTRIES)
 
 
+def test_other_users_cannot_read_what_shows_the_street(written):
+    page = written('full')
+    assert not any(path.stat().st_mode & 0o007 for path in (page, *(page.parent / 'figures').glob('*.png')))
+
+
 def test_names_of_files_cannot_break_the_page(written):
     assert 'clip &lt;1&gt;.mp4' in written('full').read_text()
 
