@@ -9,7 +9,7 @@ import numpy as np
 
 from autocalib_ros.evidence.snapshot import TRACK_ARRAYS, Evidence
 from autocalib_ros.evidence.stillness import Stillness
-from autocalib_ros.evidence.tables import OUTLINES, STILL_LINES, TABLES, merged
+from autocalib_ros.evidence.tables import OUTLINES, STILL_LINES, STRIPES, TABLES, merged
 
 JOINT_GAP_S = 2.0
 """Seconds between two recordings in joined evidence, whatever lay between them: longer than any track has gaps."""
@@ -40,8 +40,9 @@ def _moved_pairs(rows: np.ndarray, matrix: np.ndarray) -> np.ndarray:
 def joined(parts: Sequence[Evidence]) -> Evidence:
     """Return the evidence of all parts, which are of one view and registered to each other, one after the other.
 
-    Landmarks and picture are those of the first; lines of the still scene those of the part with most of them, since
-    each shows the same ones. Vehicles of different parts are different vehicles. Stamps end with the newest of all.
+    Landmarks and picture are those of the first; lines and bars of the still scene those of the part with most of them,
+    since each shows the same ones. Vehicles of different parts are different vehicles. Stamps end with the newest of
+    all.
     """
     first, *others = parts
     if not others:
@@ -53,8 +54,8 @@ def joined(parts: Sequence[Evidence]) -> Evidence:
         last_vehicle = max([last_vehicle, *(int(ids.max()) for ids in _vehicle_arrays(shifted[-1]) if len(ids))])
     seconds = offset_s - JOINT_GAP_S
     newest_ns = max(part.newest_stamp_ns for part in parts)
-    lines = max(parts, key=STILL_LINES.rows)
-    tables = [table for table in TABLES if table is not STILL_LINES]
+    still = [table.arrays(max(parts, key=table.rows)) for table in (STILL_LINES, STRIPES)]
+    tables = [table for table in TABLES if table not in (STILL_LINES, STRIPES)]
     names = [name for table in tables for name in table.names]
     rows = {name: np.concatenate([getattr(part, name) for part in shifted]) for name in (*TRACK_ARRAYS[1:], *names)}
     starts = np.cumsum([0, *(len(part.points_px) for part in parts)])
@@ -70,7 +71,7 @@ def joined(parts: Sequence[Evidence]) -> Evidence:
         track_starts=np.concatenate(
             [[0], *(part.track_starts[1:] + start for part, start in zip(parts, starts, strict=False))]
         ).astype(int),
-        **merged([rows, STILL_LINES.arrays(lines)]),
+        **merged([rows, *still]),
     )
 
 

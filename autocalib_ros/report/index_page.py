@@ -80,7 +80,7 @@ def _entry(path: Path, folder: Path) -> CameraEntry:
     common = {'name': name, 'when': when, 'report': address, 'thumbnail': _thumbnail(path.parent / 'figures')}
     nothing = dict.fromkeys(('grade', 'focal', 'tilt', 'height', 'lengths'), '')
     try:
-        document = read_json(path)
+        document = read_json(path, 'calibration')
         if document.get('state') == 'refused':
             return CameraEntry(**common, **nothing, state='refused', note=str(document['refusal']['message']))
         return CameraEntry(**common, **_numbers(calibration_from_json(document)))

@@ -13,7 +13,7 @@ from autocalib_ros.estimation.estimate import find_solution
 from autocalib_ros.estimation.known_lengths import adjust_to_lengths, scale_of, with_seen_lengths
 from autocalib_ros.estimation.observations.track_set import TrackSet, select_tracks
 from autocalib_ros.estimation.solution import Solution
-from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
+from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.synthetic.junction import synthetic_evidence
 from autocalib_ros.results.calibration import Calibration
 from autocalib_ros.results.refusals import Reason
@@ -89,15 +89,19 @@ def told(height: float = 0.0, **lanes: float) -> Solution:
     return adjust_to_lengths(found, tracks, Options(camera_height=height, lanes=LaneOptions(**lanes)))
 
 
+def horizon_px(camera: Camera, normal: np.ndarray) -> np.ndarray:
+    """Return the row of the horizon above the principal point, shape (1,)."""
+    ahead = np.array([[0.0, -normal[2], normal[1]]])
+    return camera.project(ahead * np.sign(ahead[:, 2:]))[0][0, 1:]
+
+
 def test_dashes_alone_show_the_horizon() -> None:
-    before, after = unscaled()[0], told()
-    tilt, sigma = (
-        [tilt_and_roll_deg(each.plane.normal(each.fit.state))[0] for each in (before, after)],
-        [each.plane.sigma(lambda _, normal: tilt_and_roll_deg(normal))[0] for each in (before, after)],
-    )
-    assert sigma[1] < 0.8 * sigma[0]
-    assert abs(tilt[1] - tilt_and_roll_deg(ROAD.normal_in_camera)[0]) < 2.5 * sigma[1]
-    assert [row.kind for row in after.comparisons if row.kind == 'dash_period' and row.passed]
+    before, after = unscaled()[0].plane, told().plane
+    sigma = after.sigma(horizon_px)[0]
+    assert sigma < 0.5 * before.sigma(horizon_px)[0]
+    found, true = horizon_px(*after.lens_and_normal), horizon_px(PINHOLE, ROAD.normal_in_camera)
+    assert abs(found - true) < 2.5 * sigma
+    assert [row.kind for row in told().comparisons if row.kind == 'dash_period' and row.passed]
 
 
 def test_dashes_and_lanes_of_known_size_give_scale_and_focal_length() -> None:

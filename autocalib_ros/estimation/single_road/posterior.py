@@ -44,8 +44,8 @@ TEMPER = 0.5
 KAPPA_NODES = 4
 """Curvatures at each focal length, within 2.5 standard deviations of what straight tracks show."""
 MIN_SPACINGS, FINER_SHIFTS = 1.0, np.linspace(-2.5, 2.5, 16)
-"""Standard deviation of the focal length, in spacings of the grid, below which a finer grid is solved; and the shifts of
-that grid from the mean, in spacings of the first: at least 2.5 standard deviations."""
+"""Standard deviation of the focal length, in spacings of the grid, below which a finer grid is solved; and the shifts
+of that grid from the mean, in spacings of the first: at least 2.5 standard deviations."""
 MAX_END_WEIGHT = 0.02
 """Probability of the longest focal length above which longer ones are tried: the prior alone leaves 1 % there."""
 KAPPA_TRIALS = 7
