@@ -40,6 +40,7 @@ from autocalib_ros.ros.image_input import ImageInput
 from autocalib_ros.ros.live_parameters import LiveParameters
 from autocalib_ros.ros.live_pictures import LivePictures
 from autocalib_ros.ros.log_text import describe, describe_progress
+from autocalib_ros.ros.log_throttle import LogThrottle
 from autocalib_ros.ros.publication import CalibrationPublisher, Published
 from autocalib_ros.ros.report_writer import ReportPaths, ReportWriter
 from autocalib_ros.ros.solver_process import SolverProcess
@@ -49,9 +50,9 @@ from autocalib_ros.ros.view_events import ViewEvents
 from autocalib_ros.ros.worker import CalibrationWorker, Result, Solve
 
 PROGRESS_LOG_PERIOD_S = 10.0
-"""Real seconds between two log lines of progress."""
-LOG_REPEAT_PERIOD_S = 60.0
-"""Real seconds before an unchanged warning is repeated."""
+"""Real seconds between two looks at the progress for the log."""
+PROGRESS_STEP = 10.0
+"""Change of the progress in percent that is worth a line."""
 VIEWS_PERIOD_S = 5.0
 """Real seconds between two looks for views to be stored; they change at each calibration, and with the light."""
 SHUTDOWN_S = 4.0
@@ -73,7 +74,8 @@ class AutocalibNode(Node):
             lambda: self.get_clock().now().nanoseconds,
         )
         # state of the log and of /diagnostics
-        self._logged_at: dict[str, float] = {}
+        self._throttle = LogThrottle()
+        self._told_percent = 0.0
         self._unreadable = self._withdrawn = ''
         self._rate_counter = RateCounter()
         # destinations of an accepted calibration: disk, report, driver
@@ -339,7 +341,13 @@ class AutocalibNode(Node):
 
     def _log_progress(self) -> None:
         if self.publication.state in (CalibrationState.NONE, CalibrationState.RESTORED) and self._worker.counters.used:
-            self.get_logger().info(describe_progress(self._worker.progress))
+            progress = self._worker.progress
+            percent = 0.0 if progress is None else progress.percent
+            if abs(percent - self._told_percent) >= PROGRESS_STEP:
+                self._throttle.forget('progress')
+            if self._throttle.is_due('progress', '' if progress is None else ', '.join(progress.missing)):
+                self._told_percent = percent
+                self.get_logger().info(describe_progress(progress))
 
     def _open_store(self, image_frame: str) -> Store | None:
         """Return the store of the calibration; None while its name depends on the frame of the first image."""
@@ -472,7 +480,7 @@ class AutocalibNode(Node):
             self._worker.watch_solved(result)
             self._remember(result, decision.text or 'solved')
         self._withdrawn = ''
-        self._logged_at = {}
+        self._throttle.forget('refusal')
         self._log(decision.text, good=not (decision.contradicted or self.publication.doubt))
         self.get_logger().info(describe(result))
 
@@ -513,11 +521,9 @@ class AutocalibNode(Node):
             self.get_logger().warning(text)
 
     def _log_throttled(self, topic: str, text: str, *, error: bool = True) -> None:
-        """Log a line unless one of the same topic was logged less than LOG_REPEAT_PERIOD_S ago."""
-        now = time.monotonic()
-        if now - self._logged_at.get(topic, -LOG_REPEAT_PERIOD_S) < LOG_REPEAT_PERIOD_S:
+        """Log a line unless it says what the last one of its topic said."""
+        if not self._throttle.is_due(topic, text):
             return
-        self._logged_at[topic] = now
         # rclpy allows one severity for each place in the code.
         if error:
             self.get_logger().error(text)

@@ -25,12 +25,10 @@ from std_msgs.msg import Header
 
 from autocalib_ros.errors import InputError
 from autocalib_ros.ground import Ground
+from autocalib_ros.ros.log_throttle import LogThrottle
 from autocalib_ros.ros.messages import header, validated
 from autocalib_ros.ros.qos import LATCHED
 from autocalib_ros.ros.spinning import spin_until, stop_on_signals
-
-WARN_PERIOD_S = 10.0
-"""Real seconds between two warnings."""
 
 
 class GroundPointsNode(Node):
@@ -39,6 +37,7 @@ class GroundPointsNode(Node):
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__('ground_points', **node_arguments)
         self.declare_parameter('camera_frame', '')  # only if autocalib has this option set
+        self._throttle = LogThrottle()
         self._info: CameraInfo | None = None
         self._transform: TransformStamped | None = None
         self._points = self.create_publisher(PointCloud2, 'ground_points', 10)
@@ -76,7 +75,8 @@ class GroundPointsNode(Node):
         self._points.publish(validated(cloud(found.points_m, header(message.header.stamp, ground.ground_frame))))
 
     def _warn(self, text: str) -> None:
-        self.get_logger().warning(text, throttle_duration_sec=WARN_PERIOD_S)
+        if self._throttle.is_due('pixels', text):
+            self.get_logger().warning(text)
 
 
 def cloud(points_m: np.ndarray, cloud_header: Header) -> PointCloud2:

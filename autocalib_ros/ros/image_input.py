@@ -14,6 +14,7 @@ from rclpy.subscription import Subscription
 from sensor_msgs.msg import CompressedImage, Image
 
 from autocalib_ros.config import NodeOptions
+from autocalib_ros.ros.log_throttle import LogThrottle
 from autocalib_ros.ros.watchdog import NoImageDiagnosis, PublisherOffer, diagnose, other_transport_topic
 
 QUEUE_DEPTH = 10
@@ -27,8 +28,6 @@ PUBLISHER_POLL_S = 1.0
 """Real seconds between two checks of the publishers."""
 NO_IMAGE_TIMEOUT_S = 5.0
 """Real seconds without an image before a warning."""
-NO_IMAGE_REMINDER_S = 60.0
-"""Real seconds before the same warning is repeated."""
 RELIABILITY = {'reliable': ReliabilityPolicy.RELIABLE, 'best_effort': ReliabilityPolicy.BEST_EFFORT}
 
 
@@ -53,7 +52,7 @@ class ImageInput:
         self._reliability: ReliabilityPolicy | None = None
         self._last_image = time.monotonic()
         self._any_image = False
-        self._last_warning: tuple[str, float] | None = None
+        self._throttle = LogThrottle()
         self._requested = RELIABILITY.get(options.image_reliability)
         if self._requested is not None:
             self._subscribe(self._requested)
@@ -122,12 +121,15 @@ class ImageInput:
         self.lost += event.total_count_change
 
     def _take(self, message: Any) -> None:
-        self._last_image, self._any_image, self._last_warning, self.no_image = time.monotonic(), True, None, None
+        self._last_image, self._any_image = time.monotonic(), True
+        if self.no_image is not None:
+            self.no_image = None
+            self._throttle.forget()
         self.encoding = message.encoding if self._type is Image else message.format
         self._on_image(message)
 
     def _warn_no_image(self) -> None:
-        """Diagnose a missing stream and log it, again when the reason changes or after `NO_IMAGE_REMINDER_S`."""
+        """Diagnose a missing stream and log it, again when the reason changes."""
         now = time.monotonic()
         if now - self._last_image < NO_IMAGE_TIMEOUT_S:
             return
@@ -139,10 +141,8 @@ class ImageInput:
             requests_reliable=self._reliability == ReliabilityPolicy.RELIABLE,
             other_offers=[_offer(publisher) for publisher in other_offers],
         )
-        text, warned_at = self._last_warning or ('', -NO_IMAGE_REMINDER_S)
-        if text == self.no_image.text and now - warned_at < NO_IMAGE_REMINDER_S:
+        if not self._throttle.is_due('no image', self.no_image.text, changed_s=0.0):
             return
-        self._last_warning = self.no_image.text, now
         self._node.get_logger().warning(f'no image for {now - self._last_image:.0f} s: {self.no_image.text}')
 
     def _type_name(self) -> str:
