@@ -9,6 +9,7 @@ import shutil
 import tempfile
 import zipfile
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
@@ -17,16 +18,18 @@ from types import SimpleNamespace
 
 import cv2
 import numpy as np
+from PIL import Image
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from autocalib_ros.config import BufferOptions, Options
-from autocalib_ros.errors import AutocalibError
+from autocalib_ros.errors import AutocalibError, UsageError
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.lens.camera_info_yaml import camera_info_yaml, read_camera_info, read_exact_lens
 from autocalib_ros.offline.ground_truth import read_truth, true_camera
 from autocalib_ros.offline.parameter_file import camera_info_file, override_options, parse_assignments, read_params_file
+from autocalib_ros.offline.recordings.image_files import EXIF_IFD, EXIF_ORIENTATION, EXIF_SUBSECOND, EXIF_TIME
 from autocalib_ros.offline.recordings.open import open_source
 from autocalib_ros.offline.track_files import evidence_from_file
 from autocalib_ros.offline.view_files import read_image
@@ -228,6 +231,20 @@ def _read_recording(path: Path) -> None:
         assert frame.image.dtype == np.uint8
 
 
+def _photograph(path: Path) -> None:
+    exif = Image.Exif()
+    exif[EXIF_ORIENTATION] = 1
+    exif.get_ifd(EXIF_IFD).update({EXIF_TIME: '2024:05:01 12:00:00', EXIF_SUBSECOND: '25'})
+    Image.fromarray(np.full((24, 32), 90, np.uint8)).save(path, exif=exif)
+
+
+def _read_photographs(path: Path) -> None:
+    with suppress(UsageError):  # two images of one time need a rate
+        open_source([path, path])
+    for frame in open_source([path, path], rate_hz=5.0).frames():
+        assert frame.image.dtype == np.uint8
+
+
 def _read_history(path: Path) -> None:
     for entry in read_history(path):
         describe_version(entry).encode()
@@ -298,6 +315,7 @@ TARGETS = {
     ),
     'image file': FuzzTarget('i.png', _pictures, read_image, damaged_bytes),
     'compressed image': FuzzTarget('i.bin', lambda: _pictures()[:-1], _read_compressed, damaged_bytes),
+    'photographs': FuzzTarget('p.jpg', lambda: [_written(_photograph, 'p.jpg')], _read_photographs, damaged_bytes),
     'mcap': FuzzTarget(
         'b.mcap',
         lambda: [_written(partial(_write_rosbag2, plugin=StoragePlugin.MCAP), 'b.mcap')],

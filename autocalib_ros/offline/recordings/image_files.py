@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import logging
 import os
+import warnings
 from collections.abc import Iterator, Sequence
 from datetime import datetime, timezone
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -127,27 +129,33 @@ def _is_plausible(stamps_ns: list[int]) -> bool:
 
 def _orientation(path: Path) -> int:
     """Return the orientation in EXIF, `UPRIGHT` without one."""
-    from PIL import Image  # comes with matplotlib
-
-    try:
-        with Image.open(path) as image:
-            return int(image.getexif().get(EXIF_ORIENTATION, UPRIGHT))
-    except (OSError, ValueError, TypeError, SyntaxError):
-        return UPRIGHT
+    orientation = _exif(path)[0]
+    return orientation if isinstance(orientation, int) else UPRIGHT
 
 
 def _exif_stamps(paths: list[Path]) -> list[int] | None:
     """Return the EXIF times of exposure of images, None if one has none."""
-    from PIL import Image  # comes with matplotlib
-
     stamps = []
     for path in paths:
+        tags = _exif(path)[1]
         try:
-            with Image.open(path) as image:
-                tags = image.getexif().get_ifd(EXIF_IFD)
             taken = datetime.strptime(str(tags[EXIF_TIME]), '%Y:%m:%d %H:%M:%S').replace(tzinfo=timezone.utc)
             fraction = float('0.' + (str(tags.get(EXIF_SUBSECOND, '')).strip() or '0'))
-        except (OSError, KeyError, ValueError, SyntaxError):
+        except (KeyError, ValueError):
             return None
         stamps.append(round(taken.timestamp()) * 10**9 + round(fraction * 1e9))
     return stamps
+
+
+def _exif(path: Path) -> tuple[Any, dict[int, Any]]:
+    """Return orientation and photographic data in the EXIF of an image; none if it cannot be read."""
+    from PIL import Image
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter('ignore')  # of large images, which are refused when they are read
+            with Image.open(path) as image:
+                tags = image.getexif()
+                return tags.get(EXIF_ORIENTATION), dict(tags.get_ifd(EXIF_IFD))
+    except Exception:  # damaged files raise arbitrary exceptions
+        return None, {}

@@ -100,3 +100,11 @@ def test_an_image_that_would_fill_the_memory_is_left_out_and_told(images, caplog
     (folder / 'image1.png').write_bytes(png_of(30000, 30000))
     assert len(list(open_source(folder, rate_hz=5.0).frames())) == 3
     assert 'the first: image1.png (the picture has 30000x30000 pixels, more than 100 million' in caplog.text
+
+
+def test_images_that_would_all_fill_the_memory_are_refused_with_the_first(images):
+    folder = images(3, suffix='.png')
+    for path in folder.iterdir():
+        path.write_bytes(png_of(30000, 30000))
+    with pytest.raises(InputError, match=r'none of the 3 images .*: image0.png \(the picture has 30000x30000'):
+        list(open_source(folder, rate_hz=5.0).frames())
