@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import shutil
 import subprocess
+from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 
 from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.offline.recordings.open import open_source
-from autocalib_ros.offline.recordings.videos import _FrameClock
+from autocalib_ros.offline.recordings.videos import _FrameClock, require_usual_size
 
 
 @pytest.mark.parametrize('suffix', ['.mp4', '.avi', '.mkv'])
@@ -142,3 +144,10 @@ def test_the_codec_is_named_where_nothing_can_be_decoded(tmp_path, write_video, 
     monkeypatch.setattr('autocalib_ros.offline.recordings.videos.cv2.VideoCapture.grab', lambda _: False, raising=False)
     with pytest.raises(InputError, match='its codec is'):
         open_source(path)
+
+
+@pytest.mark.parametrize(('width', 'height'), [(30000, 30000), (2**31 - 1, 1000)])
+def test_a_video_of_absurd_size_is_refused_before_a_frame_is_decoded(width, height):
+    sides = {cv2.CAP_PROP_FRAME_WIDTH: width, cv2.CAP_PROP_FRAME_HEIGHT: height}
+    with pytest.raises(InputError, match=f'a.mp4 states images of {width}x{height} pixels, more than 100 million'):
+        require_usual_size(SimpleNamespace(get=sides.get), 'a.mp4')
