@@ -33,9 +33,11 @@ MAX_BORNE_EXCESS = MAX_BORNE_SIZE_SIGMAS / MAX_SIZE_SIGMAS
 USUAL_SPEED_KM_H = 130.0
 """Fastest usual median speed: the limit of most motorways. Without a low end: traffic jams."""
 USUAL_LANES_M = (2.75, 3.75)
-"""Usual widths of lanes, from streets in towns to motorways."""
+"""Usual widths of lanes, from streets in towns to motorways. Without a high end: a line that is worn or hidden leaves
+the width of several lanes."""
 USUAL_PERIODS_M = (3.0, 18.0)
-"""Usual periods of dashes, from guide lines at junctions (1.5 m and 1.5 m) to motorways (6 m and 12 m)."""
+"""Usual periods of dashes, from guide lines at junctions (1.5 m and 1.5 m) to motorways (6 m and 12 m). Without a high
+end: dashes that are worn or hidden leave a multiple of the period."""
 MAX_SPEED_DISTANCE_HEIGHTS = 10.0
 """Farthest points whose speed counts, camera heights: farther ones are as uncertain as the horizon."""
 MIN_SPEED_TRACK_S = 0.5
@@ -109,9 +111,9 @@ def median_speed_km_h(vehicles: Evidence, camera: Camera, normal: np.ndarray, he
 def _compared(
     kind: str, name: str, value: float, usual: tuple[float, float]
 ) -> tuple[VerificationRow, Statement | None]:
-    """Return the row of a quantity against the range of usual ones, and the doubt in words if it fails."""
+    """Return the row of a quantity against the least usual one, and the doubt in words if it fails."""
     low, high = usual
-    beyond = max(float(np.log(low / value)), float(np.log(value / high)), 0.0)
+    beyond = max(float(np.log(low / value)), 0.0)
     row = verified(kind, beyond, MAX_USUAL_EXCESS)
     return row, None if row.passed else check(kind, **{name: value, 'low_m': low, 'high_m': high})
 
