@@ -146,7 +146,7 @@ class AutoCalibrator:
         return self.snapshot(with_segments=with_segments)
 
     def accepted(self, tracks: int) -> None:
-        """Note that evidence of so many tracks gave a calibration: a new solution is due when it can be better.
+        """Record that evidence of this many tracks gave a calibration: the next solution is due when it can be better.
 
         That is when the evidence could cut a standard deviation by 15 %, or when all of it is newer, which verifies the
         calibration by other traffic.

@@ -674,7 +674,7 @@ class NodeOptions(_Validated):
     )
     solve_limit_s: float = option(
         900.0,
-        'longest time of one solution, seconds; a longer one is given up, and the solver started anew',
+        'time limit of one solution, seconds; a solution that takes longer is stopped, and the solver restarted',
         low=1.0,
     )
     services: bool = option(

@@ -101,21 +101,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'status: 0 unless an option makes a result wrong with confidence (3.5 stated standard deviations), 3 '
         'otherwise.',
     )
+    _add_folder(variants)
+    variants.add_argument('--only', nargs='+', default=[], metavar='OPTION', help='options to vary (default: all)')
+    variants.add_argument('--pairs', action='store_true', help='also each pair of options')
+    _add_jobs(variants)
     moves = what.add_parser(
         'moves',
-        help='moves of the camera, applied to recordings: when they are told and how well they are measured',
+        help='camera moves applied to recordings: detection time and measurement error',
         description='Turn and zoom the images of recordings through their lens (truth.json beside them) by known '
-        'amounts, with sway, clouds, noise and a jam. Exit status: 0 if each move is told within 30 s and measured to '
-        '0.3 degrees, and nothing is told without a move, 3 otherwise.',
+        'amounts, with sway, clouds, noise and a jam. Exit status: 0 if each move is detected within 30 s and '
+        'measured to 0.3 degrees, and nothing is detected without a move, 3 otherwise.',
     )
     moves.add_argument('recordings', metavar='RECORDING', nargs='+', type=Path, help='recordings of still cameras')
     moves.add_argument(
         '--width', type=int, default=1280, metavar='PX', help='largest width of the images (default: %(default)s)'
     )
-    _add_folder(variants)
-    variants.add_argument('--only', nargs='+', default=[], metavar='OPTION', help='options to vary (default: all)')
-    variants.add_argument('--pairs', action='store_true', help='also each pair of options')
-    _add_jobs(variants)
 
 
 def _add_folder(parser: argparse.ArgumentParser) -> None:

@@ -119,7 +119,9 @@ def _resumed(arguments: argparse.Namespace, sources: list[Source]) -> tuple[Evid
         raise UsageError('--resume reads recordings to their end: leave out --start and --duration')
     before = read_evidence_to_resume(arguments.out / EVIDENCE)
     if before is None:
-        print_stderr(f'{arguments.out / EVIDENCE} does not exist: nothing to go on from, the replay begins anew.')
+        print_stderr(
+            f'{arguments.out / EVIDENCE} does not exist: no evidence to resume from, the replay starts from the beginning.'
+        )
         return None, sources
     left = sources_to_read(sources, before)
     if not arguments.quiet:

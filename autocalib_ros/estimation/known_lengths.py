@@ -115,7 +115,7 @@ class _Lengths:
     def combinations(self) -> np.ndarray:
         """Matrix that takes `log_heights` to what is observed as zero: differences of heights, and the change."""
         count = len(self.sources)
-        differ = np.hstack([-np.ones((max(count - 1, 0), min(count, 1))), np.eye(max(count - 1, 0))])
+        differ = _differences(count)
         if self.dashes is None:
             return differ
         below = np.zeros((1, count + 1))
@@ -192,7 +192,7 @@ def _compared(
     if count < 2:
         return tuple(rows), ()
     heights, covariance = here[:count], spread[:count, :count]
-    combine = np.hstack([-np.ones((count - 1, 1)), np.eye(count - 1)])
+    combine = _differences(count)
     apart = combine @ heights
     squared = apart @ np.linalg.solve(combine @ covariance @ combine.T, apart)
     rows.append(verified('known_lengths', float(np.sqrt(squared / (count - 1))), MAX_LENGTH_SIGMAS))
@@ -217,6 +217,12 @@ def _compared(
         sigmas=difference((first, second)),
     )
     return tuple(rows), (statement,)
+
+
+def _differences(count: int) -> np.ndarray:
+    """Return the matrix (count - 1, count) that subtracts the first of some numbers from each other one."""
+    others = max(count - 1, 0)
+    return np.hstack([-np.ones((others, min(count, 1))), np.eye(others)])
 
 
 def _name(source: Scale) -> str:

@@ -158,7 +158,7 @@ def measure_lanes(
     if found is None:
         return None
     probable, sigma = found
-    width = _lane_width(places, pairs[probable > 0.5], noise, np.exp(_weighted(logs[len(pitches) // 2], probable)))
+    width = _lane_width(places, pairs[probable > 0.5], np.exp(_weighted(logs[len(pitches) // 2], probable)))
     beside, beside_weights, width_sigma = width or (np.zeros((0, 2), int), np.zeros(0), np.inf)
     return LanePattern(
         along, dashes[:, :4], pairs, probable / noise**2, sigma, beside, beside_weights, float(width_sigma)
@@ -269,9 +269,7 @@ def _drift(logs: np.ndarray, plane: int) -> float:
     return float(np.abs(np.median(logs - logs[plane], axis=1)).max())
 
 
-def _lane_width(
-    places: np.ndarray, pairs: np.ndarray, noise: np.ndarray, period: float
-) -> tuple[np.ndarray, np.ndarray, float] | None:
+def _lane_width(places: np.ndarray, pairs: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray, float] | None:
     """Return pairs of dashes side by side (k, 2), their weights (k,) and the standard deviation of the log width.
 
     Of the dashes of `pairs`, whose spacing is one period. None if too few lie side by side at one distance.

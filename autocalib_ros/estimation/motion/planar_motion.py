@@ -122,9 +122,11 @@ class WindowRays:
         """
         lines = _EpipolarLines.of(self, motion)
         scale = self._masked_weight / np.sqrt(lines.gradient2)
-        columns = [scale * slope for slope in lines.lens_slopes(self, motion, polar, lens)]
+        pulls = lines.pulls(self)
+        far = np.stack(_line_back(pulls[1], motion)), np.stack(_line_ahead(pulls[0], motion)[1])
+        columns = [scale * slope for slope in lines.lens_slopes(self, far, polar, lens)]
         if len(axes):
-            levers = lines.rotation_levers(self, motion)
+            levers = lines.rotation_levers(self, pulls, far)
             columns += [scale * _dot_components(levers, tuple(axis)) for axis in axes.tolist()]
         return columns
 
@@ -165,10 +167,13 @@ class _EpipolarLines:
         return cls(turned, line, back, _dot_components(second, line), gradient2, slopes)
 
     def lens_slopes(
-        self, view: WindowRays, motion: PlanarMotion, polar: PolarRays, parameters: np.ndarray
+        self, view: WindowRays, far: tuple[np.ndarray, np.ndarray], polar: PolarRays, parameters: np.ndarray
     ) -> Iterator[np.ndarray]:
-        """Yield the derivatives by the lens of the error, less those of half the squared gradient times the ratio."""
-        ratio, (far_first, far_second) = self.ratio, self._far_lines(view, motion)
+        """Yield the derivatives by the lens of the error, less those of half the squared gradient times the ratio.
+
+        `far` is the derivative of half the squared slopes of the other end by the bearing of each end, first end first.
+        """
+        ratio, (far_first, far_second) = self.ratio, far
         (_, radial, tangential), (_, radial_second, tangential_second) = view.first, view.second
         by_u, by_v = np.stack([self.slopes[2], self.slopes[0]]), np.stack([self.slopes[3], self.slopes[1]])
         far_u = np.stack([_dot_components(radial, far_first), _dot_components(radial_second, far_second)])
@@ -182,10 +187,11 @@ class _EpipolarLines:
         ):
             yield both_ends[0] + both_ends[1]
 
-    def rotation_levers(self, view: WindowRays, motion: PlanarMotion) -> np.ndarray:
+    def rotation_levers(
+        self, view: WindowRays, pulls: tuple[np.ndarray, np.ndarray], far: tuple[np.ndarray, np.ndarray]
+    ) -> np.ndarray:
         """Return the same derivatives by the three rotations of the plane, shape (3, windows, points)."""
-        ratio, (far_first, far_second) = self.ratio, self._far_lines(view, motion)
-        pull_first, pull_second = self._pulls(view)
+        ratio, (far_first, far_second), (pull_first, pull_second) = self.ratio, far, pulls
         (first, _, _), (second, _, _) = view.first, view.second
         line, back = np.stack(self.line), np.stack(self.back)
         # every ray turns the other way; the line of the other end turns with it
@@ -198,7 +204,7 @@ class _EpipolarLines:
         """Error over its squared gradient: how much the change of the gradient counts."""
         return self.error / self.gradient2
 
-    def _pulls(self, view: WindowRays) -> tuple[np.ndarray, np.ndarray]:
+    def pulls(self, view: WindowRays) -> tuple[np.ndarray, np.ndarray]:
         """Sum of the directions of both ends times their slopes, shape (3, windows, points) each, first end first."""
         (_, radial, tangential), (_, radial_second, tangential_second) = view.first, view.second
         by_second, around_second, by_first, around_first = self.slopes
@@ -206,11 +212,6 @@ class _EpipolarLines:
             by_first * radial + around_first * tangential,
             by_second * radial_second + around_second * tangential_second,
         )
-
-    def _far_lines(self, view: WindowRays, motion: PlanarMotion) -> tuple[np.ndarray, np.ndarray]:
-        """Derivative of half the squared slopes of the other end by the bearing of each end, first end first."""
-        pull_first, pull_second = self._pulls(view)
-        return np.stack(_line_back(pull_second, motion)), np.stack(_line_ahead(pull_first, motion)[1])
 
     def derivatives(self, view: WindowRays, motion: PlanarMotion) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Yield the derivatives of the error and of half the squared gradient, by the turn and by the heading."""

@@ -20,10 +20,7 @@ from autocalib_ros.estimation.adjustment.lens_prior import DISTORTION_FREE, Lens
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig, AdjustmentState, Parameterisation
 from autocalib_ros.estimation.observations.track_set import TrackSet
 from autocalib_ros.estimation.single_road.barrel_lens import MAX_KAPPA, MIN_KAPPA, LensChoice
-from autocalib_ros.estimation.single_road.bent_road import (
-    Bend,
-    across_and_up,
-)
+from autocalib_ros.estimation.single_road.bent_road import Bend, across_and_up
 from autocalib_ros.estimation.single_road.direction_mixture import (
     MIXTURE_ROUNDS,
     SEARCHED_TURNS_RAD,
@@ -34,9 +31,7 @@ from autocalib_ros.estimation.single_road.direction_mixture import (
 )
 from autocalib_ros.estimation.single_road.road_through_lens import RoadThrough
 from autocalib_ros.estimation.vehicle_edges.edge_mixture import SYSTEMATIC_SIGMA_RAD
-from autocalib_ros.geometry.great_circles import (
-    unproject_rays,
-)
+from autocalib_ros.geometry.great_circles import unproject_rays
 from autocalib_ros.lens.camera import Camera
 
 TEMPER = 0.5
@@ -169,7 +164,8 @@ def road_posterior(
     fitted, nodes = _solve_grid(scene, solve, choice, focals)
     longer = choice.longer_than(focals)
     if len(longer) and _weights(nodes) @ [node.camera.focal_px > 0.999 * focals[-1] for node in nodes] > MAX_END_WEIGHT:
-        fitted, nodes = _solve_grid(scene, solve, choice, np.concatenate([focals, longer]))
+        further = _solve_grid(scene, solve, choice, longer)
+        fitted, nodes = [*fitted, *further[0]], [*nodes, *further[1]]
     mean, sigma = _focal_moments(nodes)
     spacing = float(np.log(focals[1] / focals[0])) if len(focals) > 1 else 0.0
     if sigma < MIN_SPACINGS * spacing:

@@ -69,11 +69,9 @@ def single_road_jam(generator: np.random.Generator) -> tuple[Junction, Evidence]
 
 def single_road_bend(generator: np.random.Generator) -> tuple[Junction, Evidence]:
     """Draw a road that bends: there is no straight part."""
-    radius_m, side = float(generator.uniform(80.0, 400.0)), float(generator.choice([-1.0, 1.0]))
-    curve = partial(drive_bend, radius_m=radius_m, towards_rad=side * np.pi / 2)
-    junction = replace(_road(generator), drive=curve)
+    radius_m, side = generator.uniform(80.0, 400.0), generator.choice([-1.0, 1.0])
+    junction, middle_m = _bent(_road(generator), float(radius_m), float(side))
     evidence = synthetic_evidence(junction, generator)
-    middle_m = np.array(junction.centre_m) + [0.0, side * radius_m]
     return junction, _with_segments(junction, evidence, generator, middle_m)
 
 
@@ -86,12 +84,11 @@ def single_road_telephoto(generator: np.random.Generator) -> tuple[Junction, Evi
     junction = replace(
         drawn, camera_from_ground=pose(float(tilt), float(roll), yaw), centre_m=(float(ahead[0]), float(ahead[1]))
     )
-    radius_m, towards_rad = generator.uniform(*TELEPHOTO_RADIUS_M), generator.choice([-1.0, 1.0]) * np.pi / 2
+    radius_m, side, middle_m = generator.uniform(*TELEPHOTO_RADIUS_M), generator.choice([-1.0, 1.0]), None
     if generator.uniform() < 0.5:
-        curve = partial(drive_bend, radius_m=float(radius_m), towards_rad=float(towards_rad))
-        junction = replace(junction, drive=curve)
+        junction, middle_m = _bent(junction, float(radius_m), float(side))
     evidence = synthetic_evidence(junction, generator)
-    return junction, _with_segments(junction, evidence, generator)
+    return junction, _with_segments(junction, evidence, generator, middle_m)
 
 
 def single_road_crossing(generator: np.random.Generator) -> tuple[Junction, Evidence]:
@@ -99,6 +96,12 @@ def single_road_crossing(generator: np.random.Generator) -> tuple[Junction, Evid
     junction = _road(generator, yaw_deg=CROSSING_YAW_DEG)
     evidence = synthetic_evidence(junction, generator)
     return junction, _with_segments(junction, evidence, generator)
+
+
+def _bent(junction: Junction, radius_m: float, side: float) -> tuple[Junction, np.ndarray]:
+    """Return the road with a bend to its left (`side` 1) or right (-1), and the middle of the bend (2,), metres."""
+    curve = partial(drive_bend, radius_m=radius_m, towards_rad=side * np.pi / 2)
+    return replace(junction, drive=curve), np.array(junction.centre_m) + [0.0, side * radius_m]
 
 
 def _road(
