@@ -9,7 +9,7 @@ import numpy as np
 
 from autocalib_ros.evidence.snapshot import TRACK_ARRAYS, Evidence
 from autocalib_ros.evidence.stillness import Stillness
-from autocalib_ros.evidence.tables import OUTLINES, STILL_LINES, STRIPES, TABLES, merged
+from autocalib_ros.evidence.tables import STILL_LINES, STRIPES, TABLES, ObservationTable, merged
 
 JOINT_GAP_S = 2.0
 """Seconds between two recordings in joined evidence, whatever lay between them: longer than any track has gaps."""
@@ -17,12 +17,7 @@ JOINT_GAP_S = 2.0
 
 def moved(evidence: Evidence, matrix: np.ndarray) -> Evidence:
     """Return evidence with all its pixels taken by a similarity (2, 3) to those of another recording."""
-    values = {table.values: _moved_pairs(getattr(evidence, table.values), matrix) for table in TABLES}
-    outlines = values[OUTLINES.values]
-    if len(outlines):  # the last column is a distance, no point
-        scale = float(np.hypot(*matrix[:, 0]))
-        gaps = evidence.outlines_px[:, -1:] * scale
-        values[OUTLINES.values] = np.hstack([outlines, gaps]).astype(np.float32)
+    values = {table.values: _moved_rows(table, getattr(evidence, table.values), matrix) for table in TABLES}
     return replace(
         evidence,
         points_px=evidence.points_px @ matrix[:, :2].T + matrix[:, 2],
@@ -30,11 +25,12 @@ def moved(evidence: Evidence, matrix: np.ndarray) -> Evidence:
     )
 
 
-def _moved_pairs(rows: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    """Return the points x0, y0, x1, y1, ... of each row (n, columns) moved; a last odd column is left out."""
+def _moved_rows(table: ObservationTable, rows: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """Return the points x0, y0, x1, y1, ... of each row (n, columns) moved; a last odd column is no point."""
     columns = rows.shape[1] // 2 * 2
-    pairs = rows[:, :columns].reshape(-1, 2)
-    return (pairs @ matrix[:, :2].T + matrix[:, 2]).reshape(len(rows), columns)
+    pairs = rows[:, :columns].reshape(-1, 2) @ matrix[:, :2].T + matrix[:, 2]
+    last = rows[:, columns:] * (np.hypot(*matrix[:, 0]) if table.ends_with_length else 1.0)
+    return np.hstack([pairs.reshape(len(rows), columns), last]).astype(rows.dtype)
 
 
 def joined(parts: Sequence[Evidence]) -> Evidence:

@@ -32,6 +32,8 @@ class ObservationTable:
     required: bool = False
     """Every evidence file has these arrays; files written before a kind was introduced lack the others."""
     saved_if_empty: bool = True
+    ends_with_length: bool = False
+    """Whether the last column is a length in pixels."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -71,7 +73,12 @@ class ObservationTable:
 SEGMENTS = ObservationTable('segments_px', vehicles='segment_vehicles', times='segment_times_s', required=True)
 EDGES = ObservationTable('edges_px', vehicles='edge_vehicles', times='edge_times_s')
 OUTLINES = ObservationTable(
-    'outlines_px', OUTLINE_COLUMNS, vehicles='outline_vehicles', times='outline_times_s', saved_if_empty=False
+    'outlines_px',
+    OUTLINE_COLUMNS,
+    vehicles='outline_vehicles',
+    times='outline_times_s',
+    saved_if_empty=False,
+    ends_with_length=True,
 )
 """Collected only without a detector, which recognises cyclists by itself."""
 STILL_LINES = ObservationTable('still_lines_px', saved_if_empty=False)

@@ -32,6 +32,7 @@ def part(first_vehicle: int, first_s: int = 0, **changes) -> Evidence:
         'outline_times_s': np.array([2.5]),
         'drift_px': 0.1,
         'still_lines_px': np.array([[0.0, 0.0, 50.0, 0.0]]),
+        'stripes_px': np.array([[10.0, 20.0, 14.0, 20.0, 60.0]]),
         'recordings': (ReadRecording(f'clip{first_s}', 10.0),),
     }
     return Evidence(**{**fields, **changes})
@@ -62,6 +63,7 @@ def test_all_pixels_are_moved_and_gaps_are_scaled():
     assert after.segments_px.tolist() == [[21.0, 37.0, 61.0, 37.0]]
     assert after.still_lines_px.tolist() == [[1.0, -3.0, 101.0, -3.0]]
     assert after.outlines_px[0, :2].tolist() == [1.0, -1.0] and after.outlines_px[0, -1] == 32.0
+    assert after.stripes_px.tolist() == [[21.0, 37.0, 29.0, 37.0, 60.0]]  # its contrast stays
     assert after.edges_px.shape == (0, 4)
     after.require_consistent()
 
