@@ -177,7 +177,7 @@ class AutoCalibrator:
         observer = stream.observer
         evidence = stream.evidence(view)
         if with_segments:
-            lines, stripes = observer.still_lines(view), observer.still_stripes(view)
+            lines, stripes = observer.still_segments(view)
             evidence = replace(evidence, still_lines_px=lines, stripes_px=stripes)
         return evidence.with_landmarks(observer.landmarks(view)) if landmarks else evidence
 

@@ -577,6 +577,11 @@ class Options(_Validated):
         _ = self.ignored_polygons
 
     @property
+    def gives_scale(self) -> bool:
+        """Whether anything gives a scale in metres."""
+        return bool(self.camera_height or self.scale.known_distances or self.scale.speed_km_h or self.lanes.given)
+
+    @property
     def ignored_polygons(self) -> tuple[tuple[tuple[float, float], ...], ...]:
         """Polygons of `ignore_regions`, each of at least three points (u, v); empty if it is empty."""
         return tuple(
@@ -649,7 +654,7 @@ class NodeOptions(_Validated):
         '',
         'path of control points (CSV or .otrfpts): ~/map_transform places the ground frame in their map; empty: none',
     )
-    map_frame: str = option('map', 'frame of that map, the parent of the ground frame')
+    map_frame: str = option('map', 'frame of the map, the parent of the ground frame in ~/map_transform')
     publish_tf: bool = option(True, 'also publish the ground transform on /tf_static, if tf2_msgs is installed')
     camera_info_url: str = option(
         '',
@@ -683,9 +688,9 @@ class NodeOptions(_Validated):
     )
     on_move: str = option(
         'mend',
-        'what is published after the camera has moved, and while the picture says nothing; mend: after a turn the pose '
-        'corrected by what the picture shows, else nothing; withhold: nothing until traffic gives a new calibration; '
-        'keep: the stale calibration. /diagnostics and ~/status tell of it in any case',
+        'what is published after the camera has moved, and while the picture shows nothing usable; mend: after a turn '
+        'the pose corrected by the picture, else nothing; withhold: nothing until traffic gives a new calibration; '
+        'keep: the stale calibration. /diagnostics and ~/status report it in any case',
         choices=('mend', 'withhold', 'keep'),
     )
     debug_rate_hz: float = option(

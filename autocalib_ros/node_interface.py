@@ -144,7 +144,8 @@ GROUND_POINTS_NODE = (
 """Interface of `ground_points_node`."""
 
 DIAGNOSTIC_VALUES = {
-    'state': '`WAITING_FOR_IMAGES`, `COLLECTING`, `RESTORED`, `CALIBRATED`, `MOVED`, `MENDED`, `BLIND` or `RECOVERED`',
+    'state': '`WAITING_FOR_IMAGES`, `COLLECTING`, `RESTORED`, `CALIBRATED`, `DEGRADED`, `MOVED`, `MENDED`, `BLIND` or '
+    '`RECOVERED`',
     'evidence_percent': 'how much of the evidence for a first solution has been collected',
     'missing': 'what is missing for a first solution',
     'outlook': 'estimated time until then, or for how long there was no traffic',

@@ -97,13 +97,12 @@ def write_ground_tracks(path: Path, replayed: ReplayResult, *, quiet: bool) -> N
 
 def warn_missing_scale(options: Options, lens: Camera | None) -> None:
     """Warn on stderr if no metric scale is given: the result has no metric ground plane."""
-    given = options.scale
-    if not (options.camera_height or given.known_distances or given.speed_km_h):
+    if not options.gives_scale:
         scale = 'is given in units of that height' if options.allow_unit_scale else 'is left out'
         calibrated = 'the lens is calibrated' if lens is None else 'the lens is known'
         print_stderr(
-            f'No camera height given: {calibrated}, the ground plane {scale} (see --camera-height, --distance and'
-            ' --scale-speed).'
+            f'No camera height given: {calibrated}, the ground plane {scale} (see --camera-height, --distance,'
+            ' --scale-speed and --lanes).'
         )
 
 

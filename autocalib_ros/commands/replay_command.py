@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='SOURCE',
         nargs='*',
         help='rosbag2 folder, .mcap, .db3, ROS 1 .bag, video file, images (folder or pattern), folder of clips, stream '
-        '(rtsp://, http://) or camera device (/dev/video0); several ones of the same view are joined',
+        '(rtsp://, http://) or camera device (/dev/video0); several recordings of the same view are joined',
     )
     add_solve_options(parser)
     parser.add_argument('--topic', metavar='T', help='image topic; required if the recording has several')
@@ -52,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--resume',
         action='store_true',
-        help='go on from evidence.npz in the folder for the results: read only what it was not read from yet',
+        help='continue from evidence.npz in the output folder: read only what it does not cover yet',
     )
     parser.add_argument('--start', type=float, default=0.0, metavar='S', help='seconds to skip at the start')
     parser.add_argument('--duration', type=float, metavar='S', help='seconds to use; of a stream, to record')
@@ -119,9 +119,7 @@ def _resumed(arguments: argparse.Namespace, sources: list[Source]) -> tuple[Evid
         raise UsageError('--resume reads recordings to their end: leave out --start and --duration')
     before = read_evidence_to_resume(arguments.out / EVIDENCE)
     if before is None:
-        print_stderr(
-            f'{arguments.out / EVIDENCE} does not exist: no evidence to resume from, the replay starts from the beginning.'
-        )
+        print_stderr(f'{arguments.out / EVIDENCE} does not exist: no evidence to resume from, so all is read.')
         return None, sources
     left = sources_to_read(sources, before)
     if not arguments.quiet:

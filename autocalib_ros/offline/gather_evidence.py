@@ -124,21 +124,22 @@ def gather_evidence(
     frames reported. A recording that is joined with others `tries_solutions` at the end only.
     """
     calibrator, trials, moves = AutoCalibrator(options, detector), _Trials(options), MoveLog()
-    count, note, stopped, checkpoint_s, first_ns = 0, '', False, CHECKPOINT_EVERY_S, None
+    count, note, stopped, checkpoint_s, first_ns, seen_s = 0, '', False, CHECKPOINT_EVERY_S, 0, 0.0
     for count, frame in enumerate(prefetched(source.frames()), start=1):
         scaled_lens = scaled(lens, (frame.image.shape[1], frame.image.shape[0]))
         calibrator.add_image(frame.stamp_ns, frame.image)
         moves.add(frame.stamp_ns, frame.image, calibrator)
-        first_ns = frame.stamp_ns if first_ns is None else first_ns
+        first_ns = frame.stamp_ns if count == 1 else first_ns
+        seen_s = (frame.stamp_ns - first_ns) * 1e-9
         due = _as_recorded(calibrator.snapshot_if_due(), source) if tries_solutions else None
         if due is not None:
             trials.begin_part(due.stillness.start_s)
             if trials.is_due(due.seconds, source.duration_s):
                 control.report(frames_before + count, 'solving')
                 trials.solve(due, scaled_lens)
-        if control.on_checkpoint is not None and (frame.stamp_ns - first_ns) * 1e-9 >= checkpoint_s:
-            checkpoint_s = (frame.stamp_ns - first_ns) * 1e-9 + CHECKPOINT_EVERY_S
-            control.on_checkpoint(_longest_part(calibrator, source, _seconds_read(source, first_ns, frame.stamp_ns)))
+        if control.on_checkpoint is not None and seen_s >= checkpoint_s:
+            checkpoint_s = seen_s + CHECKPOINT_EVERY_S
+            control.on_checkpoint(_longest_part(calibrator, source, source.window.start_s + seen_s))
         if control.on_progress is not None and count % PROGRESS_EVERY_FRAMES == 1:
             note = _progress_note(calibrator, trials)
         control.report(frames_before + count, note)
@@ -148,7 +149,7 @@ def gather_evidence(
     if not count:
         raise InputError(f'{source.name} has no images')
     to_end = not stopped and source.window.duration_s is None
-    evidence = _longest_part(calibrator, source, inf if to_end else _seconds_read(source, first_ns, frame.stamp_ns))
+    evidence = _longest_part(calibrator, source, inf if to_end else source.window.start_s + seen_s)
     trials.begin_part(evidence.stillness.start_s)
     clock = calibrator.clock()
     if clock.is_uneven:
@@ -164,11 +165,6 @@ def gather_evidence(
         stopped=stopped,
         moves=moves,
     )
-
-
-def _seconds_read(source: Source, first_ns: int | None, newest_ns: int) -> float:
-    """Return the seconds from the first image of a recording to the newest one read."""
-    return source.window.start_s + (newest_ns - (newest_ns if first_ns is None else first_ns)) * 1e-9
 
 
 def _longest_part(calibrator: AutoCalibrator, source: Source, read_s: float) -> Evidence:

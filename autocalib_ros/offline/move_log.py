@@ -81,7 +81,7 @@ class MoveLog:
 def _measured(seen: _Seen, camera: Camera | None) -> CameraMove:
     """Return a move as it is through a lens: the two views are registered to each other once more."""
     height, width = seen.before.image.shape
-    unmeasured = replace(seen.move, pan_deg=0.0, tilt_deg=0.0, roll_deg=0.0, zoom=1.0, sigma_deg=None, zoom_sigma=None)
+    unmeasured = replace(seen.move, pan_deg=0.0, tilt_deg=0.0, roll_deg=0.0, zoom=1.0, sigma_deg=None)
     if camera is None or seen.after is None or abs(width * camera.height - height * camera.width) > camera.width:
         return unmeasured
     reference = ViewReference(seen.before.image, camera.scaled_to(width, height), seen.before.ignored)
@@ -102,5 +102,4 @@ def _measured(seen: _Seen, camera: Camera | None) -> CameraMove:
         roll,
         zoom,
         (one, two, three),
-        float(np.sqrt(pose.covariance[3, 3])),
     )

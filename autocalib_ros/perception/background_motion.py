@@ -118,7 +118,7 @@ class ReferenceImage:
     def __init__(self, image: np.ndarray, ignored: np.ndarray | None = None) -> None:
         self.image = image
         self.corners_px = spread_corners(image, ignored)
-        self._cells = _cells(self.corners_px, image.shape)
+        self._cells = cells_of(self.corners_px, image.shape)
         self._cell_count = len(np.unique(self._cells))
         patterns = _windows(image, self.corners_px)
         self._deviations = np.abs(patterns - patterns.mean(axis=1, keepdims=True)).mean(axis=1)
@@ -239,11 +239,7 @@ def spread_corners(image: np.ndarray, ignored: np.ndarray | None = None) -> np.n
     if found is None:
         return np.zeros((0, 2))
     corners = found[:, 0].astype(float)  # strongest first
-    cells = _cells(corners, image.shape)
-    rank = np.zeros(len(cells), int)
-    for cell in np.unique(cells):
-        mine = np.flatnonzero(cells == cell)
-        rank[mine] = np.arange(len(mine))
+    rank = rank_in_cell(cells_of(corners, image.shape))
     order = np.argsort(rank, kind='stable')
     return corners[order[rank[order] < CORNERS_PER_CELL][:MAX_CORNERS]]
 
@@ -271,10 +267,19 @@ def _windows(image: np.ndarray, points_px: np.ndarray) -> np.ndarray:
     return image[rows[:, :, None], columns[:, None, :]].reshape(len(points_px), WINDOW_PX**2).astype(np.float32)
 
 
-def _cells(points_px: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the cell number (n,) of points (n, 2) in an image of `shape` (height, width)."""
-    places = np.floor(points_px / (shape[1], shape[0]) * CELLS).astype(int)
-    return np.clip(places, 0, np.array(CELLS) - 1) @ [1, CELLS[0]]
+def cells_of(points_px: np.ndarray, shape: tuple[int, ...], grid: tuple[int, int] = CELLS) -> np.ndarray:
+    """Return the cell number (n,) of points (n, 2) in an image of `shape` (height, width), by columns and rows."""
+    places = np.floor(points_px / (shape[1], shape[0]) * grid).astype(int)
+    return np.clip(places, 0, np.array(grid) - 1) @ [1, grid[0]]
+
+
+def rank_in_cell(cells: np.ndarray) -> np.ndarray:
+    """Return how many points before each one lie in its cell, by the cell numbers (n,), shape (n,)."""
+    rank = np.zeros(len(cells), int)
+    for cell in np.unique(cells):
+        mine = np.flatnonzero(cells == cell)
+        rank[mine] = np.arange(len(mine))
+    return rank
 
 
 def _complex(points: np.ndarray) -> np.ndarray:

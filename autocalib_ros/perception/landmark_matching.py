@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from autocalib_ros.evidence.landmarks import DESCRIPTOR_BYTES, Landmarks
-from autocalib_ros.perception.background_motion import AGREEMENT_PX, MIN_CORNERS
+from autocalib_ros.perception.background_motion import AGREEMENT_PX, MIN_CORNERS, cells_of, rank_in_cell
 from autocalib_ros.perception.segments import LOWE_RATIO
 
 LANDMARK_CELLS = (8, 6)
@@ -40,12 +40,7 @@ def find_landmarks(grey: np.ndarray, excluded: np.ndarray | None) -> Landmarks:
         return Landmarks()
     order = np.argsort([-keypoint.response for keypoint in found], kind='stable')
     points = np.array([found[index].pt for index in order], float)
-    cells = _landmark_cells(points, (grey.shape[1], grey.shape[0]))
-    rank = np.zeros(len(cells), int)
-    for cell in np.unique(cells):
-        mine = np.flatnonzero(cells == cell)
-        rank[mine] = np.arange(len(mine))
-    keep = rank < LANDMARKS_PER_CELL
+    keep = rank_in_cell(cells_of(points, grey.shape, LANDMARK_CELLS)) < LANDMARKS_PER_CELL
     return Landmarks(points[keep], np.clip(np.rint(descriptors[order[keep]]), 0, 255).astype(np.uint8))
 
 
@@ -64,7 +59,7 @@ def register(landmarks: Landmarks, reference: Landmarks, size: tuple[int, int]) 
     if matrix is None:
         return None
     inside = agreed.ravel() > 0
-    spread = len(np.unique(_landmark_cells(ends[inside], size)))
+    spread = len(np.unique(cells_of(ends[inside], size[::-1], LANDMARK_CELLS)))
     if inside.sum() < MIN_CORNERS or spread < MIN_LANDMARK_CELLS:
         return None
     return Registration(matrix, _displacement_px(matrix, size), int(inside.sum()))
@@ -96,9 +91,3 @@ def _displacement_px(matrix: np.ndarray, size: tuple[int, int]) -> float:
     grid = np.stack(np.meshgrid(np.linspace(0, size[0] - 1, 9), np.linspace(0, size[1] - 1, 9)), axis=-1).reshape(-1, 2)
     moved = grid @ matrix[:, :2].T + matrix[:, 2]
     return float(np.sqrt(((moved - grid) ** 2).sum(axis=1).mean()))
-
-
-def _landmark_cells(points_px: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Return the cell number (n,) of points (n, 2) in an image of `size`."""
-    places = np.floor(points_px / size * LANDMARK_CELLS).astype(int)
-    return np.clip(places, 0, np.array(LANDMARK_CELLS) - 1) @ [1, LANDMARK_CELLS[0]]

@@ -223,7 +223,7 @@ class Observer:
         if before is None:
             return None, edges, outlines
         ends, matched = match_segments(before, keypoints, grey.shape[1])
-        segments = Segments(time_s, of_keypoint[matched], self._to_full_pixels(ends.reshape(-1, 2)).reshape(-1, 4))
+        segments = Segments(time_s, of_keypoint[matched], self._ends_in_full_size(ends))
         return segments, edges, outlines
 
     def _moving_regions(self, shape: tuple[int, int]) -> tuple[list[Region], np.ndarray, np.ndarray]:
@@ -244,7 +244,7 @@ class Observer:
         if self._detections % EDGE_SEARCH_PERIOD:
             return None
         ends, of_edge = self._edge_finder.find(grey, regions)
-        return Edges(time_s, vehicles[of_edge], self._to_full_pixels(ends.reshape(-1, 2)).reshape(-1, 4))
+        return Edges(time_s, vehicles[of_edge], self._ends_in_full_size(ends))
 
     def _find_outlines(
         self, regions: list[Region], vehicles: np.ndarray, shape: tuple[int, int], time_s: float
@@ -301,39 +301,55 @@ class Observer:
         drift_px, stillness = self._drift_monitor.stillness(view)
         return drift_px * self._reduction, stillness.enlarged(self._reduction)
 
-    def still_lines(self, view: int | None = None) -> np.ndarray:
-        """Return the line segments of the background, x0, y0, x1, y1 in pixels of the full image, shape (n, 4)."""
+    def still_segments(self, view: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Return line segments and bright bars of the background, in pixels of the full image.
+
+        Segments are x0, y0, x1, y1, shape (n, 4); bars are as `Evidence.stripes_px`.
+        """
         scene = self._scenes[self._view if view is None else view]
-        if not scene.lines.is_current(scene.background.times_s):
-            self._find_lines(scene.lines, scene.background, scene.picture_area.mask)
-        return self._lines_in_full_size(scene.lines)
+        if not _is_searched(scene):
+            self._search(scene.lines, scene.stripes, scene.background, scene.picture_area.mask)
+        return self._in_full_size(scene.lines, scene.stripes)
 
     def search_for_segments(self) -> Callable[[], tuple[np.ndarray, np.ndarray]]:
-        """Return a function that gives `still_lines` and `still_stripes` as they are now, for another thread."""
+        """Return a function that gives `still_segments` as they are now, for another thread."""
         scene = self._scene
-        times_s = scene.background.times_s
-        if scene.lines.is_current(times_s) and scene.stripes.is_current(times_s):
-            found = self._lines_in_full_size(scene.lines), self._stripes_in_full_size(scene.stripes)
+        if _is_searched(scene):
+            found = self._in_full_size(scene.lines, scene.stripes)
             return lambda: found
         background, mask = scene.background.copy(), scene.picture_area.mask
         lines, stripes = scene.lines.fresh(), scene.stripes.fresh()
 
         def search() -> tuple[np.ndarray, np.ndarray]:
-            self._find_lines(lines, background, mask)
-            self._find_stripes(stripes, background)
-            return self._lines_in_full_size(lines), self._stripes_in_full_size(stripes)
+            self._search(lines, stripes, background, mask)
+            return self._in_full_size(lines, stripes)
 
         return search
 
-    def _find_lines(self, lines: LineSegmentDetector, background: Background, no_picture: np.ndarray | None) -> None:
-        """Find the segments of a background; uses nothing that later images change."""
+    def _search(
+        self,
+        lines: LineSegmentDetector,
+        stripes: StripeDetector,
+        background: Background,
+        no_picture: np.ndarray | None,
+    ) -> None:
+        """Find segments and bars of a background; uses nothing that later images change."""
+        grey, samples = self._still_scene(background)
+        lines.find(grey, background.times_s, no_picture, samples)
+        stripes.find(grey, background.times_s)
+
+    def _still_scene(self, background: Background) -> tuple[np.ndarray | None, list[np.ndarray]]:
+        """Return a background as grey image and the samples of which it is the median; None without samples."""
         samples = background.grey_samples()
         grey = self._tracked_image(median(samples)) if samples else None
-        tracked = [self._tracked_image(sample) for sample in samples]
-        lines.find(grey, background.times_s, no_picture, tracked)
+        return grey, [self._tracked_image(sample) for sample in samples]
 
-    def _lines_in_full_size(self, lines: LineSegmentDetector) -> np.ndarray:
-        return self._to_full_pixels(lines.lines_px.reshape(-1, 2)).reshape(-1, 4)
+    def _in_full_size(self, lines: LineSegmentDetector, stripes: StripeDetector) -> tuple[np.ndarray, np.ndarray]:
+        bars = stripes.stripes_px
+        return self._ends_in_full_size(lines.lines_px), np.hstack([self._ends_in_full_size(bars[:, :4]), bars[:, 4:]])
+
+    def _ends_in_full_size(self, ends_px: np.ndarray) -> np.ndarray:
+        return self._to_full_pixels(ends_px.reshape(-1, 2)).reshape(-1, 4)
 
     def landmarks(self, view: int) -> Landmarks:
         """Return the landmarks of the background of a view in memory, pixels of the full image; none without one."""
@@ -353,22 +369,6 @@ class Observer:
     def leave_view(self) -> None:
         """Begin another still view with the next image."""
         self._drift_monitor.leave()
-
-    def still_stripes(self, view: int | None = None) -> np.ndarray:
-        """Return the bright bars of the background, as `Evidence.stripes_px`, in pixels of the full image."""
-        scene = self._scenes[self._view if view is None else view]
-        if not scene.stripes.is_current(scene.background.times_s):
-            self._find_stripes(scene.stripes, scene.background)
-        return self._stripes_in_full_size(scene.stripes)
-
-    def _find_stripes(self, stripes: StripeDetector, background: Background) -> None:
-        """Find the bars of a background; uses nothing that later images change."""
-        grey = background.grey()
-        stripes.find(None if grey is None else self._tracked_image(grey), background.times_s)
-
-    def _stripes_in_full_size(self, stripes: StripeDetector) -> np.ndarray:
-        found = stripes.stripes_px
-        return np.hstack([self._to_full_pixels(found[:, :4].reshape(-1, 2)).reshape(-1, 4), found[:, 4:]])
 
     def picture(self, view: int) -> Picture:
         """Return the picture inside the images of a view in memory, pixels of the full image."""
@@ -405,3 +405,9 @@ def _downsampled(grey: np.ndarray, ignored: np.ndarray | None) -> np.ndarray:
     height, width = grey.shape
     columns = min(GATE_WIDTH_PX, width)
     return cv2.resize(grey, (columns, max(1, height * columns // width)), interpolation=cv2.INTER_AREA)
+
+
+def _is_searched(scene: _Scene) -> bool:
+    """Whether segments and bars of the present background of a scene are known."""
+    times_s = scene.background.times_s
+    return scene.lines.is_current(times_s) and scene.stripes.is_current(times_s)

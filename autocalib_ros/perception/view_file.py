@@ -6,7 +6,6 @@ the file may read it.
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -16,7 +15,7 @@ from autocalib_ros.errors import InputError
 from autocalib_ros.evidence.npz import LOAD_ERRORS
 from autocalib_ros.perception.view_registration import REGISTERED_WIDTH_PX, ViewPose
 from autocalib_ros.perception.view_watch import MAX_REFERENCES, KnownView
-from autocalib_ros.util.files import OWNER_ONLY, write_bytes_atomically
+from autocalib_ros.util.files import OWNER_ONLY, replaced_atomically
 from autocalib_ros.util.packed_arrays import packed_arrays
 
 MAX_VIEW_BYTES = 4 * MAX_REFERENCES * REGISTERED_WIDTH_PX**2
@@ -28,16 +27,15 @@ def write_views(path: Path, belongs_to: str, views: Sequence[KnownView]) -> None
     shape = views[0].image.shape
     kept = [view for view in views if view.image.shape == shape]
     masks = [np.zeros(shape, np.uint8) if view.ignored is None else view.ignored for view in kept]
-    content = io.BytesIO()
-    np.savez_compressed(
-        content,
-        belongs_to=np.array(belongs_to),
-        images=np.stack([view.image for view in kept]),
-        ignored=np.stack(masks) > 0,
-        rotations=np.stack([view.pose.rotation for view in kept]),
-        covariances=np.stack([view.pose.covariance for view in kept]),
-    )
-    write_bytes_atomically(path, content.getvalue(), OWNER_ONLY)
+    with replaced_atomically(path, OWNER_ONLY) as stream:
+        np.savez_compressed(
+            stream,
+            belongs_to=np.array(belongs_to),
+            images=np.stack([view.image for view in kept]),
+            ignored=np.stack(masks) > 0,
+            rotations=np.stack([view.pose.rotation for view in kept]),
+            covariances=np.stack([view.pose.covariance for view in kept]),
+        )
 
 
 def read_views(path: Path, belongs_to: str) -> tuple[KnownView, ...]:

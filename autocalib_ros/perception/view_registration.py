@@ -13,8 +13,9 @@ from functools import cached_property
 import cv2
 import numpy as np
 
+from autocalib_ros.geometry.robust_kernels import MAD_TO_SIGMA
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.perception.background_motion import CELLS, spread_corners
+from autocalib_ros.perception.background_motion import cells_of, spread_corners
 from autocalib_ros.results.camera_move import rotation_from_turn, turn_of_rotation
 
 REGISTERED_WIDTH_PX = 640
@@ -108,7 +109,7 @@ class ViewReference:
         corners_px = spread_corners(image, ignored)
         bearings, valid = camera.unproject(corners_px)
         self.corners_px, self.bearings = corners_px[valid], bearings[valid]
-        self._cells = _cells_of(self.corners_px, image.shape)
+        self._cells = cells_of(self.corners_px, image.shape)
 
     @property
     def is_registrable(self) -> bool:
@@ -173,7 +174,7 @@ class ViewReference:
         if fitted is None:
             return None
         pose, agree = fitted
-        cells = len(np.unique(_cells_of(ends[agree], pattern.shape)))
+        cells = len(np.unique(cells_of(ends[agree], pattern.shape)))
         is_enough = agree.mean() >= MIN_MATCH_SHARE and cells >= MIN_FAR_CELLS // 2
         return pose if is_enough and abs(pose.log_zoom) < np.log(ZOOMS[-1] * 1.1) else None
 
@@ -278,7 +279,7 @@ def _least_squares(camera: Camera, bearings: np.ndarray, ends: np.ndarray, pose:
     step = inverse @ slopes.T @ (ends.ravel() - now)
     errors = ends.ravel() - now - slopes @ step
     # the corners share some of their error, which their number does not average out
-    variance = (1.4826 * float(np.median(np.abs(errors)))) ** 2 + len(bearings) * COMMON_ERROR_PX**2
+    variance = (MAD_TO_SIGMA * float(np.median(np.abs(errors)))) ** 2 + len(bearings) * COMMON_ERROR_PX**2
     turned = rotation_from_turn(step[:3]) @ pose.rotation
     return ViewPose(turned, pose.log_zoom + float(step[3]), variance * inverse, pose.share)
 
@@ -329,9 +330,3 @@ def _described_keypoints(pattern: np.ndarray, ignored: np.ndarray | None) -> tup
     if words is None:
         return np.zeros((0, 2)), np.zeros((0, 128), np.float32)
     return np.array([point.pt for point in points]), words
-
-
-def _cells_of(points_px: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the cell number (n,) of points (n, 2) in an image of `shape` (height, width)."""
-    places = np.floor(points_px / (shape[1], shape[0]) * CELLS).astype(int)
-    return np.clip(places, 0, np.array(CELLS) - 1) @ [1, CELLS[0]]

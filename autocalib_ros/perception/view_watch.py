@@ -27,7 +27,7 @@ from autocalib_ros.perception.picture_faults import (
     exposure_fault,
 )
 from autocalib_ros.perception.view_registration import ViewPose, ViewReference, normalised, registered_image
-from autocalib_ros.results.camera_move import MIN_MOVE_ZOOM, CameraMove, MoveKind, kind_of_move, rotation_from_turn
+from autocalib_ros.results.camera_move import MIN_MOVE_ZOOM, CameraMove, MoveKind, kind_of_move, rotation_angle_deg
 
 CHECK_S = 1.2
 """Mean interval between two registrations, seconds."""
@@ -417,8 +417,7 @@ class ViewWatch:
         self.report = before = replace(before, checked_s=time_s, share=pose.share)
         if before.condition is ViewCondition.BLIND and self._fault is None:
             self._samples = deque([self._samples[-1]], maxlen=self._samples.maxlen)
-            before = replace(before, condition=ViewCondition.UNKNOWN, since_s=time_s, fault=None)
-            return before
+            return replace(before, condition=ViewCondition.UNKNOWN, since_s=time_s, fault=None)
         if before.condition is ViewCondition.MOVED:
             return self._judge_moved(time_s)
         moved = self._noticed(time_s)
@@ -447,15 +446,14 @@ class ViewWatch:
 
     def _judge_unseen(self, time_s: float) -> ViewReport:
         """Return the report after an image that has outlines but not those of the view."""
-        unseen_s = 0.0 if self._unseen_s is None else time_s - self._unseen_s
         limit_s = REPLACED_S if self._replaced else UNSEEN_S
-        if unseen_s < limit_s or self._unseen_s is None:
+        if self._unseen_s is None or time_s - self._unseen_s < limit_s:
             return self.report
         stands = self._candidate is not None and time_s - self._candidate[1] >= CANDIDATE_S
         if stands:
             move = CameraMove(MoveKind.OTHER_VIEW, self._unseen_s)
             return self._changed(ViewCondition.MOVED, self._unseen_s, move=move)
-        if self.report.condition is ViewCondition.MOVED or unseen_s < limit_s + CANDIDATE_S / 2:
+        if self.report.condition is ViewCondition.MOVED or time_s - self._unseen_s < limit_s + CANDIDATE_S / 2:
             return self.report
         return self._changed(ViewCondition.BLIND, self._unseen_s, fault=PictureFault.UNRECOGNISED)
 
@@ -551,12 +549,10 @@ class ViewWatch:
             roll,
             zoom,
             (float(sigma[0]), float(sigma[1]), float(sigma[2])),
-            float(np.hypot(zooms.std(ddof=1) / root, math.sqrt(covariance[3, 3]))),
         )
         if move.is_measured and move.kind is measured.kind:
-            change = rotation_from_turn(np.radians([pan, tilt, roll])) @ move.rotation.T
-            angle = math.degrees(math.acos(min(1.0, max(-1.0, (float(np.trace(change)) - 1.0) / 2.0))))
-            if angle < self._least_move_deg and abs(math.log(zoom / move.zoom)) < math.log(MIN_MOVE_ZOOM):
+            angle_deg = rotation_angle_deg(measured.rotation @ move.rotation.T)
+            if angle_deg < self._least_move_deg and abs(math.log(zoom / move.zoom)) < math.log(MIN_MOVE_ZOOM):
                 return before
         return self._changed(ViewCondition.MOVED, before.since_s, move=measured)
 

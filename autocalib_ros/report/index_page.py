@@ -19,7 +19,7 @@ from autocalib_ros.errors import AutocalibError, InputError
 from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
 from autocalib_ros.report.canvas import jpeg
 from autocalib_ros.results.calibration import Calibration
-from autocalib_ros.results.calibration_json import calibration_from_json, read_json
+from autocalib_ros.results.calibration_json import calibration_from_json, read_json_object
 from autocalib_ros.util.files import write_atomically
 
 RESULT, REPORT_PAGE = 'calibration.json', 'report.html'
@@ -80,7 +80,7 @@ def _entry(path: Path, folder: Path) -> CameraEntry:
     common = {'name': name, 'when': when, 'report': address, 'thumbnail': _thumbnail(path.parent / 'figures')}
     nothing = dict.fromkeys(('grade', 'focal', 'tilt', 'height', 'lengths'), '')
     try:
-        document = read_json(path, 'calibration')
+        document = read_json_object(path)
         if document.get('state') == 'refused':
             return CameraEntry(**common, **nothing, state='refused', note=str(document['refusal']['message']))
         return CameraEntry(**common, **_numbers(calibration_from_json(document)))
@@ -91,22 +91,17 @@ def _entry(path: Path, folder: Path) -> CameraEntry:
 def _numbers(result: Calibration) -> dict[str, Any]:
     sigma, ground = result.stddev, result.ground
     metric = ground is not None and ground.metric
+    tilt_deg = None if ground is None else float(tilt_and_roll_deg(ground.normal_in_camera)[0])
     lengths = '' if sigma.ground is None else f'± {100 * sigma.ground.worst:.1f} %'
     return {
         'state': 'calibrated' if result.grade == 'full' else 'partial',
         'grade': result.grade,
         'focal': _with_sigma(result.camera.focal_px, sigma.focal_px, 'px', 0),
-        'tilt': '' if ground is None else _with_sigma(_tilt_deg(result), sigma.tilt_deg, '°', 1),
+        'tilt': '' if tilt_deg is None else _with_sigma(tilt_deg, sigma.tilt_deg, '°', 1),
         'height': _with_sigma(ground.height_m, sigma.height_m, 'm', 2) if ground is not None and metric else '',
         'lengths': lengths,
         'note': result.helpful.text if result.helpful else '',
     }
-
-
-def _tilt_deg(result: Calibration) -> float:
-    if result.ground is None:
-        raise ValueError('the result has no ground plane')
-    return float(tilt_and_roll_deg(result.ground.normal_in_camera)[0])
 
 
 def _with_sigma(value: float, sigma: float | None, unit: str, digits: int) -> str:

@@ -151,7 +151,7 @@ def _paper_rows(result: Calibration) -> list[TableRow]:
 
 def history_rows(history: Sequence[dict[str, Any]]) -> list[TableRow]:
     """Return a table row for each version of the calibration, the newest first."""
-    return [TableRow(f'version of {entry["time"]}', describe_version(entry)) for entry in history[:-MAX_ROWS:-1]]
+    return [TableRow(f'version of {entry["time"]}', describe_version(entry)) for entry in history[-MAX_ROWS:][::-1]]
 
 
 def move_rows(moves: Sequence[CameraMove]) -> list[TableRow]:

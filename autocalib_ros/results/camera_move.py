@@ -8,6 +8,8 @@ from enum import Enum
 
 import numpy as np
 
+from autocalib_ros.geometry.small_matrices import rotation_matrix
+
 
 class MoveKind(str, Enum):
     """What happened to the view of a calibrated camera."""
@@ -47,17 +49,11 @@ class CameraMove:
     """Focal length now over that before."""
     sigma_deg: tuple[float, float, float] | None = None
     """Standard deviations of pan, tilt and roll by the registration; None if nothing was measured."""
-    zoom_sigma: float | None = None
 
     @property
     def rotation(self) -> np.ndarray:
         """Directions in the camera now from those in the camera before, shape (3, 3)."""
         return rotation_from_turn(np.radians([self.pan_deg, self.tilt_deg, self.roll_deg]))
-
-    @property
-    def angle_deg(self) -> float:
-        """Angle of the turn, degrees."""
-        return math.sqrt(self.pan_deg**2 + self.tilt_deg**2 + self.roll_deg**2)
 
     @property
     def is_measured(self) -> bool:
@@ -71,7 +67,7 @@ class CameraMove:
 
     def __str__(self) -> str:
         if self.sigma_deg is None:
-            return f'{self.kind.value}: nothing of the view of before was found'
+            return f'{self.kind.value}: nothing of the earlier view was found'
         turn = ', '.join(
             f'{name} {value:+.2f} ± {sigma:.2f}'
             for name, value, sigma in zip(
@@ -85,13 +81,8 @@ class CameraMove:
 def rotation_from_turn(turn_rad: np.ndarray) -> np.ndarray:
     """Return now_from_before (3, 3) of a camera that turned right, down and clockwise by radians (3,)."""
     # axes of the camera: x right, y down, z forward; a turn of the camera moves what it sees the other way
-    pan, tilt, roll = (-float(part) for part in turn_rad)
-    angle = math.sqrt(pan * pan + tilt * tilt + roll * roll)
-    cross = np.array([[0.0, -roll, pan], [roll, 0.0, tilt], [-pan, -tilt, 0.0]])
-    if angle < TINY_RAD:
-        return np.eye(3) + cross
-    # Rodrigues' formula
-    return np.eye(3) + math.sin(angle) / angle * cross + (1.0 - math.cos(angle)) / angle**2 * (cross @ cross)
+    pan, tilt, roll = turn_rad
+    return rotation_matrix(np.array([tilt, -pan, -roll]))
 
 
 def turn_of_rotation(now_from_before: np.ndarray) -> np.ndarray:
@@ -100,6 +91,11 @@ def turn_of_rotation(now_from_before: np.ndarray) -> np.ndarray:
     across = 0.5 * np.array([r[2, 0] - r[0, 2], r[2, 1] - r[1, 2], r[0, 1] - r[1, 0]])
     sine, cosine = float(np.linalg.norm(across)), 0.5 * (float(np.trace(r)) - 1.0)
     return across if sine < TINY_RAD else across * (math.atan2(sine, cosine) / sine)
+
+
+def rotation_angle_deg(rotation: np.ndarray) -> float:
+    """Return the angle in degrees of a rotation (3, 3) by less than 180 degrees."""
+    return float(np.degrees(np.linalg.norm(turn_of_rotation(rotation))))
 
 
 def kind_of_move(angle_deg: float, zoom: float) -> MoveKind:

@@ -48,15 +48,15 @@ class ControlPoints:
 
         Their errors are as independent as distances between points can be; all pairs would count each point often.
         """
-        joined, pairs = {0}, []
         gaps = np.hypot(*(self.places_m[:, None] - self.places_m).transpose(2, 0, 1))
-        while len(joined) < len(self.pixels):
-            outside = [index for index in range(len(self.pixels)) if index not in joined]
-            inside, other = max(
-                ((one, two) for one in joined for two in outside), key=lambda pair: float(gaps[pair[0], pair[1]])
-            )
-            pairs.append((inside, other, float(gaps[inside, other])))
-            joined.add(other)
+        longest, joined_to = gaps[0].copy(), np.zeros(len(gaps), int)  # from each point to those that are joined
+        longest[0], pairs = -np.inf, []
+        for _ in range(len(gaps) - 1):
+            other = int(longest.argmax())
+            pairs.append((int(joined_to[other]), other, float(longest[other])))
+            longer = (gaps[other] > longest) & np.isfinite(longest)
+            longest[longer], joined_to[longer] = gaps[other, longer], other
+            longest[other] = -np.inf
         return pairs
 
 
@@ -180,7 +180,7 @@ def read_control_points(path: Path) -> ControlPoints:
         raise InputError(f'{path} has {len(points.pixels)} control points, 2 to {MAX_CONTROL_POINTS} are needed')
     if not (np.isfinite(points.pixels).all() and np.isfinite(points.places_m).all()):
         raise InputError(f'{path} holds numbers that are not finite')
-    if not min(metres for _, _, metres in points.distances()) > 0:
+    if not np.ptp(points.places_m, axis=0).any():
         raise InputError(f'{path}: all control points have one place in the map')
     return points
 

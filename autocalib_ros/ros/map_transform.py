@@ -15,11 +15,7 @@ from autocalib_ros.results.calibration import Calibration
 from autocalib_ros.results.control_points import MapPlacement, place_in_map, read_control_points
 from autocalib_ros.ros.messages import header, validated
 from autocalib_ros.ros.qos import LATCHED, latched_publisher
-
-try:
-    from tf2_msgs.msg import TFMessage
-except ImportError:
-    TFMessage = None
+from autocalib_ros.ros.transforms import TFMessage
 
 
 class MapTransformPublisher:
@@ -44,8 +40,8 @@ class MapTransformPublisher:
         self._publisher.publish(message)
         if self._tf_static is not None:
             self._tf_static.publish(validated(TFMessage(transforms=[message])))
-        worst = max(placement.left_out_m, default=0.0)
-        checked = f'; control points that are left out are at most {worst:.2f} m off' if placement.left_out_m else ''
+        apart = placement.left_out_m
+        checked = f'; control points that are left out are at most {max(apart):.2f} m off' if apart else ''
         self._node.get_logger().info(
             f'placed in the map ({placement.crs}) with a scale of {placement.scale:.4f}{checked}'
         )

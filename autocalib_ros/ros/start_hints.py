@@ -23,8 +23,8 @@ HINTS = (
 )
 """Words in errors of rcl, and what is meant."""
 NO_SCALE = (
-    'no camera height is given (camera_height), no distance (scale.distances) and no speed (scale.speed_km_h): the '
-    'lens is calibrated, and no ground plane is published'
+    'no camera height is given (camera_height), no distance (scale.distances), no speed (scale.speed_km_h) and no '
+    'lanes (lanes.country): the lens is calibrated, and no ground plane is published'
 )
 
 
@@ -36,9 +36,7 @@ def with_hint(text: str) -> str:
 
 def missing_scale(options: Options) -> str:
     """Return what is missing for a ground plane in metres; '' if nothing is."""
-    given = options.scale
-    known = options.camera_height or given.known_distances or given.speed_km_h or options.allow_unit_scale
-    return '' if known else NO_SCALE
+    return '' if options.gives_scale or options.allow_unit_scale else NO_SCALE
 
 
 def unused_params_files(arguments: Sequence[str], node_name: str) -> list[str]:

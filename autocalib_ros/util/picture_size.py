@@ -9,6 +9,8 @@ import io
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from autocalib_ros.errors import InputError
 from autocalib_ros.util.input_limits import MAX_IMAGE_PIXELS
 
@@ -37,12 +39,14 @@ def check_picture(data: bytes | memoryview, limit: int = MAX_IMAGE_PIXELS) -> No
         )
 
 
-def check_picture_file(path: Path) -> None:
-    """Raise InputError as `check_picture` does, or if the file cannot be read."""
+def read_picture_bytes(path: Path) -> np.ndarray:
+    """Return the bytes of an encoded picture, uint8; InputError as of `check_picture`, or if it cannot be read."""
     try:
-        check_picture(path.read_bytes())
+        data = np.fromfile(path, np.uint8)
     except OSError as error:
         raise InputError(f'cannot read {path}: {error.strerror or error}') from error
+    check_picture(data.data)
+    return data
 
 
 def picture_size(data: bytes | memoryview) -> tuple[int, int]:

@@ -78,7 +78,7 @@ def watched(options: Options, factor: int = 1) -> Observer:
 
 
 def test_every_stripe_is_found_and_passing_traffic_is_not() -> None:
-    lines = watched(Options()).still_lines()
+    lines = watched(Options()).still_segments()[0]
     assert misses(lines, edges()).max() < WITHIN_PX
     sides = edges()[1::2]  # the long ones
     found = np.array([misses(lines, side[None]).min() for side in sides])
@@ -92,7 +92,7 @@ def test_every_stripe_is_found_and_passing_traffic_is_not() -> None:
 
 
 def test_the_longest_come_first_and_short_ones_not_at_all() -> None:
-    lines = watched(Options()).still_lines()
+    lines = watched(Options()).still_segments()[0]
     length = np.hypot(lines[:, 2] - lines[:, 0], lines[:, 3] - lines[:, 1])
     assert (np.diff(length) <= 1e-9).all()
     assert length.min() >= MIN_LINE_LENGTH * WIDTH
@@ -100,10 +100,10 @@ def test_the_longest_come_first_and_short_ones_not_at_all() -> None:
 
 def test_no_line_touches_an_ignored_region() -> None:
     right = 220
-    lines = watched(Options(ignore_regions=f'{right} 200 639 200 639 359 {right} 359')).still_lines()
+    lines = watched(Options(ignore_regions=f'{right} 200 639 200 639 359 {right} 359')).still_segments()[0]
     assert len(lines) and lines[:, ::2].max() < right
     assert misses(lines, edges()).max() < WITHIN_PX  # none along its border, which is static
-    everywhere = watched(Options()).still_lines()
+    everywhere = watched(Options()).still_segments()[0]
     assert everywhere[:, ::2].max() > right + 50
 
 
@@ -119,7 +119,7 @@ def test_a_mask_leaves_out_lines_that_only_cross_it() -> None:
 
 
 def test_wide_images_are_reduced_and_lines_come_in_pixels_of_the_full_size() -> None:
-    lines = watched(Options(max_image_width=WIDTH), factor=2).still_lines()
+    lines = watched(Options(max_image_width=WIDTH), factor=2).still_segments()[0]
     assert misses((lines + 0.5) / 2 - 0.5, edges()).max() < WITHIN_PX
     assert lines[:, ::2].max() > 1.7 * edges()[..., 0].max()
 
@@ -128,7 +128,7 @@ def test_colour_is_as_good_as_grey() -> None:
     observer = Observer(Options(), (WIDTH, HEIGHT))
     for index in range(MIN_SAMPLES):
         observer.observe(cv2.cvtColor(picture(seed=index), cv2.COLOR_GRAY2BGR), float(index))
-    lines = observer.still_lines()
+    lines = observer.still_segments()[0]
     assert len(lines) >= 12 and misses(lines, edges()).max() < WITHIN_PX
 
 
@@ -137,7 +137,7 @@ def test_there_are_no_lines_of_too_few_images(count: int) -> None:
     observer = Observer(Options(), (WIDTH, HEIGHT))
     for index in range(count):
         observer.observe(picture(seed=index), float(index))
-    assert observer.still_lines().shape == (0, 4)
+    assert observer.still_segments()[0].shape == (0, 4)
 
 
 def test_a_flat_image_has_no_lines() -> None:
@@ -197,7 +197,7 @@ def test_lines_are_there_two_seconds_after_the_first_image() -> None:
     observer = Observer(Options(), (WIDTH, HEIGHT))
     for index in range(22):  # 10 images a second
         observer.observe(picture(car_x=-80.0 + 30 * index, seed=index), 0.1 * index)
-    lines = observer.still_lines()
+    lines = observer.still_segments()[0]
     assert len(lines) >= 12 and misses(lines, edges()).max() < WITHIN_PX
 
 
@@ -208,7 +208,7 @@ def test_lines_along_a_bar_are_dropped_and_those_that_end_at_it_are_kept() -> No
         image = picture(seed=index)
         image[bar:] = 0
         observer.observe(image, float(index))
-    lines = observer.still_lines()
+    lines = observer.still_segments()[0]
     assert observer.picture(observer.view).rectangle == (0.0, 0.0, WIDTH, bar)
     assert (lines[:, 1::2].min(axis=1) < bar - 10).all()  # none along the border
     long = misses(lines, edges()[1::2])

@@ -229,11 +229,11 @@ def test_lines_that_are_searched_later_are_those_of_the_moment_of_the_question()
     for index in range(12):
         observer.observe(noisy(striped, 1.5, index), 0.5 * index)
     search = observer.search_for_segments()
-    expected, expected_stripes = observer.still_lines(), observer.still_stripes()
+    expected, expected_stripes = observer.still_segments()
     for index in range(12, 60):
         observer.observe(noisy(plain, 1.5, index), 0.5 * index)
     assert len(expected) and len(expected_stripes)
     lines, stripes = search()
     np.testing.assert_array_equal(lines, expected)
     np.testing.assert_array_equal(stripes, expected_stripes)
-    assert not np.array_equal(observer.still_lines(), expected)
+    assert not np.array_equal(observer.still_segments()[0], expected)

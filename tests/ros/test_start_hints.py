@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from autocalib_ros.config import Options, ScaleOptions
+from autocalib_ros.config import LaneOptions, Options, ScaleOptions
 from autocalib_ros.ros import ground_points_node, node
 from autocalib_ros.ros.start_hints import missing_scale, unused_params_files, with_hint
 
@@ -34,6 +34,7 @@ def test_a_missing_scale_is_told_and_a_given_one_is_not():
         Options(camera_height=8.0),
         Options(scale=ScaleOptions(distances='1 2 300 4 5')),
         Options(scale=ScaleOptions(speed_km_h=50.0)),
+        Options(lanes=LaneOptions(country='us')),
         Options(allow_unit_scale=True),
     ):
         assert not missing_scale(options)

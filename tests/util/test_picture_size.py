@@ -9,7 +9,7 @@ from hostile_files import jpeg_of, png_of
 
 from autocalib_ros.errors import InputError
 from autocalib_ros.util.input_limits import MAX_IMAGE_PIXELS
-from autocalib_ros.util.picture_size import check_picture, check_picture_file, picture_size
+from autocalib_ros.util.picture_size import check_picture, picture_size, read_picture_bytes
 
 PICTURE = np.random.default_rng(0).integers(0, 255, (37, 53, 3), np.uint8)
 
@@ -38,7 +38,7 @@ def test_pictures_that_fill_the_memory_are_refused(bomb, tmp_path):
         check_picture(bomb)
     (tmp_path / 'bomb').write_bytes(bomb)
     with pytest.raises(InputError, match='not decoded'):
-        check_picture_file(tmp_path / 'bomb')
+        read_picture_bytes(tmp_path / 'bomb')
 
 
 def test_the_limit_itself_is_allowed():

@@ -17,11 +17,13 @@ import numpy as np
 from autocalib_ros.errors import InputError
 from autocalib_ros.lens.camera import Camera, pixel_grid
 from autocalib_ros.offline.ground_truth import read_truth, true_camera
+from autocalib_ros.offline.move_log import GUESSED_FOCAL_WIDTHS
 from autocalib_ros.offline.recordings.open import open_source
+from autocalib_ros.offline.simulate.camera_motion import MOTION_GRID, resampled
 from autocalib_ros.perception.background import median
 from autocalib_ros.perception.view_registration import registered_image
 from autocalib_ros.perception.view_watch import KnownView, ViewCondition, ViewWatch
-from autocalib_ros.results.camera_move import CameraMove, rotation_from_turn
+from autocalib_ros.results.camera_move import CameraMove, rotation_angle_deg, rotation_from_turn
 
 AXES = {'pan': (1.0, 0.0, 0.0), 'tilt': (0.0, 1.0, 0.0), 'roll': (0.0, 0.0, 1.0)}
 TRUE_MOVES = (
@@ -47,8 +49,6 @@ NOISE_LEVELS = 3.0
 """Standard deviation of the noise, grey levels."""
 REPORT_LIMIT_S = 30.0
 """Time within which a move is to be told."""
-GRID = (80, 45)
-"""Columns and rows at which the turned image is computed; between them places are interpolated, to 0.01 px."""
 MOVES_HEADER = (
     f'{"recording":<28}{"move":<11}{"told after":>11}{"true pan, tilt, roll":>24}{"measured":>26}{"zoom":>8}'
     f'{"error":>8}{"60 s on":>9}'
@@ -76,7 +76,7 @@ class MoveRun:
         """Angle between the measured turn and the true one, degrees."""
         if self.measured is None:
             return math.inf
-        return _angle_deg(self.measured.rotation @ rotation_from_turn(np.radians(self.turn_deg)).T)
+        return rotation_angle_deg(self.measured.rotation @ rotation_from_turn(np.radians(self.turn_deg)).T)
 
     @property
     def is_good(self) -> bool:
@@ -105,7 +105,7 @@ def measure_moves(recordings: Sequence[Path], width: int) -> Iterator[MoveRun]:
             raise InputError(f'{source.name} has no images')
         truth = path.parent / 'truth.json'
         lens = true_camera(read_truth(truth)).lens if truth.is_file() else None
-        camera = lens if isinstance(lens, Camera) else Camera.equidistant(*size, 0.6 * size[0])
+        camera = lens if isinstance(lens, Camera) else Camera.equidistant(*size, GUESSED_FOCAL_WIDTHS * size[0])
         camera = camera.scaled_to(images[0].shape[1], images[0].shape[0])
         for name, turn_deg, zoom in TRUE_MOVES:
             yield _run(f'{path.parent.name}/{path.stem}', images, camera, (name, turn_deg, zoom))
@@ -136,7 +136,7 @@ def _run(
                 if report.move.keeps_lens:
                     total = report.move.rotation @ total
                     watch.rebase(report.move)
-    rest_deg = _angle_deg(total @ rotation_from_turn(np.radians(turn_deg)).T)
+    rest_deg = rotation_angle_deg(total @ rotation_from_turn(np.radians(turn_deg)).T)
     return MoveRun(recording, name, turn_deg, zoom, told_after_s, measured, rest_deg, false_flags)
 
 
@@ -172,18 +172,10 @@ class _Disturbances:
 
     def _turned(self, image: np.ndarray, turn_deg: np.ndarray, zoom: float) -> np.ndarray:
         now = replace(self._camera, focal_px=self._camera.focal_px * zoom)
-        bearings, _ = now.unproject(pixel_grid(now, *GRID))
+        columns, rows = MOTION_GRID
+        bearings, _ = now.unproject(pixel_grid(now, columns, rows))
         places, _ = self._camera.project(bearings @ rotation_from_turn(np.radians(turn_deg)))
-        coarse = places.astype(np.float32).reshape(GRID[1], GRID[0], 2)
-        height, width = image.shape
-        across = np.linspace(0, GRID[0] - 1, width, dtype=np.float32)
-        down = np.linspace(0, GRID[1] - 1, height, dtype=np.float32)
-        fine = cv2.remap(coarse, *np.meshgrid(across, down), cv2.INTER_LINEAR)
-        return cv2.remap(image, fine[..., 0], fine[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
-
-
-def _angle_deg(rotation: np.ndarray) -> float:
-    return math.degrees(math.acos(min(1.0, max(-1.0, (float(np.trace(rotation)) - 1.0) / 2.0))))
+        return resampled(image, places.reshape(rows, columns, 2))
 
 
 def format_move(run: MoveRun) -> str:

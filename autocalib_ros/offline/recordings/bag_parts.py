@@ -47,13 +47,14 @@ class BagPart:
 
         Files that rosbags cannot read, or would read without their order, are scanned.
         """
-        self._reader = self._open()
+        reader = self._reader = self._open()
         try:
             yield self
         finally:
-            self._reader.close()
+            reader.close()
 
     def _open(self) -> Any:
+        error = None
         if self._scanned is None:
             try:
                 reader: Any = Reader1(self._readable) if self.is_ros1 else Reader2(self._readable)
@@ -61,10 +62,9 @@ class BagPart:
                 if self._readable.suffix != '.mcap' or reader.storage.chunks or not reader.message_count:
                     return reader
                 reader.close()
-                self._scan()
-            except Exception as error:  # readers of damaged files raise arbitrary exceptions
-                self._scan(error)
-        scanned = self._scan()
+            except Exception as wrong:  # readers of damaged files raise arbitrary exceptions
+                error = wrong
+        scanned = self._scan(error)
         scanned.open()
         return scanned
 

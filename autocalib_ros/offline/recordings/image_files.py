@@ -15,7 +15,7 @@ import numpy as np
 
 from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.offline.recordings.sources import Frame, StoredImage, TimeWindow, no_image_error
-from autocalib_ros.util.picture_size import check_picture_file
+from autocalib_ros.util.picture_size import read_picture_bytes
 
 LOG = logging.getLogger(__name__)
 
@@ -92,8 +92,7 @@ class ImageFilesSource:
 def _read(path: Path) -> np.ndarray:
     """Return an image as grey or BGR uint8; InputError if it cannot be read."""
     try:
-        check_picture_file(path)
-        image = cv2.imread(str(path), cv2.IMREAD_ANYCOLOR)
+        image = cv2.imdecode(read_picture_bytes(path), cv2.IMREAD_ANYCOLOR)
     except cv2.error as error:
         raise InputError('it is damaged') from error
     if image is None or image.ndim not in (2, 3):

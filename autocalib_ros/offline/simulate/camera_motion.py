@@ -20,8 +20,9 @@ _DRIFT_AXIS = np.array([0.9, 0.3, -0.3])
 """Axis of a slow drift: the camera nods as its screw gives way."""
 _SWAY_GUST_PERIOD_S = 23.0
 """Period of the strength of the wind."""
-_GRID = (80, 45)
-"""Columns and rows at which the turned picture is computed; between them places are interpolated."""
+MOTION_GRID = (80, 45)
+"""Columns and rows at which the turned picture is computed; between them places are interpolated, to
+0.01 px."""
 
 
 class CameraMotion:
@@ -50,13 +51,12 @@ class CameraMotion:
         if not self.is_active:
             return image
         height, width = image.shape[:2]
-        grid = np.stack(np.meshgrid(np.linspace(0, width - 1, _GRID[0]), np.linspace(0, height - 1, _GRID[1])), axis=-1)
+        grid = np.stack(
+            np.meshgrid(np.linspace(0, width - 1, MOTION_GRID[0]), np.linspace(0, height - 1, MOTION_GRID[1])), axis=-1
+        )
         now = KannalaBrandtLens(self._lens.focal_px * self.zoom(time_s), self._lens.k, self._lens.centre_px)
         places, _ = self._lens.project(now.bearings(grid) @ self.rotation(time_s).T)
-        across = np.linspace(0, _GRID[0] - 1, width, dtype=np.float32)
-        down = np.linspace(0, _GRID[1] - 1, height, dtype=np.float32)
-        fine = cv2.remap(places.astype(np.float32), *np.meshgrid(across, down), cv2.INTER_LINEAR)
-        return cv2.remap(image, fine[..., 0], fine[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+        return resampled(image, places)
 
     def lit(self, image: np.ndarray, time_s: float) -> np.ndarray:
         """Return a picture in the light of its time: with option dusk night falls from the beginning to the end."""
@@ -64,3 +64,12 @@ class CameraMotion:
             return image
         share = time_s / self._options.duration_s
         return cv2.convertScaleAbs(image, alpha=NIGHT_GAIN**share)
+
+
+def resampled(image: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Return a picture (h, w) or (h, w, 3) taken from places (rows, columns, 2) of it, interpolated between them."""
+    (height, width), (rows, columns) = image.shape[:2], places.shape[:2]
+    across = np.linspace(0, columns - 1, width, dtype=np.float32)
+    down = np.linspace(0, rows - 1, height, dtype=np.float32)
+    fine = cv2.remap(places.astype(np.float32), *np.meshgrid(across, down), cv2.INTER_LINEAR)
+    return cv2.remap(image, fine[..., 0], fine[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
