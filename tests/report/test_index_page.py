@@ -55,3 +55,9 @@ def test_the_page_fits_a_desk_and_a_telephone(site):
             page.open(path, width)
             assert page.value('document.documentElement.scrollWidth <= document.documentElement.clientWidth')
         assert not page.complaints
+
+
+def test_a_file_that_is_a_list_is_a_card_and_no_end(site):
+    (site / 'torn' / 'calibration.json').write_text('[]')
+    path, cameras = write_index(site)
+    assert cameras == 4 and 'it holds no names with values' in path.read_text()

@@ -21,7 +21,7 @@ from autocalib_ros.report.page import ENTRIES, write_report
 from autocalib_ros.report.road_figures import accuracy_note, top_view
 from autocalib_ros.report.scene import MAX_SNAPSHOTS, SolutionSnapshot, append_snapshot
 from autocalib_ros.report.speed_figures import speed_histogram, speeds_above, track_pieces_on_road, vehicle_speeds
-from autocalib_ros.report.text import how_sure, needs, next_step, number_rows, verdict
+from autocalib_ros.report.text import history_rows, how_sure, needs, next_step, number_rows, verdict
 from autocalib_ros.report.traffic_figures import kept_tracks
 from autocalib_ros.results.calibration import Refusal, Residuals
 from synthetic_results import SPEED_M_S, junction_evidence
@@ -258,3 +258,10 @@ def test_exact_tracks_are_straight_in_the_undistorted_picture(full):
 @pytest.mark.parametrize(('length', 'nice'), [(0.7, 0.5), (1.0, 1.0), (3.9, 2.0), (64.0, 50.0), (10.0, 10.0)])
 def test_scales_have_round_lengths(length, nice):
     assert round_length(length) == pytest.approx(nice)
+
+
+def test_the_newest_versions_of_a_calibration_come_first():
+    history = [{'time': f'{number:02d}', 'cause': 'solved'} for number in range(20)]
+    rows = history_rows(history)
+    assert [row.name for row in rows] == [f'version of {number:02d}' for number in range(19, 7, -1)]
+    assert len(history_rows(history[:3])) == 3
