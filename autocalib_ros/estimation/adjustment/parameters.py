@@ -201,7 +201,7 @@ def level_normal(along: np.ndarray) -> np.ndarray:
     The plane contains the camera's x axis and the road. For a road along the x axis it is perpendicular to the image's
     y axis instead.
     """
-    level = np.cross(along, [1.0, 0.0, 0.0])
+    level = np.array([0.0, along[2], -along[1]])  # cross product of the road and the x axis
     image_up = along[1] * along - [0.0, 1.0, 0.0]
     normal = level if np.linalg.norm(level) > MIN_SINE_TO_X_AXIS else image_up
     return normal / max(np.linalg.norm(normal), 1e-9)

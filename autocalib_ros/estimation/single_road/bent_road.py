@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from autocalib_ros.estimation.adjustment.parameters import level_normal
 from autocalib_ros.estimation.markings.road_segments import ProjectedSegments
 from autocalib_ros.geometry.great_circles import quadratic_forms
+from autocalib_ros.geometry.small_matrices import cross
 
 USUAL_BEND = 0.02
 """Scale of the Cauchy distribution of the curvature, times the camera height: half of the roads have a radius of more
@@ -106,6 +107,6 @@ def across_and_up(along: np.ndarray, turns: np.ndarray) -> tuple[np.ndarray, np.
     """Return the directions across a road (3,) and up from it at turns (t,) from a level camera, shape (t, 3) each."""
     up = level_normal(along)
     up = -up if up[1] > 0 else up
-    level = np.cross(up, along)
+    level = cross(up, along)
     cosine, sine = np.cos(turns)[:, None], np.sin(turns)[:, None]
     return cosine * level + sine * up, cosine * up - sine * level

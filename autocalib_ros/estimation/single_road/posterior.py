@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
-from scipy.special import logsumexp, softmax
+from scipy.special import softmax
 
 from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment
 from autocalib_ros.estimation.adjustment.lens_prior import DISTORTION_FREE, LensPrior
@@ -32,6 +32,7 @@ from autocalib_ros.estimation.single_road.direction_mixture import (
 from autocalib_ros.estimation.single_road.road_through_lens import RoadThrough
 from autocalib_ros.estimation.vehicle_edges.edge_mixture import SYSTEMATIC_SIGMA_RAD
 from autocalib_ros.geometry.great_circles import unproject_rays
+from autocalib_ros.geometry.small_matrices import cross
 from autocalib_ros.lens.camera import Camera
 
 TEMPER = 0.5
@@ -85,7 +86,7 @@ class _Node:
     @property
     def log_evidence(self) -> float:
         """Log of the weight of the node, its turn integrated out."""
-        return self.log_weight + float(logsumexp(self.log_density))
+        return self.log_weight + float(np.logaddexp.reduce(self.log_density))
 
     @property
     def turn_moments(self) -> tuple[float, float]:
@@ -282,7 +283,7 @@ def _mean_node(nodes: list[_Node], scene: _RoadScene, solve: RoadThrough, choice
 def _state_at(node: _Node, turn: float) -> AdjustmentState:
     """Return the state with the road and the direction across it as its two axes."""
     up = across_and_up(node.along, np.array([turn]))[1][0]
-    rotation = np.column_stack([node.along, np.cross(up, node.along), up])
+    rotation = np.column_stack([node.along, cross(up, node.along), up])
     return AdjustmentState(node.camera, rotation, np.array([0.0, np.pi / 2]))
 
 

@@ -7,7 +7,6 @@ from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.special import logsumexp
 
 from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment, adjust
 from autocalib_ros.estimation.adjustment.lens_prior import known_lens
@@ -96,7 +95,7 @@ class RoadThrough:
         along, _ = self._search(roads[plane].forms(BENDS[COARSE_BENDS][[bend]]), along, SEARCH_REACH_RAD[BEND_SEARCH:])
         road = bent(self.turns_rad[plane])
         costs = self._bend_costs(road, along, slice(None))
-        return along, -float(logsumexp(-costs)), Bend(road.plane, float(BENDS[np.argmin(costs)]))
+        return along, -float(np.logaddexp.reduce(-costs)), Bend(road.plane, float(BENDS[np.argmin(costs)]))
 
     def _search(self, forms: np.ndarray, along: np.ndarray, reaches: np.ndarray) -> tuple[np.ndarray, float]:
         """Return the most probable direction (3,) near `along`, and its negative log likelihood."""
