@@ -38,7 +38,7 @@ def commands() -> list[str]:
 def test_readme_holds_two_commands(commands):
     assert len(commands) == 2
     assert commands[0].endswith('.venv/bin/autocalib demo')
-    assert commands[1].endswith('-m pytest -n 4')
+    assert commands[1].endswith('-m pytest -n 3 --dist worksteal')
 
 
 def test_ci_runs_the_second_command(commands):
