@@ -13,7 +13,7 @@ from autocalib_ros.errors import InputError
 from autocalib_ros.estimation.observations.selection import drop_pedestrians
 from autocalib_ros.estimation.verification.readiness import check_steady, outlook, requirements
 from autocalib_ros.evidence.snapshot import Evidence
-from autocalib_ros.evidence.still_parts import StillPart
+from autocalib_ros.evidence.solution_schedule import SolutionSchedule
 from autocalib_ros.perception.detector.detector import VehicleDetector, open_detector
 from autocalib_ros.perception.frame_clock import ClockSummary
 from autocalib_ros.perception.image_stream import ImageStream
@@ -22,15 +22,9 @@ from autocalib_ros.perception.view_watch import KnownView
 
 TRAIL_FRAMES = 16
 """Images over which the trail of a tracked point is drawn: a second at 15 Hz."""
-
-
 MIN_RESIZED_S, MIN_RESIZED_IMAGES = 3.0, 5
 """Time by the stamps and number of images in a row for which a new size lasts before it is believed: drivers that
 reconnect send a few odd images, a camera that changes its mode keeps it."""
-
-
-WORTHWHILE_GROWTH = 1.0 / 0.85**2
-"""Growth of the evidence that cuts a standard deviation by 15 %, since it falls with the root of the tracks."""
 
 
 class ImageIntake(Enum):
@@ -71,7 +65,7 @@ class AutoCalibrator:
         self._stream: ImageStream | None = None
         self._timing = ImageTiming()
         self._odd_size: tuple[tuple[int, int], int, int] | None = None
-        self._reset_schedule()
+        self._schedule = SolutionSchedule(options)
 
     def add_image(self, stamp_ns: int, image: np.ndarray) -> ImageIntake:
         """Take one image: grey (H, W) or BGR (H, W, 3), uint8; it is neither kept nor changed.
@@ -96,7 +90,7 @@ class AutoCalibrator:
         for ready in taken.ready:
             if self._stream is None:
                 self._stream = ImageStream(self._options, ready.time_ns, size, self._detector)
-                self._reset_schedule()
+                self._schedule = SolutionSchedule(self._options)
             self._stream.add(ready, self._timing.offset_ns, self._options)
         if resized:
             return ImageIntake.RESIZED
@@ -119,13 +113,7 @@ class AutoCalibrator:
     def change(self, options: Options) -> None:
         """Take other options, which may differ in what `config.is_reconfigurable` allows; a solution is due at once."""
         self._options = options
-        self._reset_schedule()
-
-    def _reset_schedule(self, part: StillPart | None = None) -> None:
-        self._scheduled = part
-        self._accepted: tuple[StillPart, int, int] | None = None
-        self._due_s = self._options.first_solve_s + (0.0 if part is None else part.start_s)
-        self._due_tracks = float(self._options.gate.min_tracks)
+        self._schedule = SolutionSchedule(options)
 
     def snapshot_if_due(self, *, with_segments: bool = True) -> Evidence | None:
         """Return a snapshot if a new solution is worth trying now, else None.
@@ -133,33 +121,14 @@ class AutoCalibrator:
         Depends on the images and their stamps alone, so that a live run and a replay solve the same evidence.
         """
         stream = self._stream
-        if stream is None:
+        if stream is None or not self._schedule.is_due(stream.part, stream.time_s):
             return None
-        part = stream.part
-        if part is not self._scheduled:
-            self._reset_schedule(part)
-        if stream.time_s < self._due_s or part.tracks_seen < self._due_tracks or not self._is_worth_it(part):
-            return None
-        tracks = max(part.buffer.track_count, self._options.gate.min_tracks)
-        self._due_tracks = part.tracks_seen + (self._options.solve_growth - 1.0) * tracks
-        self._due_s = stream.time_s + self._options.solve_interval_s
         return self.snapshot(with_segments=with_segments)
 
     def accepted(self, tracks: int) -> None:
-        """Record that evidence of this many tracks gave a calibration: the next solution is due when it can be better.
-
-        That is when the evidence could cut a standard deviation by 15 %, or when all of it is newer, which verifies the
-        calibration by other traffic.
-        """
+        """Record that evidence of this many tracks gave a calibration, which `SolutionSchedule.accepted` explains."""
         if self._stream is not None:
-            self._accepted = (self._stream.part, tracks, self._stream.part.tracks_seen)
-
-    def _is_worth_it(self, part: StillPart) -> bool:
-        """Whether a new solution can be better than an accepted one, or verify it by other traffic."""
-        accepted_part, tracks, seen = self._accepted or (None, 0, 0)
-        if accepted_part is not part:
-            return True
-        return part.buffer.track_count >= WORTHWHILE_GROWTH * tracks or part.tracks_seen - seen >= tracks
+            self._schedule.accepted(self._stream.part, tracks)
 
     def snapshot(
         self, *, longest_part: bool = False, landmarks: bool = False, with_segments: bool = True

@@ -202,17 +202,15 @@ def test_other_options_make_a_solution_due() -> None:
     assert calibrator.snapshot_if_due() is not None
 
 
-def test_an_accepted_calibration_is_solved_again_when_that_can_be_better() -> None:
-    def due_after_acceptance(tracks: int) -> bool:
-        calibrator = fed(150)
-        evidence = calibrator.snapshot_if_due()
-        assert evidence is not None and evidence.track_count > 0
-        calibrator.accepted(tracks or evidence.track_count)
-        calibrator._due_s = calibrator._due_tracks = 0.0  # by the other rules it is due
-        return calibrator.snapshot_if_due() is not None
-
-    assert not due_after_acceptance(0)  # the same evidence
-    assert due_after_acceptance(1)  # so many times the evidence of then
+@pytest.mark.parametrize('is_accepted', [True, False])
+def test_an_accepted_calibration_is_solved_again_when_that_can_be_better(is_accepted: bool) -> None:
+    calibrator = fed(150)
+    assert calibrator.snapshot_if_due() is not None
+    if is_accepted:
+        calibrator.accepted(1_000_000)  # more tracks than will come
+    for index in range(150, 300):
+        calibrator.add_image(index * 100_000_000, image(index))
+    assert (calibrator.snapshot_if_due() is None) == is_accepted
 
 
 @pytest.mark.parametrize(
