@@ -32,6 +32,7 @@ from autocalib_ros.lens.camera_info import CameraInfo
 from autocalib_ros.lens.camera_info_yaml import camera_info_yaml, read_camera_info_fields
 from autocalib_ros.results.calibration import Calibration
 from autocalib_ros.results.calibration_json import calibration_from_json, read_json_object, to_json
+from autocalib_ros.results.given_pixels import GivenPixels
 from autocalib_ros.results.grades import rank_of
 from autocalib_ros.util.files import keep_copy, remove_temporaries, write_atomically
 
@@ -51,6 +52,8 @@ class StoredCalibration:
     camera_name: str
     image_frame: str
     """frame_id of the images."""
+    given_pixels: GivenPixels | None = None
+    """Pixels that the user gave, where they are in the view of the calibration; None if the file is of before that."""
 
 
 class StoreState(Enum):
@@ -201,7 +204,13 @@ class Store:
 
 def stored_json(stored: StoredCalibration) -> str:
     """Return the text of the JSON file: calibration.json, and the content of the YAML."""
-    kept = {'camera_name': stored.camera_name, 'image_frame': stored.image_frame, 'camera_info': asdict(stored.info)}
+    kept: dict[str, Any] = {
+        'camera_name': stored.camera_name,
+        'image_frame': stored.image_frame,
+        'camera_info': asdict(stored.info),
+    }
+    if stored.given_pixels is not None:
+        kept['given_pixels'] = stored.given_pixels.document()
     document = {**to_json(stored.calibration), 'stored': kept}
     return json.dumps({**document, 'checksum': document_checksum(document)}, indent=1, allow_nan=False) + '\n'
 
@@ -247,6 +256,7 @@ def _read_stored_json(path: Path) -> StoredCalibration:
             CameraInfo(**kept['camera_info']),
             str(kept['camera_name']),
             str(kept['image_frame']),
+            GivenPixels.from_document(kept['given_pixels']) if 'given_pixels' in kept else None,
         )
         _require_plausible(stored)
         return stored

@@ -8,6 +8,7 @@ import time
 import traceback
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
@@ -28,6 +29,8 @@ from autocalib_ros.perception.images import ImageDecoder
 from autocalib_ros.perception.view_file import read_views, write_views
 from autocalib_ros.perception.view_watch import KnownView, ViewCondition, ViewReport
 from autocalib_ros.results.calibration import Calibration, Refusal
+from autocalib_ros.results.control_points import read_control_points
+from autocalib_ros.results.given_pixels import FollowedPixels, GivenPixels
 from autocalib_ros.results.history import append_version, read_history, version_entry
 from autocalib_ros.results.store import Store, StoredCalibration, calibration_checksum, resolve_url
 from autocalib_ros.revalidation import CalibrationState, with_current_options
@@ -66,6 +69,9 @@ class AutocalibNode(Node):
         super().__init__('autocalib', automatically_declare_parameters_from_overrides=True, **node_arguments)
         self.options, self.node_options = declare_parameters(self)
         self._lens = self._read_lens()
+        points_file = self.node_options.control_points
+        self._control_points = read_control_points(Path(points_file)) if points_file else None
+        self._pixels = FollowedPixels(GivenPixels.of(self.options, self._control_points))
         detector = open_detector(self.options.detector)
         self._headers = Headers(
             self.node_options,
@@ -97,6 +103,8 @@ class AutocalibNode(Node):
             self.node_options,
             self._headers,
             driver=self._driver,
+            control_points=self._control_points,
+            pixels=self._pixels,
             on_accepted=self._on_accepted,
             on_withdrawn=self._on_withdrawn,
         )
@@ -178,10 +186,30 @@ class AutocalibNode(Node):
 
     def _change(self, options: Options, node_options: NodeOptions) -> None:
         """Use other options: the evidence is solved again with them."""
+        if options.scale != self.options.scale:
+            self._pixels.given_anew(GivenPixels.of(options, self._control_points))
         self.options, self.node_options = options, node_options
         self.publication.change(options, node_options)
         self._pictures.rate_hz = node_options.debug_rate_hz
-        self._worker.change(options, node_options.idle_solve_s)
+        self._worker.change(self._options_in_view(), node_options.idle_solve_s)
+
+    def _options_in_view(self) -> Options:
+        """Return the options with known lengths in pixels of the present view."""
+        size = self.publication.image_size
+        return self.options if size is None else self._pixels.present.options_in_view(self.options, size)
+
+    def _follow_pixels(self) -> None:
+        """Solve with the pixels of the present view, and say what became of the known lengths."""
+        options = self._options_in_view()
+        if options == self._worker.options:
+            return
+        given, left = (len(each.scale.known_distances) for each in (self.options, options))
+        self._worker.change(options, self.node_options.idle_solve_s)
+        if left < given:
+            self.get_logger().warning(
+                f'{given - left} of {given} known distances are not used any more: they are pixels of the view before '
+                'the camera moved; set scale.distances to pixels of the present view'
+            )
 
     def _on_image(self, message: Any) -> None:
         """Queue the image for the perception thread and publish its CameraInfo; returns within microseconds."""
@@ -247,7 +275,7 @@ class AutocalibNode(Node):
         source = f'{self._headers.camera_name(published.image_frame) or "camera"}, live on {self._input.topic}'
 
         def write(snapshot: concurrent.futures.Future) -> None:
-            scene = self._reports.scene(published.result, snapshot.result(), self.options, source)
+            scene = self._reports.scene(published.result, snapshot.result(), self._options_in_view(), source)
             with contextlib.suppress(InputError):  # a report without a history is one
                 scene = replace(scene, history=tuple(read_history(store.history)))
             self._reports.write(ReportPaths(store.report, store.figures), scene)
@@ -364,12 +392,17 @@ class AutocalibNode(Node):
             self.get_logger().info(f'no stored calibration at {store.path}')
             return
         try:
-            restored = with_current_options(found.stored.calibration, self.options, self._lens)
+            self._pixels.resume(found.stored.given_pixels)
+            size = found.stored.calibration.evidence.image_size
+            options = self._pixels.present.options_in_view(self.options, size)
+            restored = with_current_options(found.stored.calibration, options, self._lens)
             self.publication.restore(restored, found.stored.image_frame)
         except AutocalibError as error:
             self.get_logger().warning(f'the calibration in {store.path} is not restored: {error}')
             return
         self.store_writer.saved = found.stored
+        if options != self.options:
+            self._worker.change(options, self.node_options.idle_solve_s)
         self._worker.watch_stored(restored, self._stored_views(store, found.stored.calibration))
         self.get_logger().info(f'restored from {store.path}, not yet verified: {describe(restored)}')
 
@@ -395,7 +428,11 @@ class AutocalibNode(Node):
 
     def _to_stored(self, published: Published) -> StoredCalibration:
         return StoredCalibration(
-            published.result, published.fields, self._headers.camera_name(published.image_frame), published.image_frame
+            published.result,
+            published.fields,
+            self._headers.camera_name(published.image_frame),
+            published.image_frame,
+            self._pixels.present,
         )
 
     def _on_accepted(self, published: Published, save: bool) -> None:
@@ -477,6 +514,7 @@ class AutocalibNode(Node):
         if self.publication.doubt:
             self._worker.doubt()
         if decision.calibration is result:
+            self._pixels.adopt()
             self._worker.watch_solved(result)
             self._remember(result, decision.text or 'solved')
         self._withdrawn = ''
@@ -497,11 +535,16 @@ class AutocalibNode(Node):
         self._log(text, good=good)
         unwatched = report.condition is ViewCondition.UNKNOWN and not report.is_watched
         if unwatched or report.condition in (ViewCondition.STILL, ViewCondition.SWAYING):
+            self._pixels.is_back()
             self.publication.release()
         move = report.move
+        if move is not None:
+            self._pixels.moved(None if published is None else published.result, move)
+        self._follow_pixels()
         if move is not None and mode == 'mend' and move.keeps_lens:
             turned = self.publication.mend(move, stamp_ns)
             if turned is not None:
+                self._pixels.adopt()
                 self._events.mended()
                 self._remember(turned.result, f'pose mended, {move}')
                 self._log(f'pose mended by what the picture shows: {describe(turned.result)}', good=False)

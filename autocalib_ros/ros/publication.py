@@ -18,6 +18,8 @@ from autocalib_ros.errors import InputError
 from autocalib_ros.lens.camera_info import CameraInfo as CameraInfoFields
 from autocalib_ros.results.calibration import Calibration
 from autocalib_ros.results.camera_move import CameraMove
+from autocalib_ros.results.control_points import ControlPoints
+from autocalib_ros.results.given_pixels import FollowedPixels
 from autocalib_ros.results.mending import mended
 from autocalib_ros.revalidation import CalibrationState, Decision, reconcile
 from autocalib_ros.ros import messages
@@ -50,7 +52,7 @@ class CalibrationPublisher:
 
     `on_accepted(published, new)` is called with each calibration that the traffic of this run has confirmed, and
     whether it is new; `on_withdrawn()` when none is published any more. Both are called with the lock held, in the
-    order of events.
+    order of events. `pixels` says where the control points are in the present view.
     """
 
     def __init__(
@@ -61,6 +63,8 @@ class CalibrationPublisher:
         headers: Headers,
         *,
         driver: DriverInfo,
+        control_points: ControlPoints | None,
+        pixels: FollowedPixels,
         on_accepted: Callable[[Published, bool], None],
         on_withdrawn: Callable[[], None],
     ) -> None:
@@ -93,15 +97,15 @@ class CalibrationPublisher:
         self._transforms = GroundTransformPublisher(
             node, tf_parent=options.tf_parent, publish_tf=node_options.publish_tf
         )
+        self._control_points, self._pixels = control_points, pixels
         self._map = (
             MapTransformPublisher(
                 node,
-                node_options.control_points,
                 map_frame=node_options.map_frame,
                 tf_parent=options.tf_parent,
                 publish_tf=node_options.publish_tf,
             )
-            if node_options.control_points
+            if control_points is not None
             else None
         )
 
@@ -328,9 +332,10 @@ class CalibrationPublisher:
         self._camera_info.publish(self.camera_info(published, self._later_stamp(published)))
         if published.transform is not None:
             self._transforms.publish(published.transform)
-            if self._map is not None:
+            if self._map is not None and self._control_points is not None:
                 ground_frame = self._headers.ground_frame(published.image_frame)
-                self._map.publish(published.result, published.transform.header.stamp, ground_frame)
+                points = self._pixels.present.points_in_view(self._control_points)
+                self._map.publish(published.result, points, published.transform.header.stamp, ground_frame)
         self._markers.publish(published.markers)
         self.published, self.state = published, state
         self.valid_since_ns = published.result.newest_stamp_ns
@@ -356,3 +361,5 @@ class CalibrationPublisher:
                 self._camera_info = latched_publisher(self._node, CameraInfo, '~/camera_info')
             if self.published is None or self.published.transform is None or self.withheld:
                 self._transforms.forget()
+                if self._map is not None:
+                    self._map.forget()

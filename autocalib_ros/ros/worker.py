@@ -233,6 +233,11 @@ class CalibrationWorker:
             self._options, self._idle_solve_s, self._changing = options, idle_solve_s, True
             self._changed.notify_all()
 
+    @property
+    def options(self) -> Options:
+        """Options of the next solution."""
+        return self._options
+
     def watch_stored(self, calibration: Calibration, views: Sequence[KnownView]) -> None:
         """Watch the view of a calibration of an earlier run."""
         self._at_next_image(lambda: self._watch.begin(views, calibration.camera), calibration)

@@ -10,11 +10,13 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
 from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.lens.camera_info_yaml import camera_info_yaml, read_camera_info
+from autocalib_ros.results.given_pixels import GivenPixels
 from autocalib_ros.results.store import Store, StoreState, resolve_url, stored_json
 from stored_results import calibration, lens_only, stored
 
@@ -83,6 +85,15 @@ def test_what_was_saved_comes_back_to_the_last_bit(store, kept):
     assert (found.state, found.note) == (StoreState.INTACT, '')
     assert stored_json(found.stored) == stored_json(kept)
     assert (found.stored.camera_name, found.stored.image_frame) == ('north', 'cam_optical')
+
+
+def test_pixels_that_were_given_come_back_and_damaged_ones_are_refused(store):
+    pixels = GivenPixels(np.array([[100.0, 200.0], [300.0, 210.0]]), np.array([[104.5, 198.0], [np.nan, np.nan]]), 0.3)
+    store.save(replace(FIRST, given_pixels=pixels))
+    found = store.load().stored.given_pixels
+    assert found.document() == pixels.document()
+    store.json_path.write_text(stored_json(replace(FIRST, given_pixels=replace(pixels, sigma_px=-1.0))))
+    assert 'given_pixels are damaged' in store.load().note
 
 
 def test_yaml_is_the_lens_for_camera_info_manager(store):

@@ -10,7 +10,7 @@ from builtin_interfaces.msg import Time
 from scipy.spatial.transform import Rotation
 
 from autocalib_ros.ground import Ground
-from autocalib_ros.results.control_points import MapPlacement
+from autocalib_ros.results.control_points import ControlPoints, MapPlacement
 from autocalib_ros.ros import map_transform
 from autocalib_ros.ros.map_transform import MapTransformPublisher, map_transform_message
 from stored_results import calibration
@@ -39,14 +39,12 @@ def node(monkeypatch):
     return recorder
 
 
-def points_file(tmp_path, pixels, places):
-    lines = [
-        ','.join(map(repr, [*map(float, pixel), *map(float, place)]))
-        for pixel, place in zip(pixels, places, strict=True)
-    ]
-    path = tmp_path / 'points.csv'
-    path.write_text('\n'.join(['u_px,v_px,x_m,y_m', *lines]))
-    return str(path)
+def control_points(pixels, places):
+    return ControlPoints(tuple(map(str, range(1, 1 + len(pixels)))), np.array(pixels, float), np.array(places, float))
+
+
+def map_publisher(node, tf_parent='ground', map_frame='map'):
+    return MapTransformPublisher(node, map_frame=map_frame, tf_parent=tf_parent, publish_tf=True)
 
 
 def test_the_message_takes_ground_points_to_the_map():
@@ -59,31 +57,33 @@ def test_the_message_takes_ground_points_to_the_map():
     assert in_map[:, :2] == pytest.approx(placement.to_map(ground))
 
 
-def test_a_calibration_is_placed_by_its_control_points(node, tmp_path):
+def test_a_calibration_is_placed_by_its_control_points(node):
     result = calibration()
     places = np.array([[10.0, -3.0], [18.0, 4.0], [14.0, 1.0]])
     pixels, seen = Ground.of(result).pixels(places)
     assert seen.all()
-    file = points_file(tmp_path, pixels, places + [100.0, 200.0])
-    publisher = MapTransformPublisher(node, file, map_frame='city', tf_parent='ground', publish_tf=True)
-    publisher.publish(result, STAMP, 'cam1_ground')
+    points = control_points(pixels, places + [100.0, 200.0])
+    map_publisher(node, map_frame='city').publish(result, points, STAMP, 'cam1_ground')
     (message,) = node.messages
     assert (message.transform.translation.x, message.transform.translation.y) == pytest.approx((100.0, 200.0))
     assert message.header.frame_id == 'city' and 'at most 0.00 m off' in node.lines[0]
 
 
-def test_points_above_the_horizon_are_logged_and_nothing_is_published(node, tmp_path):
-    file = points_file(tmp_path, [[300, 5], [320, 300]], [[0, 0], [1, 1]])
-    publisher = MapTransformPublisher(node, file, map_frame='map', tf_parent='ground', publish_tf=True)
-    publisher.publish(calibration(), STAMP, 'cam1_ground')
+def test_points_above_the_horizon_are_logged_and_nothing_is_published(node):
+    points = control_points([[300, 5], [320, 300]], [[0, 0], [1, 1]])
+    map_publisher(node).publish(calibration(), points, STAMP, 'cam1_ground')
     assert not node.messages and 'control points 1 lie above the horizon' in node.lines[0]
 
 
+def test_points_of_an_earlier_view_place_nothing(node):
+    map_publisher(node).publish(calibration(), None, STAMP, 'cam1_ground')
+    assert not node.messages and 'pixels of the view before the camera moved' in node.lines[0]
+
+
 @pytest.mark.parametrize(('tf_parent', 'broadcasts'), [('ground', True), ('camera', False)])
-def test_a_ground_below_the_camera_gets_no_second_parent(node, tmp_path, monkeypatch, tf_parent, broadcasts):
+def test_a_ground_below_the_camera_gets_no_second_parent(node, monkeypatch, tf_parent, broadcasts):
     monkeypatch.setattr(map_transform, 'TFMessage', types.SimpleNamespace)
     made = []
     node.create_publisher = lambda *arguments: made.append(arguments) or node
-    file = points_file(tmp_path, [[300, 205], [320, 300]], [[0, 0], [1, 1]])
-    MapTransformPublisher(node, file, map_frame='map', tf_parent=tf_parent, publish_tf=True)
+    map_publisher(node, tf_parent)
     assert bool(made) == broadcasts

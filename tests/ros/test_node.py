@@ -418,6 +418,33 @@ def test_option_says_what_is_published_after_a_bump(bench, mode, withheld):
     assert not node.publication.withheld and node.publication.published is not before
 
 
+def test_what_was_given_in_pixels_follows_the_camera(bench, tmp_path):
+    """After a bump the map stays and lengths are measured where they are now; after a zoom neither is used."""
+    points = tmp_path / 'points.csv'
+    points.write_text('u_px,v_px,x_m,y_m\n100,180,0,0\n220,200,3,1\n')
+    node, _ = calibrated(bench, control_points=str(points), scale__distances='100 180 220 180 8')
+    places = bench.collect(TransformStamped, '/autocalib/map_transform', latched=True)
+    wait_for(lambda: places, 'the place in the map')
+    node.view_changed(ViewReport(ViewCondition.MOVED, move=BUMP), START_NS)
+    wait_for(lambda: len(places) > 1, 'the place in the map after the bump')
+    before, after = (message.transform.translation for message in places)
+    assert (after.x, after.y) == pytest.approx((before.x, before.y), abs=1e-6)
+    (length,) = node._worker.options.scale.known_distances
+    assert length.metres == 8 and length.pixels[0] != (100, 180) and length.pixels[0] == pytest.approx((95, 169), abs=2)
+    node.view_changed(ViewReport(ViewCondition.MOVED, move=ZOOM), START_NS)
+    assert not node._worker.options.scale.known_distances
+
+    def is_cleared():
+        late = bench.collect(TransformStamped, '/autocalib/map_transform', latched=True)
+        bench.listening('/autocalib/map_transform')
+        time.sleep(0.2)
+        return not late
+
+    wait_for(is_cleared, 'the place in the map to be taken back')
+    node.view_changed(ViewReport(ViewCondition.STILL), START_NS)
+    assert node._worker.options.scale.known_distances == (length,)
+
+
 def test_calibration_without_a_stored_view_is_published_again_after_a_black_picture(bench):
     node, _ = calibrated(bench)
     node.view_changed(ViewReport(ViewCondition.BLIND, 20.0, fault=PictureFault.BLACK), START_NS)

@@ -1,0 +1,130 @@
+"""Known lengths and control points that are followed as the camera turns."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from autocalib_ros.config import Options, ScaleOptions
+from autocalib_ros.errors import InputError
+from autocalib_ros.ground import Ground
+from autocalib_ros.results.calibration import Calibration
+from autocalib_ros.results.camera_move import CameraMove, MoveKind
+from autocalib_ros.results.control_points import ControlPoints
+from autocalib_ros.results.given_pixels import FollowedPixels, GivenPixels
+from autocalib_ros.results.mending import mended
+from stored_results import SIZE, calibration
+
+BUMP = CameraMove(MoveKind.BUMP, 20.0, 2.0, -1.5, 0.7, sigma_deg=(0.01, 0.01, 0.01))
+ZOOM = CameraMove(MoveKind.ZOOM, 20.0, zoom=1.2, sigma_deg=(0.01, 0.01, 0.01))
+PLACES_M = np.array([[14.0, -3.0], [22.0, 2.0], [18.0, -4.0], [18.0, 4.0]])
+
+
+@pytest.fixture
+def result() -> Calibration:
+    return calibration(tilt_deg=15.0)
+
+
+@pytest.fixture
+def options(result: Calibration) -> Options:
+    """Options with two lengths on the road of the calibration, one by each option."""
+    pixels, _ = Ground.of(result).pixels(PLACES_M)
+    first, second = (' '.join(map(repr, pair.ravel().tolist())) for pair in pixels.reshape(2, 2, 2))
+    return Options(scale=ScaleOptions(distance_px=first, distance_m=9.4, distances=f'{second} 8.0'))
+
+
+def known_places(options: Options, result: Calibration) -> np.ndarray:
+    """Return the ends of the known lengths on the road of a calibration, shape (n, 2)."""
+    pixels = np.array([pixel for known in options.scale.known_distances for pixel in known.pixels])
+    return Ground.of(result).points(pixels).points_m[:, :2]
+
+
+def test_lengths_stay_where_they_are_on_the_road(result: Calibration, options: Options) -> None:
+    pixels = GivenPixels.of(options).turned(result, BUMP)
+    moved = pixels.options_in_view(options, SIZE)
+    after = mended(result, BUMP, result.newest_stamp_ns + 1)
+    np.testing.assert_allclose(known_places(moved, after), PLACES_M, atol=0.01)
+    assert [known.metres for known in moved.scale.known_distances] == [9.4, 8.0]
+    # where the old pixels are on the road now
+    assert np.abs(known_places(options, after) - PLACES_M).max() > 1.0
+
+
+def test_the_uncertainty_of_the_turn_widens_that_of_the_pixels(result: Calibration, options: Options) -> None:
+    pixels = GivenPixels.of(options).turned(result, BUMP)
+    registration = 300.0 * np.radians(np.hypot(0.01, np.hypot(0.01, 0.01)))
+    lens = np.radians(np.linalg.norm([2.0, 1.5, 0.7]))  # 1 px of 300, times 300 px
+    assert pixels.sigma_px == pytest.approx(np.hypot(registration, lens))
+    assert pixels.options_in_view(options, SIZE).scale.pixel_sigma_px == pytest.approx(np.hypot(1.0, pixels.sigma_px))
+
+
+def test_a_length_that_left_the_image_is_not_used(result: Calibration, options: Options) -> None:
+    far = replace(BUMP, pan_deg=-50.0)
+    moved = GivenPixels.of(options).turned(result, far).options_in_view(options, SIZE)
+    assert len(moved.scale.known_distances) < 2
+
+
+def test_after_a_move_that_was_not_measured_nothing_is_known(result: Calibration, options: Options) -> None:
+    only = replace(options, scale_from='distance')
+    for move in (ZOOM, CameraMove(MoveKind.OTHER_VIEW, 20.0)):
+        pixels = GivenPixels.of(only).turned(result, move)
+        assert not pixels.options_in_view(only, SIZE).gives_scale and not pixels.is_complete
+
+
+def test_options_without_pixels_are_the_same_after_a_move(result: Calibration) -> None:
+    options = Options(camera_height=8.0)
+    assert GivenPixels.of(options).turned(result, ZOOM).options_in_view(options, SIZE) is options
+
+
+def test_control_points_follow_the_lengths(result: Calibration, options: Options) -> None:
+    seen, _ = Ground.of(result).pixels(PLACES_M)
+    points = ControlPoints(('a', 'b', 'c', 'd'), seen, PLACES_M)
+    pixels = GivenPixels.of(options, points).turned(result, BUMP)
+    moved = pixels.points_in_view(points)
+    assert moved is not None
+    after = Ground.of(mended(result, BUMP, result.newest_stamp_ns + 1))
+    np.testing.assert_allclose(after.points(moved.pixels).points_m[:, :2], PLACES_M, atol=1e-6)
+    assert pixels.turned(result, ZOOM).points_in_view(points) is None
+
+
+def test_pixels_come_back_from_a_file(result: Calibration, options: Options) -> None:
+    for pixels in (GivenPixels.of(options).turned(result, BUMP), GivenPixels.of(options).turned(result, ZOOM)):
+        found = GivenPixels.from_document(json.loads(json.dumps(pixels.document(), allow_nan=False)))
+        np.testing.assert_array_equal(found.in_view, pixels.in_view)
+        np.testing.assert_array_equal(found.as_given, pixels.as_given)
+        assert found.sigma_px == pixels.sigma_px
+
+
+@pytest.mark.parametrize('fault', [{'in_view': []}, {'in_view': [[1.0]]}, {'sigma_px': -1.0}, {'as_given': 'x'}])
+def test_a_damaged_file_is_refused(options: Options, fault: dict) -> None:
+    with pytest.raises(InputError, match='given_pixels are damaged'):
+        GivenPixels.from_document({**GivenPixels.of(options).document(), **fault})
+
+
+def test_a_view_that_comes_back_has_its_pixels(result: Calibration, options: Options) -> None:
+    given = GivenPixels.of(options)
+    followed = FollowedPixels(given)
+    followed.moved(result, ZOOM)
+    assert not followed.present.is_complete
+    followed.is_back()
+    assert followed.present is given
+    # two moves, the first of which was mended
+    followed.moved(result, BUMP)
+    followed.adopt()
+    followed.moved(result, BUMP)
+    np.testing.assert_allclose(
+        followed.present.in_view, given.turned(result, BUMP).turned(result, BUMP).in_view, atol=1e-9
+    )
+
+
+def test_a_restart_goes_on_unless_other_pixels_were_given(result: Calibration, options: Options) -> None:
+    turned = GivenPixels.of(options).turned(result, BUMP)
+    followed = FollowedPixels(GivenPixels.of(options))
+    followed.resume(turned)
+    assert followed.present is turned
+    other = replace(options, scale=replace(options.scale, distances=''))
+    followed = FollowedPixels(GivenPixels.of(other))
+    followed.resume(turned)
+    assert followed.present is not turned
