@@ -150,6 +150,11 @@ def test_generated_pages_are_those_of_the_code():
     assert outdated(DOCS) == [], 'run `autocalib docs`'
 
 
+def test_a_percent_sign_is_a_single_one_in_help():
+    """argparse formats the help of options, and not descriptions: a sign that is doubled there stays doubled."""
+    assert '%%' not in (DOCS / 'reference' / 'cli.md').read_text(encoding='utf-8')
+
+
 @pytest.mark.render
 def test_docs_command_writes_and_checks(tmp_path, capsys):
     assert main(['docs', '--check', str(tmp_path)]) == 3

@@ -56,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='uneven time stamps and repeated images, applied to recordings',
         description='Apply faults of time stamps and repeated images to recordings while they are read, and compare '
         'the results with those of the recordings as they are. Exit status: 0 if each verdict is the same, each focal '
-        'length within its standard deviation and at least 80 %% of the expected tracks are left, 3 otherwise.',
+        'length within its standard deviation and at least 80 % of the expected tracks are left, 3 otherwise.',
     )
     streams.add_argument('recordings', metavar='RECORDING', nargs='+', type=Path, help='recordings to replay')
     streams.add_argument(
@@ -74,7 +74,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='errors against ground truth on scenes that are drawn, rendered and replayed',
         description='Draw scenes (layout, pose, lens, size, light), render and compress their pictures, calibrate from '
         'them, and compare errors with the stated standard deviations. Exit status: 0 unless a result is wrong by more '
-        'than 5 %% or 2 degrees at grade full, 3 otherwise.',
+        'than 5 % or 2 degrees at grade full, 3 otherwise.',
     )
     scenes.add_argument('--count', type=int, default=60, metavar='N', help='number of scenes (default: %(default)s)')
     scenes.add_argument('--first', type=int, default=0, metavar='N', help='number of the first one (default: 0)')
@@ -87,7 +87,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'stability',
         help='results with a tenth of the vehicles left out',
         description='Solve stored evidence again and again with a tenth of its vehicles left out at random. Exit '
-        'status: 0 if at least 95 %% of the draws have the verdict of all vehicles and the numbers spread by at most '
+        'status: 0 if at least 95 % of the draws have the verdict of all vehicles and the numbers spread by at most '
         'half a stated standard deviation, 3 otherwise.',
     )
     stability.add_argument('files', metavar='EVIDENCE', nargs='+', type=Path, help='evidence files (.npz)')
