@@ -11,6 +11,7 @@ import numpy as np
 from autocalib_ros.evidence.stillness import Stillness, ViewChange, ViewChangeKind
 from autocalib_ros.perception.background import median
 from autocalib_ros.perception.background_motion import LAMP_QUANTILE, PictureMotion
+from autocalib_ros.perception.ratio_test import distinctive_matches
 from autocalib_ros.perception.still_view import StillView
 
 WIDTH_PX = 640
@@ -29,8 +30,6 @@ MIN_COMMON_KEYPOINTS = 12
 """Least keypoints that two views of one scene have in common, on one similarity of four parameters."""
 MIN_COMMON_SHARE = 0.25
 """Least share of the keypoint matches on that similarity. Judgement: chance gives two or three."""
-MATCH_RATIO = 0.75
-"""Largest ratio of the distances to the best and second best match (Lowe 2004)."""
 COMMON_PX = 3.0
 """Distance within which matches lie on one similarity, pixels of the reduced image: a zoom lens is no exact one."""
 MIN_ZOOM = 1.02
@@ -361,7 +360,7 @@ class DriftMonitor:
 def _similarity_of_views(before: np.ndarray, after: np.ndarray) -> PictureMotion | None:
     """Return the motion that takes most keypoints of one grey image (H, W) to another of one scene; None if none does.
 
-    SIFT (Lowe 2004), mutual ratio test, RANSAC with OpenCV's fixed seed.
+    SIFT (Lowe 2004), ratio test, RANSAC with OpenCV's fixed seed.
     """
     sift = cv2.SIFT_create(SEARCH_FEATURES)  # type: ignore[attr-defined]  # for OpenCV 4.5
     (points, words), (others, other_words) = (
@@ -369,12 +368,11 @@ def _similarity_of_views(before: np.ndarray, after: np.ndarray) -> PictureMotion
     )
     if words is None or other_words is None or min(len(points), len(others)) < MIN_COMMON_KEYPOINTS:
         return None
-    pairs = cv2.BFMatcher().knnMatch(words, other_words, k=2)
-    good = [pair[0] for pair in pairs if len(pair) == 2 and pair[0].distance < MATCH_RATIO * pair[1].distance]
+    good = distinctive_matches(words, other_words)
     if len(good) < MIN_COMMON_KEYPOINTS:
         return None
-    starts = np.array([points[match.queryIdx].pt for match in good])
-    ends = np.array([others[match.trainIdx].pt for match in good])
+    starts = np.array([points[index].pt for index in good[:, 0]])
+    ends = np.array([others[index].pt for index in good[:, 1]])
     matrix, inliers = cv2.estimateAffinePartial2D(starts, ends, ransacReprojThreshold=COMMON_PX)
     if matrix is None or inliers.sum() < max(MIN_COMMON_KEYPOINTS, MIN_COMMON_SHARE * len(good)):
         return None

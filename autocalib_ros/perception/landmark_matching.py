@@ -9,7 +9,7 @@ import numpy as np
 
 from autocalib_ros.evidence.landmarks import DESCRIPTOR_BYTES, Landmarks
 from autocalib_ros.perception.background_motion import AGREEMENT_PX, MIN_CORNERS, cells_of, rank_in_cell
-from autocalib_ros.perception.segments import LOWE_RATIO
+from autocalib_ros.perception.ratio_test import distinctive_matches
 
 LANDMARK_CELLS = (8, 6)
 """Columns and rows of the grid over which landmarks are spread."""
@@ -77,12 +77,9 @@ def _mutual_matches(landmarks: Landmarks, reference: Landmarks) -> tuple[np.ndar
     one, other = (
         found.descriptors.astype(np.float32).reshape(-1, DESCRIPTOR_BYTES) for found in (landmarks, reference)
     )
-    matcher = cv2.BFMatcher(cv2.NORM_L2)
-    forth = {
-        m.queryIdx: m.trainIdx for m, n in matcher.knnMatch(one, other, k=2) if m.distance < LOWE_RATIO * n.distance
-    }
-    back = {m.queryIdx: m.trainIdx for (m,) in matcher.knnMatch(other, one, k=1)}
-    pairs = np.array([(a, b) for a, b in forth.items() if back[b] == a], int).reshape(-1, 2)
+    pairs = distinctive_matches(one, other)
+    back = np.array([match.trainIdx for (match,) in cv2.BFMatcher(cv2.NORM_L2).knnMatch(other, one, k=1)])
+    pairs = pairs[back[pairs[:, 1]] == pairs[:, 0]]
     return landmarks.points_px[pairs[:, 0]], reference.points_px[pairs[:, 1]]
 
 

@@ -8,9 +8,8 @@ import cv2
 import numpy as np
 
 from autocalib_ros.perception.motion_mask import Region
+from autocalib_ros.perception.ratio_test import distinctive_matches
 
-LOWE_RATIO = 0.75
-"""Largest ratio of the distances of the best and the second-best match (Lowe 2004)."""
 FULL_RESOLUTION_SIDE_PX = 48
 """Longer side up to which regions are searched at full size; larger ones at half size, which skips mostly noise."""
 MAX_KEYPOINTS_PER_REGION = 60
@@ -77,11 +76,7 @@ def match_segments(before: Keypoints, after: Keypoints, image_width: int) -> tup
     """Match two masked frames; return segments x0, y0, x1, y1 (n, 4) and the index in `after` of each (n,)."""
     if len(before.points_px) < 2 or len(after.points_px) < 2:
         return np.zeros((0, 4)), np.zeros(0, int)
-    pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(after.descriptors, before.descriptors, k=2)
-    good = [(m.queryIdx, m.trainIdx) for m, second in pairs if m.distance < LOWE_RATIO * second.distance]
-    if not good:
-        return np.zeros((0, 4)), np.zeros(0, int)
-    query, train = np.array(good).T
+    query, train = distinctive_matches(after.descriptors, before.descriptors).T
     ends = np.hstack([before.points_px[train], after.points_px[query]])
     length = np.hypot(ends[:, 2] - ends[:, 0], ends[:, 3] - ends[:, 1])
     keep = (length >= MIN_SEGMENT_LENGTH_PX) & (length <= MAX_SEGMENT_LENGTH * image_width)

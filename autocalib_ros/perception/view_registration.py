@@ -16,6 +16,7 @@ import numpy as np
 from autocalib_ros.geometry.robust_kernels import MAD_TO_SIGMA
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.perception.background_motion import cells_of, spread_corners
+from autocalib_ros.perception.ratio_test import distinctive_matches
 from autocalib_ros.results.camera_move import rotation_from_turn, turn_of_rotation
 
 REGISTERED_WIDTH_PX = 640
@@ -43,7 +44,7 @@ MIN_MATCH_SHARE = 0.25
 MAX_KEYPOINTS = 500
 """Most keypoints of an image in the search for a view."""
 KEYPOINT_RATIO = 0.8
-"""Largest ratio of the distances to best and second best match (Lowe 2004)."""
+"""Largest ratio of the distances to the best and the second-best match, Lowe's: wrong ones are outvoted later."""
 HYPOTHESES = 160
 """Pairs of rays that are tried: with a third of right ones, one in 10^8 searches finds none."""
 ZOOMS = tuple(1.15**step for step in range(-5, 6))
@@ -160,12 +161,11 @@ class ViewReference:
         (points, words), (others, other_words) = self._keypoints, _described_keypoints(pattern, self.ignored)
         if min(len(points), len(others)) < MIN_RAYS:
             return None
-        pairs = cv2.BFMatcher().knnMatch(words, other_words, k=2)
-        good = [pair[0] for pair in pairs if len(pair) == 2 and pair[0].distance < KEYPOINT_RATIO * pair[1].distance]
+        good = distinctive_matches(words, other_words, KEYPOINT_RATIO)
         if len(good) < MIN_RAYS:
             return None
-        bearings, valid = self.camera.unproject(points[[match.queryIdx for match in good]])
-        ends = others[[match.trainIdx for match in good]][valid]
+        bearings, valid = self.camera.unproject(points[good[:, 0]])
+        ends = others[good[:, 1]][valid]
         bearings = bearings[valid]
         if len(bearings) < MIN_RAYS:
             return None
