@@ -183,6 +183,20 @@ def test_constants_of_one_name_have_one_value() -> None:
     assert not {name: found for name, found in values.items() if len(found) > 1 and name not in PER_COMMAND}
 
 
+def test_kinds_of_recordings_are_imported_when_one_is_opened() -> None:
+    """Whether a source is live, or what its times are, is asked of the source: no other module needs its class."""
+    room = 'autocalib_ros.offline.recordings'
+    kinds = {f'{room}.{kind}' for kind in ('bags', 'image_files', 'live_streams')}
+    early = {
+        f'{module} imports {node.module}'
+        for module, path in MODULES.items()
+        if not module.startswith(room)
+        for node in ast.parse(path.read_text(encoding='utf-8')).body
+        if isinstance(node, ast.ImportFrom) and node.module in kinds
+    }
+    assert not early
+
+
 @pytest.mark.dds
 def test_all_but_the_live_shell_imports_without_ros():
     modules = [name for name in MODULES if room_of(name) not in ('ros', '__main__')]

@@ -115,7 +115,7 @@ def _resumed(arguments: argparse.Namespace, sources: list[Source]) -> tuple[Evid
     from autocalib_ros.offline.outputs import EVIDENCE
     from autocalib_ros.offline.resume import read_evidence_to_resume, sources_to_read
 
-    if arguments.start > 0 or (arguments.duration is not None and any(source.total for source in sources)):
+    if arguments.start > 0 or (arguments.duration is not None and not all(source.is_live for source in sources)):
         raise UsageError('--resume reads recordings to their end: leave out --start and --duration')
     before = read_evidence_to_resume(arguments.out / EVIDENCE)
     if before is None:

@@ -23,7 +23,6 @@ from autocalib_ros.offline.gather_evidence import (
 )
 from autocalib_ros.offline.join_recordings import JoinedEvidence
 from autocalib_ros.offline.recordings.listing import recordings_of
-from autocalib_ros.offline.recordings.live_streams import StreamSource
 from autocalib_ros.offline.recordings.open import open_source, open_sources
 from autocalib_ros.offline.recordings.sources import Source
 from autocalib_ros.perception.detector.detector import VehicleDetector
@@ -142,7 +141,7 @@ def _gather_all(
     """Read the recordings one after the other and join their evidence; return what those that fit gave."""
     gathered: list[GatheredEvidence] = []
     # a live stream goes on while a solution takes its time
-    alone = len(sources) == 1 and not joint and not isinstance(sources[0], StreamSource)
+    alone = len(sources) == 1 and not joint and not sources[0].is_live
     store = control.on_checkpoint
     within = replace(control, on_checkpoint=None if store is None else lambda part: store(joint.with_part(part)))
     frames = 0

@@ -9,7 +9,6 @@ from pathlib import Path
 from autocalib_ros.errors import UsageError
 from autocalib_ros.evidence.read_recording import ReadRecording
 from autocalib_ros.evidence.snapshot import Evidence
-from autocalib_ros.offline.recordings.live_streams import StreamSource
 from autocalib_ros.offline.recordings.sources import Source, TimeWindow
 
 AFTER_READ_S = 1e-6
@@ -36,7 +35,7 @@ def sources_to_read(sources: Sequence[Source], evidence: Evidence) -> list[Sourc
         read_s[recording.name] = max(recording.read_s, read_s.get(recording.name, 0.0))
     left: list[Source] = []
     for source in sources:
-        until_s = 0.0 if isinstance(source, StreamSource) else read_s.get(ReadRecording.of(source.name, 0.0).name, 0.0)
+        until_s = 0.0 if source.is_live else read_s.get(ReadRecording.of(source.name, 0.0).name, 0.0)
         if 0.0 < until_s < inf:
             source.window, source.total = TimeWindow(until_s + AFTER_READ_S), None
         if until_s < inf:

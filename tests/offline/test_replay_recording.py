@@ -26,7 +26,7 @@ pytestmark = pytest.mark.render
 class Drive:
     """A minimal `Source` of generated images."""
 
-    name, topic, image_type, camera_frame, duration_s = 'drive', '', '', '', None
+    name, topic, image_type, camera_frame, duration_s, is_live = 'drive', '', '', '', None, False
     pixel_aspect, window = 0.0, TimeWindow()
 
     def __init__(self, total: int) -> None:
@@ -149,7 +149,7 @@ def test_a_refused_solution_is_what_is_missing_and_then_since_when_it_is_calibra
 class TwoViews:
     """A title card for three seconds, then a road with a box that crosses it, by `Frame`."""
 
-    name, topic, image_type, camera_frame, duration_s = 'two views', '', '', '', None
+    name, topic, image_type, camera_frame, duration_s, is_live = 'two views', '', '', '', None, False
     pixel_aspect, window = 0.0, TimeWindow()
 
     def frames(self):

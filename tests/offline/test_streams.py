@@ -43,7 +43,7 @@ def texture(seed: int, shape: tuple[int, int]) -> np.ndarray:
 class Road:
     """A minimal `Source`: three cars on a still road, one fast and near, one small and slow."""
 
-    name, topic, image_type, camera_frame = 'road', '', '', ''
+    name, topic, image_type, camera_frame, is_live = 'road', '', '', '', False
     pixel_aspect, window = 0.0, TimeWindow()
 
     def __init__(self, total: int) -> None:

@@ -13,6 +13,8 @@ from autocalib_ros.offline.simulate.repeat_faults import CODECS, RepeatFault
 class RepeatingSource:
     """A recording some of whose images are repeated; everything else is that of the recording."""
 
+    is_live = False
+
     def __init__(self, source: Source, fault: RepeatFault, seed: int = 0) -> None:
         self._source, self._fault = source, fault
         self._stamps_ns = np.array([stored.stamp_ns for stored in source.stored()], np.int64)

@@ -39,6 +39,8 @@ class _BagMessage:
 class BagSource:
     """Images on one topic of a rosbag2 folder, a single .mcap or .db3 file, or a ROS 1 .bag."""
 
+    is_live = False
+
     def __init__(self, path: Path, topic: str | None, window: TimeWindow) -> None:
         self.name = str(path)
         self.window = window

@@ -34,6 +34,7 @@ class ImageFilesSource:
 
     topic = image_type = camera_frame = ''
     pixel_aspect = 0.0
+    is_live = False
 
     def __init__(self, paths: Sequence[Path], window: TimeWindow, rate_hz: float | None) -> None:
         if len(paths) < 2:

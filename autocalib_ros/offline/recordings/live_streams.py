@@ -42,6 +42,7 @@ class StreamSource:
     topic = image_type = camera_frame = ''
     pixel_aspect = 0.0
     total: int | None = None
+    is_live = True
 
     def __init__(self, address: str, window: TimeWindow, should_stop: Callable[[], bool] = lambda: False) -> None:
         if window.start_s > 0:

@@ -82,6 +82,8 @@ class Source(Protocol):
     """Approximate duration of the window in seconds; None if unknown."""
     pixel_aspect: float
     """Width of a pixel over its height, as the recording says; 0 if it says nothing."""
+    is_live: bool
+    """Whether images come as they are taken: they wait for nobody, are read once, and have no known end."""
 
     def frames(self) -> Iterator[Frame]:
         """Yield the decoded images of the window in order of time; InputError without an image."""

@@ -32,6 +32,7 @@ class VideoSource:
     """Images of a video file, stamped in nanoseconds since its first frame."""
 
     topic = image_type = camera_frame = ''
+    is_live = False
 
     def __init__(
         self, path: Path | str, window: TimeWindow, rate_hz: float | None = None, name: str | None = None

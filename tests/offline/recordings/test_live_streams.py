@@ -37,6 +37,13 @@ def test_a_stream_is_read_for_its_duration_with_the_times_of_receipt():
     assert len(levels) > 5 and np.allclose(np.diff(levels), 2, atol=2)
 
 
+def test_a_source_says_whether_it_is_live(tmp_path, write_video):
+    with mjpeg_server(shades(4), fps=100.0) as address:
+        assert open_source(address).is_live
+    assert open_source('rtsp://127.0.0.1:9/live').is_live
+    assert not open_source(write_video(tmp_path / 'drive.avi')).is_live
+
+
 def test_a_dropped_connection_is_made_again(monkeypatch, caplog):
     monkeypatch.setattr(live_streams, 'RECONNECT_S', (0.01,))
     monkeypatch.setattr(live_streams, 'GIVE_UP_S', 0.1)
