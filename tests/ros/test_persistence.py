@@ -2,11 +2,8 @@
 
 import os
 import signal
-import subprocess
-import sys
 import threading
 import time
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -19,6 +16,7 @@ from autocalib_ros.results.store import Store, StoredCalibration, StoreState
 from autocalib_ros.revalidation import CalibrationState
 from autocalib_ros.ros.messages import stamp_ns
 from bench import PATIENCE_S, SIZE, Bench, calibration, image, refusal, wait_for
+from processes import running_fake_node
 from test_node import GROUND, INFO, START_NS, calibrated, publish_until, used
 
 NONE, RESTORED, VERIFIED, MENDED, DEGRADED, CALIBRATED = CalibrationState
@@ -272,37 +270,12 @@ def test_solution_that_runs_during_a_reset_is_not_published(bench, store):
     assert node.publication.state is NONE and not store.path.exists()
 
 
-@contextmanager
-def process(log: Path, focal_px: float, seconds: float = 0.0, **parameters):
-    """Run a node of camera /cam1 in a process of its own; killed at the end."""
-    more = [text for name, value in {'camera_height': 8.0, **parameters}.items() for text in ('-p', f'{name}:={value}')]
-    command = [
-        sys.executable,
-        str(Path(__file__).with_name('fake_node.py')),
-        str(focal_px),
-        str(seconds),
-        '--ros-args',
-        '-r',
-        '__ns:=/cam1',
-        '-r',
-        'image:=/image',
-        *more,
-    ]
-    # the package may not be installed
-    environment = {**os.environ, 'PYTHONPATH': str(Path(__file__).parents[2])}
-    with log.open('w') as stream, subprocess.Popen(command, stderr=stream, env=environment) as run:
-        try:
-            yield run
-        finally:
-            run.kill()
-
-
 def test_killed_node_leaves_its_calibration_to_the_next_which_reports_that_it_is_not_verified(
     bench, tmp_path, ros_home
 ):
     store, publisher = Store(ros_home / 'camera_info' / 'cam1.yaml'), bench.publisher()
     info, ground = '/cam1/autocalib/camera_info', '/cam1/autocalib/ground_transform'
-    with process(tmp_path / 'first', 311.0) as first:
+    with running_fake_node(tmp_path / 'first', 311.0) as first:
         bench.connected(publisher)
         publish_until(publisher, lambda: bench.client.count_publishers(info) > 0, 'the node')
         wait_for(lambda: bench.ask('calibrate', '/cam1/autocalib').success, 'a calibration')
@@ -310,7 +283,7 @@ def test_killed_node_leaves_its_calibration_to_the_next_which_reports_that_it_is
         first.send_signal(signal.SIGKILL)
         first.wait(PATIENCE_S)
     assert store.load().state is StoreState.INTACT
-    with process(tmp_path / 'second', 350.0) as second:
+    with running_fake_node(tmp_path / 'second', 350.0) as second:
         infos = bench.collect(CameraInfo, info, latched=True)
         transforms = bench.collect(TransformStamped, ground, latched=True)
         wait_for(lambda: infos and transforms, 'what was restored, before any image')
@@ -336,7 +309,7 @@ def test_killed_node_leaves_its_calibration_to_the_next_which_reports_that_it_is
 
 def test_services_answer_while_a_solution_runs(bench, tmp_path, ros_home, kept):
     Store(ros_home / 'camera_info' / 'cam1.yaml').save(kept)
-    with process(tmp_path / 'log', 311.0, seconds=2.0 * PATIENCE_S, idle_solve_s=0.2):
+    with running_fake_node(tmp_path / 'log', 311.0, seconds=2.0 * PATIENCE_S, idle_solve_s=0.2):
         publisher, infos = bench.publisher(), bench.collect(CameraInfo, '/cam1/autocalib/camera_info')
         bench.connected(publisher)
         publish_until(publisher, lambda: len(infos) > 1, 'camera_info of images')

@@ -1,61 +1,15 @@
 """Image streams as real cameras send them: a node and a camera in processes of their own, seen by /diagnostics."""
 
-import json
-import signal
-import subprocess
-import sys
-from contextlib import contextmanager
-from pathlib import Path
-
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 
 from bench import Bench, wait_for
+from processes import PROCESS_PATIENCE_S as PATIENCE_S
+from processes import DiagnosticsLog, running_camera, running_node
 
 pytestmark = pytest.mark.dds
 
-NODE = [sys.executable, '-m', 'autocalib_ros.ros.node', '--ros-args', '-r', '__ns:=/site', '-r', 'image:=/camera/image']
-CAMERA = [sys.executable, str(Path(__file__).with_name('camera.py'))]
-PATIENCE_S = 90.0
-"""Processes take seconds to start, and much longer on a busy machine."""
 RAW, COMPRESSED, LOSSY = {}, {'compressed': True}, {'reliable': False}
-
-
-class DiagnosticsLog(list):
-    """Messages of /diagnostics, newest last."""
-
-    def newest(self) -> dict[str, str]:
-        return {} if not self else {item.key: item.value for item in self[-1].status[0].values}
-
-    def used(self) -> int:
-        return int(self.newest().get('used', 0))
-
-
-@contextmanager
-def running_node(log: Path, *arguments: str):
-    with log.open('w') as stream, subprocess.Popen([*NODE, *arguments], stderr=stream) as process:
-        try:
-            yield process
-            process.send_signal(signal.SIGINT)
-            assert process.wait(timeout=PATIENCE_S) == 0, log.read_text()
-        finally:
-            process.kill()
-    assert 'Traceback' not in log.read_text()
-
-
-@contextmanager
-def running_camera(topic: str, *phases: dict):
-    """Yield a function that sends the camera into its next phase."""
-    with subprocess.Popen([*CAMERA, topic, json.dumps(phases)], stdin=subprocess.PIPE, text=True) as process:
-
-        def go_on():
-            process.stdin.write('\n')
-            process.stdin.flush()
-
-        try:
-            yield go_on
-        finally:
-            process.kill()
 
 
 @pytest.fixture
