@@ -115,15 +115,15 @@ class AutoCalibrator:
         self._options = options
         self._schedule = SolutionSchedule(options)
 
-    def snapshot_if_due(self, *, with_segments: bool = True) -> Evidence | None:
-        """Return a snapshot if a new solution is worth trying now, else None.
+    def snapshot_if_due(self) -> Evidence | None:
+        """Return a snapshot without segments of the still scene if a new solution is worth trying now, else None.
 
         Depends on the images and their stamps alone, so that a live run and a replay solve the same evidence.
         """
         stream = self._stream
         if stream is None or not self._schedule.is_due(stream.part, stream.time_s):
             return None
-        return self.snapshot(with_segments=with_segments)
+        return self.snapshot(with_segments=False)
 
     def accepted(self, tracks: int) -> None:
         """Record that evidence of this many tracks gave a calibration, which `SolutionSchedule.accepted` explains."""
@@ -137,18 +137,26 @@ class AutoCalibrator:
 
         Evidence is of the present view of the camera, or of the one that was still for the longest time; `landmarks`
         says whether it holds those of the background, by which evidence of other recordings can be joined. Segments of
-        the still scene take longest to find: without them `search_for_segments` says how to.
+        the still scene take longest to find: `with_segments` adds them later, `search_for_segments` in another thread.
         """
         stream = self._stream
         if stream is None:
             return None
         view = stream.longest_view() if longest_part else stream.observer.view
-        observer = stream.observer
         evidence = stream.evidence(view)
         if with_segments:
-            lines, stripes = observer.still_segments(view)
-            evidence = replace(evidence, still_lines_px=lines, stripes_px=stripes)
-        return evidence.with_landmarks(observer.landmarks(view)) if landmarks else evidence
+            evidence = self._with_segments(evidence, stream, view)
+        return evidence.with_landmarks(stream.observer.landmarks(view)) if landmarks else evidence
+
+    def with_segments(self, evidence: Evidence) -> Evidence:
+        """Return a `snapshot` of the present view with the segments of the still scene, if it came without."""
+        stream = self._stream
+        return evidence if stream is None else self._with_segments(evidence, stream, stream.observer.view)
+
+    @staticmethod
+    def _with_segments(evidence: Evidence, stream: ImageStream, view: int) -> Evidence:
+        lines, stripes = stream.observer.still_segments(view)
+        return replace(evidence, still_lines_px=lines, stripes_px=stripes)
 
     def search_for_segments(self) -> Callable[[], tuple[np.ndarray, np.ndarray]] | None:
         """Return a function for another thread: the lines and bars of `snapshot` as of now; None before an image."""

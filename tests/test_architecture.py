@@ -29,7 +29,7 @@ LAYERS = (
     ('estimation.markings', 'estimation.turning', 'estimation.paper'),
     ('estimation.single_road', 'estimation.lanes'),
     ('estimation',),
-    ('report', 'calibrator', 'revalidation'),
+    ('report', 'calibrator', 'revalidation', 'solver_process'),
     ('offline.terminal',),
     ('offline.recordings', 'offline.simulate', 'ros'),
     ('offline', 'offline.synthetic'),

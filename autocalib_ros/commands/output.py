@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -47,13 +48,18 @@ def replay_and_report(
     from autocalib_ros.offline.outputs import EvidenceFile, write_outputs
     from autocalib_ros.offline.replay_recording import replay
     from autocalib_ros.offline.terminal.progress import progress_bar
+    from autocalib_ros.solver_process import BackgroundSolver
 
     if not quiet:
         warn_missing_scale(options, lens)
     file, stop = EvidenceFile(out), stop or StopRequest()
     totals = [source.total for source in sources]
     total = None if None in totals else sum(one for one in totals if one is not None)
-    with stop.listening(), progress_bar(total, 'images', 'replay', quiet=quiet) as progress:
+    with (
+        closing(BackgroundSolver()) as solver,
+        stop.listening(),
+        progress_bar(total, 'images', 'replay', quiet=quiet) as progress,
+    ):
         replayed = replay(
             sources,
             options,
@@ -63,6 +69,7 @@ def replay_and_report(
             should_stop=stop,
             on_checkpoint=file.write,
             before=before,
+            start_solving=solver,
         )
     if replayed.stopped:
         print_stderr(f'Stopped after {replayed.frames} images; the result is of these.')

@@ -12,28 +12,20 @@ import numpy as np
 from autocalib_ros.calibrator import AutoCalibrator
 from autocalib_ros.config import Options
 from autocalib_ros.errors import InputError
-from autocalib_ros.estimation.estimate import solve
 from autocalib_ros.evidence.read_recording import ReadRecording
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.move_log import MoveLog
 from autocalib_ros.offline.recordings.prefetch import prefetched
 from autocalib_ros.offline.recordings.sources import Source
+from autocalib_ros.offline.solution_trials import SolutionTrials, StartSolving, solved_in_between
 from autocalib_ros.perception.detector.detector import VehicleDetector
 from autocalib_ros.perception.frame_clock import ClockSummary
-from autocalib_ros.report.scene import SolutionSnapshot, append_snapshot
-from autocalib_ros.results.calibration import Calibration, Refusal
+from autocalib_ros.report.scene import SolutionSnapshot
+from autocalib_ros.results.calibration import Calibration
 
 LOG = logging.getLogger(__name__)
 
-SOLVE_AGAIN_GROWTH = 2.0
-"""Growth of the recording after which a refused solution is tried again: with twice the evidence a standard deviation
-falls by a third. A solution is as dear as a minute of images."""
-ACCEPTED_GROWTH = 4.0
-"""The same for an accepted one, which is solved again for the convergence plot of the report alone: the standard
-deviation halves."""
-LAST_SHARE = 0.5
-"""Share of a recording of known length behind which no solution is tried: that of the end tells nearly the same."""
 PROGRESS_EVERY_FRAMES = 15
 """Frames between progress updates."""
 CHECKPOINT_EVERY_S = 120.0
@@ -51,6 +43,8 @@ class ReplayControl:
     """Asked after each image; true: what was seen so far is solved."""
     on_checkpoint: Callable[[Evidence], None] | None = None
     """Receives the evidence so far every `CHECKPOINT_EVERY_S` of recording, and before the last solution."""
+    start_solving: StartSolving | None = None
+    """Solves the evidence on the way while images are read; None solves it in between."""
 
     def report(self, frames: int, note: str) -> None:
         """Report progress."""
@@ -78,36 +72,6 @@ class GatheredEvidence:
     """Moves of the camera."""
 
 
-class _Trials:
-    """Solutions while a recording is read, as a live node tries them."""
-
-    def __init__(self, options: Options) -> None:
-        self._options = options
-        self._part_start_s = self._next_solve_s = 0.0
-        self.latest: Calibration | Refusal | None = None
-        self.moments: tuple[SolutionSnapshot, ...] = ()
-        self.accepted_at_s: float | None = None
-
-    def begin_part(self, start_s: float) -> None:
-        """Forget the solutions if the evidence is of another still part of the recording than before."""
-        if start_s != self._part_start_s:
-            self._part_start_s, self._next_solve_s = start_s, 0.0
-            self.latest, self.moments, self.accepted_at_s = None, (), None
-
-    def is_due(self, seconds: float, duration_s: float | None) -> bool:
-        """Whether evidence of this length of a recording of that length, None if unknown, is worth a solution."""
-        return seconds >= self._next_solve_s and (duration_s is None or seconds <= LAST_SHARE * duration_s)
-
-    def solve(self, evidence: Evidence, lens: Camera | None) -> None:
-        """Solve, and decide when to solve again."""
-        tried = solve(evidence, self._options, lens=lens)
-        self.moments = append_snapshot(self.moments, tried)
-        if tried and self.accepted_at_s is None:  # a live node would have accepted it at this time
-            self.accepted_at_s = evidence.seconds
-        self.latest = tried if tried or self.accepted_at_s is None else self.latest
-        self._next_solve_s = evidence.seconds * (SOLVE_AGAIN_GROWTH if self.accepted_at_s is None else ACCEPTED_GROWTH)
-
-
 def gather_evidence(
     source: Source,
     options: Options,
@@ -123,7 +87,8 @@ def gather_evidence(
     If the view changes, the evidence is of the longest part in which it stands still. `frames_before` are added to the
     frames reported. A recording that is joined with others `tries_solutions` at the end only.
     """
-    calibrator, trials, moves = AutoCalibrator(options, detector), _Trials(options), MoveLog()
+    calibrator, moves = AutoCalibrator(options, detector), MoveLog()
+    trials = SolutionTrials(options, control.start_solving or solved_in_between)
     count, note, stopped, checkpoint_s, first_ns, seen_s = 0, '', False, CHECKPOINT_EVERY_S, 0, 0.0
     for count, frame in enumerate(prefetched(source.frames()), start=1):
         scaled_lens = scaled(lens, (frame.image.shape[1], frame.image.shape[0]))
@@ -131,12 +96,13 @@ def gather_evidence(
         moves.add(frame.stamp_ns, frame.image, calibrator)
         first_ns = frame.stamp_ns if count == 1 else first_ns
         seen_s = (frame.stamp_ns - first_ns) * 1e-9
-        due = _as_recorded(calibrator.snapshot_if_due(), source) if tries_solutions else None
+        due = calibrator.snapshot_if_due() if tries_solutions else None
         if due is not None:
             trials.begin_part(due.stillness.start_s)
             if trials.is_due(due.seconds, source.duration_s):
                 control.report(frames_before + count, 'solving')
-                trials.solve(due, scaled_lens)
+                trials.start(_as_recorded(calibrator.with_segments(due), source), scaled_lens)
+        trials.take_finished()
         if control.on_checkpoint is not None and seen_s >= checkpoint_s:
             checkpoint_s = seen_s + CHECKPOINT_EVERY_S
             control.on_checkpoint(_longest_part(calibrator, source, source.window.start_s + seen_s))
@@ -151,6 +117,7 @@ def gather_evidence(
     to_end = not stopped and source.window.duration_s is None
     evidence = _longest_part(calibrator, source, inf if to_end else source.window.start_s + seen_s)
     trials.begin_part(evidence.stillness.start_s)
+    trials.finish()
     clock = calibrator.clock()
     if clock.is_uneven:
         LOG.warning('%s: uneven time stamps, regularised: %s', source.name, clock)
@@ -169,18 +136,18 @@ def gather_evidence(
 
 def _longest_part(calibrator: AutoCalibrator, source: Source, read_s: float) -> Evidence:
     """Return the evidence so far of the longest still part, with its landmarks and what was read."""
-    evidence = _as_recorded(calibrator.snapshot(longest_part=True, landmarks=True), source)
+    evidence = calibrator.snapshot(longest_part=True, landmarks=True)
     if evidence is None:
         raise InputError(f'{source.name} has no images')
-    return replace(evidence, recordings=(ReadRecording.of(source.name, read_s),))
+    return replace(_as_recorded(evidence, source), recordings=(ReadRecording.of(source.name, read_s),))
 
 
-def _as_recorded(evidence: Evidence | None, source: Source) -> Evidence | None:
+def _as_recorded(evidence: Evidence, source: Source) -> Evidence:
     """Return evidence with the pixel aspect that its recording says."""
-    return evidence and replace(evidence, pixel_aspect=source.pixel_aspect)
+    return replace(evidence, pixel_aspect=source.pixel_aspect)
 
 
-def _progress_note(calibrator: AutoCalibrator, trials: _Trials) -> str:
+def _progress_note(calibrator: AutoCalibrator, trials: SolutionTrials) -> str:
     """Return state, progress of the evidence, and the missing evidence or the last refusal."""
     latest = trials.latest
     if isinstance(latest, Calibration):

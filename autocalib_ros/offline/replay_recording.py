@@ -25,6 +25,7 @@ from autocalib_ros.offline.join_recordings import JoinedEvidence
 from autocalib_ros.offline.recordings.listing import recordings_of
 from autocalib_ros.offline.recordings.open import open_source, open_sources
 from autocalib_ros.offline.recordings.sources import Source
+from autocalib_ros.offline.solution_trials import StartSolving
 from autocalib_ros.perception.detector.detector import VehicleDetector
 from autocalib_ros.perception.frame_clock import ClockSummary
 from autocalib_ros.report.scene import SolutionSnapshot, append_snapshot
@@ -75,6 +76,7 @@ def replay(
     should_stop: Callable[[], bool] = lambda: False,
     on_checkpoint: Callable[[Evidence], None] | None = None,
     before: Evidence | None = None,
+    start_solving: StartSolving | None = None,
 ) -> ReplayResult:
     """Collect evidence from a recording, given as a path or an open source, and solve at its end.
 
@@ -86,10 +88,13 @@ def replay(
     calibrated or refused. Once `should_stop` returns true, what was seen so far is solved. `on_checkpoint` receives the
     evidence so far every two minutes of the recording, and all of it before the last solution. With a known `lens` only
     the pose is estimated; UsageError if its aspect ratio differs from that of the images. `detector` is an open
-    detector; None opens the one of the options. InputError without an image.
+    detector; None opens the one of the options. `start_solving` solves the evidence on the way in the background, see
+    `solver_process.BackgroundSolver`; the result is the same. InputError without an image.
     """
     sources = _opened(recording)
-    control = ReplayControl(on_progress=on_progress, should_stop=should_stop, on_checkpoint=on_checkpoint)
+    control = ReplayControl(
+        on_progress=on_progress, should_stop=should_stop, on_checkpoint=on_checkpoint, start_solving=start_solving
+    )
     joint = JoinedEvidence(options.gate, before)
     gathered = _gather_all(sources, options, control, joint, lens, detector)
     if not joint:

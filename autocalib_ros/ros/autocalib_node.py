@@ -46,11 +46,11 @@ from autocalib_ros.ros.log_text import describe, describe_progress
 from autocalib_ros.ros.log_throttle import LogThrottle
 from autocalib_ros.ros.publication import CalibrationPublisher, Published
 from autocalib_ros.ros.report_writer import ReportPaths, ReportWriter
-from autocalib_ros.ros.solver_process import SolverProcess
 from autocalib_ros.ros.status import Counts, RateCounter, Situation
 from autocalib_ros.ros.store_writer import StoreWriter
 from autocalib_ros.ros.view_events import ViewEvents
 from autocalib_ros.ros.worker import CalibrationWorker, Result, Solve
+from autocalib_ros.solver_process import SolverProcess
 
 PROGRESS_LOG_PERIOD_S = 10.0
 """Real seconds between two looks at the progress for the log."""

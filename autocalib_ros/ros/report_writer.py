@@ -18,7 +18,7 @@ from autocalib_ros.evidence.buffer import EvidenceBuffer
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.report.scene import ReportScene, SolutionSnapshot, append_snapshot
 from autocalib_ros.results.calibration import Calibration, Refusal
-from autocalib_ros.ros.solver_process import NICENESS, PROCESS_EXIT_S
+from autocalib_ros.solver_process import NICENESS, PROCESS_EXIT_S
 from autocalib_ros.util.threads import limit_blas_threads
 
 

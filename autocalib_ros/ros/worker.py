@@ -32,7 +32,7 @@ from autocalib_ros.perception.view_watch import KnownView, ViewReport, ViewWatch
 from autocalib_ros.results.calibration import Calibration, Refusal
 from autocalib_ros.results.camera_move import MoveKind
 from autocalib_ros.ros.solver_activity import SolverActivity
-from autocalib_ros.ros.solver_process import SolverTimedOut
+from autocalib_ros.solver_process import SolverTimedOut
 
 IMAGE_QUEUE_SIZE = 8
 """Images waiting for the perception thread: bridges half a second at 15 Hz, 22 MB at 1280x720."""
@@ -364,7 +364,7 @@ class CalibrationWorker:
         accepted, self._accepted_tracks = self._accepted_tracks, 0
         if accepted:
             self._calibrator.accepted(accepted)
-        evidence = self._guarded(partial(self._calibrator.snapshot_if_due, with_segments=False))
+        evidence = self._guarded(self._calibrator.snapshot_if_due)
         if evidence is not None:
             self._submit(evidence, [])
         if time.monotonic() >= self._progress_at + PROGRESS_PERIOD_S:

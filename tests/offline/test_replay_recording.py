@@ -84,7 +84,7 @@ def test_a_known_lens_goes_into_each_solution_in_the_size_of_the_images(monkeypa
         reports.append(lens)
         return solve(evidence, options)
 
-    for module in ('gather_evidence', 'replay_recording'):
+    for module in ('solution_trials', 'replay_recording'):
         monkeypatch.setattr(f'autocalib_ros.offline.{module}.solve', recording_solve)
     options = Options(first_solve_s=0.0, gate=GateOptions(min_tracks=4))
     replay(Drive(150), options, lens=Camera.equidistant(320, 240, 200.0))
@@ -133,7 +133,7 @@ def test_a_refused_solution_is_what_is_missing_and_then_since_when_it_is_calibra
         code='x', message='the halves disagree', remedy='wait', method='joint', evidence=full.evidence.summary()
     )
     results = iter([refusal])
-    for module in ('gather_evidence', 'replay_recording'):
+    for module in ('solution_trials', 'replay_recording'):
         monkeypatch.setattr(f'autocalib_ros.offline.{module}.solve', lambda due, options, lens: next(results, accepted))
     reports = []
     # the box is all that there is to see, so that the background seems to drift by up to 100 px

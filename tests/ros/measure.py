@@ -160,9 +160,9 @@ def run_node(options: argparse.Namespace) -> dict:  # noqa: C901  one clock afte
     from autocalib_ros.util.threads import limit_blas_threads
 
     limit_blas_threads()
+    from autocalib_ros import solver_process as solver
     from autocalib_ros.estimation.estimate import solve
     from autocalib_ros.ros import autocalib_node, diagnostics, image_input, node, worker
-    from autocalib_ros.ros import solver_process as solver
 
     timed, latencies_ms, solved_s, ends = Timed(), [], [], []
     if options.depth:

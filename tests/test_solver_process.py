@@ -6,6 +6,7 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from autocalib_ros.calibrator import AutoCalibrator
@@ -13,12 +14,13 @@ from autocalib_ros.config import Options, ScaleOptions
 from autocalib_ros.errors import UsageError
 from autocalib_ros.estimation.estimate import solve
 from autocalib_ros.results.calibration import Refusal
-from autocalib_ros.ros.solver_process import SolverDied, SolverProcess, SolverTimedOut
-from bench import PATIENCE_S, PIXELS
+from autocalib_ros.solver_process import BackgroundSolver, SolverDied, SolverProcess, SolverTimedOut
 
 pytestmark = pytest.mark.dds
 
 OPTIONS = Options(camera_height=8.0)
+PATIENCE_S = 30.0
+PIXELS = np.random.default_rng(0).integers(0, 255, (240, 320), dtype=np.uint8)
 
 
 def snapshot():
@@ -85,3 +87,14 @@ def test_solution_that_hangs_is_given_up_and_the_next_one_starts_another_process
     assert not stopped.is_alive()
     solver.limit_s = float('inf')
     assert not solver(snapshot(), OPTIONS, lens=None)
+
+
+def test_a_background_solver_gives_the_same_and_ends_what_is_under_way():
+    background, evidence = BackgroundSolver(), snapshot()
+    assert background(evidence, OPTIONS, None).result(PATIENCE_S) == solve(evidence, OPTIONS)
+    process = background._process._process
+    os.kill(process.pid, signal.SIGSTOP)
+    under_way = background(evidence, OPTIONS, None)
+    assert not threading.Event().wait(0.2)
+    background.close()
+    assert isinstance(under_way.exception(PATIENCE_S), SolverDied) and not process.is_alive()

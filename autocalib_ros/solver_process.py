@@ -6,6 +6,7 @@ priority and ends with its parent.
 
 from __future__ import annotations
 
+import concurrent.futures
 import contextlib
 import ctypes
 import math
@@ -94,6 +95,23 @@ class SolverProcess:
         if process is not None:
             process.kill()
             process.join(PROCESS_EXIT_S)
+
+
+class BackgroundSolver:
+    """Solves one problem after the other in a child process, while the caller goes on."""
+
+    def __init__(self) -> None:
+        self._process = SolverProcess()
+        self._waiting = concurrent.futures.ThreadPoolExecutor(1, thread_name_prefix='background solver')
+
+    def __call__(self, evidence: Evidence, options: Options, lens: Camera | None) -> concurrent.futures.Future[Result]:
+        """Start a solution; the future raises what `SolverProcess` does."""
+        return self._waiting.submit(self._process, evidence, options, lens=lens)
+
+    def close(self) -> None:
+        """Give up what is under way, and end the process."""
+        self._waiting.shutdown(wait=False, cancel_futures=True)
+        self._process.close()
 
 
 def _end_with_parent() -> None:
