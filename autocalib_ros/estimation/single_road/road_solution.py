@@ -27,7 +27,7 @@ from autocalib_ros.estimation.verification.identifiability import (
 )
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.ground_plane import unsigned_angle_deg
-from autocalib_ros.lens.camera import field_of_view_deg
+from autocalib_ros.lens.camera import Camera, field_of_view_deg
 from autocalib_ros.results.refusals import Reason, reason
 from autocalib_ros.results.statements import Statement, assumption, check
 from autocalib_ros.results.verification_table import VerificationRow, verified
@@ -103,14 +103,14 @@ def solve_single_road(
     following = _following(whole, tracks)
     if isinstance(following, Reason):
         return following
-    halves = check_halves(whole, tracks, gate)
-    if isinstance(halves, Reason):
-        return halves
     roll_deg, segments = config.options.roll_prior_deg or DEFAULT_ROLL_SIGMA_DEG, _segments(evidence, whole, tracks)
     parameters, covariance = road_posterior(
         start, subsample.subset(compared), choice, segments, float(np.radians(roll_deg))
     )
     fit = evaluate_at(parameters.base, tracks, parameters.config, covariance)
+    halves = check_halves(_along_the_road(fit, whole, tracks), tracks, gate, _lenses_about(fit))
+    if isinstance(halves, Reason):
+        return halves
     edges, lines = segments
     seen = check('single_road', edges=len(edges.weights), lines=len(lines.weights), following=following)
     return SingleRoad(
@@ -120,6 +120,20 @@ def solve_single_road(
         (seen, halves.statement),
         (verified('straight_share', following, MIN_FOLLOWING), *halves.rows),
     )
+
+
+def _along_the_road(fit: Adjustment, road: Adjustment, tracks: TrackSet) -> Adjustment:
+    """Return the direction of the road through the mean lens of the posterior."""
+    start = AdjustmentState(fit.state.camera, fit.state.rotation, np.zeros(1))
+    return adjust(start, tracks, replace(road.problem.config, prior=known_lens(fit.state.camera)), refine=True)
+
+
+def _lenses_about(fit: Adjustment) -> list[Camera]:
+    """Return lenses one standard deviation from that of the posterior, along each axis of their covariance."""
+    lens = slice(0, fit.problem.parameters.lens)
+    variances, axes = np.linalg.eigh(fit.covariance[lens, lens])
+    steps = (np.sqrt(np.maximum(variances, 0.0)) * axes).T
+    return [fit.problem.config.prior.moved(fit.state.camera, step) for step in steps if step.any()]
 
 
 def _following(fit: Adjustment, tracks: TrackSet) -> float | Reason:

@@ -62,25 +62,37 @@ def compare_solutions(first: Adjustment, second: Adjustment) -> SolutionDifferen
     )
 
 
-def half_difference_sigmas(first: Adjustment, second: Adjustment, vehicles: int) -> tuple[float, float] | None:
+def half_change(first: Adjustment, second: Adjustment) -> np.ndarray:
+    """Return the difference of log focal length and of the rotation of the camera (radians) of two halves, (4,)."""
+    return _pose_about(first, second.state)
+
+
+def _pose_about(origin: Adjustment, state: AdjustmentState) -> np.ndarray:
+    """Return log focal length and rotation vector of a state, each from that of a fit, shape (4,)."""
+    focal = np.log(state.camera.focal_px / origin.state.camera.focal_px)
+    return np.array([focal, *Rotation.from_matrix(origin.state.rotation.T @ state.rotation).as_rotvec()])
+
+
+def half_difference_sigmas(
+    first: Adjustment, second: Adjustment, vehicles: int, common: np.ndarray | float = 0.0
+) -> tuple[float, float] | None:
     """Return the difference between the solutions of two halves, and its limit, in standard deviations.
 
     Focal length and all of the rotation of the camera against the roads together, with their covariance: a camera that
     turned in between turns about an axis of which traffic is far more certain than of others. Hotelling's T squared
     (1931), whose limit allows for covariances that are estimated from few vehicles, those of the smaller half. None
-    where a half determines nothing.
+    where a half determines nothing. `common` is the covariance (4, 4) of the difference by what both halves share.
     """
-    origin = first.state.rotation
 
     def pose(state: AdjustmentState) -> np.ndarray:
-        return np.array([np.log(state.camera.focal_px), *Rotation.from_matrix(origin.T @ state.rotation).as_rotvec()])
+        return _pose_about(first, state)
 
-    covariance = first.covariance_of(pose) + second.covariance_of(pose)
+    covariance = first.covariance_of(pose) + second.covariance_of(pose) + common
     compared = 1 + len(first.problem.parameters.axes)
     if not np.isfinite(covariance).all() or vehicles <= compared:
         return None
     model = np.square([HALF_MODEL_SIGMAS[0], *3 * (HALF_MODEL_SIGMAS[1],)])
-    change = pose(second.state) - pose(first.state)
+    change = half_change(first, second)
     value = float(np.sqrt(change @ np.linalg.solve(covariance + np.diag(model), change)))
     scale = compared * (vehicles - 1) / (vehicles - compared)
     return value, float(np.sqrt(scale * special.fdtri(compared, vehicles - compared, 1.0 - HALF_CONTRADICTION)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,6 +17,7 @@ from autocalib_ros.estimation.adjustment.bundle_adjustment import (
     road_support,
 )
 from autocalib_ros.estimation.adjustment.covariance import sigma_without_prior
+from autocalib_ros.estimation.adjustment.lens_prior import known_lens
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig
 from autocalib_ros.estimation.observations.track_set import TrackSet, UnprojectedTracks, long_tracks
 from autocalib_ros.estimation.observations.tracklets import no_tracklets
@@ -24,11 +26,13 @@ from autocalib_ros.estimation.straight.roads import MIN_VEHICLES_PER_ROAD
 from autocalib_ros.estimation.verification.consistency import (
     compare_solutions,
     expected_half_differences,
+    half_change,
     half_difference_sigmas,
 )
 from autocalib_ros.estimation.verification.ground_normal import LevelCamera, PlaneEstimate, orient_above_traffic
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.ground_plane import MIN_FRACTION_BELOW_HORIZON
+from autocalib_ros.lens.camera import Camera
 from autocalib_ros.results.refusals import Reason, reason
 from autocalib_ros.results.statements import Statement, check
 from autocalib_ros.results.verification_table import VerificationRow, verified
@@ -216,8 +220,14 @@ NOT_COMPARED = ComparedHalves(check('halves_not_compared'))
 """Of traffic too little for two halves."""
 
 
-def check_halves(fit: Adjustment, tracks: TrackSet, gate: GateOptions) -> Reason | ComparedHalves:
-    """Cross-validate in time: solve the earlier and the later half of the vehicles, and compare."""
+def check_halves(
+    fit: Adjustment, tracks: TrackSet, gate: GateOptions, lenses: Sequence[Camera] = ()
+) -> Reason | ComparedHalves:
+    """Cross-validate in time: solve the earlier and the later half of the vehicles, and compare.
+
+    A lens that is held may be wrong, and then shows traffic in other lanes in other directions. `lenses` are one
+    standard deviation from it along each axis of its covariance: what they change in the difference is expected.
+    """
     config = replace(fit.problem.config, vehicle_correlation=fit.vehicle_correlation)
     tracklets = no_tracklets() if config.bundle is None else config.bundle.tracklets
     early, lived, windows = _earlier_half(
@@ -228,12 +238,10 @@ def check_halves(fit: Adjustment, tracks: TrackSet, gate: GateOptions) -> Reason
     share = _compare_shares(fit, tracks, early)
     if isinstance(share, Reason):
         return share
-    fits = []
-    for masks in ((early, windows, lived), (~early, ~windows, ~lived)):
-        solved = _solve_half(fit, tracks, config, gate, masks)
-        if solved is None:
-            return replace(NOT_COMPARED, rows=(*share, *_compare_roads(fit, tracks, early)))
-        fits.append(solved)
+    masks = (early, windows, lived), (~early, ~windows, ~lived)
+    fits = _solve_halves(fit, tracks, config, gate, masks)
+    if fits is None:
+        return replace(NOT_COMPARED, rows=(*share, *_compare_roads(fit, tracks, early)))
     apart = compare_solutions(*fits)
     focal, turn = apart.focal, apart.normal_deg if fit.plane_known else 0.0  # one road does not determine the normal
     # a large sigma of one half excuses no difference that the sigma of the whole rules out
@@ -246,11 +254,27 @@ def check_halves(fit: Adjustment, tracks: TrackSet, gate: GateOptions) -> Reason
         return reason(
             'halves_disagree', focal=focal, focal_limit=focal_limit, normal_deg=turn, normal_limit_deg=turn_limit
         )
-    together = _compare_poses(*fits)
+    through = []
+    for lens in lenses:
+        state, held = replace(fit.state, camera=lens), replace(config, prior=known_lens(lens))
+        through.append(_solve_halves(replace(fit, state=state), tracks, held, gate, masks))
+    together = _compare_poses(*fits, [other for other in through if other is not None])
     if isinstance(together, Reason):
         return together
     statement = check('halves', focal=focal, normal_deg=turn if fit.plane_known else None)
     return ComparedHalves(statement, (*share, *(rows if fit.plane_known else rows[:1]), *together))
+
+
+def _solve_halves(
+    fit: Adjustment,
+    tracks: TrackSet,
+    config: AdjustmentConfig,
+    gate: GateOptions,
+    masks: tuple[tuple[np.ndarray, np.ndarray, np.ndarray], ...],
+) -> tuple[Adjustment, Adjustment] | None:
+    """Solve both halves; None if one of them has too little traffic."""
+    first, second = (_solve_half(fit, tracks, config, gate, mask) for mask in masks)
+    return None if first is None or second is None else (first, second)
 
 
 def _solve_half(
@@ -339,10 +363,16 @@ def share_difference(earlier: np.ndarray, later: np.ndarray) -> tuple[float, flo
     return (*shares, abs(shares[0] - shares[1]) / float(np.sqrt(max(independent, in_blocks))))
 
 
-def _compare_poses(first: Adjustment, second: Adjustment) -> Reason | tuple[VerificationRow, ...]:
-    """Compare focal length and rotation of two halves together; no row where a half determines nothing."""
+def _compare_poses(
+    first: Adjustment, second: Adjustment, through: Sequence[tuple[Adjustment, Adjustment]]
+) -> Reason | tuple[VerificationRow, ...]:
+    """Compare focal length and rotation of two halves together; no row where a half determines nothing.
+
+    `through` are the halves through other lenses, each a standard deviation away.
+    """
+    changes = np.array([half_change(*halves) - half_change(first, second) for halves in through]).reshape(-1, 4)
     vehicles = min(len(np.unique(fit.problem.vehicle_ids)) for fit in (first, second))
-    difference = half_difference_sigmas(first, second, vehicles)
+    difference = half_difference_sigmas(first, second, vehicles, changes.T @ changes)
     if difference is None:
         return ()
     row = verified('halves_pose', *difference)

@@ -4,8 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from autocalib_ros.config import Options
+from autocalib_ros.config import JointOptions, Options
+from autocalib_ros.estimation.adjustment.bundle_adjustment import adjust
+from autocalib_ros.estimation.adjustment.lens_prior import known_lens
+from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig, AdjustmentState
+from autocalib_ros.estimation.observations.track_set import select_tracks
+from autocalib_ros.estimation.verification.consistency import half_change, half_difference_sigmas
 from autocalib_ros.estimation.verification.gates import share_difference
 from autocalib_ros.evidence.snapshot import Track
 from autocalib_ros.offline.benchmark.monte_carlo import draw_evidence
@@ -63,3 +69,23 @@ def test_platoons_and_phases_of_a_traffic_light_make_shares_less_certain() -> No
     mixed = share_difference(phases[np.arange(100) * 7 % 100], np.ones(100, bool))
     assert mixed is not None and mixed[2] > 6.0
     assert share_difference(np.zeros(20, bool), np.ones(20, bool))[2] > 6.0
+
+
+def test_what_halves_share_is_no_difference_between_them() -> None:
+    """The lens that both are seen through may be another one, and turns one of them against the other."""
+    road = Junction(road_angles_deg=(0.0,), turning_fraction=0.0, vehicles=15)
+    fits = []
+    for angle_deg in (0.0, 4.0):
+        traffic = traffic_of(replace(road, road_angles_deg=(angle_deg,)))
+        tracks = select_tracks(evidence_from_tracks(traffic, road.image_size, 60.0), 300)
+        along = road.camera_from_ground @ Rotation.from_euler('z', angle_deg, degrees=True).as_matrix()
+        start = AdjustmentState(road.camera, along, np.zeros(1))
+        fits.append(adjust(start, tracks, AdjustmentConfig(known_lens(road.camera), JointOptions()), refine=True))
+    value, limit = half_difference_sigmas(*fits, 15)
+    assert value > limit
+    change = half_change(*fits)
+    assert np.degrees(np.linalg.norm(change[1:])) == pytest.approx(4.0, abs=0.7)
+    assert half_difference_sigmas(*fits, 15, np.outer(change, change))[0] < 1.0
+    across = np.cross([1.0, 0.0, 0.0], change[1:])
+    other = np.array([0.0, *across * np.linalg.norm(change) / np.linalg.norm(across)])
+    assert half_difference_sigmas(*fits, 15, np.outer(other, other))[0] > limit
