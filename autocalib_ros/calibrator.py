@@ -63,14 +63,14 @@ class AutoCalibrator:
         self._options = options
         self._detector = detector or open_detector(options.detector)
         self._stream: ImageStream | None = None
-        self._timing = ImageTiming()
+        self._timing = ImageTiming(self._follows)
         self._odd_size: tuple[tuple[int, int], int, int] | None = None
         self._schedule = SolutionSchedule(options)
 
     def add_image(self, stamp_ns: int, image: np.ndarray) -> ImageIntake:
         """Take one image: grey (H, W) or BGR (H, W, 3), uint8; it is neither kept nor changed.
 
-        `perception.frame_clock` gives each image its time: one odd stamp is one image, a clock that is set back goes on
+        `perception.frame_clock` gives each image its time: one odd stamp is one image, a clock that is set goes on
         with the evidence. A recording that starts again, a clock set by a day or more, or a new image size that lasts
         restarts the evidence. Raises UsageError if a pixel of scale.distance_px lies outside the image, InputError for
         an array of another kind.
@@ -83,7 +83,7 @@ class AutoCalibrator:
             return ImageIntake.ODD_SIZE
         self._odd_size = None
         if resized:
-            self._timing = ImageTiming()
+            self._timing = ImageTiming(self._follows)
         taken = self._timing.add(stamp_ns, image)
         if resized or taken.restarted:
             self._stream = None
@@ -97,6 +97,10 @@ class AutoCalibrator:
         if taken.restarted and frames > 1:
             return ImageIntake.TIME_JUMPED
         return ImageIntake.LATE if taken.is_late else ImageIntake.USED if frames else ImageIntake.FIRST
+
+    def _follows(self, image: np.ndarray) -> bool:
+        """Return whether an image shows the traffic one step after the last one."""
+        return self._stream is not None and self._stream.observer.follows(image)
 
     def _has_lasted(self, size: tuple[int, int], stamp_ns: int) -> bool:
         """Count an image of a new size; return whether that size is to be believed."""

@@ -9,13 +9,15 @@ slot passes at once. Any other is held until a later one tells what it is:
 - they continue from its stamp: the clock was set while the images go on, or a recording starts again.
 
 Without a grid (the first images, intervals without a period) the stamps are the times. Everything depends on the stamps
-and their order alone.
+and their order alone, but for two questions that they leave open: whether images were lost or the clock was set
+forward, and whether an image came late or the clock was set back by a frame. Traffic that moved by one step from image
+to image tells, where there is any: images follow at the period whatever the clock does.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -150,9 +152,14 @@ class _Arrival:
 
 
 class FrameClock:
-    """Clock of one stream of images. Deterministic and causal: an image is held for a few others at most."""
+    """Clock of one stream of images. Deterministic and causal: an image is held for a few others at most.
 
-    def __init__(self) -> None:
+    `follows` tells whether a held image, by its number, shows the traffic one step after the last image that got its
+    time in an earlier call; False where nothing tells.
+    """
+
+    def __init__(self, follows: Callable[[int], bool] = lambda image: False) -> None:
+        self._follows = follows
         self._arrived = 0
         self._summary = ClockSummary()
         self._begin()
@@ -265,16 +272,25 @@ class FrameClock:
             self._take_consecutive()  # jitter, rather than images that overtake each other
         elif count < 2 and grid.sigma >= CERTAIN_SIGMA and frames > -2 * QUEUED:
             return  # the jitter may explain it
-        elif frames < -QUEUED and self._continues(head, newest, grid.period_ns):
+        elif self._continues(head, newest, grid.period_ns) and (frames < -QUEUED or self._goes_on(head)):
             self._step(head, newest, grid.time_ns(self._slot + 1))
         else:
             self._drop_head()
 
+    def _goes_on(self, head: _Arrival) -> bool:
+        """Return whether the traffic shows that no image is missing before the first held one.
+
+        Asked only where stamps are even and none was lost of late: where images are lost all the time, one more is no
+        reason to doubt the clock.
+        """
+        even = self._grid is None or (self._grid.sigma < CERTAIN_SIGMA and max(self._advances, default=1) == 1)
+        return even and not self._timed and self._follows(head.image)
+
     def _confirm_loss(self, grid: FrameGrid, first: float) -> None:
-        """Images were lost before the first held one, if enough later ones agree; or the clock was set far ahead."""
+        """Images were lost before the first held one, if enough later ones agree; or the clock was set forward."""
         later = [grid.frames_from(self._slot + 1, arrival.stamp_ns) - index for index, arrival in enumerate(self._held)]
         head, rest = self._held[0], self._held[1:]
-        if first * grid.period_ns >= MAX_PAUSE_NS:
+        if first * grid.period_ns >= MAX_PAUSE_NS or self._goes_on(head):
             self._step(head, self._held[-1], grid.time_ns(self._slot + 1))
         elif first * grid.period_ns >= GAP_NS:
             self._held = []
@@ -346,7 +362,7 @@ class FrameClock:
         step, longest = head.stamp_ns - self._newest_ns, self._longest_raw_step()
         follows_newest = 0 < newest.stamp_ns - self._newest_ns < longest
         follows_head = 0 < newest.stamp_ns - head.stamp_ns < longest
-        if follows_head and 0 < step < MAX_PAUSE_NS:
+        if follows_head and 0 < step < MAX_PAUSE_NS and not self._goes_on(head):
             self._held = []
             self._raw.clear()
             self._emit(head, head.stamp_ns)
@@ -387,7 +403,7 @@ class FrameClock:
         assert self._first_ns is not None
         tolerance_ns = 2 * abs(newest.stamp_ns - head.stamp_ns)
         wrapped = abs(by_ns + WRAP_NS) < tolerance_ns
-        starts_again = abs(head.stamp_ns - self._first_ns) < START_NS
+        starts_again = by_ns < 0 and abs(head.stamp_ns - self._first_ns) < START_NS
         if not wrapped and (by_ns >= MAX_PAUSE_NS or by_ns <= -MAX_CLOCK_STEP_NS or starts_again):
             self._begin_anew(held)
             return

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,10 +33,13 @@ class Taken:
 
 
 class ImageTiming:
-    """A frame clock with the images that wait for it; it keeps copies of these few only."""
+    """A frame clock with the images that wait for it; it keeps copies of these few only.
 
-    def __init__(self) -> None:
-        self._clock = FrameClock()
+    `follows` tells whether an image shows the traffic one step after the last one that was ready; False if unknown.
+    """
+
+    def __init__(self, follows: Callable[[np.ndarray], bool] = lambda image: False) -> None:
+        self._clock = FrameClock(lambda number: follows(self._waiting[number]))
         self._waiting: dict[int, np.ndarray] = {}
         self._arrived = 0
 
@@ -50,8 +54,8 @@ class ImageTiming:
 
     def add(self, stamp_ns: int, image: np.ndarray) -> Taken:
         """Take the next image; return the images that have their time now."""
-        reading = self._clock.add(stamp_ns)
         self._waiting[self._arrived] = image
+        reading = self._clock.add(stamp_ns)
         ready = tuple(ReadyImage(timed.time_ns, self._waiting[timed.image], timed.lost) for timed in reading.timed)
         held = self._clock.held
         self._waiting = {number: kept for number, kept in self._waiting.items() if number in held}

@@ -55,6 +55,10 @@ they change by all of it) and of the change at the place where it should be (an 
 both), and the fraction of the fast points that stand still in a repeated image. Vehicles do not
 stop together from one image to the next; points stick to an occluder one by one.
 """
+ONE_STEP_FRACTION = 2 / 3
+"""Fraction of the moving points that make one more of their steps in an image that follows at the usual interval. From
+image to image one in ten or twenty is lost; after a pause few find their surroundings again, and hardly two of them
+where one step leads."""
 MIN_SCALED_STEP_PX = 1.0
 """Least step, pixels per image, of a point that tells how far points moved across repeated images: noise is a fifth."""
 MAX_SCALED_POINTS = 60
@@ -93,6 +97,22 @@ class PointTracker:
         contrast = np.abs(before - before.mean(axis=1, keepdims=True)).mean(axis=1)
         unchanged = change < UNCHANGED * np.minimum(contrast, change_if_moved)
         return bool(unchanged.mean() > UNCHANGED_FRACTION)
+
+    def moved_one_step(self, grey: np.ndarray) -> bool:
+        """Return whether the moving points are one step further in a grey image (H, W), whatever time has passed.
+
+        False with fewer than `MIN_FAST_POINTS` of them. After a pause of some seconds other things are in their places,
+        and after lost images they are two steps further or more.
+        """
+        if self._grey is None or self._repeats:
+            return False
+        fastest = self._fastest(np.flatnonzero(self._count))
+        if len(fastest) < MIN_FAST_POINTS:
+            return False
+        start, step = self._current_positions(fastest), self._step[fastest]
+        found, good = self._flow(self._grey, grey, start, start + step)
+        good &= np.hypot(*(found - start - step).T) <= GAP_TOLERANCE * np.hypot(*step.T)
+        return bool(good.mean() > ONE_STEP_FRACTION)
 
     def _patches(self, grey: np.ndarray, points_px: np.ndarray) -> np.ndarray:
         """Return the pixels of a grey image (H, W) around points (n, 2), float32 (n, window_px squared)."""
@@ -173,9 +193,7 @@ class PointTracker:
         The stamps do not tell: of a camera of 25 images per second that is recorded with 30, the image after a repeat
         is one step on; after a stall, as many as intervals passed.
         """
-        speed = np.hypot(*self._step[active].T) * (self._count[active] > 1)
-        fastest = active[np.argsort(-speed, kind='stable')[:MAX_SCALED_POINTS]]
-        fastest = fastest[np.hypot(*self._step[fastest].T) >= MIN_SCALED_STEP_PX]
+        fastest = self._fastest(active)
         measured, support = most, 0
         if not len(fastest):
             return measured
@@ -191,6 +209,12 @@ class PointTracker:
             if agreeing > support:
                 measured, support = middle, agreeing
         return measured
+
+    def _fastest(self, active: np.ndarray) -> np.ndarray:
+        """Return the slots (n,) of the points whose steps tell a velocity, fastest first."""
+        speed = np.hypot(*self._step[active].T) * (self._count[active] > 1)
+        fastest = active[np.argsort(-speed, kind='stable')[:MAX_SCALED_POINTS]]
+        return fastest[np.hypot(*self._step[fastest].T) >= MIN_SCALED_STEP_PX]
 
     def _predict_new(self, active: np.ndarray, known: np.ndarray, predicted: np.ndarray) -> np.ndarray:
         """Predict new points (not `known`) by the median of their vehicle, in place; return the mask (n,) of these."""

@@ -131,6 +131,15 @@ class Observer:
         segments, edges, outlines = self._detect(grey, time_s) if detect else (None, None, None)
         return FrameObservations(tracks, segments, edges, outlines, self._view)
 
+    def follows(self, image: np.ndarray) -> bool:
+        """Return whether the traffic in an image is one step further than in the last one, whatever its stamp.
+
+        False without traffic, and for an image of another size.
+        """
+        if (image.shape[1], image.shape[0]) != self._image_size:
+            return False
+        return self._tracker.moved_one_step(self._tracked_image(black_out(image, self._polygons)))
+
     def change_gate(self, gate: GateOptions) -> None:
         """Take another limit of the drift, which may change while running."""
         self._drift_monitor.change_limits(self._drift_limits(gate))

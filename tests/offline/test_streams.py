@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from drawn_pictures import noisy, paste
 
+from autocalib_ros.calibrator import AutoCalibrator
 from autocalib_ros.cli import main
 from autocalib_ros.config import Options
 from autocalib_ros.errors import UsageError
@@ -116,6 +117,18 @@ def test_repeats_are_left_out_and_cost_few_tracks(kind: str, even: StreamRun) ->
     assert even.repeated == 0 and even.tracks > 15
     assert 0.9 * repeats - 2 <= run.repeated <= repeats
     assert run.tracks >= 0.8 * even.tracks
+
+
+@pytest.mark.parametrize('kind', ['ntp_forward_0.1', 'utc_to_tai', 'ntp_back_0.1', 'dropped_2', 'pause'])
+def test_the_traffic_tells_a_clock_that_is_set_from_lost_images(kind: str, even: StreamRun) -> None:
+    calibrator = AutoCalibrator(Options())
+    for frame in streams._with_fault(Road(100), kind).frames():
+        calibrator.add_image(frame.stamp_ns, frame.image)
+    was_set = kind not in ('dropped_2', 'pause')
+    assert calibrator.clock().steps == int(was_set)
+    assert calibrator.clock().lost == (2 if kind == 'dropped_2' else 0)
+    if was_set:
+        assert calibrator.snapshot().track_count == even.tracks
 
 
 EVEN = StreamRun('even', 'full', 100, 300, 0, 500.0, 10.0)

@@ -99,6 +99,28 @@ def test_intervals_are_those_of_the_exposures(fault):
     assert result.epochs[-1] == int(fault == 'started_again')
 
 
+@pytest.mark.parametrize('rate_hz', [15.0, 30.0])
+@pytest.mark.parametrize('fault', ['ntp_forward_0.1', 'ntp_forward_1', 'utc_to_tai', 'ntp_back_0.1'])
+def test_a_clock_that_is_set_while_the_traffic_goes_on_costs_no_image_and_no_time(fault, rate_hz):
+    true_ns = exposures(rate_hz=rate_hz)
+    arrived = STAMP_FAULTS[fault](true_ns, np.random.default_rng(1))
+    clock, times = FrameClock(lambda image: True), {}
+    for stamp_ns in arrived.stamps_ns.tolist():
+        times.update({timed.image: timed.time_ns for timed in clock.add(stamp_ns).timed})
+    # stamps are whole nanoseconds, the period of the grid is not
+    np.testing.assert_allclose([times[image] - START_NS for image in range(300)], true_ns - START_NS, rtol=0, atol=10)
+    assert clock.summary().steps == 1 and clock.summary().lost == 0
+    assert clock.offset_ns == pytest.approx(arrived.stamps_ns[-1] - true_ns[-1], abs=10)
+
+
+def test_traffic_is_asked_only_where_images_are_not_lost_all_the_time():
+    asked = []
+    clock = FrameClock(lambda image: bool(asked.append(image)))
+    for stamp_ns in STAMP_FAULTS['dropped_half'](exposures(600), np.random.default_rng(1)).stamps_ns.tolist():
+        clock.add(stamp_ns)
+    assert len(asked) <= 1  # before a grid is found
+
+
 @pytest.mark.parametrize('fault', ['one_ahead_10_min', 'one_ahead_2_days', 'one_zero_in_45'])
 def test_an_odd_stamp_costs_nothing(fault):
     true_ns = exposures()

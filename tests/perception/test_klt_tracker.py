@@ -225,3 +225,29 @@ def test_tails_of_points_that_are_new_begin_where_the_points_did() -> None:
     tails = tracker.tails(6)
     np.testing.assert_array_equal(tails[:, :5], np.repeat(tails[:, :1], 5, axis=1))
     assert PointTracker(TrackingOptions()).tails(6).shape == (0, 6, 2)
+
+
+@pytest.mark.parametrize(
+    ('offset', 'expected'),
+    [
+        ((20 + 3.0 * 10, 40), True),
+        ((20 + 3.0 * 11, 40), False),  # two steps: an image was lost
+        ((20 + 3.0 * 9, 40), False),
+        ((20 + 3.0 * 30, 40), False),  # a pause
+        (None, False),
+    ],
+)
+def test_traffic_tells_whether_an_image_follows_at_the_usual_interval(offset, expected) -> None:
+    tracker = PointTracker(TrackingOptions())
+    for index in range(10):
+        tracker.follow(scene((20 + 3.0 * index, 40)), 0.1 * index)
+        if index == 0:
+            inside = np.array([(40.0, 60), (55, 55), (65, 68), (48, 70), (60, 78), (70, 50)])
+            tracker.add_points(inside, np.zeros(6, int))
+    assert len(tracker.positions()[0]) >= 5
+    assert tracker.moved_one_step(scene(offset)) is expected
+
+
+def test_a_still_road_does_not_tell_whether_images_were_lost() -> None:
+    tracker, _ = follow([None] * 5)
+    assert not tracker.moved_one_step(scene(None))
