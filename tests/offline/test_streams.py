@@ -187,9 +187,19 @@ def test_a_stream_is_compared_with_an_even_one_of_its_codec_and_its_traffic(monk
         ('jitter_30', 'even'),
         ('second_half', 'second_half'),
         ('started_again', 'second_half'),
+        ('cut', 'cut'),
+        ('pause', 'cut'),
     ]
     assert seen['even'] == seen['even_jpeg'] == list(range(9))
     assert seen['second_half'] == [4, 5, 6, 7, 8]
+    assert seen['cut'] == [0, 1, 2, 3, 4]
+
+
+def test_a_recording_without_the_images_of_a_pause_has_even_stamps() -> None:
+    paused, cut = streams._with_fault(Road(300), 'pause'), streams._without_fault(Road(300), 'cut')
+    assert paused.arrived.images.tolist() == cut.arrived.images.tolist()
+    assert np.diff(paused.arrived.stamps_ns).max() == 100 * INTERVAL_NS
+    assert set(np.diff(cut.arrived.stamps_ns).tolist()) == {INTERVAL_NS} and len(cut.arrived.images) == 201
 
 
 @pytest.mark.parametrize('kind', MESSAGE_FAULTS)

@@ -25,7 +25,9 @@ from autocalib_ros.offline.simulate.stamp_faults import (
     SECOND_NS,
     STAMP_FAULTS,
     RestampedSource,
+    StampFault,
     by_message,
+    cut,
     second_half,
 )
 from autocalib_ros.results.calibration import Refusal
@@ -38,10 +40,12 @@ MAX_FOCAL_SIGMAS = 1.0
 """Largest difference of the focal length, in its standard deviations of the recording that a fault is compared with."""
 MESSAGE_EPOCH_NS = 1_700_000_000 * SECOND_NS
 """Time of the first image of faults that messages carry: headers hold the time of day, recordings begin at zero."""
-SECOND_HALF = 'second_half'
-COMPARED_WITH = {'started_again': SECOND_HALF}
-"""Faults that are compared with a part of the recording. Stamps that begin again are another recording, of a camera
-that may have moved: the evidence is reset in the middle, and that of the second half is left.
+PARTS: dict[str, StampFault] = {'second_half': second_half, 'cut': cut}
+"""Parts of the recording with even stamps, by name."""
+COMPARED_WITH = {'started_again': 'second_half', 'pause': 'cut'}
+"""Faults that are compared with a part of the recording: with the images that are left. Stamps that begin again are
+another recording, of a camera that may have moved: the evidence is reset in the middle, and that of the second half is
+left. A pause lacks `RARE_S` of the images, which no stamps bring back; evidence from before it has to stay.
 """
 SHARE_SEEN = {'dropped_half': 0.5, 'replaced_1_in_2_jpeg': 0.5}
 """Share of the camera's images that are seen under faults that take away more than a few, 1 under the others. As many
@@ -185,8 +189,8 @@ def _with_fault(source: Source, kind: str) -> Source:
 
 def _without_fault(source: Source, name: str) -> Source:
     """Return a recording that faults are compared with."""
-    if name == SECOND_HALF:
-        return RestampedSource(source, second_half)
+    if name in PARTS:
+        return RestampedSource(source, PARTS[name])
     codec = name.removeprefix(EVEN).removeprefix('_')
     return RepeatingSource(source, RepeatFault(every_image, codec=codec)) if codec else source
 
