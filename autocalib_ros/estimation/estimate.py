@@ -10,7 +10,7 @@ from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig
 from autocalib_ros.estimation.given_lens import check_principal_point, verify_given_lens
 from autocalib_ros.estimation.known_lengths import adjust_to_lengths, scale_of, with_seen_lengths
 from autocalib_ros.estimation.observations.selection import drop_pedestrians
-from autocalib_ros.estimation.observations.track_set import TrackSet, select_tracks
+from autocalib_ros.estimation.observations.track_set import TrackSet, long_tracks, select_tracks
 from autocalib_ros.estimation.observations.two_frame_windows import ResampledTracks, find_windows
 from autocalib_ros.estimation.paper.intrinsics import paper_intrinsics
 from autocalib_ros.estimation.paper.published_method import solve_paper
@@ -58,6 +58,8 @@ SINGLE_ROAD_CODES = (
     'one_direction',
 )
 """Reasons that one straight road without visible curvature gives; other ones contradict something."""
+PLENTY = 2.0
+"""Tracks over those needed from which on it is not their number that fails: half of them and more are of no use."""
 
 
 def solve(evidence: Evidence, options: Options, *, lens: Camera | None = None) -> Calibration | Refusal:
@@ -151,7 +153,7 @@ def find_solution(
     """
     gate, joint = options.gate, options.joint
     if len(tracks) < gate.min_tracks:
-        return reason('too_few_tracks', 'short', tracks=len(tracks), limit=gate.min_tracks)
+        return _too_few_tracks(evidence, len(tracks), gate.min_tracks)
     crossing_rad = None if joint.crossing_deg is None else float(np.radians(joint.crossing_deg))
     instants = ResampledTracks(evidence)
     windows = find_windows(evidence, instants)
@@ -179,6 +181,17 @@ def find_solution(
         return with_stated_aspect(estimate_with_aspect(given, 0.0), given, 'given')
     found = choose_aspect(hypotheses, estimate_with_aspect, tracks, gate)
     return with_stated_aspect(found, evidence.pixel_aspect, 'recording')
+
+
+def _too_few_tracks(evidence: Evidence, usable: int, limit: int) -> Reason:
+    """Return why too few tracks are usable: few vehicles so far, paths that are not straight, or short ones.
+
+    Where there are several times as many tracks as needed, their kind is the cause, and more of them will not help.
+    """
+    kind = ''
+    if evidence.track_count >= PLENTY * limit:
+        kind = 'curved' if len(long_tracks(evidence)) >= limit else 'far'
+    return reason('too_few_tracks', kind or 'short', tracks=usable, all=evidence.track_count, limit=limit)
 
 
 def _estimate(observations: Observations, config: AdjustmentConfig) -> Solution | Reason:

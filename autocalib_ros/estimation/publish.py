@@ -32,7 +32,7 @@ from autocalib_ros.results.calibration import (
     StandardDeviations,
 )
 from autocalib_ros.results.grades import GRADE_LIMITS, GroundSigma, rank_of
-from autocalib_ros.results.refusals import WAIT, Reason, reason
+from autocalib_ros.results.refusals import SECOND_ROAD, TELL_LENS, Reason, reason
 from autocalib_ros.results.statements import check
 from autocalib_ros.results.verification_table import verified
 
@@ -218,9 +218,10 @@ def require_grade(result: Calibration, least: str) -> Calibration | Refusal:
         if lens_certain:
             return result
         missing = result.ground_refusal
-        cause, remedy = 'lens', WAIT if missing is None else missing.remedy
+        cause, remedy = 'lens', TELL_LENS if missing is None else missing.remedy
     else:
-        cause, remedy = '' if sigma else 'no_road_ahead', helpful.text if helpful else WAIT
+        cause = '' if sigma else 'no_road_ahead'
+        remedy = f'give one more number, {helpful.text}' if helpful else SECOND_ROAD
     why = reason(
         'grade_too_low',
         cause,

@@ -15,7 +15,7 @@ from autocalib_ros.estimation.observations.two_frame_windows import ResampledTra
 from autocalib_ros.estimation.verification.ground_normal import PlaneEstimate
 from autocalib_ros.estimation.verification.scale import Scale
 from autocalib_ros.evidence.snapshot import Evidence
-from autocalib_ros.results.refusals import Reason
+from autocalib_ros.results.refusals import OR, TELL_LENS, Reason
 from autocalib_ros.results.statements import Statement
 from autocalib_ros.results.verification_table import VerificationRow
 
@@ -122,15 +122,24 @@ def is_better(other: Solution | Reason, found: Solution | Reason) -> bool:
     return other.plane.worst_sigma_deg < found.plane.worst_sigma_deg
 
 
-def append_reason(found: Solution | Reason, further: Reason) -> Solution | Reason:
-    """Add to the reason why something is missing, if anything is, why a further strategy failed too."""
+def append_reason(found: Solution | Reason, further: Reason, *, asks_less: bool = False) -> Solution | Reason:
+    """Add to the reason why something is missing, if anything is, why a further strategy failed too.
+
+    Where the further strategy `asks_less` of the traffic than what was found lacks, its remedy is the one to give: any
+    strategy suffices, and this one is the nearest to success. A told lens shows straight roads, and no more vehicles.
+    """
     if isinstance(found, Solution):
         refusal = found.plane_refusal
-        return found if refusal is None else replace(found, plane_refusal=_joined(refusal, further))
-    return _joined(found, further)
+        return found if refusal is None else replace(found, plane_refusal=_joined(refusal, further, asks_less))
+    return _joined(found, further, asks_less)
 
 
-def _joined(first: Reason, further: Reason) -> Reason:
-    return replace(
-        first, message=f'{first.message}; {further.message}', values={**first.values, 'further': further.code}
-    )
+def _joined(first: Reason, further: Reason, asks_less: bool) -> Reason:
+    values = {**first.values, 'further': further.code}
+    remedy = first.remedy
+    if asks_less:
+        told = TELL_LENS in first.remedy and further.code != 'too_few_vehicles'
+        remedy = further.remedy + (OR + TELL_LENS if told else '')
+    if first.code == further.code:  # told once, by the number that is nearer to its limit
+        return replace(further if asks_less else first, values=values)
+    return replace(first, message=f'{first.message}; {further.message}', remedy=remedy, values=values)

@@ -119,7 +119,7 @@ def with_single_road(found: Solution | Reason, single: Solution | Reason) -> Sol
     """
     if isinstance(single, Reason):
         assumed = isinstance(found, Solution) and not found.fit.plane_known and len(found.fit.problem.config.prior.free)
-        return single if assumed else append_reason(found, single)
+        return single if assumed else append_reason(found, single, asks_less=True)
     if isinstance(found, Reason) or found.plane_refusal or found.rests_on_told_focal:
         return single
     difference_deg = unsigned_angle_deg(found.plane.normal(found.fit.state), single.plane.normal(single.fit.state))

@@ -32,6 +32,7 @@ class RefusalCode:
     limit: str
     """The option or constant that decides, with its value."""
     remedy: str
+    """What helps; alternatives are separated by '; or '. A test tries each one on simulated traffic that is refused."""
     missing: str
     """The name of the requirement that was not met, for tables."""
     message: str
@@ -46,7 +47,13 @@ def reason(code: str, cause: str = '', **values: object) -> Reason:
     return Reason(code, message.format(**plain), (remedy or entry.remedy).format(**plain), plain)
 
 
+OR = '; or '
+"""Separates the alternatives of a remedy, each of which helps by itself."""
 WAIT = 'wait for more traffic, or record for longer'
+WAIT_STRAIGHT = 'wait for vehicles that drive straight'
+STRAIGHT_ROAD = 'turn the camera towards a straight road'
+TELL_LENS = 'give the focal length or field of view of the lens, as its data sheet says (--focal-px, --hfov-deg)'
+SECOND_ROAD = 'wait for traffic on a second road, or for vehicles that turn'
 
 REFUSALS = (
     RefusalCode(
@@ -99,10 +106,20 @@ REFUSALS = (
         message='{tracks} tracks after {seconds:.0f} s (at least {limit} needed)',
         variants={
             'short': ('{tracks} tracks are long enough (at least {limit} needed)', ''),
+            'curved': (
+                '{tracks} of {all} tracks are nearly straight (at least {limit} needed): the traffic turns, or the '
+                'road bends',
+                WAIT_STRAIGHT + OR + STRAIGHT_ROAD,
+            ),
+            'far': (
+                'vehicles are followed over short ways only, as far away: {tracks} of {all} tracks are long enough (at '
+                'least {limit} needed)',
+                'turn the camera towards a nearer part of the road' + OR + 'use a longer lens',
+            ),
             'paper': (
                 'no track lasted for {lifetime:.0%} of an interval of {window_s:g} s with a path of at most '
                 '{path_ratio:g} times its displacement',
-                'record slower traffic, shorten paper.window_s, or use method joint',
+                'shorten paper.window_s' + OR + 'use method joint',
             ),
         },
     ),
@@ -110,7 +127,7 @@ REFUSALS = (
         code='poor_coverage',
         cause='Traffic crosses too small a part of the image.',
         limit='gate.min_coverage, 15 % of the image cells',
-        remedy='turn the camera so that the road fills more of the image, or use a longer lens',
+        remedy='turn the camera so that the road fills more of the image' + OR + 'use a longer lens',
         missing='traffic in enough of the image',
         message='traffic crossed {coverage:.0%} of the image (at least {limit:.0%} needed)',
     ),
@@ -118,7 +135,7 @@ REFUSALS = (
         code='no_direction',
         cause='No road direction found: the straight tracks have no common vanishing point.',
         limit='no fixed limit: the consensus search must return a direction',
-        remedy='wait for straight traffic, or turn the camera towards a straight road',
+        remedy=WAIT_STRAIGHT + OR + STRAIGHT_ROAD,
         missing='tracks along a common direction',
         message='{tracks} tracks have no common vanishing point',
     ),
@@ -127,8 +144,7 @@ REFUSALS = (
         cause='The focal length is not identifiable: the best candidate explains hardly more straight traffic than '
         'the median candidate.',
         limit='support at the best focal length at least 1.3 times the median (MIN_FOCAL_CONTRAST)',
-        remedy='wait for straight traffic, above all near the borders of the image; the traffic may be turning, or the '
-        'lens may have no distortion: then set joint.road_angle or joint.focal_prior_px',
+        remedy=WAIT_STRAIGHT + OR + TELL_LENS,
         missing='an identifiable focal length',
         message='focal length not identifiable: support of straight traffic at the best candidate is {contrast:.2f} '
         'times the median (at least {limit:g} needed)',
@@ -138,7 +154,7 @@ REFUSALS = (
         cause='Too few vehicles follow the straight roads that were found: the traffic turns, or the road bends.',
         limit='at least 25 % of the vehicles on two or more roads, 75 % on a single road (50 % if at least 80 % of '
         'those keep to it)',
-        remedy='wait for straight traffic, or turn the camera towards a straight road',
+        remedy=WAIT_STRAIGHT + OR + STRAIGHT_ROAD,
         missing='straight traffic',
         message='{fraction:.0%} of the vehicles follow the {roads} straight roads that fit best (at least {limit:.0%} '
         'needed): the traffic turns, or the road bends',
@@ -154,7 +170,7 @@ REFUSALS = (
         code='horizon',
         cause='Tracked points lie above the horizon of the estimated plane, so the tracks do not belong to one plane.',
         limit='at least 95 % of the tracked points below the horizon',
-        remedy=WAIT,
+        remedy=WAIT_STRAIGHT + OR + STRAIGHT_ROAD,
         missing='traffic below the horizon',
         message='{fraction:.0%} of the tracked points lie above the horizon of the estimated plane (limit {limit:.0%})',
     ),
@@ -163,8 +179,7 @@ REFUSALS = (
         cause='The focal length is uncertain: straight traffic shows too little lens curvature.',
         limit='gate.max_sigma_focal_rel, 25 % (one sigma); or a focal length above 1.5 image diagonals; or a '
         'distortion-free lens without a known road angle or focal length',
-        remedy='wait for traffic nearer the borders of the image; a lens without distortion needs the angle between '
-        'two roads (joint.road_angle) or its focal length (joint.focal_prior_px)',
+        remedy=TELL_LENS,
         missing='lens curvature',
         message='straight traffic shows too little lens curvature: focal length {focal_px:.0f} px +- {sigma:.1%} '
         '(at most {limit:.0%} allowed)',
@@ -173,7 +188,7 @@ REFUSALS = (
         code='too_little_turning',
         cause='The focal length is uncertain: too few vehicles turn, or they turn too little.',
         limit='gate.max_sigma_focal_rel (25 % of the focal length, one sigma)',
-        remedy='wait for more turning vehicles, or for straight traffic',
+        remedy='wait for more vehicles that turn' + OR + TELL_LENS,
         missing='turning traffic',
         message='turning traffic does not determine the lens: focal length {focal_px:.0f} px +- {sigma:.1%} '
         '(at most {limit:.0%} allowed)',
@@ -182,7 +197,7 @@ REFUSALS = (
         code='lens_model',
         cause='The estimated distortion k1 is too far from the assumed lens family.',
         limit='3.5 times joint.k1_sigma (0.03)',
-        remedy='increase joint.k1_sigma if the lens is known to differ',
+        remedy=WAIT + OR + TELL_LENS + OR + 'increase joint.k1_sigma if the lens is known to differ',
         missing='a lens near its family',
         message='the lens is not close to {family}: k1 = {k1:.3f}, {sigmas:.1f} sigma off (limit {limit:g})',
     ),
@@ -191,7 +206,7 @@ REFUSALS = (
         cause='Cross-validation in time failed: the earlier and the later half of the traffic give different results.',
         limit='3 % in focal length and 1.5 degrees in the ground normal, or 3.5 sigma if that is larger; 0.3 % by '
         'chance for focal length and rotation together; and 4 sigma for the share of vehicles on the roads',
-        remedy='record for longer, and check that the camera is firmly fixed',
+        remedy='fix the camera firmly, and record again' + OR + 'record for longer',
         missing='agreement of both halves of the traffic',
         message='the earlier and the later half of the traffic disagree: focal length by {focal:.1%} (limit '
         '{focal_limit:.1%}), ground normal by {normal_deg:.1f} degrees (limit {normal_limit_deg:.1f})',
@@ -214,7 +229,7 @@ REFUSALS = (
         'outside them.',
         limit='3 % of the focal length, or of the image width for the principal point, or 3 sigma if that is larger',
         remedy='give the camera_info file of this camera in this resolution, mode and zoom, and check that K belongs '
-        'to the size in the file; or leave the file out',
+        'to the size in the file' + OR + 'leave the file out',
         missing='a lens that belongs to the images',
         message='the traffic contradicts the given lens: its focal length is {given_px:.1f} px, the traffic gives '
         '{traffic_px:.1f} +- {sigma_px:.1f} px',
@@ -247,8 +262,7 @@ REFUSALS = (
         'squeeze.',
         limit='gate.max_sigma_focal_rel, 25 % (one sigma), with the difference that the pixel aspect makes',
         remedy='set lens.pixel_aspect, the width of a pixel over its height: 1 if the images are not squeezed, else '
-        'the shape of the picture over that of the image (720x576 of a 16:9 picture: 1.422); or wait for traffic '
-        'nearer the borders of the image',
+        'the shape of the picture over that of the image (720x576 of a 16:9 picture: 1.422)',
         missing='the shape of the pixels',
         message='pixels may be {aspect:.3g} times as wide as high: the traffic measures {measured:.2f} +- '
         '{sigma:.2f}, and the focal length is +- {focal:.0%} with it (at most {limit:.0%} allowed)',
@@ -265,7 +279,7 @@ REFUSALS = (
         cause='No ground plane: a single road direction leaves the rotation about that road free. Method paper: the '
         'orientation histogram has fewer than two peaks.',
         limit='gate.min_tracks_per_road, 10 tracks on each of two roads',
-        remedy='wait for traffic across the main road, or for turning vehicles; or set joint.roll_prior_deg',
+        remedy=SECOND_ROAD + OR + 'set joint.roll_prior_deg if the camera is level',
         missing='traffic in two directions, or that turns',
         message='too little traffic across the main road: {across} of {limit} tracks; {along} tracks follow one road, '
         'and the rotation about it is free',
@@ -292,7 +306,7 @@ REFUSALS = (
         'result as its candidate.',
         limit='gate.least_grade: fair (10 %) for what the node publishes, coarse (25 %) for a recording; one standard '
         'deviation of a length on the road 20 m ahead, along or across the view',
-        remedy='give one more number, {helpful}; or ' + WAIT,
+        remedy='{helpful}',
         missing='certainty of lengths on the road',
         message='the result is of grade {grade}, at least {least} is asked for: lengths on the road along the view '
         '+- {along:.0%}, across it +- {across:.0%}',
@@ -318,11 +332,13 @@ REFUSALS = (
         variants={
             'level_road': (
                 'the road runs level across the image, where the roll of the camera does not determine the plane',
-                'wait for traffic across the road, or for turning vehicles',
+                SECOND_ROAD,
             ),
             'edges_and_level': (
                 'edges of vehicles and a level camera disagree by {difference_deg:.1f} degrees about the road',
-                'set joint.roll_prior_deg to 0 to trust the edges, or to the largest roll that the camera may have',
+                'set joint.roll_prior_deg to 0 to trust the edges'
+                + OR
+                + 'set it to the largest roll that the camera may have',
             ),
             'lane_changes': (
                 'two estimates of the plane differ by {difference_deg:.1f} degrees (limit {limit_deg:.1f}): '
@@ -403,15 +419,18 @@ REFUSALS = (
         code='no_height',
         cause='No ground plane: the scale is unknown, because no camera height was given.',
         limit='camera_height above 0',
-        remedy='give camera_height in metres, or a distance on the road or the mean traffic speed (scale_from), or set '
-        'allow_unit_scale for a plane in units of the height',
+        remedy='give camera_height in metres'
+        + OR
+        + 'give a distance on the road or the mean traffic speed (scale_from)'
+        + OR
+        + 'set allow_unit_scale for a plane in units of the height',
         missing='a scale',
         message='the ground plane needs the height of the camera above the road, which was not given',
         variants={
             'no_dashes': (
                 'the ground plane needs a scale: lane width or dash period are given, but not enough dashes of lane '
                 'lines are seen',
-                'give camera_height in metres, or a distance on the road (scale.distances)',
+                'give camera_height in metres' + OR + 'give a distance on the road (scale.distances)',
             ),
         },
     ),
@@ -460,8 +479,7 @@ REFUSALS = (
         code='scale_uncertain',
         cause='The camera height that follows from the given scale is too uncertain.',
         limit='gate.max_sigma_height_rel, 50 % (one sigma)',
-        remedy='give a longer distance on the road nearer to the camera, wait for more traffic, or give the camera '
-        'height',
+        remedy='give a longer distance on the road nearer to the camera' + OR + 'give the camera height',
         missing='a certain scale',
         message='camera height {height_m:.2f} m +- {sigma:.0%} (at most {limit:.0%} allowed)',
     ),

@@ -49,7 +49,7 @@ def jackknife_covariance(
     np.add.at(matrices, inverse, weight[:, None, None] * curvatures)
     information = matrices.sum(axis=0) + np.diag(prior)
     values, vectors = np.linalg.eigh(information)
-    if values[0] < MIN_EIGENVALUE_RATIO * values[-1]:
+    if not values[0] > MIN_EIGENVALUE_RATIO * values[-1]:  # all of them are zero where no track has weight
         return np.full((size, size), np.inf)
     # Hessian of the redescending loss in whitened parameters, where the information is the identity
     whiten = vectors / np.sqrt(values)

@@ -77,6 +77,10 @@ def test_undetermined_parameters_get_an_infinite_variance() -> None:
     assert np.isinf(plain(slopes, np.ones(20), np.arange(20), np.zeros(2))).all()
 
 
+def test_no_information_at_all_gives_an_infinite_variance() -> None:
+    assert np.isinf(plain(np.zeros((20, 2)), np.zeros(20), np.arange(20), np.zeros(2))).all()
+
+
 def test_one_vehicle_gives_an_infinite_variance() -> None:
     assert np.isinf(plain(np.ones((5, 1)), np.zeros(5), np.zeros(5, int), np.zeros(1))).all()
 
