@@ -39,7 +39,9 @@ def run(arguments: argparse.Namespace) -> int:
     outputs.prepare_output_dir(arguments.out, bag)
     try:
         truth = simulate_bag(bag, arguments.seed)
-        replayed = replay_and_report([open_source(bag)], options_from_truth(truth, arguments.scale_from), arguments.out)
+        replayed = replay_and_report(
+            [open_source(bag)], options_from_truth(truth, arguments.scale_from), arguments.out, truth=truth
+        )
     finally:
         if not arguments.keep_bag:
             shutil.rmtree(bag, ignore_errors=True)

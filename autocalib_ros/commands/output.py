@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from autocalib_ros.commands.interruption import StopRequest
 from autocalib_ros.commands.map_output import place_result, placement_lines, write_map
@@ -39,11 +39,13 @@ def replay_and_report(
     before: Evidence | None = None,
     named_after: Sequence[Source] | None = None,
     points: ControlPoints | None = None,
+    truth: Mapping[str, Any] | None = None,
 ) -> ReplayResult:
     """Replay recordings of one camera, write the output files and print the result.
 
     `stop` is the request that live streams among the sources ask; `before` is evidence of an earlier run, then the
-    results are named after all its sources, `named_after`. Control `points` give the place in the map.
+    results are named after all its sources, `named_after`. Control `points` give the place in the map. With
+    the `truth` of a simulation the report compares the result with it.
     """
     from autocalib_ros.offline.outputs import EvidenceFile, write_outputs
     from autocalib_ros.offline.replay_recording import replay
@@ -82,7 +84,7 @@ def replay_and_report(
         print_stderr(f'{replayed.repeated} of {replayed.frames} images repeat an earlier one and are left out.')
     if not quiet and not replayed.evidence.picture.fills_image:
         print_stderr(replayed.evidence.picture.description)
-    names = write_outputs(out, replayed, named_after or sources, file)
+    names = write_outputs(out, replayed, named_after or sources, file, truth)
     print_result(replayed, out, names, quiet=quiet, json=json, points=points)
     return replayed
 
@@ -125,6 +127,7 @@ def print_result(
     """Print a refusal on stderr, and the summary or calibration.json on stdout; place it in the map of `points`."""
     from autocalib_ros.offline.terminal.style import coloured, is_terminal, state_colour, terminal_width
     from autocalib_ros.offline.terminal.summary import summary_lines
+    from autocalib_ros.report.next_command import next_command
     from autocalib_ros.report.text import remedy, verdict
     from autocalib_ros.results.calibration_json import calibration_json
 
@@ -143,6 +146,9 @@ def print_result(
         if result:
             print(coloured(verdict(result), state_colour(result), sys.stdout))
         print('\n'.join(summary_lines(result, replayed.accepted_at_s, columns, replayed.moves)))
+        command = next_command(result, replayed.options, out) if out is not None and names else ''
+        if command:
+            print(f'  to try next: {command}')
     if placement is not None and points is not None:
         print('\n'.join(placement_lines(placement, points)), file=sys.stderr if json else sys.stdout)
     if names:

@@ -135,7 +135,8 @@ def append_reason(found: Solution | Reason, further: Reason, *, asks_less: bool 
 
 
 def _joined(first: Reason, further: Reason, asks_less: bool) -> Reason:
-    values = {**first.values, 'further': further.code}
+    numbers = {f'further_{name}': value for name, value in further.values.items()}
+    values = {**first.values, **numbers, 'further': further.code}
     remedy = first.remedy
     if asks_less:
         told = TELL_LENS in first.remedy and further.code != 'too_few_vehicles'

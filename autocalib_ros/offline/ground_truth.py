@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -10,9 +11,11 @@ import numpy as np
 
 from autocalib_ros.comparison import compare_calibrations
 from autocalib_ros.errors import InputError
-from autocalib_ros.geometry.ground_plane import GroundPlane
+from autocalib_ros.geometry.ground_plane import GroundPlane, tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.pictures.views import image_to_ground
+from autocalib_ros.report.scene import KnownTruth
+from autocalib_ros.results.calibration import Calibration
 from autocalib_ros.results.saved_camera import SavedCamera
 from autocalib_ros.util.documents import read_json
 from autocalib_ros.util.input_limits import MAX_METADATA_BYTES
@@ -61,7 +64,7 @@ SUPPORTED_LENS_MODELS = ('equidistant', 'kannala_brandt')
 """Lens models of a truth.json that can be read; both are the Kannala-Brandt model of `Camera`."""
 
 
-def true_camera(truth: dict[str, Any]) -> SavedCamera:
+def true_camera(truth: Mapping[str, Any]) -> SavedCamera:
     """Return the lens and pose of a truth.json, or raise InputError if it has none."""
     try:
         lens, pose = truth['lens'], truth['camera']
@@ -106,3 +109,39 @@ def errors_against_truth(known: SavedCamera, truth: dict[str, Any]) -> dict[str,
         if ground is not None and ground.metric
         else None,
     }
+
+
+def beside_truth(found: Calibration, truth: Mapping[str, Any]) -> tuple[KnownTruth, ...]:
+    """Return the numbers of a calibration beside the truth of a simulation, and the errors in sigmas."""
+    true, sigma = true_camera(truth), found.stddev
+    lens = cast(Camera, true.lens)
+    right, down = sigma.principal_point_px or (None, None)
+    rows = [
+        _beside('focal length', found.camera.focal_px, lens.focal_px, sigma.focal_px, 1, 'px'),
+        _beside('principal point x', found.camera.principal_point_px[0], lens.principal_point_px[0], right, 1, 'px'),
+        _beside('principal point y', found.camera.principal_point_px[1], lens.principal_point_px[1], down, 1, 'px'),
+        _beside('k1', found.camera.k[0], lens.k[0], sigma.k1, 4, ''),
+    ]
+    if found.ground is not None and true.ground is not None:
+        angles = zip(
+            ('tilt', 'roll'),
+            tilt_and_roll_deg(found.ground.normal_in_camera).tolist(),
+            tilt_and_roll_deg(true.ground.normal_in_camera).tolist(),
+            (sigma.tilt_deg, sigma.roll_deg),
+            strict=True,
+        )
+        rows += [_beside(name, here, there, deviation, 2, 'degrees') for name, here, there, deviation in angles]
+        if found.ground.metric:
+            rows.append(_beside('camera height', found.ground.height_m, true.ground.height_m, sigma.height_m, 2, 'm'))
+    return tuple(rows)
+
+
+def _beside(name: str, found: float, true: float, sigma: float | None, digits: int, unit: str) -> KnownTruth:
+    spread = f' ± {sigma:.{digits}f}' if sigma else ''
+    return KnownTruth(
+        name=name,
+        found=f'{found:.{digits}f}{spread} {unit}'.strip(),
+        true=f'{true:.{digits}f} {unit}'.strip(),
+        error=f'{found - true:+.{digits}f} {unit}'.strip(),
+        sigmas=abs(found - true) / sigma if sigma else None,
+    )

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from autocalib_ros.errors import AutocalibError, InputError, UsageError
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.lens.camera_info_yaml import write_camera_info_yaml
+from autocalib_ros.offline.ground_truth import beside_truth
 from autocalib_ros.offline.recordings.sources import Source, camera_name
 from autocalib_ros.offline.replay_recording import ReplayResult
 from autocalib_ros.report.scene import ReportScene
@@ -76,13 +78,18 @@ def write_outputs(
     replayed: ReplayResult,
     sources: Source | Sequence[Source],
     evidence_file: EvidenceFile | None = None,
+    truth: Mapping[str, Any] | None = None,
 ) -> list[str]:
-    """Write the result files and the evidence of a replay; return the names of the files."""
+    """Write the result files and the evidence of a replay; return the names of the files.
+
+    The report compares the result with the `truth` of a simulation, if it is given.
+    """
     listed = list(sources) if isinstance(sources, Sequence) else [sources]
     first, more = listed[0], len(listed) - 1
     file = evidence_file or EvidenceFile(out_dir)
     file.write(replayed.evidence)
-    names = write_result(out_dir, replayed, f'{first.name} and {more} more' if more else first.name, camera_name(first))
+    name = f'{first.name} and {more} more' if more else first.name
+    names = write_result(out_dir, replayed, name, camera_name(first), truth)
     if replayed.result:
         file.drop_backup()
     return [*names, EVIDENCE]
@@ -117,7 +124,13 @@ def _keep_accepted(out_dir: Path) -> None:
     )
 
 
-def write_result(out_dir: Path, replayed: ReplayResult, source_name: str, name_of_camera: str = 'camera') -> list[str]:
+def write_result(
+    out_dir: Path,
+    replayed: ReplayResult,
+    source_name: str,
+    name_of_camera: str = 'camera',
+    truth: Mapping[str, Any] | None = None,
+) -> list[str]:
     """Write the result files and remove stale ones of an earlier run; return the names of the files.
 
     A refusal does not replace an earlier calibration that was accepted: its files are kept as .bak.
@@ -145,6 +158,8 @@ def write_result(out_dir: Path, replayed: ReplayResult, source_name: str, name_o
             accepted_at_s=replayed.accepted_at_s,
             moments=replayed.moments,
             moves=replayed.moves,
+            truth=() if truth is None or result.candidate is None else beside_truth(result.candidate, truth),
+            folder=out_dir if (out_dir / EVIDENCE).exists() else None,
         ),
     )
     return ([CAMERA_INFO] if result else []) + [CALIBRATION, REPORT]

@@ -96,6 +96,11 @@ def _draw_direction(axes: Axes, camera: Camera, direction: np.ndarray, index: in
         if np.linalg.norm(normal) > 0.05:
             lines += project_great_circle(camera, normal)
     plot_paths(axes, lines, road_colour(index), f'lines along road {index + 1}', width=0.7, alpha=0.6)
+    draw_vanishing_points(axes, camera, direction, index)
+
+
+def draw_vanishing_points(axes: Axes, camera: Camera, direction: np.ndarray, index: int) -> None:
+    """Mark both vanishing points of road `index` with a direction (3,), in or near the image."""
     ends, valid = camera.project(np.array([direction, -np.asarray(direction)]))
     size = np.array([camera.width, camera.height])
     ends = ends[valid & (np.abs(ends / size - 0.5) < 0.5 + MARGIN).all(axis=1)]

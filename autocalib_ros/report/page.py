@@ -20,29 +20,33 @@ from autocalib_ros.report import (
     residual_figures,
     road_figures,
     settling_figures,
+    sketch_figures,
     speed_figures,
     traffic_figures,
 )
 from autocalib_ros.report.canvas import STYLE, jpeg, png, render_bgr
+from autocalib_ros.report.next_command import next_command
+from autocalib_ros.report.requirements import needs
 from autocalib_ros.report.ruler import ruler_data
 from autocalib_ros.report.scene import ReportScene
 from autocalib_ros.report.text import (
     contradictions,
     file_rows,
+    headline,
     history_rows,
     how_sure,
+    measured,
     move_rows,
-    needs,
     next_step,
     number_rows,
-    verdict,
 )
 from autocalib_ros.results.calibration import Calibration, Refusal
 from autocalib_ros.util.files import NOT_FOR_OTHERS, write_atomically, write_picture_bytes
 
 JPEG_SAVES = 1.5
 """Least saving in size for which a figure is embedded as JPEG: diagrams are sharper as PNG and hardly larger."""
-CHAPTERS = ROAD, TRAFFIC, LENS, DIRECTIONS, TIME = (
+CHAPTERS = FOUND, ROAD, TRAFFIC, LENS, DIRECTIONS, TIME = (
+    'What was found so far',
     'Ground plane',
     'Traffic',
     'Lens',
@@ -66,6 +70,15 @@ class _Entry:
 
 
 ENTRIES = (
+    _Entry(
+        'roads_so_far',
+        FOUND,
+        'Roads so far',
+        'Trajectories coloured by the straight road that they follow, and where these roads vanish. A sketch, which is'
+        ' not used.',
+        sketch_figures.roads_so_far,
+        more=sketch_figures.sketch_note,
+    ),
     _Entry(
         'ground_grid',
         ROAD,
@@ -196,6 +209,15 @@ ENTRIES = (
         direction_figures.directions,
     ),
     _Entry(
+        'still_lines',
+        DIRECTIONS,
+        'Lines of the scene',
+        'Lines of the background, coloured by the direction of the road along which the result sees them: lane'
+        ' markings and kerbs along it, stop lines across it, posts upright.',
+        sketch_figures.still_lines,
+        more=sketch_figures.still_lines_note,
+    ),
+    _Entry(
         'settling',
         TIME,
         'Focal length and tilt over time',
@@ -271,13 +293,16 @@ def _page(scene: ReportScene, drawn: list[_Drawn]) -> str:
     result, found = scene.result, scene.calibration
     chapters = [(chapter, [one for one in drawn if one.entry.chapter == chapter]) for chapter in CHAPTERS]
     return template.render(
-        verdict=verdict(result),
+        verdict=headline(result),
+        measured=measured(result),
         state=_state(result),
         source=scene.source,
         version=__version__,
         how_sure=how_sure(result),
         contradictions=contradictions(result),
         next_step=next_step(result),
+        command=next_command(result, scene.options, scene.folder),
+        truth=scene.truth,
         code=_code(result),
         needs=needs(result, scene.evidence, scene.options.gate),
         rows=[

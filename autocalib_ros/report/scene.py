@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from autocalib_ros.config import Options
+from autocalib_ros.estimation.road_sketch import RoadSketch, sketch_roads
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.ground_plane import GroundPlane, tilt_and_roll_deg
 from autocalib_ros.results.calibration import Calibration, Refusal
@@ -53,6 +55,18 @@ def append_snapshot(
 
 
 @dataclass(frozen=True, kw_only=True)
+class KnownTruth:
+    """A number of the result beside its true value, as text."""
+
+    name: str
+    found: str
+    true: str
+    error: str
+    sigmas: float | None
+    """Error in standard deviations; None for a number that has none."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class ReportScene:
     """Result with the data that its figures need."""
 
@@ -70,6 +84,15 @@ class ReportScene:
     history: tuple[dict[str, Any], ...] = ()
     """Versions that a live node accepted, `history.version_entry`, oldest first."""
     moments: tuple[SolutionSnapshot, ...] = ()
+    truth: tuple[KnownTruth, ...] = ()
+    """The result beside the truth, where a simulation knows it."""
+    folder: Path | None = None
+    """Folder with `evidence.npz` of the result; None if it is not saved."""
+
+    @cached_property
+    def sketch(self) -> RoadSketch | None:
+        """Roads through an assumed lens, where nothing was found; None with a calibration or without roads."""
+        return None if self.calibration is not None else sketch_roads(self.evidence, self.options)
 
     @property
     def calibration(self) -> Calibration | None:

@@ -8,15 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from autocalib_ros.config import GateOptions
 from autocalib_ros.evidence.snapshot import Evidence
-from autocalib_ros.evidence.stillness import drift_limit_px
 from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera, field_of_view_deg
 from autocalib_ros.results.calibration import GROUND_DISTANCES_M, Calibration, Refusal
 from autocalib_ros.results.camera_move import CameraMove
 from autocalib_ros.results.history import describe_version
-from autocalib_ros.results.refusals import BY_CODE
+from autocalib_ros.results.road_words import in_road_words
 from autocalib_ros.results.statements import SCALE_KINDS
 
 MAX_ROWS = 12
@@ -34,9 +32,25 @@ class TableRow:
 
 
 def verdict(result: Calibration | Refusal) -> str:
-    """Return the result in one sentence with uncertainties, or the reason why something is missing."""
+    """Return the result in words with uncertainties, or the reason why something is missing, with its numbers."""
+    told = [headline(result)]
+    return ' '.join([*told, _measured(result)] if isinstance(result, Refusal) and _measured(result) else told)
+
+
+def _measured(result: Refusal) -> str:
+    """Return the numbers of a refusal whose headline has none; '' if the headline is its message."""
+    return f'{_sentence(_capital(result.message))}' if in_road_words(result.code, result.values) else ''
+
+
+def measured(result: Calibration | Refusal) -> str:
+    """Return the numbers behind the headline of a refusal, '' without."""
+    return _measured(result) if isinstance(result, Refusal) else ''
+
+
+def headline(result: Calibration | Refusal) -> str:
+    """Return the result in one sentence with uncertainties, or what a refusal means at the road."""
     if isinstance(result, Refusal):
-        return f'Not calibrated: {_sentence(result.message)}'
+        return f'Not calibrated: {_sentence(in_road_words(result.code, result.values) or result.message)}'
     focal = f'focal length {_with_sigma(result.camera.focal_px, result.stddev.focal_px, 1)} px'
     if result.ground is None:
         why = '' if result.ground_refusal is None else ' ' + _sentence(_capital(result.ground_refusal.message))
@@ -76,6 +90,11 @@ def _capital(text: str) -> str:
 
 def _with_sigma(value: float, sigma: float | None, digits: int) -> str:
     return f'{value:.{digits}f}' if sigma is None else f'{value:.{digits}f} ± {sigma:.{digits}f}'
+
+
+def sentence(text: str) -> str:
+    """Return a text as a sentence: with a capital and a full stop."""
+    return _sentence(_capital(text))
 
 
 def _sentence(text: str) -> str:
@@ -290,62 +309,3 @@ def next_step(result: Calibration | Refusal) -> str:
     if result.grade != 'full':
         return f'{check}; the ground plane depends on an assumption until crossing or turning traffic is observed.'
     return f'{check} and that the speeds are plausible for this road; then use the files.'
-
-
-@dataclass(frozen=True)
-class ReportRequirement:
-    """Requirement of a calibration with the value found, the value needed and whether it is met."""
-
-    name: str
-    found: str
-    needed: str
-    met: bool
-
-
-def needs(result: Calibration | Refusal, evidence: Evidence, gate: GateOptions) -> list[ReportRequirement]:
-    """Return the requirements with the one that was not met; empty if the calibration is complete."""
-    refusal = result if isinstance(result, Refusal) else result.ground_refusal
-    if refusal is None:
-        return []
-    limit = drift_limit_px(evidence.image_size[0], gate)
-    counted = (
-        (
-            ('camera_moving',),
-            ReportRequirement(
-                'stationary camera',
-                f'background motion {evidence.drift_px:.1f} px',
-                f'at most {limit:.1f} px',
-                refusal.code != 'camera_moving' and evidence.drift_px <= limit,
-            ),
-        ),
-        (
-            ('no_motion', 'too_few_tracks'),
-            ReportRequirement(
-                'tracks of moving traffic',
-                f'{evidence.track_count}',
-                f'at least {gate.min_tracks}',
-                evidence.track_count >= gate.min_tracks,
-            ),
-        ),
-        (
-            ('poor_coverage',),
-            ReportRequirement(
-                'image coverage',
-                f'{100 * evidence.coverage:.0f} %',
-                f'at least {100 * gate.min_coverage:.0f} %',
-                evidence.coverage >= gate.min_coverage,
-            ),
-        ),
-    )
-    rows = [need for _, need in counted]
-    if any(refusal.code in codes and not need.met for codes, need in counted):
-        return rows
-    return [
-        *rows,
-        ReportRequirement(
-            BY_CODE[refusal.code].missing if refusal.code in BY_CODE else refusal.code.replace('_', ' '),
-            _sentence(_capital(refusal.message)),
-            '',
-            False,
-        ),
-    ]

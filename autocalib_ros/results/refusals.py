@@ -20,7 +20,8 @@ class Reason:
     message: str
     remedy: str
     values: Mapping[str, Value] = field(default_factory=dict, compare=False)
-    """The numbers of the message and the limit that they missed, by the names in the table."""
+    """The numbers of the message and the limit that they missed, by the names in the table, and the `cause` if the
+    code has several; `further` is the code of a strategy that failed too, and `further_NAME` its numbers."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +45,8 @@ def reason(code: str, cause: str = '', **values: object) -> Reason:
     """Return the refusal of a code with its numbers; `cause` names one of its variants."""
     entry, plain = BY_CODE[code], plain_values(values)
     message, remedy = entry.variants[cause] if cause else (entry.message, '')
-    return Reason(code, message.format(**plain), (remedy or entry.remedy).format(**plain), plain)
+    told = {**plain, 'cause': cause} if cause else plain
+    return Reason(code, message.format(**plain), (remedy or entry.remedy).format(**plain), told)
 
 
 OR = '; or '

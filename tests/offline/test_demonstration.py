@@ -11,7 +11,7 @@ from autocalib_ros.config import Options
 from autocalib_ros.errors import InputError
 from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.offline.demonstration import compare_with_truth, options_from_truth
-from autocalib_ros.offline.ground_truth import read_truth
+from autocalib_ros.offline.ground_truth import beside_truth, read_truth
 from autocalib_ros.pictures.views import ground_to_image
 
 
@@ -89,3 +89,17 @@ def test_a_truth_that_cannot_be_read_is_one_line(tmp_path, text):
         path.write_text(text)
     with pytest.raises(InputError, match=r'truth\.json'):
         read_truth(path)
+
+
+def test_the_report_sets_the_result_beside_the_truth(full):
+    camera, ground = full.result.camera, full.result.ground
+    truth = {
+        'width': camera.width,
+        'height': camera.height,
+        'lens': {'model': 'kannala_brandt', 'f': 137.0, 'cx': 0.0, 'cy': 0.0, 'k': [0.0, 0.0, 0.0, 0.0]},
+        'camera': {'R_world_from_camera': ground.rotation.tolist(), 'height': 8.0},
+    }
+    rows = {row.name: row for row in beside_truth(full.result, truth)}
+    assert rows['focal length'].true == '137.0 px' and rows['focal length'].error == '+3.0 px'
+    assert rows['focal length'].sigmas == pytest.approx(3.0 / full.result.stddev.focal_px)
+    assert rows['tilt'].sigmas == pytest.approx(0.0, abs=1e-6) and rows['camera height'].error == '+0.00 m'
