@@ -603,7 +603,8 @@ def _inverse(pose: ViewPose) -> ViewPose:
 
 
 def _correlation(one: np.ndarray, other: np.ndarray) -> float:
-    """Return the correlation of two normalised images (H, W) in small."""
-    small = [cv2.resize(image, COMPARED_SIZE, interpolation=cv2.INTER_AREA).ravel() for image in (one, other)]
-    correlation = float(np.corrcoef(np.array(small, float))[0, 1])
-    return correlation if math.isfinite(correlation) else 0.0
+    """Return the correlation of two normalised images (H, W) in small; 0 where one shows nothing, as a black one."""
+    small = [cv2.resize(image, COMPARED_SIZE, interpolation=cv2.INTER_AREA).astype(float) for image in (one, other)]
+    first, second = (image - image.mean() for image in small)
+    norm = math.sqrt(float((first**2).sum() * (second**2).sum()))
+    return float((first * second).sum()) / norm if norm > 0 else 0.0

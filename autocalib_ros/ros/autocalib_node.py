@@ -5,7 +5,6 @@ from __future__ import annotations
 import concurrent.futures
 import contextlib
 import time
-import traceback
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -42,20 +41,18 @@ from autocalib_ros.ros.headers import DEFAULT_FRAME, Headers
 from autocalib_ros.ros.image_input import ImageInput
 from autocalib_ros.ros.live_parameters import LiveParameters
 from autocalib_ros.ros.live_pictures import LivePictures
-from autocalib_ros.ros.log_text import describe, describe_progress
-from autocalib_ros.ros.log_throttle import LogThrottle
+from autocalib_ros.ros.log_text import describe, describe_briefly, describe_progress
+from autocalib_ros.ros.node_log import NodeLog
 from autocalib_ros.ros.publication import CalibrationPublisher, Published
 from autocalib_ros.ros.report_writer import ReportPaths, ReportWriter
 from autocalib_ros.ros.status import Counts, RateCounter, Situation
 from autocalib_ros.ros.store_writer import StoreWriter
-from autocalib_ros.ros.view_events import ViewEvents
+from autocalib_ros.ros.view_events import ViewEvents, clock_text
 from autocalib_ros.ros.worker import CalibrationWorker, Result, Solve
 from autocalib_ros.solver_process import SolverProcess
 
 PROGRESS_LOG_PERIOD_S = 10.0
 """Real seconds between two looks at the progress for the log."""
-PROGRESS_STEP = 10.0
-"""Change of the progress in percent that is worth a line."""
 VIEWS_PERIOD_S = 5.0
 """Real seconds between two looks for views to be stored; they change at each calibration, and with the light."""
 SHUTDOWN_S = 4.0
@@ -80,8 +77,7 @@ class AutocalibNode(Node):
             lambda: self.get_clock().now().nanoseconds,
         )
         # state of the log and of /diagnostics
-        self._throttle = LogThrottle()
-        self._told_percent = 0.0
+        self._told = NodeLog(self.get_logger())
         self._unreadable = self._withdrawn = ''
         self._rate_counter = RateCounter()
         # destinations of an accepted calibration: disk, report, driver
@@ -89,8 +85,8 @@ class AutocalibNode(Node):
         self.store_writer = StoreWriter(
             lambda fault: self.get_logger().error(f'the calibration was not saved: {fault}')
         )
-        self._reports = ReportWriter(lambda text, good: self._log(text, good=good))
-        self._upload = DriverUpload(self, self._log) if self.node_options.upload_to_driver else None
+        self._reports = ReportWriter(lambda text, good: self._told.tell(text, good=good))
+        self._upload = DriverUpload(self, self._told.tell) if self.node_options.upload_to_driver else None
         self._events = ViewEvents()
         self._set_aside: tuple[Published, tuple[KnownView, ...]] | None = None
         """Calibration that was withdrawn for another image size, with its views."""
@@ -217,14 +213,16 @@ class AutocalibNode(Node):
         self._worker.offer(self._headers.stamp_ns(message.header.stamp), message)
         foreign = self.publication.on_image(message, frame_id)
         if foreign is not None and self.publication.published is None:
-            self.get_logger().warning(
+            self._told.tell_event(
+                'frame',
                 f"restored calibration withdrawn: its frame is '{foreign.image_frame}', that of the images "
-                f"'{frame_id}'; still collecting evidence"
+                f"'{frame_id}'; still collecting evidence",
             )
         elif foreign is not None:
-            self.get_logger().warning(
+            self._told.tell_event(
+                'frame',
                 f"the frame of the images is now '{frame_id}', before '{foreign.image_frame}': the ground transform is "
-                'published for the new frame; consumers of tf keep the one of before until they restart'
+                'published for the new frame; consumers of tf keep the one of before until they restart',
             )
         if self._store is None:
             self._store = store = self._open_store(frame_id)
@@ -297,6 +295,7 @@ class AutocalibNode(Node):
             + '; collecting new evidence'
         )
         self.get_logger().info(f'reset: {response.message}')
+        self._told.start_over()
         return response
 
     def _wrap_future(self, running: concurrent.futures.Future) -> Future:
@@ -364,18 +363,12 @@ class AutocalibNode(Node):
             f'{", ".join(sorted(names)) or "a node of the same name"} also publishes {topic}: remap one of the two, '
             'here with -r ~/camera_info:=...'
         )
-        self._log_throttled('other publishers', text, error=False)
+        self._told.tell_state('other publishers', text, error=False)
         return text
 
     def _log_progress(self) -> None:
         if self.publication.state in (CalibrationState.NONE, CalibrationState.RESTORED) and self._worker.counters.used:
-            progress = self._worker.progress
-            percent = 0.0 if progress is None else progress.percent
-            if abs(percent - self._told_percent) >= PROGRESS_STEP:
-                self._throttle.forget('progress')
-            if self._throttle.is_due('progress', '' if progress is None else ', '.join(progress.missing)):
-                self._told_percent = percent
-                self.get_logger().info(describe_progress(progress))
+            self._told.tell_progress(self._worker.progress)
 
     def _open_store(self, image_frame: str) -> Store | None:
         """Return the store of the calibration; None while its name depends on the frame of the first image."""
@@ -387,7 +380,7 @@ class AutocalibNode(Node):
         """Publish the stored calibration of an earlier run, as not yet verified."""
         store.remove_leftovers()
         found = store.load()
-        self._log(found.note, good=False)
+        self._told.tell(found.note, good=False)
         if found.stored is None:
             self.get_logger().info(f'no stored calibration at {store.path}')
             return
@@ -465,7 +458,8 @@ class AutocalibNode(Node):
                 f'{state.value} calibration withdrawn: its images have {old_width}x{old_height} pixels, the present '
                 f'ones {width}x{height}'
             )
-            self.get_logger().warning(f'{self._withdrawn}; collecting new evidence')
+            self._told.tell_event('size', f'{self._withdrawn}; collecting new evidence')
+            self._told.start_over()
 
     def _take_back(self, width: int, height: int) -> None:
         """Publish the calibration that was withdrawn for another image size again, now that its size is back."""
@@ -482,31 +476,29 @@ class AutocalibNode(Node):
             return
         self._worker.watch_stored(published.result, views)
         self._withdrawn = ''
-        self.get_logger().info(f'images have {width}x{height} pixels again: {describe(published.result)}')
+        again = f'images have {width}x{height} pixels again'
+        self._told.tell_solution(published.result, again, good=True)
 
-    def on_evidence_reset(self, why: str) -> None:
+    def on_evidence_reset(self, why: str, stamp_ns: int) -> None:
         """Log that the evidence was dropped; the calibration stays until a new one is as precise."""
         self._pictures.forget()
         self.publication.on_evidence_reset()
-        self._log_throttled(f'reset {why}', f'{why}: collecting new evidence', error=False)
+        self._told.tell_event(f'reset {why}', f'{why} at {clock_text(stamp_ns * 1e-9)}: collecting new evidence')
 
     def image_unreadable(self, error: AutocalibError) -> None:
         """Log an image that cannot be used."""
         self._unreadable = str(error)
-        self._log_throttled('unreadable', f'image skipped: {error} ({self._worker.counters})')
+        self._told.tell_state('unreadable', f'image skipped: {error} ({self._worker.counters})')
 
     def failed(self, error: Exception) -> None:
-        """Log a fault of the program with its traceback, for a bug report; one of the machine in a line."""
-        if isinstance(error, AutocalibError):
-            self._log_throttled(f'fault {type(error).__name__}', str(error))
-            return
-        self._log_throttled(f'fault {type(error).__name__}', ''.join(traceback.format_exception(error)).rstrip())
+        """Log a fault of the program or of the machine."""
+        self._told.tell_fault(error)
 
     def solved(self, result: Result) -> None:
         """Publish a calibration unless the current one is more precise; only log a refusal."""
         self._reports.solved(result)
         if isinstance(result, Refusal):
-            self._log_throttled(f'refusal {result.code}', describe(result), error=False)
+            self._told.tell_refusal(result)
             return
         decision = self.publication.solved(result)
         if decision is None:
@@ -518,9 +510,8 @@ class AutocalibNode(Node):
             self._worker.watch_solved(result)
             self._remember(result, decision.text or 'solved')
         self._withdrawn = ''
-        self._throttle.forget('refusal')
-        self._log(decision.text, good=not (decision.contradicted or self.publication.doubt))
-        self.get_logger().info(describe(result))
+        good = not (decision.contradicted or self.publication.doubt)
+        self._told.tell_solution(result, decision.text, good=good)
 
     def _remember(self, result: Calibration, cause: str) -> None:
         """Append a version to the history, beside the stored calibration."""
@@ -532,7 +523,7 @@ class AutocalibNode(Node):
         """Publish, withhold or mend the calibration by what the newest image says about the view."""
         published, mode = self.publication.published, self.node_options.on_move
         text, good = self._events.told(report, stamp_ns, has_calibration=published is not None)
-        self._log(text, good=good)
+        logged = self._told.tell_view(report, text, good=good)
         unwatched = report.condition is ViewCondition.UNKNOWN and not report.is_watched
         if unwatched or report.condition in (ViewCondition.STILL, ViewCondition.SWAYING):
             self._pixels.is_back()
@@ -547,28 +538,12 @@ class AutocalibNode(Node):
                 self._pixels.adopt()
                 self._events.mended()
                 self._remember(turned.result, f'pose mended, {move}')
-                self._log(f'pose mended by what the picture shows: {describe(turned.result)}', good=False)
+                if logged:
+                    mended = f'pose mended by what the picture shows: {describe_briefly(turned.result)}'
+                    self._told.tell(mended, good=False)
                 return turned.result
         if move is not None:
             self.publication.outdate()
         if (move is not None or report.fault is not None) and mode != 'keep':
             self.publication.withhold(text or str(report))
         return None
-
-    def _log(self, text: str, *, good: bool) -> None:
-        """Log a line as information or warning; '' logs nothing."""
-        # rclpy allows one severity for each place in the code.
-        if text and good:
-            self.get_logger().info(text)
-        elif text:
-            self.get_logger().warning(text)
-
-    def _log_throttled(self, topic: str, text: str, *, error: bool = True) -> None:
-        """Log a line unless it says what the last one of its topic said."""
-        if not self._throttle.is_due(topic, text):
-            return
-        # rclpy allows one severity for each place in the code.
-        if error:
-            self.get_logger().error(text)
-        else:
-            self.get_logger().warning(text)

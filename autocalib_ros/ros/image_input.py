@@ -53,6 +53,7 @@ class ImageInput:
         self._last_image = time.monotonic()
         self._any_image = False
         self._throttle = LogThrottle()
+        self._outage_told = False
         self._requested = RELIABILITY.get(options.image_reliability)
         if self._requested is not None:
             self._subscribe(self._requested)
@@ -121,10 +122,14 @@ class ImageInput:
         self.lost += event.total_count_change
 
     def _take(self, message: Any) -> None:
-        self._last_image, self._any_image = time.monotonic(), True
+        now = time.monotonic()
         if self.no_image is not None:
             self.no_image = None
             self._throttle.forget()
+            if self._outage_told:
+                self._node.get_logger().info(f'images on {self.topic} again, after {now - self._last_image:.0f} s')
+            self._outage_told = False
+        self._last_image, self._any_image = now, True
         self.encoding = message.encoding if self._type is Image else message.format
         self._on_image(message)
 
@@ -143,6 +148,7 @@ class ImageInput:
         )
         if not self._throttle.is_due('no image', self.no_image.text, changed_s=0.0):
             return
+        self._outage_told = self._any_image
         self._node.get_logger().warning(f'no image for {now - self._last_image:.0f} s: {self.no_image.text}')
 
     def _type_name(self) -> str:

@@ -29,6 +29,11 @@ def describe_calibration(result: Calibration) -> str:
     return _one_line(f'calibrated, grade {result.grade}: {numbers}; assumptions: {assumptions}{checked}')
 
 
+def describe_briefly(result: Calibration) -> str:
+    """Return grade, focal length, tilt and height as one line."""
+    return _one_line(f'calibrated, grade {result.grade}: {", ".join(describe_numbers(result))}')
+
+
 def describe_numbers(result: Calibration) -> list[str]:
     """Return focal length, tilt and height with their sigma, or why there is no ground plane."""
     sigma = result.stddev

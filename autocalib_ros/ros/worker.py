@@ -68,8 +68,8 @@ class Listener(Protocol):
     def image_accepted(self, width: int, height: int) -> None:
         """Take the size of a decoded image."""
 
-    def on_evidence_reset(self, why: str) -> None:
-        """Note that all evidence so far was dropped."""
+    def on_evidence_reset(self, why: str, stamp_ns: int) -> None:
+        """Note that all evidence before an image of this stamp was dropped."""
 
     def image_unreadable(self, error: AutocalibError) -> None:
         """Take the error of an image that could not be used."""
@@ -353,7 +353,7 @@ class CalibrationWorker:
             return
         if intake in (ImageIntake.TIME_JUMPED, ImageIntake.RESIZED):
             self._refused = ''
-            self._listener.on_evidence_reset(intake.value)
+            self._listener.on_evidence_reset(intake.value, stamp_ns)
         self.counters.used += 1
         with self._changed:
             self._unsolved_images += self._generation == self._calibrator_generation

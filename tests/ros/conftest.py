@@ -12,7 +12,7 @@ os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
 HAS_ROS = all(importlib.util.find_spec(name) for name in ('rclpy', 'sensor_msgs', 'std_srvs'))
 
 
-NEED_NO_ROS = ('test_cameras.py', 'test_log_throttle.py', 'test_watchdog.py', 'test_status.py')
+NEED_NO_ROS = ('test_cameras.py', 'test_log_throttle.py', 'test_node_log.py', 'test_watchdog.py', 'test_status.py')
 """Tests of modules of the live shell that need no ROS."""
 
 

@@ -1,6 +1,6 @@
 """A line that has not changed comes a few times in the first hour, and once an hour then."""
 
-from autocalib_ros.ros.log_throttle import FIRST_REPEAT_S, LAST_REPEAT_S, LogThrottle
+from autocalib_ros.ros.log_throttle import EVENTS_S, FIRST_REPEAT_S, LAST_REPEAT_S, MAX_EVENTS, LogThrottle
 
 
 class Watch:
@@ -48,3 +48,22 @@ def test_topics_do_not_know_each_other_and_can_be_forgotten():
     assert throttle.is_due('refusal a', 'text') and throttle.is_due('fault', 'text')
     throttle.forget('refusal')
     assert throttle.is_due('refusal a', 'text') and not throttle.is_due('fault', 'text')
+
+
+def test_events_are_told_each_until_there_are_too_many_and_those_left_out_are_counted():
+    clock = Watch()
+    throttle = LogThrottle(clock)
+    told = []
+    for second in range(0, 2 * round(EVENTS_S), 60):
+        clock.now = 1000.0 + second
+        told.append(throttle.event('frozen'))
+    assert told[:MAX_EVENTS] == [''] * MAX_EVENTS and told[MAX_EVENTS] is None
+    left_out = round(EVENTS_S) // 60 - MAX_EVENTS
+    assert [text for text in told if text] == [f' ({left_out} more like this were not logged)']
+    assert len([text for text in told if text is not None]) == 2 * MAX_EVENTS
+    assert throttle.event('black') == ''
+
+
+def test_words_that_go_to_and_fro_are_some_lines_an_hour():
+    logged = lines_in(24, lambda step: f'state {"ab"[step // 9 % 2]}')  # every 90 s
+    assert len(logged) <= 24 * (MAX_EVENTS + 2)

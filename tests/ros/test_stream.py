@@ -33,7 +33,7 @@ def test_camera_that_starts_late_and_changes_its_reliability_twice_is_heard(diag
             newest, status = diagnostics.newest(), diagnostics[-1].status[0]
             go_on()
             wait_for(
-                lambda: 'the image size changed: collecting new evidence' in (tmp_path / 'log').read_text(),
+                lambda: 'the image size changed at ' in (tmp_path / 'log').read_text(),
                 'the news',
                 PATIENCE_S,
             )

@@ -30,7 +30,7 @@ class Heard:
     def image_accepted(self, width, height):
         self.sizes.append((width, height))
 
-    def on_evidence_reset(self, why):
+    def on_evidence_reset(self, why, stamp_ns):
         self.anew.append(why)
 
     def image_unreadable(self, error):
