@@ -26,6 +26,8 @@ SHORTEST_INTERVAL_S = 1e-3
 """Shortest usual interval; files that were copied or unpacked have such times."""
 EXIF_IFD, EXIF_TIME, EXIF_SUBSECOND = 0x8769, 0x9003, 0x9291
 """Tags of EXIF 2.3: where the photographic data are, DateTimeOriginal, SubSecTimeOriginal."""
+MAX_STAMP_NS = 2**63
+"""Stamps are nanoseconds in 64 bits, which end in the year 2262."""
 EXIF_ORIENTATION, UPRIGHT = 0x0112, 1
 
 
@@ -134,16 +136,20 @@ def _orientation(path: Path) -> int:
 
 
 def _exif_stamps(paths: list[Path]) -> list[int] | None:
-    """Return the EXIF times of exposure of images, None if one has none."""
+    """Return the EXIF times of exposure of images, None if one has none that a stamp of 64 bits holds."""
     stamps = []
     for path in paths:
         tags = _exif(path)[1]
         try:
             taken = datetime.strptime(str(tags[EXIF_TIME]), '%Y:%m:%d %H:%M:%S').replace(tzinfo=timezone.utc)
-            fraction = float('0.' + (str(tags.get(EXIF_SUBSECOND, '')).strip() or '0'))
         except (KeyError, ValueError):
             return None
-        stamps.append(round(taken.timestamp()) * 10**9 + round(fraction * 1e9))
+        digits = str(tags.get(EXIF_SUBSECOND, '')).strip() or '0'
+        if not (digits.isascii() and digits.isdecimal()):
+            return None
+        stamps.append(round(taken.timestamp()) * 10**9 + round(float(f'0.{digits}') * 1e9))
+        if abs(stamps[-1]) >= MAX_STAMP_NS:
+            return None
     return stamps
 
 

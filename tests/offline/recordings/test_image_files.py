@@ -57,6 +57,18 @@ def test_exif_tells_the_times(images):
     assert since_first(open_source(images(6, at=lambda _: 1000, tags=tags))) == [0, 250, 500, 750, 1000, 1250]
 
 
+@pytest.mark.parametrize(
+    'tags',
+    [
+        {EXIF_TIME: '2024:05:01 12:00:00', EXIF_SUBSECOND: '2e30'},
+        {EXIF_TIME: '9000:05:01 12:00:00', EXIF_SUBSECOND: '25'},
+        {EXIF_TIME: '2024:13:01 12:00:00'},
+    ],
+)
+def test_absurd_exif_is_none(images, tags):
+    assert len(since_first(open_source(images(6, at=lambda index: 1000 + 0.1 * index, tags=lambda _: tags)))) == 6
+
+
 @pytest.mark.parametrize('at', [lambda _: 1000, lambda index: 1000 - index, lambda index: 60 * index])
 def test_times_of_copies_are_none(images, at):
     with pytest.raises(UsageError, match='--rate'):
