@@ -25,12 +25,12 @@ from autocalib_ros.lens.camera_info import camera_info
 from autocalib_ros.lens.camera_info_yaml import read_camera_info
 from autocalib_ros.perception.detector.detector import VehicleDetector, open_detector
 from autocalib_ros.perception.images import ImageDecoder
-from autocalib_ros.perception.view_file import read_views, write_views
+from autocalib_ros.perception.view_file import read_views
 from autocalib_ros.perception.view_watch import KnownView, ViewCondition, ViewReport
 from autocalib_ros.results.calibration import Calibration, Refusal
 from autocalib_ros.results.control_points import read_control_points
 from autocalib_ros.results.given_pixels import FollowedPixels, GivenPixels
-from autocalib_ros.results.history import append_version, read_history, version_entry
+from autocalib_ros.results.history import read_history, version_entry
 from autocalib_ros.results.store import Store, StoredCalibration, calibration_checksum, resolve_url
 from autocalib_ros.revalidation import CalibrationState, with_current_options
 from autocalib_ros.ros.declared_parameters import declare_parameters
@@ -45,6 +45,7 @@ from autocalib_ros.ros.log_text import describe, describe_briefly, describe_prog
 from autocalib_ros.ros.node_log import NodeLog
 from autocalib_ros.ros.publication import CalibrationPublisher, Published
 from autocalib_ros.ros.report_writer import ReportPaths, ReportWriter
+from autocalib_ros.ros.side_files import SideFiles
 from autocalib_ros.ros.status import Counts, RateCounter, Situation
 from autocalib_ros.ros.store_writer import StoreWriter
 from autocalib_ros.ros.view_events import ViewEvents, clock_text
@@ -85,12 +86,12 @@ class AutocalibNode(Node):
         self.store_writer = StoreWriter(
             lambda fault: self.get_logger().error(f'the calibration was not saved: {fault}')
         )
+        self._side_files = SideFiles(self.store_writer)
         self._reports = ReportWriter(lambda text, good: self._told.tell(text, good=good))
         self._upload = DriverUpload(self, self._told.tell) if self.node_options.upload_to_driver else None
         self._events = ViewEvents()
         self._set_aside: tuple[Published, tuple[KnownView, ...]] | None = None
         """Calibration that was withdrawn for another image size, with its views."""
-        self._views_stored: tuple[int, ...] = ()
         # topics
         self._driver = DriverInfo(self, self.node_options)
         self.publication = CalibrationPublisher(
@@ -410,14 +411,12 @@ class AutocalibNode(Node):
 
     def _store_views(self) -> None:
         """Store the views of the stored calibration when there are others than those stored last."""
+        self._side_files.catch_up()
         calibration, views = self._worker.known
         store, saved = self._store, self.store_writer.saved
         if store is None or calibration is None or saved is None or saved.calibration is not calibration:
             return
-        shown = tuple(map(id, (calibration, *views)))
-        if views and shown != self._views_stored:
-            self._views_stored = shown
-            self.store_writer.run(partial(write_views, store.views, calibration_checksum(calibration), views))
+        self._side_files.keep_views(store, calibration, views)
 
     def _to_stored(self, published: Published) -> StoredCalibration:
         return StoredCalibration(
@@ -516,8 +515,7 @@ class AutocalibNode(Node):
     def _remember(self, result: Calibration, cause: str) -> None:
         """Append a version to the history, beside the stored calibration."""
         if self._store is not None and self.node_options.autosave:
-            entry = version_entry(result, cause, time.time())
-            self.store_writer.run(partial(append_version, self._store.history, entry))
+            self._side_files.remember(self._store, version_entry(result, cause, time.time()))
 
     def view_changed(self, report: ViewReport, stamp_ns: int) -> Calibration | None:
         """Publish, withhold or mend the calibration by what the newest image says about the view."""

@@ -2,10 +2,15 @@
 
 import threading
 
+import numpy as np
 import pytest
 
-from autocalib_ros.results.store import Store
-from autocalib_ros.ros.store_writer import StoreWriter
+from autocalib_ros.perception.view_file import read_views
+from autocalib_ros.perception.view_watch import KnownView
+from autocalib_ros.results.history import read_history
+from autocalib_ros.results.store import Store, calibration_checksum
+from autocalib_ros.ros.side_files import SideFiles
+from autocalib_ros.ros.store_writer import SAVE_PERIOD_S, StoreWriter
 from bench import PATIENCE_S, wait_for
 from stored_results import calibration, stored
 
@@ -88,6 +93,28 @@ def test_fault_is_reported_once_and_the_offer_is_tried_again(start, store, warni
     (quick_path / 'camera_info').unlink()
     wait_for(lambda: kept(store) == 0, 'the calibration')
     wait_for(lambda: not store_writer.fault, 'the end of the fault')
+
+
+def test_history_and_views_that_could_not_be_written_are_written_later(start, store, quick_path):
+    (quick_path / 'camera_info').touch()
+    now = [0.0]
+    side = SideFiles(start(), lambda: now[0])
+    views, found = (KnownView(np.full((36, 64), 7, np.uint8), None),), calibration()
+
+    def look() -> bool:
+        now[0] += SAVE_PERIOD_S
+        side.catch_up()
+        side.keep_views(store, found, views)
+        return store.views.exists() and store.history.exists()
+
+    side.remember(store, {'time': 'first'})
+    side.remember(store, {'time': 'second'})
+    assert not any(look() for _ in range(3))
+    (quick_path / 'camera_info').unlink()
+    wait_for(look, 'both files')
+    wait_for(lambda: len(read_history(store.history)) == 2, 'both versions')
+    assert [entry['time'] for entry in read_history(store.history)] == ['first', 'second']
+    assert len(read_views(store.views, calibration_checksum(found))) == 1
 
 
 def test_closed_writer_takes_no_more_steps(start):
