@@ -9,11 +9,12 @@ from __future__ import annotations
 import concurrent.futures
 import contextlib
 import ctypes
-import math
 import multiprocessing
 import os
 import signal
+import threading
 import traceback
+from collections.abc import Callable
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 
@@ -28,6 +29,8 @@ PR_SET_PDEATHSIG = 1
 """Option of prctl(2): the signal that a process gets when its parent ends."""
 NICENESS = 10
 """Nice value of the child: a solution has minutes, an image milliseconds."""
+OUT_OF_MEMORY = 75
+"""Exit status of a child that got no more memory; EX_TEMPFAIL of sysexits.h: the next solution may succeed."""
 PROCESS_EXIT_S = 1.0
 """Real seconds to wait for the end of a killed process."""
 
@@ -69,25 +72,47 @@ class SolverProcess:
         After the latter two the next call starts a new process.
         """
         self._process = process = self._process or self._start()
+        expired = threading.Event()
+        limit = self._limit(process, expired)
         try:
             self._pipe.send((evidence, options, lens))
-            if not self._pipe.poll(None if math.isinf(self.limit_s) else self.limit_s):
-                self.close()
-                raise SolverTimedOut(
-                    f'a solution took longer than {self.limit_s:g} s and was given up, and the solver starts anew: '
-                    'the machine is too busy, or raise solve_limit_s'
-                )
             result, error, child_traceback = self._pipe.recv()
         except (EOFError, OSError) as lost:
             process.join(PROCESS_EXIT_S)
             self._process = None
-            raise SolverDied(
-                f'the solver process ended with status {process.exitcode} before it returned a result, possibly out '
-                'of memory; the next solution starts a new process'
-            ) from lost
+            raise self._reason(process.exitcode, is_late=expired.is_set()) from lost
+        finally:
+            limit.cancel()
+        if expired.is_set():  # the result came as the limit passed
+            self._process = None
         if error is not None:
             raise error from _ChildTraceback(child_traceback)
         return result
+
+    def _limit(self, process: BaseProcess, expired: threading.Event) -> threading.Timer:
+        """Return a running timer that ends the process: one that stands still may not even take the problem."""
+
+        def give_up() -> None:
+            expired.set()
+            process.kill()
+
+        timer = threading.Timer(min(self.limit_s, threading.TIMEOUT_MAX), give_up)
+        timer.daemon = True
+        timer.start()
+        return timer
+
+    def _reason(self, status: int | None, *, is_late: bool) -> AutocalibError:
+        """Return why there is no result."""
+        if is_late:
+            return SolverTimedOut(
+                f'a solution took longer than {self.limit_s:g} s and was given up, and the solver starts anew: '
+                'the machine is too busy, or raise solve_limit_s'
+            )
+        memory = 'out of memory' if status == OUT_OF_MEMORY else 'possibly out of memory'
+        return SolverDied(
+            f'the solver process ended with status {status} before it returned a result, {memory}; the next solution '
+            'starts a new process: where that comes again, give it more memory or lower joint.max_tracks'
+        )
 
     def close(self) -> None:
         """Kill the process, also during a solution."""
@@ -127,12 +152,23 @@ def _run_child(pipe: Connection) -> None:
     os.nice(NICENESS)
     from autocalib_ros.estimation.estimate import solve  # here alone: the parent starts faster and smaller without it
 
-    while True:
-        try:
-            evidence, options, lens = pipe.recv()
-        except EOFError:
-            return
-        try:
-            pipe.send((solve(evidence, options, lens=lens), None, ''))
-        except Exception as error:  # raised again in the parent, at the call
-            pipe.send((None, error, traceback.format_exc()))
+    try:
+        while True:
+            _answer(pipe, solve)
+    except EOFError:
+        return
+    except MemoryError:
+        os._exit(OUT_OF_MEMORY)  # at once: a traceback needs memory, and the parent tells the reason
+
+
+def _answer(pipe: Connection, solve: Callable[..., Result]) -> None:
+    """Solve one problem."""
+    evidence, options, lens = pipe.recv()
+    answer: tuple[Result | None, Exception | None, str]
+    try:
+        answer = (solve(evidence, options, lens=lens), None, '')
+    except MemoryError:
+        raise
+    except Exception as error:  # raised again in the parent, at the call
+        answer = (None, error, traceback.format_exc())
+    pipe.send(answer)

@@ -1,10 +1,12 @@
 """The solver in a child process."""
 
 import os
+import resource
 import signal
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,6 +29,11 @@ def snapshot():
     calibrator = AutoCalibrator(OPTIONS)
     calibrator.add_image(0, PIXELS)
     return calibrator.snapshot()
+
+
+def large_snapshot():
+    """Return evidence that no pipe takes at once."""
+    return replace(snapshot(), points_px=np.zeros((2, 2_000_000), np.float32))
 
 
 @pytest.fixture(scope='module')
@@ -75,6 +82,27 @@ def test_close_ends_a_solution_that_runs(solver):
         solver.close()
         assert isinstance(answer.exception(PATIENCE_S), SolverDied)
     assert not process.is_alive()
+
+
+def test_process_without_memory_is_reported_in_a_line_and_the_next_solution_starts_another(solver, capfd):
+    assert not solver(snapshot(), OPTIONS, lens=None)
+    first = solver._process
+    size = int(Path(f'/proc/{first.pid}/statm').read_text().split()[0]) * resource.getpagesize()
+    resource.prlimit(first.pid, resource.RLIMIT_AS, (size, resource.RLIM_INFINITY))
+    with pytest.raises(SolverDied, match=r'status 75 .* out of memory; .* joint\.max_tracks'):
+        solver(large_snapshot(), OPTIONS, lens=None)
+    assert 'Traceback' not in capfd.readouterr().err
+    assert not solver(snapshot(), OPTIONS, lens=None)
+    assert solver._process.pid != first.pid
+
+
+def test_process_that_takes_no_problem_is_given_up(solver):
+    assert not solver(snapshot(), OPTIONS, lens=None)
+    os.kill(solver._process.pid, signal.SIGSTOP)
+    solver.limit_s = 0.3
+    with pytest.raises(SolverTimedOut, match=r'longer than 0\.3 s'):
+        solver(large_snapshot(), OPTIONS, lens=None)
+    solver.limit_s = float('inf')
 
 
 def test_solution_that_hangs_is_given_up_and_the_next_one_starts_another_process(solver):

@@ -38,7 +38,7 @@ from autocalib_ros.ros.diagnostics import Diagnostics
 from autocalib_ros.ros.driver_info import DriverInfo
 from autocalib_ros.ros.driver_upload import DriverUpload
 from autocalib_ros.ros.headers import DEFAULT_FRAME, Headers
-from autocalib_ros.ros.image_input import ImageInput
+from autocalib_ros.ros.image_input import ImageInput, node_name
 from autocalib_ros.ros.live_parameters import LiveParameters
 from autocalib_ros.ros.live_pictures import LivePictures
 from autocalib_ros.ros.log_text import describe, describe_briefly, describe_progress
@@ -357,13 +357,12 @@ class AutocalibNode(Node):
         topic = self.publication.topic
         if self.count_publishers(topic) < 2:
             return ''
-        names = {
-            f'{info.node_namespace.rstrip("/")}/{info.node_name}' for info in self.get_publishers_info_by_topic(topic)
-        } - {self.get_fully_qualified_name()}
-        text = (
-            f'{", ".join(sorted(names)) or "a node of the same name"} also publishes {topic}: remap one of the two, '
-            'here with -r ~/camera_info:=...'
-        )
+        own = self.get_fully_qualified_name()
+        names = {node_name(info) for info in self.get_publishers_info_by_topic(topic)} - {own}
+        remedy = 'remap one of the two, here with -r ~/camera_info:=...'
+        if not names:
+            names, remedy = {'a second node of this name'}, 'end one of the two, or give it -r __ns:=/OTHER'
+        text = f'{", ".join(sorted(names))} also publishes {topic}: {remedy}'
         self._told.tell_state('other publishers', text, error=False)
         return text
 

@@ -28,6 +28,8 @@ PUBLISHER_POLL_S = 1.0
 """Real seconds between two checks of the publishers."""
 NO_IMAGE_TIMEOUT_S = 5.0
 """Real seconds without an image before a warning."""
+UNKNOWN = '_UNKNOWN_'
+"""Part of the name that rmw gives a node of which it has only seen a topic."""
 RELIABILITY = {'reliable': ReliabilityPolicy.RELIABLE, 'best_effort': ReliabilityPolicy.BEST_EFFORT}
 
 
@@ -155,6 +157,14 @@ class ImageInput:
         return f'sensor_msgs/msg/{self._type.__name__}'
 
 
+def node_name(endpoint: Any) -> str:
+    """Return the full name of the node of a publisher or subscription; it may not be known for some seconds."""
+    if UNKNOWN in endpoint.node_name:
+        return 'a node whose name is not known yet'
+    return f'{endpoint.node_namespace.rstrip("/")}/{endpoint.node_name}'
+
+
 def _offer(publisher: Any) -> PublisherOffer:
-    name = f'{publisher.node_namespace.rstrip("/")}/{publisher.node_name}'
-    return PublisherOffer(name, publisher.topic_type, publisher.qos_profile.reliability == ReliabilityPolicy.RELIABLE)
+    return PublisherOffer(
+        node_name(publisher), publisher.topic_type, publisher.qos_profile.reliability == ReliabilityPolicy.RELIABLE
+    )
