@@ -1,5 +1,9 @@
-"""The real node with a solver that returns what the arguments say, after a time that they give: FOCAL_PX SECONDS ..."""
+"""The real node with a solver that returns what the arguments say, after a time that they give: FOCAL_PX SECONDS ...
 
+With FAKE_NODE_SYNC_S, files take as many seconds to reach the disk.
+"""
+
+import os
 import sys
 import time
 from functools import partial
@@ -18,6 +22,9 @@ def main() -> int:
             sum(range(1000))
         return calibration(evidence, focal_px, height_m=options.camera_height)
 
+    slow_s = float(os.environ.get('FAKE_NODE_SYNC_S', '0'))
+    if slow_s:
+        os.fsync = lambda _: time.sleep(slow_s)
     autocalib_node.AutocalibNode = partial(autocalib_node.AutocalibNode, solve=solve)
     return node.main()
 

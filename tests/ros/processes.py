@@ -5,7 +5,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -48,15 +48,24 @@ def running_node(log: Path, *arguments: str) -> Iterator[subprocess.Popen]:
 
 @contextmanager
 def running_fake_node(
-    log: Path, focal_px: float, seconds: float = 0.0, *, variables: dict[str, str] | None = None, **parameters: Any
+    log: Path,
+    focal_px: float,
+    seconds: float = 0.0,
+    *,
+    variables: dict[str, str] | None = None,
+    under: Sequence[str] = (),
+    **parameters: Any,
 ) -> Iterator[subprocess.Popen]:
-    """Run a node of camera /cam1 whose solver finds a focal length after some seconds; killed at the end."""
+    """Run a node of camera /cam1 whose solver finds a focal length after some seconds; killed at the end.
+
+    `variables` are put into its environment; `under` is the start of its command.
+    """
     more = [text for name, value in {'camera_height': 8.0, **parameters}.items() for text in ('-p', f'{name}:={value}')]
     remapped = ['--ros-args', '-r', '__ns:=/cam1', '-r', 'image:=/image', *more]
     command = [sys.executable, str(HERE / 'fake_node.py'), str(focal_px), str(seconds), *remapped]
     with (
         log.open('w') as stream,
-        subprocess.Popen(command, stderr=stream, env=environment(**(variables or {}))) as process,
+        subprocess.Popen([*under, *command], stderr=stream, env=environment(**(variables or {}))) as process,
     ):
         try:
             yield process
