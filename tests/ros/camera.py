@@ -7,6 +7,7 @@ import json
 import select
 import sys
 import time
+from array import array
 
 import cv2
 import numpy as np
@@ -39,8 +40,10 @@ def play(node: Node, topic: str, phase: dict) -> None:
     message.header.frame_id = 'optical'
     while not select.select([sys.stdin], [], [], 0)[0]:
         message.header.stamp = node.get_clock().now().to_msg()
+        if not compressed:  # no two images of a sensor are the same
+            message.data[:8] = array('B', time.time_ns().to_bytes(8, 'little'))
         publisher.publish(message)
-        time.sleep(INTERVAL_S)
+        time.sleep(phase.get('interval_s', INTERVAL_S))
     sys.stdin.readline()
     node.destroy_publisher(publisher)
 
