@@ -12,7 +12,7 @@ from autocalib_ros.ros import driver_upload
 from bench import calibration, wait_for
 from test_node import calibrated, publish_until
 
-LOG_METHOD = 'autocalib_ros.ros.autocalib_node.AutocalibNode._log'
+LOG_METHOD = 'autocalib_ros.ros.node_log.NodeLog.tell'
 
 
 @pytest.fixture
