@@ -9,11 +9,12 @@ import numpy as np
 from autocalib_ros.config import GateOptions
 from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment
 from autocalib_ros.estimation.adjustment.lens_prior import LensPrior
+from autocalib_ros.estimation.certainty import certainty_of_lengths
 from autocalib_ros.estimation.lanes.lane_dashes import LanePattern
 from autocalib_ros.estimation.observations.track_set import TrackSet, evenly_spaced
 from autocalib_ros.estimation.observations.two_frame_windows import ResampledTracks, TwoFrameWindows
 from autocalib_ros.estimation.verification.ground_normal import PlaneEstimate
-from autocalib_ros.estimation.verification.scale import Scale
+from autocalib_ros.estimation.verification.scale import UNIT_SCALE, Scale
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.results.refusals import OR, TELL_LENS, Reason
 from autocalib_ros.results.statements import Statement
@@ -98,6 +99,12 @@ class Solution:
         return bool(self.from_markings and told and self.fit.focal_sigma > MIN_MEASURED_SHARE * prior.sigma[0])
 
     @property
+    def uncertainty(self) -> tuple[float, float]:
+        """Standard deviation of lengths on the road for a known height, then of the plane, degrees; inf if unknown."""
+        certainty = certainty_of_lengths(self.plane, UNIT_SCALE)
+        return np.inf if certainty is None else certainty.ground_sigma.worst, self.plane.worst_sigma_deg
+
+    @property
     def full(self) -> bool:
         """Whether crossing roads or turning vehicles determine all of it, with certainty."""
         return self.plane_refusal is None and self.lens_refusal is None and not self.assumed and self.sharp
@@ -114,12 +121,15 @@ def accepted(found: Solution | Reason) -> Solution | Reason:
 
 
 def is_better(other: Solution | Reason, found: Solution | Reason) -> bool:
-    """Whether `other` gives more than `found`: any solution, then a plane, then the smaller sigma of the plane."""
+    """Whether `other` gives more than `found`: any solution, then a plane, then more certain lengths on the road.
+
+    These are what the grade is about: a plane that is certain through a lens that is not gives no certain lengths.
+    """
     if isinstance(other, Reason) or isinstance(found, Reason):
         return isinstance(other, Solution)
     if other.plane_refusal or found.plane_refusal:
         return other.plane_refusal is None
-    return other.plane.worst_sigma_deg < found.plane.worst_sigma_deg
+    return other.uncertainty < found.uncertainty
 
 
 def append_reason(found: Solution | Reason, further: Reason, *, asks_less: bool = False) -> Solution | Reason:

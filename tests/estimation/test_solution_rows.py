@@ -8,10 +8,12 @@ import pytest
 
 from autocalib_ros.config import GateOptions, Options
 from autocalib_ros.estimation.adjustment.lens_prior import lens_priors
-from autocalib_ros.estimation.solution import Solution
+from autocalib_ros.estimation.solution import Solution, is_better
 from autocalib_ros.estimation.solution_rows import with_solution_rows
+from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.synthetic.junction import Junction, synthetic_evidence
 from autocalib_ros.results.calibration import Calibration
+from autocalib_ros.results.refusals import reason
 from solved_once import solve_once
 
 SIZE = (1280, 720)
@@ -34,6 +36,38 @@ def test_a_principal_point_far_from_the_centre_lowers_the_grade(sigmas: float, c
     assert found.reduced is contradicted
     (row,) = [row for row in found.comparisons if row.kind == 'principal_point_prior']
     assert row.passed is not contradicted and row.value == pytest.approx(abs(sigmas))
+
+
+class UncertainPlane:
+    """A camera 30 degrees down, with independent errors of focal length and tilt."""
+
+    def __init__(self, focal_sigma: float, tilt_sigma_deg: float) -> None:
+        self.lens_and_normal = Camera(*SIZE, 600.0, (639.5, 359.5)), self._up(30.0)
+        self.worst_sigma_deg, self._focal_sigma = tilt_sigma_deg, focal_sigma
+
+    @staticmethod
+    def _up(tilt_deg: float) -> np.ndarray:
+        tilt = np.radians(tilt_deg)
+        return np.array([0.0, -np.cos(tilt), -np.sin(tilt)])
+
+    def covariance(self, function) -> np.ndarray:
+        camera, up = self.lens_and_normal
+        one_sigma = [(replace(camera, focal_px=600.0 * (1 + 1e-3)), up), (camera, self._up(30.0 + 1e-3))]
+        steps = np.array([function(*state) - function(camera, up) for state in one_sigma]) / 1e-3
+        steps *= np.array([[self._focal_sigma], [self.worst_sigma_deg]])
+        return steps.T @ steps
+
+
+def solution_with_plane(focal_sigma: float, tilt_sigma_deg: float) -> Solution:
+    return replace(solution_with_point(639.5), plane=UncertainPlane(focal_sigma, tilt_sigma_deg))
+
+
+def test_the_better_solution_has_the_more_certain_lengths_on_the_road() -> None:
+    by_lens, by_plane = solution_with_plane(0.05, 1.3), solution_with_plane(0.13, 1.0)
+    assert is_better(by_lens, by_plane) and not is_better(by_plane, by_lens)
+    assert is_better(solution_with_plane(0.05, 1.0), by_lens)
+    no_plane = replace(solution_with_plane(0.01, 0.1), plane_refusal=reason('plane_uncertain', 'level_road'))
+    assert not is_better(no_plane, by_lens) and is_better(by_lens, no_plane)
 
 
 @pytest.mark.solve

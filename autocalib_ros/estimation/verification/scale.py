@@ -74,6 +74,10 @@ class Scale:
         return (assumption(self.kind, **self.values, **derived),)
 
 
+UNIT_SCALE = Scale(lambda *_: 1.0, 0.0, False)
+"""Lengths in camera heights."""
+
+
 def known_scale(options: Options, camera: Camera, normal: np.ndarray, flow: TrackSet | None = None) -> Scale | Reason:
     """Return the scale that follows from all that the options give, or why there is none.
 
@@ -91,7 +95,7 @@ def combined_scale(
     if sources:
         return sources[0] if len(sources) == 1 else _combined(sources, camera, normal)
     if options.allow_unit_scale:
-        return Scale(lambda *_: 1.0, 0.0, False)
+        return UNIT_SCALE
     return reason('no_height')
 
 
