@@ -86,11 +86,23 @@ def test_a_recorder_of_30_shows_every_fifth_image_of_25_twice() -> None:
 @pytest.mark.parametrize('new_codec', [jpeg, skipping])
 def test_a_repeat_through_a_codec_differs_somewhere_and_hardly_on_average(new_codec) -> None:
     code, (first, second) = new_codec(), [frame.image for frame in Road(62).frames()][60:]
-    once, twice, new = code(first), code(first), code(second)
+    once, twice, new = code(first, 0), code(first, 0), code(second, 1)
     moving = (slice(125, 165), slice(200, 280))  # where the fast car is
     assert cv2.absdiff(once, twice)[moving].mean() < 0.5 * cv2.absdiff(twice, new)[moving].mean()
     if new_codec is jpeg:
         assert cv2.absdiff(once, twice).max() > 4
+
+
+@pytest.mark.parametrize('kind', ['repeated_25_in_30_jpeg', 'repeated_in_bursts_jpeg', 'frozen_jpeg'])
+def test_through_jpeg_an_image_is_shown_first_as_in_the_stream_without_repeats(kind: str) -> None:
+    source = RepeatingSource(Road(40), REPEAT_FAULTS[kind])
+    alone = [frame.image for frame in streams._without_fault(Road(40), 'even_jpeg').frames()]
+    same = [
+        np.array_equal(frame.image, alone[index]) for index, frame in zip(source.order, source.frames(), strict=True)
+    ]
+    repeats = np.diff(source.order, prepend=-1) == 0
+    assert all(np.array(same)[~repeats])
+    assert not any(np.array(same)[np.flatnonzero(repeats & ~np.roll(repeats, 1))])  # the first repeat of each
 
 
 @pytest.fixture(scope='module')

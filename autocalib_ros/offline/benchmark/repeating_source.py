@@ -31,7 +31,7 @@ class RepeatingSource:
         for number, index in enumerate(self.order.tolist()):
             while shown < index:
                 image, shown = next(frames).image, shown + 1
-            yield Frame(self._stamp_ns(number), code(image))
+            yield Frame(self._stamp_ns(number), code(image, index))
 
     def stored(self) -> Iterator[StoredImage]:
         """Yield the stamps of the stream."""

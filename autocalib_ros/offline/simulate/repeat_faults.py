@@ -25,8 +25,8 @@ FREEZE_IMAGES, FREEZE_PERIOD = 15, 150
 
 Order = Callable[[int, np.random.Generator], np.ndarray]
 """Returns the index of the image that each image of the stream shows, increasing or equal, shape (m,)."""
-Codec = Callable[[np.ndarray], np.ndarray]
-"""Encodes and decodes the next image of one stream."""
+Codec = Callable[[np.ndarray, int], np.ndarray]
+"""Encodes and decodes the next image of one stream; the number is that of the image that it shows."""
 
 
 @dataclass(frozen=True)
@@ -79,13 +79,17 @@ def frozen(count: int, random: np.random.Generator) -> np.ndarray:
 
 
 def jpeg() -> Codec:
-    """Return a codec that encodes each image anew, at another quality than the one before."""
-    number = 0
+    """Return a codec that encodes each image anew, at another quality than the one before.
 
-    def code(image: np.ndarray) -> np.ndarray:
-        nonlocal number
-        quality, number = JPEG_QUALITIES[number % len(JPEG_QUALITIES)], number + 1
-        return _through_jpeg(image, quality)
+    The quality at which an image is shown first is the same in every stream, repeats or not: so repeats alone make
+    the difference.
+    """
+    shown, repeats = -1, 0
+
+    def code(image: np.ndarray, number: int) -> np.ndarray:
+        nonlocal shown, repeats
+        shown, repeats = number, repeats + 1 if number == shown else 0
+        return _through_jpeg(image, JPEG_QUALITIES[(number + repeats) % len(JPEG_QUALITIES)])
 
     return code
 
@@ -94,7 +98,7 @@ def skipping() -> Codec:
     """Return a codec that sends only the macroblocks that change, and refines them in the next image."""
     sent: np.ndarray | None = None
 
-    def code(image: np.ndarray) -> np.ndarray:
+    def code(image: np.ndarray, number: int) -> np.ndarray:
         nonlocal sent
         decoded = _through_jpeg(image, JPEG_QUALITIES[0])
         if sent is not None:
@@ -127,7 +131,7 @@ REPEAT_FAULTS: dict[str, RepeatFault] = {
 """Faults by name."""
 
 
-def _unchanged(image: np.ndarray) -> np.ndarray:
+def _unchanged(image: np.ndarray, number: int) -> np.ndarray:
     return image
 
 
