@@ -15,7 +15,7 @@ import numpy as np
 
 from autocalib_ros.errors import InputError
 from autocalib_ros.perception.intensity_normalisation import IntensityNormaliser
-from autocalib_ros.util.picture_size import check_picture
+from autocalib_ros.util.picture_size import check_picture, require_pixels
 
 LOG = logging.getLogger(__name__)
 
@@ -97,6 +97,7 @@ class ImageDecoder:
         encoding = canonical_encoding(message.encoding)
         if message.width < 1 or message.height < 1:
             raise InputError(f"image of encoding '{encoding}' has no pixels: {message.width} x {message.height}")
+        require_pixels(int(message.width), int(message.height))
         if encoding in ASSUMED_ENCODINGS:
             self._warn_once(encoding)
         if encoding in PACKED_ENCODINGS:

@@ -24,6 +24,11 @@ MAX_EVIDENCE_BYTES = 500_000_000
 MAX_CHUNK_BYTES = 500_000_000
 """Most bytes of an unpacked message or chunk of a recording: a raw image of `MAX_IMAGE_PIXELS` in colour; recorders
 close their chunks after 4 MB, or after the first larger message."""
+MAX_PACKED_RATIO, ALWAYS_UNPACKED_BYTES = 1000, 1_000_000_000
+"""Most bytes of a recording that was compressed as a whole, for each of its own, and the size up to which any ratio
+will do: raw images of a real sensor shrink to a fifth, drawn ones without noise to a hundredth."""
+MIN_FREE_BYTES = 1_000_000_000
+"""Least room left on the disk beside copies of recordings, for what else the computer writes."""
 MAX_MODEL_SIDE_PX = 8192
 """Longest side of the input of a detector: its tensor has 0.8 GB then."""
 MAX_CLASSES = 10_000

@@ -32,7 +32,11 @@ Pillow would reserve the memory of the picture at once."""
 
 def check_picture(data: bytes | memoryview, limit: int = MAX_IMAGE_PIXELS) -> None:
     """Raise InputError if an encoded picture has more than `limit` pixels, or a header that cannot be read."""
-    width, height = picture_size(data)
+    require_pixels(*picture_size(data), limit)
+
+
+def require_pixels(width: int, height: int, limit: int = MAX_IMAGE_PIXELS) -> None:
+    """Raise InputError for a picture of more than `limit` pixels."""
     if width * height > limit:
         raise InputError(
             f'the picture has {width}x{height} pixels, more than {limit // 1_000_000} million: it is not decoded'

@@ -31,6 +31,7 @@ from autocalib_ros.offline.ground_truth import read_truth, true_camera
 from autocalib_ros.offline.parameter_file import camera_info_file, override_options, parse_assignments, read_params_file
 from autocalib_ros.offline.recordings.image_files import EXIF_IFD, EXIF_ORIENTATION, EXIF_SUBSECOND, EXIF_TIME
 from autocalib_ros.offline.recordings.open import open_source
+from autocalib_ros.offline.recordings.unpacking import zstd_module
 from autocalib_ros.offline.track_files import evidence_from_file
 from autocalib_ros.offline.view_files import read_image
 from autocalib_ros.perception.detector.detector import _names
@@ -169,6 +170,11 @@ def _write_rosbag2(path: Path, plugin: StoragePlugin) -> None:
         for time_ns, message in _messages(store.types):
             writer.write(connection, time_ns, store.serialize_cdr(message, kind))
     shutil.copy(path.with_suffix('') / path.name, path)
+
+
+def _packed_recording() -> bytes:
+    whole = _written(partial(_write_rosbag2, plugin=StoragePlugin.MCAP), 'b.mcap')
+    return zstd_module().compress(whole)
 
 
 def _write_rosbag1(path: Path) -> None:
@@ -322,6 +328,7 @@ TARGETS = {
         _read_recording,
         damaged_bytes,
     ),
+    'packed mcap': FuzzTarget('b.mcap.zstd', lambda: [_packed_recording()], _read_recording, damaged_bytes),
     'sqlite': FuzzTarget(
         'b.db3',
         lambda: [_written(partial(_write_rosbag2, plugin=StoragePlugin.SQLITE3), 'b.db3')],

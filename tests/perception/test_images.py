@@ -357,6 +357,7 @@ def test_a_compressed_bayer_mosaic_is_coloured():
         ({'step': 16, 'data': b'\0' * 575}, 'needs rows of 48 bytes, but its step is 16'),
         ({'width': 0}, "'bgr8' has no pixels: 0 x 12"),
         ({'height': 0}, "'bgr8' has no pixels: 16 x 0"),
+        ({'width': 20_000, 'height': 20_000}, '20000x20000 pixels, more than 100 million'),
     ],
 )
 def test_a_broken_image_is_refused_with_the_reason(change, reason):

@@ -6,7 +6,7 @@ import logging
 import shutil
 import sqlite3
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -16,16 +16,20 @@ from rosbags.rosbag2 import Reader as Reader2
 from autocalib_ros.errors import AutocalibError, InputError
 from autocalib_ros.offline.recordings.listing import ACTIVE_SUFFIX, PACKED_SUFFIXES, PART_SUFFIXES, bare
 from autocalib_ros.offline.recordings.scanned_files import ScannedFile
-from autocalib_ros.offline.recordings.unpacking import limit_readers, zstd_module
+from autocalib_ros.offline.recordings.unpacking import limit_readers, require_room, unpack_file
 from autocalib_ros.util.documents import read_yaml
 from autocalib_ros.util.input_limits import MAX_METADATA_BYTES
 
 LOG = logging.getLogger(__name__)
 
 limit_readers()
+COLUMN_KINDS, COMPUTED = (
+    "SELECT max(c.hidden) FROM sqlite_master AS m JOIN pragma_table_xinfo(m.name) AS c WHERE m.type = 'table'",
+    2,
+)
+"""Asks what SQLite hides of the columns of all tables, and from which answer on values are computed."""
 LOG_SUFFIXES = ('-wal', '-journal')
 """What SQLite keeps beside a database until it is closed."""
-COPY_BYTES = 1 << 20
 
 
 class BagPart:
@@ -55,6 +59,8 @@ class BagPart:
 
     def _open(self) -> Any:
         error = None
+        if self._readable.suffix == '.db3':
+            _require_stored_values(self._readable)
         if self._scanned is None:
             try:
                 reader: Any = Reader1(self._readable) if self.is_ros1 else Reader2(self._readable)
@@ -186,13 +192,9 @@ def _prepared(path: Path, temporary: Callable[[], Path]) -> BagPart:
 
 def _unpacked(path: Path, copy: Path) -> Path:
     """Unpack a file into a copy, as far as it goes."""
-    zstd = zstd_module()
-    with path.open('rb') as packed, copy.open('wb') as unpacked:
-        try:
-            with zstd.open(packed, 'rb') as stream:
-                shutil.copyfileobj(stream, unpacked, COPY_BYTES)
-        except (EOFError, zstd.ZstdError) as error:
-            LOG.warning('%s is damaged; what could be unpacked is used: %s', path, one_line(error))
+    damage = unpack_file(path, copy)
+    if damage:
+        LOG.warning('%s is damaged; what could be unpacked is used: %s', path, damage)
     return copy
 
 
@@ -200,6 +202,7 @@ def _with_log(path: Path, copy: Path) -> Path:
     """Copy a database with its log, and let SQLite merge them: readers of rosbags leave the log out."""
     for suffix in ('', *LOG_SUFFIXES):
         if Path(f'{path}{suffix}').exists():
+            require_room(copy.parent, Path(f'{path}{suffix}').stat().st_size)
             shutil.copyfile(f'{path}{suffix}', f'{copy}{suffix}')
     try:
         with closing(sqlite3.connect(copy)) as database:
@@ -210,6 +213,17 @@ def _with_log(path: Path, copy: Path) -> Path:
         raise InputError(f'cannot read {path} with its log: {one_line(error)}') from error
     LOG.warning('%s was not closed by its recorder: the messages in its log are read too', path)
     return copy
+
+
+def _require_stored_values(path: Path) -> None:
+    """Raise InputError for a database that computes values: a row of 20 bytes could give gigabytes."""
+    with (
+        suppress(sqlite3.Error, UnicodeDecodeError),  # the latter where a damaged name is in the message of an error
+        closing(sqlite3.connect(f'{path.absolute().as_uri()}?mode=ro&immutable=1', uri=True)) as database,
+    ):
+        (hidden,) = database.execute(COLUMN_KINDS).fetchone()
+        if (hidden or 0) >= COMPUTED:
+            raise InputError(f'{path} has columns that are computed, which no recorder writes')
 
 
 def one_line(error: Exception) -> str:

@@ -1,10 +1,14 @@
-"""Unpack chunks and messages of recordings up to a size: 1 MB of Zstandard can hold terabytes."""
+"""Unpack recordings, their chunks and messages up to a size: 1 MB of Zstandard can hold terabytes."""
 
 from __future__ import annotations
 
 import bz2
+import errno
+import os
+import shutil
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import lz4.frame  # type: ignore[import-untyped]  # comes with rosbags, as that for zstd
@@ -12,7 +16,12 @@ from rosbags.rosbag1 import reader as rosbag1_reader
 from rosbags.rosbag2 import storage_mcap
 
 from autocalib_ros.errors import InputError
-from autocalib_ros.util.input_limits import MAX_CHUNK_BYTES
+from autocalib_ros.util.input_limits import (
+    ALWAYS_UNPACKED_BYTES,
+    MAX_CHUNK_BYTES,
+    MAX_PACKED_RATIO,
+    MIN_FREE_BYTES,
+)
 
 
 def zstd_module() -> Any:
@@ -31,6 +40,7 @@ DECOMPRESSORS: dict[str, Callable[[], Any]] = {
 }
 
 
+COPY_BYTES = 1 << 20
 MAX_LZ4_RATIO = 256
 """No LZ4 frame unpacks to more bytes for each of its own: a byte adds 255 to the length of a match."""
 
@@ -54,6 +64,40 @@ def unpack(compression: str, packed: bytes | memoryview, limit: int = MAX_CHUNK_
             raise InputError('a chunk or message is cut')
         rest = frame.unused_data or b''
     return b''.join(parts)
+
+
+def unpack_file(path: Path, copy: Path) -> str:
+    """Unpack a file of Zstandard into a copy, as far as it goes; return why not further, '' if it is whole.
+
+    InputError if it unpacks to absurdly much, or to more than the disk has room for. OSError if it cannot be written.
+    """
+    zstd = zstd_module()
+    limit = max(MAX_PACKED_RATIO * path.stat().st_size, ALWAYS_UNPACKED_BYTES)
+    written = 0
+    with path.open('rb') as packed, copy.open('wb') as unpacked:
+        try:
+            with zstd.open(packed, 'rb') as stream:
+                while part := stream.read(COPY_BYTES):
+                    written += len(part)
+                    if written > limit:
+                        raise InputError(
+                            f'{path} unpacks to more than {MAX_PACKED_RATIO} times its size: unpack it yourself if '
+                            'that is right, and give the result'
+                        )
+                    require_room(copy.parent, len(part))
+                    unpacked.write(part)
+        except (EOFError, zstd.ZstdError) as error:
+            return ' '.join(str(error).split())
+        except InputError:
+            copy.unlink()
+            raise
+    return ''
+
+
+def require_room(folder: Path, size: int) -> None:
+    """Raise OSError unless a disk has room for so many bytes and `MIN_FREE_BYTES` beside."""
+    if shutil.disk_usage(folder).free < size + MIN_FREE_BYTES:
+        raise OSError(errno.ENOSPC, f'{os.strerror(errno.ENOSPC)} ({MIN_FREE_BYTES // 10**9} GB are left free)')
 
 
 def limit_readers() -> None:

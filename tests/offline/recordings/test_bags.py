@@ -286,6 +286,21 @@ def test_a_torn_sqlite_file_gives_images_or_one_line(tmp_path, write_bag, images
         assert '\n' not in str(error)
 
 
+def test_a_database_that_computes_its_messages_is_refused(tmp_path, write_bag, images):
+    """A row of 20 bytes would give 900 MB."""
+    whole = write_bag(tmp_path / 'bag', images(1)) / 'bag.db3'
+    database = sqlite3.connect(whole)
+    with database:
+        database.execute('ALTER TABLE messages RENAME TO stored')
+        database.execute(
+            'CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INT, timestamp INT, data AS (zeroblob(900000000)))'
+        )
+        database.execute('INSERT INTO messages(topic_id, timestamp) SELECT topic_id, timestamp FROM stored')
+    database.close()
+    with pytest.raises(InputError, match='has columns that are computed'):
+        open_source(whole)
+
+
 @pytest.mark.parametrize('name', ['text.mcap', 'text.db3', 'text.bag'])
 def test_a_text_file_named_as_a_recording_is_one_clear_line(tmp_path, name):
     path = tmp_path / name
