@@ -78,7 +78,8 @@ def refine_and_verify(
     halves = check_halves(fit, tracks, gate)
     if isinstance(halves, Reason):
         return halves
-    # Errors that no residual shows widen the covariance.
+    # A turn of the camera that the halves do not exclude, and errors that no residual shows, widen the covariance.
+    fit = halves.covered_by(fit)
     fit = widen_by_point_slip(fit, observations.windows)
     fit = widen_by_tracklet_difference(fit, tracklets)
     # Other focal lengths that are about as probable widen it, too.

@@ -23,6 +23,12 @@ HALF_MODEL_SIGMAS = (0.01, np.radians(0.3))
 the camera about each axis in radians (their traffic covers other parts of the road, which is not planar)."""
 HALF_CONTRADICTION = 3e-3
 """Probability that two consistent halves differ by more."""
+TURNED_PROBABILITY = 0.05
+"""Probability, before the traffic is compared, that the camera turned between two halves unnoticed: where the still
+scene has few corners, as at night, nothing else shows it. Judgement."""
+TURNED_SIGMA_RAD = np.radians(3.0)
+"""Standard deviation of such a turn about each axis: smaller ones are followed, larger ones change the whole picture.
+Judgement."""
 
 
 @dataclass(frozen=True)
@@ -73,10 +79,22 @@ def _pose_about(origin: Adjustment, state: AdjustmentState) -> np.ndarray:
     return np.array([focal, *Rotation.from_matrix(origin.state.rotation.T @ state.rotation).as_rotvec()])
 
 
-def half_difference_sigmas(
+@dataclass(frozen=True)
+class HalfDifference:
+    """The difference between the poses and focal lengths of two halves of the traffic, with what explains it."""
+
+    sigmas: float
+    """The difference in standard deviations."""
+    limit: float
+    """Its limit: two halves of one view exceed it with the probability `HALF_CONTRADICTION`."""
+    turned: float
+    """Probability that the camera turned in between."""
+
+
+def half_difference(
     first: Adjustment, second: Adjustment, vehicles: int, common: np.ndarray | float = 0.0
-) -> tuple[float, float] | None:
-    """Return the difference between the solutions of two halves, and its limit, in standard deviations.
+) -> HalfDifference | None:
+    """Return the difference between the solutions of two halves of at least `vehicles` vehicles each.
 
     Focal length and all of the rotation of the camera against the roads together, with their covariance: a camera that
     turned in between turns about an axis of which traffic is far more certain than of others. Hotelling's T squared
@@ -91,11 +109,23 @@ def half_difference_sigmas(
     compared = 1 + len(first.problem.parameters.axes)
     if not np.isfinite(covariance).all() or vehicles <= compared:
         return None
-    model = np.square([HALF_MODEL_SIGMAS[0], *3 * (HALF_MODEL_SIGMAS[1],)])
     change = half_change(first, second)
-    value = float(np.sqrt(change @ np.linalg.solve(covariance + np.diag(model), change)))
+    one_view = covariance + np.diag(np.square([HALF_MODEL_SIGMAS[0], *3 * (HALF_MODEL_SIGMAS[1],)]))
+    two_views = one_view + np.diag(np.square([0.0, *3 * (TURNED_SIGMA_RAD,)]))
     scale = compared * (vehicles - 1) / (vehicles - compared)
-    return value, float(np.sqrt(scale * special.fdtri(compared, vehicles - compared, 1.0 - HALF_CONTRADICTION)))
+    limit = float(np.sqrt(scale * special.fdtri(compared, vehicles - compared, 1.0 - HALF_CONTRADICTION)))
+    log_odds = special.logit(TURNED_PROBABILITY) + (
+        _log_density(change, two_views, vehicles - compared) - _log_density(change, one_view, vehicles - compared)
+    )
+    return HalfDifference(
+        float(np.sqrt(change @ np.linalg.solve(one_view, change))), limit, float(special.expit(log_odds))
+    )
+
+
+def _log_density(change: np.ndarray, covariance: np.ndarray, freedom: int) -> float:
+    """Log density of Student's distribution, up to a constant, at a difference (n,) with its covariance (n, n)."""
+    square = float(change @ np.linalg.solve(covariance, change))
+    return float(-0.5 * np.linalg.slogdet(covariance)[1] - 0.5 * (freedom + len(change)) * np.log1p(square / freedom))
 
 
 def expected_half_differences(whole: Adjustment, *halves: Adjustment) -> np.ndarray:

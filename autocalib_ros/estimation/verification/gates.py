@@ -18,6 +18,7 @@ from autocalib_ros.estimation.adjustment.bundle_adjustment import (
 )
 from autocalib_ros.estimation.adjustment.covariance import sigma_without_prior
 from autocalib_ros.estimation.adjustment.lens_prior import known_lens
+from autocalib_ros.estimation.adjustment.model_selection import select_model
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig
 from autocalib_ros.estimation.observations.track_set import TrackSet, UnprojectedTracks, long_tracks
 from autocalib_ros.estimation.observations.tracklets import no_tracklets
@@ -27,9 +28,10 @@ from autocalib_ros.estimation.verification.consistency import (
     compare_solutions,
     expected_half_differences,
     half_change,
-    half_difference_sigmas,
+    half_difference,
 )
 from autocalib_ros.estimation.verification.ground_normal import LevelCamera, PlaneEstimate, orient_above_traffic
+from autocalib_ros.estimation.verification.half_starts import turned_start
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.ground_plane import MIN_FRACTION_BELOW_HORIZON
 from autocalib_ros.lens.camera import Camera
@@ -214,6 +216,13 @@ class ComparedHalves:
 
     statement: Statement
     rows: tuple[VerificationRow, ...] = ()
+    steps: np.ndarray | None = None
+    """Steps (2, parameters) from the solution to the view of each half, times the root of the probability that this is
+    the view, as the camera turned in between; None where nothing was compared."""
+
+    def covered_by(self, fit: Adjustment) -> Adjustment:
+        """Return the solution whose covariance covers two views, by how probable they are (model averaging)."""
+        return fit if self.steps is None else replace(fit, covariance=fit.covariance + self.steps.T @ self.steps)
 
 
 NOT_COMPARED = ComparedHalves(check('halves_not_compared'))
@@ -258,11 +267,14 @@ def check_halves(
     for lens in lenses:
         state, held = replace(fit.state, camera=lens), replace(config, prior=known_lens(lens))
         through.append(_solve_halves(replace(fit, state=state), tracks, held, gate, masks))
-    together = _compare_poses(*fits, [other for other in through if other is not None])
-    if isinstance(together, Reason):
-        return together
+    poses = _compare_poses(*fits, [other for other in through if other is not None])
+    if isinstance(poses, Reason):
+        return poses
+    together, turned = poses
+    steps = np.array([fit.problem.parameters.step_to(each.state) for each in fits])
     statement = check('halves', focal=focal, normal_deg=turn if fit.plane_known else None)
-    return ComparedHalves(statement, (*share, *(rows if fit.plane_known else rows[:1]), *together))
+    compared = (*share, *(rows if fit.plane_known else rows[:1]), *together)
+    return ComparedHalves(statement, compared, np.sqrt(0.5 * turned) * steps)
 
 
 def _solve_halves(
@@ -292,10 +304,15 @@ def _solve_half(
         return None
     _, motion, shapes = fit.problem.warm_start
     warm_start = None, motion.subset(seen) if motion else None, shapes.subset(living) if bundle and shapes else None
-    solved = adjust(fit.state, part, part_setting, refine=True, warm_start=warm_start)
-    if any(mask.sum() < gate.min_tracks_per_road // 2 for mask in road_support(solved, part)):
-        return None
-    return solved
+    fits = [adjust(fit.state, part, part_setting, refine=True, warm_start=warm_start)]
+    # a camera that turned in between shows each half roads that are not those of the whole
+    turned = turned_start(fit.state, part)
+    if turned is not None:
+        fits.append(adjust(turned, part, part_setting))
+    supported = [
+        each for each in fits if all(mask.sum() >= gate.min_tracks_per_road // 2 for mask in road_support(each, part))
+    ]
+    return select_model(supported, part) if supported else None
 
 
 def _compare_shares(fit: Adjustment, tracks: TrackSet, early: np.ndarray) -> Reason | tuple[VerificationRow, ...]:
@@ -365,19 +382,20 @@ def share_difference(earlier: np.ndarray, later: np.ndarray) -> tuple[float, flo
 
 def _compare_poses(
     first: Adjustment, second: Adjustment, through: Sequence[tuple[Adjustment, Adjustment]]
-) -> Reason | tuple[VerificationRow, ...]:
+) -> Reason | tuple[tuple[VerificationRow, ...], float]:
     """Compare focal length and rotation of two halves together; no row where a half determines nothing.
 
-    `through` are the halves through other lenses, each a standard deviation away.
+    `through` are the halves through other lenses, each a standard deviation away. Returns also the probability that the
+    camera turned in between.
     """
     changes = np.array([half_change(*halves) - half_change(first, second) for halves in through]).reshape(-1, 4)
     vehicles = min(len(np.unique(fit.problem.vehicle_ids)) for fit in (first, second))
-    difference = half_difference_sigmas(first, second, vehicles, changes.T @ changes)
+    difference = half_difference(first, second, vehicles, changes.T @ changes)
     if difference is None:
-        return ()
-    row = verified('halves_pose', *difference)
+        return (), 0.0
+    row = verified('halves_pose', difference.sigmas, difference.limit)
     if row.passed:
-        return (row,)
+        return (row,), difference.turned
     turned = Rotation.from_matrix(first.state.rotation.T @ second.state.rotation).magnitude()
     return reason('halves_disagree', 'pose', sigmas=row.value, limit=row.limit, turned_deg=float(np.degrees(turned)))
 

@@ -11,9 +11,10 @@ from autocalib_ros.estimation.adjustment.bundle_adjustment import adjust
 from autocalib_ros.estimation.adjustment.lens_prior import known_lens
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig, AdjustmentState
 from autocalib_ros.estimation.observations.track_set import select_tracks
-from autocalib_ros.estimation.verification.consistency import half_change, half_difference_sigmas
+from autocalib_ros.estimation.verification.consistency import half_change, half_difference
 from autocalib_ros.estimation.verification.gates import share_difference
 from autocalib_ros.evidence.snapshot import Track
+from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
 from autocalib_ros.offline.benchmark.monte_carlo import draw_evidence
 from autocalib_ros.offline.synthetic.junction import Junction, evidence_from_tracks
 from autocalib_ros.results.calibration import Calibration, Refusal
@@ -28,6 +29,23 @@ def test_a_camera_that_turned_in_between_is_noticed_by_its_traffic(run: int, num
     result = solve_once(evidence, Options(camera_height=junction.height_m, joint=ONE_FAMILY))
     assert isinstance(result, Refusal) and result.code == 'halves_disagree'
     assert result.values['sigmas'] > result.values['limit'] and number in result.values
+
+
+@pytest.mark.parametrize('run', [9, 17])
+def test_a_road_of_one_view_and_another_of_the_other_do_not_hide_that_the_camera_turned(run: int) -> None:
+    junction, evidence = draw_evidence('mixed_views', 101, run)
+    result = solve_once(evidence, Options(camera_height=junction.height_m, joint=ONE_FAMILY))
+    assert isinstance(result, Refusal) and result.code == 'halves_disagree'
+
+
+def test_a_turn_that_the_halves_do_not_exclude_widens_the_standard_deviation() -> None:
+    junction, evidence = draw_evidence('mixed_views', 101, 5)
+    result = solve_once(evidence, Options(camera_height=junction.height_m, joint=ONE_FAMILY))
+    assert isinstance(result, Calibration) and result.ground is not None
+    pose = next(row for row in result.verification if row.kind == 'halves_pose')
+    assert pose.passed and pose.value > 0.7 * pose.limit
+    _, roll = tilt_and_roll_deg(result.ground.normal_in_camera) - tilt_and_roll_deg(junction.normal_in_camera)
+    assert 1.0 < abs(roll) < 3.0 * result.stddev.roll_deg
 
 
 def test_halves_of_one_view_agree() -> None:
@@ -81,11 +99,12 @@ def test_what_halves_share_is_no_difference_between_them() -> None:
         along = road.camera_from_ground @ Rotation.from_euler('z', angle_deg, degrees=True).as_matrix()
         start = AdjustmentState(road.camera, along, np.zeros(1))
         fits.append(adjust(start, tracks, AdjustmentConfig(known_lens(road.camera), JointOptions()), refine=True))
-    value, limit = half_difference_sigmas(*fits, 15)
-    assert value > limit
+    alone = half_difference(*fits, 15)
+    assert alone.sigmas > alone.limit and alone.turned > 0.9
     change = half_change(*fits)
     assert np.degrees(np.linalg.norm(change[1:])) == pytest.approx(4.0, abs=0.7)
-    assert half_difference_sigmas(*fits, 15, np.outer(change, change))[0] < 1.0
+    shared = half_difference(*fits, 15, np.outer(change, change))
+    assert shared.sigmas < 1.0 and shared.turned < 0.05
     across = np.cross([1.0, 0.0, 0.0], change[1:])
     other = np.array([0.0, *across * np.linalg.norm(change) / np.linalg.norm(across)])
-    assert half_difference_sigmas(*fits, 15, np.outer(other, other))[0] > limit
+    assert half_difference(*fits, 15, np.outer(other, other)).sigmas > alone.limit
