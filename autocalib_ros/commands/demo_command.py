@@ -5,10 +5,16 @@ from __future__ import annotations
 import argparse
 import shutil
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from autocalib_ros.commands import DONE, REFUSED
 from autocalib_ros.commands.output import print_stderr, replay_and_report
 from autocalib_ros.commands.replay_command import DEFAULT_OUT
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from autocalib_ros.results.calibration import Calibration
 
 HELP = 'simulate traffic, calibrate from it and compare with the ground truth'
 DESCRIPTION = None
@@ -30,22 +36,37 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Simulate, replay and compare with the ground truth; return the exit status."""
+    """Simulate, calibrate meanwhile, and compare with the ground truth; return the exit status."""
+    print_stderr('Simulating a minute of traffic at a junction, and calibrating from it meanwhile.')
     from autocalib_ros.offline import outputs
-    from autocalib_ros.offline.demonstration import compare_with_truth, options_from_truth, simulate_bag
-    from autocalib_ros.offline.recordings.open import open_source
+    from autocalib_ros.offline.demonstration import (
+        PICTURE,
+        compare_with_truth,
+        options_from_truth,
+        simulated,
+        write_picture,
+    )
 
     bag = arguments.out / 'recording'
     outputs.prepare_output_dir(arguments.out, bag)
+    recording = simulated(bag, arguments.seed)
+
+    def show(found: Calibration, image: np.ndarray) -> None:
+        if write_picture(arguments.out / PICTURE, found, image):
+            print_stderr(f'First picture, with the grid on the road: {arguments.out / PICTURE}')
+
     try:
-        truth = simulate_bag(bag, arguments.seed)
         replayed = replay_and_report(
-            [open_source(bag)], options_from_truth(truth, arguments.scale_from), arguments.out, truth=truth
+            [recording],
+            options_from_truth(recording.truth, arguments.scale_from),
+            arguments.out,
+            truth=recording.truth,
+            on_accepted=show,
         )
     finally:
         if not arguments.keep_bag:
             shutil.rmtree(bag, ignore_errors=True)
-    comparison = compare_with_truth(replayed.result, truth)
+    comparison = compare_with_truth(replayed.result, recording.truth)
     if comparison is None:
         return REFUSED
     print(comparison.table())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,11 +13,14 @@ from autocalib_ros.commands.map_output import place_result, placement_lines, wri
 from autocalib_ros.config import Options
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from autocalib_ros.evidence.snapshot import Evidence
     from autocalib_ros.lens.camera import Camera
     from autocalib_ros.offline.recordings.sources import Source
     from autocalib_ros.offline.replay_recording import ReplayResult
     from autocalib_ros.perception.detector.detector import VehicleDetector
+    from autocalib_ros.results.calibration import Calibration
     from autocalib_ros.results.control_points import ControlPoints
 
 
@@ -40,12 +43,13 @@ def replay_and_report(
     named_after: Sequence[Source] | None = None,
     points: ControlPoints | None = None,
     truth: Mapping[str, Any] | None = None,
+    on_accepted: Callable[[Calibration, np.ndarray], None] | None = None,
 ) -> ReplayResult:
     """Replay recordings of one camera, write the output files and print the result.
 
     `stop` is the request that live streams among the sources ask; `before` is evidence of an earlier run, then the
     results are named after all its sources, `named_after`. Control `points` give the place in the map. With
-    the `truth` of a simulation the report compares the result with it.
+    the `truth` of a simulation the report compares the result with it. `on_accepted` receives the first calibration.
     """
     from autocalib_ros.offline.outputs import EvidenceFile, write_outputs
     from autocalib_ros.offline.replay_recording import replay
@@ -72,6 +76,7 @@ def replay_and_report(
             on_checkpoint=file.write,
             before=before,
             start_solving=solver,
+            on_accepted=on_accepted,
         )
     if replayed.stopped:
         print_stderr(f'Stopped after {replayed.frames} images; the result is of these.')

@@ -2,23 +2,30 @@
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from autocalib_ros.config import Options, ScaleOptions
+from autocalib_ros.errors import InputError
 from autocalib_ros.geometry.ground_plane import angles_deg
 from autocalib_ros.offline.ground_truth import (
     MAX_COMPARED_RANGE_M,
     distance_error_percent,
     nearby_road_points,
-    read_truth,
 )
+from autocalib_ros.offline.simulate.options import SimulationOptions
+from autocalib_ros.offline.simulate.simulation import Simulation
+from autocalib_ros.offline.simulated_recording import SimulatedRecording
+from autocalib_ros.pictures.showcase import showcase
 from autocalib_ros.results.calibration import Calibration, Refusal
+from autocalib_ros.results.saved_camera import SavedCamera
+from autocalib_ros.util.files import write_picture_bytes
 
+PICTURE, PICTURE_QUALITY = 'picture.jpg', 90
 MAX_FOCAL_ERROR_PERCENT = 3.0
 MAX_NORMAL_ERROR_DEG = 1.0
 MAX_ROAD_ANGLE_DEG, MAX_DETOUR_RATIO = 6.0, 1.05
@@ -55,17 +62,25 @@ class TruthErrors:
         return '\n'.join(['Errors against the truth:', *lines])
 
 
-def simulate_bag(bag: Path, seed: int) -> dict[str, Any]:
-    """Simulate the default scene into a new bag and return its ground truth.
+def simulated(bag: Path, seed: int) -> SimulatedRecording:
+    """Return the default scene, simulated into a new bag while it is read.
 
     Images are stored as JPEG: raw images would take gigabytes.
     """
-    from autocalib_ros.offline import simulate
+    return SimulatedRecording(bag, Simulation(SimulationOptions(seed=seed, compressed=True)))
 
-    parser = argparse.ArgumentParser()
-    simulate.add_arguments(parser)
-    simulate.run(parser.parse_args([str(bag), '--seed', str(seed), '--compressed']))
-    return read_truth(bag / 'truth.json')
+
+def write_picture(path: Path, found: Calibration, image: np.ndarray) -> bool:
+    """Write an image with the grid on the road, and its top view; return False if there is no road to show."""
+    if found.ground is None:
+        return False
+    try:
+        picture = showcase(SavedCamera.of(found), image)
+    except InputError:
+        return False
+    _, data = cv2.imencode(path.suffix, picture, [cv2.IMWRITE_JPEG_QUALITY, PICTURE_QUALITY])
+    write_picture_bytes(path, data.tobytes())
+    return True
 
 
 def options_from_truth(truth: dict[str, Any], scale_from: str) -> Options:

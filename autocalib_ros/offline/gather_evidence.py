@@ -46,6 +46,9 @@ class ReplayControl:
     start_solving: StartSolving | None = None
     """Solves the evidence on the way while images are read; None solves it in between."""
 
+    on_accepted: Callable[[Calibration, np.ndarray], None] | None = None
+    """Receives the first calibration that is accepted while the recording is read, and the newest image."""
+
     def report(self, frames: int, note: str) -> None:
         """Report progress."""
         if self.on_progress is not None:
@@ -89,7 +92,7 @@ def gather_evidence(
     """
     calibrator, moves = AutoCalibrator(options, detector), MoveLog()
     trials = SolutionTrials(options, control.start_solving or solved_in_between)
-    count, note, stopped, checkpoint_s, first_ns, seen_s = 0, '', False, CHECKPOINT_EVERY_S, 0, 0.0
+    count, note, stopped, shown, checkpoint_s, first_ns, seen_s = 0, '', False, False, CHECKPOINT_EVERY_S, 0, 0.0
     for count, frame in enumerate(prefetched(source.frames()), start=1):
         scaled_lens = scaled(lens, (frame.image.shape[1], frame.image.shape[0]))
         calibrator.add_image(frame.stamp_ns, frame.image)
@@ -103,6 +106,9 @@ def gather_evidence(
                 control.report(frames_before + count, 'solving')
                 trials.start(_as_recorded(calibrator.with_segments(due), source), scaled_lens)
         trials.take_finished()
+        if control.on_accepted is not None and not shown and isinstance(trials.latest, Calibration):
+            shown = True
+            control.on_accepted(trials.latest, frame.image)
         if control.on_checkpoint is not None and seen_s >= checkpoint_s:
             checkpoint_s = seen_s + CHECKPOINT_EVERY_S
             control.on_checkpoint(_longest_part(calibrator, source, source.window.start_s + seen_s))

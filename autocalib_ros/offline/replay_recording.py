@@ -77,6 +77,7 @@ def replay(
     on_checkpoint: Callable[[Evidence], None] | None = None,
     before: Evidence | None = None,
     start_solving: StartSolving | None = None,
+    on_accepted: Callable[[Calibration, np.ndarray], None] | None = None,
 ) -> ReplayResult:
     """Collect evidence from a recording, given as a path or an open source, and solve at its end.
 
@@ -86,14 +87,19 @@ def replay(
 
     `on_progress` receives the number of frames and a short note, whose first word is the state: collecting, solving,
     calibrated or refused. Once `should_stop` returns true, what was seen so far is solved. `on_checkpoint` receives the
-    evidence so far every two minutes of the recording, and all of it before the last solution. With a known `lens` only
-    the pose is estimated; UsageError if its aspect ratio differs from that of the images. `detector` is an open
-    detector; None opens the one of the options. `start_solving` solves the evidence on the way in the background, see
-    `solver_process.BackgroundSolver`; the result is the same. InputError without an image.
+    evidence so far every two minutes of the recording, and all of it before the last solution. `on_accepted` receives
+    the first calibration on the way, with the newest image. With a known `lens` only the pose is estimated; UsageError
+    if its aspect ratio differs from that of the images. `detector` is an open detector; None opens the one of the
+    options. `start_solving` solves the evidence on the way in the background, see `solver_process.BackgroundSolver`; the
+    result is the same. InputError without an image.
     """
     sources = _opened(recording)
     control = ReplayControl(
-        on_progress=on_progress, should_stop=should_stop, on_checkpoint=on_checkpoint, start_solving=start_solving
+        on_progress=on_progress,
+        should_stop=should_stop,
+        on_checkpoint=on_checkpoint,
+        on_accepted=on_accepted,
+        start_solving=start_solving,
     )
     joint = JoinedEvidence(options.gate, before)
     gathered = _gather_all(sources, options, control, joint, lens, detector)

@@ -10,7 +10,7 @@ import pytest
 from autocalib_ros.config import Options
 from autocalib_ros.errors import InputError
 from autocalib_ros.geometry.ground_plane import GroundPlane
-from autocalib_ros.offline.demonstration import compare_with_truth, options_from_truth
+from autocalib_ros.offline.demonstration import compare_with_truth, options_from_truth, write_picture
 from autocalib_ros.offline.ground_truth import beside_truth, read_truth
 from autocalib_ros.pictures.views import ground_to_image
 
@@ -103,3 +103,11 @@ def test_the_report_sets_the_result_beside_the_truth(full):
     assert rows['focal length'].true == '137.0 px' and rows['focal length'].error == '+3.0 px'
     assert rows['focal length'].sigmas == pytest.approx(3.0 / full.result.stddev.focal_px)
     assert rows['tilt'].sigmas == pytest.approx(0.0, abs=1e-6) and rows['camera height'].error == '+0.00 m'
+
+
+def test_the_picture_shows_a_road_or_is_left_out(full, lens_only, tmp_path):
+    image = np.full((full.result.camera.height, full.result.camera.width, 3), 90, np.uint8)
+    assert (
+        write_picture(tmp_path / 'picture.jpg', full.result, image) and (tmp_path / 'picture.jpg').stat().st_size > 1000
+    )
+    assert not write_picture(tmp_path / 'none.jpg', lens_only.result, image)

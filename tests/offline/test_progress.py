@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+import time
 
 import pytest
 
@@ -81,3 +82,15 @@ def test_no_time_is_told_before_it_is_known():
         progress.update_to(500, 'collecting again')
         progress.update_to(501, 'solving')
     assert ' left, ' in stream.getvalue()
+
+
+def test_no_time_is_foretold_before_the_rate_is_known(monkeypatch):
+    clock = iter([0.0, 30.0, 35.2, 40.4, 46.0, 46.0])
+    monkeypatch.setattr(time, 'monotonic', lambda: next(clock))
+    stream = io.StringIO()
+    with progress_bar(100, 'images', 'replay', stream=stream) as progress:
+        for done in (1, 4, 21, 100):  # the first image took 30 s: libraries, and the backdrop of a simulation
+            progress.update_to(done)
+    lines = stream.getvalue().splitlines()
+    assert ['left' in line for line in lines] == [False, False, True, False]
+    assert '41 s left' in lines[2]  # 79 images at 20 in 10.4 s

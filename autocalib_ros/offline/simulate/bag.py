@@ -6,7 +6,8 @@ import json
 import multiprocessing
 import os
 import shutil
-from collections.abc import Callable, Iterator
+import signal
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
@@ -44,15 +45,31 @@ def write_bag(
     workers: number of rendering processes (default: one per core); the result does not depend on it.
     overwrite: replace an existing bag.  progress: called with (frames done, total frames).
     """
-    path = Path(path)
     if workers is not None and workers < 1:
         raise UsageError(f'workers is {workers}: choose 1 or more')
-    _prepare_target(path, overwrite)
-    simulation = Simulation(options)
+    _prepare_target(Path(path), overwrite)
+    return write_simulation(Path(path), Simulation(options), workers=workers, progress=progress)
+
+
+def write_simulation(
+    path: Path,
+    simulation: Simulation,
+    *,
+    workers: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    truth: Mapping[str, Any] | None = None,
+    on_image: Callable[[bytes], None] | None = None,
+) -> Path:
+    """Write a simulation into a new bag folder, see `write_bag`; return the folder.
+
+    truth: that of the simulation if it is known already.  on_image: receives each serialised image once it is written;
+    what it raises ends the writing and removes the bag.
+    """
+    options = simulation.options
     try:
         with _writer(path, options) as writer:
-            _write_messages(writer, simulation, workers or _core_count(), progress)
-        text = json.dumps(truth_of(simulation), indent=1)
+            _write_messages(writer, simulation, workers or _core_count(), progress, on_image)
+        text = json.dumps(truth or truth_of(simulation), indent=1)
         (path / TRUTH_FILE_NAME).write_text(text, encoding='utf-8')
     except BaseException as error:
         shutil.rmtree(path, ignore_errors=True)  # leave no incomplete bag behind
@@ -100,6 +117,7 @@ def _write_messages(
     simulation: Simulation,
     workers: int,
     progress: Callable[[int, int], None] | None,
+    on_image: Callable[[bytes], None] | None,
 ) -> None:
     options, store = simulation.options, _typestore()
     kind = 'CompressedImage' if options.compressed else 'Image'
@@ -111,6 +129,8 @@ def _write_messages(
             recorded_ns = simulation.stamp_ns(index) + _LATENCY_NS
             writer.write(images, recorded_ns, message)
             writer.write(infos, recorded_ns, _camera_info(simulation, index))
+            if on_image is not None:
+                on_image(message)
             if progress is not None:
                 progress(index + 1, options.frame_count)
 
@@ -141,6 +161,7 @@ _worker_simulation: Simulation | None = None
 def _start_worker(simulation: Simulation) -> None:
     global _worker_simulation
     cv2.setNumThreads(1)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group: the program decides
     _worker_simulation = simulation
 
 

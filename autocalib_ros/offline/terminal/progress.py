@@ -16,6 +16,8 @@ MIN_INTERVAL_S = 1.0
 """Shortest time between two lines, seconds: a short run does not need a line for every tenth of it."""
 KNOWN_FRACTION = 0.05
 """Fraction of the work after which the time left is told: before, the start of libraries and the first images count."""
+MIN_MEASURED_S = 2.0
+"""Shortest time since the first item from which a rate is told, seconds."""
 BAR = '{desc} {percentage:3.0f} %|{bar:8}| {remaining} left{postfix}'
 BEGINNING_BAR = '{desc} {percentage:3.0f} %|{bar:8}|{postfix}'
 OPEN_BAR = '{desc} {n_fmt}{unit}, {elapsed}{postfix}'
@@ -101,6 +103,7 @@ class _ProgressLines:
     def __init__(self, total: float | None, unit: str, label: str, stream: TextIO) -> None:
         self._total, self._unit, self._label, self._stream = total, unit, label, stream
         self._started_at = self._reported_at = time.monotonic()
+        self._first: tuple[float, float] | None = None
         self._reported = self._done = 0.0
         self._note = self._reported_note = ''
 
@@ -109,6 +112,8 @@ class _ProgressLines:
         self._done, self._note = done, note
         step = LINE_EVERY_FRACTION * self._total if self._total else float('inf')
         now = time.monotonic()
+        if self._first is None and done > 0:
+            self._first = now, done
         late = now - self._reported_at >= LINE_EVERY_S
         far = done - self._reported >= step or _state(note) != _state(self._reported_note)
         complete = self._total is not None and self._reported < self._total <= done
@@ -126,15 +131,19 @@ class _ProgressLines:
         parts = [f'{self._done:g} {self._unit}']
         if self._total:
             parts = [f'{self._done:g} of {self._total:g} {self._unit} ({100 * self._done / self._total:.0f} %)']
-            left_s = elapsed * (self._total - self._done) / max(self._done, 1e-9)
-            parts += [f'{left_s:.0f} s left'] if _knows_time_left(self._done, self._total) else []
+            left_s = self._left_s(now)
+            parts += [] if left_s is None else [f'{left_s:.0f} s left']
         parts += [f'{self._done / elapsed:.1f} {self._unit}/s'] + ([self._note] if self._note else [])
         print(f'{self._label}: ' + ', '.join(parts), file=self._stream, flush=True)
 
-
-def _knows_time_left(done: float, total: float) -> bool:
-    """Whether enough is done to say how long the rest takes."""
-    return KNOWN_FRACTION * total <= done < total
+    def _left_s(self, now: float) -> float | None:
+        """Return how long the rest takes at the rate since the first item; None while too little is done to tell."""
+        if self._first is None or not self._total or not KNOWN_FRACTION * self._total <= self._done < self._total:
+            return None
+        first_at, first = self._first
+        if self._done <= first or now - first_at < MIN_MEASURED_S:
+            return None
+        return (now - first_at) * (self._total - self._done) / (self._done - first)
 
 
 def _state(note: str) -> str:
