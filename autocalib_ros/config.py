@@ -531,9 +531,10 @@ class Options(_Validated):
     )
     distortion_model: str = option(
         'auto',
-        'distortion model of the published CameraInfo; auto: equidistant, which is exact. The others are fitted to '
-        'the visible field and refused if the error exceeds 0.5 px',
-        choices=('auto', 'equidistant', 'rational_polynomial', 'plumb_bob'),
+        'distortion model of the published CameraInfo; auto: equidistant, which is exact; kannala_brandt: the same '
+        'lens by the name that Foxglove reads. The others are fitted to the visible field and refused if the error '
+        'exceeds 0.5 px',
+        choices=('auto', 'equidistant', 'kannala_brandt', 'rational_polynomial', 'plumb_bob'),
     )
     rectified_balance: float = option(
         0.0,

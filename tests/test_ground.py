@@ -34,6 +34,7 @@ K = (560.0, 0.0, 630.0, 0.0, 560.0, 371.0, 0.0, 0.0, 1.0)
 TALL = (560.0, 0.0, 630.0, 0.0, 548.0, 371.0, 0.0, 0.0, 1.0)
 LENSES = {
     'equidistant': ('equidistant', K, (0.015, -0.003, 0.001, -0.0002)),
+    'kannala_brandt': ('kannala_brandt', K, (0.015, -0.003, 0.001, -0.0002)),
     'equidistant, tall pixels': ('equidistant', TALL, (0.015, -0.003, 0.001, -0.0002)),
     'plumb_bob': ('plumb_bob', K, (-0.2, 0.03, 0.001, -0.002, 0.0)),
     'plumb_bob, no distortion': ('plumb_bob', K, (0.0,) * 5),
@@ -118,7 +119,7 @@ def opencv_pixels(lens: tuple[str, tuple[float, ...], tuple[float, ...]], points
     model, k, d = lens
     turn, _ = cv2.Rodrigues(CAMERA_FROM_GROUND)
     shift = CAMERA_FROM_GROUND @ [0.0, 0.0, -HEIGHT_M]
-    if model == 'equidistant':
+    if model in ('equidistant', 'kannala_brandt'):
         pixels, _ = cv2.fisheye.projectPoints(points_m[:, None], turn, shift, np.reshape(k, (3, 3)), np.array(d))
     else:
         pixels, _ = cv2.projectPoints(points_m, turn, shift, np.reshape(k, (3, 3)), np.array(d))
@@ -252,7 +253,7 @@ def test_a_rotation_that_is_none_is_refused():
     ('given', 'said'),
     [
         ({'k': (0.0,) * 9}, 'not calibrated'),
-        ({'model': 'kannala_brandt'}, 'distortion model'),
+        ({'model': 'division'}, 'distortion model'),
         ({'d': (0.0,) * 9}, '9 numbers, expected at most 4'),
     ],
 )
@@ -328,7 +329,7 @@ def test_a_point_beyond_the_fold_or_behind_has_no_pixel():
     assert np.isnan(pixels[1:]).all()
 
 
-@pytest.mark.parametrize('lens', ['equidistant', 'rational_polynomial'])
+@pytest.mark.parametrize('lens', ['equidistant', 'kannala_brandt', 'rational_polynomial'])
 def test_binned_and_cut_images_show_the_same_road(lens, places):
     whole = Ground.from_messages(info(*LENSES[lens]), transform())
     part = Ground.from_messages(info(*LENSES[lens], binning=2, offset=(320, 180)), transform())

@@ -23,7 +23,7 @@ from autocalib_ros.estimation.verification.scale import Scale, check_scale
 from autocalib_ros.evidence.snapshot import Evidence, TrackKind
 from autocalib_ros.geometry.ground_plane import ground_plane, ground_points, pixels_ahead, tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.lens.camera_info import ModelMisfit
+from autocalib_ros.lens.camera_info import EXACT_MODELS, ModelMisfit
 from autocalib_ros.results.calibration import (
     GROUND_DISTANCES_M,
     Calibration,
@@ -109,7 +109,7 @@ def with_requested_model(result: Calibration, options: Options) -> Calibration |
     except ModelMisfit as misfit:
         why = reason('distortion_model', 'misfit', misfit=misfit.message, instead=misfit.remedy)
         return Refusal.from_reason(why, result.method, result.evidence, result.figures)
-    if info.distortion_model == 'equidistant':
+    if info.distortion_model in EXACT_MODELS:
         return requested
     statement = check('distortion_model', model=info.distortion_model, error_px=info.error_px)
     return replace(requested, checks=(*result.checks, statement))

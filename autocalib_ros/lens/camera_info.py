@@ -26,8 +26,13 @@ DISTORTION_MODELS = {
     'rational_polynomial': (8,),
     'equidistant': (0, 1, 2, 3, 4),
     'fisheye': (0, 1, 2, 3, 4),
+    'kannala_brandt': (0, 1, 2, 3, 4),
 }
 """Distortion models that can be read, with the permitted numbers of coefficients."""
+EXACT_MODELS = ('equidistant', 'kannala_brandt')
+"""Names under which the lens is published as it is: that of ROS, and that of Foxglove."""
+FISHEYE_MODELS = (*EXACT_MODELS, 'fisheye')
+"""Names of the Kannala-Brandt lens of `Camera`."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +81,8 @@ class ModelMisfit(UsageError):
 def camera_info(camera: Camera, distortion_model: str = 'auto', rectified_balance: float = 0.0) -> CameraInfo:
     """Return the CameraInfo of a lens; K is the same in every distortion model, and R is the identity.
 
-    'auto' is 'equidistant', which represents every Camera exactly; 'rational_polynomial' and 'plumb_bob' are fitted
+    'auto' is 'equidistant', which represents every Camera exactly; 'kannala_brandt' is another name of it;
+    'rational_polynomial' and 'plumb_bob' are fitted
     to the visible field. ModelMisfit if the error of the fit exceeds `MAX_MODEL_ERROR_PX`.
     """
     model = 'equidistant' if distortion_model == 'auto' else distortion_model
@@ -140,7 +146,7 @@ def _to_full_resolution(
 
 def _coefficients(camera: Camera, model: str) -> tuple[list[float], float]:
     """Return D in a distortion model, and its maximum error in pixels."""
-    if model == 'equidistant':
+    if model in EXACT_MODELS:
         coefficients = [float(value) for value in camera.k]
         if not any(abs(value) >= EQUIDISTANT_K1_FLOOR for value in coefficients):
             coefficients[0] = EQUIDISTANT_K1_FLOOR

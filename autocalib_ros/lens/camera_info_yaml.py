@@ -14,7 +14,13 @@ import yaml
 
 from autocalib_ros.errors import AutocalibError, InputError
 from autocalib_ros.lens.camera import Camera
-from autocalib_ros.lens.camera_info import DISTORTION_MODELS, EQUIDISTANT_K1_FLOOR, CameraInfo, camera_info
+from autocalib_ros.lens.camera_info import (
+    DISTORTION_MODELS,
+    EQUIDISTANT_K1_FLOOR,
+    FISHEYE_MODELS,
+    CameraInfo,
+    camera_info,
+)
 from autocalib_ros.lens.opencv_lens import OpencvLens, fit_kannala_brandt
 from autocalib_ros.util.documents import parse_yaml
 from autocalib_ros.util.files import write_atomically
@@ -148,7 +154,7 @@ def lens_from_fields(fields: Mapping[str, Any]) -> OpencvLens:
     _require_calibrated(matrix)
     _require_full_frame(fields, width, height)
     given = _parse_numbers(fields, sizes, 'distortion_coefficients', 'd')
-    equidistant = model in ('equidistant', 'fisheye')
+    equidistant = model in FISHEYE_MODELS
     coefficients = (*given, *[0.0] * ((4 if equidistant else 8) - len(given)))
     if coefficients == (EQUIDISTANT_K1_FLOOR, 0.0, 0.0, 0.0):
         coefficients = (0.0,) * 4  # `camera_info` adds this floor

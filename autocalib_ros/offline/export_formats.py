@@ -16,6 +16,7 @@ import yaml
 
 from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.ground import Ground
+from autocalib_ros.lens.camera_info import FISHEYE_MODELS
 from autocalib_ros.results.calibration import Calibration
 from autocalib_ros.results.calibration_json import calibration_from_json, read_json_object
 from autocalib_ros.results.control_points import MapPlacement, to_lon_lat
@@ -138,7 +139,7 @@ def _opencv(camera: ExportedCamera, _: MapPlacement | None) -> str:
     storage = cv2.FileStorage('.yml', cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     storage.write('image_width', info.width)
     storage.write('image_height', info.height)
-    is_fisheye = info.distortion_model in ('equidistant', 'fisheye')
+    is_fisheye = info.distortion_model in FISHEYE_MODELS
     storage.write('distortion_model', 'fisheye' if is_fisheye else info.distortion_model)
     storage.write('camera_matrix', np.reshape(info.k, (3, 3)))
     storage.write('distortion_coefficients', np.reshape(info.d, (1, -1)))
@@ -149,7 +150,7 @@ def _opencv(camera: ExportedCamera, _: MapPlacement | None) -> str:
 
 def _kalibr(camera: ExportedCamera, _: MapPlacement | None) -> str:
     info = camera.calibration.camera_info
-    if info.distortion_model not in ('equidistant', 'fisheye'):
+    if info.distortion_model not in FISHEYE_MODELS:
         raise UsageError(f'Kalibr has no model {info.distortion_model}: calibrate with distortion_model:=equidistant')
     chain = {
         'cam0': {

@@ -6,6 +6,7 @@ import math
 
 from autocalib_ros.calibrator import CalibrationProgress
 from autocalib_ros.geometry.ground_plane import GroundPlane
+from autocalib_ros.lens.camera_info import EXACT_MODELS
 from autocalib_ros.results.calibration import Calibration, Refusal
 from autocalib_ros.results.verification_table import summarise_verification
 
@@ -47,7 +48,7 @@ def describe_numbers(result: Calibration) -> list[str]:
     elif result.ground_refusal is not None:
         parts.append(f'no ground plane ({result.ground_refusal.code}): {result.ground_refusal.message}')
     info = result.camera_info
-    if info.distortion_model != 'equidistant':
+    if info.distortion_model not in EXACT_MODELS:
         parts.append(f'camera_info {info.distortion_model}, error at most {info.error_px:.2g} px')
     return parts
 

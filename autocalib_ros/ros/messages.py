@@ -18,11 +18,11 @@ from std_msgs.msg import Header
 
 from autocalib_ros.errors import AutocalibError
 from autocalib_ros.geometry.ground_plane import GroundPlane
+from autocalib_ros.lens.camera_info import EXACT_MODELS, Readout, to_full_resolution
 from autocalib_ros.lens.camera_info import CameraInfo as CameraInfoFields
-from autocalib_ros.lens.camera_info import Readout, to_full_resolution
 
-COEFFICIENT_COUNT = {'plumb_bob': 5, 'rational_polynomial': 8, 'equidistant': 4}
-"""Length of D for each distortion model known to consumers (sensor_msgs/distortion_models.hpp)."""
+COEFFICIENT_COUNT = {'plumb_bob': 5, 'rational_polynomial': 8, **dict.fromkeys(EXACT_MODELS, 4)}
+"""Length of D for each distortion model known to consumers (sensor_msgs/distortion_models.hpp; Foxglove)."""
 INTEGER_BITS = {'int8': 8, 'uint8': 8, 'int16': 16, 'uint16': 16, 'int32': 32, 'uint32': 32, 'int64': 64, 'uint64': 64}
 TF2_QUATERNION_TOLERANCE = 1e-6
 """tf2 rejects quaternions whose length differs from 1 by more than this."""
@@ -186,7 +186,7 @@ def _check_camera_info(info: CameraInfo) -> None:
     _require(length is not None, f'{path}.distortion_model', f'is {info.distortion_model!r}')
     _require(len(info.d) == length, f'{path}.d', f'holds {len(info.d)} numbers, not {length}')
     # image_proc does not rectify at all if D is all zero, whatever the model
-    _require(info.distortion_model != 'equidistant' or any(info.d), f'{path}.d', 'is all zero')
+    _require(info.distortion_model not in EXACT_MODELS or any(info.d), f'{path}.d', 'is all zero')
     for field, matrix, columns in (('k', info.k, 3), ('p', info.p, 4)):
         _require(matrix[0] > 0 and matrix[columns + 1] > 0, f'{path}.{field}', 'has no positive focal length')
     roi = info.roi

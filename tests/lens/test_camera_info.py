@@ -31,6 +31,16 @@ def test_distortion_is_never_all_zero() -> None:
     assert any(abs(value) >= 1e-9 for value in camera_info(CAMERA).d)
 
 
+def test_foxglove_s_name_stands_for_the_same_numbers_and_is_read_again(tmp_path: Path) -> None:
+    lens = Camera(1280, 720, 560.0, (639.5, 359.5), (0.02, -0.003, 0.0, 0.0))
+    named, usual = camera_info(lens, 'kannala_brandt'), camera_info(lens)
+    assert (named.distortion_model, usual.distortion_model) == ('kannala_brandt', 'equidistant')
+    assert (named.d, named.k, named.p, named.error_px) == (usual.d, usual.k, usual.p, 0.0)
+    write_camera_info_yaml(tmp_path / 'camera_info.yaml', lens, 'camera', 'kannala_brandt')
+    assert 'distortion_model: kannala_brandt' in (tmp_path / 'camera_info.yaml').read_text()
+    assert read_camera_info(tmp_path / 'camera_info.yaml') == lens
+
+
 def test_camera_info_has_the_lengths_of_the_message() -> None:
     info = camera_info(CAMERA)
     assert [len(info.k), len(info.d), len(info.r), len(info.p)] == [9, 4, 9, 12]

@@ -49,7 +49,7 @@ def unchecked(message, field: str, value):
     st.floats(50, 5000),
     st.floats(-0.02, 0.02),
     st.floats(0, 1),
-    st.sampled_from(['auto', 'equidistant', 'rational_polynomial', 'plumb_bob']),
+    st.sampled_from(['auto', 'equidistant', 'kannala_brandt', 'rational_polynomial', 'plumb_bob']),
 )
 @settings(deadline=None)
 def test_camera_info_of_any_lens_is_valid_and_survives_the_wire(width, height, focal_px, k1, balance, model):
