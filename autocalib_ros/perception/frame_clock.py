@@ -188,7 +188,11 @@ class FrameClock:
         self._surplus: deque[bool] = deque(maxlen=CHECKED)
 
     def _abandon_grid(self) -> None:
-        """Look for another grid, in later images: those so far are of the old one."""
+        """Look for another grid, in later images: those so far are of the old one.
+
+        The slots that its last images left empty were none: they are why it is left.
+        """
+        self._count(lost=len(self._advances) - sum(self._advances))
         held, self._held = self._held, []
         self._leave_grid()
         self._distrusted = True

@@ -161,6 +161,22 @@ def test_images_that_wait_for_each_other_are_not_lost(rate_hz):
     assert clocked(stamps).summary.lost == 0  # also not by a grid that was found within the first burst
 
 
+@pytest.mark.parametrize('count', [10, 21, 40])
+def test_a_stream_that_begins_with_a_burst_has_lost_nothing(count):
+    # decoders that read ahead give their first images at once, half a millisecond apart
+    stamps = exposures(300)
+    stamps[:count] = stamps[count] - SECOND // 20 - (SECOND // 2000) * np.arange(count)[::-1]
+    summary = clocked(stamps).summary
+    assert summary.lost == 0 and summary.period_s == pytest.approx(1 / 15, rel=1e-3)
+
+
+@pytest.mark.parametrize('rates_hz', [(30.0, 15.0), (15.0, 30.0)])
+def test_a_rate_that_halves_or_doubles_loses_nothing(rates_hz):
+    first = exposures(200, rates_hz[0])
+    stamps = np.append(first, exposures(200, rates_hz[1], int(first[-1] + SECOND / rates_hz[1])))
+    assert clocked(stamps).summary.lost == 0
+
+
 @pytest.mark.parametrize('spread', [0.5, 0.8])
 def test_irregular_intervals_keep_their_stamps(spread):
     random = np.random.default_rng(3)

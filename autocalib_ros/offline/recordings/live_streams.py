@@ -8,11 +8,13 @@ import os
 import queue
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import urlsplit
 
 import cv2
+import numpy as np
 
 from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.offline.recordings.listing import DEVICE
@@ -29,6 +31,14 @@ GIVE_UP_S = 300.0
 """Time without an image after which a stream is taken to have ended: cameras restart within five minutes."""
 MAX_WAITING_BYTES = 400_000_000
 """Most bytes of images that wait to be processed: 10 s of 720p at 15 images a second."""
+TIMED_SCHEMES = ('rtsp', 'rtsps', 'rtp', 'srt')
+"""Streams that carry the times of their images; for others FFmpeg makes them up."""
+WAITED = 0.5
+"""Share of the interval between two images from which the reader has waited for the second: it did not lie in a buffer.
+FFmpeg reads up to five seconds of a stream to know its codec, and then gives these images at once."""
+MAX_BUFFERED = 300
+"""Most images of such a beginning: five seconds at 60 a second. If none is waited for until then, stamps stay those of
+receipt."""
 SINGLE_IMAGES = 3
 """Connections in a row that give one image each, from which an address is known for one of snapshots."""
 
@@ -81,6 +91,41 @@ class StreamSource:
         raise UsageError(f'{self.name} is a live stream and cannot be written as a bag: record it first')
 
 
+@dataclass(frozen=True)
+class _Received:
+    """An image of the beginning of a connection."""
+
+    stamp_ns: int
+    """When it came."""
+    waited_s: float
+    """How long the reader had waited for it."""
+    stream_s: float
+    """Its time in the stream."""
+    image: np.ndarray
+
+    def was_waited_for(self, before: Sequence[_Received]) -> bool:
+        """Whether it came when it was taken, and had not lain in a buffer."""
+        # the first image has no interval, and FFmpeg often another time than the stream
+        interval_s = self.stream_s - before[-1].stream_s if len(before) > 1 else 0.0
+        return 0.0 < WAITED * interval_s <= self.waited_s
+
+
+def dated_back(received: Sequence[_Received]) -> list[Frame]:
+    """Return the images of the beginning of a connection with the times at which they were sent.
+
+    The last one came when it was taken; those that had waited in a buffer are dated back by the times of the stream.
+    One whose time there is not before that of the next is left out.
+    """
+    if not received or len(received) == MAX_BUFFERED:
+        return [Frame(one.stamp_ns, one.image) for one in received]
+    newest, frames = received[-1], [Frame(received[-1].stamp_ns, received[-1].image)]
+    for one in reversed(received[:-1]):
+        stamp_ns = newest.stamp_ns - round(1e9 * (newest.stream_s - one.stream_s))
+        if stamp_ns < frames[-1].stamp_ns:
+            frames.append(Frame(stamp_ns, one.image))
+    return frames[::-1]
+
+
 class _Reader:
     """Reads a stream in a thread into a bounded queue."""
 
@@ -89,6 +134,8 @@ class _Reader:
         self._waiting: queue.Queue[Frame] = queue.Queue()
         self._bytes = self._dropped = self._connections = 0
         self._stop = threading.Event()
+        self._is_timed = urlsplit(address).scheme in TIMED_SCHEMES
+        self._newest_ns = 0
         self.has_ended = self.is_of_single_images = False
         self.problem = ''
 
@@ -122,12 +169,24 @@ class _Reader:
             except InputError as error:
                 self.problem = str(error)
                 return 0
-            while not self._stop.is_set() and capture.grab():
-                stamp_ns = time.time_ns()
+            beginning: list[_Received] | None = [] if self._is_timed else None
+            while not self._stop.is_set():
+                began_s = time.monotonic()
+                if not capture.grab():
+                    break
+                stamp_ns, waited_s = time.time_ns(), time.monotonic() - began_s
                 decoded, image = capture.retrieve()
-                if decoded and image is not None:
+                if not decoded or image is None:
+                    continue
+                count += 1
+                if beginning is None:
                     self._put(Frame(stamp_ns, image))
-                    count += 1
+                    continue
+                beginning.append(_Received(stamp_ns, waited_s, 1e-3 * capture.get(cv2.CAP_PROP_POS_MSEC), image))
+                if beginning[-1].was_waited_for(beginning[:-1]) or len(beginning) == MAX_BUFFERED:
+                    self._put_beginning(beginning)
+                    beginning = None
+            self._put_beginning(beginning or [])
         finally:
             capture.release()
         self._connections += bool(count)
@@ -139,7 +198,14 @@ class _Reader:
             self.problem = self.problem or f'{self._name} gives no image that can be decoded'
         return count
 
+    def _put_beginning(self, received: list[_Received]) -> None:
+        for frame in dated_back(received):
+            self._put(frame)
+
     def _put(self, frame: Frame) -> None:
+        if frame.stamp_ns <= self._newest_ns:
+            return  # a connection made anew began with images that were there already
+        self._newest_ns = frame.stamp_ns
         if self._bytes + frame.image.nbytes > MAX_WAITING_BYTES:
             self._dropped += 1
             return

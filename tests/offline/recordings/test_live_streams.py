@@ -103,6 +103,29 @@ def test_what_no_stream_can_do_is_said(address, more, error, message):
         open_source(address, **more)
 
 
+def received(*rows):
+    return [
+        live_streams._Received(round(1e9 * came_s), waited_s, stream_s, np.zeros((2, 2, 3), np.uint8))
+        for came_s, waited_s, stream_s in rows
+    ]
+
+
+def test_images_that_lay_in_a_buffer_at_the_beginning_are_dated_back():
+    # three at once, the first with another time than the stream, and then one that was waited for
+    burst = received((50.0, 0.3, 0.0), (50.001, 0.001, -0.2), (50.002, 0.001, -0.1), (50.08, 0.078, 0.0))
+    assert [one.was_waited_for(burst[:index]) for index, one in enumerate(burst)] == [False, False, False, True]
+    stamps_s = [1e-9 * frame.stamp_ns for frame in live_streams.dated_back(burst)]
+    assert stamps_s == pytest.approx([49.88, 49.98, 50.08])
+
+
+def test_images_are_not_dated_back_where_the_stream_has_no_times(monkeypatch):
+    monkeypatch.setattr(live_streams, 'MAX_BUFFERED', 3)
+    burst = received((50.0, 0.1, 0.0), (50.1, 0.1, 0.0), (50.2, 0.1, 0.0))
+    assert not any(one.was_waited_for(burst[:index]) for index, one in enumerate(burst))
+    assert [frame.stamp_ns for frame in live_streams.dated_back(burst)] == [one.stamp_ns for one in burst]
+    assert live_streams.dated_back([]) == []
+
+
 def has_gstreamer(python: str) -> bool:
     code = "import gi; gi.require_version('GstRtspServer', '1.0'); from gi.repository import GstRtspServer"
     found = shutil.which(python)
@@ -120,7 +143,11 @@ def test_an_rtsp_server_is_read():
         [python, str(RTSP_SERVER), pipeline], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     )
     try:
-        frames = list(open_source(server.stdout.readline().strip(), duration_s=0.5).frames())
+        frames = list(open_source(server.stdout.readline().strip(), duration_s=2.0).frames())
     finally:
         server.communicate()
-    assert len(frames) >= 5 and frames[0].image.shape == (120, 160, 3)
+    assert frames[0].image.shape == (120, 160, 3)
+    # none is lost, and those that FFmpeg had read to know the codec have the times at which they were sent
+    intervals_s = 1e-9 * np.diff([frame.stamp_ns for frame in frames])
+    assert 57 <= len(frames) <= 63 and np.median(intervals_s) == pytest.approx(1 / 30, rel=0.05)
+    assert (intervals_s > 0.25 / 30).mean() > 0.9  # a busy machine takes some of them late
