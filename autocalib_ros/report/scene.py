@@ -5,16 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from autocalib_ros.config import Options
-from autocalib_ros.estimation.road_sketch import RoadSketch, sketch_roads
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.ground_plane import GroundPlane, tilt_and_roll_deg
 from autocalib_ros.results.calibration import Calibration, Refusal
 from autocalib_ros.results.camera_move import CameraMove
+
+if TYPE_CHECKING:
+    from autocalib_ros.estimation.road_sketch import RoadSketch
 
 NOT_USED, REJECTED = -1, -2
 MAX_SNAPSHOTS = 64
@@ -92,7 +94,11 @@ class ReportScene:
     @cached_property
     def sketch(self) -> RoadSketch | None:
         """Roads through an assumed lens, where nothing was found; None with a calibration or without roads."""
-        return None if self.calibration is not None else sketch_roads(self.evidence, self.options)
+        if self.calibration is not None:
+            return None
+        from autocalib_ros.estimation.road_sketch import sketch_roads  # lazy import: a live node draws elsewhere
+
+        return sketch_roads(self.evidence, self.options)
 
     @property
     def calibration(self) -> Calibration | None:
