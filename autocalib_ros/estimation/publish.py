@@ -227,6 +227,7 @@ def require_grade(result: Calibration, least: str) -> Calibration | Refusal:
         cause,
         grade=result.grade,
         least=least,
+        limit=GRADE_LIMITS.get(least),
         along=sigma.along if sigma else None,
         across=sigma.across if sigma else None,
         focal=(result.stddev.focal_px or 0.0) / result.camera.focal_px,

@@ -13,7 +13,7 @@ TELL = {
     'no_height': '--camera-height METRES',
     'implausible': '--camera-height METRES',
     'scale_uncertain': '--camera-height METRES',
-    'scale_off_road': "--distance 'U V U V METRES'",
+    'scale_off_road': '--distance U1 V1 U2 V2 METRES',
     'pixel_aspect': '-p lens.pixel_aspect:=1.0',
     'distortion_model': '-p distortion_model:=equidistant',
     'vanishing_points_disagree': '--method joint',
@@ -23,8 +23,8 @@ TELL = {
 MEASURED = {
     'focal': '--hfov-deg DEGREES',
     'height': '--camera-height METRES',
-    'length_along': "--distance 'U V U V METRES'",
-    'length_across': "--distance 'U V U V METRES'",
+    'length_along': '--distance U1 V1 U2 V2 METRES',
+    'length_across': '--distance U1 V1 U2 V2 METRES',
     'roll': '--roll-sigma-deg 1',
 }
 """How a helpful measure is told, by its kind."""
@@ -58,7 +58,7 @@ def _told_so_far(options: Options, replaced: str) -> str:
     usual = {item.name: item.default for item in walk_options(Options())}
     now = {
         '--camera-height': 'camera_height',
-        '--distance': 'scale.distances',
+        '--distance': 'scale.distance',
         '--hfov-deg': 'lens.',
         '--method': 'method',
     }

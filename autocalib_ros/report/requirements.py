@@ -25,6 +25,11 @@ NUMBERS = {
     'one_direction': ('tracks across the main road', '{across}', 'at least {limit}'),
     'plane_uncertain': ('ground normal', '± {sigma_deg:.1f} degrees', 'at most ± {limit_deg:g} degrees'),
     'too_few_vehicles': ('vehicles on one straight road', '{vehicles}', 'at least {limit}'),
+    'grade_too_low': (
+        'certainty of lengths on the road',
+        '± {along:.0%} along the view, ± {across:.0%} across it',
+        'grade {least}: at most ± {limit:.0%}',
+    ),
     'scale_uncertain': ('camera height', '± {sigma:.0%}', 'at most ± {limit:.0%}'),
     'too_few_tracks': ('tracks that are long and straight enough', '{tracks}', 'at least {limit}'),
 }

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from autocalib_ros.cli import _parse_arguments
-from autocalib_ros.config import LensOptions, Options
+from autocalib_ros.config import LensOptions, Options, ScaleOptions
 from autocalib_ros.estimation.road_sketch import sketch_roads
 from autocalib_ros.estimation.solution import append_reason
 from autocalib_ros.geometry.ground_plane import GroundPlane
@@ -95,6 +95,14 @@ def test_each_requirement_shows_how_near_it_is(joined: Reason) -> None:
     assert len(missing) == 3 and 'image coverage' not in missing
 
 
+def test_the_certainty_of_lengths_is_a_number_beside_its_limit() -> None:
+    rough = {'grade': 'assumed', 'least': 'coarse', 'limit': 0.25, 'focal': 0.4, 'helpful': ''}
+    rows = needs(refusal(reason('grade_too_low', along=0.34, across=0.12, **rough)), evidence_once(ROAD), OPTIONS.gate)
+    assert (rows[-1].found, rows[-1].needed) == ('± 34% along the view, ± 12% across it', 'grade coarse: at most ± 25%')
+    lens = refusal(reason('grade_too_low', 'lens', along=None, across=None, **rough))
+    assert needs(lens, evidence_once(ROAD), OPTIONS.gate)[-1].found.startswith('The lens alone is known')
+
+
 def test_a_sketch_shows_where_the_road_vanishes() -> None:
     sketch = sketch_roads(evidence_once(ROAD), OPTIONS)
     assert sketch is not None and sketch.shares[0] > 0.7
@@ -132,6 +140,11 @@ def test_too_little_traffic_has_no_sketch() -> None:
             'autocalib evidence out/evidence.npz --camera-height 8 -p distortion_model:=equidistant --out out',
         ),
         (
+            reason('scale_off_road', u=1.0, v=2.0, angle_deg=1.0, side='above', limit_deg=1.7),
+            Options(scale=ScaleOptions(distance_px='1 2 300 2', distance_m=9.0)),
+            'autocalib evidence out/evidence.npz --distance U1 V1 U2 V2 METRES --out out',
+        ),
+        (
             reason('poor_coverage', coverage=0.1, limit=0.15),
             OPTIONS,
             'autocalib replay NEW_RECORDING --camera-height 8 --out out',
@@ -141,7 +154,8 @@ def test_too_little_traffic_has_no_sketch() -> None:
 def test_the_command_to_try_next_can_be_copied(why: Reason, options: Options, command: str) -> None:
     assert next_command(refusal(why), options, Path('out')) == command
     assert next_command(refusal(why), options, None) == ''
-    words = [{'METRES': '8.0', 'DEGREES': '60'}.get(word, word) for word in shlex.split(command)]
+    numbers = {'METRES': '8.0', 'DEGREES': '60', 'U1': '1', 'V1': '2', 'U2': '3', 'V2': '4'}
+    words = [numbers.get(word, word) for word in shlex.split(command)]
     assert _parse_arguments(words[1:]).command == words[1]
 
 
