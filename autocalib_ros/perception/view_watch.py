@@ -107,6 +107,11 @@ class ViewCondition(str, Enum):
     MOVED = 'moved'
     BLIND = 'blind'
 
+    @property
+    def is_seen(self) -> bool:
+        """Whether the picture shows the view of the calibration."""
+        return self in (ViewCondition.STILL, ViewCondition.SWAYING)
+
 
 @dataclass(frozen=True)
 class ViewReport:
@@ -228,7 +233,7 @@ class ViewWatch:
     def succeed(self, view: KnownView, camera: Camera) -> None:
         """Watch the view of a newer calibration; where the camera stands as before, go on with what is known of it."""
         small = _scaled_lens(camera, view.image.shape)
-        calm = self.report.condition in (ViewCondition.STILL, ViewCondition.SWAYING)
+        calm = self.report.condition.is_seen
         since = None
         if calm and small is not None and self.camera is not None and self.size == (camera.width, camera.height):
             since = self._registered(registered_image(view.image, self._registered_size))
@@ -331,12 +336,10 @@ class ViewWatch:
         if not usable:
             return None
         pattern = normalised(image)
-        for reference in usable:
-            since = self._last.after(_inverse(reference.known.pose))
-            found = reference.view.near(pattern, since)
-            if found is not None:
-                self._near_s = time_s
-                return self._found(reference, found)
+        near = self._near(pattern)
+        if near is not None:
+            self._near_s = time_s
+            return self._found(*near)
         self._begun_s = min(self._begun_s, time_s)
         if time_s < self._search_due_s:
             return None
@@ -354,12 +357,16 @@ class ViewWatch:
 
     def _registered(self, image: np.ndarray) -> ViewPose | None:
         """Return the pose of an image since the calibration, near the last one; None if it is not recognised."""
-        pattern = normalised(image)
+        near = self._near(normalised(image))
+        return None if near is None else near[1].after(near[0].known.pose)
+
+    def _near(self, pattern: np.ndarray) -> tuple[_Reference, ViewPose] | None:
+        """Return the first reference that a normalised image shows near the last pose, and its pose since that."""
         for reference in self._references:
-            if reference.view.image.shape == image.shape:
+            if reference.view.image.shape == pattern.shape:
                 found = reference.view.near(pattern, self._last.after(_inverse(reference.known.pose)))
                 if found is not None:
-                    return found.after(reference.known.pose)
+                    return reference, found
         return None
 
     def _found(self, reference: _Reference, pose: ViewPose) -> ViewPose:
@@ -574,7 +581,7 @@ class ViewWatch:
         self._images.append((time_s, image))
         first = self._references[0]
         worn = first.is_worn(pose.share)
-        still = self.report.condition in (ViewCondition.STILL, ViewCondition.SWAYING)
+        still = self.report.condition.is_seen
         if not worn or not still or len(self._images) < REFERENCE_IMAGES or time_s - self._renewed_s < MIN_RENEWAL_S:
             return
         self._renewed_s = time_s

@@ -522,7 +522,7 @@ class AutocalibNode(Node):
         text, good = self._events.told(report, stamp_ns, has_calibration=published is not None)
         logged = self._told.tell_view(report, text, good=good)
         unwatched = report.condition is ViewCondition.UNKNOWN and not report.is_watched
-        if unwatched or report.condition in (ViewCondition.STILL, ViewCondition.SWAYING):
+        if unwatched or report.condition.is_seen:
             self._pixels.is_back()
             self.publication.release()
         move = report.move
@@ -542,5 +542,5 @@ class AutocalibNode(Node):
         if move is not None:
             self.publication.outdate()
         if (move is not None or report.fault is not None) and mode != 'keep':
-            self.publication.withhold(text or str(report))
+            self.publication.withhold(text or str(report), is_blind=report.fault is not None)
         return None

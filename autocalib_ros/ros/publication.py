@@ -74,6 +74,8 @@ class CalibrationPublisher:
         self._per_image = node_options.camera_info_mode == 'per_image'
         self.withheld = ''
         """Why the calibration is not published for now; '' while it is."""
+        self._waits_for_sight = False
+        """Whether it is withheld because the picture says nothing, of which no solution can tell."""
         self.valid_since_ns = 0
         """Stamp from which the calibration holds: that of its newest evidence, or of the move that it was mended by."""
         self.doubt = ''
@@ -186,7 +188,7 @@ class CalibrationPublisher:
         with self._lock:
             if self.published is not before:
                 return None
-            self.withheld, self.is_stale = '', False
+            self._hold_back_no_more()
             self._publish(CalibrationState.MENDED, published)
             self.valid_since_ns = round(move.time_s * 1e9)
             self._on_accepted(published, True)
@@ -197,10 +199,14 @@ class CalibrationPublisher:
         with self._lock:
             self.is_stale = True
 
-    def withhold(self, why: str) -> None:
-        """Publish a calibration no longer, but keep it; all CameraInfo say from now on that there is none."""
+    def withhold(self, why: str, *, is_blind: bool) -> None:
+        """Publish a calibration no longer, but keep it; all CameraInfo say from now on that there is none.
+
+        `is_blind` says that the picture shows nothing: a new solution, of images before that, is withheld as well.
+        """
         with self._lock:
             published, was, self.withheld = self.published, self.withheld, why
+            self._waits_for_sight = is_blind
             if published is None or was:
                 return
             stamp = messages.time_message(published.result.newest_stamp_ns)
@@ -213,7 +219,8 @@ class CalibrationPublisher:
     def release(self) -> None:
         """Publish a withheld calibration again: it holds."""
         with self._lock:
-            was, self.withheld, self.is_stale = self.withheld, '', False
+            was = self.withheld
+            self._hold_back_no_more()
             if was and self.published is not None:
                 self._publish(self.state, self.published)
 
@@ -245,8 +252,11 @@ class CalibrationPublisher:
     def _apply(self, decision: Decision, published: Published, *, new: bool) -> None:
         confirmed = self.state is not decision.state
         if new:
-            self._is_superseded = False
-            self.withheld, self.is_stale = '', False
+            self._is_superseded = self.is_stale = False
+        if new and self._waits_for_sight:
+            self._keep(decision.state, published)
+        elif new:
+            self._hold_back_no_more()
             self._publish(decision.state, published)
         self.state = decision.state
         self.doubt = decision.text if decision.state is CalibrationState.DEGRADED else ''
@@ -276,7 +286,7 @@ class CalibrationPublisher:
         with self._lock:
             was, self.state, self.published = self.state, CalibrationState.NONE, None
             self.doubt = ''
-            self.withheld, self.is_stale = '', False
+            self._hold_back_no_more()
             if was is not CalibrationState.NONE:
                 self._markers.publish(no_markers())
             self._on_withdrawn()
@@ -337,8 +347,14 @@ class CalibrationPublisher:
                 points = self._pixels.present.points_in_view(self._control_points)
                 self._map.publish(published.result, points, published.transform.header.stamp, ground_frame)
         self._markers.publish(published.markers)
+        self._keep(state, published)
+
+    def _keep(self, state: CalibrationState, published: Published) -> None:
         self.published, self.state = published, state
         self.valid_since_ns = published.result.newest_stamp_ns
+
+    def _hold_back_no_more(self) -> None:
+        self.withheld, self.is_stale, self._waits_for_sight = '', False, False
 
     def _later_stamp(self, published: Published) -> Time | None:
         """Return the stamp of the newest image if it is later than the evidence of a calibration: none steps back."""

@@ -213,7 +213,7 @@ def _move_values(move: CameraMove | None) -> Iterator[tuple[str, str]]:
 
 def _level(state: NodeState, situation: Situation) -> int:
     """Return the level of a state; a restored calibration is good once the picture shows its view."""
-    verified = situation.view.condition in (ViewCondition.STILL, ViewCondition.SWAYING)
+    verified = situation.view.condition.is_seen
     return OK if state is NodeState.RESTORED and verified else LEVELS[state]
 
 
@@ -226,7 +226,7 @@ def _headline(state: NodeState, situation: Situation) -> str:
     if state is NodeState.MOVED and situation.last_move is not None:
         return f'{state.value}: the camera moved at {clock_text(situation.last_move.time_s)}: {_move_text(situation)}'
     if result is not None:
-        verified = view.condition in (ViewCondition.STILL, ViewCondition.SWAYING)
+        verified = view.condition.is_seen
         note = {
             NodeState.RESTORED: ', view verified by the picture, not yet by traffic'
             if verified

@@ -13,7 +13,6 @@ MOVED_TOLD_S = 60.0
 """Real seconds for which a move is told as an error although the pose is mended: monitors ask once a minute or so."""
 RECOVERED_TOLD_S = 10.0
 """Real seconds for which the end of a fault is told."""
-SEEN = (ViewCondition.STILL, ViewCondition.SWAYING)
 
 
 class ViewEvents:
@@ -37,7 +36,7 @@ class ViewEvents:
             self._lost = True
             self.last_move = report.move
             return f'the camera moved at {clock_text(report.move.time_s)}: {report}', False
-        if report.condition in SEEN and self._lost:
+        if report.condition.is_seen and self._lost:
             self._lost = False
             self._recovered_at = self._clock()
             held = 'the calibrated view is back' if has_calibration else 'the picture is back'

@@ -455,6 +455,21 @@ def test_calibration_without_a_stored_view_is_published_again_after_a_black_pict
     assert not node.publication.withheld  # which it cannot be
 
 
+def test_solution_of_images_before_a_black_picture_is_withheld_until_the_picture_is_back(bench):
+    node, publisher = calibrated(bench)
+    before = node.publication.published
+    infos = bench.collect(CameraInfo, INFO)
+    bench.listening(INFO)
+    node.view_changed(ViewReport(ViewCondition.BLIND, 20.0, fault=PictureFault.BLACK), START_NS)
+    assert bench.calibrate().success
+    assert node.publication.published is not before and node.publication.withheld
+    infos.clear()
+    publish_until(publisher, lambda: infos, 'a CameraInfo')
+    assert not any(info.k[0] for info in infos)
+    node.view_changed(ViewReport(ViewCondition.STILL), START_NS)
+    publish_until(publisher, lambda: infos[-1].k[0] == 300.0, 'the calibration')
+
+
 def test_status_tells_programs_that_the_picture_is_black(bench):
     node, _ = calibrated(bench)
     statuses = bench.collect(DiagnosticStatus, '/autocalib/status', latched=True)
