@@ -16,8 +16,8 @@ from autocalib_ros.offline.recordings.open import open_source
 from autocalib_ros.offline.recordings.sources import Source
 from autocalib_ros.offline.recordings.videos import FALLBACK_FPS
 from autocalib_ros.offline.terminal.progress import progress_bar
+from autocalib_ros.perception.image_file import read_image
 from autocalib_ros.util.files import create_for_picture
-from autocalib_ros.util.picture_size import check_picture
 
 PICTURE_SUFFIXES = ('.png', '.jpg', '.jpeg')
 VIDEO_CODECS = {'.mp4': 'mp4v', '.avi': 'MJPG'}
@@ -75,22 +75,6 @@ def _check(source: Path, out: Path, selection: SourceSelection) -> None:
         )
     if kind in PICTURE_SUFFIXES and selection.duration_s is not None:
         raise UsageError(f'{out} is one picture, and --duration is for videos: give --at alone')
-
-
-def read_image(path: Path) -> np.ndarray:
-    """Read an image file as BGR uint8, or raise InputError."""
-    try:
-        data = np.fromfile(path, np.uint8)
-    except OSError as error:
-        raise InputError(f'cannot read {path}: {error.strerror or error}') from error
-    try:
-        check_picture(data.data)
-        image = cv2.imdecode(data, cv2.IMREAD_COLOR)
-    except (InputError, cv2.error) as error:
-        raise InputError(f'{path} is not a readable image: {" ".join(str(error).split())}') from error
-    if image is None:
-        raise InputError(f'{path} is not a readable image: damaged, truncated or unsupported')
-    return image
 
 
 def _render(renderer_for: Callable[[int, int], Renderer], image: np.ndarray) -> np.ndarray:

@@ -17,6 +17,7 @@ from jinja2 import Environment, StrictUndefined
 from autocalib_ros import __version__
 from autocalib_ros.errors import AutocalibError, InputError
 from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
+from autocalib_ros.perception.image_file import read_image
 from autocalib_ros.report.canvas import jpeg
 from autocalib_ros.results.calibration import Calibration
 from autocalib_ros.results.calibration_json import calibration_from_json, read_json_object
@@ -111,8 +112,11 @@ def _with_sigma(value: float, sigma: float | None, unit: str, digits: int) -> st
 def _thumbnail(figures: Path) -> str:
     """Return a small picture of a report as a data address; '' if it has none."""
     found = next((path for name in THUMBNAILS if (path := figures / f'{name}.png').exists()), None)
-    picture = None if found is None else cv2.imread(str(found))
-    if picture is None:
+    if found is None:
+        return ''
+    try:
+        picture = read_image(found)
+    except InputError:
         return ''
     size = (THUMBNAIL_PX, max(1, picture.shape[0] * THUMBNAIL_PX // picture.shape[1]))
     small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)

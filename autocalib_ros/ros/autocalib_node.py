@@ -456,8 +456,7 @@ class AutocalibNode(Node):
                 f'{state.value} calibration withdrawn: its images have {old_width}x{old_height} pixels, the present '
                 f'ones {width}x{height}'
             )
-            self._told.tell_event('size', f'{self._withdrawn}; collecting new evidence')
-            self._told.start_over()
+            self._told.tell_begin('size', f'{self._withdrawn}; collecting new evidence')
 
     def _take_back(self, width: int, height: int) -> None:
         """Publish the calibration that was withdrawn for another image size again, now that its size is back."""
@@ -474,8 +473,8 @@ class AutocalibNode(Node):
             return
         self._worker.watch_stored(published.result, views)
         self._withdrawn = ''
-        again = f'images have {width}x{height} pixels again'
-        self._told.tell_solution(published.result, again, good=True)
+        again = describe_briefly(published.result)
+        self._told.tell_end('size', f'images have {width}x{height} pixels again: {again}')
 
     def on_evidence_reset(self, why: str, stamp_ns: int) -> None:
         """Log that the evidence was dropped; the calibration stays until a new one is as precise."""

@@ -37,7 +37,7 @@ class NodeLog:
         self._throttle = throttle or LogThrottle()
         self._told_percent = 0.0
         self._told_grade = ''
-        self._loss_told = True
+        self._begun: dict[str, bool] = {}
 
     def tell(self, text: str, *, good: bool) -> None:
         """Log a line as information or warning; '' logs nothing."""
@@ -61,6 +61,15 @@ class NodeLog:
         if more is not None:
             self._logger.warning(text + more)
         return more is not None
+
+    def tell_begin(self, kind: str, text: str, cause: str = '') -> bool:
+        """Log what begins, as `tell_event`, by its cause."""
+        self._begun[kind] = self.tell_event(f'{kind} {cause}', text)
+        return self._begun[kind]
+
+    def tell_end(self, kind: str, text: str) -> None:
+        """Log that it is over, where its beginning was logged; '' logs nothing."""
+        self.tell(text if self._begun.get(kind, True) else '', good=True)
 
     def tell_fault(self, error: Exception) -> None:
         """Log a fault of the program with its traceback, for a bug report; one of the machine in a line."""
@@ -91,13 +100,12 @@ class NodeLog:
             self._logger.info(describe_progress(progress))
 
     def tell_view(self, report: ViewReport, text: str, *, good: bool) -> bool:
-        """Log what happened to the view; return whether it was logged. That it is over is told where it was told."""
+        """Log what happened to the view; return whether what began was logged."""
         if good:
-            self.tell(text if self._loss_told else '', good=True)
+            self.tell_end('view', text)
         elif text:
-            cause = report.fault or (report.move and report.move.kind)
-            self._loss_told = self.tell_event(f'view {cause}', text)
-        return self._loss_told
+            self.tell_begin('view', text, str(report.fault or (report.move and report.move.kind)))
+        return self._begun.get('view', True)
 
     def start_over(self) -> None:
         """Tell the next calibration in full: that before was withdrawn."""

@@ -33,8 +33,8 @@ from autocalib_ros.offline.recordings.image_files import EXIF_IFD, EXIF_ORIENTAT
 from autocalib_ros.offline.recordings.open import open_source
 from autocalib_ros.offline.recordings.unpacking import zstd_module
 from autocalib_ros.offline.track_files import evidence_from_file
-from autocalib_ros.offline.view_files import read_image
 from autocalib_ros.perception.detector.detector import _names
+from autocalib_ros.perception.image_file import read_image
 from autocalib_ros.perception.images import ImageDecoder
 from autocalib_ros.perception.view_file import read_views, write_views
 from autocalib_ros.perception.view_watch import KnownView

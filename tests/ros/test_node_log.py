@@ -65,3 +65,11 @@ def test_progress_is_told_when_it_changed(lines):
     assert told(3, '40 tracks')
     assert not told(3, '40 tracks') and not told(12, '31 tracks')
     assert told(14, '30 tracks') and not told(14, '30 tracks')
+
+
+def test_what_begins_and_ends_all_the_time_is_told_in_pairs(lines):
+    log = NodeLog(lines)
+    for number in range(3 * MAX_EVENTS):
+        log.tell_begin('size', f'withdrawn {number}')
+        log.tell_end('size', f'again {number}')
+    assert lines == [f'{what} {number}' for number in range(MAX_EVENTS) for what in ('withdrawn', 'again')]
