@@ -17,6 +17,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 
+from autocalib_ros.ros.headers import MAX_FRAME_LENGTH
 from autocalib_ros.ros.messages import validated
 from autocalib_ros.ros.qos import LATCHED, latched_publisher
 
@@ -29,6 +30,9 @@ LISTEN_S = 2.0
 """Real seconds of listening before the first broadcast: tf2 consumers never drop a static transform."""
 TF_QUEUE = 100
 """Queue of /tf and /tf_static messages: each static publisher latches one."""
+MAX_FOREIGN = 10_000
+"""Most transforms of others that are kept: a robot has hundreds of frames, but a tracker may publish one for each
+vehicle, for months."""
 TF_STATIC_QOS = QoSProfile(
     depth=TF_QUEUE, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
@@ -112,6 +116,8 @@ class GroundTransformPublisher:
             new = edges - self._ours - self._foreign
             if new:
                 self._foreign |= new
+                if len(self._foreign) > MAX_FOREIGN:
+                    self._foreign = set() if self._edge is None else relevant(*self._edge, self._foreign)
                 self._check_conflict()
 
     def _set_edge(self, parent: str, child: str) -> None:
@@ -157,12 +163,19 @@ def conflict(parent: str, child: str, foreign: Set[tuple[str, str]], *, tf_paren
             if tf_parent == 'ground'
             else f"{unique_name}, or tf_parent to 'ground'"
         )
-        problem = f"publishes '{others[0]}' as the parent of '{child}', and tf allows one parent"
+        other = others[0][:MAX_FRAME_LENGTH]
+        problem = f"publishes {other!r} as the parent of '{child}', and tf allows one parent"
     elif child in _ancestors(parent, foreign):
         remedy, problem = unique_name, f"publishes '{parent}' below '{child}', and ours would close a loop in tf"
     else:
         return ''
     return f'nothing is published on /tf_static: another node {problem}; {remedy}, and restart the node'
+
+
+def relevant(parent: str, child: str, foreign: Set[tuple[str, str]]) -> set[tuple[str, str]]:
+    """Return the transforms of others that can be in conflict with ours: what our frames hang from."""
+    above = {parent, child} | _ancestors(parent, foreign) | _ancestors(child, foreign)
+    return {edge for edge in foreign if edge[1] in above}
 
 
 def _ancestors(frame: str, edges: Set[tuple[str, str]]) -> set[str]:

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.ros import transforms
 from autocalib_ros.ros.messages import InvalidMessage, ground_transform_message, time_message, validated
-from autocalib_ros.ros.transforms import conflict
+from autocalib_ros.ros.transforms import conflict, relevant
 from bench import ROTATION, Bench, calibration, image, wait_for
 
 GROUND = '/autocalib/ground_transform'
@@ -91,6 +91,17 @@ def test_a_second_parent_and_a_loop_are_reported_with_the_parameter_to_set(forei
 
 def test_a_tree_of_others_with_a_loop_of_its_own_ends():
     assert conflict('ground', 'cam', {('a', 'b'), ('b', 'a'), ('a', 'ground')}, tf_parent='ground') == ''
+
+
+def test_of_many_transforms_of_others_those_above_our_frames_are_kept():
+    vehicles = {('cam1_ground', f'vehicle_{number}') for number in range(1000)}
+    tree = {('map', 'site'), ('site', 'pole'), ('pole', 'cam1')}
+    assert relevant('cam1_ground', 'cam1', vehicles | tree) == tree
+
+
+def test_a_frame_of_others_does_not_break_the_line_of_the_log():
+    text = conflict('cam1_ground', 'cam1', {('a\nb\x1b[31m', 'cam1')}, tf_parent='ground')
+    assert text.isprintable() and 'publishes' in text
 
 
 @with_tf2
