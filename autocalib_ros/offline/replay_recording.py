@@ -90,8 +90,8 @@ def replay(
     evidence so far every two minutes of the recording, and all of it before the last solution. `on_accepted` receives
     the first calibration on the way, with the newest image. With a known `lens` only the pose is estimated; UsageError
     if its aspect ratio differs from that of the images. `detector` is an open detector; None opens the one of the
-    options. `start_solving` solves the evidence on the way in the background, see `solver_process.BackgroundSolver`; the
-    result is the same. InputError without an image.
+    options. `start_solving` solves the evidence on the way in the background, with the same result (see
+    `solver_process.BackgroundSolver`). InputError without an image.
     """
     sources = _opened(recording)
     control = ReplayControl(

@@ -14,6 +14,7 @@ from rclpy.subscription import Subscription
 from sensor_msgs.msg import CompressedImage, Image
 
 from autocalib_ros.config import NodeOptions
+from autocalib_ros.errors import printable_line
 from autocalib_ros.ros.log_throttle import LogThrottle
 from autocalib_ros.ros.watchdog import NoImageDiagnosis, PublisherOffer, diagnose, other_transport_topic
 
@@ -28,6 +29,8 @@ PUBLISHER_POLL_S = 1.0
 """Real seconds between two checks of the publishers."""
 NO_IMAGE_TIMEOUT_S = 5.0
 """Real seconds without an image before a warning."""
+MAX_ENCODING = 100
+"""Most characters of an encoding that are told; those of compressed images have up to 40."""
 UNKNOWN = '_UNKNOWN_'
 """Part of the name that rmw gives a node of which it has only seen a topic."""
 RELIABILITY = {'reliable': ReliabilityPolicy.RELIABLE, 'best_effort': ReliabilityPolicy.BEST_EFFORT}
@@ -132,7 +135,8 @@ class ImageInput:
                 self._node.get_logger().info(f'images on {self.topic} again, after {now - self._last_image:.0f} s')
             self._outage_told = False
         self._last_image, self._any_image = now, True
-        self.encoding = message.encoding if self._type is Image else message.format
+        encoding = message.encoding if self._type is Image else message.format
+        self.encoding = printable_line(encoding, MAX_ENCODING, 0)
         self._on_image(message)
 
     def _warn_no_image(self) -> None:
