@@ -85,7 +85,7 @@ def remedy(result: Calibration | Refusal) -> str:
 
 
 def _capital(text: str) -> str:
-    return text[:1].upper() + text[1:]
+    return text if '_' in text.partition(' ')[0] else text[:1].upper() + text[1:]  # names of options stay
 
 
 def _with_sigma(value: float, sigma: float | None, digits: int) -> str:

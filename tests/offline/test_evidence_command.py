@@ -240,7 +240,9 @@ def test_camera_info_is_in_the_distortion_model_that_is_asked_for(evidence):
 def test_a_model_that_cannot_say_the_lens_is_a_refusal_that_names_another(evidence):
     status, stdout, stderr = evidence('--method', 'paper', '--json', '-p', 'distortion_model=plumb_bob')
     assert (status, document(stdout)['refusal']['code']) == (3, 'distortion_model')
-    assert stderr.startswith('Not calibrated: plumb_bob would be off by up to ')
+    assert stderr.startswith(
+        'Not calibrated: the distortion model that was asked for does not fit the lens. plumb_bob would be'
+    )
     assert 'Set distortion_model to rational_polynomial, which is off by' in stderr
 
 
