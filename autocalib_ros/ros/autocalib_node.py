@@ -88,7 +88,11 @@ class AutocalibNode(Node):
         )
         self._side_files = SideFiles(self.store_writer)
         self._reports = ReportWriter(lambda text, good: self._told.tell(text, good=good))
-        self._upload = DriverUpload(self, self._told.tell) if self.node_options.upload_to_driver else None
+        self._upload = (
+            DriverUpload(self, partial(self._told.tell_outcome, 'upload'))
+            if self.node_options.upload_to_driver
+            else None
+        )
         self._events = ViewEvents()
         self._set_aside: tuple[Published, tuple[KnownView, ...]] | None = None
         """Calibration that was withdrawn for another image size, with its views."""

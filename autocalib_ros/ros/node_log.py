@@ -55,6 +55,11 @@ class NodeLog:
         else:
             self._logger.warning(text)
 
+    def tell_outcome(self, topic: str, text: str, *, good: bool) -> None:
+        """Log how something ended that is tried again and again, unless it ended like that before."""
+        if self._throttle.is_due(topic, text, changed_s=0.0):
+            self.tell(text, good=good)
+
     def tell_event(self, kind: str, text: str) -> bool:
         """Log what happened as a warning, unless it happens all the time; return whether it was logged."""
         more = self._throttle.event(kind)
