@@ -72,7 +72,15 @@ def _with_lanes(found: Solution, evidence: Evidence) -> Solution:
         return found
     camera, normal = found.plane.lens_and_normal
     width = lanes.width(camera, normal) if lanes.has_width else None
-    seen = check('lane_dashes', period=lanes.period(camera, normal), spacings=lanes.spacings, width=width)
+    period = lanes.period(camera, normal)
+    seen = check(
+        'lane_dashes',
+        period=period,
+        spacings=lanes.spacings,
+        width=width,
+        dash=period * lanes.dash_share(camera, normal),
+        rival=period * lanes.rival if lanes.rival else None,
+    )
     return replace(found, lanes=lanes, checks=(*found.checks, seen))
 
 

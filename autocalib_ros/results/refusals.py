@@ -430,8 +430,8 @@ REFUSALS = (
         message='the ground plane needs the height of the camera above the road, which was not given',
         variants={
             'no_dashes': (
-                'the ground plane needs a scale: lane width or dash period are given, but not enough dashes of lane '
-                'lines are seen',
+                'the ground plane needs a scale: lane width or dash period are given, but no dashes of '
+                'lane lines are seen that show such a period without doubt',
                 'give camera_height in metres' + OR + 'give a distance on the road (scale.distances)',
             ),
         },

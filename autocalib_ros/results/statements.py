@@ -207,9 +207,13 @@ def _vehicle_size(
     )
 
 
-def _lane_dashes(period: float, spacings: int, width: float | None) -> str:
+def _lane_dashes(
+    period: float, spacings: int, width: float | None, dash: float | None = None, rival: float | None = None
+) -> str:
+    long = '' if dash is None else f', dashes {dash:.2f} long'
     lanes = '' if width is None else f', between lanes {width:.2f} camera heights wide'
-    return f'dashes of lane lines repeat every {period:.2f} camera heights ({spacings} spacings){lanes}'
+    others = '' if rival is None else f'; those of other lines every {rival:.2f}, so that a told period may be either'
+    return f'dashes of lane lines repeat every {period:.2f} camera heights ({spacings} spacings{long}){lanes}{others}'
 
 
 def _scale_vehicles(

@@ -125,4 +125,4 @@ def test_dashes_that_contradict_the_height_are_named_with_both_numbers() -> None
 
 def test_lanes_are_told_and_no_dash_is_seen() -> None:
     why = scale_of(replace(unscaled()[0], lanes=None), Options(lanes=LaneOptions(country='us')))
-    assert isinstance(why, Reason) and 'not enough dashes' in why.message and 'camera_height' in why.remedy
+    assert isinstance(why, Reason) and 'no dashes of lane lines' in why.message and 'camera_height' in why.remedy

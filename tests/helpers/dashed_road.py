@@ -15,11 +15,12 @@ def dashes(
     *,
     period_m: float = PERIOD_M,
     lines_m: tuple[float, ...] = LINES_M,
+    dash_m: float = DASH_M,
     noise_px: float = 0.4,
 ) -> np.ndarray:
     """Return the dashes (n, 5) of a road along the first axis of the ground that are seen, as `Evidence.stripes_px`."""
     starts = np.arange(-60.0, 120.0, period_m)
-    ends = np.array([[[x, y], [x + DASH_M, y]] for y in lines_m for x in starts + generator.uniform(0, period_m)])
+    ends = np.array([[[x, y], [x + dash_m, y]] for y in lines_m for x in starts + generator.uniform(0, period_m)])
     return bars_seen(junction, ends, generator, noise_px)
 
 

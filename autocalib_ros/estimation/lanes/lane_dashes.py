@@ -1,8 +1,11 @@
 """Dashes of lane lines: those that repeat along the road, and how far it is from one to the next.
 
-Bars on the road that point along it are followed from each to the next one ahead. If many of these spacings are
-alike, they are the period of the dashes; a plane in which they are alike near and far is the right one. The period is
-found by a mixture of one spacing and any other ones, over all planes that the uncertainty of the plane allows.
+Bars on the road that point along it are followed from each to the next one ahead. A period repeats: a spacing counts
+only if the one before or after it on its line is alike, and if nothing is painted between its ends. The stripes of two
+crosswalks are as far apart in every column, but nothing follows them. If many of the spacings that are left are alike,
+they are the period of the dashes; a plane in which they are alike near and far is the right one. The period is found
+by a mixture of one spacing, its multiples where dashes are hidden, and any other ones, over all planes that the
+uncertainty of the plane allows. A second period that is no multiple of the first is a rival.
 """
 
 from __future__ import annotations
@@ -10,8 +13,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import logsumexp
 
+from autocalib_ros.estimation.lanes.period_mixture import (
+    MAX_GAP_HEIGHTS,
+    MIN_PERIODIC_SPACINGS,
+    PERIOD_PAINT_SIGMA,
+    SAME_PERIOD,
+    one_period,
+)
 from autocalib_ros.estimation.markings.road_segments import (
     MAX_DISTANCE_TO_TRAFFIC,
     all_within,
@@ -26,13 +35,19 @@ MIN_DASH_DEPRESSION_SINE = 0.03
 """Least sine of the depression angle of a dash, 33 camera heights away: beyond it a pixel is longer than a dash."""
 MAX_DASH_SLOPE = 0.12
 """Largest slope of a bar against the road on the ground: a bend of 7 degrees, or the width of a short bar."""
-MAX_GAP_HEIGHTS = 6.0
-"""Farthest next dash, camera heights: 18 m from a camera 3 m high."""
 MIN_GAP_LENGTHS = 0.7
 """Least spacing from a bar to the next, in units of the sum of their lengths: dashes do not touch. Judgement."""
 MAX_ASIDE_HEIGHTS, MAX_ASIDE_SLOPE = 0.05, 0.03
 """Largest distance of the next bar from the line that a bar continues, camera heights, and per unit of the spacing:
 the width of a line, and a bend within one spacing."""
+MAX_REPEAT_CHANGE = 0.3
+"""Largest difference of the logarithms of two spacings in a row that are one period: less than that of a spacing and
+its double or half, 0.69, by a factor of two."""
+REPEAT_SIGMAS = 2.0
+"""As `MAX_REPEAT_CHANGE` beyond `SAME_PERIOD`, standard deviations of both spacings."""
+MIN_STARTS, SAME_START = 3, 0.2
+"""Fewest places along the road at which spacings begin, and distance of two places in units of the period: two
+crosswalks and what is by chance behind them give two, however many stripes they have."""
 MAX_LENGTH_RATIO, MAX_CONTRAST_RATIO = 2.2, 3.3
 """Largest ratio of length and of contrast of a dash and the next. Judgement."""
 DASH_PLACE_SIGMA = 5.5e-4
@@ -43,18 +58,6 @@ PITCH_STEP_RAD, PITCH_SIGMAS, MIN_PITCH_SIGMA_RAD = np.radians(0.25), 3.0, np.ra
 """Planes that are tried: turned about the direction across the road in such steps, within so many standard deviations
 of the plane, which is at least that of the grade along a road."""
 MAX_PITCH_RAD = np.radians(6.0)
-TRIAL_PERIODS = np.geomspace(0.15, MAX_GAP_HEIGHTS, 180)
-"""Periods that are tried, camera heights: 2 % apart."""
-DASH_SHARES = np.array([0.2, 0.4, 0.6, 0.8])
-"""Shares of the spacings that are one period."""
-MIN_PERIOD_NATS, MIN_OTHER_NATS, SAME_PERIOD = 8.0, 3.0, 0.15
-"""Least log likelihood of a period over none, which is more than the logarithm of the planes and periods that are
-tried; and over any other period, which differs by more than this in its logarithm."""
-MIN_PERIODIC_SPACINGS = 6
-"""Fewest spacings that are one period. Judgement."""
-PERIOD_PAINT_SIGMA = 0.03
-"""Standard deviation of the logarithm of a period that no spread shows: crews lay out dashes by the machine's wheel.
-Judgement; two rendered highways were 1 % off, four real recordings 2 to 6 % at camera heights by hand."""
 SLOPE_SIGMA = 0.03
 """Standard deviation of the change of a period by the logarithm of the distance that no spread shows: sag and crest of
 the road. Judgement."""
@@ -88,6 +91,8 @@ class LanePattern:
     """Inverse variances of the log spacings, times the probability that they are one period, shape (m,)."""
     period_sigma: float
     """Standard deviation of the log period for exact lens and plane."""
+    rival: float
+    """Ratio of a second period, of other lines, to this one; 0 if there is none."""
     beside: np.ndarray
     """Indices of a dash and of the nearest one in the next line to its left, shape (k, 2); empty if it is not known."""
     beside_weights: np.ndarray
@@ -110,6 +115,12 @@ class LanePattern:
         places = _on_road(camera, normal, self.along, self.dashes_px)
         logs, _ = _spacings(places, self.successive)
         return float(np.exp(self.spacing_weights @ logs / self.spacing_weights.sum()))
+
+    def dash_share(self, camera: Camera, normal: np.ndarray) -> float:
+        """Return the length of a dash in units of the period; blur makes it too large by up to a half."""
+        ways = np.diff(_on_road(camera, normal, self.along, self.dashes_px), axis=1)[:, 0]
+        lengths = np.log(np.maximum(np.hypot(*ways.T), 1e-6))[self.successive[:, 0]]
+        return float(np.exp(_weighted(lengths, self.spacing_weights)) / self.period(camera, normal))
 
     def width(self, camera: Camera, normal: np.ndarray) -> float:
         """Return the width of a lane, camera heights."""
@@ -143,6 +154,10 @@ def measure_lanes(
     if len(pairs) < MIN_PERIODIC_SPACINGS:
         return None
     noise = _spacing_sigmas(evidence, camera, normal, along, dashes, pairs)
+    repeated = _repeated(_spacings(places, pairs)[0], noise, pairs)
+    pairs, noise = pairs[repeated], noise[repeated]
+    if len(pairs) < MIN_PERIODIC_SPACINGS:
+        return None
     ahead = along - (along @ normal) * normal
     ahead /= np.linalg.norm(ahead)
     reach = min(PITCH_SIGMAS * max(sigma_rad, MIN_PITCH_SIGMA_RAD), MAX_PITCH_RAD)
@@ -154,14 +169,18 @@ def measure_lanes(
         ]
     )
     prior = -0.5 * (pitches / max(sigma_rad, MIN_PITCH_SIGMA_RAD)) ** 2
-    found = _one_period(logs, noise, prior)
+    found = one_period(logs, noise, prior)
     if found is None:
         return None
-    probable, sigma = found
-    width = _lane_width(places, pairs[probable > 0.5], np.exp(_weighted(logs[len(pitches) // 2], probable)))
+    probable, sigma, rival = found
+    period, periodic = np.exp(_weighted(logs[len(pitches) // 2], probable)), pairs[probable > 0.5]
+    starts = np.sort(places[periodic[:, 0], 0, 0])
+    if 1 + np.count_nonzero(np.diff(starts) > SAME_START * period) < MIN_STARTS:
+        return None
+    width = _lane_width(places, periodic, period)
     beside, beside_weights, width_sigma = width or (np.zeros((0, 2), int), np.zeros(0), np.inf)
     return LanePattern(
-        along, dashes[:, :4], pairs, probable / noise**2, sigma, beside, beside_weights, float(width_sigma)
+        along, dashes[:, :4], pairs, probable / noise**2, sigma, rival, beside, beside_weights, float(width_sigma)
     )
 
 
@@ -209,13 +228,25 @@ def _successive(places: np.ndarray, contrast: np.ndarray) -> np.ndarray:
     length, slope = np.hypot(*way.T), way[:, 1] / np.maximum(way[:, 0], 1e-6)
     gap = middle[:, 0] - middle[:, 0][:, None]
     aside = middle[:, 1] - middle[:, 1][:, None] - 0.5 * gap * (slope + slope[:, None])
-    next_one = (gap > MIN_GAP_LENGTHS * (length + length[:, None])) & (gap < MAX_GAP_HEIGHTS)
-    next_one &= np.abs(aside) < MAX_ASIDE_HEIGHTS + MAX_ASIDE_SLOPE * gap
+    on_line = np.abs(aside) < MAX_ASIDE_HEIGHTS + MAX_ASIDE_SLOPE * np.abs(gap)
+    next_one = on_line & (gap > MIN_GAP_LENGTHS * (length + length[:, None])) & (gap < MAX_GAP_HEIGHTS)
     next_one &= np.abs(np.log(length / length[:, None])) < np.log(MAX_LENGTH_RATIO)
     next_one &= np.abs(np.log(contrast / contrast[:, None])) < np.log(MAX_CONTRAST_RATIO)
     nearest = np.where(next_one, gap, np.inf).argmin(axis=1)
     has = next_one.any(axis=1)
-    return np.column_stack([np.flatnonzero(has), nearest[has]])
+    pairs = np.column_stack([np.flatnonzero(has), nearest[has]])
+    one, other = pairs.T
+    # another bar wholly between the two: a dash of other contrast or length, so that the spacing may be two periods
+    between = (places[:, 0, 0] > places[one, 1, 0][:, None]) & (places[:, 1, 0] < places[other, 0, 0][:, None])
+    return pairs[~(between & on_line[one] & on_line[:, other].T).any(axis=1)]
+
+
+def _repeated(logs: np.ndarray, noise: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    """Return the mask (m,) of the spacings that a spacing alike follows or precedes on the same line."""
+    one, next_one = np.nonzero(pairs[:, 1][:, None] == pairs[:, 0])
+    limit = np.minimum(SAME_PERIOD + REPEAT_SIGMAS * np.hypot(noise[one], noise[next_one]), MAX_REPEAT_CHANGE)
+    alike = np.abs(logs[one] - logs[next_one]) < limit
+    return np.isin(np.arange(len(pairs)), np.concatenate([one[alike], next_one[alike]]))
 
 
 def _spacings(places: np.ndarray, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -237,36 +268,6 @@ def _spacing_sigmas(
     by_step = np.hypot(*(_on_road(camera, normal, along, moved).mean(axis=1) - middle).T)
     spacing = np.hypot(*(middle[pairs[:, 1]] - middle[pairs[:, 0]]).T)
     return np.hypot(MIN_SPACING_SIGMA, np.hypot(by_step[pairs[:, 0]], by_step[pairs[:, 1]]) / spacing)
-
-
-def _one_period(logs: np.ndarray, noise: np.ndarray, prior: np.ndarray) -> tuple[np.ndarray, float] | None:
-    """Return the probability of each spacing to be one period (m,), and the standard deviation of the log period.
-
-    `logs` (p, m) are the log spacings in each of the planes, of log prior (p,); `noise` (m,) are their standard
-    deviations. None if there is no one period.
-    """
-    centre = len(logs) // 2
-    spread = max(float(logs[centre].std()), 0.4)
-    any_other = np.exp(-0.5 * ((logs - logs[centre].mean()) / spread) ** 2) / spread
-    trial = np.log(TRIAL_PERIODS)[:, None, None]
-    one = np.exp(-0.5 * ((logs - trial) / noise) ** 2) / noise  # (periods, planes, spacings)
-    share = DASH_SHARES[:, None, None, None]
-    mixed = np.log(share * one + (1.0 - share) * any_other).sum(axis=-1) + prior  # (shares, periods, planes)
-    best = np.unravel_index(np.argmax(mixed), mixed.shape)
-    none = float(logsumexp(np.log(any_other).sum(axis=-1) + prior))
-    others = np.abs(np.log(TRIAL_PERIODS / TRIAL_PERIODS[best[1]])) > SAME_PERIOD + _drift(logs, int(best[2]))
-    if mixed[best] < none + MIN_PERIOD_NATS or mixed[best] < mixed[:, others].max(initial=-np.inf) + MIN_OTHER_NATS:
-        return None
-    share_best, density = DASH_SHARES[best[0]], one[best[1], best[2]]
-    probable = share_best * density / (share_best * density + (1.0 - share_best) * any_other[best[2]])
-    if np.count_nonzero(probable > 0.5) < MIN_PERIODIC_SPACINGS:
-        return None
-    return probable, float(np.hypot((probable / noise**2).sum() ** -0.5, PERIOD_PAINT_SIGMA))
-
-
-def _drift(logs: np.ndarray, plane: int) -> float:
-    """Return how much the same spacings differ from plane to plane: a period in another plane is no other period."""
-    return float(np.abs(np.median(logs - logs[plane], axis=1)).max())
 
 
 def _lane_width(places: np.ndarray, pairs: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray, float] | None:

@@ -18,6 +18,14 @@ TOLD_WIDTH_SIGMA, TOLD_PERIOD_SIGMA = 0.04, 0.02
 countries prescribe: what is painted differs from what is ordered. Judgement."""
 MIN_PERIOD_RATIO = 1.15
 """The prescribed period that fits best has to be nearer than the next one by this factor, or none is taken."""
+DASH_SHARE_FACTORS = (0.7, 1.9)
+"""Range of the measured length of a dash in units of the period over the prescribed one: bars end at half of their
+contrast, and blur lengthens them: 1.0 to 1.1 times on two rendered roads and one real one. Where every other dash is
+missed it is half of that; the lower bound is the geometric mean of 1 and a half. Where the period is halved, it is 2
+or more."""
+ANY_DASH_SHARES = (0.12, 0.8)
+"""Range where no dash is prescribed: from 0.7 times 1 m of 6 m, to warning lines of 4 m of 6 m with blur. Less is a
+multiple of the period, more is joints and seams."""
 
 
 @dataclass(frozen=True)
@@ -29,6 +37,8 @@ class ToldLanes:
     width_sigma_m: float
     periods_m: tuple[float, ...]
     """Periods that may be; empty if nothing is known."""
+    dash_shares: tuple[float, ...]
+    """Length of a dash in units of each of these periods; empty if it is not known."""
     period_sigma: float
     """Relative standard deviation."""
     source: str
@@ -42,12 +52,13 @@ class ToldLanes:
         if width <= 0 and standard is not None:
             width, sigma = standard.width_m, standard.width_sigma_m
         periods = () if standard is None else standard.periods_m
+        shares = () if standard is None else tuple(np.divide(standard.dashes_m, standard.periods_m).tolist())
         relative = TOLD_PERIOD_SIGMA
         if options.dash_period_m > 0:
-            periods = (options.dash_period_m,)
+            periods, shares = (options.dash_period_m,), ()
             relative = options.dash_period_sigma_m / options.dash_period_m or TOLD_PERIOD_SIGMA
         numbers = options.width_m > 0 or options.dash_period_m > 0
-        return cls(width, sigma, periods, relative, 'given' if numbers else options.country)
+        return cls(width, sigma, periods, shares, relative, 'given' if numbers else options.country)
 
 
 def lane_scales(
@@ -55,26 +66,39 @@ def lane_scales(
 ) -> list[Scale]:
     """Return the scales that follow from the lanes; none without a pattern, or where nothing is told.
 
-    Of several prescribed periods the one is taken that fits the `others` best, or else the width of the lanes.
+    Of several prescribed periods the one is taken that fits the `others` best, or else the width of the lanes. None is
+    taken where the period found may be a multiple of the prescribed one by the length of the dashes, or where lines of
+    a second period are about and nothing else tells which of the two is meant.
     """
     if pattern is None:
         return []
     found = [_of_width(pattern, told, camera, normal)] if pattern.has_width and told.width_m > 0 else []
     expected = [source.height(camera, normal) for source in (others or found)]
-    period_m = _fitting(told.periods_m, pattern.period(camera, normal), expected)
+    period_m = _fitting(pattern, told, (camera, normal), expected)
     return found if period_m is None else [*found, _of_period(pattern, told, period_m, camera, normal)]
 
 
-def _fitting(periods_m: tuple[float, ...], measured: float, heights: list[float]) -> float | None:
-    """Return the period that fits one measured in camera heights best; None if another one fits about as well."""
-    if len(periods_m) < 2:
-        return periods_m[0] if periods_m else None
-    if not heights:
+def _fitting(
+    pattern: LanePattern, told: ToldLanes, at: tuple[Camera, np.ndarray], heights: list[float]
+) -> float | None:
+    """Return the told period that fits the one measured best; None if another pair of the two fits about as well."""
+    measured, share = pattern.period(*at), pattern.dash_share(*at)
+    if not ANY_DASH_SHARES[0] < share < ANY_DASH_SHARES[1]:
         return None
-    expected = measured * float(np.exp(np.mean(np.log(heights))))
-    first, second = sorted(periods_m, key=lambda period: abs(np.log(period / expected)))[:2]
-    far, near = abs(np.log(second / expected)), abs(np.log(first / expected))
-    return first if far - near > np.log(MIN_PERIOD_RATIO) else None
+    rivals = (1.0, pattern.rival) if pattern.rival else (1.0,)
+    pairs = [(index, ratio) for index in range(len(told.periods_m)) for ratio in rivals]
+    if not pairs or (len(pairs) > 1 and not heights):
+        return None
+    if len(pairs) > 1:
+        height = float(np.exp(np.mean(np.log(heights))))
+        off = [abs(float(np.log(told.periods_m[index] / (measured * ratio * height)))) for index, ratio in pairs]
+        first, second = np.argsort(off)[:2].tolist()
+        pairs = [pairs[first]] if off[second] - off[first] > np.log(MIN_PERIOD_RATIO) else []
+    low, high = DASH_SHARE_FACTORS
+    for index, ratio in pairs:
+        if ratio == 1.0 and (not told.dash_shares or low < share / told.dash_shares[index] < high):
+            return told.periods_m[index]
+    return None
 
 
 def _of_width(pattern: LanePattern, told: ToldLanes, camera: Camera, normal: np.ndarray) -> Scale:

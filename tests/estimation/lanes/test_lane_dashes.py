@@ -69,6 +69,69 @@ def test_bars_without_a_period_show_none(seed: int) -> None:
     assert pattern(clutter(80, seed)) is None
 
 
+def crosswalks(*places_m: float) -> np.ndarray:
+    """Stripes of crosswalks at some places along the road."""
+    lateral = np.arange(-6.5, 7.0, 1.0)
+    ends = np.array([[[along, y], [along + 3.0, y]] for along in places_m for y in lateral])
+    return bars_seen(ROAD, ends, np.random.default_rng(3))
+
+
+@pytest.mark.parametrize('apart_m', [12.0, 18.0, 24.0])
+def test_stripes_of_two_crosswalks_are_no_dashes(apart_m: float) -> None:
+    assert pattern(crosswalks(14.0, 14.0 + apart_m)) is None
+
+
+def test_dashes_between_crosswalks_show_their_own_period() -> None:
+    stripes = np.vstack([crosswalks(14.0, 38.0), dashes(ROAD, np.random.default_rng(1), period_m=6.0)])
+    found = pattern(stripes)
+    assert found is None or found.period(PINHOLE, NORMAL) == pytest.approx(6.0 / HEIGHT_M, rel=0.03)
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_faint_dashes_between_bright_ones_double_no_period(seed: int) -> None:
+    bright, faint = (dashes(ROAD, np.random.default_rng(seed)) for _ in range(2))
+    way = 0.5 * (bright[1:, :4] - bright[:-1, :4])  # halfway to the next one of the line
+    faint = faint[:-1].copy()
+    faint[:, :4] += way
+    faint[:, 4] *= 0.25
+    assert pattern(np.vstack([bright, faint])) is None
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_hidden_dashes_do_not_double_the_period(seed: int) -> None:
+    generator = np.random.default_rng(seed)
+    stripes = dashes(ROAD, generator, period_m=6.0)
+    found = pattern(stripes[generator.uniform(size=len(stripes)) < 0.7])
+    assert found is None or found.period(PINHOLE, NORMAL) == pytest.approx(6.0 / HEIGHT_M, rel=0.04)
+
+
+def test_a_second_period_of_other_lines_is_a_rival() -> None:
+    generator = np.random.default_rng(1)
+    lines = [(6.0, (-3.5, 3.5)), (9.0, (-7.0, 0.0, 7.0))]
+    found = pattern(np.vstack([dashes(ROAD, generator, period_m=each, lines_m=at) for each, at in lines]))
+    period = found.period(PINHOLE, NORMAL) * HEIGHT_M
+    assert sorted([period, period * found.rival]) == pytest.approx([6.0, 9.0], rel=0.05)
+    # which of the two is told, another length has to say
+    told = ToldLanes.of(LaneOptions(dash_period_m=period))
+    height = Scale(lambda *_: HEIGHT_M, 0.1, True, 'scale_height')
+    assert lane_scales(found, told, PINHOLE, NORMAL, []) == []
+    assert len(lane_scales(found, told, PINHOLE, NORMAL, [height])) == 1
+    wrong = Scale(lambda *_: HEIGHT_M / found.rival, 0.1, True, 'scale_height')
+    assert lane_scales(found, told, PINHOLE, NORMAL, [wrong]) == []
+
+
+def test_the_length_of_the_dashes_tells_a_multiple_of_the_prescribed_period() -> None:
+    found = pattern(dashes(ROAD, np.random.default_rng(1)))
+    assert found.dash_share(PINHOLE, NORMAL) == pytest.approx(0.25, rel=0.1)
+    told = replace(ToldLanes.of(LaneOptions(country='us')), width_m=0.0)  # 3.05 of 12.19 m
+    assert [scale.kind for scale in lane_scales(found, told, PINHOLE, NORMAL, [])] == ['scale_dashes']
+    assert lane_scales(found, replace(told, dash_shares=(0.5,)), PINHOLE, NORMAL, []) == []
+    every_other = pattern(dashes(ROAD, np.random.default_rng(1), dash_m=1.0))
+    if every_other is not None:  # a twelfth is painted nowhere
+        told = ToldLanes.of(LaneOptions(dash_period_m=PERIOD_M))
+        assert lane_scales(every_other, told, PINHOLE, NORMAL, []) == []
+
+
 def test_without_bars_or_traffic_there_is_no_pattern() -> None:
     assert pattern(np.zeros((0, 5))) is None
     assert pattern(dashes(ROAD, np.random.default_rng(1))[:5]) is None
