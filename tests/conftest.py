@@ -15,7 +15,7 @@ from stored_results import quick_folder  # noqa: E402
 gc.disable()  # while tests are collected: what they import stays until the end
 os.environ.pop('FORCE_COLOR', None)  # some test machines set it, and messages are compared as they are
 
-COSTS_S = {'slow': 60.0, 'solve': 2.0, 'dds': 4.0, 'render': 1.5, 'unit': 0.02}
+COSTS_S = {'exhaustive': 2.0, 'slow': 60.0, 'solve': 2.0, 'dds': 4.0, 'render': 1.5, 'unit': 0.02}
 """Markers and about how many seconds one of their tests takes, see pytest.ini; without another it is a `unit` test."""
 FIXTURE_COSTS = {'bench': 'dds', 'written': 'render', 'still_video': 'render', 'video': 'render'}
 """Markers of all tests that ask for a fixture: a workbench of nodes, a report, videos."""

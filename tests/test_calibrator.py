@@ -13,6 +13,7 @@ import pytest
 from autocalib_ros.calibrator import AutoCalibrator, CalibrationProgress, ImageIntake
 from autocalib_ros.config import BufferOptions, GateOptions, Options
 from autocalib_ros.errors import InputError
+from autocalib_ros.evidence.solution_schedule import SolutionSchedule
 from autocalib_ros.evidence.stillness import ViewChangeKind
 from autocalib_ros.offline.simulate.stamp_faults import STAMP_FAULTS
 
@@ -202,15 +203,11 @@ def test_other_options_make_a_solution_due() -> None:
     assert calibrator.snapshot_if_due() is not None
 
 
-@pytest.mark.parametrize('is_accepted', [True, False])
-def test_an_accepted_calibration_is_solved_again_when_that_can_be_better(is_accepted: bool) -> None:
-    calibrator = fed(150)
-    assert calibrator.snapshot_if_due() is not None
-    if is_accepted:
-        calibrator.accepted(1_000_000)  # more tracks than will come
-    for index in range(150, 300):
-        calibrator.add_image(index * 100_000_000, image(index))
-    assert (calibrator.snapshot_if_due() is None) == is_accepted
+def test_the_schedule_learns_what_was_accepted(monkeypatch: pytest.MonkeyPatch) -> None:
+    calibrator, told = fed(20), []
+    monkeypatch.setattr(SolutionSchedule, 'accepted', lambda _self, part, tracks: told.append((part.frames, tracks)))
+    calibrator.accepted(7)
+    assert told == [(20, 7)]
 
 
 @pytest.mark.parametrize(

@@ -61,6 +61,7 @@ LINK = re.compile(r'!?\[[^\]]*\]\(([^)\s]+)(?: "[^"]*")?\)')
 HEADING = re.compile(r'^#+ (.*)$', re.MULTILINE)
 OPTION = re.compile(r'(?<!-)--[a-z][a-z-]+')
 OPTIONS_OF_OTHERS = {
+    '--dist',
     '--ros-args',
     '--params-file',
     '--skip-keys',

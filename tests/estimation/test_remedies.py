@@ -484,6 +484,7 @@ def number_of(trial: Trial) -> str:
     return f'{trial.code}-{trial.cause}' if trial.cause else trial.code
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize('trial', TRIALS, ids=number_of)
 def test_each_remedy_of_a_refusal_gives_another_verdict(trial: Trial) -> None:
     question = trial.asked()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -16,9 +18,14 @@ from autocalib_ros.offline.simulated_recording import SimulatedRecording
 pytestmark = pytest.mark.render
 
 
-def recording(bag, **options) -> SimulatedRecording:
-    small = {'width_px': 96, 'height_px': 64, 'duration_s': 0.4, 'compressed': True}
-    return SimulatedRecording(bag, Simulation(SimulationOptions(**{**small, **options})))
+@cache
+def simulation(**options) -> Simulation:
+    """Return a small simulation, whose world takes longer to build than its images."""
+    return Simulation(SimulationOptions(width_px=96, height_px=64, duration_s=0.4, **options))
+
+
+def recording(bag, *, compressed=True) -> SimulatedRecording:
+    return SimulatedRecording(bag, simulation(compressed=compressed))
 
 
 def test_it_gives_the_images_that_the_bag_has_afterwards(tmp_path):

@@ -11,7 +11,7 @@ from bench import PATIENCE_S, wait_for
 from calibrated_site import FRAME_NS, site
 from processes import running_camera
 
-pytestmark = pytest.mark.dds
+pytestmark = [pytest.mark.dds, pytest.mark.exhaustive]
 
 HOUR_NS = 3600 * 10**9
 MAX_8K_MB = 1000

@@ -16,7 +16,7 @@ from bench import PATIENCE_S, image, wait_for
 from calibrated_site import NODE, site
 from processes import PROCESS_PATIENCE_S, interrupt, running_fake_node, running_node
 
-pytestmark = pytest.mark.dds
+pytestmark = [pytest.mark.dds, pytest.mark.exhaustive]
 
 
 @pytest.fixture
