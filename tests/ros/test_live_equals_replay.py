@@ -43,8 +43,8 @@ def bag(tmp_path_factory) -> Path:
             focal_px=140.0,
             principal_point_offset_px=(2.0, -1.5),
             camera_height_m=HEIGHT_M,
-            duration_s=20.0,
-            rate_hz=8.0,
+            duration_s=18.0,
+            rate_hz=6.0,
             topic=TOPIC,
         ),
     )
