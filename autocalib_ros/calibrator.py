@@ -18,13 +18,11 @@ from autocalib_ros.perception.detector.detector import VehicleDetector, open_det
 from autocalib_ros.perception.frame_clock import ClockSummary
 from autocalib_ros.perception.image_stream import ImageStream
 from autocalib_ros.perception.image_timing import ImageTiming
+from autocalib_ros.perception.size_change import SizeChange
 from autocalib_ros.perception.view_watch import KnownView
 
 TRAIL_FRAMES = 16
 """Images over which the trail of a tracked point is drawn: a second at 15 Hz."""
-MIN_RESIZED_S, MIN_RESIZED_IMAGES = 3.0, 5
-"""Time by the stamps and number of images in a row for which a new size lasts before it is believed: drivers that
-reconnect send a few odd images, a camera that changes its mode keeps it."""
 
 
 class ImageIntake(Enum):
@@ -64,7 +62,7 @@ class AutoCalibrator:
         self._detector = detector or open_detector(options.detector)
         self._stream: ImageStream | None = None
         self._timing = ImageTiming(self._follows)
-        self._odd_size: tuple[tuple[int, int], int, int] | None = None
+        self._size_change = SizeChange()
         self._schedule = SolutionSchedule(options)
 
     def add_image(self, stamp_ns: int, image: np.ndarray) -> ImageIntake:
@@ -79,9 +77,9 @@ class AutoCalibrator:
             raise InputError(f'an image is grey (H, W) or BGR (H, W, 3) in 8 bits, got {image.dtype} {image.shape}')
         size, frames = (image.shape[1], image.shape[0]), 0 if self._stream is None else self._stream.frames
         resized = self._stream is not None and size != self._stream.size
-        if resized and not self._has_lasted(size, stamp_ns):
+        if resized and not self._size_change.has_lasted(size, stamp_ns):
             return ImageIntake.ODD_SIZE
-        self._odd_size = None
+        self._size_change = SizeChange()
         if resized:
             self._timing = ImageTiming(self._follows)
         taken = self._timing.add(stamp_ns, image)
@@ -101,14 +99,6 @@ class AutoCalibrator:
     def _follows(self, image: np.ndarray) -> bool:
         """Return whether an image shows the traffic one step after the last one."""
         return self._stream is not None and self._stream.observer.follows(image)
-
-    def _has_lasted(self, size: tuple[int, int], stamp_ns: int) -> bool:
-        """Count an image of a new size; return whether that size is to be believed."""
-        before, since_ns, count = self._odd_size or (size, stamp_ns, 0)
-        if before != size or stamp_ns < since_ns:
-            since_ns, count = stamp_ns, 0
-        self._odd_size = (size, since_ns, count + 1)
-        return count + 1 >= MIN_RESIZED_IMAGES and stamp_ns - since_ns >= MIN_RESIZED_S * 1e9
 
     def clock(self) -> ClockSummary:
         """Return what the frame clock made of the stamps since the image size changed last."""
