@@ -16,7 +16,7 @@ from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment, ad
 from autocalib_ros.estimation.adjustment.lens_prior import LOOSE_PRINCIPAL_POINT_SIGMA_FRACTION, LensPrior
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentState
 from autocalib_ros.estimation.observations.track_set import TrackSet
-from autocalib_ros.estimation.solution import Solution
+from autocalib_ros.estimation.solution import Solution, same_change
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.results.refusals import Reason, reason
 from autocalib_ros.results.statements import check
@@ -81,6 +81,7 @@ def verify_given_lens(
         if row is not None:
             found = found.compared(row)
         found = found.compared(verified('given_lens_sigma', release.fit.focal_sigma, MAX_TESTING_SIGMA))
+        found = _covering_difference(found, release)
         if found.full:
             return found if row is None or row.passed else _doubted(found, release)
     free = solve_free()
@@ -90,6 +91,20 @@ def verify_given_lens(
     if contradiction is None and isinstance(found, Reason) and _points_differ(lens, free):
         contradiction = _point_contradiction(lens, free.fit)
     return contradiction or found
+
+
+def _covering_difference(found: Solution, release: _Release) -> Solution:
+    """Let the covariance of the plane cover that with the focal length of the traffic.
+
+    A difference within the tolerance may be a fault of either, and the plane turns with it. What exceeds the error of
+    the traffic is taken for the error of the lens (moment estimator of DerSimonian and Laird 1986, for one difference).
+    """
+    _, sigmas = release.change(lambda camera: np.array([np.log(camera.focal_px)]))
+    if sigmas <= 1.0:
+        return found
+    turned = replace(release.fit.state, camera=release.given)
+    step = same_change(found.fit, (found.of_traffic or found.fit).state, turned)
+    return found.covering(np.sqrt(1.0 - 1.0 / sigmas**2) * step)
 
 
 def _test_by_release(

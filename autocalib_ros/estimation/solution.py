@@ -9,6 +9,7 @@ import numpy as np
 from autocalib_ros.config import GateOptions
 from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment
 from autocalib_ros.estimation.adjustment.lens_prior import LensPrior
+from autocalib_ros.estimation.adjustment.parameters import AdjustmentState
 from autocalib_ros.estimation.certainty import certainty_of_lengths
 from autocalib_ros.estimation.lanes.lane_dashes import LanePattern
 from autocalib_ros.estimation.observations.track_set import TrackSet, evenly_spaced
@@ -98,6 +99,11 @@ class Solution:
         told = prior.focal_known and prior.sigma[0] > 0
         return bool(self.from_markings and told and self.fit.focal_sigma > MIN_MEASURED_SHARE * prior.sigma[0])
 
+    def covering(self, step: np.ndarray) -> Solution:
+        """Return the solution with a covariance that covers a step (parameters,) besides."""
+        fit = replace(self.fit, covariance=self.fit.covariance + np.outer(step, step))
+        return replace(self, fit=fit, plane=replace(self.plane, fit=fit))
+
     @property
     def uncertainty(self) -> tuple[float, float]:
         """Standard deviation of lengths on the road for a known height, then of the plane, degrees; inf if unknown."""
@@ -154,3 +160,18 @@ def _joined(first: Reason, further: Reason, asks_less: bool) -> Reason:
     if first.code == further.code:  # told once, by the number that is nearer to its limit
         return replace(further if asks_less else first, values=values)
     return replace(first, message=f'{first.message}; {further.message}', remedy=remedy, values=values)
+
+
+def same_change(fit: Adjustment, before: AdjustmentState, after: AdjustmentState) -> np.ndarray:
+    """Return the step (parameters,) of a fit that changes lens and plane as from one state to another."""
+    camera, point = fit.state.camera, np.subtract(after.camera.principal_point_px, before.camera.principal_point_px)
+    k = np.add(camera.k, np.subtract(after.camera.k, before.camera.k))
+    moved = replace(
+        camera,
+        focal_px=camera.focal_px * after.camera.focal_px / before.camera.focal_px,
+        principal_point_px=tuple(np.add(camera.principal_point_px, point).tolist()),
+        k=tuple(k.tolist()),
+        pixel_aspect=camera.pixel_aspect * after.camera.pixel_aspect / before.camera.pixel_aspect,
+    )
+    rotation = after.rotation @ before.rotation.T @ fit.state.rotation
+    return fit.problem.parameters.step_to(replace(fit.state, camera=moved, rotation=rotation))

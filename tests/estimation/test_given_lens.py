@@ -9,6 +9,7 @@ import pytest
 
 from autocalib_ros.config import Options
 from autocalib_ros.evidence.snapshot import Evidence
+from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.results.calibration import Calibration, Refusal
 from solved_once import solve_once
@@ -49,6 +50,18 @@ def test_a_lens_with_skew_and_two_focal_lengths_is_published_as_it_is(two_roads:
     assert isinstance(result, Calibration)
     assert result.camera == exact
     assert result.camera_info.k == pytest.approx(exact.matrix.ravel().tolist())
+
+
+@pytest.mark.parametrize('factor', [1.01, 1.025])
+def test_a_difference_within_the_tolerance_widens_the_plane(two_roads: Evidence, right: Camera, factor: float) -> None:
+    free = solve_once(two_roads, OPTIONS)
+    held = solve_once(two_roads, OPTIONS, lens=replace(right, focal_px=factor * right.focal_px))
+    assert isinstance(free, Calibration) and isinstance(held, Calibration)
+    assert free.ground is not None and held.ground is not None
+    change = tilt_and_roll_deg(held.ground.normal_in_camera) - tilt_and_roll_deg(free.ground.normal_in_camera)
+    exact = solve_once(two_roads, OPTIONS, lens=right)
+    assert isinstance(exact, Calibration) and exact.stddev.tilt_deg and held.stddev.tilt_deg
+    assert abs(change[0]) < 1.5 * held.stddev.tilt_deg and held.stddev.tilt_deg > 1.2 * exact.stddev.tilt_deg
 
 
 @pytest.mark.parametrize('factor', [0.5, 0.9, 1.1, 4 / 3, 2.0], ids=['half', 'short', 'long', 'crop', 'double'])

@@ -18,7 +18,7 @@ from autocalib_ros.estimation.adjustment.lens_prior import LENS_PARAMETERS
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentState
 from autocalib_ros.estimation.observations.track_set import TrackSet
 from autocalib_ros.estimation.pixels.aspect_hypotheses import AspectHypotheses
-from autocalib_ros.estimation.solution import Solution
+from autocalib_ros.estimation.solution import Solution, same_change
 from autocalib_ros.estimation.verification.gates import check_plane
 from autocalib_ros.results.refusals import Reason, reason
 from autocalib_ros.results.statements import Statement, assumption, check
@@ -274,24 +274,18 @@ def _averaged(found: Solution, measured: MeasuredAspect, expected: float, gate: 
     prior_odds = np.exp(-EXPECTED_NATS - MARKINGS_NATS * _is_confirmed(found))
     probability, square = measured.unexpected(expected, float(prior_odds))
     before, after = (measured.state_at(expected * float(np.exp(step))) for step in (0.0, ASPECT_STEP))
-    step = _same_change(found.fit, before, after) / ASPECT_STEP
-    covering = _covering(found, np.sqrt(probability * square) * step)
+    step = same_change(found.fit, before, after) / ASPECT_STEP
+    covering = found.covering(np.sqrt(probability * square) * step)
     if covering.fit.focal_sigma > gate.max_sigma_focal_rel >= found.fit.focal_sigma:
         return _uncertain(measured, covering.fit, gate, against=measured.aspect)
     return covering
-
-
-def _covering(found: Solution, step: np.ndarray) -> Solution:
-    """Return a solution whose covariance covers a step (parameters,)."""
-    fit = replace(found.fit, covariance=found.fit.covariance + np.outer(step, step))
-    return replace(found, fit=fit, plane=replace(found.plane, fit=fit))
 
 
 def _widened(
     found: Solution, measured: MeasuredAspect, state: AdjustmentState, gate: GateOptions, *, against: float
 ) -> Solution | Reason:
     """Add the difference to the state with another pixel aspect to the covariance; a reason if that is too much."""
-    covering = _covering(found, _same_change(found.fit, (found.of_traffic or found.fit).state, state))
+    covering = found.covering(same_change(found.fit, (found.of_traffic or found.fit).state, state))
     expected = found.fit.problem.config.prior.centre.pixel_aspect
     sigma, sigmas = measured.aspect * measured.sigma, measured.sigmas_from(expected)
     if not (np.isfinite(sigma) and covering.fit.focal_sigma <= gate.max_sigma_focal_rel):
@@ -311,21 +305,6 @@ def _uncertain(measured: MeasuredAspect, fit: Adjustment, gate: GateOptions, *, 
         focal=min(fit.focal_sigma, 9.99) if np.isfinite(sigma) else 9.99,
         limit=gate.max_sigma_focal_rel,
     )
-
-
-def _same_change(fit: Adjustment, before: AdjustmentState, after: AdjustmentState) -> np.ndarray:
-    """Return the step (parameters,) of a fit that changes lens and plane as from one state to another."""
-    camera, point = fit.state.camera, np.subtract(after.camera.principal_point_px, before.camera.principal_point_px)
-    k = np.add(camera.k, np.subtract(after.camera.k, before.camera.k))
-    moved = replace(
-        camera,
-        focal_px=camera.focal_px * after.camera.focal_px / before.camera.focal_px,
-        principal_point_px=tuple(np.add(camera.principal_point_px, point).tolist()),
-        k=tuple(k.tolist()),
-        pixel_aspect=camera.pixel_aspect * after.camera.pixel_aspect / before.camera.pixel_aspect,
-    )
-    rotation = after.rotation @ before.rotation.T @ fit.state.rotation
-    return fit.problem.parameters.step_to(replace(fit.state, camera=moved, rotation=rotation))
 
 
 def with_stated_aspect(found: Solution | Reason, aspect: float, source: str) -> Solution | Reason:
