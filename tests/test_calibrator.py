@@ -9,6 +9,7 @@ from functools import cache
 import cv2
 import numpy as np
 import pytest
+from many_cases import one_and_exhaustive
 
 from autocalib_ros.calibrator import AutoCalibrator, CalibrationProgress, ImageIntake
 from autocalib_ros.config import BufferOptions, GateOptions, Options
@@ -113,7 +114,9 @@ def tracks_with_stamps(fault: str) -> int:
     return evidence.track_count
 
 
-@pytest.mark.parametrize('fault', ['jitter_30', 'early_doublets', 'alternating', 'rare_bursts_of_10', 'wrapped'])
+@pytest.mark.parametrize(
+    'fault', one_and_exhaustive(['jitter_30', 'early_doublets', 'alternating', 'rare_bursts_of_10', 'wrapped'])
+)
 def test_uneven_stamps_give_the_tracks_of_even_ones(fault: str) -> None:
     assert tracks_with_stamps(fault) >= 0.8 * tracks_with_stamps('even') > 8
 

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from drawn_pictures import noisy, paste
+from many_cases import one_and_exhaustive
 
 from autocalib_ros.calibrator import AutoCalibrator
 from autocalib_ros.cli import main
@@ -121,7 +122,7 @@ def even(unsolved: None) -> StreamRun:
 TRACKED = ['repeated_in_bursts', 'repeated_25_in_30_jpeg', 'repeated_15_in_30_skipping', 'repeated_at_random']
 
 
-@pytest.mark.parametrize('kind', TRACKED)
+@pytest.mark.parametrize('kind', one_and_exhaustive(TRACKED))
 def test_repeats_are_left_out_and_cost_few_tracks(kind: str, even: StreamRun) -> None:
     source = RepeatingSource(Road(100), REPEAT_FAULTS[kind])
     run = run_stream(kind, source, Options())
@@ -131,7 +132,9 @@ def test_repeats_are_left_out_and_cost_few_tracks(kind: str, even: StreamRun) ->
     assert run.tracks >= 0.8 * even.tracks
 
 
-@pytest.mark.parametrize('kind', ['ntp_forward_0.1', 'utc_to_tai', 'ntp_back_0.1', 'dropped_2', 'pause'])
+@pytest.mark.parametrize(
+    'kind', one_and_exhaustive(['ntp_forward_0.1', 'utc_to_tai', 'ntp_back_0.1', 'dropped_2', 'pause'])
+)
 def test_the_traffic_tells_a_clock_that_is_set_from_lost_images(kind: str, even: StreamRun) -> None:
     calibrator = AutoCalibrator(Options())
     for frame in streams._with_fault(Road(100), kind).frames():
