@@ -229,14 +229,20 @@ class Ground:
             return None
         with np.errstate(all='ignore'):  # invalid pixels may give anything, and are masked
             places = [
-                ((height_m - camera_m[2]) / rays[:, 2])[:, None] * rays[:, :2]
-                for lens, rotation, camera_m in moved
-                for rays in [lens.unproject(pixels)[0] @ rotation.T]
+                points_from_foot(lens, rotation, camera_m, pixels, height_m) for lens, rotation, camera_m in moved
             ]
             sides = np.reshape(places, (len(places) // 2, 2, len(pixels), 2))
             spread = _outer_product_sum((sides[:, 0] - sides[:, 1]) / (2 * PERTURBATION_SIGMAS))
         spread[~valid] = np.nan
         return spread
+
+
+def points_from_foot(
+    lens: Camera, rotation: np.ndarray, camera_m: np.ndarray, pixels: np.ndarray, height_m: float | np.ndarray = 0.0
+) -> np.ndarray:
+    """Return where the rays of pixels (n, 2) are at a height over the road, from the foot of the camera, (n, 2)."""
+    rays = lens.unproject(pixels)[0] @ rotation.T
+    return np.asarray(((height_m - camera_m[2]) / rays[:, 2])[:, None] * rays[:, :2])
 
 
 def _outer_product_sum(moves: np.ndarray) -> np.ndarray:

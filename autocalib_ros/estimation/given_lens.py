@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -57,6 +58,12 @@ class _Release:
         # the smallest eigenvalues of a singular covariance are of a direction that is not free
         return change, float(np.sqrt(max(change @ np.linalg.pinv(covariance, rcond=1e-9) @ change, 0.0)))
 
+    @cached_property
+    def focal_change(self) -> tuple[float, float]:
+        """Change of the log focal length, and its absolute value in standard deviations."""
+        change, sigmas = self.change(lambda camera: np.array([np.log(camera.focal_px)]))
+        return float(change[0]), sigmas
+
 
 def check_principal_point(lens: Camera) -> Reason | None:
     """Refuse a lens whose principal point lies outside the image."""
@@ -99,7 +106,7 @@ def _covering_difference(found: Solution, release: _Release) -> Solution:
     A difference within the tolerance may be a fault of either, and the plane turns with it. What exceeds the error of
     the traffic is taken for the error of the lens (moment estimator of DerSimonian and Laird 1986, for one difference).
     """
-    _, sigmas = release.change(lambda camera: np.array([np.log(camera.focal_px)]))
+    _, sigmas = release.focal_change
     if sigmas <= 1.0:
         return found
     turned = replace(release.fit.state, camera=release.given)
@@ -116,13 +123,13 @@ def _test_by_release(
     """
     loose = LOOSE_PRINCIPAL_POINT_SIGMA_FRACTION * lens.width
     focal = _released(lens, found, tracks, [np.inf, 0.0, 0.0, 0.0, 0.0, 0.0])
-    change, sigmas = focal.change(lambda camera: np.array([np.log(camera.focal_px)]))
-    if abs(change[0]) > LENS_TOLERANCE and sigmas > CONTRADICTION_SIGMAS:
+    off, sigmas = focal.focal_change
+    if abs(off) > LENS_TOLERANCE and sigmas > CONTRADICTION_SIGMAS:
         sigma_px = focal.fit.focal_sigma * focal.camera.focal_px
         return _focal_contradiction(lens, focal.camera.focal_px, sigma_px)
     row = None
     if sigmas > 0:
-        row = verified('given_lens', abs(change[0]), max(DOUBT_SIGMAS * abs(change[0]) / sigmas, LENS_TOLERANCE))
+        row = verified('given_lens', abs(off), max(DOUBT_SIGMAS * abs(off) / sigmas, LENS_TOLERANCE))
     point = _released(lens, found, tracks, [0.0, loose, loose * lens.pixel_aspect, 0.0, 0.0, 0.0])
     change, sigmas = point.change(lambda camera: np.array(camera.principal_point_px))
     if np.hypot(*change) > LENS_TOLERANCE * lens.width and sigmas > CONTRADICTION_SIGMAS:

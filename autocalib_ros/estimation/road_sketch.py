@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from autocalib_ros.config import Options
 from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment
-from autocalib_ros.estimation.adjustment.lens_prior import known_lens, lens_priors
-from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig
+from autocalib_ros.estimation.adjustment.lens_prior import lens_priors
+from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig, level_normal
 from autocalib_ros.estimation.observations.track_set import TrackSet, select_tracks
 from autocalib_ros.estimation.single_road.barrel_lens import LensChoice
-from autocalib_ros.estimation.single_road.road_solution import FIXED_LENS_SIGMA, MIN_BARREL_GAIN
-from autocalib_ros.estimation.straight.initialisation import solve_from_consensus
+from autocalib_ros.estimation.single_road.road_solution import most_followed, roads_through
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.ground_plane import orient_upward
 from autocalib_ros.lens.camera import Camera
@@ -49,17 +48,8 @@ def sketch_roads(evidence: Evidence, options: Options) -> RoadSketch | None:
     aspect = options.lens.pixel_aspect_or(evidence.pixel_aspect)
     prior = lens_priors(evidence.image_size, options.joint, evidence.picture, aspect, options.lens)[0]
     config, generator = AdjustmentConfig(prior, options.joint), np.random.default_rng(options.random_seed)
-    fits: list[Adjustment] = []
-    for lens in LensChoice(prior, options.joint).trials():
-        trial = replace(config, prior=replace(known_lens(lens), sigma=FIXED_LENS_SIGMA))
-        solved = solve_from_consensus(tracks, trial, generator)
-        if solved is not None and len(solved[0].state.angles_rad):
-            fits.append(solved[0])
-    if not fits:
-        return None
-    follow = np.array([float(tracks.vehicle_weight @ fit.inliers()) for fit in fits])
-    best = fits[int(np.argmax(follow > follow.max() / MIN_BARREL_GAIN))]  # straighter lenses come first
-    return _sketched(best, tracks, evidence.track_count)
+    fits = [fit for _, fit in roads_through(LensChoice(prior, options.joint), tracks, config, generator)]
+    return _sketched(most_followed(fits, tracks), tracks, evidence.track_count) if fits else None
 
 
 def _sketched(fit: Adjustment, tracks: TrackSet, count: int) -> RoadSketch | None:
@@ -75,8 +65,7 @@ def _sketched(fit: Adjustment, tracks: TrackSet, count: int) -> RoadSketch | Non
     for index, road in enumerate(shown):
         labels[tracks.indices[followed & (fit.labels == road)]] = index
     directions = fit.state.directions[shown]
-    level = np.cross(directions[0], [1.0, 0.0, 0.0])
-    normal = fit.state.rotation[:, 2] if len(shown) > 1 else level / np.linalg.norm(level)
+    normal = fit.state.rotation[:, 2] if len(shown) > 1 else level_normal(directions[0])
     bearings, _ = fit.state.camera.unproject(tracks.pixels.reshape(-1, 2))
     up, _ = orient_upward(normal, bearings)
     return RoadSketch(fit.state.camera, directions, up, tuple(shares[road] for road in shown), labels)

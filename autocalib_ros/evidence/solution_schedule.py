@@ -12,9 +12,9 @@ WORTHWHILE_GROWTH = 1.0 / 0.85**2
 class SolutionSchedule:
     """Decides by the images and their stamps alone, so that a live run and a replay solve the same evidence."""
 
-    def __init__(self, options: Options, part: StillPart | None = None) -> None:
+    def __init__(self, options: Options) -> None:
         self._options = options
-        self._restart(part)
+        self._restart(None)
 
     def _restart(self, part: StillPart | None) -> None:
         """Plan the first solution of the evidence of a still part."""

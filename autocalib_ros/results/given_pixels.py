@@ -49,7 +49,7 @@ class GivenPixels:
     def turned(self, result: Calibration, move: CameraMove) -> GivenPixels:
         """Return the pixels after a move of the camera with this calibration; unknown if the lens is another now."""
         if not move.keeps_lens or move.sigma_deg is None:
-            return replace(self, in_view=np.full_like(self.in_view, np.nan))
+            return self.unknown()
         camera = result.camera
         bearings, seen = camera.unproject(self.in_view)
         pixels, inside = camera.project(bearings @ move.rotation.T)
@@ -59,6 +59,10 @@ class GivenPixels:
         registration_rad = np.radians(np.linalg.norm(move.sigma_deg))
         added = camera.focal_px * float(np.hypot(registration_rad, focal * turn_rad))
         return replace(self, in_view=pixels, sigma_px=float(np.hypot(self.sigma_px, added)))
+
+    def unknown(self) -> GivenPixels:
+        """Return the pixels in a view of which nothing is known."""
+        return replace(self, in_view=np.full_like(self.in_view, np.nan))
 
     def options_in_view(self, options: Options, image_size: tuple[int, int]) -> Options:
         """Return options with the known lengths where they are in the view; without those that cannot be used.
@@ -144,8 +148,7 @@ class FollowedPixels:
         """Follow a move of the camera away from the view of the calibration in force."""
         with self._lock:
             before = self._in_force
-            unknown = replace(before, in_view=np.full_like(before.in_view, np.nan))
-            self._present = unknown if result is None else before.turned(result, move)
+            self._present = before.unknown() if result is None else before.turned(result, move)
 
     def is_back(self) -> None:
         """Note that the present view is that of the calibration in force."""

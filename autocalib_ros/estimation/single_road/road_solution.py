@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -159,23 +160,42 @@ def _find_road(
 
     The mask (tracks,) is of those that follow the same road through any of the lenses that are tried. None without one.
     """
-    found = []
-    for lens in choice.trials():
-        trial = replace(config, prior=replace(known_lens(lens), sigma=FIXED_LENS_SIGMA), crossing_rad=None)
-        solved = solve_from_consensus(tracks, trial, generator)
-        if solved is not None and len(solved[0].state.angles_rad):
-            found.append(_busiest_road(solved[0], tracks, replace(trial, prior=known_lens(lens))))
+    config = replace(config, crossing_rad=None)
+    found = [
+        _busiest_road(fit, tracks, replace(config, prior=known_lens(lens)))
+        for lens, fit in roads_through(choice, tracks, config, generator)
+    ]
     if not found:
         return None
-    follow = np.array([float(tracks.vehicle_weight @ fit.inliers()) for fit in found])
-    # straighter lenses come first: barrel distortion is believed where it explains clearly more
-    best = found[int(np.argmax(follow > follow.max() / MIN_BARREL_GAIN))]
+    best = most_followed(found, tracks)
     same = [
         fit.inliers()
         for fit in found
         if unsigned_angle_deg(fit.state.directions[0], best.state.directions[0]) < SAME_ROAD_DEG
     ]
     return best, np.any(same, axis=0)
+
+
+def roads_through(
+    choice: LensChoice, tracks: TrackSet, config: AdjustmentConfig, generator: np.random.Generator
+) -> list[tuple[Camera, Adjustment]]:
+    """Return the lenses that are tried and show roads, straighter ones first, with the roads through each."""
+    found = []
+    for lens in choice.trials():
+        trial = replace(config, prior=replace(known_lens(lens), sigma=FIXED_LENS_SIGMA))
+        solved = solve_from_consensus(tracks, trial, generator)
+        if solved is not None and len(solved[0].state.angles_rad):
+            found.append((lens, solved[0]))
+    return found
+
+
+def most_followed(fits: Sequence[Adjustment], tracks: TrackSet) -> Adjustment:
+    """Return the solution that most vehicles follow, of solutions through lenses in the order of `roads_through`.
+
+    Barrel distortion is believed where it explains clearly more.
+    """
+    follow = np.array([float(tracks.vehicle_weight @ fit.inliers()) for fit in fits])
+    return fits[int(np.argmax(follow > follow.max() / MIN_BARREL_GAIN))]
 
 
 def _busiest_road(fit: Adjustment, tracks: TrackSet, config: AdjustmentConfig) -> Adjustment:

@@ -19,7 +19,7 @@ from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.estimation.estimate import solve
 from autocalib_ros.evidence.buffer import EvidenceBuffer
 from autocalib_ros.evidence.snapshot import Evidence, Track
-from autocalib_ros.ground import PERTURBATION_SIGMAS, Ground
+from autocalib_ros.ground import PERTURBATION_SIGMAS, Ground, points_from_foot
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.benchmark.processes import map_in_order
 from autocalib_ros.results.calibration import Calibration
@@ -148,8 +148,7 @@ def length_errors(road: MeasuredRoad, found: Calibration, at: np.ndarray) -> tup
 
 
 def _lengths(camera: Camera, rotation: np.ndarray, camera_m: np.ndarray, ends_px: np.ndarray) -> np.ndarray:
-    rays = camera.unproject(ends_px)[0] @ rotation.T
-    places = (-camera_m[2] / rays[:, 2])[:, None] * rays[:, :2]
+    places = points_from_foot(camera, rotation, camera_m, ends_px)
     return np.asarray(np.hypot(*(places[::2] - places[1::2]).T))
 
 
