@@ -75,6 +75,8 @@ class Solution:
     """Whether lens and plane come from the lane markings."""
     of_traffic: Adjustment | None = None
     """The adjustment of the traffic that lane markings replaced; None if `fit` is it, or there is none."""
+    with_free_aspect: Adjustment | None = None
+    """The adjustment of lane markings alone with the pixel aspect free; None where the traffic measures it."""
     lanes: LanePattern | None = None
     """The dashes of lane lines on the road; None if they show no period."""
     vehicles: Scale | None = None

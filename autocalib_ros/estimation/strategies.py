@@ -137,7 +137,7 @@ def estimate_from_lane_markings(observations: Observations, config: AdjustmentCo
     found = fit_to_markings(observations.evidence, observations.tracks, priors, config, observations.gate)
     if isinstance(found, Reason):
         return found
-    fit, statement = found
+    fit = found.fit
     verification = verify_with_traffic(fit, _planes_of_traffic(fit, observations, config))
     if isinstance(verification, Reason):
         return verification
@@ -149,11 +149,12 @@ def estimate_from_lane_markings(observations: Observations, config: AdjustmentCo
         plane,
         along,
         flow,
-        (*lens_assumptions(fit, ()), statement),
+        (*lens_assumptions(fit, ()), found.assumption),
         checks,
         check_plane(plane, observations.gate),
         reduced=True,
         from_markings=True,
+        with_free_aspect=found.with_free_aspect,
         comparisons=rows,
     )
 

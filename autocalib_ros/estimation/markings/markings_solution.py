@@ -17,8 +17,13 @@ from autocalib_ros.estimation.adjustment.parameters import (
     AdjustmentConfig,
     AdjustmentState,
 )
-from autocalib_ros.estimation.markings.grid_mixture import MarkingGrid
-from autocalib_ros.estimation.markings.grid_search import find_grids, find_grids_near, keep_segments_near_traffic
+from autocalib_ros.estimation.markings.grid_mixture import MarkingGrid, refine_grid
+from autocalib_ros.estimation.markings.grid_search import (
+    ANNEALING_WIDTHS_RAD,
+    find_grids,
+    find_grids_near,
+    keep_segments_near_traffic,
+)
 from autocalib_ros.estimation.markings.road_segments import ProjectedSegments, RoadSegments, segments_on_road
 from autocalib_ros.estimation.observations.track_set import TrackSet
 from autocalib_ros.estimation.verification.gates import check_markings_view
@@ -46,13 +51,20 @@ MAX_SKEW_SIGMAS = 2.5
 """Largest deviation from a right angle, in standard deviations of `RIGHT_ANGLE_SIGMA_RAD`. Judgement."""
 
 
+@dataclass(frozen=True)
+class MarkingsFit:
+    """Lens and plane from lane markings alone."""
+
+    fit: Adjustment
+    with_free_aspect: Adjustment
+    """The same with the pixel aspect free: lane markings at right angles measure it, too."""
+    assumption: Statement
+
+
 def fit_to_markings(
     evidence: Evidence, tracks: TrackSet, priors: list[LensPrior], config: AdjustmentConfig, gate: GateOptions
-) -> tuple[Adjustment, Statement] | Reason:
-    """Estimate lens and plane from segments on the road.
-
-    Returns the adjustment and its assumption in words, or the reason why not.
-    """
+) -> MarkingsFit | Reason:
+    """Estimate lens and plane from segments on the road; the reason why not if they do not determine them."""
     candidates = segments_on_road(evidence)
     grids = find_grids(candidates, priors)
     # a loose principal point turns planes and lenses that a usual one tells apart into one: no ambiguity of the best
@@ -61,12 +73,20 @@ def fit_to_markings(
     if isinstance(accepted, Reason):
         return accepted
     segments, best = accepted
-    best = _covering_others(segments, best, grids)
-    state = AdjustmentState(best.camera, best.rotation, np.array([0.0, np.pi / 2 + best.skew_rad]))
-    fit = evaluate_at(state, tracks, replace(config, prior=best.prior, crossing_rad=None), best.covariance)
+    free_aspect = best.prior.with_pixel_aspect(best.camera.pixel_aspect, np.inf)
+    with_free_aspect = refine_grid(segments, free_aspect, best.camera, best.rotation, ANNEALING_WIDTHS_RAD[-1:])
+    fit = _adjustment_of(_covering_others(segments, best, grids), tracks, config)
     if not fit.focal_sigma <= gate.max_sigma_focal_rel:
         return reason('no_markings', 'focal_length', sigma=min(fit.focal_sigma, 9.99), limit=gate.max_sigma_focal_rel)
-    return check_markings_view(fit, tracks) or (fit, _describe(segments, best))
+    return check_markings_view(fit, tracks) or MarkingsFit(
+        fit, _adjustment_of(with_free_aspect, tracks, config), _describe(segments, best)
+    )
+
+
+def _adjustment_of(grid: MarkingGrid, tracks: TrackSet, config: AdjustmentConfig) -> Adjustment:
+    """Return a grid as an adjustment, with the tracks evaluated at its lens and plane."""
+    state = AdjustmentState(grid.camera, grid.rotation, np.array([0.0, np.pi / 2 + grid.skew_rad]))
+    return evaluate_at(state, tracks, replace(config, prior=grid.prior, crossing_rad=None), grid.covariance)
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
-"""Test of the shape of the pixels by the traffic, and the choice between square and squeezed ones.
+"""Test of the shape of the pixels by what gives the lens, and the choice between square and squeezed ones.
 
 A lens images a straight path as the same curve wherever it lies about the axis, and a right angle on the road as one
 set of vanishing points: a squeeze breaks both. With the pixel aspect as one more free parameter the traffic measures
-it, to a few per cent where lens curvature is seen.
+it, to a few per cent where lens curvature is seen. Where lens and plane come from lane markings alone, these do.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ SolveUnder = Callable[[float, float], Solution | Reason]
 
 @dataclass(frozen=True)
 class MeasuredAspect:
-    """The pixel aspect that the traffic gives, starting from a solution."""
+    """The pixel aspect that traffic or lane markings give, starting from a solution."""
 
     free: Adjustment
     """The solution with the pixel aspect free."""
@@ -71,11 +71,11 @@ class MeasuredAspect:
 
     @property
     def sigma(self) -> float:
-        """Standard deviation of its logarithm, by the traffic alone."""
+        """Standard deviation of its logarithm, without a prior."""
         return float(self.free.sigma(lambda state: np.array([np.log(state.camera.pixel_aspect)]))[0])
 
     def sigmas_from(self, aspect: float, its_sigma: float = 0.0) -> float:
-        """Return the difference from another pixel aspect in standard deviations; 0 if the traffic tells nothing.
+        """Return the difference from another pixel aspect in standard deviations; 0 if nothing tells it.
 
         `its_sigma` is the standard deviation of the logarithm of that aspect.
         """
@@ -83,7 +83,7 @@ class MeasuredAspect:
         return abs(float(np.log(self.aspect / aspect))) / sigma if np.isfinite(sigma) else 0.0
 
     def log_odds(self, aspect: float, other: float, sigma: float = 0.0) -> float:
-        """Return the log odds in nats, by the traffic alone, of a pixel aspect against another.
+        """Return the log odds in nats, without a prior, of a pixel aspect against another.
 
         `sigma` is the standard deviation of the logarithm of either.
         """
@@ -106,7 +106,7 @@ class MeasuredAspect:
         return other / (other + as_expected), float((posterior * logs**2).sum() / posterior.sum())
 
     def state_at(self, aspect: float) -> AdjustmentState:
-        """Return the state that the traffic would give with another pixel aspect, to first order.
+        """Return the state that would result with another pixel aspect, to first order.
 
         The measured state where the covariance is infinite.
         """
@@ -124,7 +124,12 @@ def _student_loss(squares: np.ndarray) -> np.ndarray:
 
 
 def measure_aspect(found: Solution, tracks: TrackSet) -> MeasuredAspect:
-    """Return the pixel aspect that the traffic of a solution gives; the angle of its roads is free, unless given."""
+    """Return the pixel aspect that what gives the lens of a solution measures: traffic, or lane markings alone.
+
+    The angle of the roads is free, unless given.
+    """
+    if found.with_free_aspect is not None:
+        return MeasuredAspect(found.with_free_aspect)
     fit = found.of_traffic or found.fit
     config, camera = fit.problem.config, fit.state.camera
     given = config.options.crossing_deg is not None
