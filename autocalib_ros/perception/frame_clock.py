@@ -179,6 +179,8 @@ class FrameClock:
     def _leave_grid(self) -> None:
         self._grid: FrameGrid | None = None
         self._lost_by_grid = 0
+        self._unbroken = 0
+        """Images in a row, each in the slot after that of the one before, since the clock was set."""
         self._unsearched = 0
         self._slot = 0
         self._window: deque[tuple[int, int, bool]] = deque(maxlen=MAX_IMAGES)
@@ -284,17 +286,18 @@ class FrameClock:
     def _goes_on(self, head: _Arrival) -> bool:
         """Return whether the traffic shows that no image is missing before the first held one.
 
-        Asked only where stamps are even and none was lost of late: where images are lost all the time, one more is no
-        reason to doubt the clock.
+        Asked only where stamps are even and more images than a burst holds came since one was lost, or the clock set:
+        where images are lost all the time, one more is no reason to doubt the clock, and the even stamps within bursts
+        are those of the network.
         """
-        even = self._grid is None or (self._grid.sigma < CERTAIN_SIGMA and max(self._advances, default=1) == 1)
+        even = self._grid is None or (self._grid.sigma < CERTAIN_SIGMA and self._unbroken >= MAX_HELD)
         return even and not self._timed and self._follows(head.image)
 
     def _confirm_loss(self, grid: FrameGrid, first: float) -> None:
         """Images were lost before the first held one, if enough later ones agree; or the clock was set forward."""
         later = [grid.frames_from(self._slot + 1, arrival.stamp_ns) - index for index, arrival in enumerate(self._held)]
-        head, rest = self._held[0], self._held[1:]
-        if first * grid.period_ns >= MAX_PAUSE_NS or self._goes_on(head):
+        head, rest, lost = self._held[0], self._held[1:], max(round(min(later)), 0)
+        if first * grid.period_ns >= MAX_PAUSE_NS or (lost and self._goes_on(head)):
             self._step(head, self._held[-1], grid.time_ns(self._slot + 1))
         elif first * grid.period_ns >= GAP_NS:
             self._held = []
@@ -302,7 +305,7 @@ class FrameClock:
             self._accept_all(rest)
         elif len(rest) > 1 or grid.sigma < CERTAIN_SIGMA:
             self._held = []
-            self._take_slot(head, self._slot + 1 + max(round(min(later)), 0))
+            self._take_slot(head, self._slot + 1 + lost)
             self._accept_all(rest)
 
     def _take_consecutive(self) -> None:
@@ -422,6 +425,7 @@ class FrameClock:
             self._grid = self._grid.shifted(by_ns)
             self._window = deque(((slot, s + by_ns, counts) for slot, s, counts in self._window), maxlen=MAX_IMAGES)
         self._count(steps=1)
+        self._unbroken = 0
         self._accept_all(held)
 
     def _begin_anew(self, arrivals: Sequence[_Arrival]) -> None:
@@ -451,6 +455,7 @@ class FrameClock:
         self._lost_by_grid += lost
         self._count(lost=lost, queued=int(after_queued), odd=int(not explained))
         self._advances.append(slot - self._slot)
+        self._unbroken = 0 if lost else self._unbroken + 1
         self._surplus.append(False)
         self._slot = slot
         self._window.append((slot, arrival.stamp_ns, fits and not waited))
@@ -536,12 +541,14 @@ class FrameClock:
             return
         self._leave_grid()
         self._grid = found
-        for stamp_ns in self._raw:
-            slot = round(found.frames_from(0, stamp_ns))
-            self._window.append((slot, stamp_ns, abs(found.frames_from(slot, stamp_ns)) < QUEUED / 2))
-        # after the last image that had not waited, one slot for each: the newest may be the first of a burst
         steps = np.diff(stamps)
-        fresh = int(np.flatnonzero(steps >= QUEUED * found.period_ns)[-1])
+        waited = np.append(steps < QUEUED * found.period_ns, False)
+        for stamp_ns, in_queue in zip(self._raw, waited.tolist(), strict=True):
+            slot = round(found.frames_from(0, stamp_ns))
+            near = abs(found.frames_from(slot, stamp_ns)) < QUEUED / 2
+            self._window.append((slot, stamp_ns, near and not in_queue))
+        # after the last image that had not waited, one slot for each: the newest may be the first of a burst
+        fresh = int(np.flatnonzero(~waited[:-1])[-1])
         self._slot = self._window[fresh][0] + len(steps) - fresh
 
     def _leave_out(self, misfit: bool = False) -> None:

@@ -36,6 +36,11 @@ leaves 2 +- 0.4 with 24 images, intervals that are irregular themselves leave re
 """
 MATTERS = 0.05
 """Robust standard deviation, fraction of the period, below which it does not matter what the residuals do."""
+WITHIN_BURST, MIN_QUEUED = 0.25, 0.5
+"""Fraction of the mean interval below which an image follows the one before in a burst, and share of such intervals
+from which on the stream comes in bursts."""
+MIN_BURSTS = 3
+"""Whole bursts through which a grid is laid: two intervals between their ends, which have to agree."""
 CERTAIN_SIGMA = 0.15
 """Robust standard deviation, fraction of the period, below which half a period is three standard deviations."""
 SLOTS_PER_IMAGE = {'few': 1.2, 'some': 1.6, 'most': 8.0}
@@ -80,7 +85,9 @@ def find_grid(stamps_ns: np.ndarray, exact: bool = False) -> FrameGrid | None:
     if len(since_ns) < MIN_IMAGES or (np.diff(since_ns) <= 0).any():
         return None
     candidates = _candidates(since_ns)
-    if len(since_ns) < MIN_JITTERED_IMAGES:
+    if _is_in_bursts(since_ns):
+        found = _by_bursts(since_ns)
+    elif len(since_ns) < MIN_JITTERED_IMAGES:
         found = _by_phase(since_ns, candidates, EXACT if exact else EVEN, SLOTS_PER_IMAGE['few'])
     else:
         present = PRESENT + PRESENT_FEW / len(since_ns)
@@ -127,6 +134,32 @@ def _candidates(since_ns: np.ndarray) -> list[float]:
 def _fresh(since_ns: np.ndarray, period: float) -> np.ndarray:
     """Return the mask (n,) of the images that did not wait in a queue."""
     return np.append(np.diff(since_ns) >= QUEUED * period, True)
+
+
+def _is_in_bursts(since_ns: np.ndarray) -> bool:
+    """Return whether most images follow the one before at once, and more than one burst is there."""
+    steps = np.diff(since_ns)
+    within = steps < WITHIN_BURST * steps.mean()
+    return bool(within.mean() > MIN_QUEUED)
+
+
+def _by_bursts(since_ns: np.ndarray) -> FrameGrid | None:
+    """Return the grid with one slot for each image through the ends of bursts, if these are `MIN_BURSTS` and agree.
+
+    Bursts at equal intervals lie on many grids with lost images as well: the phases of their ends tell nothing.
+    """
+    steps = np.diff(since_ns)
+    ends = np.flatnonzero(steps >= WITHIN_BURST * steps.mean())  # the last burst may go on
+    if len(ends) < MIN_BURSTS:
+        return None
+    slots, times = (ends - ends[-1]).astype(float), since_ns[ends] - since_ns[ends[-1]]
+    period = float(times[0] / slots[0])
+    shift, slope = _robust_line(slots, times - slots * period, 1e-3 * period)
+    left = (times - shift - slots * (period + slope)) / (period + slope)
+    sigma = _spread(left)
+    if np.abs(left).max() > QUEUED or sigma > CERTAIN_SIGMA:
+        return None
+    return FrameGrid(round(since_ns[ends[-1]] + shift), period + slope, sigma, _independence(left))
 
 
 def _by_phase(since_ns: np.ndarray, candidates: list[float], least: float, slots_per_image: float) -> FrameGrid | None:

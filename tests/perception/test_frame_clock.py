@@ -113,6 +113,21 @@ def test_a_clock_that_is_set_while_the_traffic_goes_on_costs_no_image_and_no_tim
     assert clock.offset_ns == pytest.approx(arrived.stamps_ns[-1] - true_ns[-1], abs=10)
 
 
+@pytest.mark.parametrize('rate_hz', [15.0, 30.0, 60.0])
+@pytest.mark.parametrize('count', [3, 5, 8, 10, 14])
+@pytest.mark.parametrize('follows', [False, True])
+def test_bursts_of_any_size_are_spread_over_their_exposures(count, rate_hz, follows):
+    true_ns = exposures(600, rate_hz)
+    waited_for = np.minimum(np.arange(600) // count * count + count - 1, 599)
+    clock, times = FrameClock(lambda image: follows), {}
+    for stamp_ns in (true_ns[waited_for] + np.arange(600) % count * 500_000).tolist():
+        times.update({timed.image: timed.time_ns for timed in clock.add(stamp_ns).timed})
+    intervals = np.diff([times[image] for image in range(600)]) * rate_hz / SECOND
+    # a grid takes three whole bursts, and the one after them is spread from its first image on
+    assert np.abs(intervals[5 * count :] - 1.0).max() < 0.1
+    assert (clock.summary().steps, clock.summary().lost) == (0, 0)
+
+
 def test_traffic_is_asked_only_where_images_are_not_lost_all_the_time():
     asked = []
     clock = FrameClock(lambda image: bool(asked.append(image)))

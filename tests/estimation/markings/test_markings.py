@@ -7,6 +7,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from squeezed_evidence import squeezed
 
 from autocalib_ros.config import GateOptions, JointOptions, LensOptions, Options
 from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment
@@ -39,7 +40,6 @@ from autocalib_ros.results.refusals import Reason
 from autocalib_ros.results.statements import Statement
 from road_lines import Paint, painted_lines, post_lines, random_lines
 from solved_once import evidence_once, solve_once
-from squeezed_evidence import squeezed
 
 pytestmark = pytest.mark.solve
 
