@@ -22,6 +22,7 @@ from autocalib_ros.estimation.turning.turning_traffic import (
     widen_by_tracklet_difference,
 )
 from autocalib_ros.estimation.verification.focal_modes import widen_by_focal_modes
+from autocalib_ros.estimation.verification.focal_profile import widen_by_focal_profile
 from autocalib_ros.estimation.verification.gates import check_focal_length, check_halves, check_lens, check_plane
 from autocalib_ros.estimation.verification.ground_normal import LevelCamera, PlaneEstimate
 from autocalib_ros.estimation.verification.identifiability import fix_unidentifiable, free_k2, lens_assumptions
@@ -83,7 +84,8 @@ def refine_and_verify(
     fit = widen_by_point_slip(fit, observations.windows)
     fit = widen_by_tracklet_difference(fit, tracklets)
     # Other focal lengths that are about as probable widen it, too.
-    fit = widen_by_focal_modes(fit, tracks.subset(evenly_spaced(len(tracks), MAX_SUBSAMPLE_TRACKS)))
+    some = tracks.subset(evenly_spaced(len(tracks), MAX_SUBSAMPLE_TRACKS))
+    fit = widen_by_focal_profile(widen_by_focal_modes(fit, some), some)
     uncertain = check_focal_length(fit, gate, turned=turned)
     assumptions = lens_assumptions(fit, fixed)
     compared = (*explained, *halves.rows, *(() if tracklets is None else (tracklets.row,)))

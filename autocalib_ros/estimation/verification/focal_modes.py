@@ -36,7 +36,7 @@ def widen_by_focal_modes(fit: Adjustment, tracks: TrackSet) -> Adjustment:
         return fit
     here = adjust(fit.state, tracks, replace(fit.problem.config, bundle=None), refine=True)
     fits, scales = [here, *modes], np.min([each.scales for each in (here, *modes)], axis=0)
-    costs = np.array([laplace_cost(each, tracks, scales) for each in fits]) / _overdispersion(fit)
+    costs = np.array([laplace_cost(each, tracks, scales) for each in fits]) / overdispersion(fit)
     weights = np.where(costs - costs.min() < MODEL_SELECTION_MARGIN, np.exp(0.5 * (costs.min() - costs)), 0.0)
     steps = np.array([fit.problem.parameters.step_to(each.state) for each in fits])
     distinct = _distinct(steps[:, 0])
@@ -66,7 +66,7 @@ def _solve_from(start: AdjustmentState, fit: Adjustment, tracks: TrackSet) -> Ad
     return mode if np.isfinite(mode.covariance).all() else None
 
 
-def _overdispersion(fit: Adjustment) -> float:
+def overdispersion(fit: Adjustment) -> float:
     """Return the ratio of the stated variance of the focal length to that of independent rows, at least 1."""
     _, prior = fit.problem.parameters.prior_gradient(fit.state)
     return max(float((fit.focal_sigma / sigma_of_information(fit.information, prior)[0]) ** 2), 1.0)
