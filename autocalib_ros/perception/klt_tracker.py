@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections import deque
 
-import cv2
 import numpy as np
 
 from autocalib_ros.config import TrackingOptions
 from autocalib_ros.evidence.snapshot import Track
 from autocalib_ros.perception.frame_gate import match_grey_levels
+from autocalib_ros.perception.sparse_flow import follow_points
 
 MAX_TRACK_SAMPLES = 256
 """Most images of one track; a longer one is finished and continued as a new track."""
@@ -231,40 +231,17 @@ class PointTracker:
         self, before: np.ndarray, after: np.ndarray, start: np.ndarray, guess: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Track forwards from a guess and back at full resolution; return positions (n, 2) and their validity (n,)."""
-        side = self._options.window_px
-        criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.02)
-        origin = _as_opencv_points(start)
-        found, forward, _ = cv2.calcOpticalFlowPyrLK(
-            before,
-            after,
-            origin,
-            _as_opencv_points(guess),
-            winSize=(side, side),
-            maxLevel=self._options.pyramid_levels,
-            criteria=criteria,
-            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        options = self._options
+        ends, round_trip_px, tracked = follow_points(
+            before, after, start, guess, window_px=options.window_px, levels=options.pyramid_levels
         )
-        back, backward, _ = cv2.calcOpticalFlowPyrLK(
-            after,
-            before,
-            found,
-            origin.copy(),
-            winSize=(side, side),
-            maxLevel=0,
-            criteria=criteria,
-            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-        )
-        round_trip_px = np.hypot(*(back - origin)[:, 0].T)
-        found = found[:, 0].astype(float)
-        margin, (height, width) = side / 2, after.shape
+        found = ends.astype(float)
+        margin, (height, width) = options.window_px / 2, after.shape
         inside = ((found >= margin) & (found < [width - margin, height - margin])).all(axis=1)
         if self._excluded is not None:
             columns, rows = np.round(np.clip(found, 0, [width - 1, height - 1])).astype(int).T
             inside &= self._excluded[rows, columns] == 0
-        good = (
-            (forward.ravel() == 1) & (backward.ravel() == 1) & (round_trip_px <= self._options.round_trip_px) & inside
-        )
-        return found, good
+        return found, tracked & (round_trip_px <= options.round_trip_px) & inside
 
     def _current_positions(self, slots: np.ndarray) -> np.ndarray:
         return self._history[slots, self._count[slots] - 1, 1:]
@@ -374,8 +351,3 @@ def _is_discontinuous(before: np.ndarray, now: np.ndarray) -> np.ndarray:
     astray = deviation > np.maximum(MAX_TURN_PX, MAX_TURN_FRACTION * speed)
     uneven = (along < MIN_STEP_RATIO * speed) | (along > np.maximum(MAX_STEP_RATIO * speed, speed + MAX_TURN_PX))
     return (speed > MAX_TURN_PX) & (astray | uneven)
-
-
-def _as_opencv_points(points_px: np.ndarray) -> np.ndarray:
-    """Return points (n, 2) as a new contiguous array (n, 1, 2) float32, as OpenCV needs it."""
-    return np.ascontiguousarray(points_px, np.float32).reshape(-1, 1, 2)

@@ -64,8 +64,9 @@ class PictureArea:
         samples = samples if ignored is None else [_with_ramp(sample, ignored) for sample in samples]
         height, width = samples[0].shape[:2]
         across, down = self._image_size[0] / width, self._image_size[1] / height
-        self.picture = self._scaled(_find_picture(samples), across, down)
-        self._see_overlays(_find_overlays(samples, ignored), (width, height))
+        grey = [cv2.cvtColor(sample, cv2.COLOR_BGR2GRAY) for sample in samples]
+        self.picture = self._scaled(_find_picture(np.stack(grey)), across, down)
+        self._see_overlays(_find_overlays(samples, grey, ignored), (width, height))
         before, self.mask = self.mask, self._mask()
         if before is None or self.mask is None:
             return before is not self.mask
@@ -104,9 +105,8 @@ class PictureArea:
         return cv2.bitwise_or(overlaid, outside_of(self.picture.in_images_of(self._tracked_size), BORDER_MARGIN_PX))
 
 
-def _find_picture(samples: list[np.ndarray]) -> Picture:
-    """Find the picture in BGR images (H, W, 3) of one view."""
-    grey = np.stack([cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) for image in samples])
+def _find_picture(grey: np.ndarray) -> Picture:
+    """Find the picture in grey images (n, H, W) of one view."""
     height, width = grey.shape[1:]
     x0, y0, x1, y1 = find_rectangle(grey)
     circle = find_circle(grey[:, y0:y1, x0:x1])
@@ -125,12 +125,11 @@ def _with_ramp(image: np.ndarray, ignored: np.ndarray) -> np.ndarray:
     return np.where(ignored[..., None] > 0, ramp, image)
 
 
-def _find_overlays(samples: list[np.ndarray], ignored: np.ndarray | None) -> list[Box]:
-    """Find text and rectangles that are drawn into BGR images (H, W, 3) of one view, with their margins.
+def _find_overlays(samples: list[np.ndarray], grey: list[np.ndarray], ignored: np.ndarray | None) -> list[Box]:
+    """Find text and rectangles that are drawn into images (H, W, 3) of one view, also in grey, with their margins.
 
     Rectangles at the mask `ignored` (H, W) have their sides from it, and those in few images are vehicles.
     """
-    grey = [cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) for image in samples]
     boxes = []
     for x0, y0, x1, y1 in find_boxes(median(grey)) if len(grey) >= MIN_SAMPLES else []:
         box = (x0 - BOX_MARGIN_PX, y0 - BOX_MARGIN_PX, x1 + BOX_MARGIN_PX, y1 + BOX_MARGIN_PX)

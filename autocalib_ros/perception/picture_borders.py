@@ -63,10 +63,11 @@ def darkest_and_deviation(samples: np.ndarray, colour: float) -> np.ndarray:
     A border stays constant when lamps pass; the largest is left out where there are three samples or more, because one
     image in a few is torn.
     """
-    deviations = np.abs(samples.astype(np.float32) - np.float32(colour))
-    if len(samples) < 3:
-        return deviations.max(axis=0)
-    return np.partition(deviations, len(samples) - 2, axis=0)[-2]
+    first = second = np.zeros(samples.shape[1:], np.float32)
+    for sample in samples:
+        deviation = np.abs(sample.astype(np.float32) - np.float32(colour))
+        second, first = np.maximum(second, np.minimum(first, deviation)), np.maximum(first, deviation)
+    return np.asarray(first if len(samples) < 3 else second)
 
 
 def find_rectangle(samples: np.ndarray) -> tuple[int, int, int, int]:
@@ -104,9 +105,9 @@ def _strip(samples: np.ndarray) -> int:
         return 0
     samples = samples[:, :limit]
     colour = float(np.median(samples[:, 0]))
-    deviation = darkest_and_deviation(samples, colour)
-    if np.mean(deviation[0] <= STEP_LEVELS) < MIN_STRIP_SHARE:
+    if np.mean(darkest_and_deviation(samples[:, :1], colour) <= STEP_LEVELS) < MIN_STRIP_SHARE:
         return 0
+    deviation = darkest_and_deviation(samples, colour)
     columns = along // SIDE_BINS
     bins = deviation[:, : columns * SIDE_BINS].reshape(limit, SIDE_BINS, columns)
     profile = np.quantile(bins, BIN_QUANTILE, axis=2)
