@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -27,13 +28,30 @@ MIN_SAMPLES = 5
 BAND_BYTES = 1 << 19
 """Size of the bands of rows of all images that are sorted at once: they fit into the cache of a core."""
 
-REDUCED_FLAGS = (
-    cv2.IMREAD_COLOR,
-    cv2.IMREAD_REDUCED_COLOR_2,
-    cv2.IMREAD_REDUCED_COLOR_4,
-    cv2.IMREAD_REDUCED_COLOR_8,
-)
-"""Decoding of a JPEG in whole, half, quarter and eighth size, each cheaper than the one before."""
+STRIP_BYTES = 1 << 20
+"""Size of the strips in which samples are encoded: the median takes one strip of each, 17 MB at most, where whole images
+of 3840x2160 would need 423 MB."""
+STRIP_ROWS = 16
+"""Strips are whole blocks of the JPEG, 16 rows where colours have half the resolution."""
+REDUCED_WIDTH_PX = 960
+"""Largest width of the copies that are kept as they are, halved until they fit: letters can still be read, and borders
+are found to one of their pixels. 17 of them take 26 MB at most, what decoding them again would."""
+
+
+@dataclass(frozen=True)
+class _StoredSample:
+    """One image: encoded, and reduced."""
+
+    time_s: float
+    strips: tuple[np.ndarray, ...]
+    """JPEG of the strips of rows, from top to bottom."""
+    reduced: np.ndarray
+    """Grey or BGR uint8, at most `REDUCED_WIDTH_PX` wide."""
+
+    def grey(self, size: tuple[int, int]) -> np.ndarray:
+        """Return the image in grey, uint8 (height, width) of a `size` (width, height) that it is reduced to."""
+        image = np.concatenate([cv2.imdecode(strip, cv2.IMREAD_GRAYSCALE) for strip in self.strips])
+        return image if image.shape == size[::-1] else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 
 class Background:
@@ -45,32 +63,30 @@ class Background:
     """
 
     def __init__(self) -> None:
-        self._regular: list[tuple[float, np.ndarray]] = []
-        self._early: list[tuple[float, np.ndarray]] = []
+        self._regular: list[_StoredSample] = []
+        self._early: list[_StoredSample] = []
         self._interval_s = FIRST_INTERVAL_S
         self._next_s = self._next_early_s = 0.0
-        self._width = 0
 
     def copy(self) -> Background:
         """Return the same samples, for another thread; an encoded sample is never changed."""
         other = Background()
-        other._regular, other._early, other._width = list(self._regular), list(self._early), self._width
+        other._regular, other._early = list(self._regular), list(self._early)
         return other
 
     def update(self, image: np.ndarray, time_s: float) -> None:
         """Add a grey or BGR uint8 image if the sampling interval has passed."""
         if not self.is_due(time_s):
             return
-        ok, encoded = cv2.imencode('.jpg', image, [cv2.IMWRITE_JPEG_QUALITY, 92])
-        self._width = image.shape[1]
+        sample = _StoredSample(time_s, _encoded(image), _halved(image))
         if time_s >= self._next_s - SAMPLE_TOLERANCE_S:
-            self._regular += [(time_s, encoded)] if ok else []
+            self._regular.append(sample)
             while len(self._regular) > MAX_SAMPLES:
                 self._thin()
             self._next_s = self._interval_s * (_multiple(time_s, self._interval_s) + 1)
             self._early = self._early if self._is_early else []
         else:
-            self._early += [(time_s, encoded)] if ok else []
+            self._early.append(sample)
         self._next_early_s = EARLY_INTERVAL_S * (_multiple(time_s, EARLY_INTERVAL_S) + 1)
 
     @property
@@ -78,15 +94,15 @@ class Background:
         return len(self._regular) < MIN_SAMPLES
 
     @property
-    def _samples(self) -> list[tuple[float, np.ndarray]]:
-        return sorted([*self._regular, *self._early], key=lambda sample: sample[0])
+    def _samples(self) -> list[_StoredSample]:
+        return sorted([*self._regular, *self._early], key=lambda sample: sample.time_s)
 
     def _thin(self) -> None:
         if 2 * self._interval_s > MAX_INTERVAL_S:
             self._regular = self._regular[1:]
             return
         self._interval_s *= 2
-        first_of = {_multiple(time_s, self._interval_s): (time_s, data) for time_s, data in self._regular[::-1]}
+        first_of = {_multiple(sample.time_s, self._interval_s): sample for sample in self._regular[::-1]}
         self._regular = list(first_of.values())[::-1]
 
     def is_due(self, time_s: float) -> bool:
@@ -97,33 +113,46 @@ class Background:
     @property
     def times_s(self) -> tuple[float, ...]:
         """Times of the images that the background is computed from."""
-        return tuple(time_s for time_s, _ in self._samples)
+        return tuple(sample.time_s for sample in self._samples)
 
     def image(self) -> np.ndarray | None:
         """Return the median image, BGR uint8 (H, W, 3); None before the first image."""
-        return self._median(cv2.IMREAD_COLOR) if self._samples else None
+        samples = self._samples
+        if not samples:
+            return None
+        strips = zip(*(sample.strips for sample in samples), strict=True)
+        return np.concatenate([median([cv2.imdecode(part, cv2.IMREAD_COLOR) for part in strip]) for strip in strips])
 
-    def grey(self) -> np.ndarray | None:
-        """Return the median image in grey, uint8 (H, W); None while there are fewer than `MIN_SAMPLES`."""
-        return median(samples) if (samples := self.grey_samples()) else None
+    def grey_samples(self, size: tuple[int, int]) -> list[np.ndarray]:
+        """Return the images in grey, uint8 (height, width) of a `size` (width, height) that they are reduced to.
 
-    def grey_samples(self) -> list[np.ndarray]:
-        """Return the images in grey, uint8 (H, W), oldest first; none while there are fewer than `MIN_SAMPLES`."""
-        return self._decoded(cv2.IMREAD_GRAYSCALE) if len(self._samples) >= MIN_SAMPLES else []
+        Oldest first; none while there are fewer than `MIN_SAMPLES`.
+        """
+        samples = self._samples
+        return [sample.grey(size) for sample in samples] if len(samples) >= MIN_SAMPLES else []
 
-    def samples(self, max_width: int) -> list[np.ndarray]:
-        """Return the images, BGR uint8 (h, w, 3), oldest first, halved until they are at most `max_width` wide."""
-        halvings = 0
-        while self._width > max_width << halvings and halvings + 1 < len(REDUCED_FLAGS):
-            halvings += 1
-        return self._decoded(REDUCED_FLAGS[halvings])
+    def reduced_samples(self) -> list[np.ndarray]:
+        """Return the images, BGR uint8 (h, w, 3), oldest first, at most `REDUCED_WIDTH_PX` wide."""
+        reduced = [sample.reduced for sample in self._samples]
+        return [image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) for image in reduced]
 
-    def _median(self, flags: int) -> np.ndarray:
-        return median(self._decoded(flags))
 
-    def _decoded(self, flags: int) -> list[np.ndarray]:
-        images = [cv2.imdecode(encoded, flags) for _, encoded in self._samples]
-        return [image for image in images if image is not None]
+def _encoded(image: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Encode the strips of an image (H, W) or (H, W, 3)."""
+    rows = max(1, STRIP_BYTES // (3 * image.shape[1] * STRIP_ROWS)) * STRIP_ROWS
+    strips = (np.ascontiguousarray(image[top : top + rows]) for top in range(0, len(image), rows))
+    return tuple(cv2.imencode('.jpg', strip, [cv2.IMWRITE_JPEG_QUALITY, 92])[1] for strip in strips)
+
+
+def _halved(image: np.ndarray) -> np.ndarray:
+    """Return a copy of an image, halved until it is at most `REDUCED_WIDTH_PX` wide."""
+    factor = 1
+    while image.shape[1] > REDUCED_WIDTH_PX * factor:
+        factor *= 2
+    if factor == 1:
+        return image.copy()
+    size = (max(1, round(image.shape[1] / factor)), max(1, round(image.shape[0] / factor)))
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 
 def _multiple(time_s: float, interval_s: float) -> int:

@@ -349,9 +349,8 @@ class Observer:
 
     def _still_scene(self, background: Background) -> tuple[np.ndarray | None, list[np.ndarray]]:
         """Return a background as grey image and the samples of which it is the median; None without samples."""
-        samples = background.grey_samples()
-        grey = self._tracked_image(median(samples)) if samples else None
-        return grey, [self._tracked_image(sample) for sample in samples]
+        samples = background.grey_samples(self._tracked_size)
+        return (median(samples) if samples else None), samples
 
     def _in_full_size(self, lines: LineSegmentDetector, stripes: StripeDetector) -> tuple[np.ndarray, np.ndarray]:
         bars = stripes.stripes_px
@@ -363,11 +362,11 @@ class Observer:
     def landmarks(self, view: int) -> Landmarks:
         """Return the landmarks of the background of a view in memory, pixels of the full image; none without one."""
         scene = self._scenes[view]
-        samples = scene.background.grey_samples()
+        samples = scene.background.grey_samples(self._tracked_size)
         if not samples:
             return Landmarks()
         excluded = union(self._excluded_by_options, scene.picture_area.mask)
-        found = find_landmarks(self._tracked_image(median(samples)), excluded)
+        found = find_landmarks(median(samples), excluded)
         return Landmarks(self._to_full_pixels(found.points_px), found.descriptors)
 
     def known_view(self, view: int) -> KnownView | None:

@@ -18,9 +18,6 @@ from autocalib_ros.perception.picture_borders import find_circle, find_rectangle
 
 MIN_PICTURE_SAMPLES = 3
 """Images that show what is constant: with two, one that is torn or lit by a lamp would decide."""
-ANALYSIS_WIDTH_PX = 960
-"""Largest width of the images that are analysed, pixels: wider ones are halved until they fit. Letters can still be
-read, and borders are found to one of these pixels."""
 REPEAT_FACTOR, REPEAT_INTERVAL_S = 1.5, 3600.0
 """The next analysis is due at this factor of the time of the last one, or after this interval: evidence grows with
 time, and an analysis costs tenths of a second."""
@@ -59,7 +56,7 @@ class PictureArea:
             return False
         self._newest_s = times[-1]
         self._due_s = min(REPEAT_FACTOR * times[-1], times[-1] + REPEAT_INTERVAL_S)
-        samples = background.samples(ANALYSIS_WIDTH_PX)
+        samples = background.reduced_samples()
         ignored = self._ignored(samples[0].shape[1::-1])
         samples = samples if ignored is None else [_with_ramp(sample, ignored) for sample in samples]
         height, width = samples[0].shape[:2]

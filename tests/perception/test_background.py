@@ -33,14 +33,14 @@ def test_colours_have_medians_of_their_own() -> None:
 @pytest.mark.parametrize(('count', 'there'), [(MIN_SAMPLES - 1, False), (MIN_SAMPLES, True)])
 def test_there_is_no_grey_before_traffic_is_outvoted(count: int, there: bool) -> None:
     background = Background()
-    assert background.grey() is None and background.image() is None
+    assert not background.grey_samples((32, 24)) and background.image() is None
     for index in range(count):
         # something dark covers the road in the first two
         background.update(flat(30 if index < 2 else 150), float(index))
-    assert (background.grey() is not None) == there
+    assert bool(background.grey_samples((32, 24))) == there
     assert background.image().shape == (24, 32, 3)
     if there:
-        assert np.abs(background.grey().astype(int) - 150).max() <= JPEG
+        assert np.abs(median(background.grey_samples((32, 24))).astype(int) - 150).max() <= JPEG
 
 
 def test_images_between_the_intervals_are_not_kept() -> None:
@@ -76,7 +76,8 @@ def test_where_vehicles_stand_for_a_third_of_the_time_the_road_is_seen_at_any_ti
     for second in range(120):
         covered = cv2.resize((random.random((30, 40)) < 1 / 3).astype(np.uint8), (320, 240), interpolation=0)
         background.update(np.where(covered > 0, np.uint8(30), np.uint8(150)), float(second))
-        seen = background.grey()
+        samples = background.grey_samples((320, 240))
+        seen = median(samples) if samples else None
         shares += [float((seen[4::8, 4::8] < 90).mean())] if seen is not None else []
     # binomial: 21 % of the places from five images, 14 % from nine, 8 % from 17
     assert max(shares[MAX_SAMPLES:]) < 0.18
@@ -97,3 +98,25 @@ def test_the_interval_grows_until_the_longest_and_no_more_images_are_held() -> N
     # nothing is left of what the road looked like long ago
     assert background.times_s[0] > seconds - (MAX_SAMPLES + 1) * MAX_INTERVAL_S
     assert background.times_s[-1] > seconds - MAX_INTERVAL_S - step_s
+
+
+def test_strips_of_an_image_are_put_together_again() -> None:
+    rows, columns = np.mgrid[:1100, :1900].astype(np.float32)
+    image = np.dstack([columns / 8, rows / 5, 255 - (rows + columns) / 13]).astype(np.uint8)
+    background = Background()
+    for index in range(MIN_SAMPLES):
+        background.update(image, float(index))
+    assert np.abs(background.image().astype(int) - image).max() <= 2 * JPEG  # colours have half the resolution
+    grey = median(background.grey_samples((1900, 1100)))
+    assert np.abs(grey.astype(int) - cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)).max() <= JPEG
+    assert median(background.grey_samples((950, 550))).shape == (550, 950)
+
+
+@pytest.mark.parametrize(
+    ('size', 'reduced'), [((3840, 2160), (960, 540)), ((1280, 720), (640, 360)), ((854, 480),) * 2]
+)
+def test_reduced_samples_are_halved_until_they_are_small(size: tuple[int, int], reduced: tuple[int, int]) -> None:
+    background = Background()
+    background.update(np.full((size[1], size[0]), 77, np.uint8), 0.0)
+    (sample,) = background.reduced_samples()
+    assert sample.shape == (reduced[1], reduced[0], 3) and (sample == 77).all()
