@@ -132,6 +132,51 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     moves.add_argument(
         '--width', type=int, default=1280, metavar='PX', help='largest width of the images (default: %(default)s)'
     )
+    still = what.add_parser(
+        'still',
+        help='hours of images of a camera that stands: moves and faults told all the same',
+        description='Play recordings of still cameras for hours in the light and weather of days, with sway, jams and '
+        'noise, and show them to the watch of the view; in the first hours also to the perception. Exit status: 0 '
+        'unless more than one move, fault or further view is told, 3 otherwise.',
+    )
+    still.add_argument('recordings', metavar='RECORDING', nargs='+', type=Path, help='recordings of still cameras')
+    still.add_argument('--hours', type=float, default=10.0, metavar='H', help='hours of all (default: %(default)s)')
+    still.add_argument(
+        '--perception-hours', type=float, default=2.0, metavar='H', help='those with perception (default: %(default)s)'
+    )
+    still.add_argument(
+        '--day-hours', type=float, default=5.0, metavar='H', help='hours of a day (default: %(default)s)'
+    )
+    still.add_argument(
+        '--width', type=int, default=640, metavar='PX', help='largest width of the images (default: %(default)s)'
+    )
+    soaked = what.add_parser(
+        'soak',
+        help='a day and a night of a live node, faster than real time (needs ROS)',
+        description='Run a live node in a process of its own on images of a recording in the light and weather of a '
+        'day, and sample its memory, descriptors, threads, log and answer. Some hours have traffic in the images; in '
+        'the others its observations come with images of the still road. Exit status: 0 if all is flat, 3 otherwise.',
+    )
+    soaked.add_argument(
+        'recording',
+        metavar='RECORDING',
+        type=Path,
+        help='recording of a still camera; or samples of an earlier run (.csv), to be judged and drawn again',
+    )
+    soaked.add_argument('--hours', type=float, default=24.0, metavar='H', help='simulated hours (default: %(default)s)')
+    soaked.add_argument(
+        '--image-hours', type=float, default=1.0, metavar='H', help='those with traffic in the images (default: 1)'
+    )
+    soaked.add_argument(
+        '--day-hours', type=float, default=24.0, metavar='H', help='hours of a day and a night (default: %(default)s)'
+    )
+    soaked.add_argument(
+        '--width', type=int, default=640, metavar='PX', help='largest width of the images (default: %(default)s)'
+    )
+    _add_camera_height(soaked)
+    soaked.add_argument('--log', type=Path, default=Path('soak.log'), metavar='FILE', help='log of the node to write')
+    soaked.add_argument('--csv', type=Path, metavar='FILE', help='samples to write')
+    soaked.add_argument('--figure', type=Path, metavar='FILE', help='figure to write, as .svg or .png')
 
 
 def _add_folder(parser: argparse.ArgumentParser) -> None:
@@ -278,6 +323,51 @@ def _run_moves(arguments: argparse.Namespace) -> int:
     return DONE if good else MOVED
 
 
+def _run_still(arguments: argparse.Namespace) -> int:
+    from autocalib_ros.offline.benchmark import still_hours
+
+    hours = []
+    print(still_hours.STILL_HEADER)
+    for each in still_hours.measure_still_hours(
+        arguments.recordings,
+        arguments.hours,
+        perception_hours=arguments.perception_hours,
+        day_hours=arguments.day_hours,
+        width=arguments.width,
+    ):
+        hours.append(each)
+        print(still_hours.format_still_hour(each), flush=True)
+    print(still_hours.format_still_summary(hours))
+    return MOVED if sum(each.false_flags for each in hours) > still_hours.ALLOWED_FALSE_FLAGS else DONE
+
+
+def _run_soak(arguments: argparse.Namespace) -> int:
+    from autocalib_ros.offline.benchmark import long_stream, soak
+
+    print(soak.SOAK_HEADER)
+    if arguments.recording.suffix == '.csv':
+        samples = soak.read_samples(arguments.recording)
+        print('\n'.join(map(soak.format_soak_sample, samples)))
+    else:
+        recording = long_stream.read_short_recording(
+            arguments.recording, arguments.width, soak.DENSE_HZ, long_stream.MAX_RECORDED
+        )
+        plan = soak.SoakPlan(arguments.hours, arguments.image_hours, arguments.day_hours, arguments.camera_height)
+        samples = []
+        for each in soak.soak(recording, plan, arguments.log):
+            samples.append(each)
+            print(soak.format_soak_sample(each), flush=True)
+            if arguments.csv is not None:
+                soak.write_samples(arguments.csv, samples)
+    checks = soak.soak_checks(samples)
+    print(soak.format_soak_checks(checks))
+    if arguments.figure is not None:
+        from autocalib_ros.offline.benchmark.soak_figure import write_soak_figure
+
+        write_soak_figure(arguments.figure, samples)
+    return DONE if all(check.is_flat for check in checks) else MOVED
+
+
 BENCHMARK_TABLES = {
     'streams': _run_streams,
     'scenes': _run_scenes,
@@ -285,5 +375,7 @@ BENCHMARK_TABLES = {
     'lengths': _run_lengths,
     'options': _run_options,
     'moves': _run_moves,
+    'still': _run_still,
+    'soak': _run_soak,
 }
 """Benchmarks that print one row after the other."""

@@ -7,7 +7,7 @@ from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.evidence.still_parts import StillPart, StillParts
 from autocalib_ros.perception.detector.detector import VehicleDetector
 from autocalib_ros.perception.image_timing import ReadyImage
-from autocalib_ros.perception.observer import Observer
+from autocalib_ros.perception.observer import FrameObservations, Observer
 
 FORGET_PERIOD_S = 10.0
 """Seconds of recording between two searches for old evidence; each costs milliseconds."""
@@ -41,9 +41,7 @@ class ImageStream:
             self._gate = options.gate
             self.observer.change_gate(options.gate)
         observed = self.observer.observe(ready.image, time_s, ready.lost)
-        part = self._parts.part(observed.view, time_s)
-        part.buffer.add(observed.tracks, observed.segments, observed.edges, observed.outlines)
-        part.tracks_seen += len(observed.tracks)
+        part = self.take(observed, time_s)
         self._newest_ns, self._offset_ns = ready.time_ns, offset_ns
         part.newest_s = time_s
         part.frames += 1
@@ -53,6 +51,13 @@ class ImageStream:
         if time_s >= self._next_forget_s:  # old evidence that newer evidence replaces
             self._next_forget_s = time_s + FORGET_PERIOD_S
             part.buffer.forget_replaced(time_s - options.buffer.seconds)
+
+    def take(self, observed: FrameObservations, time_s: float) -> StillPart:
+        """Keep observations, and return the evidence of their view; times are seconds since the first image."""
+        part = self._parts.part(observed.view, time_s)
+        part.buffer.add(observed.tracks, observed.segments, observed.edges, observed.outlines)
+        part.tracks_seen += len(observed.tracks)
+        return part
 
     def evidence(self, view: int | None = None) -> Evidence:
         """Freeze the evidence of a view, the present one for None, without its lines, which take longer to find."""

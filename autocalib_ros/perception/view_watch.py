@@ -276,6 +276,11 @@ class ViewWatch:
         camera = self.camera
         return None if camera is None else (camera.width, camera.height)
 
+    def lasting_turn_deg(self) -> np.ndarray | None:
+        """Return mean pan, tilt and roll since the calibration over `MOVE_WINDOW_S`, degrees (3,); None if unknown."""
+        turns, _ = self._window(self._newest_s - MOVE_WINDOW_S)
+        return turns.mean(axis=0) if len(turns) >= MIN_MOVE_SAMPLES else None
+
     def newest_view(self, since_s: float) -> KnownView | None:
         """Return the median of the images seen since a time, such as that of a move; None if there are too few."""
         images = [image for time_s, image in self._images if time_s > since_s + CHECK_S]

@@ -18,6 +18,7 @@ from rclpy.parameter import Parameter
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
+from autocalib_ros.calibrator import AutoCalibrator
 from autocalib_ros.config import NodeOptions, Options
 from autocalib_ros.errors import AutocalibError, InputError
 from autocalib_ros.lens.camera import Camera
@@ -49,7 +50,7 @@ from autocalib_ros.ros.side_files import SideFiles
 from autocalib_ros.ros.status import Counts, RateCounter, Situation
 from autocalib_ros.ros.store_writer import StoreWriter
 from autocalib_ros.ros.view_events import ViewEvents, clock_text
-from autocalib_ros.ros.worker import CalibrationWorker, Result, Solve
+from autocalib_ros.ros.worker import CalibrationWorker, CalibratorFactory, Result, Solve
 from autocalib_ros.solver_process import SolverProcess
 
 PROGRESS_LOG_PERIOD_S = 10.0
@@ -61,9 +62,14 @@ SHUTDOWN_S = 4.0
 
 
 class AutocalibNode(Node):
-    """Node `autocalib`. `solve` replaces the solver process by a function that runs in the solver thread."""
+    """Node `autocalib`. `solve` replaces the solver process by a function that runs in the solver thread.
 
-    def __init__(self, *, solve: Solve | None = None, **node_arguments: Any) -> None:
+    `calibrator` makes the object that gathers the evidence.
+    """
+
+    def __init__(
+        self, *, solve: Solve | None = None, calibrator: CalibratorFactory = AutoCalibrator, **node_arguments: Any
+    ) -> None:
         super().__init__('autocalib', automatically_declare_parameters_from_overrides=True, **node_arguments)
         self.options, self.node_options = declare_parameters(self)
         self._lens = self._read_lens()
@@ -118,7 +124,7 @@ class AutocalibNode(Node):
             failed=self.failed,
             progress=lambda: self._worker.progress,
         )
-        self._worker = self._start_worker(solve, detector)
+        self._worker = self._start_worker(solve, detector, calibrator)
         if self._store is not None:
             self._restore(self._store)
         # inputs: last, because their callbacks use all of the above
@@ -144,7 +150,9 @@ class AutocalibNode(Node):
         camera_info(lens, self.options.distortion_model)
         return lens
 
-    def _start_worker(self, solve: Solve | None, detector: VehicleDetector | None) -> CalibrationWorker:
+    def _start_worker(
+        self, solve: Solve | None, detector: VehicleDetector | None, calibrator: CalibratorFactory
+    ) -> CalibrationWorker:
         solver = SolverProcess(self.node_options.solve_limit_s)
         return CalibrationWorker(
             self.options,
@@ -156,6 +164,7 @@ class AutocalibNode(Node):
             lens=self._lens,
             detector=detector,
             stop_solving=solver.close,
+            calibrator=calibrator,
         )
 
     def _create_services(self) -> None:

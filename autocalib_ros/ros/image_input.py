@@ -106,7 +106,7 @@ class ImageInput:
         profile = QoSProfile(depth=QUEUE_DEPTH, history=HistoryPolicy.KEEP_LAST, reliability=reliability)
         events = SubscriptionEventCallbacks(incompatible_qos=self._on_incompatible, message_lost=self._on_lost)
         self._subscription = self._node.create_subscription(
-            self._type, self.topic, self._take, profile, event_callbacks=events
+            self._type, self.topic, self.take, profile, event_callbacks=events
         )
         self._node.get_logger().info(f'subscribed to {self.topic} ({self._type_name()}, {reliability.name.lower()})')
 
@@ -126,7 +126,8 @@ class ImageInput:
     def _on_lost(self, event: Any) -> None:
         self.lost += event.total_count_change
 
-    def _take(self, message: Any) -> None:
+    def take(self, message: Any) -> None:
+        """Take an image, as from the topic."""
         now = time.monotonic()
         if self.no_image is not None:
             self.no_image = None

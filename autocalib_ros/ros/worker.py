@@ -43,6 +43,7 @@ MAX_REFUSED_PERCENT = 99.0
 PROGRESS_PERIOD_S = 1.0
 """Real seconds between two progress updates."""
 Result = Calibration | Refusal
+CalibratorFactory = Callable[[Options, VehicleDetector | None], AutoCalibrator]
 
 
 class Solve(Protocol):
@@ -138,11 +139,12 @@ class CalibrationWorker:
         lens: Camera | None = None,
         detector: VehicleDetector | None = None,
         stop_solving: Callable[[], None] = lambda: None,
+        calibrator: CalibratorFactory = AutoCalibrator,
     ) -> None:
-        self._stop_solving = stop_solving
+        self._stop_solving, self._new_calibrator = stop_solving, calibrator
         self._options, self._idle_solve_s, self._lens, self._detector = options, idle_solve_s, lens, detector
         self._decode, self._solve, self._listener, self._viewer = decode, solve, listener, viewer
-        self._calibrator = AutoCalibrator(options, detector)
+        self._calibrator = calibrator(options, detector)
         self._changed = threading.Condition()
         self._images: deque[tuple[int, Any]] = deque(maxlen=IMAGE_QUEUE_SIZE)
         self._requests: list[Future] = []
@@ -309,7 +311,7 @@ class CalibrationWorker:
                     requests, self._requests = self._requests, []
             if generation != self._calibrator_generation:
                 self._calibrator, self._calibrator_generation = (
-                    AutoCalibrator(self._options, self._detector),
+                    self._new_calibrator(self._options, self._detector),
                     generation,
                 )
             if changing:

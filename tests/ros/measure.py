@@ -168,7 +168,7 @@ def run_node(options: argparse.Namespace) -> dict:  # noqa: C901  one clock afte
     if options.depth:
         image_input.QUEUE_DEPTH = options.depth
     start: list[tuple[float, float]] = []
-    own_take = image_input.ImageInput._take
+    own_take = image_input.ImageInput.take
 
     def take(self, message):
         start or start.append((time.monotonic(), cpu_s()))
@@ -177,7 +177,7 @@ def run_node(options: argparse.Namespace) -> dict:  # noqa: C901  one clock afte
         own_take(self, message)
         ends[:] = [(time.monotonic(), cpu_s())]
 
-    image_input.ImageInput._take = take
+    image_input.ImageInput.take = take
     timed.wrap(autocalib_node.AutocalibNode, '_on_image')
     timed.wrap(diagnostics.Diagnostics, '_publish')
     timed.wrap(image_input.ImageInput, '_check_publishers')

@@ -14,11 +14,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from autocalib_ros.errors import InputError
 from autocalib_ros.lens.camera import Camera, pixel_grid
-from autocalib_ros.offline.ground_truth import read_truth, true_camera
-from autocalib_ros.offline.move_log import GUESSED_FOCAL_WIDTHS
-from autocalib_ros.offline.recordings.open import open_source
+from autocalib_ros.offline.benchmark.long_stream import read_short_recording
 from autocalib_ros.offline.simulate.camera_motion import MOTION_GRID, resampled
 from autocalib_ros.perception.background import median
 from autocalib_ros.perception.view_registration import registered_image
@@ -92,27 +89,13 @@ def measure_moves(recordings: Sequence[Path], width: int) -> Iterator[MoveRun]:
     recording has no images.
     """
     for path in recordings:
-        source = open_source(path)
-        images: list[np.ndarray] = []
-        size, due_ns = (1, 1), -math.inf
-        for frame in source.frames():
-            if frame.stamp_ns >= due_ns and len(images) < MAX_IMAGES:
-                due_ns = frame.stamp_ns + 1e9 / IMAGES_HZ - 1e6
-                size = (frame.image.shape[1], frame.image.shape[0])
-                across = min(width, size[0])
-                images.append(registered_image(frame.image, (across, round(size[1] * across / size[0]))))
-        if not images:
-            raise InputError(f'{source.name} has no images')
-        truth = path.parent / 'truth.json'
-        lens = true_camera(read_truth(truth)).lens if truth.is_file() else None
-        camera = lens if isinstance(lens, Camera) else Camera.equidistant(*size, GUESSED_FOCAL_WIDTHS * size[0])
-        camera = camera.scaled_to(images[0].shape[1], images[0].shape[0])
+        recording = read_short_recording(path, width, IMAGES_HZ, MAX_IMAGES)
         for name, turn_deg, zoom in TRUE_MOVES:
-            yield _run(f'{path.parent.name}/{path.stem}', images, camera, (name, turn_deg, zoom))
+            yield _run(recording.name, recording.images, recording.camera, (name, turn_deg, zoom))
 
 
 def _run(
-    recording: str, images: list[np.ndarray], camera: Camera, move: tuple[str, tuple[float, float, float], float]
+    recording: str, images: Sequence[np.ndarray], camera: Camera, move: tuple[str, tuple[float, float, float], float]
 ) -> MoveRun:
     """Watch one move."""
     name, turn_deg, zoom = move
@@ -143,14 +126,14 @@ def _run(
 class _Disturbances:
     """Images with sway, clouds, noise and a jam, turned and zoomed through the lens."""
 
-    def __init__(self, images: list[np.ndarray], camera: Camera) -> None:
+    def __init__(self, images: Sequence[np.ndarray], camera: Camera) -> None:
         self._images, self._camera = images, camera
         self._generator = np.random.default_rng(0)
         height, width = images[0].shape
         coarse = self._generator.normal(size=(height, 4 * width)).astype(np.float32)
         field = cv2.GaussianBlur(coarse, (0, 0), height / 6.0)
         self._clouds: np.ndarray = 1.0 - CLOUD_DEPTH * (np.tanh(2.0 * field / field.std()) + 1.0) / 2.0
-        self.background = median(images[:: max(1, len(images) // 15)][:15])
+        self.background = median(list(images[:: max(1, len(images) // 15)][:15]))
         traffic = [cv2.absdiff(image, self.background) > 20 for image in images]
         self._jam = images[int(np.argmax([mask.sum() for mask in traffic]))]
         busiest = max(traffic, key=np.count_nonzero).astype(np.uint8)
