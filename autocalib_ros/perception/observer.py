@@ -85,6 +85,8 @@ class Observer:
         self._drift_monitor = DriftMonitor(self._drift_limits(options.gate), self._ignored)
         self._scenes = {0: self._new_scene()}
         self._view = 0
+        self._no_picture: np.ndarray | None = None
+        """Mask of the tracked image where there is no picture, as far as is known."""
         self._sift = cv2.SIFT_create(contrastThreshold=0.03)  # type: ignore[attr-defined]  # for OpenCV 4.5
         self._keypoints: Keypoints | None = None
         self._frame_gate = FrameGate(RepeatDetector(), LEVEL_SHIFT_THRESHOLD)
@@ -119,7 +121,8 @@ class Observer:
             return self._leave_out(status)
         ended = self._reset_appearance() if status is FrameStatus.LEVEL_SHIFT else []
         self._scene.background.update(image, time_s)
-        if self._scene.picture_area.update(self._scene.background):
+        was_known = self._scene.picture_area.is_known
+        if self._scene.picture_area.update(self._scene.background) or was_known != self._scene.picture_area.is_known:
             self._exclude_no_picture()
         tracks = [self._to_full_size(track) for track in (*ended, *self._tracker.follow_new(grey, time_s))]
         passed, self._slots, self._lost = self._slots, self._slots + 1 + self._lost, 0
@@ -189,8 +192,14 @@ class Observer:
         return FrameObservations([], None, None, view=self._view)
 
     def _exclude_no_picture(self) -> None:
-        """Leave out what is no picture in all that follows: tracks, moving regions and corners of the background."""
-        mask = self._scene.picture_area.mask
+        """Leave out what is no picture in all that follows: tracks, moving regions and corners of the background.
+
+        In a view that has just begun that is what was none in the one before: text stays where it is as the camera
+        turns, and its corners would hold the picture still.
+        """
+        if self._scene.picture_area.is_known:
+            self._no_picture = self._scene.picture_area.mask
+        mask = self._no_picture
         margin = 2 * self._options.tracking.window_px + 1
         near = None if mask is None else cv2.dilate(mask, np.ones((margin, margin), np.uint8))
         self._excluded = union(self._excluded_by_options, near)

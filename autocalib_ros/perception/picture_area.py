@@ -19,8 +19,8 @@ from autocalib_ros.perception.picture_borders import find_circle, find_rectangle
 MIN_PICTURE_SAMPLES = 3
 """Images that show what is constant: with two, one that is torn or lit by a lamp would decide."""
 REPEAT_FACTOR, REPEAT_INTERVAL_S = 1.5, 3600.0
-"""The next analysis is due at this factor of the time of the last one, or after this interval: evidence grows with
-time, and an analysis costs tenths of a second."""
+"""The next analysis is due at this factor of the age of the view at the last one, or after this interval: evidence
+grows with time, and an analysis costs tenths of a second."""
 OVERLAY_MEMORY = 8
 """Analyses over which it is averaged where overlays were seen: letters on bright vehicles are missed at times."""
 MIN_OVERLAY_SHARE = 0.3
@@ -39,8 +39,7 @@ class PictureArea:
     def __init__(self, image_size: tuple[int, int], tracked_size: tuple[int, int], polygons: Polygons = ()) -> None:
         """`polygons` of the images are blacked out before they come: they tell nothing about the picture."""
         self._image_size, self._tracked_size, self._polygons = image_size, tracked_size, polygons
-        self._newest_s = -np.inf
-        self._due_s = 0.0
+        self._newest_s, self._due_s, self._start_s = -np.inf, 0.0, 0.0
         self._overlay_share = np.zeros(tracked_size[::-1], np.float32)
         self._analyses = 0
         self.picture = Picture.whole(image_size)
@@ -49,13 +48,20 @@ class PictureArea:
         """1 where there is no picture, else 0, uint8 (h, w) of the tracked image; None if there is picture everywhere.
         """
 
+    @property
+    def is_known(self) -> bool:
+        """Whether the picture was looked for: a view that has just begun says nothing."""
+        return self._analyses > 0
+
     def update(self, background: Background) -> bool:
         """Look again if the background has a new sample and that is due; return whether the mask changed."""
         times = background.times_s
         if len(times) < MIN_PICTURE_SAMPLES or times[-1] <= self._newest_s or times[-1] < self._due_s:
             return False
+        if not self._analyses:
+            self._start_s = times[0]
         self._newest_s = times[-1]
-        self._due_s = min(REPEAT_FACTOR * times[-1], times[-1] + REPEAT_INTERVAL_S)
+        self._due_s = times[-1] + min((REPEAT_FACTOR - 1.0) * (times[-1] - self._start_s), REPEAT_INTERVAL_S)
         samples = background.reduced_samples()
         ignored = self._ignored(samples[0].shape[1::-1])
         samples = samples if ignored is None else [_with_ramp(sample, ignored) for sample in samples]

@@ -186,6 +186,25 @@ def test_a_running_clock_is_no_vehicle_and_no_corner_of_the_background() -> None
     assert len(corners) and not ((corners[:, 0] > 440) & (corners[:, 1] > 325)).any()
 
 
+def test_text_stays_masked_when_the_camera_has_moved() -> None:
+    """Its corners do not move with the camera: in the view that has just begun they would hold the picture still."""
+    observer = Observer(Options(), SIZE[::-1])
+    index = 0
+    while observer.view == 0 and index < 120:
+        image = stamped(0.1 * index)
+        if index >= 40:  # the scene moves, the clock does not
+            turned = np.roll(image, 40, axis=1)
+            turned[325:355, 438:632] = image[325:355, 438:632]
+            image = turned
+        observer.observe(image, 0.1 * index)
+        index += 1
+    assert observer.view == 1
+    begun = observer.known_view(1)
+    assert begun is not None and begun.ignored is not None
+    assert begun.ignored[330:350, 450:600].all()
+    assert not begun.ignored[:200].any()
+
+
 def swaying(time_s: float) -> tuple[float, float]:
     return 2.0 * np.sin(4.4 * time_s), 0.8 * np.sin(7.0 * time_s)
 

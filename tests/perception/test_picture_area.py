@@ -215,3 +215,16 @@ def test_an_ignored_region_along_a_side_is_no_bar() -> None:
 def test_nothing_is_masked_before_three_images_and_in_a_plain_scene() -> None:
     assert area_after([padded(street(index), (0, 0, 0, 40)) for index in range(2)]).mask is None
     assert area_after([street(index) for index in range(5)]).mask is None
+
+
+def test_a_view_that_begins_late_is_looked_at_as_often_as_the_first() -> None:
+    """A day into the stream, half of its time would be twelve hours."""
+    size = (WIDTH, HEIGHT)
+    background, area, found = Background(), PictureArea(size, size), []
+    for index in range(70):
+        image = stamped(index, 'Cam 12', 10, 230) if index > 2 else street(index)
+        background.update(image, 86_400.0 + 0.5 * index)
+        area.update(background)
+        found.append(area.mask is not None)
+    assert not any(found[:3])
+    assert found[-1]
