@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import cv2
@@ -88,7 +88,7 @@ def image_axes(
     picture = scene.background if picture is None else picture
     axes.set_facecolor(PANEL_COLOUR)
     if picture is not None:
-        axes.imshow(faded_rgb(picture, fade), interpolation='bilinear')
+        show_picture(axes, picture, fade, round(WIDTH_IN * DPI / (1 + 2 * margin)))
     elif margin:
         axes.plot(*np.array([[0, 0], [width, 0], [width, height], [0, height], [0, 0]]).T - 0.5, color=MUTED_COLOUR)
     axes.set(
@@ -116,8 +116,29 @@ def _outline_picture(axes: Axes, picture: Picture) -> None:
 
 def faded_rgb(picture: np.ndarray, fade: float) -> np.ndarray:
     """Return a BGR or grey image as RGB, blended with white so that lines are visible."""
-    rgb = picture[..., ::-1] if picture.ndim == 3 else np.repeat(picture[..., None], 3, axis=2)
-    return (rgb * (1 - fade) + 255 * fade).astype(np.uint8)
+    rgb = cv2.cvtColor(picture, cv2.COLOR_BGR2RGB if picture.ndim == 3 else cv2.COLOR_GRAY2RGB)
+    return np.asarray(cv2.convertScaleAbs(rgb, alpha=1 - fade, beta=255 * fade))
+
+
+def show_picture(axes: Axes, picture: np.ndarray, fade: float, shown_px: int) -> None:
+    """Draw a BGR or grey image under all else, in its pixel coordinates, lightened by `fade`.
+
+    It is brought to the width in which it is shown beforehand: Matplotlib resamples more slowly, in RGBA.
+    """
+    height, width = picture.shape[:2]
+    size = (shown_px, max(1, round(shown_px * height / width)))
+    shrinks = shown_px < width
+    shown = cv2.resize(picture, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+    axes.imshow(
+        faded_rgb(shown, fade), extent=(-0.5, width - 0.5, height - 0.5, -0.5), interpolation='nearest', zorder=0
+    )
+
+
+def mapped(function: Callable[[np.ndarray], np.ndarray], paths: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Return paths, each (n, 2), of which a function maps the points: all at once, since there are thousands."""
+    if not len(paths):
+        return []
+    return np.split(function(np.concatenate(paths)), np.cumsum([len(path) for path in paths[:-1]]))
 
 
 def plot_paths(
@@ -171,7 +192,7 @@ def cell_map(scene: ReportScene, values: np.ma.MaskedArray, scale: Normalize, la
     axes = figure.add_axes((0, BAR_ROOM_IN / height_in, 1, 1 - BAR_ROOM_IN / height_in))
     axes.set_facecolor(PANEL_COLOUR)
     if scene.background is not None:
-        axes.imshow(faded_rgb(scene.background, 0.25), interpolation='bilinear')
+        show_picture(axes, scene.background, 0.25, round(WIDTH_IN * DPI))
     rows, columns = values.shape
     cells = axes.pcolormesh(
         np.linspace(0, width, columns + 1) - 0.5,

@@ -16,6 +16,7 @@ from autocalib_ros.report.canvas import (
     draw_legend,
     image_axes,
     label_colour,
+    mapped,
     plot_paths,
     road_colour,
 )
@@ -34,7 +35,7 @@ def undistorted(scene: ReportScene) -> Figure | None:
     matrix = rectified_matrix(camera, pixel_aspect=camera.pixel_aspect)
     figure, axes = undistorted_axes(scene)
     for name, label, tracks in scene.groups():
-        paths = [in_undistorted(camera, matrix, path) for path in tracks]
+        paths = mapped(lambda pixels: in_undistorted(camera, matrix, pixels), tracks)
         plot_paths(axes, paths, label_colour(label), name, alpha=0.6, width=0.8)
     draw_legend(axes)
     return figure
@@ -65,9 +66,9 @@ def straightness(scene: ReportScene) -> Figure | None:
     figure, (axes,) = chart(4.4)
     camera, ends = scene.calibration.camera, []
     for label in scene.roads:
-        errors = np.array(
-            [(line_error_px(path), line_error_px(camera.undistort(path))) for path in scene.paths(label)]
-        ).reshape(-1, 2)
+        paths = scene.paths(label)
+        straightened = mapped(camera.undistort, paths)
+        errors = np.array([[line_error_px(path) for path in each] for each in (paths, straightened)]).T
         errors = np.maximum(errors[np.isfinite(errors).all(axis=1)], MIN_ERROR_PX)
         if len(errors):
             before, after = np.median(errors, axis=0)

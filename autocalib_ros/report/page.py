@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 
+import numpy as np
 from jinja2 import Environment, StrictUndefined
 from matplotlib import rc_context
 from matplotlib.figure import Figure
@@ -253,20 +255,25 @@ def write_report(path: Path, scene: ReportScene, figures: Path | None = None) ->
     """
     folder = figures or path.parent / 'figures'
     _clear(folder)  # fail early if the folder is not writable: drawing takes seconds
-    with rc_context(STYLE):
-        drawn = [one for entry in ENTRIES if (one := _drawn(entry, scene)) is not None]
+    with rc_context(STYLE), ThreadPoolExecutor(1, thread_name_prefix='encoder') as encoder:
+        # OpenCV encodes without Python's lock, while Matplotlib draws the next figure
+        encoded = [encoder.submit(_encoded, *one) for entry in ENTRIES if (one := _drawn(entry, scene)) is not None]
+        drawn = [each.result() for each in encoded]
     _write_figures(folder, {one.entry.name: one.png for one in drawn})
     write_atomically(path, _page(scene, drawn), NOT_FOR_OTHERS)
 
 
-def _drawn(entry: _Entry, scene: ReportScene) -> _Drawn | None:
+def _drawn(entry: _Entry, scene: ReportScene) -> tuple[_Entry, str, np.ndarray] | None:
+    """Return an entry with its caption and its figure as BGR image; None if it has nothing to show."""
     figure = entry.draw(scene)
     if figure is None:
         return None
-    picture = render_bgr(figure)
-    whole = png(picture)
     caption = ' '.join(filter(None, [entry.caption, entry.more(scene) if entry.more else '']))
-    photograph = jpeg(picture)
+    return entry, caption, render_bgr(figure)
+
+
+def _encoded(entry: _Entry, caption: str, picture: np.ndarray) -> _Drawn:
+    whole, photograph = png(picture), jpeg(picture)
     return _Drawn(entry, caption, whole, photograph if JPEG_SAVES * len(photograph) < len(whole) else whole)
 
 

@@ -60,9 +60,9 @@ def coverage(scene: ReportScene) -> Figure | None:
     cells = np.floor(evidence.points_px / evidence.image_size * COVERAGE_CELLS).astype(int)
     column, row = np.clip(cells, 0, np.array(COVERAGE_CELLS) - 1).T
     tracks = np.repeat(np.arange(evidence.track_count), np.diff(evidence.track_starts))
-    column, row, _ = np.unique(np.stack([column, row, tracks]), axis=1)
-    counts = np.zeros(COVERAGE_CELLS[::-1])
-    np.add.at(counts, (row, column), 1)
+    columns, rows = COVERAGE_CELLS
+    crossed = np.unique((tracks * rows + row) * columns + column) % (rows * columns)
+    counts = np.bincount(crossed, minlength=rows * columns).reshape(rows, columns)
     return cell_map(scene, np.ma.masked_equal(counts, 0), LogNorm(1, max(counts.max(), 10)), 'trajectories in a cell')
 
 
