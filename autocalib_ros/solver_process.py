@@ -7,8 +7,6 @@ priority and ends with its parent.
 from __future__ import annotations
 
 import concurrent.futures
-import contextlib
-import ctypes
 import multiprocessing
 import os
 import signal
@@ -23,10 +21,9 @@ from autocalib_ros.errors import AutocalibError
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.results.calibration import Calibration, Refusal
+from autocalib_ros.util.child_process import end_with_parent
 
 Result = Calibration | Refusal
-PR_SET_PDEATHSIG = 1
-"""Option of prctl(2): the signal that a process gets when its parent ends."""
 NICENESS = 10
 """Nice value of the child: a solution has minutes, an image milliseconds."""
 OUT_OF_MEMORY = 75
@@ -139,16 +136,10 @@ class BackgroundSolver:
         self._process.close()
 
 
-def _end_with_parent() -> None:
-    """Let the kernel end this process with its parent, also where that is killed in the middle of a solution."""
-    with contextlib.suppress(OSError, AttributeError):  # Linux has it; elsewhere the closed pipe ends the process later
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, int(signal.SIGKILL))
-
-
 def _run_child(pipe: Connection) -> None:
     """Solve the problems that arrive until the parent closes the pipe."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is handled by the parent
-    _end_with_parent()
+    end_with_parent()
     os.nice(NICENESS)
     from autocalib_ros.estimation.estimate import solve  # here alone: the parent starts faster and smaller without it
 

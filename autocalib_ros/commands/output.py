@@ -54,6 +54,7 @@ def replay_and_report(
     from autocalib_ros.offline.outputs import EvidenceFile, write_outputs
     from autocalib_ros.offline.replay_recording import replay
     from autocalib_ros.offline.terminal.progress import progress_bar
+    from autocalib_ros.report.figure_process import FigureProcess
     from autocalib_ros.solver_process import BackgroundSolver
 
     if not quiet:
@@ -61,37 +62,45 @@ def replay_and_report(
     file, stop = EvidenceFile(out), stop or StopRequest()
     totals = [source.total for source in sources]
     total = None if None in totals else sum(one for one in totals if one is not None)
-    with (
-        closing(BackgroundSolver()) as solver,
-        stop.listening(),
-        progress_bar(total, 'images', 'replay', quiet=quiet) as progress,
-    ):
-        replayed = replay(
-            sources,
-            options,
-            progress.update_to,
-            lens=lens,
-            detector=detector,
-            should_stop=stop,
-            on_checkpoint=file.write,
-            before=before,
-            start_solving=solver,
-            on_accepted=on_accepted,
-        )
-    if replayed.stopped:
-        print_stderr(f'Stopped after {replayed.frames} images; the result is of these.')
-    if replayed.displacements_px and not quiet:
+    with closing(FigureProcess()) as figures:
+        with (
+            closing(BackgroundSolver()) as solver,
+            stop.listening(),
+            progress_bar(total, 'images', 'replay', quiet=quiet) as progress,
+        ):
+            replayed = replay(
+                sources,
+                options,
+                progress.update_to,
+                lens=lens,
+                detector=detector,
+                should_stop=stop,
+                on_checkpoint=file.write,
+                before=before,
+                start_solving=solver,
+                on_accepted=on_accepted,
+                on_last_solution=figures.start,
+            )
+        if replayed.stopped:
+            print_stderr(f'Stopped after {replayed.frames} images; the result is of these.')
+        if not quiet:
+            _tell_of_images(replayed)
+        names = write_outputs(out, replayed, named_after or sources, file, truth, figures)
+    print_result(replayed, out, names, quiet=quiet, json=json, points=points)
+    return replayed
+
+
+def _tell_of_images(replayed: ReplayResult) -> None:
+    """Tell on stderr what became of the images, where that is not what one expects."""
+    if replayed.displacements_px:
         print_stderr(
             f'{1 + len(replayed.displacements_px)} recordings are joined; their views were displaced by up to '
             f'{max(replayed.displacements_px):.2f} px, which is undone.'
         )
-    if replayed.repeated and not quiet:
+    if replayed.repeated:
         print_stderr(f'{replayed.repeated} of {replayed.frames} images repeat an earlier one and are left out.')
-    if not quiet and not replayed.evidence.picture.fills_image:
+    if not replayed.evidence.picture.fills_image:
         print_stderr(replayed.evidence.picture.description)
-    names = write_outputs(out, replayed, named_after or sources, file, truth)
-    print_result(replayed, out, names, quiet=quiet, json=json, points=points)
-    return replayed
 
 
 def write_ground_tracks(path: Path, replayed: ReplayResult, *, quiet: bool) -> None:

@@ -14,6 +14,7 @@ from autocalib_ros.lens.camera_info_yaml import write_camera_info_yaml
 from autocalib_ros.offline.ground_truth import beside_truth
 from autocalib_ros.offline.recordings.sources import Source, camera_name
 from autocalib_ros.offline.replay_recording import ReplayResult
+from autocalib_ros.report.figure_process import FigureProcess
 from autocalib_ros.report.scene import ReportScene
 from autocalib_ros.results.calibration import Calibration
 from autocalib_ros.results.calibration_json import read_json_object, write_calibration_json
@@ -79,17 +80,18 @@ def write_outputs(
     sources: Source | Sequence[Source],
     evidence_file: EvidenceFile | None = None,
     truth: Mapping[str, Any] | None = None,
+    process: FigureProcess | None = None,
 ) -> list[str]:
     """Write the result files and the evidence of a replay; return the names of the files.
 
-    The report compares the result with the `truth` of a simulation, if it is given.
+    The report compares the result with the `truth` of a simulation, if it is given; a second `process` draws with it.
     """
     listed = list(sources) if isinstance(sources, Sequence) else [sources]
     first, more = listed[0], len(listed) - 1
     file = evidence_file or EvidenceFile(out_dir)
     file.write(replayed.evidence)
     name = f'{first.name} and {more} more' if more else first.name
-    names = write_result(out_dir, replayed, name, camera_name(first), truth)
+    names = write_result(out_dir, replayed, name, camera_name(first), truth, process)
     if replayed.result:
         file.drop_backup()
     return [*names, EVIDENCE]
@@ -130,6 +132,7 @@ def write_result(
     source_name: str,
     name_of_camera: str = 'camera',
     truth: Mapping[str, Any] | None = None,
+    process: FigureProcess | None = None,
 ) -> list[str]:
     """Write the result files and remove stale ones of an earlier run; return the names of the files.
 
@@ -161,6 +164,7 @@ def write_result(
             truth=() if truth is None or result.candidate is None else beside_truth(result.candidate, truth),
             folder=out_dir if (out_dir / EVIDENCE).exists() else None,
         ),
+        process=process,
     )
     return ([CAMERA_INFO] if result else []) + [CALIBRATION, REPORT]
 

@@ -78,6 +78,7 @@ def replay(
     before: Evidence | None = None,
     start_solving: StartSolving | None = None,
     on_accepted: Callable[[Calibration, np.ndarray], None] | None = None,
+    on_last_solution: Callable[[], None] = lambda: None,
 ) -> ReplayResult:
     """Collect evidence from a recording, given as a path or an open source, and solve at its end.
 
@@ -91,7 +92,8 @@ def replay(
     the first calibration on the way, with the newest image. With a known `lens` only the pose is estimated; UsageError
     if its aspect ratio differs from that of the images. `detector` is an open detector; None opens the one of the
     options. `start_solving` solves the evidence on the way in the background, with the same result (see
-    `solver_process.BackgroundSolver`). InputError without an image.
+    `solver_process.BackgroundSolver`). `on_last_solution` is called before the last solution, which takes seconds.
+    InputError without an image.
     """
     sources = _opened(recording)
     control = ReplayControl(
@@ -109,6 +111,7 @@ def replay(
     if on_checkpoint is not None:
         on_checkpoint(evidence)
     control.report(frames, 'solving')
+    on_last_solution()
     result = solve(evidence, options, lens=scaled(lens, evidence.image_size))
     control.report(frames, 'calibrated' if result else 'refused')
     alone = gathered[0] if len(gathered) == 1 and before is None else None

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -27,6 +28,7 @@ from autocalib_ros.report import (
     traffic_figures,
 )
 from autocalib_ros.report.canvas import STYLE, jpeg, png, render_bgr
+from autocalib_ros.report.figure_process import FigureProcess
 from autocalib_ros.report.next_command import next_command
 from autocalib_ros.report.requirements import needs
 from autocalib_ros.report.ruler import ruler_data
@@ -232,49 +234,91 @@ ENTRIES = (
 
 
 @dataclass(frozen=True)
-class _Drawn:
-    entry: _Entry
+class DrawnFigure:
+    """Figure of the report, encoded."""
+
+    index: int
+    """Of its entry in `ENTRIES`."""
     caption: str
     png: bytes
     shown: bytes
     """Embedded image: JPEG if it is smaller by `JPEG_SAVES`, else PNG."""
 
     @property
+    def entry(self) -> _Entry:
+        """Its entry."""
+        return ENTRIES[self.index]
+
+    @property
     def kind(self) -> str:
-        return 'png' if self.shown is self.png else 'jpeg'
+        """Format of the embedded image."""
+        return 'png' if self.shown == self.png else 'jpeg'
 
     @property
     def data(self) -> str:
+        """The embedded image in base64."""
         return base64.b64encode(self.shown).decode()
 
 
-def write_report(path: Path, scene: ReportScene, figures: Path | None = None) -> None:
+def write_report(
+    path: Path, scene: ReportScene, figures: Path | None = None, process: FigureProcess | None = None
+) -> None:
     """Write the page to `path` and its figures into a folder, default `figures` next to it; replace earlier figures.
 
-    InputError if that fails.
+    A second `process` that was started draws its part of the figures. InputError if that fails.
     """
     folder = figures or path.parent / 'figures'
     _clear(folder)  # fail early if the folder is not writable: drawing takes seconds
-    with rc_context(STYLE), ThreadPoolExecutor(1, thread_name_prefix='encoder') as encoder:
-        # OpenCV encodes without Python's lock, while Matplotlib draws the next figure
-        encoded = [encoder.submit(_encoded, *one) for entry in ENTRIES if (one := _drawn(entry, scene)) is not None]
-        drawn = [each.result() for each in encoded]
+    drawn = _draw_all(scene, process or FigureProcess())
     _write_figures(folder, {one.entry.name: one.png for one in drawn})
     write_atomically(path, _page(scene, drawn), NOT_FOR_OTHERS)
 
 
-def _drawn(entry: _Entry, scene: ReportScene) -> tuple[_Entry, str, np.ndarray] | None:
-    """Return an entry with its caption and its figure as BGR image; None if it has nothing to show."""
-    figure = entry.draw(scene)
-    if figure is None:
+def _draw_all(scene: ReportScene, process: FigureProcess) -> list[DrawnFigure]:
+    """Draw the figures here from the first one on, those that the process begins from the last one there."""
+    process.begin(draw_entry, scene, len(ENTRIES))
+    drawn: dict[int, Future[DrawnFigure | None]] = {}
+    with ThreadPoolExecutor(1, thread_name_prefix='encoder') as encoder:
+        # OpenCV encodes without Python's lock, while Matplotlib draws the next figure
+        for index in range(len(ENTRIES)):
+            if process.leaves(index):
+                drawn[index] = encoder.submit(_encoded, index, *_drawn(index, scene))
+    figures = [
+        drawn[index].result() if index in drawn else _from(process, index, scene) for index in range(len(ENTRIES))
+    ]
+    return [figure for figure in figures if figure is not None]
+
+
+def _from(process: FigureProcess, index: int, scene: ReportScene) -> DrawnFigure | None:
+    """Return the figure that the process draws; it is drawn here if that has died."""
+    try:
+        found: DrawnFigure | None = process.result(index)
+    except BrokenProcessPool:
+        found = draw_entry(index, scene)
+    return found
+
+
+def draw_entry(index: int, scene: ReportScene) -> DrawnFigure | None:
+    """Draw and encode the figure of an entry; None if it has nothing to show."""
+    return _encoded(index, *_drawn(index, scene))
+
+
+def _drawn(index: int, scene: ReportScene) -> tuple[str, np.ndarray | None]:
+    """Return the caption of an entry and its figure as BGR image; None if it has nothing to show."""
+    entry = ENTRIES[index]
+    with rc_context(STYLE):
+        figure = entry.draw(scene)
+        if figure is None:
+            return '', None
+        caption = ' '.join(filter(None, [entry.caption, entry.more(scene) if entry.more else '']))
+        return caption, render_bgr(figure)
+
+
+def _encoded(index: int, caption: str, picture: np.ndarray | None) -> DrawnFigure | None:
+    if picture is None:
         return None
-    caption = ' '.join(filter(None, [entry.caption, entry.more(scene) if entry.more else '']))
-    return entry, caption, render_bgr(figure)
-
-
-def _encoded(entry: _Entry, caption: str, picture: np.ndarray) -> _Drawn:
     whole, photograph = png(picture), jpeg(picture)
-    return _Drawn(entry, caption, whole, photograph if JPEG_SAVES * len(photograph) < len(whole) else whole)
+    return DrawnFigure(index, caption, whole, photograph if JPEG_SAVES * len(photograph) < len(whole) else whole)
 
 
 def _clear(folder: Path) -> None:
@@ -294,7 +338,7 @@ def _write_figures(folder: Path, pictures: dict[str, bytes]) -> None:
         raise InputError(f'cannot write {folder}: {error.strerror or error}') from error
 
 
-def _page(scene: ReportScene, drawn: list[_Drawn]) -> str:
+def _page(scene: ReportScene, drawn: list[DrawnFigure]) -> str:
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     template = environment.from_string(_template('report.html.j2'))
     result, found = scene.result, scene.calibration

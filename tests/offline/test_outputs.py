@@ -66,7 +66,7 @@ def test_a_refusal_removes_the_camera_info_of_an_earlier_run(tmp_path, refused, 
 
 
 def test_a_refusal_keeps_an_earlier_calibration_that_was_accepted(tmp_path, monkeypatch, full, refused, source, caplog):
-    monkeypatch.setattr('autocalib_ros.report.page.write_report', lambda path, _: path.write_text('page'))
+    monkeypatch.setattr('autocalib_ros.report.page.write_report', lambda path, _, process: path.write_text('page'))
     outputs.write_outputs(tmp_path, full, source)
     accepted = {name: (tmp_path / name).read_bytes() for name in ('calibration.json', 'evidence.npz')}
     for _ in range(2):  # a second refusal keeps the calibration, and not the first refusal
@@ -81,7 +81,7 @@ def test_a_refusal_keeps_an_earlier_calibration_that_was_accepted(tmp_path, monk
 
 
 def test_evidence_on_the_way_keeps_that_of_an_accepted_calibration(tmp_path, monkeypatch, full, refused, source):
-    monkeypatch.setattr('autocalib_ros.report.page.write_report', lambda path, _: path.write_text('page'))
+    monkeypatch.setattr('autocalib_ros.report.page.write_report', lambda path, _, process: path.write_text('page'))
     outputs.write_outputs(tmp_path, full, source)
     accepted = (tmp_path / 'evidence.npz').read_bytes()
     for _ in range(2):  # runs that are killed after two checkpoints

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import multiprocessing
-import os
 import shutil
 import signal
 from collections.abc import Callable, Iterator, Mapping
@@ -24,6 +23,7 @@ from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.offline.simulate.options import SimulationOptions
 from autocalib_ros.offline.simulate.simulation import Simulation
 from autocalib_ros.offline.simulate.truth import truth_of
+from autocalib_ros.util.child_process import usable_processors
 
 TRUTH_FILE_NAME = 'truth.json'
 _BAG_VERSION: Literal[9] = 9
@@ -68,7 +68,7 @@ def write_simulation(
     options = simulation.options
     try:
         with _writer(path, options) as writer:
-            _write_messages(writer, simulation, workers or _core_count(), progress, on_image)
+            _write_messages(writer, simulation, workers or usable_processors(), progress, on_image)
         text = json.dumps(truth or truth_of(simulation), indent=1)
         (path / TRUTH_FILE_NAME).write_text(text, encoding='utf-8')
     except BaseException as error:
@@ -104,12 +104,6 @@ def _writer(path: Path, options: SimulationOptions) -> Writer:
     if options.zstd:
         writer.set_compression(CompressionMode.MESSAGE, CompressionFormat.ZSTD)
     return writer
-
-
-def _core_count() -> int:
-    if hasattr(os, 'sched_getaffinity'):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _write_messages(
