@@ -126,9 +126,14 @@ class BackgroundSolver:
         self._process = SolverProcess()
         self._waiting = concurrent.futures.ThreadPoolExecutor(1, thread_name_prefix='background solver')
 
-    def __call__(self, evidence: Evidence, options: Options, lens: Camera | None) -> concurrent.futures.Future[Result]:
-        """Start a solution; the future raises what `SolverProcess` does."""
-        return self._waiting.submit(self._process, evidence, options, lens=lens)
+    def __call__(
+        self, evidence: Callable[[], Evidence], options: Options, lens: Camera | None
+    ) -> concurrent.futures.Future[Result]:
+        """Solve what a function returns, called in another thread; the future raises what `SolverProcess` does."""
+        return self._waiting.submit(self._solve, evidence, options, lens)
+
+    def _solve(self, evidence: Callable[[], Evidence], options: Options, lens: Camera | None) -> Result:
+        return self._process(evidence(), options, lens=lens)
 
     def close(self) -> None:
         """Give up what is under way, and end the process."""

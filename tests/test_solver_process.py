@@ -119,10 +119,10 @@ def test_solution_that_hangs_is_given_up_and_the_next_one_starts_another_process
 
 def test_a_background_solver_gives_the_same_and_ends_what_is_under_way():
     background, evidence = BackgroundSolver(), snapshot()
-    assert background(evidence, OPTIONS, None).result(PATIENCE_S) == solve(evidence, OPTIONS)
+    assert background(lambda: evidence, OPTIONS, None).result(PATIENCE_S) == solve(evidence, OPTIONS)
     process = background._process._process
     os.kill(process.pid, signal.SIGSTOP)
-    under_way = background(evidence, OPTIONS, None)
+    under_way = background(lambda: evidence, OPTIONS, None)
     assert not threading.Event().wait(0.2)
     background.close()
     assert isinstance(under_way.exception(PATIENCE_S), SolverDied) and not process.is_alive()

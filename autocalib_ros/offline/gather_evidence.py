@@ -21,7 +21,6 @@ from autocalib_ros.offline.recordings.sources import Source
 from autocalib_ros.offline.solution_trials import SolutionTrials, StartSolving, solved_in_between
 from autocalib_ros.perception.detector.detector import VehicleDetector
 from autocalib_ros.perception.frame_clock import ClockSummary
-from autocalib_ros.report.scene import SolutionSnapshot
 from autocalib_ros.results.calibration import Calibration
 
 LOG = logging.getLogger(__name__)
@@ -65,10 +64,8 @@ class GatheredEvidence:
     frames: int
     repeated: int
     clock: ClockSummary
-    accepted_at_s: float | None
-    """Seconds of recording before the first accepted calibration; None without one."""
-    moments: tuple[SolutionSnapshot, ...]
-    """The solutions on the way."""
+    trials: SolutionTrials
+    """The solutions on the way, of which the last one may still be running."""
     stopped: bool
     """Whether `ReplayControl.should_stop` ended the reading."""
     moves: MoveLog
@@ -104,7 +101,7 @@ def gather_evidence(
             trials.begin_part(due.stillness.start_s)
             if trials.is_due(due.seconds, source.duration_s):
                 control.report(frames_before + count, 'solving')
-                trials.start(_as_recorded(calibrator.with_segments(due), source), scaled_lens)
+                trials.start(due.seconds, _completed(_as_recorded(due, source), calibrator), scaled_lens)
         trials.take_finished()
         if control.on_accepted is not None and not shown and isinstance(trials.latest, Calibration):
             shown = True
@@ -123,7 +120,6 @@ def gather_evidence(
     to_end = not stopped and source.window.duration_s is None
     evidence = _longest_part(calibrator, source, inf if to_end else source.window.start_s + seen_s)
     trials.begin_part(evidence.stillness.start_s)
-    trials.finish()
     clock = calibrator.clock()
     if clock.is_uneven:
         LOG.warning('%s: uneven time stamps, regularised: %s', source.name, clock)
@@ -133,8 +129,7 @@ def gather_evidence(
         frames=count,
         repeated=calibrator.repeated,
         clock=clock,
-        accepted_at_s=trials.accepted_at_s,
-        moments=trials.moments,
+        trials=trials,
         stopped=stopped,
         moves=moves,
     )
@@ -146,6 +141,17 @@ def _longest_part(calibrator: AutoCalibrator, source: Source, read_s: float) -> 
     if evidence is None:
         raise InputError(f'{source.name} has no images')
     return replace(_as_recorded(evidence, source), recordings=(ReadRecording.of(source.name, read_s),))
+
+
+def _completed(evidence: Evidence, calibrator: AutoCalibrator) -> Callable[[], Evidence]:
+    """Return a function for another thread that adds the segments of the still scene as of now."""
+    search = calibrator.search_for_segments()
+
+    def complete() -> Evidence:
+        lines, stripes = (evidence.still_lines_px, evidence.stripes_px) if search is None else search()
+        return replace(evidence, still_lines_px=lines, stripes_px=stripes)
+
+    return complete
 
 
 def _as_recorded(evidence: Evidence, source: Source) -> Evidence:

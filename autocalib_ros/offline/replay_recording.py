@@ -114,9 +114,11 @@ def replay(
     on_last_solution()
     result = solve(evidence, options, lens=scaled(lens, evidence.image_size))
     control.report(frames, 'calibrated' if result else 'refused')
-    alone = gathered[0] if len(gathered) == 1 and before is None else None
-    accepted_at_s = None if alone is None else alone.accepted_at_s
-    if result and alone is not None and accepted_at_s is None:
+    trials = gathered[0].trials if len(gathered) == 1 and before is None else None
+    if trials is not None:
+        trials.finish()
+    accepted_at_s = None if trials is None else trials.accepted_at_s
+    if result and trials is not None and accepted_at_s is None:
         accepted_at_s = evidence.seconds
     camera = None if result.candidate is None else result.candidate.camera
     return ReplayResult(
@@ -127,7 +129,7 @@ def replay(
         frames=frames,
         repeated=sum(one.repeated for one in gathered),
         options=options,
-        moments=append_snapshot(() if alone is None else alone.moments, result),
+        moments=append_snapshot(() if trials is None else trials.moments, result),
         clock=gathered[-1].clock if gathered else ClockSummary(),
         stopped=any(one.stopped for one in gathered),
         left_out=tuple(joint.left_out),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import Future
-from types import SimpleNamespace
+from functools import partial
 
 import pytest
 
@@ -47,13 +47,13 @@ def tried(make, outcomes, until_s=200, duration_s=None):
     began, outcomes = [], iter(outcomes)
 
     def start(evidence, options, lens):
-        began.append(evidence.seconds)
+        began.append(evidence())
         return make(next(outcomes))
 
     trials = SolutionTrials(Options(), start)
     for seconds in range(10, until_s):
         if trials.is_due(seconds, duration_s):
-            trials.start(SimpleNamespace(seconds=seconds), None)
+            trials.start(seconds, partial(int, seconds), None)
         trials.take_finished()
     trials.finish()
     return began, trials
@@ -64,6 +64,18 @@ def test_a_refused_solution_is_tried_at_twice_the_length_and_an_accepted_one_at_
     began, trials = tried(make, ['', '', 'accepted', 'accepted'])
     assert began == [10, 20, 40, 160]
     assert (trials.accepted_at_s, trials.latest, len(trials.moments)) == (40, 'accepted', 4)
+
+
+def test_evidence_that_may_be_due_waits_for_the_solution_before():
+    began, first = [], Late('accepted')
+    trials = SolutionTrials(Options(), lambda evidence, options, lens: began.append(evidence()) or first)
+    for seconds in range(10, 50):
+        if trials.is_due(seconds, None):
+            trials.start(seconds, partial(int, seconds), None)
+        trials.take_finished()
+    assert began == [10]
+    trials.finish()
+    assert began == [10, 40]
 
 
 def test_no_solution_is_tried_in_the_second_half_of_a_recording():
