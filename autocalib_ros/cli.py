@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import codecs
 import logging
 import os
 import re
@@ -27,6 +28,7 @@ from autocalib_ros.commands import replay_command as replay
 from autocalib_ros.commands import simulate_command as simulate
 from autocalib_ros.commands import topview_command as topview
 from autocalib_ros.errors import AutocalibError, UsageError
+from autocalib_ros.util.plain_text import in_ascii
 from autocalib_ros.util.threads import limit_blas_threads
 
 COMMANDS = {
@@ -43,6 +45,8 @@ COMMANDS = {
     'benchmark': benchmark,
     'docs': docs,
 }
+PLAIN = 'autocalib_plain'
+"""Name of the handler for characters that an encoding lacks."""
 COMPLETION = '_ARGCOMPLETE'
 """Environment variable that argcomplete sets while a shell completes a line."""
 
@@ -81,10 +85,18 @@ def _silence_libraries() -> None:
 
 
 def _replace_unencodable_characters() -> None:
-    """Make stdout and stderr replace characters that their encoding lacks, such as the plus-minus sign."""
+    """Make stdout and stderr write characters that their encoding lacks otherwise, as +- for the plus-minus sign."""
+    codecs.register_error(PLAIN, _in_plain_characters)
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, 'reconfigure'):
-            stream.reconfigure(errors='replace')
+            stream.reconfigure(errors=PLAIN)
+
+
+def _in_plain_characters(error: UnicodeError) -> tuple[str, int]:
+    """Return what stands for characters that cannot be encoded, and where to go on."""
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    return in_ascii(error.object[error.start : error.end]), error.end
 
 
 @contextmanager

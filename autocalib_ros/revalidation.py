@@ -161,7 +161,7 @@ def _differences(before: list[_Estimate], fresh: list[_Estimate]) -> list[str | 
             found.append(None)
         elif difference > AGREEMENT_SIGMAS * math.hypot(old.sigma, new.sigma):
             found.append(
-                f'{old.name} before {old.value:.4g} +- {old.sigma:.2g}{old.unit}, new {new.value:.4g} +- '
+                f'{old.name} before {old.value:.4g} ± {old.sigma:.2g}{old.unit}, new {new.value:.4g} ± '
                 f'{new.sigma:.2g}{new.unit}'
             )
     return found

@@ -35,7 +35,7 @@ image_axes.set_title('tracked points')
 
 # %% The same points on the road, if there is a metric ground plane.
 if result and result.ground is not None and result.ground.metric:
-    print(f'focal length {result.camera.focal_px:.1f} +- {result.stddev.focal_px or 0.0:.1f} px, grade {result.grade}')
+    print(f'focal length {result.camera.focal_px:.1f} ± {result.stddev.focal_px or 0.0:.1f} px, grade {result.grade}')
     ground = Ground.of(result)
     grid_m = np.array([[x, y] for x in range(0, 45, 5) for y in range(-15, 20, 5)], float)
     pixels, seen = ground.pixels(grid_m)

@@ -33,7 +33,7 @@ def test_solution_of_this_run_is_replaced_by_one_that_is_as_precise_whatever_it_
     newer = calibration(400.0)
     decision = reconcile(CALIBRATED, KEPT, newer)
     assert (decision.state, decision.calibration) == (CALIBRATED, newer)
-    assert 'focal length before 300 +- 1 px, new 400 +- 1 px' in decision.text
+    assert 'focal length before 300 ± 1 px, new 400 ± 1 px' in decision.text
 
 
 def test_vague_solution_that_agrees_changes_nothing():
@@ -44,7 +44,7 @@ def test_traffic_that_contradicts_degrades_and_twice_in_a_row_replaces():
     contrary = calibration(330.0, sigmas=3.0)
     first = reconcile(CALIBRATED, KEPT, contrary)
     assert (first.state, first.calibration) == (DEGRADED, KEPT)
-    assert 'focal length before 300 +- 1 px, new 330 +- 3 px' in first.text
+    assert 'focal length before 300 ± 1 px, new 330 ± 3 px' in first.text
     again = reconcile(DEGRADED, KEPT, contrary)
     assert (again.state, again.calibration) == (CALIBRATED, contrary)
     assert reconcile(DEGRADED, KEPT, VAGUE).state is CALIBRATED  # it was an episode
@@ -73,10 +73,10 @@ def test_solution_that_agrees_and_is_as_precise_takes_over():
 @pytest.mark.parametrize(
     ('fresh', 'expected'),
     [
-        (calibration(310.0, sigmas=3.0), 'focal length before 300 +- 1 px, new 310 +- 3 px'),
-        (calibration(tilt_deg=14.5, sigmas=3.0), 'tilt before 12.3 +- 0.2 deg, new 14.5 +- 0.6 deg'),
+        (calibration(310.0, sigmas=3.0), 'focal length before 300 ± 1 px, new 310 ± 3 px'),
+        (calibration(tilt_deg=14.5, sigmas=3.0), 'tilt before 12.3 ± 0.2 deg, new 14.5 ± 0.6 deg'),
         (calibration(roll_deg=3.0, sigmas=3.0), 'roll'),
-        (calibration(height_m=8.7, sigmas=3.0), 'height before 8.1 +- 0.05 m, new 8.7 +- 0.15 m'),
+        (calibration(height_m=8.7, sigmas=3.0), 'height before 8.1 ± 0.05 m, new 8.7 ± 0.15 m'),
         (replace(VAGUE, camera=replace(VAGUE.camera, principal_point_px=(340.0, 179.5))), 'principal point x'),
     ],
 )

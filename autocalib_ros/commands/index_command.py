@@ -21,8 +21,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Write the page; return the exit status."""
-    from autocalib_ros.report.index_page import write_index
+    from autocalib_ros.report.index_page import count_of_cameras, write_index
 
     path, cameras = write_index(arguments.folder)
-    print(f'Written to {path}: {cameras} cameras')
+    print(f'Written to {path}: {count_of_cameras(cameras)}')
     return DONE

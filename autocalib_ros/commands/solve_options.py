@@ -53,16 +53,14 @@ def add_solve_options(parser: argparse.ArgumentParser) -> None:
         help='country whose standards give lane width and dash period, as far as dashes of lane lines are seen',
     )
     known.add_argument(
-        '--lane-width', type=float, metavar='W', help='width of the lanes in metres, line to line, +- 4 %%'
+        '--lane-width', type=float, metavar='W', help='width of the lanes in metres, line to line, ± 4 %%'
     )
     known.add_argument(
-        '--dash-period', type=float, metavar='P', help='length of a dash and its gap together in metres, +- 2 %%'
+        '--dash-period', type=float, metavar='P', help='length of a dash and its gap together in metres, ± 2 %%'
     )
     lens = known.add_mutually_exclusive_group()
-    lens.add_argument(
-        '--focal-px', type=float, metavar='F', help='focal length from the data sheet in pixels, +- 10 %%'
-    )
-    lens.add_argument('--hfov-deg', type=float, metavar='A', help='field of view across the image in degrees, +- 10 %%')
+    lens.add_argument('--focal-px', type=float, metavar='F', help='focal length from the data sheet in pixels, ± 10 %%')
+    lens.add_argument('--hfov-deg', type=float, metavar='A', help='field of view across the image in degrees, ± 10 %%')
     known.add_argument('--focal-sigma-px', type=float, metavar='S', help='standard deviation of --focal-px')
     known.add_argument(
         '--roll-sigma-deg',

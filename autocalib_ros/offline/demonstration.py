@@ -139,5 +139,5 @@ def compare_with_truth(result: Calibration | Refusal, truth: dict[str, Any]) -> 
         float(angle),
         result.ground.height_m - truth['camera']['height'],
         distance_error_percent(result.camera, result.ground, truth),
-        'given' if sigma is None else f'stated +- {sigma:.2g} m',
+        'given' if sigma is None else f'stated ± {sigma:.2g} m',
     )

@@ -104,16 +104,16 @@ def replay(
         start_solving=start_solving,
     )
     joint = JoinedEvidence(options.gate, before)
-    gathered = _gather_all(sources, options, control, joint, lens, detector)
+    gathered, read = _gather_all(sources, options, control, joint, lens, detector)
     if not joint:
         raise InputError('no evidence: there is no recording to read')
     evidence, frames = joint.all(), sum(one.frames for one in gathered)
     if on_checkpoint is not None:
         on_checkpoint(evidence)
-    control.report(frames, 'solving')
+    control.report(read, 'solving')
     on_last_solution()
     result = solve(evidence, options, lens=scaled(lens, evidence.image_size))
-    control.report(frames, 'calibrated' if result else 'refused')
+    control.report(read, 'calibrated' if result else 'refused')
     trials = gathered[0].trials if len(gathered) == 1 and before is None else None
     if trials is not None:
         trials.finish()
@@ -153,8 +153,11 @@ def _gather_all(
     joint: JoinedEvidence,
     lens: Camera | None,
     detector: VehicleDetector | None,
-) -> list[GatheredEvidence]:
-    """Read the recordings one after the other and join their evidence; return what those that fit gave."""
+) -> tuple[list[GatheredEvidence], int]:
+    """Read the recordings one after the other and join their evidence.
+
+    Return what those that fit gave, and how many images are done, those of recordings that are left out among them.
+    """
     gathered: list[GatheredEvidence] = []
     # a live stream goes on while a solution takes its time
     alone = len(sources) == 1 and not joint and not sources[0].is_live
@@ -170,13 +173,14 @@ def _gather_all(
             if len(sources) == 1 and not joint:
                 raise
             LOG.warning('left out: %s', error)
+            frames += source.total or 0
             continue
         frames += found.frames
         if joint.add(found.evidence, source.name):
             gathered.append(found)
         if found.stopped:
             break
-    return gathered
+    return gathered, frames
 
 
 def solve_evidence(evidence: Evidence, options: Options, lens: Camera | None = None) -> ReplayResult:

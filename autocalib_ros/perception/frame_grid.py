@@ -32,7 +32,7 @@ MAX_SIGMA = 0.35
 """Largest robust standard deviation of a jitter, fraction of the period; 0.29 is that of times at random."""
 MIN_INDEPENDENCE, MIN_INDEPENDENCE_FOUND = 0.8, 1.2
 """Least Durbin-Watson statistic of the residuals of a grid in use, and of one to be taken: jitter around a regular grid
-leaves 2 +- 0.4 with 24 images, intervals that are irregular themselves leave residuals that wander, below 0.8.
+leaves 2 ± 0.4 with 24 images, intervals that are irregular themselves leave residuals that wander, below 0.8.
 """
 MATTERS = 0.05
 """Robust standard deviation, fraction of the period, below which it does not matter what the residuals do."""

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from autocalib_ros.util.plain_text import in_ascii
+
 INK, PAPER, GREY = '#1c2733', '#ffffff', '#9aa5ae'
 ROAD_COLOURS = ('#0077bb', '#ee7733', '#009988', '#cc3377', '#ddaa33')
 """One per road direction; distinguishable with all common forms of colour blindness (Paul Tol, vibrant)."""
@@ -70,7 +72,7 @@ def _fixed_point(path: np.ndarray) -> np.ndarray:
 
 def text_size(text: str, text_height: float) -> tuple[int, int]:
     """Return the width and the line height of a text in pixels."""
-    (width, _), _ = cv2.getTextSize(text, FONT, text_height / FONT_HEIGHT_PX, stroke_px(text_height))
+    (width, _), _ = cv2.getTextSize(in_ascii(text), FONT, text_height / FONT_HEIGHT_PX, stroke_px(text_height))
     return width, round(text_height)
 
 
@@ -81,10 +83,9 @@ def stroke_px(text_height: float) -> int:
 
 def draw_text(picture: np.ndarray, text: str, left: float, top: float, text_height: float, colour: str) -> None:
     """Draw one line of text with its upper left corner at (left, top); the OpenCV font has ASCII only."""
-    plain = text.encode('ascii', 'replace').decode()
     cv2.putText(
         picture,
-        plain,
+        in_ascii(text),
         (round(left), round(top + 0.75 * text_height)),
         FONT,
         text_height / FONT_HEIGHT_PX,

@@ -151,4 +151,4 @@ def _add_captions(overlay: Overlay, known: SavedCamera, ground: GroundPlane, row
 
 
 def _with_sigma(value: float, sigma: float | None) -> str:
-    return f'{value:.1f}' if sigma is None else f'{value:.1f} +- {sigma:.1f}'
+    return f'{value:.1f}' if sigma is None else f'{value:.1f} ± {sigma:.1f}'

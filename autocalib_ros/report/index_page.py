@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-import base64
 import os
 from dataclasses import dataclass
 from datetime import datetime, timezone
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-import cv2
-from jinja2 import Environment, StrictUndefined
-
-from autocalib_ros import __version__
 from autocalib_ros.errors import AutocalibError, InputError
 from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
 from autocalib_ros.perception.image_file import read_image
-from autocalib_ros.report.canvas import jpeg
+from autocalib_ros.report.rendering import data_address, render_page
 from autocalib_ros.results.calibration import Calibration
 from autocalib_ros.results.calibration_json import calibration_from_json, read_json_object
 from autocalib_ros.util.files import write_atomically
@@ -27,9 +21,17 @@ RESULT, REPORT_PAGE = 'calibration.json', 'report.html'
 THUMBNAILS = ('ground_grid', 'coverage', 'all_tracks')
 """Figures of a report of which the first one that exists is shown."""
 THUMBNAIL_PX = 320
-MAX_CAMERAS = 1000
+MAX_PICTURES = 1000
+"""Most cameras that are shown with a picture, each 15 kB; the page says so."""
 ORDER = ('refused', 'unreadable', 'partial', 'calibrated')
 """What needs attention comes first."""
+STATE_WORDS = {
+    'refused': 'refused',
+    'unreadable': 'unreadable',
+    'partial': 'with an assumption, or without a scale',
+    'calibrated': 'calibrated',
+}
+"""What the states are called on the page."""
 
 
 @dataclass(frozen=True)
@@ -49,8 +51,8 @@ class CameraEntry:
     when: str
     report: str
     """Address of its report relative to the page; '' without one."""
-    thumbnail: str
-    """Data address of a picture; '' without one."""
+    figures: Path
+    """Folder in which a picture may be."""
 
 
 def write_index(folder: Path) -> tuple[Path, int]:
@@ -58,19 +60,26 @@ def write_index(folder: Path) -> tuple[Path, int]:
 
     InputError if there is none, or if it cannot be written.
     """
-    found = sorted(folder.rglob(RESULT))[:MAX_CAMERAS]
+    found = sorted(folder.rglob(RESULT))
     if not found:
         raise InputError(f'there is no {RESULT} in {folder} or below it')
     entries = sorted((_entry(path, folder) for path in found), key=lambda one: (ORDER.index(one.state), one.name))
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    template = (files('autocalib_ros.report') / 'templates' / 'index.html.j2').read_text(encoding='utf-8')
-    counts = [(state, sum(one.state == state for one in entries)) for state in ORDER]
-    page = environment.from_string(template).render(
-        entries=entries, counts=[(state, count) for state, count in counts if count], version=__version__
+    counts = [(STATE_WORDS[state], sum(one.state == state for one in entries)) for state in ORDER]
+    page = render_page(
+        'index.html.j2',
+        title=count_of_cameras(len(entries)),
+        entries=[(one, _thumbnail(one.figures) if index < MAX_PICTURES else '') for index, one in enumerate(entries)],
+        counts=[(words, count) for words, count in counts if count],
+        max_pictures=MAX_PICTURES if len(entries) > MAX_PICTURES else 0,
     )
     path = folder / 'index.html'
     write_atomically(path, page)
     return path, len(entries)
+
+
+def count_of_cameras(count: int) -> str:
+    """Return a number of cameras in words."""
+    return f'{count} camera{"" if count == 1 else "s"}'
 
 
 def _entry(path: Path, folder: Path) -> CameraEntry:
@@ -78,8 +87,8 @@ def _entry(path: Path, folder: Path) -> CameraEntry:
     when = datetime.fromtimestamp(path.stat().st_mtime, timezone.utc).strftime('%Y-%m-%d %H:%M UTC')
     report = path.with_name(REPORT_PAGE)
     address = quote(os.path.relpath(report, folder)) if report.exists() else ''
-    common = {'name': name, 'when': when, 'report': address, 'thumbnail': _thumbnail(path.parent / 'figures')}
-    nothing = dict.fromkeys(('grade', 'focal', 'tilt', 'height', 'lengths'), '')
+    common: dict[str, Any] = {'name': name, 'when': when, 'report': address, 'figures': path.parent / 'figures'}
+    nothing: dict[str, Any] = dict.fromkeys(('grade', 'focal', 'tilt', 'height', 'lengths'), '')
     try:
         document = read_json_object(path)
         if document.get('state') == 'refused':
@@ -118,6 +127,4 @@ def _thumbnail(figures: Path) -> str:
         picture = read_image(found)
     except InputError:
         return ''
-    size = (THUMBNAIL_PX, max(1, picture.shape[0] * THUMBNAIL_PX // picture.shape[1]))
-    small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
-    return 'data:image/jpeg;base64,' + base64.b64encode(jpeg(small)).decode()
+    return data_address(picture, THUMBNAIL_PX)

@@ -7,15 +7,12 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
-from jinja2 import Environment, StrictUndefined
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
-from autocalib_ros import __version__
 from autocalib_ros.errors import InputError
 from autocalib_ros.report import (
     direction_figures,
@@ -30,6 +27,7 @@ from autocalib_ros.report import (
 from autocalib_ros.report.canvas import STYLE, jpeg, png, render_bgr
 from autocalib_ros.report.figure_process import FigureProcess
 from autocalib_ros.report.next_command import next_command
+from autocalib_ros.report.rendering import render_page, template_text
 from autocalib_ros.report.requirements import needs
 from autocalib_ros.report.ruler import ruler_data
 from autocalib_ros.report.scene import ReportScene
@@ -339,16 +337,14 @@ def _write_figures(folder: Path, pictures: dict[str, bytes]) -> None:
 
 
 def _page(scene: ReportScene, drawn: list[DrawnFigure]) -> str:
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    template = environment.from_string(_template('report.html.j2'))
     result, found = scene.result, scene.calibration
     chapters = [(chapter, [one for one in drawn if one.entry.chapter == chapter]) for chapter in CHAPTERS]
-    return template.render(
+    return render_page(
+        'report.html.j2',
         verdict=headline(result),
         measured=measured(result),
         state=_state(result),
         source=scene.source,
-        version=__version__,
         how_sure=how_sure(result),
         contradictions=contradictions(result),
         next_step=next_step(result),
@@ -367,12 +363,8 @@ def _page(scene: ReportScene, drawn: list[DrawnFigure]) -> str:
         verification=found.verification if found else (),
         chapters=[(chapter, figures) for chapter, figures in chapters if figures],
         ruler=ruler_data(scene),
-        ruler_script=_template('ruler.js'),
+        ruler_script=template_text('ruler.js'),
     )
-
-
-def _template(name: str) -> str:
-    return (files('autocalib_ros.report') / 'templates' / name).read_text(encoding='utf-8')
 
 
 def _state(result: Calibration | Refusal) -> str:

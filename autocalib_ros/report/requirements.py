@@ -11,7 +11,7 @@ from autocalib_ros.evidence.stillness import drift_limit_px
 from autocalib_ros.report.text import sentence
 from autocalib_ros.results.calibration import Calibration, Refusal
 from autocalib_ros.results.refusals import BY_CODE
-from autocalib_ros.results.statements import Value
+from autocalib_ros.results.statements import Value, in_words
 
 USUAL_RECORDING_S = 10.0
 """Shortest recording in which traffic is usually enough, seconds: a vehicle takes some through the picture."""
@@ -19,8 +19,8 @@ NUMBERS = {
     'no_agreement': ('lens curvature seen in straight traffic', '{contrast:.2f}', 'at least {limit:g}'),
     'turning_traffic': ('vehicles that follow straight roads', '{fraction:.0%}', 'at least {limit:.0%}'),
     'horizon': ('traffic above the horizon', '{fraction:.0%}', 'at most {limit:.0%}'),
-    'too_little_curvature': ('focal length', '± {sigma:.0%}', 'at most ± {limit:.0%}'),
-    'too_little_turning': ('focal length', '± {sigma:.0%}', 'at most ± {limit:.0%}'),
+    'too_little_curvature': ('focal length', '{sigma:±.0%}', 'at most ± {limit:.0%}'),
+    'too_little_turning': ('focal length', '{sigma:±.0%}', 'at most ± {limit:.0%}'),
     'lens_model': ('lens unlike a usual one', '{sigmas:.1f} sigma', 'at most {limit:g} sigma'),
     'one_direction': ('tracks across the main road', '{across}', 'at least {limit}'),
     'plane_uncertain': ('ground normal', '± {sigma_deg:.1f} degrees', 'at most ± {limit_deg:g} degrees'),
@@ -30,7 +30,7 @@ NUMBERS = {
         '± {along:.0%} along the view, ± {across:.0%} across it',
         'grade {least}: at most ± {limit:.0%}',
     ),
-    'scale_uncertain': ('camera height', '± {sigma:.0%}', 'at most ± {limit:.0%}'),
+    'scale_uncertain': ('camera height', '{sigma:±.0%}', 'at most ± {limit:.0%}'),
     'too_few_tracks': ('tracks that are long and straight enough', '{tracks}', 'at least {limit}'),
 }
 """Name, value and limit of the requirement of a code, as templates of the numbers of its message."""
@@ -115,10 +115,10 @@ def _of_code(code: str, values: Mapping[str, Value]) -> ReportRequirement | None
     if templates is None:
         return None
     try:
-        name, found, needed = (text.format(**values) for text in templates)
+        name, found, needed = (in_words(text, values) for text in templates)
     except (KeyError, ValueError, TypeError):  # another cause of the code, or numbers that a file does not have
         return None
-    return ReportRequirement(name, found.replace('± 999%', 'unknown'), needed, False)
+    return ReportRequirement(name, found, needed, False)
 
 
 def _further_numbers(values: Mapping[str, Value]) -> dict[str, Value]:

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import base64
 from typing import Any
 
-import cv2
 import numpy as np
 
 from autocalib_ros.ground import PERTURBATION_SIGMAS, Ground
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.pictures.views import TopView, resample
-from autocalib_ros.report.canvas import jpeg
+from autocalib_ros.report.rendering import data_address
 from autocalib_ros.report.road_figures import top_view_extent
 from autocalib_ros.report.scene import ReportScene
 
@@ -41,7 +39,7 @@ def ruler_data(scene: ReportScene) -> dict[str, Any] | None:
         'sigmas': PERTURBATION_SIGMAS,
         'click_px': CLICK_SIGMA_PX,
         'size': [camera.width, camera.height],
-        'image': _embedded(scene.background, MAX_RULER_PX),
+        'image': data_address(scene.background, MAX_RULER_PX),
     }
     view = top_view_extent(scene, RULER_TOP_VIEW_PX)
     if view is not None:
@@ -52,7 +50,7 @@ def ruler_data(scene: ReportScene) -> dict[str, Any] | None:
 def _top(scene: ReportScene, view: TopView) -> dict[str, Any]:
     picture = resample(np.asarray(scene.background), view.sources(scene.calibrated.camera, scene.ground))
     return {
-        'image': _embedded(picture[:, :, :3] if picture.ndim == 3 else picture, RULER_TOP_VIEW_PX),
+        'image': data_address(picture[:, :, :3] if picture.ndim == 3 else picture, RULER_TOP_VIEW_PX),
         'size': [view.columns, view.rows],
         'low': [float(value) for value in view.low_m],
         'high': [float(value) for value in view.high_m],
@@ -63,11 +61,3 @@ def _numbers(camera: Camera, rotation: np.ndarray, camera_m: np.ndarray) -> list
     """Return focal length, principal point, k1 to k4, pixel aspect, skew, ground_from_camera by rows, and position."""
     lens = [camera.focal_px, *camera.principal_point_px, *camera.k, camera.pixel_aspect, camera.skew]
     return [float(value) for value in (*lens, *rotation.ravel(), *camera_m)]
-
-
-def _embedded(picture: np.ndarray, longest_px: int) -> str:
-    """Return a picture as a data address, reduced to a longest side."""
-    factor = min(1.0, longest_px / max(picture.shape[:2]))
-    if factor < 1.0:
-        picture = cv2.resize(picture, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
-    return 'data:image/jpeg;base64,' + base64.b64encode(jpeg(picture)).decode()

@@ -297,7 +297,7 @@ def next_step(result: Calibration | Refusal) -> str:
     check = 'Check that the ground grid lies flat along the road markings'
     size = next((each.values for each in result.checks if each.kind == 'vehicle_size'), None)
     if size and any(row.kind == 'vehicle_size' and row.contradicts for row in result.verification):
-        height = f'{size["usual_height_m"]:.3g} +- {size["usual_height_sigma_m"]:.2g} m'
+        height = f'{size["usual_height_m"]:.3g} ± {size["usual_height_sigma_m"]:.2g} m'
         return (
             f'Check the camera height, or the length or speed from which it follows: at {height} the vehicles would be '
             'as large as usual.'

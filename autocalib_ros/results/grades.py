@@ -45,7 +45,7 @@ class HelpfulMeasure:
     @property
     def text(self) -> str:
         """The measure in words, with the certainty to expect."""
-        return f'{MEASURES.get(self.kind, self.kind)} (lengths then +- {100 * self.expected:.2g} %)'
+        return f'{MEASURES.get(self.kind, self.kind)} (lengths then ± {100 * self.expected:.2g} %)'
 
 
 MEASURES = {

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from autocalib_ros.results.statements import Value, plain_values
+from autocalib_ros.results.statements import Value, in_words, plain_values
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ def reason(code: str, cause: str = '', **values: object) -> Reason:
     entry, plain = BY_CODE[code], plain_values(values)
     message, remedy = entry.variants[cause] if cause else (entry.message, '')
     told = {**plain, 'cause': cause} if cause else plain
-    return Reason(code, message.format(**plain), (remedy or entry.remedy).format(**plain), told)
+    return Reason(code, in_words(message, plain), in_words(remedy or entry.remedy, plain), told)
 
 
 OR = '; or '
@@ -183,8 +183,8 @@ REFUSALS = (
         'distortion-free lens without a known road angle or focal length',
         remedy=TELL_LENS,
         missing='lens curvature',
-        message='straight traffic shows too little lens curvature: focal length {focal_px:.0f} px +- {sigma:.1%} '
-        '(at most {limit:.0%} allowed)',
+        message='straight traffic shows too little lens curvature: focal length {focal_px:.0f} px, {sigma:±.1%} '
+        '(at most ± {limit:.0%} allowed)',
     ),
     RefusalCode(
         code='too_little_turning',
@@ -192,8 +192,8 @@ REFUSALS = (
         limit='gate.max_sigma_focal_rel (25 % of the focal length, one sigma)',
         remedy='wait for more vehicles that turn' + OR + TELL_LENS,
         missing='turning traffic',
-        message='turning traffic does not determine the lens: focal length {focal_px:.0f} px +- {sigma:.1%} '
-        '(at most {limit:.0%} allowed)',
+        message='turning traffic does not determine the lens: focal length {focal_px:.0f} px, {sigma:±.1%} '
+        '(at most ± {limit:.0%} allowed)',
     ),
     RefusalCode(
         code='lens_model',
@@ -234,7 +234,7 @@ REFUSALS = (
         'to the size in the file' + OR + 'leave the file out',
         missing='a lens that belongs to the images',
         message='the traffic contradicts the given lens: its focal length is {given_px:.1f} px, the traffic gives '
-        '{traffic_px:.1f} +- {sigma_px:.1f} px',
+        '{traffic_px:.1f} ± {sigma_px:.1f} px',
         variants={
             'outside': (
                 'the principal point of the given lens, ({x_px:.1f}, {y_px:.1f}), lies outside the images of '
@@ -243,17 +243,17 @@ REFUSALS = (
             ),
             'principal_point': (
                 'the traffic contradicts the given lens: its principal point is ({x_px:.1f}, {y_px:.1f}), the traffic '
-                'gives ({traffic_x_px:.1f}, {traffic_y_px:.1f}) +- {sigma_px:.1f} px',
+                'gives ({traffic_x_px:.1f}, {traffic_y_px:.1f}) ± {sigma_px:.1f} px',
                 '',
             ),
             'pixel_aspect': (
                 'the traffic contradicts the given lens: its pixels are {aspect:.3f} times as wide as high, the '
-                'traffic gives {traffic_aspect:.3f} +- {sigma:.3f}',
+                'traffic gives {traffic_aspect:.3f} ± {sigma:.3f}',
                 '',
             ),
             'angle': (
                 'the traffic contradicts the given lens: it images {given_deg:.1f} degrees from its axis at '
-                '{radius_px:.0f} px, the traffic gives {traffic_deg:.1f} +- {sigma_deg:.1f} degrees there',
+                '{radius_px:.0f} px, the traffic gives {traffic_deg:.1f} ± {sigma_deg:.1f} degrees there',
                 '',
             ),
         },
@@ -266,12 +266,12 @@ REFUSALS = (
         remedy='set lens.pixel_aspect, the width of a pixel over its height: 1 if the images are not squeezed, else '
         'the shape of the picture over that of the image (720x576 of a 16:9 picture: 1.422)',
         missing='the shape of the pixels',
-        message='pixels may be {aspect:.3g} times as wide as high: the traffic measures {measured:.2f} +- '
-        '{sigma:.2f}, and the focal length is +- {focal:.0%} with it (at most {limit:.0%} allowed)',
+        message='pixels may be {aspect:.3g} times as wide as high: the traffic measures {measured:.2f} ± '
+        '{sigma:.2f}, and the focal length is {focal:±.0%} with it (at most ± {limit:.0%} allowed)',
         variants={
             'undecided': (
                 'pixels of these images of {width}x{height} may be {aspect:.3g} times as wide as high: the traffic '
-                'measures {measured:.2f} +- {sigma:.2f}, which does not exclude {other:.3g}',
+                'measures {measured:.2f} ± {sigma:.2f}, which does not exclude {other:.3g}',
                 '',
             )
         },
@@ -311,10 +311,10 @@ REFUSALS = (
         remedy='{helpful}',
         missing='certainty of lengths on the road',
         message='the result is of grade {grade}, at least {least} is asked for: lengths on the road along the view '
-        '+- {along:.0%}, across it +- {across:.0%}',
+        '± {along:.0%}, across it ± {across:.0%}',
         variants={
             'lens': (
-                'the lens alone is known, and its focal length to +- {focal:.0%} only (10 % without a ground plane)',
+                'the lens alone is known, and its focal length to ± {focal:.0%} only (10 % without a ground plane)',
                 '{helpful}',
             ),
             'no_road_ahead': (
@@ -330,7 +330,7 @@ REFUSALS = (
         limit='gate.max_sigma_tilt_deg, 5 degrees (one sigma)',
         remedy='wait for more traffic on the quieter road',
         missing='a certain ground plane',
-        message='ground normal +- {sigma_deg:.1f} degrees (at most {limit_deg:g} allowed)',
+        message='ground normal ± {sigma_deg:.1f} degrees (at most {limit_deg:g} allowed)',
         variants={
             'level_road': (
                 'the road runs level across the image, where the roll of the camera does not determine the plane',
@@ -380,7 +380,7 @@ REFUSALS = (
                 '',
             ),
             'focal_length': (
-                'lane markings do not determine lens and plane: focal length +- {sigma:.1%} (at most {limit:.0%} '
+                'lane markings do not determine lens and plane: focal length {sigma:±.1%} (at most ± {limit:.0%} '
                 'allowed)',
                 '',
             ),
@@ -409,7 +409,7 @@ REFUSALS = (
         remedy='wait for more traffic, straight or turning',
         missing='traffic that confirms the lane markings',
         message='lane markings give a lens and a plane, but the traffic cannot confirm them: ground normal from '
-        'traffic +- {sigma_deg:.0f} degrees (at most {limit_deg:g} allowed)',
+        'traffic ± {sigma_deg:.0f} degrees (at most {limit_deg:g} allowed)',
         variants={
             'no_traffic': (
                 'lane markings give a lens and a plane, but no traffic confirms them',
@@ -483,7 +483,7 @@ REFUSALS = (
         limit='gate.max_sigma_height_rel, 50 % (one sigma)',
         remedy='give a longer distance on the road nearer to the camera' + OR + 'give the camera height',
         missing='a certain scale',
-        message='camera height {height_m:.2f} m +- {sigma:.0%} (at most {limit:.0%} allowed)',
+        message='camera height {height_m:.2f} m, {sigma:±.0%} (at most ± {limit:.0%} allowed)',
     ),
     RefusalCode(
         code='vanishing_points_disagree',

@@ -6,6 +6,7 @@ the kind and the numbers; logs, the report and the terminal print the text.
 
 from __future__ import annotations
 
+import string
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
@@ -13,6 +14,26 @@ import numpy as np
 
 Value = float | int | str | bool | None
 """What a statement may hold: everything that JSON can say in one item."""
+
+
+UNDETERMINED = 9.99
+"""Relative standard deviation from which a number is not determined, not even to a factor of ten; larger ones and
+infinity are stated as this one, since JSON has no infinity."""
+
+
+class _Words(string.Formatter):
+    """Templates of str.format in which a standard deviation may have the form '±.1%': '± 12.3%' or 'not determined'."""
+
+    def format_field(self, value: object, format_spec: str) -> str:
+        if not format_spec.startswith('±'):
+            return str(super().format_field(value, format_spec))
+        undetermined = isinstance(value, (int, float)) and value >= UNDETERMINED
+        return 'not determined' if undetermined else f'± {super().format_field(value, format_spec[1:])}'
+
+
+def in_words(template: str, values: Mapping[str, object]) -> str:
+    """Return a template filled with values."""
+    return _Words().vformat(template, (), values)
 
 
 @dataclass(frozen=True)
@@ -51,7 +72,7 @@ def plain_values(values: Mapping[str, object]) -> dict[str, Value]:
 def _worded(table: Mapping[str, Wording], kind: str, values: Mapping[str, object]) -> Statement:
     plain = plain_values(values)
     wording = table[kind]
-    text = wording.format(**plain) if isinstance(wording, str) else wording(**plain)
+    text = in_words(wording, plain) if isinstance(wording, str) else wording(**plain)
     return Statement(kind, text, plain)
 
 
@@ -67,13 +88,13 @@ FAMILY_NAMES = {
 
 
 def plus_minus(sigma: float | None, form: str = 'g') -> str:
-    """Return ' +- sigma', '' for an exact value."""
-    return f' +- {sigma:{form}}' if sigma else ''
+    """Return ' ± sigma', '' for an exact value."""
+    return f' ± {sigma:{form}}' if sigma else ''
 
 
 def _lens_family(family: str, k1_sigma: float) -> str:
     name, k1 = FAMILY_NAMES[family]
-    return f'{name}: k1 = {k1} +- {k1_sigma:.3g}'
+    return f'{name}: k1 = {k1} ± {k1_sigma:.3g}'
 
 
 def _principal_point(
@@ -83,8 +104,8 @@ def _principal_point(
     if covered:
         where += f', of which bars cover a part (seen: {picture}),'
     if sigma_down_px is not None:
-        return f'principal point at {where} +- {sigma_px:.0f} px across and {sigma_down_px:.0f} px down'
-    return f'principal point at {where}' + (f' +- {sigma_px:.0f} px' if sigma_px > 0 else '')
+        return f'principal point at {where} ± {sigma_px:.0f} px across and {sigma_down_px:.0f} px down'
+    return f'principal point at {where}' + (f' ± {sigma_px:.0f} px' if sigma_px > 0 else '')
 
 
 def _focal_given(focal_px: float, sigma_px: float) -> str:
@@ -105,17 +126,17 @@ def _lane_markings_difference(focal: float, normal_deg: float, used: bool) -> st
 def _crossing_angle(angle_deg: float, sigma_deg: float | None, source: str) -> str:
     if source == 'given':
         return f'roads cross at {angle_deg:g} degrees (given)'
-    measured = f'{angle_deg:.1f} +- {sigma_deg:.1f} degrees'
+    measured = f'{angle_deg:.1f} ± {sigma_deg:.1f} degrees'
     return (
         f'roads cross at {measured}'
         if source == 'measured'
-        else f'roads cross at 90 +- 1 degrees (measured: {measured})'
+        else f'roads cross at 90 ± 1 degrees (measured: {measured})'
     )
 
 
 def _transverse_edges(vehicles: int, sigma_deg: float, level_sigma_deg: float | None) -> str:
-    level = '' if level_sigma_deg is None else f' and of a level camera (roll 0 +- {level_sigma_deg:g} degrees)'
-    return f'plane across one road from edges of {vehicles} vehicles{level}: +- {sigma_deg:.1f} degrees about the road'
+    level = '' if level_sigma_deg is None else f' and of a level camera (roll 0 ± {level_sigma_deg:g} degrees)'
+    return f'plane across one road from edges of {vehicles} vehicles{level}: ± {sigma_deg:.1f} degrees about the road'
 
 
 def _height_note(height_m: float | None, height_sigma_m: float | None) -> str:
@@ -137,8 +158,8 @@ def _scale_distance(
     height_sigma_m: float | None = None,
 ) -> str:
     return (
-        f'scale from {distance_m:g} +- {distance_sigma_m:g} m on the road between the pixels {pixels}, each '
-        f'+- {pixel_sigma_px:g} px (given){_height_note(height_m, height_sigma_m)}'
+        f'scale from {distance_m:g} ± {distance_sigma_m:g} m on the road between the pixels {pixels}, each '
+        f'± {pixel_sigma_px:g} px (given){_height_note(height_m, height_sigma_m)}'
     )
 
 
@@ -153,8 +174,8 @@ def _scale_speed(
     height_sigma_m: float | None = None,
 ) -> str:
     return (
-        f'scale from a mean speed of {speed_km_h:g} +- {speed_sigma_km_h:g} km/h (given) of {vehicles} vehicles on the '
-        f'busiest road (their speeds vary by {variation:.0%}), tracked {point_height_m:g} +- '
+        f'scale from a mean speed of {speed_km_h:g} ± {speed_sigma_km_h:g} km/h (given) of {vehicles} vehicles on the '
+        f'busiest road (their speeds vary by {variation:.0%}), tracked {point_height_m:g} ± '
         f'{point_height_sigma_m:g} m above it{_height_note(height_m, height_sigma_m)}'
     )
 
@@ -172,7 +193,7 @@ def _scale_lanes(
     height_sigma_m: float | None = None,
 ) -> str:
     return (
-        f'scale from lanes {width_m:g} +- {width_sigma_m:.2g} m wide ({_told(source)}), seen in {places} places'
+        f'scale from lanes {width_m:g} ± {width_sigma_m:.2g} m wide ({_told(source)}), seen in {places} places'
         f'{_height_note(height_m, height_sigma_m)}'
     )
 
@@ -186,7 +207,7 @@ def _scale_dashes(
     height_sigma_m: float | None = None,
 ) -> str:
     return (
-        f'scale from dashes of lane lines every {period_m:g} +- {period_sigma_m:.2g} m ({_told(source)}), {spacings} '
+        f'scale from dashes of lane lines every {period_m:g} ± {period_sigma_m:.2g} m ({_told(source)}), {spacings} '
         f'spacings seen{_height_note(height_m, height_sigma_m)}'
     )
 
@@ -203,7 +224,7 @@ def _vehicle_size(
     cars = '' if width_m is None else f' (cars {width_m:.2g} m wide, {usual_width_m:g} m is usual)'
     return (
         f'{vehicles} vehicles are {ratio:.2f} times as large as usual at a camera height of {height_m:.3g} m{cars}; '
-        f'{usual_height_m:.3g} +- {usual_height_sigma_m:.2g} m would make them usual'
+        f'{usual_height_m:.3g} ± {usual_height_sigma_m:.2g} m would make them usual'
     )
 
 
@@ -221,7 +242,7 @@ def _scale_vehicles(
 ) -> str:
     return (
         f'scale from the size of {vehicles} vehicles, as no length is given: cars {car_m:g} m wide in the mean, '
-        f'+- {sigma:.0%}{_height_note(height_m, height_sigma_m)}'
+        f'± {sigma:.0%}{_height_note(height_m, height_sigma_m)}'
     )
 
 
@@ -242,24 +263,24 @@ ASSUMPTIONS: dict[str, Wording] = {
     'lens_given': 'the lens is given: only the pose was estimated',
     'lens_family': _lens_family,
     'lens_barrel': 'lens from equidistant (k1 = 0) to distortion-free (1/3), by how much straight traffic curves: k1 = '
-    '{k1:.2f} +- {sigma:.2f}',
-    'field_of_view': 'field of view across the image {view_deg:.0f} degrees (focal length +- {sigma:.0%}): usual '
+    '{k1:.2f} ± {sigma:.2f}',
+    'field_of_view': 'field of view across the image {view_deg:.0f} degrees (focal length ± {sigma:.0%}): usual '
     'ones are {usual_deg:.0f} degrees within a factor of {factor:.2f}',
     'principal_point': _principal_point,
     'focal_given': _focal_given,
-    'view_given': 'field of view across the image {view_deg:g} +- {sigma_deg:.2g} degrees (given)',
+    'view_given': 'field of view across the image {view_deg:g} ± {sigma_deg:.2g} degrees (given)',
     'pixel_aspect': _pixel_aspect,
     'squeezed_pixels': 'pixels {aspect:.4g} times as wide as high, a picture of {shape}: the traffic measures '
-    '{measured:.3f} +- {sigma:.3f} (log odds {log_odds:.0f} against square pixels)',
-    'nearly_square_pixels': 'pixels {aspect:.4f} +- {sigma:.4f} times as wide as high: {width}x{height} may be a '
+    '{measured:.3f} ± {sigma:.3f} (log odds {log_odds:.0f} against square pixels)',
+    'nearly_square_pixels': 'pixels {aspect:.4f} ± {sigma:.4f} times as wide as high: {width}x{height} may be a '
     'picture of another size, squeezed',
     'parameter_fixed': '{parameter} fixed at its prior: the traffic does not determine it',
     'crossing_angle': _crossing_angle,
-    'level_camera': 'plane across one road from a level camera: roll = 0 +- {sigma_deg:g} degrees',
+    'level_camera': 'plane across one road from a level camera: roll = 0 ± {sigma_deg:g} degrees',
     'transverse_edges': _transverse_edges,
-    'lane_changes': 'plane across one road from {vehicles} vehicles that change lanes: +- {sigma_deg:.1f} degrees '
+    'lane_changes': 'plane across one road from {vehicles} vehicles that change lanes: ± {sigma_deg:.1f} degrees '
     'about the road',
-    'lane_markings': '{lines} lane markings in {places} places taken as parallel or perpendicular: 90 +- {sigma_deg:g} '
+    'lane_markings': '{lines} lane markings in {places} places taken as parallel or perpendicular: 90 ± {sigma_deg:g} '
     'degrees (measured: {angle_deg:.1f})',
     'scale_height': _scale_height,
     'scale_distance': _scale_distance,
@@ -267,9 +288,9 @@ ASSUMPTIONS: dict[str, Wording] = {
     'scale_lanes': _scale_lanes,
     'scale_dashes': _scale_dashes,
     'scale_vehicles': _scale_vehicles,
-    'scale_combined': 'scale from {sources} measures together: camera height {height_m:.3f} +- {height_sigma_m:.2g} m',
+    'scale_combined': 'scale from {sources} measures together: camera height {height_m:.3f} ± {height_sigma_m:.2g} m',
     'mended_pose': 'pose turned with the camera, by what the picture shows: pan {pan_deg:+.2f}, tilt {tilt_deg:+.2f}, '
-    'roll {roll_deg:+.2f} degrees (+- {sigma_deg:.2f})',
+    'roll {roll_deg:+.2f} degrees (± {sigma_deg:.2f})',
     'paper_lens': 'equidistant lens with the principal point at the centre of the picture',
     'paper_roads': 'the two roads are perpendicular',
     'paper_uncertainty': 'the published method gives no uncertainty',
@@ -297,7 +318,7 @@ CHECKS: dict[str, Wording] = {
     'halves': _halves,
     'halves_not_compared': 'not cross-validated in time: the earlier or the later half has too little traffic',
     'edges_and_level': 'edges of vehicles and a level camera differ by {difference_deg:.1f} degrees about the road',
-    'lane_changes': '{vehicles} vehicles that change lanes (+- {sigma_deg:.1f} degrees about the road) differ by '
+    'lane_changes': '{vehicles} vehicles that change lanes (± {sigma_deg:.1f} degrees about the road) differ by '
     '{difference_deg:.1f} degrees from the assumed plane',
     'vehicle_size': _vehicle_size,
     'usual_speed': 'at this scale half of the vehicles drive faster than {speed_km_h:.0f} km/h; up to {usual_km_h:.0f} '
@@ -305,8 +326,8 @@ CHECKS: dict[str, Wording] = {
     'usual_lanes': 'at this scale lanes are {width_m:.2g} m wide; {low_m:.3g} to {high_m:.3g} m are usual',
     'usual_dashes': 'at this scale dashes of lane lines repeat every {period_m:.3g} m; {low_m:.3g} to {high_m:.3g} m '
     'are usual: the scale or the focal length is wrong',
-    'known_lengths': '{first} means a camera height of {first_m:.3g} +- {first_sigma_m:.2g} m, {second} one of '
-    '{second_m:.3g} +- {second_sigma_m:.2g} m: they differ by {sigmas:.1f} standard deviations of what the traffic '
+    'known_lengths': '{first} means a camera height of {first_m:.3g} ± {first_sigma_m:.2g} m, {second} one of '
+    '{second_m:.3g} ± {second_sigma_m:.2g} m: they differ by {sigmas:.1f} standard deviations of what the traffic '
     'leaves open',
     'lane_dashes': _lane_dashes,
     'lane_markings': _lane_markings_difference,
@@ -314,11 +335,11 @@ CHECKS: dict[str, Wording] = {
     'degrees ({sigma_deg:.1f} expected)',
     'markings_and_traffic_road': 'road of the traffic and the markings along it differ by {difference_deg:.1f} degrees '
     '({sigma_deg:.1f} expected)',
-    'given_focal': 'the road alone shows a focal length of {road_px:.0f} +- {road_sigma_px:.0f} px; {given_px:.0f} px '
+    'given_focal': 'the road alone shows a focal length of {road_px:.0f} ± {road_sigma_px:.0f} px; {given_px:.0f} px '
     'are given, and believed with a probability of {believed:.0%}',
-    'given_lens': 'traffic gives a focal length of {traffic_px:.1f} +- {sigma_px:.1f} px, the given lens has '
+    'given_lens': 'traffic gives a focal length of {traffic_px:.1f} ± {sigma_px:.1f} px, the given lens has '
     '{given_px:.1f} px',
-    'pixel_aspect': 'traffic measures pixels {measured:.3f} +- {sigma:.3f} times as wide as high, '
+    'pixel_aspect': 'traffic measures pixels {measured:.3f} ± {sigma:.3f} times as wide as high, '
     '{sigmas:.1f} sigma from square: standard deviations cover {aspect:.3g}',
     'pedestrians_kept': 'pedestrian tracks kept in the plane estimate; without them: {without}',
     'distortion_model': 'camera_info uses {model}: at most {error_px:.2g} px off anywhere in the image',

@@ -72,7 +72,7 @@ def test_a_focal_length_of_another_mode_is_refused_with_both_numbers(
     found = refused(two_roads, given)
     assert found.values['given_px'] == pytest.approx(given.focal_px)
     assert found.values['traffic_px'] == pytest.approx(right.focal_px, rel=0.01)
-    assert f'{given.focal_px:.1f} px' in found.message and f'{right.focal_px:.1f} +-' in found.message
+    assert f'{given.focal_px:.1f} px' in found.message and f'{right.focal_px:.1f} ±' in found.message
 
 
 def test_a_matrix_that_was_not_scaled_to_the_images_is_refused(two_roads: Evidence, right: Camera) -> None:

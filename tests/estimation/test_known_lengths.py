@@ -119,7 +119,7 @@ def test_dashes_that_contradict_the_height_are_named_with_both_numbers() -> None
     row = next(row for row in result.comparisons if row.kind == 'known_lengths')
     text = next(statement.text for statement in result.checks if statement.kind == 'known_lengths')
     assert not row.passed
-    assert text.startswith('the given camera height means a camera height of 40 +- 0.04 m, the ')
+    assert text.startswith('the given camera height means a camera height of 40 ± 0.04 m, the ')
     assert not [each for each in told(ROAD.height_m, dash_period_m=12.0).checks if each.kind == 'known_lengths']
 
 

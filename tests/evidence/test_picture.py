@@ -140,12 +140,12 @@ def test_evidence_in_images_of_another_size_scales_its_picture() -> None:
 @pytest.mark.parametrize(
     ('values', 'words'),
     [
-        ({}, 'at the image centre +- 6 px'),
-        ({'picture': str(BELOW)}, 'at the centre of the picture (640x360 at (0, 0) in images of 640x480) +- 6 px'),
+        ({}, 'at the image centre ± 6 px'),
+        ({'picture': str(BELOW)}, 'at the centre of the picture (640x360 at (0, 0) in images of 640x480) ± 6 px'),
         (
             {'picture': str(COVERED), 'covered': True, 'sigma_down_px': 30.7},
             'at the image centre, of which bars cover a part (seen: 640x300 at (0, 0) in images of 640x360), '
-            '+- 6 px across and 31 px down',
+            '± 6 px across and 31 px down',
         ),
     ],
 )

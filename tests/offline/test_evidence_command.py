@@ -173,13 +173,13 @@ def test_the_speed_of_the_traffic_gives_the_height(without_height):
     assert (status, found['grade']) == (0, 'fair')  # the height is as uncertain as the speed and the tracked height
     height, sigma = found['ground_from_camera']['translation_m'][2], found['stddev']['height_m']
     assert height == pytest.approx(JUNCTION.height_m, abs=3 * sigma) and sigma < 0.15 * JUNCTION.height_m
-    assert found['assumptions'][-1]['text'].startswith('scale from a mean speed of 34.2 +- 2 km/h')
+    assert found['assumptions'][-1]['text'].startswith('scale from a mean speed of 34.2 ± 2 km/h')
 
 
 def test_the_height_and_its_source_are_summed_up(without_height):
     _, stdout, _ = without_height('--camera-height', '8', '-p', 'camera_height_sigma=0.1')
     assert re.search(r'camera height +8.00 m +± 0.10\n', stdout)
-    assert 'assumed:    scale from the camera height of 8 +- 0.1 m (given)' in stdout
+    assert 'assumed:    scale from the camera height of 8 ± 0.1 m (given)' in stdout
 
 
 def test_a_distance_above_the_horizon_leaves_the_lens(without_height):

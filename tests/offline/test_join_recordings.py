@@ -96,8 +96,9 @@ class Road:
 @pytest.mark.render
 def test_clips_of_one_view_are_replayed_as_one_and_another_view_is_left_out():
     clips = [Road('a', 0, 1), Road('b', 1, 2), Road('c', 0, 3)]
-    stored = []
-    replayed = replay(clips, Options(), on_checkpoint=stored.append)
+    stored, told = [], []
+    replayed = replay(clips, Options(), lambda done, note: told.append((done, note)), on_checkpoint=stored.append)
+    assert told[-1] == (sum(clip.total for clip in clips), 'refused')  # of all that was read
     assert replayed.frames == 100 and replayed.evidence.frames == 100
     assert [line.split(' is left out')[0] for line in replayed.left_out] == ['b']
     assert [one.name.split('#')[0] for one in replayed.evidence.recordings] == ['a', 'c']

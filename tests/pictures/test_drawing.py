@@ -91,5 +91,5 @@ def test_an_overlay_covers_by_its_opacity():
 def test_text_is_written_in_ascii():
     pictures = [np.zeros((40, 200, 3), np.uint8) for _ in range(2)]
     draw_text(pictures[0], '20 ± 3', 5, 5, 20.0, PAPER)
-    draw_text(pictures[1], '20 ? 3', 5, 5, 20.0, PAPER)
+    draw_text(pictures[1], '20 +- 3', 5, 5, 20.0, PAPER)
     assert (pictures[0] == pictures[1]).all() and pictures[0].any()

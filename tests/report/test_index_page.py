@@ -41,6 +41,8 @@ def test_each_camera_has_a_card_and_what_needs_attention_comes_first(site):
 def test_the_command_says_what_it_wrote(site, tmp_path, capsys):
     assert main(['index', str(site)]) == 0
     assert capsys.readouterr().out == f'Written to {site / "index.html"}: 4 cameras\n'
+    assert main(['index', str(site / 'north')]) == 0
+    assert capsys.readouterr().out.endswith(': 1 camera\n')
     (tmp_path / 'empty').mkdir()
     with pytest.raises(InputError, match=r'there is no calibration\.json'):
         write_index(tmp_path / 'empty')
@@ -61,3 +63,11 @@ def test_a_file_that_is_a_list_is_a_card_and_no_end(site):
     (site / 'torn' / 'calibration.json').write_text('[]')
     path, cameras = write_index(site)
     assert cameras == 4 and 'it holds no names with values' in path.read_text()
+
+
+def test_cameras_beyond_the_most_pictures_are_shown_without_one_and_the_page_says_so(site, monkeypatch):
+    monkeypatch.setattr('autocalib_ros.report.index_page.MAX_PICTURES', 1)
+    path, cameras = write_index(site)
+    page = path.read_text()
+    assert cameras == 4 and page.count('<li class=') == 4 and '<img' not in page  # the first one has no picture
+    assert 'The first 1 are shown with a picture' in page

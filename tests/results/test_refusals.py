@@ -22,6 +22,7 @@ from autocalib_ros.evidence.stillness import MIN_DRIFT_LIMIT_PX, MIN_STILL_PART_
 from autocalib_ros.geometry.ground_plane import MIN_FRACTION_BELOW_HORIZON
 from autocalib_ros.lens.opencv_lens import MAX_MODEL_ERROR_PX
 from autocalib_ros.results.refusals import BY_CODE, REFUSALS, reason
+from autocalib_ros.results.statements import UNDETERMINED
 
 GATE, JOINT, PAPER = GateOptions(), JointOptions(), PaperOptions()
 LIMITS = {
@@ -81,3 +82,10 @@ def test_a_variant_has_its_own_message_and_the_usual_remedy_unless_it_names_anot
     )
     assert short.message.startswith('3 tracks are long enough') and short.remedy == BY_CODE['too_few_tracks'].remedy
     assert 'paper.window_s' in paper.remedy
+
+
+def test_a_number_that_is_not_determined_is_told_as_such_and_without_a_made_up_uncertainty():
+    known = reason('too_little_curvature', focal_px=293.0, sigma=0.312, limit=0.25).message
+    assert known.endswith('focal length 293 px, ± 31.2% (at most ± 25% allowed)')
+    unknown = reason('too_little_curvature', focal_px=293.0, sigma=UNDETERMINED, limit=0.25).message
+    assert unknown.endswith('focal length 293 px, not determined (at most ± 25% allowed)')

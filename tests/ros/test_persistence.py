@@ -27,7 +27,7 @@ def never(evidence, options, lens):
 
 
 def focal(focal_px: float, **more):
-    """Return a solver that finds this focal length, +- 1 px."""
+    """Return a solver that finds this focal length, ± 1 px."""
     return lambda evidence, options, lens: calibration(evidence, focal_px, **more)
 
 

@@ -30,7 +30,7 @@ from autocalib_ros.estimation.verification.gates import check_markings_view
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.ground_plane import unsigned_angle_deg
 from autocalib_ros.results.refusals import Reason, reason
-from autocalib_ros.results.statements import Statement, assumption
+from autocalib_ros.results.statements import UNDETERMINED, Statement, assumption
 
 MIN_ALIGNED_FRACTION = 0.1
 """Fraction of the segments along either direction: by chance it is a few per cent, and a single road's own markings are
@@ -77,7 +77,9 @@ def fit_to_markings(
     with_free_aspect = refine_grid(segments, free_aspect, best.camera, best.rotation, ANNEALING_WIDTHS_RAD[-1:])
     fit = _adjustment_of(_covering_others(segments, best, grids), tracks, config)
     if not fit.focal_sigma <= gate.max_sigma_focal_rel:
-        return reason('no_markings', 'focal_length', sigma=min(fit.focal_sigma, 9.99), limit=gate.max_sigma_focal_rel)
+        return reason(
+            'no_markings', 'focal_length', sigma=min(fit.focal_sigma, UNDETERMINED), limit=gate.max_sigma_focal_rel
+        )
     return check_markings_view(fit, tracks) or MarkingsFit(
         fit, _adjustment_of(with_free_aspect, tracks, config), _describe(segments, best)
     )

@@ -21,7 +21,7 @@ from autocalib_ros.estimation.pixels.aspect_hypotheses import AspectHypotheses
 from autocalib_ros.estimation.solution import Solution, same_change
 from autocalib_ros.estimation.verification.gates import check_plane
 from autocalib_ros.results.refusals import Reason, reason
-from autocalib_ros.results.statements import Statement, assumption, check
+from autocalib_ros.results.statements import UNDETERMINED, Statement, assumption, check
 from autocalib_ros.results.verification_table import verified
 
 FREEDOM = 10.0
@@ -236,7 +236,7 @@ def _clear_other(
 
 def _undecided(hypotheses: AspectHypotheses, aspect: float, measured: MeasuredAspect, other: float) -> Reason:
     width, height = hypotheses.size
-    sigma = min(measured.aspect * measured.sigma, 9.99)
+    sigma = min(measured.aspect * measured.sigma, UNDETERMINED)
     return reason(
         'pixel_aspect',
         'undecided',
@@ -296,7 +296,9 @@ def _widened(
     if not (np.isfinite(sigma) and covering.fit.focal_sigma <= gate.max_sigma_focal_rel):
         return _uncertain(measured, covering.fit, gate, against=against)
     uncertain = found.plane_refusal or check_plane(covering.plane, gate)
-    statement = check('pixel_aspect', aspect=against, measured=measured.aspect, sigma=min(sigma, 9.99), sigmas=sigmas)
+    statement = check(
+        'pixel_aspect', aspect=against, measured=measured.aspect, sigma=min(sigma, UNDETERMINED), sigmas=sigmas
+    )
     return replace(covering, plane_refusal=uncertain, reduced=True, checks=(*found.checks, statement))
 
 
@@ -306,8 +308,8 @@ def _uncertain(measured: MeasuredAspect, fit: Adjustment, gate: GateOptions, *, 
         'pixel_aspect',
         aspect=against,
         measured=measured.aspect,
-        sigma=min(sigma, 9.99),
-        focal=min(fit.focal_sigma, 9.99) if np.isfinite(sigma) else 9.99,
+        sigma=min(sigma, UNDETERMINED),
+        focal=min(fit.focal_sigma, UNDETERMINED) if np.isfinite(sigma) else UNDETERMINED,
         limit=gate.max_sigma_focal_rel,
     )
 

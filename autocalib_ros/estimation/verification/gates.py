@@ -36,7 +36,7 @@ from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.ground_plane import MIN_FRACTION_BELOW_HORIZON
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.results.refusals import Reason, reason
-from autocalib_ros.results.statements import Statement, check
+from autocalib_ros.results.statements import UNDETERMINED, Statement, check
 from autocalib_ros.results.verification_table import VerificationRow, verified
 
 MIN_STRAIGHT_FRACTION = 0.25
@@ -178,7 +178,7 @@ def check_focal_length(fit: Adjustment, gate: GateOptions, *, turned: bool) -> R
     if not (too_long or circular or not sigma <= needed):
         return None
     code = 'too_little_turning' if turned else 'too_little_curvature'
-    return reason(code, focal_px=camera.focal_px, sigma=min(sigma, 9.99), limit=needed)
+    return reason(code, focal_px=camera.focal_px, sigma=min(sigma, UNDETERMINED), limit=needed)
 
 
 def _check_lens_model(fit: Adjustment) -> Reason | None:

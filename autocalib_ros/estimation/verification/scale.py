@@ -19,7 +19,7 @@ from autocalib_ros.geometry.ground_plane import ground_points
 from autocalib_ros.geometry.robust_kernels import MAD_TO_SIGMA
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.results.refusals import Reason, reason
-from autocalib_ros.results.statements import Statement, Value, assumption
+from autocalib_ros.results.statements import UNDETERMINED, Statement, Value, assumption
 
 SIMILAR_HEIGHT_FACTOR = 1.25
 """Heights within this factor of the default weigh near and far points alike, so that nothing is estimated again."""
@@ -144,7 +144,9 @@ def check_scale(height: float, sigma: float, gate: GateOptions) -> Reason | None
     """Check a height against its total standard deviation."""
     if sigma <= gate.max_sigma_height_rel * height:
         return None
-    return reason('scale_uncertain', height_m=height, sigma=min(sigma / height, 9.99), limit=gate.max_sigma_height_rel)
+    return reason(
+        'scale_uncertain', height_m=height, sigma=min(sigma / height, UNDETERMINED), limit=gate.max_sigma_height_rel
+    )
 
 
 def is_unusual(height_m: float) -> bool:

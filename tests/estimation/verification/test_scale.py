@@ -168,7 +168,7 @@ def test_the_source_of_the_scale_stands_among_the_assumptions(result: Calibratio
     assert (source.values['distance_m'], source.values['distance_sigma_m']) == (10.0, 0.4)
     assert source.values['height_m'] == result.ground.height_m
     assert source.values['height_sigma_m'] == result.stddev.height_m
-    assert f'camera height {result.ground.height_m:.3f} +- {result.stddev.height_m:.2g} m' in source.text
+    assert f'camera height {result.ground.height_m:.3f} ± {result.stddev.height_m:.2g} m' in source.text
 
 
 @pytest.mark.solve
@@ -178,7 +178,7 @@ def test_road_points_are_as_unsure_as_the_scale(evidence: Evidence, result: Cali
         evidence, Options(joint=ONE_FAMILY, camera_height=result.ground.height_m, camera_height_sigma=0.4)
     )
     assert exact.stddev.height_m is None and given.stddev.height_m == 0.4
-    assert '+- 0.4 m (given)' in given.assumptions[-1].text and '+-' not in exact.assumptions[-1].text
+    assert '± 0.4 m (given)' in given.assumptions[-1].text and '±' not in exact.assumptions[-1].text
     for distance, without, with_sigma, by_tape in zip(
         (10.0, 20.0, 40.0),
         exact.stddev.ground_point_m,
@@ -338,7 +338,7 @@ def test_a_scale_less_sure_than_the_gate_is_refused_with_numbers(evidence: Evide
     assert isinstance(found, Calibration) and found.ground is None and found.grade == 'lens'
     reason = found.ground_refusal
     assert reason is not None and reason.code == 'scale_uncertain'
-    assert reason.values['limit'] == 0.5 and reason.values['sigma'] > 0.5 and 'm +- ' in reason.message
+    assert reason.values['limit'] == 0.5 and reason.values['sigma'] > 0.5 and 'm, ± ' in reason.message
 
 
 @pytest.mark.parametrize('count', [0, MIN_SPEED_VEHICLES - 1])
