@@ -49,7 +49,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Solve saved evidence; return the exit status."""
-    options = options_from_arguments(arguments)
+    points = control_points(arguments)
+    options = options_from_arguments(arguments, points)
     if printed_params(arguments, options, 'FILE'):
         return DONE
     lens = read_known_lens(arguments, options)
@@ -68,7 +69,7 @@ def run(arguments: argparse.Namespace) -> int:
     first, more = arguments.files[0], len(arguments.files) - 1
     name = f'{first.name} and {more} more' if more else first.name
     names = [] if out is None else outputs.write_result(out, solved, name)
-    print_result(solved, out, names, quiet=arguments.quiet, json=arguments.json, points=control_points(arguments))
+    print_result(solved, out, names, quiet=arguments.quiet, json=arguments.json, points=points)
     if arguments.tracks is not None:
         write_ground_tracks(arguments.tracks, solved, quiet=arguments.quiet)
     return DONE if solved.result else REFUSED

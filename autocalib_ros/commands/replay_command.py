@@ -63,7 +63,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Calibrate from a recording; return the exit status."""
-    options = options_from_arguments(arguments)
+    points = control_points(arguments)
+    options = options_from_arguments(arguments, points)
     if printed_params(arguments, options, 'SOURCE'):
         return DONE
     lens = read_known_lens(arguments, options)
@@ -101,7 +102,7 @@ def run(arguments: argparse.Namespace) -> int:
         stop=stop,
         before=before,
         named_after=named,
-        points=control_points(arguments),
+        points=points,
     )
     if arguments.tracks is not None:
         write_ground_tracks(arguments.tracks, replayed, quiet=arguments.quiet)

@@ -101,14 +101,16 @@ def add_solve_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--json', action='store_true', help='print calibration.json on stdout instead of the summary')
 
 
-def options_from_arguments(arguments: argparse.Namespace) -> Options:
-    """Return the options: defaults, overridden by the parameter file, overridden by the command line."""
+def options_from_arguments(arguments: argparse.Namespace, points: ControlPoints | None = None) -> Options:
+    """Return the options: defaults, overridden by the parameter file, overridden by the command line.
+
+    The lengths between control `points` are among them.
+    """
     from autocalib_ros.offline.parameter_file import override_options, parse_assignments, read_params_file
 
     values: dict[str, Any] = read_params_file(arguments.params_file) if arguments.params_file else {}
     values.update(parse_assignments(arguments.param))
     values.update(_known_values(arguments))
-    points = control_points(arguments)
     if points is not None:
         values.update(distance_options(points, values))
     if arguments.method is not None:

@@ -101,12 +101,19 @@ class ViewPose:
 class ViewReference:
     """A grey image (H, W) of a view, at most `REGISTERED_WIDTH_PX` wide, that others are registered to.
 
-    `camera` is the lens for images of this size, `ignored` a mask (H, W) of pixels that are no picture of the scene.
+    `camera` is the lens for images of this size, `ignored` a mask (H, W) of pixels that are no picture of the scene,
+    `pattern` the normalised image, if it is known.
     """
 
-    def __init__(self, image: np.ndarray, camera: Camera, ignored: np.ndarray | None = None) -> None:
+    def __init__(
+        self,
+        image: np.ndarray,
+        camera: Camera,
+        ignored: np.ndarray | None = None,
+        pattern: np.ndarray | None = None,
+    ) -> None:
         self.image, self.camera, self.ignored = image, camera, ignored
-        self.pattern = normalised(image)
+        self.pattern = normalised(image) if pattern is None else pattern
         corners_px = spread_corners(image, ignored)
         bearings, valid = camera.unproject(corners_px)
         self.corners_px, self.bearings = corners_px[valid], bearings[valid]

@@ -321,7 +321,8 @@ class ViewWatch:
         self._due_s, self._newest_s = time_s + CHECK_S * (1.0 + 2.0 * INTERVAL_SPREAD * place), time_s
         image = registered_image(image, self._registered_size)
         frozen = self._freeze.is_frozen(image, time_s)
-        pose = self._register(image, time_s)
+        pattern = normalised(image)
+        pose = self._register(pattern, time_s)
         if pose is not None:
             self._samples.append(_Sample(time_s, pose))
             self._unseen_s = self._candidate = None
@@ -329,18 +330,17 @@ class ViewWatch:
                 self._samples.popleft()
         elif self._unseen_s is None:
             self._unseen_s = time_s
-        self._judge_fault(image, pose, frozen, time_s)
+        self._judge_fault(image, pattern, pose, frozen, time_s)
         self.report = replace(self._judged(image, pose, time_s), is_watched=bool(self._references))
         if pose is not None:
             self._renew(image, pose, time_s)
         return self.report
 
-    def _register(self, image: np.ndarray, time_s: float) -> ViewPose | None:
-        """Return the pose of an image since the calibration; None if it is not recognised."""
-        usable = [one for one in self._references if one.view.image.shape == image.shape]
+    def _register(self, pattern: np.ndarray, time_s: float) -> ViewPose | None:
+        """Return the pose of a normalised image since the calibration; None if it is not recognised."""
+        usable = [one for one in self._references if one.view.image.shape == pattern.shape]
         if not usable:
             return None
-        pattern = normalised(image)
         near = self._near(pattern)
         if near is not None:
             self._near_s = time_s
@@ -381,9 +381,11 @@ class ViewWatch:
         self._last = pose.after(reference.known.pose)
         return self._last
 
-    def _judge_fault(self, image: np.ndarray, pose: ViewPose | None, frozen: bool, time_s: float) -> None:
+    def _judge_fault(
+        self, image: np.ndarray, pattern: np.ndarray, pose: ViewPose | None, frozen: bool, time_s: float
+    ) -> None:
         """Note which fault the picture has, and since when."""
-        fault = PictureFault.FROZEN if frozen else self._fault_of(image, pose)
+        fault = PictureFault.FROZEN if frozen else self._fault_of(image, pattern, pose)
         self._clear = 0 if fault is not None else self._clear + 1
         if fault is None:
             if pose is not None or self._clear >= CLEAR_CHECKS:
@@ -393,10 +395,10 @@ class ViewWatch:
         else:
             self._fault = (fault, self._fault[1])
 
-    def _fault_of(self, image: np.ndarray, pose: ViewPose | None) -> PictureFault | None:
+    def _fault_of(self, image: np.ndarray, pattern: np.ndarray, pose: ViewPose | None) -> PictureFault | None:
         """Return the fault of a single image."""
         if pose is None:
-            is_empty = bool(self._references) and not self._has_outlines(image)
+            is_empty = bool(self._references) and not self._has_outlines(image, pattern)
             return exposure_fault(image) or (PictureFault.COVERED if is_empty else None)
         if self._checks % SHARPNESS_PERIOD == 0:  # and else as before
             first = self._references[0]
@@ -404,14 +406,14 @@ class ViewWatch:
             self._blurred = first.detail.sharpness(first.view.aligned(image, since)) < BLURRED_RATIO
         return PictureFault.BLURRED if self._blurred else None
 
-    def _has_outlines(self, image: np.ndarray) -> bool:
-        """Whether an image has enough corners to be found again."""
+    def _has_outlines(self, image: np.ndarray, pattern: np.ndarray) -> bool:
+        """Whether an image, normalised its pattern, has enough corners to be found again."""
         if self._candidate is not None:
             candidate, _ = self._candidate
-            if candidate.image.shape == image.shape and candidate.near(normalised(image), ViewPose.identity()):
+            if candidate.image.shape == image.shape and candidate.near(pattern, ViewPose.identity()):
                 return True
         first = self._references[0]
-        new = ViewReference(image, first.view.camera, first.known.ignored)
+        new = ViewReference(image, first.view.camera, first.known.ignored, pattern)
         self._candidate = (new, self._newest_s)
         return new.is_registrable
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import struct
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -54,8 +54,8 @@ class _Place(NamedTuple):
 
 class _Record(NamedTuple):
     opcode: int
-    head: bytes
-    """Fields of the header of ROS 1; empty for MCAP."""
+    fields: Mapping[bytes, bytes]
+    """Of the header of ROS 1, by name; none for MCAP."""
     position: int
     """Of the content."""
     size: int
@@ -198,7 +198,7 @@ class _McapFormat:
             return None
         opcode, size = MCAP_RECORD.unpack(head)
         begin = position + MCAP_RECORD.size
-        return None if opcode == 0 or begin + size > end else _Record(opcode, b'', begin, size)
+        return None if opcode == 0 or begin + size > end else _Record(opcode, {}, begin, size)
 
     @staticmethod
     def kind(record: _Record) -> str:
@@ -249,8 +249,8 @@ class _Rosbag1Format:
         if head is None or len(length) < 4:
             return None
         begin, (size,) = stream.tell(), struct.unpack('<I', length)
-        operation = _fields(head).get(b'op', b'\0')
-        return None if begin + size > end else _Record(operation[0], head, begin, size)
+        fields = _fields(head)
+        return None if begin + size > end else _Record(fields.get(b'op', b'\0')[0], fields, begin, size)
 
     @staticmethod
     def kind(record: _Record) -> str:
@@ -260,22 +260,20 @@ class _Rosbag1Format:
     @staticmethod
     def message(_: BinaryIO, record: _Record) -> tuple[int, int, int]:
         """Return connection and time of a message; its data have no head."""
-        fields = _fields(record.head)
-        seconds, nanoseconds = struct.unpack('<II', fields[b'time'])
-        return struct.unpack('<I', fields[b'conn'])[0], seconds * 10**9 + nanoseconds, 0
+        seconds, nanoseconds = struct.unpack('<II', record.fields[b'time'])
+        return struct.unpack('<I', record.fields[b'conn'])[0], seconds * 10**9 + nanoseconds, 0
 
     @staticmethod
     def connection(content: bytes, record: _Record) -> ScannedConnection:
         """Return a connection."""
-        fields = _fields(record.head)
-        (key,) = struct.unpack('<I', fields[b'conn'])
+        (key,) = struct.unpack('<I', record.fields[b'conn'])
         kind = _fields(content).get(b'type', b'').decode('utf-8', 'replace')
-        return ScannedConnection(key, fields[b'topic'].decode('utf-8', 'replace'), _ros2_name(kind), True)
+        return ScannedConnection(key, record.fields[b'topic'].decode('utf-8', 'replace'), _ros2_name(kind), True)
 
     @staticmethod
     def unpacked(stream: BinaryIO, record: _Record) -> bytes:
         """Return the records of a chunk at whose content the stream is."""
-        return _decompress(_fields(record.head)[b'compression'].decode(), stream.read(record.size), None)
+        return _decompress(record.fields[b'compression'].decode(), stream.read(record.size), None)
 
 
 def _decompress(compression: str, packed: bytes, size: int | None) -> bytes:
