@@ -43,6 +43,7 @@ from autocalib_ros.estimation.strategies import (
     sharpen_with_lane_markings,
     with_single_road,
 )
+from autocalib_ros.estimation.verification.cut_picture import with_cut_picture
 from autocalib_ros.estimation.verification.readiness import check_readiness
 from autocalib_ros.estimation.verification.scale import is_unusual
 from autocalib_ros.evidence.snapshot import Evidence
@@ -171,7 +172,11 @@ def find_solution(
 
     def estimate_with_aspect(aspect: float, sigma: float) -> Solution | Reason:
         families = lens_priors(evidence.image_size, joint, evidence.picture, aspect, options.lens)
-        return estimate_under([prior.with_pixel_aspect(aspect, sigma) for prior in families])
+        families = [prior.with_pixel_aspect(aspect, sigma) for prior in families]
+        found = estimate_under(families)
+        if isinstance(found, Reason) or not found.clearly_cut:
+            return found
+        return with_cut_picture(estimate_under([prior.with_loose_centre() for prior in families]), found)
 
     if lens is not None:
         return verify_given_lens(

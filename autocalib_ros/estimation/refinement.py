@@ -21,6 +21,7 @@ from autocalib_ros.estimation.turning.turning_traffic import (
     widen_by_point_slip,
     widen_by_tracklet_difference,
 )
+from autocalib_ros.estimation.verification.cut_picture import compare_cut_picture
 from autocalib_ros.estimation.verification.focal_modes import widen_by_focal_modes
 from autocalib_ros.estimation.verification.focal_profile import widen_by_focal_profile
 from autocalib_ros.estimation.verification.gates import check_focal_length, check_halves, check_lens, check_plane
@@ -86,6 +87,9 @@ def refine_and_verify(
     # Other focal lengths that are about as probable widen it, too.
     some = tracks.subset(evenly_spaced(len(tracks), MAX_SUBSAMPLE_TRACKS))
     fit = widen_by_focal_profile(widen_by_focal_modes(fit, some), some)
+    # A picture that was cut off away from its centre, too.
+    cut = compare_cut_picture(fit, tracks)
+    fit = fit if cut is None else cut.covered()
     uncertain = check_focal_length(fit, gate, turned=turned)
     assumptions = lens_assumptions(fit, fixed)
     compared = (*explained, *halves.rows, *(() if tracklets is None else (tracklets.row,)))
@@ -99,7 +103,18 @@ def refine_and_verify(
     plane = PlaneEstimate.of(fit, tracks)
     checks = (*_plane_checks(fit, angle), halves.statement)
     refusal = check_plane(plane, gate)
-    return Solution(fit, plane, along, flow, assumptions, checks, refusal, lens_refusal=uncertain, comparisons=compared)
+    return Solution(
+        fit,
+        plane,
+        along,
+        flow,
+        assumptions,
+        checks,
+        refusal,
+        lens_refusal=uncertain,
+        comparisons=compared,
+        clearly_cut=cut is not None and cut.is_clear,
+    )
 
 
 def _check_lens(

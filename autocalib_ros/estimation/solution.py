@@ -77,6 +77,8 @@ class Solution:
     """The adjustment of the traffic that lane markings replaced; None if `fit` is it, or there is none."""
     with_free_aspect: Adjustment | None = None
     """The adjustment of lane markings alone with the pixel aspect free; None where the traffic measures it."""
+    clearly_cut: bool = False
+    """Whether the traffic shows a picture that was cut off, so that its centre tells nothing of the principal point."""
     lanes: LanePattern | None = None
     """The dashes of lane lines on the road; None if they show no period."""
     vehicles: Scale | None = None

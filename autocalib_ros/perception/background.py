@@ -29,8 +29,8 @@ BAND_BYTES = 1 << 19
 """Size of the bands of rows of all images that are sorted at once: they fit into the cache of a core."""
 
 STRIP_BYTES = 1 << 20
-"""Size of the strips in which samples are encoded: the median takes one strip of each, 17 MB at most, where whole images
-of 3840x2160 would need 423 MB."""
+"""Size of the strips in which samples are encoded: the median takes one strip of each, 17 MB at most, where whole
+images of 3840x2160 would need 423 MB."""
 STRIP_ROWS = 16
 """Strips are whole blocks of the JPEG, 16 rows where colours have half the resolution."""
 REDUCED_WIDTH_PX = 960
@@ -121,7 +121,9 @@ class Background:
         if not samples:
             return None
         strips = zip(*(sample.strips for sample in samples), strict=True)
-        return np.concatenate([median([cv2.imdecode(part, cv2.IMREAD_COLOR) for part in strip]) for strip in strips])
+        return np.concatenate(
+            [median([np.asarray(cv2.imdecode(part, cv2.IMREAD_COLOR)) for part in strip]) for strip in strips]
+        )
 
     def grey_samples(self, size: tuple[int, int]) -> list[np.ndarray]:
         """Return the images in grey, uint8 (height, width) of a `size` (width, height) that they are reduced to.

@@ -267,6 +267,8 @@ ASSUMPTIONS: dict[str, Wording] = {
     'field_of_view': 'field of view across the image {view_deg:.0f} degrees (focal length ± {sigma:.0%}): usual '
     'ones are {usual_deg:.0f} degrees within a factor of {factor:.2f}',
     'principal_point': _principal_point,
+    'cut_picture': 'a picture that was cut off or zoomed: its optical axis is {right_px:+.0f} ± {sigma_px:.1f} px to '
+    'the right of the centre and {down_px:+.0f} ± {sigma_down_px:.1f} px below it, by the traffic',
     'focal_given': _focal_given,
     'view_given': 'field of view across the image {view_deg:g} ± {sigma_deg:.2g} degrees (given)',
     'pixel_aspect': _pixel_aspect,

@@ -156,7 +156,13 @@ class LensPrior:
         return replace(self, sigma=np.where(fixed, 0.0, self.sigma))
 
     def with_loose_principal_point(self) -> LensPrior:
-        """Return the prior with a loose principal point and free k2, unless these are fixed by an option.
+        """Return the prior with a loose centre and free k2, unless these are fixed by an option."""
+        sigma = self.with_loose_centre().sigma.copy()
+        sigma[4] = max(sigma[4], K2_SIGMA) if sigma[3] > 0 else sigma[4]
+        return replace(self, sigma=sigma)
+
+    def with_loose_centre(self) -> LensPrior:
+        """Return the prior of a picture that may be cut off: with a loose principal point, unless an option fixes it.
 
         The image circle of a fisheye shows its centre: there the principal point stays as it is.
         """
@@ -165,7 +171,6 @@ class LensPrior:
         loose_px = 0.0 if whole_circle else LOOSE_PRINCIPAL_POINT_SIGMA_FRACTION * self.centre.width
         loose = np.maximum(loose_px * np.array([1.0, self.centre.pixel_aspect]), sigma[1:3])
         sigma[1:3] = np.where(sigma[1:3] > 0, loose, 0.0)
-        sigma[4] = max(sigma[4], K2_SIGMA) if sigma[3] > 0 else sigma[4]
         return replace(self, sigma=sigma)
 
     def with_pixel_aspect(self, aspect: float, sigma: float) -> LensPrior:

@@ -33,8 +33,8 @@ from autocalib_ros.results.refusals import Reason, reason
 from autocalib_ros.results.statements import UNDETERMINED, Statement, assumption
 
 MIN_ALIGNED_FRACTION = 0.1
-"""Fraction of the segments along either direction: by chance it is a few per cent, and a single road's own markings are
-along the other direction. Judgement."""
+"""Fraction of the segments along either direction, of those that are not upright: by chance it is a few per cent, and a
+single road's own markings are along the other direction. Posts and walls say nothing about it. Judgement."""
 MIN_PLACES, MIN_PLACES_CONFIRMED = 5, 3
 """Distinct groups along either direction, without and with confirmation by the traffic: a single stop line, or the
 shadow of a lamp post, may be askew. Judgement."""
@@ -262,7 +262,7 @@ def _normal_difference_deg(segments: RoadSegments, one: MarkingGrid, other: Mark
 def _check_axes(segments: RoadSegments, grid: MarkingGrid, min_places: int) -> Reason | None:
     """Return a refusal if too few segments are along one of the directions, or if these are not perpendicular."""
     places = min(len(np.unique(segments.groups[mask])) for mask in grid.responsibilities[:2] > 0.5)
-    fraction = grid.fractions[:2].min()
+    fraction = grid.fractions[:2].min() / (1.0 - grid.fractions[2])
     if fraction < MIN_ALIGNED_FRACTION or places < min_places:
         return reason(
             'no_markings',

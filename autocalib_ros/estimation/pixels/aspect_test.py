@@ -40,9 +40,11 @@ MARKINGS_NATS = 3.0
 chance one grid of lines in twenty does. Judgement."""
 CLEAR_NATS = 4.5
 """Smallest log odds between two pixel aspects of which one is taken for sure: 1 in 90 is wrong."""
-UNUSUAL_SIGMA, UNUSUAL_STEPS = 0.12, 141
-"""Standard deviation of the logarithm of a pixel aspect other than the expected one: most squeezes are of 2 to 20 %,
-and wider ones go with sizes by which they are known. And the number of values tried, up to four deviations."""
+UNUSUAL_SCALE, UNUSUAL_FREEDOM = 0.08, 3.0
+"""Scale and degrees of freedom of Student's t for the logarithm of a pixel aspect other than the expected one: most
+squeezes are of 2 to 20 %, some of a factor of 4/3 to 2."""
+UNUSUAL_RANGE, UNUSUAL_STEPS = 1.0, 201
+"""Largest logarithm of a pixel aspect that is tried, and the number of values."""
 CONTRADICTIONS = ('horizon', 'too_little_curvature', 'lens_model', 'halves_disagree', 'markings_contradicted')
 """Refusals of the expected pixels after which others are tried: those that a squeeze causes."""
 POSSIBLE_CONTRADICTIONS = ('no_agreement', 'turning_traffic', 'too_little_turning', 'one_direction')
@@ -94,11 +96,11 @@ class MeasuredAspect:
     def unexpected(self, expected: float, prior_odds: float) -> tuple[float, float]:
         """Return the probability of another pixel aspect than the expected one, and its mean squared logarithm.
 
-        Bayesian model averaging (Hoeting et al. 1999) over the expected aspect and normally distributed others, whose
-        prior odds against it are `prior_odds`.
+        Bayesian model averaging (Hoeting et al. 1999) over the expected aspect and others, whose prior odds against it
+        are `prior_odds`.
         """
-        deviations = np.linspace(-4.0, 4.0, UNUSUAL_STEPS)
-        logs, prior = UNUSUAL_SIGMA * deviations, np.exp(-0.5 * deviations**2)
+        logs = np.linspace(-UNUSUAL_RANGE, UNUSUAL_RANGE, UNUSUAL_STEPS)
+        prior = np.exp(-_student_loss((logs / UNUSUAL_SCALE) ** 2, UNUSUAL_FREEDOM))
         away = (np.log(self.aspect / expected) - np.append(logs, 0.0)) / self.sigma
         likelihood = np.exp(-_student_loss(away**2))
         posterior = prior / prior.sum() * likelihood[:-1]
@@ -118,9 +120,9 @@ class MeasuredAspect:
         return parameters.state(covariance[:, at] / max(covariance[at, at], 1e-12) * change)
 
 
-def _student_loss(squares: np.ndarray) -> np.ndarray:
+def _student_loss(squares: np.ndarray, freedom: float = FREEDOM) -> np.ndarray:
     """Negative log density, up to a constant, of squared differences in standard deviations."""
-    return 0.5 * (FREEDOM + 1.0) * np.log1p(squares / FREEDOM)
+    return 0.5 * (freedom + 1.0) * np.log1p(squares / freedom)
 
 
 def measure_aspect(found: Solution, tracks: TrackSet) -> MeasuredAspect:
