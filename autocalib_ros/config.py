@@ -334,6 +334,11 @@ class JointOptions(_Validated):
             return None
         return angle if 10.0 <= angle <= 170.0 else None
 
+    @property
+    def crossing_rad(self) -> float | None:
+        """The given angle between the roads in radians; None for auto and free."""
+        return None if self.crossing_deg is None else math.radians(self.crossing_deg)
+
 
 @dataclass(frozen=True)
 class KnownDistance:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from autocalib_ros.config import Options
@@ -10,7 +12,7 @@ from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig
 from autocalib_ros.estimation.given_lens import check_principal_point, verify_given_lens
 from autocalib_ros.estimation.known_lengths import adjust_to_lengths, scale_of, with_seen_lengths
 from autocalib_ros.estimation.observations.selection import drop_pedestrians
-from autocalib_ros.estimation.observations.track_set import TrackSet, long_tracks, select_tracks
+from autocalib_ros.estimation.observations.track_set import TrackSet, evenly_spaced, long_tracks, select_tracks
 from autocalib_ros.estimation.observations.two_frame_windows import ResampledTracks, find_windows
 from autocalib_ros.estimation.paper.intrinsics import paper_intrinsics
 from autocalib_ros.estimation.paper.published_method import solve_paper
@@ -27,6 +29,7 @@ from autocalib_ros.estimation.publish import (
     with_requested_model,
 )
 from autocalib_ros.estimation.solution import (
+    MAX_SUBSAMPLE_TRACKS,
     Observations,
     Solution,
     accepted,
@@ -46,6 +49,7 @@ from autocalib_ros.estimation.strategies import (
 from autocalib_ros.estimation.verification.cut_picture import with_cut_picture
 from autocalib_ros.estimation.verification.readiness import check_readiness
 from autocalib_ros.estimation.verification.scale import is_unusual
+from autocalib_ros.estimation.verification.stated_family import verify_stated_family
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.results.calibration import Calibration, Refusal
@@ -59,6 +63,8 @@ SINGLE_ROAD_CODES = (
     'one_direction',
 )
 """Reasons that one straight road without visible curvature gives; other ones contradict something."""
+COMPARED_FAMILIES = ('equidistant', 'distortion_free')
+"""Lens families that exclude each other."""
 PLENTY = 2.0
 """Tracks over those needed from which on it is not their number that fails: half of them and more are of no use."""
 
@@ -155,7 +161,6 @@ def find_solution(
     gate, joint = options.gate, options.joint
     if len(tracks) < gate.min_tracks:
         return _too_few_tracks(evidence, len(tracks), gate.min_tracks)
-    crossing_rad = None if joint.crossing_deg is None else float(np.radians(joint.crossing_deg))
     instants = ResampledTracks(evidence)
     windows = find_windows(evidence, instants)
 
@@ -168,7 +173,7 @@ def find_solution(
     def estimate_under(priors: list[LensPrior]) -> Solution | Reason:
         generator = np.random.default_rng(options.random_seed)
         observations = Observations(tracks, windows, instants, priors, gate, evidence, generator, unmeasured)
-        return _estimate(observations, AdjustmentConfig(priors[0], joint, height_m, crossing_rad))
+        return _estimate(observations, AdjustmentConfig(priors[0], joint, height_m, joint.crossing_rad))
 
     def estimate_with_aspect(aspect: float, sigma: float) -> Solution | Reason:
         families = lens_priors(evidence.image_size, joint, evidence.picture, aspect, options.lens)
@@ -183,9 +188,37 @@ def find_solution(
             lens, estimate_under([known_lens(lens)]), tracks, lambda: estimate_with_aspect(lens.pixel_aspect, 0.0)
         )
     if given > 0.0:
-        return with_stated_aspect(estimate_with_aspect(given, 0.0), given, 'given')
-    found = choose_aspect(hypotheses, estimate_with_aspect, tracks, gate)
-    return with_stated_aspect(found, evidence.pixel_aspect, 'recording')
+        found = with_stated_aspect(estimate_with_aspect(given, 0.0), given, 'given')
+    else:
+        found = choose_aspect(hypotheses, estimate_with_aspect, tracks, gate)
+        found = with_stated_aspect(found, evidence.pixel_aspect, 'recording')
+    return _with_stated_family(found, evidence, tracks, options, height_m)
+
+
+def _with_stated_family(
+    found: Solution | Reason, evidence: Evidence, tracks: TrackSet, options: Options, height_m: float
+) -> Solution | Reason:
+    """Add to a solution the comparison of the lens family that an option states with others; a reason if it is wrong.
+
+    The family between the others, which contains both, is not compared.
+    """
+    joint, fit = options.joint, None if isinstance(found, Reason) else found.of_traffic or found.fit
+    aspect = options.lens.pixel_aspect_or(evidence.pixel_aspect) if fit is None else fit.state.camera.pixel_aspect
+
+    def priors(family: str) -> list[LensPrior]:
+        stated = replace(joint, lens_prior=family)
+        return lens_priors(evidence.image_size, stated, evidence.picture, aspect, options.lens)
+
+    if joint.lens_prior not in COMPARED_FAMILIES:
+        return found
+    others = [prior for family in COMPARED_FAMILIES if family != joint.lens_prior for prior in priors(family)]
+    config = AdjustmentConfig(priors(joint.lens_prior)[0], joint, height_m, joint.crossing_rad)
+    some = tracks.subset(evenly_spaced(len(tracks), MAX_SUBSAMPLE_TRACKS))
+    generator = np.random.default_rng(options.random_seed)
+    compared = verify_stated_family(fit, config, others, tracks, some, generator)
+    if isinstance(compared, Reason):
+        return compared
+    return found if compared is None or isinstance(found, Reason) else found.compared(compared)
 
 
 def _too_few_tracks(evidence: Evidence, usable: int, limit: int) -> Reason:

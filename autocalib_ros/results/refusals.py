@@ -197,11 +197,20 @@ REFUSALS = (
     ),
     RefusalCode(
         code='lens_model',
-        cause='The estimated distortion k1 is too far from the assumed lens family.',
-        limit='3.5 times joint.k1_sigma (0.03)',
+        cause='The estimated distortion k1 is too far from the assumed lens family; or far more vehicles drive '
+        'straight through a lens of another family than of the one that is set.',
+        limit='3.5 times joint.k1_sigma (0.03); 3 sigma of the number of vehicles that drive straight',
         remedy=WAIT + OR + TELL_LENS + OR + 'increase joint.k1_sigma if the lens is known to differ',
         missing='a lens near its family',
         message='the lens is not close to {family}: k1 = {k1:.3f}, {sigmas:.1f} sigma off (limit {limit:g})',
+        variants={
+            'family': (
+                'the traffic contradicts joint.lens_prior {stated}: {following:.0%} of the vehicles drive straight '
+                'through such a lens, {other_following:.0%} through one that is {other}, {sigmas:.1f} sigma more '
+                '(limit {limit:g})',
+                'set joint.lens_prior to auto',
+            )
+        },
     ),
     RefusalCode(
         code='halves_disagree',

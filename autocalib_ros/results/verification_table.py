@@ -48,6 +48,11 @@ VERIFIED_QUANTITIES: dict[str, VerifiedQuantity] = {
     'below_horizon': VerifiedQuantity('tracked points below the horizon', '%', REFUSED, at_least=True),
     'straight_share': VerifiedQuantity('vehicles that follow the roads', '%', REFUSED, at_least=True),
     'k1_prior': VerifiedQuantity('k1 against its lens family', 'sigma', REFUSED),
+    'lens_family': VerifiedQuantity(
+        'vehicles that follow roads through a lens of another family, more than through the stated one',
+        'sigma',
+        REFUSED,
+    ),
     'principal_point_prior': VerifiedQuantity(
         'principal point against the centre of the picture', 'sigma', CONTRADICTED
     ),

@@ -316,6 +316,12 @@ TRIALS = (
         },
     ),
     Trial(
+        'lens_model',
+        lambda: Question.of(CROSSING, joint=replace(ONE_FAMILY, lens_prior='distortion_free')),
+        {'set joint.lens_prior to auto': lambda question: question.told(joint=replace(ONE_FAMILY, lens_prior='auto'))},
+        'family',
+    ),
+    Trial(
         'halves_disagree',
         lambda: drawn('mixed_views', 0, 28, joint=ONE_FAMILY),
         {

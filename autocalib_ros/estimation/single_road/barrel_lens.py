@@ -13,6 +13,7 @@ import numpy as np
 
 from autocalib_ros.config import JointOptions
 from autocalib_ros.estimation.adjustment.lens_prior import DISTORTION_FREE, LensPrior
+from autocalib_ros.estimation.single_road.told_focal import WRONG_TOLD
 from autocalib_ros.lens.camera import Camera
 
 MIN_KAPPA, MAX_KAPPA = -0.15, 1.05
@@ -111,7 +112,10 @@ class LensChoice:
         return self._focal_of_view(kappa) if self.prior.view_deg > 0 else self.prior.centre.focal_px
 
     def _kappa_density(self, kappa: float) -> float:
-        """Return the density of a curvature over the lens families that may be, each as probable as the others."""
+        """Return the density of a curvature over the lens families that may be, each as probable as the others.
+
+        A family that an option states may be wrong: straight traffic on one road hardly tells.
+        """
         sigma = max(3.0 * self.options.k1_sigma, 1e-3)  # of kappa, which is three times k1
         peaks = {
             'auto': tuple(USUAL_KAPPAS.values()),
@@ -122,9 +126,9 @@ class LensChoice:
         densities = [
             float(np.exp(-0.5 * ((kappa - mean) / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi))) for mean, sigma in peaks
         ]
-        if self.options.lens_prior in ('auto', 'kannala_brandt'):
-            densities.append(1.0)  # anything in between
-        return float(np.mean(densities))
+        if self.options.lens_prior in ('equidistant', 'distortion_free'):  # it may be wrong, as a told focal length
+            return (1.0 - WRONG_TOLD) * densities[0] + WRONG_TOLD
+        return float(np.mean([*densities, 1.0]))  # or anything in between
 
     @property
     def _half_width(self) -> float:
