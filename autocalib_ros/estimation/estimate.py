@@ -9,7 +9,7 @@ import numpy as np
 from autocalib_ros.config import Options
 from autocalib_ros.estimation.adjustment.lens_prior import LensPrior, known_lens, lens_priors
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig
-from autocalib_ros.estimation.given_lens import check_principal_point, verify_given_lens
+from autocalib_ros.estimation.given_lens import check_view, verify_given_lens
 from autocalib_ros.estimation.known_lengths import adjust_to_lengths, scale_of, with_seen_lengths
 from autocalib_ros.estimation.observations.selection import drop_pedestrians
 from autocalib_ros.estimation.observations.track_set import TrackSet, evenly_spaced, long_tracks, select_tracks
@@ -80,7 +80,7 @@ def solve(evidence: Evidence, options: Options, *, lens: Camera | None = None) -
     aspect = options.lens.pixel_aspect_or(evidence.pixel_aspect)
     draft = ResultDraft.begin(evidence, options, paper_intrinsics(with_square_pixels(evidence, aspect), options.paper))
     # A given lens that cannot be of these images is not tried.
-    impossible = None if lens is None or options.method == 'paper' else check_principal_point(lens)
+    impossible = None if lens is None or options.method == 'paper' else check_view(lens, evidence.points_px)
     if impossible:
         return draft.refusal(impossible)
     # Pedestrians that a detector saw are left out.

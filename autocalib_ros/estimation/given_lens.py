@@ -8,16 +8,24 @@ lens does not give everything, the traffic alone has to agree with it.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 
 import numpy as np
+from numpy.linalg import norm
 
-from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment, adjust
-from autocalib_ros.estimation.adjustment.lens_prior import LOOSE_PRINCIPAL_POINT_SIGMA_FRACTION, LensPrior
+from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment
+from autocalib_ros.estimation.adjustment.lens_prior import LOOSE_PRINCIPAL_POINT_SIGMA_FRACTION
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentState
+from autocalib_ros.estimation.given_curve import (
+    FOCAL_AND_K1,
+    LENS_TOLERANCE,
+    compare_curve,
+    curve_contradiction,
+    step_with_curve,
+)
 from autocalib_ros.estimation.observations.track_set import TrackSet
-from autocalib_ros.estimation.solution import Solution, same_change
+from autocalib_ros.estimation.released_lens import ReleasedLens, released_lens, step_with_focal_length
+from autocalib_ros.estimation.solution import Solution
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.results.refusals import Reason, reason
 from autocalib_ros.results.statements import check
@@ -26,9 +34,8 @@ from autocalib_ros.results.verification_table import VerificationRow, verified
 CONTRADICTION_SIGMAS, DOUBT_SIGMAS = 3.0, 2.0
 """A lens that differs by more standard deviations from what the traffic asks for is refused (0.3 % of right ones), or
 believed less (5 %)."""
-LENS_TOLERANCE = 0.03
-"""Difference that is always allowed, in log focal length, log pixel aspect, and widths of the image for the principal
-point: the promised accuracy, as between two halves of the traffic."""
+MAX_UNSEEN = 0.01
+"""Share of the tracked points, some of which are wrong, that may lie where the lens images nothing."""
 TRAFFIC_RADIUS_QUANTILE = 0.75
 """Quantile of the distances of tracked points from the principal point at which the angles of two lenses are compared:
 lens curvature shows in the outer half of the traffic, and few points lie farther out."""
@@ -37,40 +44,16 @@ MAX_TESTING_SIGMA = 0.033
 mode or camera, is then noticed at three of them."""
 
 
-@dataclass(frozen=True)
-class _Release:
-    """The solution with some parameters of the given lens free."""
-
-    given: Camera
-    fit: Adjustment
-
-    @property
-    def camera(self) -> Camera:
-        """The lens that the traffic asks for."""
-        return self.fit.state.camera
-
-    def change(self, function: Callable[[Camera], np.ndarray]) -> tuple[np.ndarray, float]:
-        """Return the change (n,) of a function of the lens, and its length in standard deviations."""
-        change = function(self.camera) - function(self.given)
-        covariance = self.fit.covariance_of(lambda state: function(state.camera))
-        if not np.isfinite(covariance).all():
-            return change, 0.0
-        # the smallest eigenvalues of a singular covariance are of a direction that is not free
-        return change, float(np.sqrt(max(change @ np.linalg.pinv(covariance, rcond=1e-9) @ change, 0.0)))
-
-    @cached_property
-    def focal_change(self) -> tuple[float, float]:
-        """Change of the log focal length, and its absolute value in standard deviations."""
-        change, sigmas = self.change(lambda camera: np.array([np.log(camera.focal_px)]))
-        return float(change[0]), sigmas
-
-
-def check_principal_point(lens: Camera) -> Reason | None:
-    """Refuse a lens whose principal point lies outside the image."""
+def check_view(lens: Camera, points_px: np.ndarray) -> Reason | None:
+    """Refuse a lens whose principal point lies outside the image, or that does not image what was tracked (n, 2)."""
     (x, y), width, height = lens.principal_point_px, lens.width, lens.height
-    if -0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5:
+    if not (-0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5):
+        return reason('given_lens', 'outside', x_px=x, y_px=y, width=width, height=height)
+    unseen = 1.0 - float(lens.unproject(points_px)[1].mean()) if len(points_px) else 0.0
+    if unseen <= MAX_UNSEEN:
         return None
-    return reason('given_lens', 'outside', x_px=x, y_px=y, width=width, height=height)
+    radius_px = float(lens.radius(np.array([lens.max_angle_rad]))[0])
+    return reason('given_lens', 'unseen', radius_px=radius_px, unseen=unseen, limit=MAX_UNSEEN)
 
 
 def verify_given_lens(
@@ -88,7 +71,13 @@ def verify_given_lens(
         if row is not None:
             found = found.compared(row)
         found = found.compared(verified('given_lens_sigma', release.fit.focal_sigma, MAX_TESTING_SIGMA))
-        found = _covering_difference(found, release)
+        curve = released_lens(lens, found, tracks, FOCAL_AND_K1)
+        compared = compare_curve(lens, curve)
+        if isinstance(compared, Reason):
+            return _in_words_of(compared, lens, solve_free(), tracks)
+        found = found.covering(max(step_with_focal_length(found, release), step_with_curve(found, curve), key=norm))
+        if compared is not None:
+            found = found.compared(compared)
         if found.full:
             return found if row is None or row.passed else _doubted(found, release)
     free = solve_free()
@@ -100,29 +89,15 @@ def verify_given_lens(
     return contradiction or found
 
 
-def _covering_difference(found: Solution, release: _Release) -> Solution:
-    """Let the covariance of the plane cover that with the focal length of the traffic.
-
-    A difference within the tolerance may be a fault of either, and the plane turns with it. What exceeds the error of
-    the traffic is taken for the error of the lens (moment estimator of DerSimonian and Laird 1986, for one difference).
-    """
-    _, sigmas = release.focal_change
-    if sigmas <= 1.0:
-        return found
-    turned = replace(release.fit.state, camera=release.given)
-    step = same_change(found.fit, (found.of_traffic or found.fit).state, turned)
-    return found.covering(np.sqrt(1.0 - 1.0 / sigmas**2) * step)
-
-
 def _test_by_release(
     lens: Camera, found: Solution, tracks: TrackSet
-) -> Reason | tuple[_Release, VerificationRow | None]:
+) -> Reason | tuple[ReleasedLens, VerificationRow | None]:
     """Return why the traffic contradicts the lens, else the release of its focal length and the comparison of both.
 
     The comparison fails where the lens is doubtful; None if the traffic gives no focal length.
     """
     loose = LOOSE_PRINCIPAL_POINT_SIGMA_FRACTION * lens.width
-    focal = _released(lens, found, tracks, [np.inf, 0.0, 0.0, 0.0, 0.0, 0.0])
+    focal = released_lens(lens, found, tracks, [np.inf, 0.0, 0.0, 0.0, 0.0, 0.0])
     off, sigmas = focal.focal_change
     if abs(off) > LENS_TOLERANCE and sigmas > CONTRADICTION_SIGMAS:
         sigma_px = focal.fit.focal_sigma * focal.camera.focal_px
@@ -130,24 +105,17 @@ def _test_by_release(
     row = None
     if sigmas > 0:
         row = verified('given_lens', abs(off), max(DOUBT_SIGMAS * abs(off) / sigmas, LENS_TOLERANCE))
-    point = _released(lens, found, tracks, [0.0, loose, loose * lens.pixel_aspect, 0.0, 0.0, 0.0])
+    point = released_lens(lens, found, tracks, [0.0, loose, loose * lens.pixel_aspect, 0.0, 0.0, 0.0])
     change, sigmas = point.change(lambda camera: np.array(camera.principal_point_px))
     if np.hypot(*change) > LENS_TOLERANCE * lens.width and sigmas > CONTRADICTION_SIGMAS:
         return _point_contradiction(lens, point.fit)
-    shape = _released(lens, found, tracks, [0.0, 0.0, 0.0, 0.0, 0.0, np.inf])
+    shape = released_lens(lens, found, tracks, [0.0, 0.0, 0.0, 0.0, 0.0, np.inf])
     change, sigmas = shape.change(lambda camera: np.array([np.log(camera.pixel_aspect)]))
     if abs(change[0]) > LENS_TOLERANCE and sigmas > CONTRADICTION_SIGMAS:
         numbers = {'aspect': lens.pixel_aspect, 'traffic_aspect': shape.camera.pixel_aspect}
         sigma = abs(change[0]) / sigmas * shape.camera.pixel_aspect
         return reason('given_lens', 'pixel_aspect', **numbers, sigma=sigma)
     return focal, row
-
-
-def _released(lens: Camera, found: Solution, tracks: TrackSet, sigma: list[float]) -> _Release:
-    """Adjust with parameters of the given lens free; `sigma` is of the `LENS_PARAMETERS`."""
-    fit = found.of_traffic or found.fit
-    config = replace(fit.problem.config, prior=LensPrior('known', lens, np.array(sigma)))
-    return _Release(lens, adjust(fit.state, tracks, config, refine=True, warm_start=fit.problem.warm_start))
 
 
 def _focal_contradiction(lens: Camera, traffic_px: float, sigma_px: float) -> Reason:
@@ -160,6 +128,8 @@ def _in_words_of(contradiction: Reason, lens: Camera, free: Solution | Reason, t
         return contradiction
     camera = free.fit.state.camera
     if abs(np.log(lens.focal_px / camera.focal_px)) > LENS_TOLERANCE:
+        if contradiction.values.get('cause') == 'focal_and_k1':
+            return curve_contradiction(lens, free.fit)
         return _focal_contradiction(lens, camera.focal_px, free.fit.focal_sigma * camera.focal_px)
     if np.hypot(*np.subtract(lens.principal_point_px, camera.principal_point_px)) > LENS_TOLERANCE * lens.width:
         return _point_contradiction(lens, free.fit)
@@ -213,7 +183,7 @@ def _contradiction_of_angles(lens: Camera, free: Solution, tracks: TrackSet) -> 
     )
 
 
-def _doubted(found: Solution, doubt: _Release) -> Solution:
+def _doubted(found: Solution, doubt: ReleasedLens) -> Solution:
     """Lower the grade of a solution, and say why."""
     focal_px = doubt.camera.focal_px
     statement = check(

@@ -245,6 +245,17 @@ REFUSALS = (
         message='the traffic contradicts the given lens: its focal length is {given_px:.1f} px, the traffic gives '
         '{traffic_px:.1f} ± {sigma_px:.1f} px',
         variants={
+            'unseen': (
+                'the given lens images nothing farther than {radius_px:.0f} px from its principal point, where '
+                '{unseen:.0%} of the tracked points lie (at most {limit:.0%} allowed)',
+                '',
+            ),
+            'focal_and_k1': (
+                'the traffic contradicts the given lens: its focal length is {given_px:.1f} px with k1 = '
+                '{given_k1:.3f}, the traffic gives {traffic_px:.1f} +- {sigma_px:.1f} px with {traffic_k1:.3f} +- '
+                '{k1_sigma:.3f}',
+                '',
+            ),
             'outside': (
                 'the principal point of the given lens, ({x_px:.1f}, {y_px:.1f}), lies outside the images of '
                 '{width}x{height}',

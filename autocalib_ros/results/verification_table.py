@@ -81,6 +81,9 @@ VERIFIED_QUANTITIES: dict[str, VerifiedQuantity] = {
         'standard deviation of the focal length by the traffic, which tests the given one', '%', UNTESTED
     ),
     'given_lens': VerifiedQuantity('given focal length against the one by the traffic', '%', CONTRADICTED),
+    'given_curve': VerifiedQuantity(
+        'given focal length against the one by the traffic with k1 free, too', '%', CONTRADICTED
+    ),
 }
 """Every quantity of a verification, by its kind."""
 

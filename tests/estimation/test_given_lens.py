@@ -11,6 +11,7 @@ from autocalib_ros.config import Options
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.ground_plane import tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera
+from autocalib_ros.offline.benchmark.monte_carlo import draw_evidence
 from autocalib_ros.results.calibration import Calibration, Refusal
 from solved_once import solve_once
 
@@ -84,6 +85,35 @@ def test_a_principal_point_outside_the_images_is_refused_at_once(two_roads: Evid
     empty = two_roads.select_tracks(two_roads.track_vehicles[:0])
     found = refused(empty, replace(right, principal_point_px=(1744.0, 597.0)))
     assert '(1744.0, 597.0)' in found.message and '1280x720' in found.message
+
+
+def test_a_lens_that_does_not_image_the_traffic_is_refused_at_once(two_roads: Evidence, right: Camera) -> None:
+    found = refused(two_roads, replace(right, k=(-0.4, 0.0, 0.0, 0.0)))
+    # the image of such a lens ends where its slope is zero: theta^2 = 1 / 1.2, at 2/3 of f theta
+    assert found.values['radius_px'] == pytest.approx(right.focal_px * 2 / 3 / 1.2**0.5, rel=1e-3)
+    assert found.values['unseen'] > 0.05
+
+
+def test_focal_length_and_k1_that_make_up_for_each_other_are_refused_with_both_numbers() -> None:
+    # the file of another focal length with a distortion of its own: held, it gave a tilt wrong by 25 sigmas
+    junction, evidence = draw_evidence('wrong_lens_file', 5, 11)
+    true = junction.camera
+    given = replace(true, focal_px=0.842 * true.focal_px, k=(0.0494, 0.0, 0.0, 0.0))
+    found = refused(evidence, given)
+    assert found.values['cause'] == 'focal_and_k1'
+    assert found.values['traffic_px'] == pytest.approx(true.focal_px, rel=0.05)
+    assert f'{given.focal_px:.1f} px with k1 = 0.049' in found.message
+
+
+def test_focal_length_and_k1_that_differ_a_little_widen_the_plane(two_roads: Evidence, right: Camera) -> None:
+    exact = solve_once(two_roads, OPTIONS, lens=right)
+    k1 = right.k[0] - 0.038  # curves alike where the traffic is
+    held = solve_once(two_roads, OPTIONS, lens=replace(right, focal_px=1.04 * right.focal_px, k=(k1, *right.k[1:])))
+    assert isinstance(exact, Calibration) and isinstance(held, Calibration)
+    assert exact.ground is not None and held.ground is not None and exact.stddev.tilt_deg and held.stddev.tilt_deg
+    change = tilt_and_roll_deg(held.ground.normal_in_camera) - tilt_and_roll_deg(exact.ground.normal_in_camera)
+    assert abs(change[0]) < 1.5 * held.stddev.tilt_deg and held.stddev.tilt_deg > 3.0 * exact.stddev.tilt_deg
+    assert held.grade != 'full'
 
 
 def test_a_wrong_principal_point_is_refused_with_both_points(two_roads: Evidence, right: Camera) -> None:
