@@ -63,16 +63,19 @@ def curve_contradiction(lens: Camera, fit: Adjustment) -> Reason:
 def step_with_curve(found: Solution, release: ReleasedLens) -> np.ndarray:
     """Return the step (parameters,) of a solution that covers the plane with focal length and k1 of the traffic.
 
-    Times the root of the probability that the lens is wrong, after the traffic was seen (model averaging).
+    Times the root of the probability that the lens is wrong, after the traffic was seen (model averaging). A lens that
+    is doubted is believed no more than the traffic: what exceeds the error of the traffic is the error of the lens
+    (moment estimator of DerSimonian and Laird 1986, for one difference in two dimensions).
     """
-    change, _ = release.change(_focal_and_k1)
+    change, sigmas = release.change(_focal_and_k1)
     covariance = release.fit.covariance_of(lambda state: _focal_and_k1(state.camera))
     step = step_to_released(found, release)
     if not np.isfinite(covariance).all():
         return 0.0 * step
     wrong = covariance + np.diag(np.square(WRONG_CURVE_SIGMAS))
     log_odds = special.logit(WRONG_LENS) + _log_density(change, wrong) - _log_density(change, covariance)
-    return np.sqrt(special.expit(log_odds)) * step
+    exceeding = 1.0 - 2.0 / sigmas**2 if sigmas > CURVE_DOUBT_SIGMAS else 0.0
+    return np.sqrt(max(float(special.expit(log_odds)), exceeding)) * step
 
 
 def _focal_and_k1(camera: Camera) -> np.ndarray:

@@ -19,7 +19,7 @@ from autocalib_ros.estimation.adjustment.bundle_adjustment import (
 )
 from autocalib_ros.estimation.adjustment.model_selection import MODEL_SELECTION_MARGIN
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentState
-from autocalib_ros.estimation.observations.track_set import TrackSet
+from autocalib_ros.estimation.observations.track_set import TrackSet, evenly_spaced
 from autocalib_ros.estimation.verification.focal_modes import overdispersion
 from autocalib_ros.geometry.robust_kernels import geman_mcclure_bounded_loss
 
@@ -28,6 +28,8 @@ QUADRATIC_FOCAL_SIGMA = 0.04
 log f changes by less than a tenth within one."""
 PROFILE_STEP = 0.1
 """Step of the profile in log f."""
+MAX_PROFILE_TURNS = 40
+"""Windows and tracklets of turning vehicles by which focal lengths are compared: they cost most of the time."""
 MAX_PROFILE_STEPS = 12
 """Steps to either side: a third to three times the focal length. Wider or narrower lenses are no neighbours."""
 
@@ -40,7 +42,7 @@ def widen_by_focal_profile(fit: Adjustment, tracks: TrackSet) -> Adjustment:
     prior = fit.problem.config.prior
     if prior.focal_known or 0 not in prior.free or not QUADRATIC_FOCAL_SIGMA < fit.focal_sigma < np.inf:
         return fit
-    here = adjust(fit.state, tracks, fit.problem.config, refine=True, warm_start=fit.problem.warm_start)
+    here = _with_some_turns(fit, tracks)
     share = float(here.information[0, 0] / fit.information[0, 0])
     if not share > 0.0 or not np.isfinite(here.covariance).all():
         return fit
@@ -53,6 +55,26 @@ def widen_by_focal_profile(fit: Adjustment, tracks: TrackSet) -> Adjustment:
     # what the covariance covers already is not added twice
     missing = 1.0 - fit.focal_sigma**2 / max(float(moments[0, 0]), 1e-12)
     return replace(fit, covariance=fit.covariance + missing * moments) if missing > 0.0 else fit
+
+
+def _with_some_turns(fit: Adjustment, tracks: TrackSet) -> Adjustment:
+    """Adjust with at most `MAX_PROFILE_TURNS` windows and tracklets, evenly spaced in their lists."""
+    config, (_, motion, shapes) = fit.problem.config, fit.problem.warm_start
+    seen = np.zeros(len(config.windows), bool)
+    seen[evenly_spaced(len(seen), MAX_PROFILE_TURNS)] = True
+    living = np.zeros(0 if config.bundle is None else len(config.bundle.tracklets), bool)
+    living[evenly_spaced(len(living), MAX_PROFILE_TURNS)] = True
+    some = replace(
+        config,
+        windows=config.windows.subset(seen),
+        bundle=None if config.bundle is None else config.bundle.subset(living),
+    )
+    warm_start = (
+        None,
+        None if motion is None else motion.subset(seen),
+        None if shapes is None else shapes.subset(living),
+    )
+    return adjust(fit.state, tracks, some, refine=True, warm_start=warm_start)
 
 
 @dataclass(frozen=True)
