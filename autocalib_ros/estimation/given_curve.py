@@ -10,7 +10,7 @@ import numpy as np
 from scipy import special
 
 from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment
-from autocalib_ros.estimation.released_lens import ReleasedLens, step_to_released
+from autocalib_ros.estimation.released_lens import ReleasedLens, step_of_released, step_to_released
 from autocalib_ros.estimation.solution import Solution
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.results.refusals import Reason, reason
@@ -60,22 +60,25 @@ def curve_contradiction(lens: Camera, fit: Adjustment) -> Reason:
     )
 
 
-def step_with_curve(found: Solution, release: ReleasedLens) -> np.ndarray:
-    """Return the step (parameters,) of a solution that covers the plane with focal length and k1 of the traffic.
+def steps_with_curve(found: Solution, release: ReleasedLens) -> np.ndarray:
+    """Return the steps (3, parameters) of a solution that cover the plane with focal length and k1 of the traffic.
 
-    Times the root of the probability that the lens is wrong, after the traffic was seen (model averaging). A lens that
-    is doubted is believed no more than the traffic: what exceeds the error of the traffic is the error of the lens
-    (moment estimator of DerSimonian and Laird 1986, for one difference in two dimensions).
+    The step to these, and one standard deviation of theirs along each axis, all times the root of the probability that
+    the lens is wrong, after the traffic was seen (model averaging). A lens that is doubted is believed no more than the
+    traffic: what exceeds the error of the traffic is the error of the lens (moment estimator of DerSimonian and Laird
+    1986, for one difference in two dimensions).
     """
     change, sigmas = release.change(_focal_and_k1)
     covariance = release.fit.covariance_of(lambda state: _focal_and_k1(state.camera))
     step = step_to_released(found, release)
-    if not np.isfinite(covariance).all():
-        return 0.0 * step
+    if not (np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance)[0] > 0.0):
+        return np.zeros((3, len(step)))
     wrong = covariance + np.diag(np.square(WRONG_CURVE_SIGMAS))
     log_odds = special.logit(WRONG_LENS) + _log_density(change, wrong) - _log_density(change, covariance)
     exceeding = 1.0 - 2.0 / sigmas**2 if sigmas > CURVE_DOUBT_SIGMAS else 0.0
-    return np.sqrt(max(float(special.expit(log_odds)), exceeding)) * step
+    with_lens = release.fit.covariance[:, :2] @ np.linalg.inv(np.linalg.cholesky(release.fit.covariance[:2, :2])).T
+    spread = [step_of_released(found, release, each) for each in with_lens.T]
+    return np.sqrt(max(float(special.expit(log_odds)), exceeding)) * np.array([step, *spread])
 
 
 def _focal_and_k1(camera: Camera) -> np.ndarray:
@@ -85,4 +88,4 @@ def _focal_and_k1(camera: Camera) -> np.ndarray:
 
 def _log_density(change: np.ndarray, covariance: np.ndarray) -> float:
     """Return the log density (up to a constant) of a normal distribution about zero."""
-    return float(-0.5 * (change @ np.linalg.lstsq(covariance, change)[0] + np.linalg.slogdet(covariance)[1]))
+    return float(-0.5 * (change @ np.linalg.solve(covariance, change) + np.linalg.slogdet(covariance)[1]))

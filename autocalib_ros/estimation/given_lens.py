@@ -21,7 +21,7 @@ from autocalib_ros.estimation.given_curve import (
     LENS_TOLERANCE,
     compare_curve,
     curve_contradiction,
-    step_with_curve,
+    steps_with_curve,
 )
 from autocalib_ros.estimation.observations.track_set import TrackSet
 from autocalib_ros.estimation.released_lens import ReleasedLens, released_lens, step_with_focal_length
@@ -75,7 +75,9 @@ def verify_given_lens(
         compared = compare_curve(lens, curve)
         if isinstance(compared, Reason):
             return _in_words_of(compared, lens, solve_free(), tracks)
-        found = found.covering(max(step_with_focal_length(found, release), step_with_curve(found, curve), key=norm))
+        step, *spread = steps_with_curve(found, curve)
+        for each in (max(step, step_with_focal_length(found, release), key=norm), *spread):
+            found = found.covering(each)
         if compared is not None:
             found = found.compared(compared)
         if found.full:

@@ -56,6 +56,12 @@ def step_to_released(found: Solution, release: ReleasedLens) -> np.ndarray:
     return same_change(found.fit, (found.of_traffic or found.fit).state, turned)
 
 
+def step_of_released(found: Solution, release: ReleasedLens, step: np.ndarray) -> np.ndarray:
+    """Return the step (parameters,) by which the plane of a solution turns as with a step of the released one."""
+    before, after = release.fit.state, release.fit.problem.parameters.state(step)
+    return same_change(found.fit, before, replace(after, camera=before.camera))
+
+
 def step_with_focal_length(found: Solution, release: ReleasedLens) -> np.ndarray:
     """Return the step (parameters,) of a solution that covers the plane with the focal length of the traffic.
 

@@ -116,6 +116,16 @@ def test_focal_length_and_k1_that_differ_a_little_widen_the_plane(two_roads: Evi
     assert held.grade != 'full'
 
 
+def test_a_lens_refuted_within_the_tolerance_is_as_uncertain_as_the_traffic() -> None:
+    # the traffic gives a focal length that is 2 % shorter, by 7 sigma of it alone; with k1 it is 4 % uncertain itself
+    junction, evidence = draw_evidence('wrong_lens_file', 33, 34)
+    given = replace(junction.camera, focal_px=585.5, k=(0.0, 0.0, 0.0, 0.0))
+    found = solve_once(evidence, Options(camera_height=junction.height_m), lens=given)
+    assert isinstance(found, Calibration) and found.ground is not None and found.stddev.tilt_deg
+    error = tilt_and_roll_deg(found.ground.normal_in_camera) - tilt_and_roll_deg(junction.normal_in_camera)
+    assert 2.0 < abs(error[0]) < 2.5 * found.stddev.tilt_deg  # it was 4.0 sigma
+
+
 def test_a_wrong_principal_point_is_refused_with_both_points(two_roads: Evidence, right: Camera) -> None:
     x, y = right.principal_point_px
     found = refused(two_roads, replace(right, principal_point_px=(x, y + 120.0)))
