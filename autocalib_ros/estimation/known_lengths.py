@@ -8,19 +8,22 @@ The dashes of lane lines are a length that nobody needs to know: they are as lon
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from autocalib_ros.config import Options
 from autocalib_ros.estimation.adjustment.bundle_adjustment import evaluate_at
 from autocalib_ros.estimation.adjustment.noise_model import DEFAULT_CAMERA_HEIGHT_M
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentState
-from autocalib_ros.estimation.lanes.lane_dashes import LanePattern, measure_lanes
+from autocalib_ros.estimation.lanes.lane_dashes import MeanLog, measure_lanes
 from autocalib_ros.estimation.lanes.lane_scales import ToldLanes, lane_scales
 from autocalib_ros.estimation.observations.track_set import TrackSet
 from autocalib_ros.estimation.solution import Solution
+from autocalib_ros.estimation.steady_speeds import measure_steady_speeds
 from autocalib_ros.estimation.verification.ground_normal import STEP_RAD, PlaneEstimate
 from autocalib_ros.estimation.verification.scale import (
     MIN_HEIGHT_M,
@@ -31,8 +34,9 @@ from autocalib_ros.estimation.verification.scale import (
 )
 from autocalib_ros.estimation.verification.vehicle_size import measure_vehicle_size
 from autocalib_ros.evidence.snapshot import Evidence
+from autocalib_ros.lens.camera import Camera
 from autocalib_ros.results.refusals import Reason, reason
-from autocalib_ros.results.statements import Statement, check
+from autocalib_ros.results.statements import Statement, assumption, check
 from autocalib_ros.results.verification_table import VerificationRow, verified
 
 ITERATIONS = 5
@@ -104,39 +108,45 @@ def _sources(solution: Solution, options: Options) -> list[Scale] | Reason:
 
 
 @dataclass(frozen=True)
+class ChangeWithDistance:
+    """What does not change with distance in the right plane."""
+
+    kind: str
+    """Kind of the row that compares it."""
+    of: Callable[[Camera, np.ndarray], MeanLog | None]
+    """Its change by lens and upward normal (3,); None if it cannot be measured there."""
+    said: tuple[Statement, ...] = ()
+    """What it assumes."""
+
+
+@dataclass(frozen=True)
 class _Lengths:
-    """What is observed: lengths that agree on one camera height, and dashes that do not change with distance."""
+    """What is observed: lengths that agree on one camera height, dashes and speeds that do not change with distance."""
 
     plane: PlaneEstimate
     sources: list[Scale]
-    dashes: LanePattern | None
-    """None if their change with distance is not used."""
+    changes: tuple[ChangeWithDistance, ...]
+    """Of dashes, and of the speed of the traffic."""
 
     def log_heights(self, state: AdjustmentState, turn_rad: float = 0.0) -> np.ndarray:
-        """Return the log of the camera height by each source, and the change of the dashes, shape (n,)."""
+        """Return the log of the camera height by each source, and the changes with distance, shape (n,)."""
         camera, normal = state.camera, self.plane.normal(state, turn_rad)
         heights = np.log([max(source.height(camera, normal), MIN_HEIGHT_M) for source in self.sources])
-        change = None if self.dashes is None else self.dashes.change_with_distance(camera, normal)
-        return heights if self.dashes is None else np.append(heights, 0.0 if change is None else change.mean)
+        changes = [change.of(camera, normal) for change in self.changes]
+        return np.append(heights, [0.0 if change is None else change.mean for change in changes])
 
     @property
     def combinations(self) -> np.ndarray:
-        """Matrix that takes `log_heights` to what is observed as zero: differences of heights, and the change."""
-        count = len(self.sources)
-        differ = _differences(count)
-        if self.dashes is None:
-            return differ
-        below = np.zeros((1, count + 1))
-        below[0, -1] = 1.0
-        return np.vstack([np.hstack([differ, np.zeros((len(differ), 1))]), below])
+        """Matrix that takes `log_heights` to what is observed as zero: differences of heights, and the changes."""
+        return block_diag(_differences(len(self.sources)), np.eye(len(self.changes)))
 
     @property
     def noise(self) -> np.ndarray:
         """Covariance of `log_heights` for exact lens and plane, with the part of an assumed plane."""
         camera, normal = self.plane.lens_and_normal
         sigmas = relative_sigmas(self.sources, camera, normal)
-        change = None if self.dashes is None else self.dashes.change_with_distance(camera, normal)
-        covariance = np.diag(np.append(sigmas, [] if change is None else change.sigma) ** 2)
+        changes = [change.of(camera, normal) for change in self.changes]
+        covariance = np.diag(np.append(sigmas, [1.0 if change is None else change.sigma for change in changes]) ** 2)
         if self.plane.assumed is None:
             return covariance
         state = self.plane.fit.state
@@ -156,10 +166,8 @@ def adjust_to_lengths(found: Solution, tracks: TrackSet, options: Options) -> So
     sources = _sources(found, options)
     if isinstance(sources, Reason):
         return found
-    at, lanes = found.plane.lens_and_normal, found.lanes
-    # crossing roads and turning vehicles know the plane better than dashes, whose road may sag
-    usable = found.assumed and lanes is not None and lanes.change_with_distance(*at) is not None
-    lengths = _Lengths(found.plane, sources, lanes if usable else None)
+    # crossing roads and turning vehicles know the plane better than dashes and speeds, whose road may sag
+    lengths = _Lengths(found.plane, sources, _changes(found) if found.assumed else ())
     if not len(lengths.combinations):
         return found
     plane, parameters, covariance = found.plane, found.fit.problem.parameters, found.fit.covariance
@@ -181,10 +189,25 @@ def adjust_to_lengths(found: Solution, tracks: TrackSet, options: Options) -> So
         gain = covariance @ (combine @ slopes).T @ np.linalg.inv(innovation)
         step = gain @ (combine @ (slopes @ step - here))
         step = np.clip(step, -MAX_STEP_SIGMAS * sigmas, MAX_STEP_SIGMAS * sigmas)
-    found = replace(found.compared(*rows), checks=(*found.checks, *differing))
+    said = (each for change in lengths.changes for each in change.said)
+    found = replace(found.compared(*rows), checks=(*found.checks, *differing), assumptions=(*found.assumptions, *said))
     updated = covariance - gain @ combine @ slopes @ covariance
     fit = evaluate_at(parameters.state(step), tracks, parameters.config, 0.5 * (updated + updated.T))
     return replace(found, fit=fit, plane=replace(plane, fit=fit))
+
+
+def _changes(found: Solution) -> tuple[ChangeWithDistance, ...]:
+    """Return what shows a change with distance about a solution."""
+    at = found.plane.lens_and_normal
+    steady = measure_steady_speeds(*at, found.flow)
+    changes = [] if found.lanes is None else [ChangeWithDistance('dash_period', found.lanes.change_with_distance)]
+    if steady is not None:
+        change = steady.change_with_distance(*at)
+        own = float(found.plane.sigma(lambda *here: np.array([steady.change_with_distance(*here).mean]))[0])
+        if abs(change.mean) < MAX_LENGTH_SIGMAS * np.hypot(change.sigma, own):  # else the traffic brakes or speeds up
+            said = assumption('steady_speed', vehicles=steady.vehicles, sigma=steady.sigma)
+            changes.append(ChangeWithDistance('steady_speed', steady.change_with_distance, (said,)))
+    return tuple(change for change in changes if change.of(*at) is not None)
 
 
 def _compared(
@@ -192,11 +215,14 @@ def _compared(
 ) -> tuple[tuple[VerificationRow, ...], tuple[Statement, ...]]:
     """Return rows of the comparisons before the update, and in words the two lengths that contradict each other most.
 
-    `here` (n,) are the log heights and the change of the dashes, `spread` (n, n) is their covariance.
+    `here` (n,) are the log heights and the changes with distance, `spread` (n, n) is their covariance.
     """
-    rows, count = [], len(lengths.sources)
-    if lengths.dashes is not None:
-        rows.append(verified('dash_period', abs(here[-1]) / spread[-1, -1] ** 0.5, MAX_LENGTH_SIGMAS))
+    count = len(lengths.sources)
+    sigmas = np.sqrt(np.diag(spread))
+    rows = [
+        verified(change.kind, abs(here[at]) / sigmas[at], MAX_LENGTH_SIGMAS)
+        for at, change in enumerate(lengths.changes, start=count)
+    ]
     if count < 2:
         return tuple(rows), ()
     heights, covariance = here[:count], spread[:count, :count]

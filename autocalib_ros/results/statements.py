@@ -282,6 +282,8 @@ ASSUMPTIONS: dict[str, Wording] = {
     'transverse_edges': _transverse_edges,
     'lane_changes': 'plane across one road from {vehicles} vehicles that change lanes: ± {sigma_deg:.1f} degrees '
     'about the road',
+    'steady_speed': 'traffic keeps its speed from near to far: that of {vehicles} vehicles changes by 0 ± {sigma:.0%} '
+    'over 2.7 times the distance',
     'lane_markings': '{lines} lane markings in {places} places taken as parallel or perpendicular: 90 ± {sigma_deg:g} '
     'degrees (measured: {angle_deg:.1f})',
     'scale_height': _scale_height,

@@ -41,6 +41,7 @@ VERIFIED_QUANTITIES: dict[str, VerifiedQuantity] = {
     ),
     'known_lengths': VerifiedQuantity('known lengths against each other', 'sigma', CONTRADICTED),
     'dash_period': VerifiedQuantity('period of dashes far away against near ones', 'sigma', CONTRADICTED),
+    'steady_speed': VerifiedQuantity('speed of the traffic far away against nearby', 'sigma', CONTRADICTED),
     'vehicle_size': VerifiedQuantity('size of the vehicles against the usual one', '%', DOUBTED),
     'usual_speed': VerifiedQuantity('median speed against the fastest usual one', '%', DOUBTED),
     'usual_lanes': VerifiedQuantity('width of the lanes below usual ones', '%', DOUBTED),

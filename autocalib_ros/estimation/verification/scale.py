@@ -207,7 +207,7 @@ def _scale_from_speed(given: ScaleOptions, camera: Camera, normal: np.ndarray, f
         return reason('too_few_vehicles', vehicles=vehicles, limit=MIN_SPEED_VEHICLES)
     speeds = _vehicle_speeds(camera, normal, tracks)
     mean, error = trimmed_mean(speeds)
-    varying = MAD_TO_SIGMA * float(np.median(np.abs(speeds - np.median(speeds)))) / mean
+    varying = _variation(speeds) / mean
     above = given.speed_km_h * M_S_PER_KM_H / mean
     relative = np.linalg.norm([given.speed_sigma_km_h / given.speed_km_h, error / mean, varying**2])
     return Scale(
@@ -254,6 +254,16 @@ def _vehicle_speeds(camera: Camera, normal: np.ndarray, tracks: TrackSet) -> np.
     order = np.argsort(tracks.vehicles, kind='stable')
     edges = np.flatnonzero(np.diff(tracks.vehicles[order])) + 1
     return np.array([np.median(part) for part in np.split(speeds[order], edges)])
+
+
+def speed_variation(camera: Camera, normal: np.ndarray, tracks: TrackSet) -> float:
+    """Return the standard deviation of the speeds of vehicles, relative to their median."""
+    speeds = _vehicle_speeds(camera, normal, tracks)
+    return _variation(speeds) / max(float(np.median(speeds)), 1e-12)
+
+
+def _variation(speeds: np.ndarray) -> float:
+    return MAD_TO_SIGMA * float(np.median(np.abs(speeds - np.median(speeds))))
 
 
 def trimmed_mean(values: np.ndarray) -> tuple[float, float]:
