@@ -20,7 +20,8 @@ from autocalib_ros.estimation.adjustment.bundle_adjustment import evaluate_at
 from autocalib_ros.estimation.adjustment.noise_model import DEFAULT_CAMERA_HEIGHT_M
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentState
 from autocalib_ros.estimation.lanes.lane_dashes import MeanLog, measure_lanes
-from autocalib_ros.estimation.lanes.lane_scales import ToldLanes, lane_scales
+from autocalib_ros.estimation.lanes.lane_scales import ToldLanes, lane_scales, spacing_scales
+from autocalib_ros.estimation.lanes.lane_spacing import measure_lane_spacing
 from autocalib_ros.estimation.observations.track_set import TrackSet
 from autocalib_ros.estimation.solution import Solution
 from autocalib_ros.estimation.steady_speeds import measure_steady_speeds
@@ -62,6 +63,8 @@ def with_seen_lengths(found: Solution, evidence: Evidence, options: Options) -> 
     if found.plane_refusal is not None:
         return found
     found = _with_lanes(found, evidence)
+    if ToldLanes.of(options.lanes).width_m > 0 and (found.lanes is None or not found.lanes.has_width):
+        found = _with_spacing(found, evidence)
     if options.allow_unit_scale or _sources(found, options):
         return found
     at = (*found.plane.lens_and_normal, DEFAULT_CAMERA_HEIGHT_M)
@@ -88,13 +91,23 @@ def _with_lanes(found: Solution, evidence: Evidence) -> Solution:
     return replace(found, lanes=lanes, checks=(*found.checks, seen))
 
 
+def _with_spacing(found: Solution, evidence: Evidence) -> Solution:
+    """Return a solution with lines or vehicles at equal spacing, where dashes show no width of the lanes."""
+    spacing = measure_lane_spacing(evidence, found.flow, *found.plane.lens_and_normal, found.along)
+    if spacing is None:
+        return found
+    width = spacing.width(*found.plane.lens_and_normal)
+    seen = check('lane_spacing', of=spacing.kind, width=width, places=len(spacing.places_px))
+    return replace(found, spacing=spacing, checks=(*found.checks, seen))
+
+
 def scale_of(solution: Solution, options: Options) -> Scale | Reason:
     """Return the scale that the options ask for in a solution, or why there is none."""
     sources = _sources(solution, options)
     if not sources and solution.vehicles is not None:
         return solution.vehicles
     if not sources and options.lanes.given and not options.allow_unit_scale:
-        return reason('no_height', 'no_dashes')
+        return reason('no_height', 'no_dashes' if options.lanes.dash_period_m > 0 else 'no_lanes')
     return combined_scale(sources, options, *solution.plane.lens_and_normal)
 
 
@@ -104,7 +117,9 @@ def _sources(solution: Solution, options: Options) -> list[Scale] | Reason:
     sources = scale_sources(options, *at, solution.flow)
     if isinstance(sources, Reason):
         return sources
-    return [*sources, *lane_scales(solution.lanes, ToldLanes.of(options.lanes), *at, sources)]
+    told = ToldLanes.of(options.lanes)
+    sources += spacing_scales(solution.spacing, told, options.scale, *at)
+    return [*sources, *lane_scales(solution.lanes, told, *at, sources)]
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from autocalib_ros.estimation.adjustment.lens_prior import LensPrior
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentState
 from autocalib_ros.estimation.certainty import certainty_of_lengths
 from autocalib_ros.estimation.lanes.lane_dashes import LanePattern
+from autocalib_ros.estimation.lanes.lane_spacing import LaneSpacing
 from autocalib_ros.estimation.observations.track_set import TrackSet, evenly_spaced
 from autocalib_ros.estimation.observations.two_frame_windows import ResampledTracks, TwoFrameWindows
 from autocalib_ros.estimation.verification.ground_normal import PlaneEstimate
@@ -81,6 +82,8 @@ class Solution:
     """Whether the traffic shows a picture that was cut off, so that its centre tells nothing of the principal point."""
     lanes: LanePattern | None = None
     """The dashes of lane lines on the road; None if they show no period."""
+    spacing: LaneSpacing | None = None
+    """Lines or vehicles at equal spacing, where a width of lanes is told and dashes do not show it; None without."""
     vehicles: Scale | None = None
     """The scale by the size of the vehicles; None if it is not needed, or too few are seen whole."""
     comparisons: tuple[VerificationRow, ...] = ()

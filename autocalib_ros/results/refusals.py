@@ -454,6 +454,11 @@ REFUSALS = (
                 'lane lines are seen that show such a period without doubt',
                 'give camera_height in metres' + OR + 'give a distance on the road (scale.distances)',
             ),
+            'no_lanes': (
+                'the ground plane needs a scale: the width of the lanes is given, but neither dashes, lines nor rows '
+                'of vehicles are seen that repeat across the road',
+                'give camera_height in metres' + OR + 'give a distance on the road (scale.distances)',
+            ),
         },
     ),
     RefusalCode(

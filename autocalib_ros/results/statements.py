@@ -191,9 +191,11 @@ def _scale_lanes(
     source: str,
     height_m: float | None = None,
     height_sigma_m: float | None = None,
+    of: str = '',
 ) -> str:
+    seen = f'by {places} {"bars of lines" if of == "lines" else of}' if of else f'seen in {places} places'
     return (
-        f'scale from lanes {width_m:g} ± {width_sigma_m:.2g} m wide ({_told(source)}), seen in {places} places'
+        f'scale from lanes {width_m:g} ± {width_sigma_m:.2g} m wide ({_told(source)}), {seen}'
         f'{_height_note(height_m, height_sigma_m)}'
     )
 
@@ -334,6 +336,7 @@ CHECKS: dict[str, Wording] = {
     '{second_m:.3g} ± {second_sigma_m:.2g} m: they differ by {sigmas:.1f} standard deviations of what the traffic '
     'leaves open',
     'lane_dashes': _lane_dashes,
+    'lane_spacing': '{places} {of} along the road repeat across it every {width:.2f} camera heights',
     'lane_markings': _lane_markings_difference,
     'markings_and_traffic_normal': 'ground normals from traffic and lane markings differ by {difference_deg:.1f} '
     'degrees ({sigma_deg:.1f} expected)',

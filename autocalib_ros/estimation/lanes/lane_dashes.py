@@ -112,25 +112,25 @@ class LanePattern:
 
     def period(self, camera: Camera, normal: np.ndarray) -> float:
         """Return the period of the dashes, camera heights."""
-        places = _on_road(camera, normal, self.along, self.dashes_px)
+        places = on_road(camera, normal, self.along, self.dashes_px)
         logs, _ = _spacings(places, self.successive)
         return float(np.exp(self.spacing_weights @ logs / self.spacing_weights.sum()))
 
     def dash_share(self, camera: Camera, normal: np.ndarray) -> float:
         """Return the length of a dash in units of the period; blur makes it too large by up to a half."""
-        ways = np.diff(_on_road(camera, normal, self.along, self.dashes_px), axis=1)[:, 0]
+        ways = np.diff(on_road(camera, normal, self.along, self.dashes_px), axis=1)[:, 0]
         lengths = np.log(np.maximum(np.hypot(*ways.T), 1e-6))[self.successive[:, 0]]
         return float(np.exp(_weighted(lengths, self.spacing_weights)) / self.period(camera, normal))
 
     def width(self, camera: Camera, normal: np.ndarray) -> float:
         """Return the width of a lane, camera heights."""
-        offsets = _offsets(_on_road(camera, normal, self.along, self.dashes_px), self.beside)
+        offsets = _offsets(on_road(camera, normal, self.along, self.dashes_px), self.beside)
         logs = np.log(np.maximum(np.abs(offsets), 1e-6))
         return float(np.exp(self.beside_weights @ logs / self.beside_weights.sum()))
 
     def change_with_distance(self, camera: Camera, normal: np.ndarray) -> MeanLog | None:
         """Return the change of the log period by the log distance, which is 0; None if all dashes are equally far."""
-        logs, distances = _spacings(_on_road(camera, normal, self.along, self.dashes_px), self.successive)
+        logs, distances = _spacings(on_road(camera, normal, self.along, self.dashes_px), self.successive)
         weights, away = self.spacing_weights, np.log(np.maximum(distances, 1e-6))
         total = weights.sum()
         away = away - weights @ away / total
@@ -147,8 +147,8 @@ def measure_lanes(
 
     `sigma_rad` is the standard deviation of the plane.
     """
-    dashes = _bars_on_road(evidence, camera, normal)
-    places = _on_road(camera, normal, along, dashes[:, :4])
+    dashes = bars_near_traffic(evidence, camera, normal)
+    places = on_road(camera, normal, along, dashes[:, :4])
     dashes, places = _sorted_along(dashes, places)
     pairs = _successive(places, dashes[:, 4])
     if len(pairs) < MIN_PERIODIC_SPACINGS:
@@ -164,7 +164,7 @@ def measure_lanes(
     pitches = PITCH_STEP_RAD * np.arange(-(reach // PITCH_STEP_RAD), reach // PITCH_STEP_RAD + 1)
     logs = np.array(
         [
-            _spacings(_on_road(camera, np.cos(turn) * normal + np.sin(turn) * ahead, along, dashes[:, :4]), pairs)[0]
+            _spacings(on_road(camera, np.cos(turn) * normal + np.sin(turn) * ahead, along, dashes[:, :4]), pairs)[0]
             for turn in pitches.tolist()
         ]
     )
@@ -188,7 +188,7 @@ def _weighted(values: np.ndarray, weights: np.ndarray) -> float:
     return float(weights @ values / weights.sum())
 
 
-def _bars_on_road(evidence: Evidence, camera: Camera, normal: np.ndarray) -> np.ndarray:
+def bars_near_traffic(evidence: Evidence, camera: Camera, normal: np.ndarray) -> np.ndarray:
     """Return the bars (n, STRIPE_COLUMNS) below the horizon and near traffic."""
     bars = evidence.stripes_px
     if not len(bars) or not len(evidence.points_px):
@@ -200,7 +200,7 @@ def _bars_on_road(evidence: Evidence, camera: Camera, normal: np.ndarray) -> np.
     return bars[all_within(sample_segments(bars[:, :4]), traffic_cells(evidence), reach)] if len(bars) else bars
 
 
-def _on_road(camera: Camera, normal: np.ndarray, along: np.ndarray, ends_px: np.ndarray) -> np.ndarray:
+def on_road(camera: Camera, normal: np.ndarray, along: np.ndarray, ends_px: np.ndarray) -> np.ndarray:
     """Return the ends (n, 2, 2) of segments (n, 4) on the road: along it and to its left, camera heights."""
     places = ground_points(camera, normal, 1.0, ends_px.reshape(-1, 2))
     ahead = ahead_direction(normal)
@@ -261,11 +261,11 @@ def _spacing_sigmas(
 ) -> np.ndarray:
     """Return the standard deviations (m,) of the log spacings, from the place of the dashes in the image."""
     ends = dashes[:, :4]
-    middle = _on_road(camera, normal, along, ends).mean(axis=1)
+    middle = on_road(camera, normal, along, ends).mean(axis=1)
     step = DASH_PLACE_SIGMA * evidence.image_size[0]
     way = ends[:, 2:] - ends[:, :2]
     moved = ends + np.tile(step * way / np.linalg.norm(way, axis=1, keepdims=True), 2)
-    by_step = np.hypot(*(_on_road(camera, normal, along, moved).mean(axis=1) - middle).T)
+    by_step = np.hypot(*(on_road(camera, normal, along, moved).mean(axis=1) - middle).T)
     spacing = np.hypot(*(middle[pairs[:, 1]] - middle[pairs[:, 0]]).T)
     return np.hypot(MIN_SPACING_SIGMA, np.hypot(by_step[pairs[:, 0]], by_step[pairs[:, 1]]) / spacing)
 

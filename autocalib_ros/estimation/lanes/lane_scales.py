@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from autocalib_ros.config import LaneOptions
+from autocalib_ros.config import LaneOptions, ScaleOptions
 from autocalib_ros.estimation.lanes.lane_dashes import LanePattern
+from autocalib_ros.estimation.lanes.lane_spacing import LaneSpacing
 from autocalib_ros.estimation.lanes.lane_standards import LANE_STANDARDS
 from autocalib_ros.estimation.verification.scale import HeightFunction, Scale
 from autocalib_ros.lens.camera import Camera
@@ -76,6 +77,37 @@ def lane_scales(
     expected = [source.height(camera, normal) for source in (others or found)]
     period_m = _fitting(pattern, told, (camera, normal), expected)
     return found if period_m is None else [*found, _of_period(pattern, told, period_m, camera, normal)]
+
+
+def spacing_scales(
+    spacing: LaneSpacing | None, told: ToldLanes, options: ScaleOptions, camera: Camera, normal: np.ndarray
+) -> list[Scale]:
+    """Return the scale by lines or vehicles at equal spacing; none without them, or where no width is told.
+
+    Points of vehicles are above the road, so that their spacing gives the height of the camera above them.
+    """
+    if spacing is None or told.width_m <= 0:
+        return []
+    above, above_sigma = (options.point_height_m, options.point_height_sigma_m) if spacing.raised else (0.0, 0.0)
+    relative = float(np.hypot(told.width_sigma_m / told.width_m, spacing.sigma))
+    over = told.width_m / spacing.width(camera, normal)
+    values: dict[str, Value] = {
+        'width_m': told.width_m,
+        'width_sigma_m': told.width_sigma_m,
+        'places': len(spacing.places_px),
+        'source': told.source,
+        'of': spacing.kind,
+    }
+    return [
+        Scale(
+            lambda lens, up: told.width_m / spacing.width(lens, up) + above,
+            float(np.hypot(relative * over, above_sigma)),
+            True,
+            'scale_lanes',
+            values,
+            derived=True,
+        )
+    ]
 
 
 def _fitting(
