@@ -6,6 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 from dashed_road import dashes
+from lane_traffic import FOUR_LANES, traffic
 from pinhole_road import PINHOLE, ROAD
 
 from autocalib_ros.config import GateOptions, LaneOptions, LensOptions, Options, ScaleOptions
@@ -13,6 +14,7 @@ from autocalib_ros.estimation.estimate import find_solution
 from autocalib_ros.estimation.known_lengths import adjust_to_lengths, scale_of, with_seen_lengths
 from autocalib_ros.estimation.observations.track_set import TrackSet, select_tracks
 from autocalib_ros.estimation.solution import Solution
+from autocalib_ros.estimation.verification.scale import Scale
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.synthetic.junction import synthetic_evidence
 from autocalib_ros.results.calibration import Calibration
@@ -125,4 +127,20 @@ def test_dashes_that_contradict_the_height_are_named_with_both_numbers() -> None
 
 def test_lanes_are_told_and_no_dash_is_seen() -> None:
     why = scale_of(replace(unscaled()[0], lanes=None), Options(lanes=LaneOptions(country='us')))
-    assert isinstance(why, Reason) and 'no dashes of lane lines' in why.message and 'camera_height' in why.remedy
+    assert isinstance(why, Reason) and 'neither dashes, lines nor rows' in why.message and 'camera_height' in why.remedy
+    why = scale_of(replace(unscaled()[0], lanes=None), Options(lanes=LaneOptions(dash_period_m=9.0)))
+    assert isinstance(why, Reason) and 'no dashes of lane lines' in why.message
+
+
+def test_a_lane_width_without_dashes_gives_the_scale_by_rows_of_vehicles() -> None:
+    options = Options(lanes=LaneOptions(width_m=3.5))
+    bare = replace(evidence_once(ROAD), stripes_px=np.zeros((0, 5)))
+    seen = with_seen_lengths(replace(unscaled()[0], lanes=None, flow=traffic(FOUR_LANES)), bare, options)
+    assert seen.spacing is not None and seen.spacing.kind == 'vehicles' and seen.vehicles is None
+    scale = scale_of(seen, options)
+    assert isinstance(scale, Scale)
+    height = scale.height(*seen.plane.lens_and_normal)
+    of_plane = seen.plane.sigma(lambda *at: np.array([scale.height(*at)]))[0]
+    assert abs(height - ROAD.height_m) < 2.5 * np.hypot(scale.sigma, of_plane)
+    assert scale.sigma < 0.12 * height
+    assert [each.kind for each in seen.checks if each.kind == 'lane_spacing']

@@ -27,7 +27,7 @@ PLACED_SHARE = 0.8
 LINE_SCATTERS, VEHICLE_SCATTERS = (0.03, 0.06), (0.09, 0.14)
 """Standard deviations from these places that are tried, in units of the width: 0.1 to 0.2 m of lines, which are as wide
 as that, and 0.3 to 0.5 m of vehicles, which keep to the middle of a lane to 0.3 m, seen at one side or at the roof."""
-MIN_TAKEN, MIN_STEPS = {'lines': 2.0, 'vehicles': 4.0}, 2
+MIN_TAKEN, MIN_STEPS = {'lines': 2, 'vehicles': 3}, 2
 """Fewest bars or vehicles that make a line or a lane, and fewest pairs of neighbours at the spacing. Judgement."""
 SPACING_SIGMAS = {'lines': 0.03, 'vehicles': 0.06}
 """Standard deviation of the log width that no scatter shows: paint, and border lines that stand aside; drivers who keep
@@ -168,12 +168,12 @@ def _spacing(
 
 
 def _best_width(
-    offsets: np.ndarray, sides: np.ndarray, scatters: tuple[float, ...], least: float
+    offsets: np.ndarray, sides: np.ndarray, scatters: tuple[float, ...], least: int
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Return the lane (n,) of each offset (n,) and the mask (n,) of those at one; None if no width is probable."""
     tried = [_lanes_of(offsets, sides, width, scatter, least) for width in TRIAL_WIDTHS for scatter in scatters]
-    nats = np.array([each[0] for each in tried]).reshape(len(TRIAL_WIDTHS), -1).max(axis=1)
-    best = int(np.argmax([each[0] for each in tried]))
+    every = np.array([each[0] for each in tried])
+    best, nats = int(np.argmax(every)), every.reshape(len(TRIAL_WIDTHS), -1).max(axis=1)
     others = np.abs(np.log(TRIAL_WIDTHS / TRIAL_WIDTHS[best // len(scatters)])) > SAME_PERIOD
     if nats.max() < max(MIN_PERIOD_NATS, nats[others].max() + MIN_OTHER_NATS):
         return None
@@ -181,7 +181,7 @@ def _best_width(
 
 
 def _lanes_of(
-    offsets: np.ndarray, sides: np.ndarray, width: float, scatter: float, least: float
+    offsets: np.ndarray, sides: np.ndarray, width: float, scatter: float, least: int
 ) -> tuple[float, np.ndarray, np.ndarray]:
     """Return log likelihood over that of any places, lanes (n,) and the mask (n,) of a width; -inf if it never repeats.
 

@@ -36,7 +36,9 @@ from autocalib_ros.geometry.small_matrices import cross
 from autocalib_ros.lens.camera import Camera
 
 TEMPER = 0.5
-"""Share of the log likelihood of edges and lines that counts: those of one scene repeat each other. Judgement."""
+"""Share of the log likelihood of edges and lines that counts: where the road bends, those of one place are turned
+alike. The errors of focal length have a root mean square of 0.6 standard deviations on 57 simulated straight roads
+and of 0.95 on 31 bends; with 0.7 it was 1.5 on 16 bends, up to 4.2."""
 KAPPA_NODES = 4
 """Curvatures at each focal length, within 2.5 standard deviations of what straight tracks show."""
 MIN_SPACINGS, FINER_SHIFTS = 1.0, np.linspace(-2.5, 2.5, 16)

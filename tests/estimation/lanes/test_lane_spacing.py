@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from dashed_road import bars_seen
+from lane_traffic import FOUR_LANES, traffic
 from pinhole_road import PINHOLE, ROAD
 
 from autocalib_ros.config import LaneOptions, ScaleOptions
@@ -16,28 +17,6 @@ from solved_once import evidence_once
 
 NORMAL, ALONG = ROAD.normal_in_camera, ROAD.camera_from_ground[:, 0]
 HEIGHT_M, LANE_M = ROAD.height_m, 3.5
-FOUR_LANES = {-1.0: (-5.25, -1.75), 1.0: (1.75, 5.25)}
-"""Middles of lanes by direction of travel, metres to the left."""
-
-
-def traffic(lanes: dict[float, tuple[float, ...]], count: int = 48, scatter_m: float = 0.3) -> TrackSet:
-    """Vehicles in lanes, by direction of travel, of points up to 1.2 m above the road."""
-    generator = np.random.default_rng(2)
-    each = [(way, y) for way, middles in lanes.items() for y in middles]
-    way, y = np.array([each[index % len(each)] for index in range(count)]).T
-    share = np.linspace(0.0, 1.0, 10)
-    places = np.stack(
-        [
-            19.0 + way[:, None] * (share - 0.5) * 18.0,
-            np.broadcast_to((y + scatter_m * generator.normal(size=count))[:, None], (count, 10)),
-            np.broadcast_to(generator.uniform(0.2, 1.2, (count, 1)) - HEIGHT_M, (count, 10)),
-        ],
-        axis=-1,
-    )
-    pixels, _ = PINHOLE.project(places.reshape(-1, 3) @ ROAD.camera_from_ground.T)
-    times = np.broadcast_to(share, (count, 10))
-    weights, numbers = np.full((count, 10), 0.1), np.arange(count)
-    return TrackSet(pixels.reshape(count, 10, 2), weights, numbers, times, numbers)
 
 
 def lines(*across_m: float, starts_m: tuple[float, ...] = (10.0, 17.0, 24.0, 31.0), length_m: float = 6.0) -> Evidence:
