@@ -30,6 +30,8 @@ traffic flows, each changes its speed by little, and all of them by less. Judgem
 MAX_VARIATION = 0.25
 """Largest standard deviation between vehicles of the change of speed, and of the speed itself (relative), up to which
 traffic flows: by about a fifth on free roads, far more before stop lines and in jams, where all brake in one place."""
+MIN_INFORMATION = 1e-12
+"""Added to the information of a way that is farther away than any road, in a plane that is tried."""
 MEAN_ROUNDS = 5
 """Rounds of the robust mean."""
 
@@ -87,7 +89,7 @@ def _reaching(camera: Camera, normal: np.ndarray, tracks: TrackSet) -> np.ndarra
     bearings, valid = camera.unproject(tracks.pixels.reshape(-1, 2))
     near = (valid & (bearings @ normal < -1.0 / FARTHEST_STEADY_HEIGHTS)).reshape(tracks.weights.shape).all(axis=1)
     away = np.linalg.norm(_places(camera, normal, tracks), axis=-1)
-    several = (tracks.weights > 0).sum(axis=1) >= 4
+    several = (np.diff(tracks.sample_times_s, axis=1) > 0).sum(axis=1) >= 3  # times of damaged evidence may stand still
     return near & several & (away.max(axis=1) > MIN_DISTANCE_RATIO * away.min(axis=1))
 
 
@@ -106,7 +108,7 @@ def _changes(camera: Camera, normal: np.ndarray, tracks: TrackSet) -> tuple[np.n
     design = np.stack([np.ones_like(times), times, times * times], axis=-1)
     # the length of road that a pixel covers grows with the square of the distance from the camera
     weights = (tracks.weights > 0) / (1.0 + away * away) ** 2
-    inverse = np.linalg.inv(np.einsum('tsi,ts,tsj->tij', design, weights, design))
+    inverse = np.linalg.inv(np.einsum('tsi,ts,tsj->tij', design, weights, design) + MIN_INFORMATION * np.eye(3))
     fitted = np.einsum('tij,tsj,ts,ts->ti', inverse, design, weights, ways)
     left = ways - np.einsum('tsi,ti->ts', design, fitted)
     noise2 = float(np.median((weights * left * left).sum(axis=1) / ((weights > 0).sum(axis=1) - design.shape[-1])))

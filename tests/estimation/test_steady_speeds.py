@@ -67,3 +67,15 @@ def test_few_vehicles_and_far_ones_measure_nothing() -> None:
     assert measure_steady_speeds(PINHOLE, NORMAL, every.subset(np.arange(8))) is None
     near = replace(every, pixels=every.pixels[:, :1] + 0.0 * every.pixels)
     assert measure_steady_speeds(PINHOLE, NORMAL, near) is None
+
+
+def test_times_that_stand_still_measure_nothing() -> None:
+    every = tracks()
+    assert measure_steady_speeds(PINHOLE, NORMAL, replace(every, sample_times_s=0.0 * every.sample_times_s)) is None
+
+
+def test_a_plane_that_the_road_leaves_is_no_error() -> None:
+    steady = measure_steady_speeds(PINHOLE, NORMAL, tracks())
+    assert steady is not None
+    away = Rotation.from_rotvec(np.radians(-25.0) * ACROSS).apply(NORMAL)
+    assert isinstance(steady.change_with_distance(PINHOLE, away).mean, float)
