@@ -50,7 +50,7 @@ class _StoredSample:
 
     def grey(self, size: tuple[int, int]) -> np.ndarray:
         """Return the image in grey, uint8 (height, width) of a `size` (width, height) that it is reduced to."""
-        image = np.concatenate([cv2.imdecode(strip, cv2.IMREAD_GRAYSCALE) for strip in self.strips])
+        image = np.concatenate([_decoded(strip, cv2.IMREAD_GRAYSCALE) for strip in self.strips])
         return image if image.shape == size[::-1] else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 
@@ -121,9 +121,7 @@ class Background:
         if not samples:
             return None
         strips = zip(*(sample.strips for sample in samples), strict=True)
-        return np.concatenate(
-            [median([np.asarray(cv2.imdecode(part, cv2.IMREAD_COLOR)) for part in strip]) for strip in strips]
-        )
+        return np.concatenate([median([_decoded(part, cv2.IMREAD_COLOR) for part in strip]) for strip in strips])
 
     def grey_samples(self, size: tuple[int, int]) -> list[np.ndarray]:
         """Return the images in grey, uint8 (height, width) of a `size` (width, height) that they are reduced to.
@@ -144,6 +142,10 @@ def _encoded(image: np.ndarray) -> tuple[np.ndarray, ...]:
     rows = max(1, STRIP_BYTES // (3 * image.shape[1] * STRIP_ROWS)) * STRIP_ROWS
     strips = (np.ascontiguousarray(image[top : top + rows]) for top in range(0, len(image), rows))
     return tuple(cv2.imencode('.jpg', strip, [cv2.IMWRITE_JPEG_QUALITY, 92])[1] for strip in strips)
+
+
+def _decoded(strip: np.ndarray, flags: int) -> np.ndarray:
+    return np.asarray(cv2.imdecode(strip, flags))
 
 
 def _halved(image: np.ndarray) -> np.ndarray:

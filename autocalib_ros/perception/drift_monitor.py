@@ -12,6 +12,7 @@ from autocalib_ros.evidence.stillness import Stillness, ViewChange, ViewChangeKi
 from autocalib_ros.perception.background import median
 from autocalib_ros.perception.background_motion import LAMP_QUANTILE, PictureMotion
 from autocalib_ros.perception.ratio_test import distinctive_matches
+from autocalib_ros.perception.reductions import Reductions
 from autocalib_ros.perception.still_view import StillView
 
 WIDTH_PX = 640
@@ -109,20 +110,23 @@ class DriftMonitor:
         for view in filter(None, (self._view, self._kept, self._candidate)):
             view.exclude(self._ignored_of(view.size))
 
-    def update(self, grey: np.ndarray, time_s: float) -> ImagePose:
-        """Take a grey image (H, W); say whether it shows the present view, and how far the picture moved."""
-        self._newest_s = time_s
+    def update(self, grey: np.ndarray, time_s: float, reductions: Reductions | None = None) -> ImagePose:
+        """Take a grey image (H, W); say whether it shows the present view, and how far the picture moved.
+
+        There may be `reductions` of the image.
+        """
+        self._newest_s, reductions = time_s, reductions or Reductions(grey)
         view = self._view
         if self._is_left and view is not None:
             self._is_left = False
-            reduced = self._reduced(grey)
+            reduced = self._reduced(reductions, grey.shape)
             new = self._new_view(self._next_number(), reduced, time_s)
             new.position = view.position + view.last.shift
             self._adopt(new, ViewChange(ViewChangeKind.TURN, time_s, time_s, view.moved_px * self._factor))
             return ImagePose(new.number, True)
         if view is not None and self._unsettled_s is None and time_s < self._due_s:
             return ImagePose(view.number, True)
-        reduced = self._reduced(grey)
+        reduced = self._reduced(reductions, grey.shape)
         if view is None or not view.reference.is_textured:
             view = self._begin_or_wait(view, reduced, time_s)
         else:
@@ -153,12 +157,10 @@ class DriftMonitor:
         """Take other limits from the next image on."""
         self._limits = limits
 
-    def _reduced(self, grey: np.ndarray) -> np.ndarray:
-        self._factor = max(1.0, grey.shape[1] / WIDTH_PX)
-        if self._factor == 1.0:
-            return grey.copy()
-        size = (round(grey.shape[1] / self._factor), round(grey.shape[0] / self._factor))
-        return cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    def _reduced(self, reductions: Reductions, shape: tuple[int, ...]) -> np.ndarray:
+        """Return an image of `shape` in the size at which views are compared."""
+        self._factor = max(1.0, shape[1] / WIDTH_PX)
+        return reductions.at((round(shape[1] / self._factor), round(shape[0] / self._factor)))
 
     def _begin_or_wait(self, view: StillView | None, reduced: np.ndarray, time_s: float) -> StillView:
         """Begin with the first image that has corners: dark, foggy or covered ones say nothing about the pose."""

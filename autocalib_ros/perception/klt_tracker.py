@@ -77,6 +77,8 @@ class PointTracker:
         self._time_s = self._interval_s = 0.0
         self._repeats = 0
         self._intervals_s: deque[float] = deque(maxlen=USUAL_INTERVALS)
+        self._times_s: deque[float] = deque(maxlen=MAX_TRACK_SAMPLES)
+        """Times of the last images; each point was in all of them since its track started."""
         slots = options.max_points
         self._history = np.zeros((slots, MAX_TRACK_SAMPLES, 3))
         self._count = np.zeros(slots, int)
@@ -91,8 +93,8 @@ class PointTracker:
         if len(fast) < MIN_FAST_POINTS:
             return False
         positions = self._current_positions(fast)
-        before, after = (self._patches(image, positions) for image in (self._grey, grey))
-        moved = self._patches(grey, positions + self._step[fast])
+        here, there = (self._windows(grey.shape, points) for points in (positions, positions + self._step[fast]))
+        before, after, moved = _pixels(self._grey, here), _pixels(grey, here), _pixels(grey, there)
         change, change_if_moved = (np.abs(image - before).mean(axis=1) for image in (after, moved))
         contrast = np.abs(before - before.mean(axis=1, keepdims=True)).mean(axis=1)
         unchanged = change < UNCHANGED * np.minimum(contrast, change_if_moved)
@@ -114,12 +116,12 @@ class PointTracker:
         good &= np.hypot(*(found - start - step).T) <= GAP_TOLERANCE * np.hypot(*step.T)
         return bool(good.mean() > ONE_STEP_FRACTION)
 
-    def _patches(self, grey: np.ndarray, points_px: np.ndarray) -> np.ndarray:
-        """Return the pixels of a grey image (H, W) around points (n, 2), float32 (n, window_px squared)."""
+    def _windows(self, shape: tuple[int, ...], points_px: np.ndarray) -> np.ndarray:
+        """Return the indices (n, window_px squared) of the pixels around points (n, 2) in an image of `shape`."""
         reach = np.arange(self._options.window_px) - self._options.window_px // 2
         columns, rows = np.round(points_px).astype(int).T[..., None] + reach
-        rows, columns = np.clip(rows, 0, grey.shape[0] - 1), np.clip(columns, 0, grey.shape[1] - 1)
-        return grey[rows[:, :, None], columns[:, None, :]].reshape(len(points_px), -1).astype(np.float32)
+        rows, columns = np.clip(rows, 0, shape[0] - 1), np.clip(columns, 0, shape[1] - 1)
+        return (rows[:, :, None] * shape[1] + columns[:, None, :]).reshape(len(points_px), -1)
 
     def skip_repeat(self) -> None:
         """Count a repeated image that is left out: the next step is over one more frame interval."""
@@ -144,17 +146,18 @@ class PointTracker:
             interval_s = time_s - self._time_s
             if not 0 < interval_s <= MAX_GAP_S:
                 finished = self.finish_all()
+                self._times_s.clear()
             else:
                 self._intervals_s.append(interval_s / intervals)  # repeats are images too
-                usual_s = float(np.quantile(self._intervals_s, USUAL_QUANTILE))
+                frame_s, usual_s = np.quantile(self._intervals_s, (FRAME_QUANTILE, USUAL_QUANTILE)).tolist()
                 gap = interval_s > GAP_INTERVALS * usual_s
                 before = match_grey_levels(self._grey, grey) if gap else self._grey
-                frame_s = float(np.quantile(self._intervals_s, FRAME_QUANTILE))
                 interval_s = frame_s if interval_s < SHORTEST_INTERVAL * frame_s else interval_s
                 finished = self._follow(before, grey, time_s, interval_s, gap, after_repeats=intervals > 1)
                 if intervals == 1 or not self._interval_s:
                     self._interval_s = interval_s
         self._grey, self._time_s = grey, time_s
+        self._times_s.append(time_s)
         return finished
 
     def _follow(
@@ -250,9 +253,8 @@ class PointTracker:
         """Return the mask of the slots whose points moved less than `STATIONARY_PX` in the last `STATIONARY_S`."""
         if not len(slots):
             return np.zeros(0, bool)
-        times = self._history[slots, :, 0]
-        filled = np.arange(MAX_TRACK_SAMPLES) < self._count[slots, None]
-        earlier = ((times <= time_s - STATIONARY_S) & filled).sum(axis=1) - 1
+        newer = 1 + sum(1 for earlier_s in self._times_s if earlier_s > time_s - STATIONARY_S)
+        earlier = self._count[slots] - 1 - newer
         old_enough = earlier >= 0
         then = self._history[slots, np.maximum(earlier, 0), 1:]
         return old_enough & (np.hypot(*(self._current_positions(slots) - then).T) < STATIONARY_PX)
@@ -329,6 +331,11 @@ class PointTracker:
         if len(chosen) < MIN_TRACK_SAMPLES:
             return None
         return Track(int(self._vehicle[slot]), path[chosen, 0].copy(), path[chosen, 1:].copy())
+
+
+def _pixels(grey: np.ndarray, indices: np.ndarray) -> np.ndarray:
+    """Return the pixels (n, m) of a grey image (H, W) at indices, as float32."""
+    return grey.ravel().take(indices).astype(np.float32)
 
 
 def _whole(ratio: float) -> float:

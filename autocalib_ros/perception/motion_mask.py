@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from autocalib_ros.config import MotionOptions
+from autocalib_ros.perception.reductions import Reductions
 
 MOG2_VARIANCE_THRESHOLD = 25.0
 """Squared Mahalanobis distance from the background above which a pixel is foreground: five sigmas."""
@@ -36,13 +37,12 @@ class MotionMask:
         self._size = (0, 0)
         self._newest_s = 0.0
 
-    def update(self, grey: np.ndarray, time_s: float) -> None:
-        """Update the model with a grey image (H, W) taken at `time_s` seconds."""
+    def update(self, grey: np.ndarray, time_s: float, reductions: Reductions | None = None) -> None:
+        """Update the model with a grey image (H, W) taken at `time_s` seconds, of which there may be `reductions`."""
         height, width = grey.shape
         reduced_width = min(self._options.width_px, width)
-        reduced = cv2.resize(
-            grey, (reduced_width, max(1, round(height * reduced_width / width))), interpolation=cv2.INTER_AREA
-        )
+        size = (reduced_width, max(1, round(height * reduced_width / width)))
+        reduced = (reductions or Reductions(grey)).at(size)
         first = self._mask is None
         rate = 1.0 if first else min(max((time_s - self._newest_s) / self._options.history_s, 1e-4), 0.2)
         foreground = self._subtractor.apply(reduced, learningRate=rate)

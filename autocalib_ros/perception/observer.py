@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -17,7 +18,6 @@ from autocalib_ros.perception.background import Background, median
 from autocalib_ros.perception.detector.detector import VehicleDetector
 from autocalib_ros.perception.detector_tracks import DetectorTracks
 from autocalib_ros.perception.drift_monitor import DriftLimits, DriftMonitor, ImagePose
-from autocalib_ros.perception.edges import EdgeFinder
 from autocalib_ros.perception.frame_gate import LEVEL_SHIFT_THRESHOLD, FrameGate, FrameStatus
 from autocalib_ros.perception.ignore_regions import IgnoreMask, black_out, require_polygons_inside, union
 from autocalib_ros.perception.klt_tracker import PointTracker
@@ -25,21 +25,21 @@ from autocalib_ros.perception.landmark_matching import find_landmarks
 from autocalib_ros.perception.line_segments import LineSegmentDetector
 from autocalib_ros.perception.motion_mask import MotionMask, Region, exclude_pixels
 from autocalib_ros.perception.picture_area import PictureArea
+from autocalib_ros.perception.reductions import Reductions
 from autocalib_ros.perception.repeats import RepeatDetector
-from autocalib_ros.perception.segments import Keypoints, find_keypoints, match_segments
 from autocalib_ros.perception.silhouettes import outlines_of
 from autocalib_ros.perception.still_view import warped
 from autocalib_ros.perception.stripe_detector import StripeDetector
+from autocalib_ros.perception.vehicle_search import MaskedFrame, VehicleSearch
 from autocalib_ros.perception.view_watch import KnownView
 
 MOTION_MASK_PERIOD = 2
 """Frames between updates of the motion mask: traffic needs no finer time step."""
-EDGE_SEARCH_PERIOD = 2
-"""Keypoint detections between edge searches, which cost as much; edges change little in between."""
-
-
 GATE_WIDTH_PX = 320
 """Width at which frames are compared with the frame gate."""
+
+
+OnVehicles = TypeVar('OnVehicles', Segments, Edges)
 
 
 @dataclass(frozen=True)
@@ -87,8 +87,7 @@ class Observer:
         self._view = 0
         self._no_picture: np.ndarray | None = None
         """Mask of the tracked image where there is no picture, as far as is known."""
-        self._sift = cv2.SIFT_create(contrastThreshold=0.03)  # type: ignore[attr-defined]  # for OpenCV 4.5
-        self._keypoints: Keypoints | None = None
+        self._vehicle_search = VehicleSearch()
         self._frame_gate = FrameGate(RepeatDetector(), LEVEL_SHIFT_THRESHOLD)
         self.repeated = 0
         """Number of images so far that repeat an earlier one."""
@@ -97,8 +96,6 @@ class Observer:
         self._lost = 0
         """Images lost since the last one that was new."""
         self._vehicles = 0
-        self._edge_finder = EdgeFinder()
-        self._detections = 0
 
     def observe(self, image: np.ndarray, time_s: float, lost: int = 0) -> FrameObservations:
         """Process a grey (H, W) or BGR (H, W, 3) uint8 image; repeated frames and closed shutters yield nothing.
@@ -108,15 +105,18 @@ class Observer:
         self._lost += lost
         image = black_out(image, self._polygons)
         grey = self._tracked_image(image)
-        status = self._frame_gate.classify(_downsampled(grey, self._ignored), time_s)
+        reductions = Reductions(grey)
+        status = self._frame_gate.classify(self._compared_image(reductions, grey), time_s)
         if status is FrameStatus.REPEATED:
             return self._leave_out(status)
-        pose = self._drift_monitor.update(grey, time_s)
+        pose = self._drift_monitor.update(grey, time_s, reductions)
         if pose.view != self._view:
             return self._change_view(pose.view)
         if status is FrameStatus.HIDDEN or not pose.is_usable:
             return FrameObservations([], None, None, view=self._view)
-        image, grey = self._in_rest_position(image, grey, pose, time_s)
+        if pose.is_compensated:
+            image, grey = self._in_rest_position(image, grey, pose, time_s)
+            reductions = Reductions(grey)
         if self._tracker.is_repeat(grey, time_s):
             return self._leave_out(status)
         ended = self._reset_appearance() if status is FrameStatus.LEVEL_SHIFT else []
@@ -124,15 +124,20 @@ class Observer:
         was_known = self._scene.picture_area.is_known
         if self._scene.picture_area.update(self._scene.background) or was_known != self._scene.picture_area.is_known:
             self._exclude_no_picture()
+        segments, edges = self._vehicle_search.go_on(self._tracker)
         tracks = [self._to_full_size(track) for track in (*ended, *self._tracker.follow_new(grey, time_s))]
         passed, self._slots, self._lost = self._slots, self._slots + 1 + self._lost, 0
         detect = _reaches_multiple(passed, self._slots, self._options.tracking.detect_every)
         if detect or _reaches_multiple(passed, self._slots, MOTION_MASK_PERIOD):
-            self._motion.update(grey, time_s)
+            self._motion.update(grey, time_s, reductions)
         if self._detector_tracks is not None:
             self._detector_tracks.follow(image, time_s, self._tracker, self._reduction)
-        segments, edges, outlines = self._detect(grey, time_s) if detect else (None, None, None)
-        return FrameObservations(tracks, segments, edges, outlines, self._view)
+        outlines = None
+        if detect:
+            frame = MaskedFrame(grey, time_s, *self._moving_regions(grey.shape))
+            outlines = self._find_outlines(frame)
+            edges = self._vehicle_search.begin(frame) or edges
+        return FrameObservations(tracks, self._in_full_size(segments), self._in_full_size(edges), outlines, self._view)
 
     def follows(self, image: np.ndarray) -> bool:
         """Return whether the traffic in an image is one step further than in the last one, whatever its stamp.
@@ -177,8 +182,6 @@ class Observer:
         self, image: np.ndarray, grey: np.ndarray, pose: ImagePose, time_s: float
     ) -> tuple[np.ndarray, np.ndarray]:
         """Undo the sway of an image, in full size only if the background takes it, and of the tracked image."""
-        if not pose.is_compensated:
-            return image, grey
         if self._scene.background.is_due(time_s):
             image = warped(image, pose.motion.enlarged(self._reduction))
         return image, warped(grey, pose.motion)
@@ -208,7 +211,8 @@ class Observer:
 
     def _reset_appearance(self) -> list[Track]:
         """Reset all state that depends on earlier grey levels; return the tracks that end."""
-        self._motion, self._edge_finder, self._keypoints = MotionMask(self._options.motion), EdgeFinder(), None
+        self._motion = MotionMask(self._options.motion)
+        self._vehicle_search.restart()
         return self._tracker.finish_all()
 
     def _tracked_image(self, image: np.ndarray) -> np.ndarray:
@@ -217,32 +221,22 @@ class Observer:
             grey = cv2.resize(grey, self._tracked_size, interpolation=cv2.INTER_AREA)
         return grey
 
+    def _compared_image(self, reductions: Reductions, grey: np.ndarray) -> np.ndarray:
+        """Return a grey image (H, W) in `GATE_WIDTH_PX`, which averages noise but keeps moving vehicles.
+
+        Ignored pixels get the mean of the others, so that they affect no comparison.
+        """
+        ignored = self._ignored
+        if ignored is not None and not ignored.all():
+            reductions = Reductions(np.where(ignored > 0, np.uint8(grey[ignored == 0].mean()), grey))
+        height, width = grey.shape
+        columns = min(GATE_WIDTH_PX, width)
+        return reductions.at((columns, max(1, height * columns // width)))
+
     @property
     def _tracked_size(self) -> tuple[int, int]:
         width, height = self._image_size
         return round(width / self._reduction), round(height / self._reduction)
-
-    def _detect(self, grey: np.ndarray, time_s: float) -> tuple[Segments | None, Edges | None, Outlines | None]:
-        """Detect silhouettes, keypoints and edges in the moving regions; start tracks and match segments."""
-        regions, vehicles, people = self._moving_regions(grey.shape)
-        outlines = self._find_outlines(regions, vehicles, grey.shape, time_s)
-        keypoints = find_keypoints(grey, regions, self._sift)
-        of_keypoint, of_person = vehicles[keypoints.regions], people[keypoints.regions]
-        order = np.lexsort((-keypoints.responses, of_person))  # by response, people last
-        self._tracker.add_points(keypoints.points_px[order], of_keypoint[order])
-        keypoints, of_keypoint = keypoints.subset(~of_person), of_keypoint[~of_person]
-        edges = self._find_edges(
-            grey,
-            [region for region, person in zip(regions, people, strict=True) if not person],
-            vehicles[~people],
-            time_s,
-        )
-        before, self._keypoints = self._keypoints, keypoints
-        if before is None:
-            return None, edges, outlines
-        ends, matched = match_segments(before, keypoints, grey.shape[1])
-        segments = Segments(time_s, of_keypoint[matched], self._ends_in_full_size(ends))
-        return segments, edges, outlines
 
     def _moving_regions(self, shape: tuple[int, int]) -> tuple[list[Region], np.ndarray, np.ndarray]:
         """Return the moving regions, the vehicle id of each (n,), and whether it is a detected person (n,)."""
@@ -256,23 +250,13 @@ class Observer:
             np.array([self._detector_tracks.kind(one) is TrackKind.PERSON for one in vehicles], bool),
         )
 
-    def _find_edges(self, grey: np.ndarray, regions: list[Region], vehicles: np.ndarray, time_s: float) -> Edges | None:
-        """Find straight edges, in every `EDGE_SEARCH_PERIOD`th detection."""
-        self._detections += 1
-        if self._detections % EDGE_SEARCH_PERIOD:
-            return None
-        ends, of_edge = self._edge_finder.find(grey, regions)
-        return Edges(time_s, vehicles[of_edge], self._ends_in_full_size(ends))
-
-    def _find_outlines(
-        self, regions: list[Region], vehicles: np.ndarray, shape: tuple[int, int], time_s: float
-    ) -> Outlines | None:
+    def _find_outlines(self, frame: MaskedFrame) -> Outlines | None:
         """Return the silhouettes of the regions; None with a detector, which classifies cyclists itself."""
-        if self._detector_tracks is not None or not regions:
+        if self._detector_tracks is not None or not frame.regions:
             return None
-        return Outlines(
-            time_s, vehicles, outlines_of(regions, self._motion.dilation_px, shape, self._reduction, self._excluded)
-        )
+        shape, dilation_px = frame.grey.shape, self._motion.dilation_px
+        silhouettes = outlines_of(frame.regions, dilation_px, shape, self._reduction, self._excluded)
+        return Outlines(frame.time_s, frame.vehicles, silhouettes)
 
     def _assign_vehicles(self, regions: list[Region]) -> np.ndarray:
         """Return the vehicle id (n,) of each region: the majority of the tracked points inside, or a new one."""
@@ -327,20 +311,20 @@ class Observer:
         scene = self._scenes[self._view if view is None else view]
         if not _is_searched(scene):
             self._search(scene.lines, scene.stripes, scene.background, scene.picture_area.mask)
-        return self._in_full_size(scene.lines, scene.stripes)
+        return self._segments_and_bars(scene.lines, scene.stripes)
 
     def search_for_segments(self) -> Callable[[], tuple[np.ndarray, np.ndarray]]:
         """Return a function that gives `still_segments` as they are now, for another thread."""
         scene = self._scene
         if _is_searched(scene):
-            found = self._in_full_size(scene.lines, scene.stripes)
+            found = self._segments_and_bars(scene.lines, scene.stripes)
             return lambda: found
         background, mask = scene.background.copy(), scene.picture_area.mask
         lines, stripes = scene.lines.fresh(), scene.stripes.fresh()
 
         def search() -> tuple[np.ndarray, np.ndarray]:
             self._search(lines, stripes, background, mask)
-            return self._in_full_size(lines, stripes)
+            return self._segments_and_bars(lines, stripes)
 
         return search
 
@@ -361,9 +345,13 @@ class Observer:
         samples = background.grey_samples(self._tracked_size)
         return (median(samples) if samples else None), samples
 
-    def _in_full_size(self, lines: LineSegmentDetector, stripes: StripeDetector) -> tuple[np.ndarray, np.ndarray]:
+    def _segments_and_bars(self, lines: LineSegmentDetector, stripes: StripeDetector) -> tuple[np.ndarray, np.ndarray]:
         bars = stripes.stripes_px
         return self._ends_in_full_size(lines.lines_px), np.hstack([self._ends_in_full_size(bars[:, :4]), bars[:, 4:]])
+
+    def _in_full_size(self, found: OnVehicles | None) -> OnVehicles | None:
+        """Return segments or edges in pixels of the full image."""
+        return None if found is None else replace(found, ends_px=self._ends_in_full_size(found.ends_px))
 
     def _ends_in_full_size(self, ends_px: np.ndarray) -> np.ndarray:
         return self._to_full_pixels(ends_px.reshape(-1, 2)).reshape(-1, 4)
@@ -410,18 +398,6 @@ class Observer:
 def _reaches_multiple(before: int, now: int, period: int) -> bool:
     """Return whether one of the numbers from `before` to `now` - 1 is a multiple of the period."""
     return -(-now // period) > -(-before // period)
-
-
-def _downsampled(grey: np.ndarray, ignored: np.ndarray | None) -> np.ndarray:
-    """Reduce a grey image (H, W) to `GATE_WIDTH_PX`, which averages noise but keeps moving vehicles.
-
-    Pixels where the mask `ignored` (H, W) is not 0 get the mean of the others, so that they affect no comparison.
-    """
-    if ignored is not None and not ignored.all():
-        grey = np.where(ignored > 0, np.uint8(grey[ignored == 0].mean()), grey)
-    height, width = grey.shape
-    columns = min(GATE_WIDTH_PX, width)
-    return cv2.resize(grey, (columns, max(1, height * columns // width)), interpolation=cv2.INTER_AREA)
 
 
 def _is_searched(scene: _Scene) -> bool:

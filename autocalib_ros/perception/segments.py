@@ -38,25 +38,61 @@ class Keypoints:
         return Keypoints(self.points_px[keep], self.responses[keep], self.regions[keep], self.descriptors[keep])
 
 
-def find_keypoints(grey: np.ndarray, regions: list[Region], sift: cv2.SIFT) -> Keypoints:
-    """Detect SIFT keypoints inside the regions of a grey image (H, W)."""
-    found = [_region_keypoints(grey, region, sift) for region in regions]
-    labels = [np.full(len(points), index) for index, (points, _, _) in enumerate(found)]
-    return Keypoints(
-        points_px=np.concatenate([points for points, _, _ in found] or [np.zeros((0, 2))]),
-        responses=np.concatenate([responses for _, responses, _ in found] or [np.zeros(0)]),
-        regions=np.concatenate(labels or [np.zeros(0)]).astype(int),
-        descriptors=np.concatenate([descriptors for _, _, descriptors in found] or [np.zeros((0, 128))]).astype(
-            np.float32
-        ),
-    )
+class KeypointSearch:
+    """Detects SIFT keypoints inside the regions of a grey image (H, W), in two steps of about the same cost."""
+
+    def __init__(self, grey: np.ndarray, regions: list[Region], sift: cv2.SIFT) -> None:
+        self._grey, self._regions, self._sift = grey, regions, sift
+        self._found: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
+        self._steps = _halves([_searched_pixels(region) for region in regions])
+
+    def step(self) -> None:
+        """Search the next half of the regions."""
+        for index in self._steps.pop(0) if self._steps else []:
+            self._found[index] = _region_keypoints(self._grey, self._regions[index], self._sift)
+
+    def keypoints(self) -> Keypoints:
+        """Return the keypoints of all regions, in the order of the regions, after the steps that are left."""
+        while self._steps:
+            self.step()
+        found = [self._found[index] for index in range(len(self._regions))]
+        labels = [np.full(len(points), index) for index, (points, _, _) in enumerate(found)]
+        return Keypoints(
+            points_px=np.concatenate([points for points, _, _ in found] or [np.zeros((0, 2))]),
+            responses=np.concatenate([responses for _, responses, _ in found] or [np.zeros(0)]),
+            regions=np.concatenate(labels or [np.zeros(0)]).astype(int),
+            descriptors=np.concatenate([descriptors for _, _, descriptors in found] or [np.zeros((0, 128))]).astype(
+                np.float32
+            ),
+        )
+
+
+def _halves(costs: list[float]) -> list[list[int]]:
+    """Divide indices into two lists of about the same sum of costs: each goes to the cheaper one, dearest first."""
+    halves: list[list[int]] = [[], []]
+    sums = [0.0, 0.0]
+    for index in sorted(range(len(costs)), key=lambda index: -costs[index]):
+        cheaper = int(sums[1] < sums[0])
+        halves[cheaper].append(index)
+        sums[cheaper] += costs[index]
+    return halves
+
+
+def _searched_pixels(region: Region) -> float:
+    """Return the number of pixels in which a region is searched."""
+    return region.mask.size / (4.0 if _is_coarse(region) else 1.0)
+
+
+def _is_coarse(region: Region) -> bool:
+    """Whether a region is searched at half size."""
+    return max(region.mask.shape) > FULL_RESOLUTION_SIDE_PX
 
 
 def _region_keypoints(grey: np.ndarray, region: Region, sift: cv2.SIFT) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     height, width = region.mask.shape
     crop = grey[region.y : region.y + height, region.x : region.x + width]
     mask = region.mask
-    coarse = max(height, width) > FULL_RESOLUTION_SIDE_PX
+    coarse = _is_coarse(region)
     if coarse:
         size = (max(1, width // 2), max(1, height // 2))
         crop = cv2.resize(crop, size, interpolation=cv2.INTER_AREA)

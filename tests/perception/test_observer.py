@@ -119,7 +119,7 @@ def test_lost_images_do_not_delay_detections() -> None:
         seen = [whole.observe(image, time_s)]
         seen += [half.observe(image, time_s, lost=int(index > 0))] if index % 2 == 0 else []
         for times, observed in zip(detected, seen, strict=False):
-            times += [time_s] if observed.segments is not None else []
+            times += [] if observed.segments is None else [observed.segments.time_s]
     assert len(detected[0]) > 5 and detected[1] == detected[0]
 
 
