@@ -194,7 +194,7 @@ def test_figures_of_the_method_are_drawn(tmp_path):
     spec.loader.exec_module(module)
     module.FOLDER = tmp_path
     shutil.copy(DOCS / 'explanation' / 'grades.csv', tmp_path)
-    for draw in (module.straight, module.turning, module.loss, module.grades):
+    for draw in (module.straight, module.turning, module.loss, module.grades, module.cost):
         draw()
         name = f'{draw.__name__}.svg'
         sizes = [

@@ -17,6 +17,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     runtime = what.add_parser('cost', help='processor time per frame and per solution, and memory')
     runtime.add_argument('source', metavar='SOURCE', type=Path, help='recording to replay')
     runtime.add_argument('--duration', type=float, metavar='S', help='seconds of the recording to use')
+    runtime.add_argument('--history', type=Path, metavar='FILE', help='CSV file to add a row of ratios and errors to')
+    runtime.add_argument('--no-replay', action='store_true', help='leave out the whole replay on all cores')
     accuracy = what.add_parser('accuracy', help='errors against ground truth on synthetic traffic, by Monte Carlo')
     accuracy.add_argument('--runs', type=int, default=20, metavar='N', help='draws per family (default: %(default)s)')
     accuracy.add_argument('--family', nargs='+', default=[], metavar='NAME', help='evidence families (default: all)')
@@ -207,10 +209,7 @@ def _add_camera_height(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run a benchmark and print its report; return the exit status."""
     if arguments.what == 'cost':
-        from autocalib_ros.offline.benchmark.runtime import measure_cost
-
-        print(measure_cost(arguments.source, arguments.duration))
-        return DONE
+        return _run_cost(arguments)
     if arguments.what == 'golden':
         from autocalib_ros.offline.benchmark import golden
 
@@ -238,6 +237,18 @@ def run(arguments: argparse.Namespace) -> int:
             )
         )
     )
+    return DONE
+
+
+def _run_cost(arguments: argparse.Namespace) -> int:
+    from autocalib_ros.offline.benchmark import cost_history, runtime
+
+    cost = runtime.measure_live_cost(arguments.source, arguments.duration)
+    print(runtime.format_cost(cost), flush=True)
+    if arguments.history is not None:
+        cost_history.add_to_history(arguments.history, cost, arguments.source)
+    if not arguments.no_replay:
+        print(runtime.measure_replay_speed(arguments.source, arguments.duration))
     return DONE
 
 

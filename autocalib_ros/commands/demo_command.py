@@ -46,7 +46,9 @@ def run(arguments: argparse.Namespace) -> int:
         simulated,
         write_picture,
     )
+    from autocalib_ros.perception.opencv_threads import pin_opencv_threads
 
+    pin_opencv_threads()
     bag = arguments.out / 'recording'
     outputs.prepare_output_dir(arguments.out, bag)
     recording = simulated(bag, arguments.seed)

@@ -71,7 +71,9 @@ def run(arguments: argparse.Namespace) -> int:
     from autocalib_ros.offline.recordings.listing import recordings_of
     from autocalib_ros.offline.recordings.open import open_sources
     from autocalib_ros.perception.detector.detector import open_detector
+    from autocalib_ros.perception.opencv_threads import pin_opencv_threads
 
+    pin_opencv_threads()
     detector = open_detector(options.detector)
     if detector is not None and not arguments.quiet:
         print_stderr(f'Vehicle tracks from a {detector}')

@@ -69,9 +69,11 @@ def _run(args: list[str]) -> None:
     """Run the node until a signal."""
     import rclpy
 
+    from autocalib_ros.perception.opencv_threads import pin_opencv_threads
     from autocalib_ros.ros.autocalib_node import AutocalibNode
     from autocalib_ros.ros.spinning import spin_until, stop_on_signals
 
+    pin_opencv_threads()
     stop = stop_on_signals()
     _init(args)
     try:

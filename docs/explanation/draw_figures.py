@@ -10,6 +10,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 FOLDER = Path(__file__).parent
+HISTORY = FOLDER.parents[1] / 'benchmarks' / 'history.csv'
 WIDTH, HEIGHT, FOCAL = 1280, 720, 560.0
 TILT = np.radians(28.0)
 CAMERA_HEIGHT = 8.0
@@ -116,6 +117,31 @@ def grades() -> None:
     save(figure, 'grades.svg')
 
 
+def cost() -> None:
+    """Draw the history of cost and accuracy, from the rows of `autocalib benchmark cost --history`, by commit."""
+    with HISTORY.open(encoding='utf-8') as stream:
+        rows = list(csv.DictReader(stream))
+    commits = list(dict.fromkeys(row['commit'] for row in rows))
+    recordings = list(dict.fromkeys((row['recording'], row['size']) for row in rows))
+    figure, panels = plt.subplots(1, 3, figsize=(9.6, 3.4))
+    for axes, column, label in (
+        (panels[0], 'image_ratio', 'image, in bare optical flows'),
+        (panels[1], 'solution_s', 'solution, seconds'),
+        (panels[2], 'focal_error_percent', 'error of the focal length, %'),
+    ):
+        for recording in recordings:
+            own = [row for row in rows if (row['recording'], row['size']) == recording and row[column]]
+            places = [commits.index(row['commit']) for row in own]
+            name = f'{recording[0].split("/")[0]}, {recording[1]}'
+            axes.plot(places, [float(row[column]) for row in own], 'o-', markersize=4, linewidth=1.0, label=name)
+        axes.set(title=label, xticks=range(len(commits)))
+        axes.title.set_fontsize(9)
+        axes.set_xticklabels(commits, rotation=60, ha='right', fontsize=7)
+        axes.axhline(0.0, color=GREY, linewidth=0.6)
+    panels[0].legend(fontsize=7)
+    save(figure, 'cost.svg')
+
+
 def save(figure: plt.Figure, name: str) -> None:
     """Write a figure without a date, so that it changes only when it is drawn differently."""
     figure.tight_layout()
@@ -129,3 +155,4 @@ if __name__ == '__main__':
     turning()
     loss()
     grades()
+    cost()
