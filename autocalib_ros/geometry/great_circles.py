@@ -33,6 +33,10 @@ class Rays:
 
     Of pixels that are not square, the two are the derivatives by u and v: at right angles in the image too."""
 
+    def subset(self, keep: np.ndarray) -> Rays:
+        """Return the rays of a mask or of indices `keep`."""
+        return Rays(self.bearings[keep], self.radial[keep], self.tangential[keep])
+
     def pixel_scale(self, normals: np.ndarray) -> np.ndarray:
         """Return pixels per unit of n.b, shape (...), for circle normals (..., 3) that broadcast to the bearings."""
         outwards, around = dot(self.radial, normals), dot(self.tangential, normals)

@@ -41,7 +41,7 @@ class Problem:
         warm_start: WarmStart = (None, None, None),
         unprojected: UnprojectedTracks | None = None,
     ) -> None:
-        self.parameters = Parameterisation(base, config)
+        self.parameters, self._tracks = Parameterisation(base, config), tracks
         self.used = np.flatnonzero(labels >= 0)
         """Indices of the tracks on a road, one for each row of the first block."""
         unprojected = unprojected or UnprojectedTracks.through(base.camera, tracks)
@@ -90,7 +90,8 @@ class Problem:
 
     def at(self, step: np.ndarray) -> tuple[WarmStart, np.ndarray]:
         """Return the eliminated unknowns and the mean squared whitened residuals (rows,) at a parameter step."""
-        squared = [self.straight.at(step)]
+        rays = UnprojectedTracks.through(self.parameters.state(step).camera, self._tracks).rays
+        squared = [self.straight.at(step, rays.subset(self.used))]
         motion, squared_windows = self.planar.at(step)
         squared.append(squared_windows)
         shapes = None

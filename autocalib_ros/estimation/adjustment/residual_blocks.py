@@ -98,12 +98,15 @@ class StraightTrackBlock:
         normals, _ = fit_circles_through(whitened.transpose(0, 2, 1) @ whitened, state.directions[self._labels])
         return normals
 
-    def at(self, step: np.ndarray) -> np.ndarray:
-        """Return the mean squared whitened distance of each track at a parameter step, shape (tracks,)."""
+    def at(self, step: np.ndarray, rays: Rays | None = None) -> np.ndarray:
+        """Return the mean squared whitened distance of each track at a parameter step, shape (tracks,).
+
+        `rays` are those of the tracks through the lens at the step, if they are known.
+        """
         if not len(self.dof):
             return np.zeros(0)
         state = self._parameters.state(step)
-        rays = unproject_rays(state.camera, self._tracks.pixels)
+        rays = rays or unproject_rays(state.camera, self._tracks.pixels)
         distance = rays.distance_px(self._circles(state, rays)[:, None])
         return ((self.whiten @ distance[..., None])[..., 0] ** 2).sum(axis=1) / self.dof
 

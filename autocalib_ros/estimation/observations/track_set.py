@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -44,6 +45,11 @@ class TrackSet:
             self.pixels[keep], self.weights[keep], self.vehicles[keep], self.sample_times_s[keep], self.indices[keep]
         )
 
+    @cached_property
+    def unprojected(self) -> dict[Camera, UnprojectedTracks]:
+        """The tracks through one lens: adjustments ask for the same again after a step, and where the lens is fixed."""
+        return {}
+
     @property
     def times_s(self) -> np.ndarray:
         """Mean time of each track, shape (tracks,)."""
@@ -52,11 +58,16 @@ class TrackSet:
     @property
     def vehicle_weight(self) -> np.ndarray:
         """Weight of each track that gives every vehicle a sum of 1, shape (tracks,)."""
-        return kish_weight(self.vehicles, 1.0)
+        return self.kish_weight(1.0)
 
     def kish_weight(self, correlation: float) -> np.ndarray:
         """Return weights (tracks,) for errors with a correlation, 0 to 1, within a vehicle."""
-        return kish_weight(self.vehicles, correlation)
+        return _kish_weight_of(self._vehicle_sizes, correlation)
+
+    @cached_property
+    def _vehicle_sizes(self) -> np.ndarray:
+        """Number of tracks of the vehicle of each track, shape (tracks,)."""
+        return _group_sizes(self.vehicles)
 
 
 def kish_weight(vehicle_ids: np.ndarray, correlation: float) -> np.ndarray:
@@ -64,8 +75,17 @@ def kish_weight(vehicle_ids: np.ndarray, correlation: float) -> np.ndarray:
 
     One over the design effect of Kish (1965); with a correlation of 1 all observations of a vehicle count as one.
     """
+    return _kish_weight_of(_group_sizes(vehicle_ids), correlation)
+
+
+def _group_sizes(vehicle_ids: np.ndarray) -> np.ndarray:
+    """Return the number of observations (n,) of the vehicle of each."""
     _, inverse, counts = np.unique(vehicle_ids, return_inverse=True, return_counts=True)
-    return 1.0 / (1.0 + (counts[inverse] - 1.0) * correlation)
+    return counts[inverse]
+
+
+def _kish_weight_of(sizes: np.ndarray, correlation: float) -> np.ndarray:
+    return 1.0 / (1.0 + (sizes - 1.0) * correlation)
 
 
 def select_tracks(evidence: Evidence, limit: int) -> TrackSet:
@@ -153,16 +173,24 @@ class UnprojectedTracks:
 
     rays: Rays
     """Of shape (tracks, samples)."""
-    matrix: np.ndarray
-    """Scatter matrix of each track, shape (tracks, 3, 3)."""
+    weights: np.ndarray
+    """As those of the tracks, shape (tracks, samples)."""
 
     @classmethod
     def through(cls, camera: Camera, tracks: TrackSet) -> UnprojectedTracks:
-        """Unproject tracks and compute their scatter matrices."""
-        rays = unproject_rays(camera, tracks.pixels)
-        return cls(rays, circle_scatter(rays, tracks.weights) if len(tracks) else np.zeros((0, 3, 3)))
+        """Unproject tracks; through the camera that was asked for last, return the same again."""
+        if camera not in tracks.unprojected:
+            tracks.unprojected.clear()
+            tracks.unprojected[camera] = cls(unproject_rays(camera, tracks.pixels), tracks.weights)
+        return tracks.unprojected[camera]
+
+    @cached_property
+    def matrix(self) -> np.ndarray:
+        """Scatter matrix of each track, shape (tracks, 3, 3)."""
+        return circle_scatter(self.rays, self.weights) if len(self.weights) else np.zeros((0, 3, 3))
 
     def subset(self, keep: np.ndarray) -> UnprojectedTracks:
         """Return the tracks of a mask or of indices `keep`."""
-        rays = Rays(self.rays.bearings[keep], self.rays.radial[keep], self.rays.tangential[keep])
-        return UnprojectedTracks(rays, self.matrix[keep])
+        part = UnprojectedTracks(self.rays.subset(keep), self.weights[keep])
+        vars(part)['matrix'] = self.matrix[keep]  # known already
+        return part
