@@ -11,12 +11,12 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.interpolate import CubicHermiteSpline
 from scipy.sparse import coo_matrix
 
 from autocalib_ros.estimation.observations.grouping import component_labels, farthest_points, group_indices, round_robin
 from autocalib_ros.estimation.observations.track_set import SAMPLES_PER_TRACK, kish_weight
 from autocalib_ros.evidence.snapshot import Evidence
+from autocalib_ros.geometry.cubic_curves import cubic_through
 
 RESAMPLING_INTERVAL_S = 0.4
 """Tracks are resampled at whole multiples of this; windows begin, end and have their middle there."""
@@ -194,12 +194,12 @@ class ResampledTracks:
         steps[starts[1:] - 1] = 1.0
         along = np.concatenate([[0.0], np.cumsum(steps)])
         # not linear: chords cut the curve of a turning vehicle by several pixels
-        curve = (
-            CubicHermiteSpline(along, evidence.points_px, _velocities(along, evidence.points_px, starts, ends))
-            if len(track)
-            else np.zeros_like
-        )
-        self._places = curve(along[starts[track]] + wanted - evidence.times_s[starts[track]]).reshape(-1, 2)
+        places = evidence.points_px
+        if len(track):
+            velocities = _velocities(along, places, starts, ends)
+            shifted = along[starts[track]] + wanted - evidence.times_s[starts[track]]
+            places = cubic_through(along, places, velocities, shifted)
+        self._places = places[: len(track)].reshape(-1, 2)
 
     def positions_at(self, tracks: np.ndarray, instant: int) -> np.ndarray:
         """Positions (n, 2) of tracks (n,) at one multiple of the interval."""

@@ -11,7 +11,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 from scipy.special import softmax
 
@@ -31,6 +30,7 @@ from autocalib_ros.estimation.single_road.direction_mixture import (
 )
 from autocalib_ros.estimation.single_road.road_through_lens import RoadThrough
 from autocalib_ros.estimation.vehicle_edges.edge_mixture import SYSTEMATIC_SIGMA_RAD
+from autocalib_ros.geometry.cubic_curves import cubic_through, spline_slopes
 from autocalib_ros.geometry.great_circles import unproject_rays
 from autocalib_ros.geometry.small_matrices import cross
 from autocalib_ros.lens.camera import Camera
@@ -244,7 +244,8 @@ def _curvature_nodes(solve: RoadThrough, choice: LensChoice, focal_px: float) ->
     tried = np.linspace(MIN_KAPPA, MAX_KAPPA, KAPPA_TRIALS)
     costs = np.array([solve(choice.lens(focal_px, kappa))[1] for kappa in tried.tolist()])
     near = np.linspace(MIN_KAPPA, MAX_KAPPA, 50 * KAPPA_TRIALS)
-    density = np.exp(-CubicSpline(tried, costs - costs.min())(near))
+    costs = costs - costs.min()
+    density = np.exp(-cubic_through(tried, costs, spline_slopes(tried, costs), near))
     density /= density.sum()
     mean = float(density @ near)
     reach = max(2.5 * float(np.sqrt(density @ (near - mean) ** 2)), MIN_KAPPA_REACH)
