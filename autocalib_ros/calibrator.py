@@ -8,7 +8,7 @@ from enum import Enum
 
 import numpy as np
 
-from autocalib_ros.config import Options
+from autocalib_ros.config import Options, Polygons
 from autocalib_ros.errors import InputError
 from autocalib_ros.estimation.observations.selection import drop_pedestrians
 from autocalib_ros.estimation.verification.readiness import check_steady, outlook, requirements
@@ -61,6 +61,8 @@ class AutoCalibrator:
         self._options = options
         self._detector = detector or open_detector(options.detector)
         self._stream: ImageStream | None = None
+        self.ignored = options.ignored_polygons
+        """Polygons that are ignored, in pixels of the full image."""
         self._timing = ImageTiming(self._follows)
         self._size_change = SizeChange()
         self._schedule = SolutionSchedule(options)
@@ -89,6 +91,7 @@ class AutoCalibrator:
             if self._stream is None:
                 self._stream = ImageStream(self._options, ready.time_ns, size, self._detector)
                 self._schedule = SolutionSchedule(self._options)
+                self.ignore(self.ignored)
             self._stream.add(ready, self._timing.offset_ns, self._options)
         if resized:
             return ImageIntake.RESIZED
@@ -108,6 +111,12 @@ class AutoCalibrator:
         """Take other options, which may differ in what `config.is_reconfigurable` allows; a solution is due at once."""
         self._options = options
         self._schedule = SolutionSchedule(options)
+
+    def ignore(self, polygons: Polygons) -> None:
+        """Ignore other regions from the next image on, as where the camera has turned."""
+        self.ignored = polygons
+        if self._stream is not None and polygons != self._stream.observer.ignored:
+            self._stream.observer.ignore(polygons)
 
     def snapshot_if_due(self) -> Evidence | None:
         """Return a snapshot without segments of the still scene if a new solution is worth trying now, else None.

@@ -15,6 +15,9 @@ from typing import Any
 
 from autocalib_ros.errors import UsageError
 
+Polygons = tuple[tuple[tuple[float, float], ...], ...]
+"""Polygons of points (u, v) in pixels of the full image."""
+
 
 def option(
     default: Any, doc: str, *, low: float | None = None, high: float | None = None, choices: tuple[str, ...] = ()
@@ -588,7 +591,7 @@ class Options(_Validated):
         return bool(self.camera_height or self.scale.known_distances or self.scale.speed_km_h or self.lanes.given)
 
     @property
-    def ignored_polygons(self) -> tuple[tuple[tuple[float, float], ...], ...]:
+    def ignored_polygons(self) -> Polygons:
         """Polygons of `ignore_regions`, each of at least three points (u, v); empty if it is empty."""
         return tuple(
             _polygon(text) for text in self.ignore_regions.strip().rstrip(';').split(';') if self.ignore_regions.strip()

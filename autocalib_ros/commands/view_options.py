@@ -11,8 +11,8 @@ from autocalib_ros.commands import DONE
 from autocalib_ros.commands.compare_command import CALIBRATION_FILES
 
 if TYPE_CHECKING:
+    from autocalib_ros.config import Polygons
     from autocalib_ros.offline.view_files import Renderer
-    from autocalib_ros.perception.ignore_regions import Polygons
     from autocalib_ros.results.saved_camera import SavedCamera
 
 

@@ -12,12 +12,11 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
+from autocalib_ros.config import Polygons
 from autocalib_ros.errors import UsageError
 
 SUBPIXEL_BITS = 4
 """Fractional bits of the polygon coordinates passed to OpenCV."""
-Polygons = tuple[tuple[tuple[float, float], ...], ...]
-"""Polygons of points (u, v) in pixels of the full image."""
 
 
 def black_out(image: np.ndarray, polygons: Polygons) -> np.ndarray:

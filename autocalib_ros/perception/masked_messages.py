@@ -7,8 +7,9 @@ from typing import Any
 import cv2
 import numpy as np
 
+from autocalib_ros.config import Polygons
 from autocalib_ros.errors import InputError, UsageError
-from autocalib_ros.perception.ignore_regions import Polygons, ignored_mask
+from autocalib_ros.perception.ignore_regions import ignored_mask
 from autocalib_ros.perception.images import (
     CHANNELS,
     NUMBER_FORMATS,

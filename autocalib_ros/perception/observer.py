@@ -9,7 +9,7 @@ from typing import TypeVar
 import cv2
 import numpy as np
 
-from autocalib_ros.config import GateOptions, Options
+from autocalib_ros.config import GateOptions, Options, Polygons
 from autocalib_ros.evidence.landmarks import Landmarks
 from autocalib_ros.evidence.picture import Picture
 from autocalib_ros.evidence.snapshot import Edges, Outlines, Segments, Track, TrackKind
@@ -74,11 +74,11 @@ class Observer:
         self._options = options
         self._image_size = image_size
         self._reduction = max(1.0, image_size[0] / options.max_image_width)
-        self._polygons = options.ignored_polygons
-        require_polygons_inside(self._polygons, image_size)
-        ignored = IgnoreMask(self._polygons, image_size, self._tracked_size)
-        self._ignored = ignored.near(0)
-        self._excluded_by_options = self._excluded = ignored.near(options.tracking.window_px)
+        self.ignored = options.ignored_polygons
+        """Polygons that are ignored, in pixels of the full image."""
+        require_polygons_inside(self.ignored, image_size)
+        self._ignored, self._excluded_by_options = self._masks()
+        self._excluded = self._excluded_by_options
         self._motion = MotionMask(options.motion)
         self._detector_tracks = None if detector is None else DetectorTracks(detector, options.detector)
         self._tracker = PointTracker(options.tracking, self._excluded)
@@ -103,7 +103,7 @@ class Observer:
         Images that were `lost` before it count for the intervals between detections: traffic went on meanwhile.
         """
         self._lost += lost
-        image = black_out(image, self._polygons)
+        image = black_out(image, self.ignored)
         grey = self._tracked_image(image)
         reductions = Reductions(grey)
         status = self._frame_gate.classify(self._compared_image(reductions, grey), time_s)
@@ -146,11 +146,25 @@ class Observer:
         """
         if (image.shape[1], image.shape[0]) != self._image_size:
             return False
-        return self._tracker.moved_one_step(self._tracked_image(black_out(image, self._polygons)))
+        return self._tracker.moved_one_step(self._tracked_image(black_out(image, self.ignored)))
 
     def change_gate(self, gate: GateOptions) -> None:
         """Take another limit of the drift, which may change while running."""
         self._drift_monitor.change_limits(self._drift_limits(gate))
+
+    def ignore(self, polygons: Polygons) -> None:
+        """Ignore other regions from the next image on, in pixels of the full image.
+
+        Lines of the still scene follow with the next view: regions change when the camera has moved.
+        """
+        self.ignored = polygons
+        self._ignored, self._excluded_by_options = self._masks()
+        self._exclude_no_picture()
+
+    def _masks(self) -> tuple[np.ndarray | None, np.ndarray | None]:
+        """Return the masks of the tracked image of what is ignored, and of what is too near to it to be tracked."""
+        ignored = IgnoreMask(self.ignored, self._image_size, self._tracked_size)
+        return ignored.near(0), ignored.near(self._options.tracking.window_px)
 
     def _drift_limits(self, gate: GateOptions) -> DriftLimits:
         """Return what counts as standing still, in pixels of the tracked image."""
@@ -163,7 +177,7 @@ class Observer:
             Background(),
             LineSegmentDetector(self._excluded_by_options),
             StripeDetector(self._excluded_by_options),
-            PictureArea(self._image_size, self._tracked_size, self._polygons),
+            PictureArea(self._image_size, self._tracked_size, self.ignored),
         )
 
     @property
@@ -382,9 +396,7 @@ class Observer:
     def background(self, view: int | None = None) -> np.ndarray | None:
         """Return the background image, BGR uint8 (H, W, 3); None before the first image."""
         image = self._scenes[self._view if view is None else view].background.image()
-        return (
-            None if image is None else black_out(image, self._polygons)
-        )  # JPEG ringing at the borders of the polygons
+        return None if image is None else black_out(image, self.ignored)  # JPEG ringing at the borders of the polygons
 
     def _to_full_size(self, track: Track) -> Track:
         kind = TrackKind.UNKNOWN if self._detector_tracks is None else self._detector_tracks.kind(track.vehicle)

@@ -9,9 +9,10 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from autocalib_ros.config import Polygons
 from autocalib_ros.evidence.picture import Picture
 from autocalib_ros.perception.background import MIN_SAMPLES, Background, median
-from autocalib_ros.perception.ignore_regions import Polygons, ignored_mask
+from autocalib_ros.perception.ignore_regions import ignored_mask
 from autocalib_ros.perception.overlay_boxes import Box, find_boxes
 from autocalib_ros.perception.overlay_text import MARGIN_HEIGHTS, find_text
 from autocalib_ros.perception.picture_borders import find_circle, find_rectangle

@@ -16,9 +16,11 @@ from functools import cached_property
 import cv2
 import numpy as np
 
+from autocalib_ros.config import Polygons
 from autocalib_ros.errors import UsageError
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.perception.background import median
+from autocalib_ros.perception.ignore_regions import IgnoreMask, union
 from autocalib_ros.perception.picture_faults import (
     BLURRED_RATIO,
     Detail,
@@ -195,6 +197,7 @@ class ViewWatch:
         self.size: tuple[int, int] | None = None
         """Width and height of the images of the calibration; None without one."""
         self._references: list[_Reference] = []
+        self._ignored_polygons: Polygons = ()
         self._checks = 0
         self._due_s = -math.inf
         self._newest_s = -math.inf
@@ -261,6 +264,20 @@ class ViewWatch:
         self._forget()
         self._references, self.report, self.size = [], ViewReport(), None
 
+    def ignore(self, polygons: Polygons) -> None:
+        """Leave regions out of the views that are added from now on, in pixels of the images of the calibration."""
+        self._ignored_polygons = polygons
+
+    def _masked(self, image: np.ndarray, pose: ViewPose | None = None) -> KnownView:
+        """Return an image (H, W) as a view in which ignored regions are black, and its corners elsewhere."""
+        first = self._references[0].known
+        mask = None
+        if self.size is not None:
+            mask = IgnoreMask(self._ignored_polygons, self.size, image.shape[1::-1]).near(0)
+        if mask is not None:
+            image = np.where(mask > 0, np.uint8(0), image)
+        return KnownView(image, union(first.ignored, mask), pose or ViewPose.identity())
+
     @property
     def views(self) -> tuple[KnownView, ...]:
         """Images of the calibrated view so far, for the next start."""
@@ -286,7 +303,7 @@ class ViewWatch:
         images = [image for time_s, image in self._images if time_s > since_s + CHECK_S]
         if len(images) < VERIFY_SAMPLES or not self._references:
             return None
-        return KnownView(median(images), self._references[0].known.ignored)
+        return self._masked(median(images))
 
     def rebase(self, move: CameraMove) -> None:
         """Take the pose after a move for that of the calibration, whose pose was mended by it."""
@@ -413,7 +430,7 @@ class ViewWatch:
             if candidate.image.shape == image.shape and candidate.near(pattern, ViewPose.identity()):
                 return True
         first = self._references[0]
-        new = ViewReference(image, first.view.camera, first.known.ignored, pattern)
+        new = ViewReference(image, first.view.camera, self._masked(image).ignored, pattern)
         self._candidate = (new, self._newest_s)
         return new.is_registrable
 
@@ -596,8 +613,7 @@ class ViewWatch:
         found = first.view.near(normalised(shown), self._last.after(_inverse(first.known.pose)))
         if found is None:
             return
-        known = KnownView(shown, first.known.ignored, found.without_zoom().after(first.known.pose))
-        self._add_reference(known, first.view.camera)
+        self._add_reference(self._masked(shown, found.without_zoom().after(first.known.pose)), first.view.camera)
 
     def _add_reference(self, known: KnownView, camera: Camera) -> None:
         """Use another reference first; drop the one that was not used for the longest time."""

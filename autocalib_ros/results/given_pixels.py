@@ -1,12 +1,14 @@
-"""Pixels that a user gave, known lengths and control points, followed as the camera turns.
+"""Pixels that a user gave, known lengths, ignored regions and control points, followed as the camera turns.
 
 They are places on the road in the view of the day when they were measured. After a turn of the camera the same places
 lie elsewhere in the image, and a length between the old pixels would be another length. So the pixels are carried
-along by the measured rotation through the lens; after a move that was not measured nothing is known of them.
+along by the measured rotation through the lens; after a move that was not measured nothing is known of them. Ignored
+regions may be private places, which move with the view, or text in the image, which does not: both are ignored.
 """
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -14,11 +16,17 @@ from typing import Any
 
 import numpy as np
 
-from autocalib_ros.config import MIN_PIXEL_SEPARATION_SIGMAS, Options
+from autocalib_ros.config import MIN_PIXEL_SEPARATION_SIGMAS, Options, Polygons
 from autocalib_ros.errors import InputError
 from autocalib_ros.results.calibration import Calibration
 from autocalib_ros.results.camera_move import CameraMove, rotation_angle_deg
 from autocalib_ros.results.control_points import ControlPoints
+
+OUTLINE_STEP_PX = 32.0
+"""Longest piece of the outline of a region that is carried along as a straight one, pixels: a lens of 120 degrees bends
+it by half a pixel."""
+OUTLINE_SIGMAS, OUTLINE_MARGIN_PX = 3.0, 1.0
+"""Standard deviations, and pixels for the pieces, by which a region that was carried along is made wider."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,20 +34,22 @@ class GivenPixels:
     """Pixels as they were given, and where the same places are in a view."""
 
     as_given: np.ndarray
-    """Both pixels of each known length, then the control points, shape (n, 2)."""
+    """Outlines of the ignored regions, both pixels of each known length, the control points, shape (n, 2)."""
     in_view: np.ndarray
     """Shape (n, 2), NaN where it is unknown."""
     sigma_px: float = 0.0
     """Standard deviation that the moves of the camera have added to each coordinate."""
+    outlines: tuple[int, ...] = ()
+    """Number of pixels of each ignored region."""
 
     @classmethod
     def of(cls, options: Options, points: ControlPoints | None = None) -> GivenPixels:
         """Return the pixels that options and control points give, in the view in which they were measured."""
         lengths = [pixel for known in options.scale.known_distances for pixel in known.pixels]
-        given = np.array(lengths, float).reshape(-1, 2)
-        if points is not None:
-            given = np.vstack([given, points.pixels])
-        return cls(given, given)
+        outlines = [_outline(np.array(polygon)) for polygon in options.ignored_polygons]
+        ends = [] if points is None else [points.pixels]
+        given = np.vstack([*outlines, np.array(lengths, float).reshape(-1, 2), *ends])
+        return cls(given, given, outlines=tuple(map(len, outlines)))
 
     @property
     def is_complete(self) -> bool:
@@ -48,17 +58,35 @@ class GivenPixels:
 
     def turned(self, result: Calibration, move: CameraMove) -> GivenPixels:
         """Return the pixels after a move of the camera with this calibration; unknown if the lens is another now."""
-        if not move.keeps_lens or move.sigma_deg is None:
+        if move.sigma_deg is None:
             return self.unknown()
         camera = result.camera
+        now = replace(camera, focal_px=camera.focal_px * move.zoom)
         bearings, seen = camera.unproject(self.in_view)
-        pixels, inside = camera.project(bearings @ move.rotation.T)
-        pixels = np.where((seen & inside)[:, None], pixels, np.nan)
+        pixels, inside = now.project(bearings @ move.rotation.T)
+        # through a lens that is not calibrated any more regions are followed well enough to cover them, lengths are not
+        is_outline = np.arange(len(self.as_given)) < sum(self.outlines)
+        used = seen & inside & (move.keeps_lens | is_outline)
+        pixels = np.where(used[:, None], pixels, np.nan)
         focal = 0.0 if result.stddev.focal_px is None else result.stddev.focal_px / camera.focal_px
         turn_rad = np.radians(rotation_angle_deg(move.rotation))
         registration_rad = np.radians(np.linalg.norm(move.sigma_deg))
         added = camera.focal_px * float(np.hypot(registration_rad, focal * turn_rad))
         return replace(self, in_view=pixels, sigma_px=float(np.hypot(self.sigma_px, added)))
+
+    def regions_in_view(self, options: Options) -> Polygons:
+        """Return the ignored regions as they were given, then those places that lie elsewhere in the view."""
+        followed: list[tuple[tuple[float, float], ...]] = []
+        begin = 0
+        for count in self.outlines:
+            rows = slice(begin, begin + count)
+            begin += count
+            pixels = self.in_view[rows][np.isfinite(self.in_view[rows]).all(axis=1)]
+            if len(pixels) < 3 or np.array_equal(pixels, self.as_given[rows]):
+                continue
+            wider = _wider(pixels, OUTLINE_SIGMAS * self.sigma_px + OUTLINE_MARGIN_PX)
+            followed.append(tuple((float(u), float(v)) for u, v in wider))
+        return (*options.ignored_polygons, *followed)
 
     def unknown(self) -> GivenPixels:
         """Return the pixels in a view of which nothing is known."""
@@ -71,8 +99,10 @@ class GivenPixels:
         """
         scale = options.scale
         known = scale.known_distances
-        ends = self.in_view[: 2 * len(known)].reshape(-1, 4)
-        if np.array_equal(ends, self.as_given[: 2 * len(known)].reshape(-1, 4)):
+        first = sum(self.outlines)
+        rows = slice(first, first + 2 * len(known))
+        ends = self.in_view[rows].reshape(-1, 4)
+        if np.array_equal(ends, self.as_given[rows].reshape(-1, 4)):
             return options
         limit = np.tile(image_size, 2) - 0.5
         sigma_px = float(np.hypot(scale.pixel_sigma_px, self.sigma_px))
@@ -102,7 +132,12 @@ class GivenPixels:
     def document(self) -> dict[str, Any]:
         """Return this for a JSON file; a place that is unknown is null."""
         in_view = [pixel.tolist() if np.isfinite(pixel).all() else None for pixel in self.in_view]
-        return {'as_given': self.as_given.tolist(), 'in_view': in_view, 'sigma_px': self.sigma_px}
+        return {
+            'as_given': self.as_given.tolist(),
+            'in_view': in_view,
+            'sigma_px': self.sigma_px,
+            'outlines': list(self.outlines),
+        }
 
     @classmethod
     def from_document(cls, document: Mapping[str, Any]) -> GivenPixels:
@@ -113,10 +148,12 @@ class GivenPixels:
                 np.array(document['as_given'], float).reshape(-1, 2),
                 np.array([unknown if pixel is None else pixel for pixel in document['in_view']], float).reshape(-1, 2),
                 float(document['sigma_px']),
+                tuple(int(count) for count in document.get('outlines', ())),
             )
         except (LookupError, TypeError, ValueError) as error:
             raise InputError(f'its given_pixels are damaged ({type(error).__name__}: {error})') from error
-        if found.as_given.shape != found.in_view.shape or not 0 <= found.sigma_px < np.inf:
+        counts = min(found.outlines, default=0) >= 0 and sum(found.outlines) <= len(found.as_given)
+        if found.as_given.shape != found.in_view.shape or not 0 <= found.sigma_px < np.inf or not counts:
             raise InputError('its given_pixels are damaged')
         return found
 
@@ -159,3 +196,18 @@ class FollowedPixels:
         """Note that the calibration in force is one of the present view from now on."""
         with self._lock:
             self._in_force = self._present
+
+
+def _outline(polygon: np.ndarray) -> np.ndarray:
+    """Return a closed polygon (n, 2) with further points on its sides, (m, 2)."""
+    pieces = []
+    for start, end in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
+        count = max(1, math.ceil(float(np.hypot(*(end - start))) / OUTLINE_STEP_PX))
+        pieces.append(start + (end - start) * np.arange(count)[:, None] / count)
+    return np.vstack(pieces)
+
+
+def _wider(polygon: np.ndarray, margin_px: float) -> np.ndarray:
+    """Return a polygon (n, 2) whose points are farther from their centre by a margin."""
+    from_centre = polygon - polygon.mean(axis=0)
+    return polygon + margin_px * from_centre / np.maximum(np.hypot(*from_centre.T), 1e-9)[:, None]

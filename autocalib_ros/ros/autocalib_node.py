@@ -29,6 +29,7 @@ from autocalib_ros.perception.images import ImageDecoder
 from autocalib_ros.perception.view_file import read_views
 from autocalib_ros.perception.view_watch import KnownView, ViewCondition, ViewReport
 from autocalib_ros.results.calibration import Calibration, Refusal
+from autocalib_ros.results.camera_move import CameraMove, MoveKind
 from autocalib_ros.results.control_points import read_control_points
 from autocalib_ros.results.given_pixels import FollowedPixels, GivenPixels
 from autocalib_ros.results.history import read_history, version_entry
@@ -221,6 +222,20 @@ class AutocalibNode(Node):
                 'the camera moved; set scale.distances to pixels of the present view'
             )
 
+    def _follow_regions(self, move: CameraMove | None) -> None:
+        """Ignore the given regions where they are in the image, and where the same places are in the present view."""
+        if not self.options.ignored_polygons:
+            return
+        ignored = self._pixels.present.regions_in_view(self.options)
+        self._worker.ignore(ignored)
+        self._pictures.ignored = ignored
+        if move is not None and move.kind is MoveKind.OTHER_VIEW:
+            self._told.tell_event(
+                'regions',
+                'ignore_regions stay where they are in the image, since the turn of the camera is unknown: check that '
+                'they cover private places in the present view',
+            )
+
     def _on_image(self, message: Any) -> None:
         """Queue the image for the perception thread and publish its CameraInfo; returns within microseconds."""
         frame_id = self._headers.frame_id(message.header.frame_id)
@@ -401,6 +416,7 @@ class AutocalibNode(Node):
             self._pixels.resume(found.stored.given_pixels)
             size = found.stored.calibration.evidence.image_size
             options = self._pixels.present.options_in_view(self.options, size)
+            self._follow_regions(None)
             restored = with_current_options(found.stored.calibration, options, self._lens)
             self.publication.restore(restored, found.stored.image_frame)
         except AutocalibError as error:
@@ -541,6 +557,7 @@ class AutocalibNode(Node):
         if move is not None:
             self._pixels.moved(None if published is None else published.result, move)
         self._follow_pixels()
+        self._follow_regions(move)
         if move is not None and mode == 'mend' and move.keeps_lens:
             turned = self.publication.mend(move, stamp_ns)
             if turned is not None:

@@ -24,8 +24,9 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
 from autocalib_ros.calibrator import CalibrationProgress
+from autocalib_ros.config import Polygons
 from autocalib_ros.evidence.snapshot import Evidence
-from autocalib_ros.perception.ignore_regions import Polygons, black_out
+from autocalib_ros.perception.ignore_regions import black_out
 from autocalib_ros.pictures.drawing import Caption
 from autocalib_ros.pictures.live_overlay import DebugPicture, LabelledTracks, RectifiedPicture, TopPicture
 from autocalib_ros.results.calibration import Calibration, Refusal
@@ -67,7 +68,7 @@ class LivePictures:
         progress: Callable[[], CalibrationProgress | None],
         failed: Callable[[Exception], None],
     ) -> None:
-        self.rate_hz, self._ignored = rate_hz, ignored
+        self.rate_hz, self.ignored = rate_hz, ignored
         self._publication, self._headers, self._progress, self._failed = publication, headers, progress, failed
         self._debug_image = _picture_publisher(node, '~/debug_image')
         self._top_view = _picture_publisher(node, '~/top_view')
@@ -134,7 +135,7 @@ class LivePictures:
 
     def _show(self, pending: _PendingImage) -> None:
         """Draw the subscribed pictures."""
-        image = black_out(pending.image, self._ignored)  # the only source of all pictures
+        image = black_out(pending.image, self.ignored)  # the only source of all pictures
         height, width = image.shape[:2]
         published, state = self._publication.published, self._publication.state
         withheld = self._publication.withheld

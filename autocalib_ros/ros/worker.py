@@ -22,7 +22,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from autocalib_ros.calibrator import AutoCalibrator, CalibrationProgress, ImageIntake
-from autocalib_ros.config import Options
+from autocalib_ros.config import Options, Polygons
 from autocalib_ros.errors import AutocalibError
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.lens.camera import Camera
@@ -174,6 +174,7 @@ class CalibrationWorker:
         self.known: tuple[Calibration | None, tuple[KnownView, ...]] = (None, ())
         """The calibration whose view is watched, with images of that view for the next start."""
         self._watched: Calibration | None = None
+        self._ignored = options.ignored_polygons
         self.solved_view: KnownView | None = None
         """View of the result that the listener is handling; None otherwise."""
         self._threads = [
@@ -255,6 +256,10 @@ class CalibrationWorker:
     def doubt(self) -> None:
         """Ask for another solution soon; to be called by the listener as it takes one that contradicts."""
         self._is_in_doubt = True
+
+    def ignore(self, polygons: Polygons) -> None:
+        """Ignore other regions from the next image on, in pixels of the full image."""
+        self._ignored = polygons
 
     def watch_nothing(self) -> None:
         """Watch no view any more: there is no calibration."""
@@ -339,6 +344,7 @@ class CalibrationWorker:
             image = self._decode(message)
             height, width = image.shape[:2]
             self._lens_for((width, height))  # skips an image whose shape is not that of the lens
+            self._calibrator.ignore(self._ignored)
             repeated = self._calibrator.repeated
             intake = self._calibrator.add_image(stamp_ns, image)
             self.counters.repeated += max(0, self._calibrator.repeated - repeated)
@@ -387,6 +393,7 @@ class CalibrationWorker:
             self._left_ns = 0
         if self._watch.size not in (None, image.shape[1::-1]) or not (steps or self._watch.is_due(time_s)):
             return
+        self._watch.ignore(self._ignored)
         before, report = self.view, self._watch.update(image, time_s)
         self.view = report
         if (report.condition, report.move, report.fault) != (before.condition, before.move, before.fault):
@@ -396,6 +403,7 @@ class CalibrationWorker:
                 self._left_ns = round(move.time_s * 1e9)
                 self._calibrator.leave_view(self._left_ns)
                 if mended is not None:
+                    self._watch.ignore(self._ignored)  # the listener may have turned them with the camera
                     self._watch.rebase(move)
                     self._watched, self.view = mended, self._watch.report
         self.known = (self._watched, self._watch.views)

@@ -109,6 +109,21 @@ def test_the_background_is_black_there_and_nowhere_else() -> None:
     assert mask[60, 150] and mask[50, 100] and not mask[60, 99] and not mask[152, 150]
 
 
+def test_other_regions_are_ignored_from_the_next_image_on() -> None:
+    calibrator = AutoCalibrator(Options(ignore_regions='100 50 200 50 150 150'))
+    moved = Options(ignore_regions='100 50 200 50 150 150; 300 20 380 20 380 90 300 90').ignored_polygons
+    for index in range(25):
+        if index == 5:
+            calibrator.ignore(moved)
+        calibrator.add_image(10**9 + index * 10**8, scene(0.1 * index, ()))
+    background = calibrator.background()
+    assert not background[ignored_mask(moved, (WIDTH, HEIGHT))].any()
+    # a clock that is set by a day begins anew, and regions do not
+    calibrator.add_image(10**9 + 2 * 86_400 * 10**9, scene(0.0, ()))
+    calibrator.add_image(10**9 + 2 * 86_400 * 10**9 + 10**8, scene(0.1, ()))
+    assert not calibrator.background()[ignored_mask(moved, (WIDTH, HEIGHT))].any()
+
+
 def test_blacking_out_leaves_the_image_given_alone() -> None:
     image = np.full((HEIGHT, WIDTH, 3), 90, np.uint8)
     image.flags.writeable = False

@@ -217,3 +217,18 @@ def test_light_that_changes_gets_a_reference_of_its_own() -> None:
     played(watch, lambda _: shadow, 10, 50)
     assert len(watch.views) == 2
     np.testing.assert_allclose(np.degrees(watch.views[0].pose.turn_rad), 0.0, atol=0.05)
+
+
+def test_ignored_regions_are_black_in_the_views_that_are_added() -> None:
+    """They are stored, and private places are nobody else's."""
+    watch = watching()
+    watch.ignore((((100.0, 60.0), (180.0, 60.0), (180.0, 120.0), (100.0, 120.0)),))
+    played(watch, lambda _: ROAD, 0, 10)
+    shadow = np.where(np.arange(WIDTH) > 0.35 * WIDTH, OTHER, ROAD)
+    played(watch, lambda _: shadow, 10, 50)
+    assert len(watch.views) == 2
+    added = watch.views[0]
+    assert added.ignored is not None and added.ignored[60:120, 100:180].all()
+    assert not added.image[60:120, 100:180].any() and added.image[60:120, 200:280].all()
+    shown = watch.newest_view(30.0)
+    assert shown is not None and not shown.image[60:120, 100:180].any()

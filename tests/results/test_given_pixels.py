@@ -128,3 +128,46 @@ def test_a_restart_goes_on_unless_other_pixels_were_given(result: Calibration, o
     followed = FollowedPixels(GivenPixels.of(other))
     followed.resume(turned)
     assert followed.present is not turned
+
+
+PRIVATE = '200 60 260 60 260 110 200 110'
+
+
+def test_ignored_regions_stay_and_cover_the_same_places_in_the_view(result: Calibration, options: Options) -> None:
+    private = replace(options, ignore_regions=PRIVATE)
+    pixels = GivenPixels.of(private)
+    assert pixels.regions_in_view(private) == private.ignored_polygons
+    given, followed = pixels.turned(result, BUMP).regions_in_view(private)
+    assert (given,) == private.ignored_polygons  # burnt-in text stays where it is
+    corners = np.array(given)
+    bearings, _ = result.camera.unproject(corners)
+    places, _ = result.camera.project(bearings @ BUMP.rotation.T)
+    centre = np.array(followed).mean(axis=0)
+    np.testing.assert_allclose(centre, places.mean(axis=0), atol=1.0)  # the lens bends the sides by less than a pixel
+    reach = np.hypot(*(places - centre).T).max()
+    assert reach < np.hypot(*(np.array(followed) - centre).T).max() < 1.2 * reach
+    # known lengths are followed as without regions
+    lengths = GivenPixels.of(options).turned(result, BUMP).options_in_view(options, SIZE).scale
+    assert pixels.turned(result, BUMP).options_in_view(private, SIZE).scale == lengths
+
+
+def test_ignored_regions_follow_a_zoom_and_nothing_else_does(result: Calibration, options: Options) -> None:
+    private = replace(options, ignore_regions=PRIVATE)
+    pixels = GivenPixels.of(private).turned(result, ZOOM)
+    _, larger = pixels.regions_in_view(private)
+    grown = np.ptp(np.array(larger), axis=0) / np.ptp(np.array(private.ignored_polygons[0]), axis=0)
+    assert (grown > 1.15).all() and (grown < 1.4).all()
+    assert not pixels.options_in_view(private, SIZE).scale.known_distances
+
+
+def test_ignored_regions_in_another_view_stay_where_they_are(result: Calibration, options: Options) -> None:
+    private = replace(options, ignore_regions=PRIVATE)
+    away = CameraMove(MoveKind.OTHER_VIEW, 20.0)
+    assert GivenPixels.of(private).turned(result, away).regions_in_view(private) == private.ignored_polygons
+
+
+def test_ignored_regions_survive_a_restart(result: Calibration, options: Options) -> None:
+    private = replace(options, ignore_regions=PRIVATE)
+    pixels = GivenPixels.of(private).turned(result, BUMP)
+    found = GivenPixels.from_document(json.loads(json.dumps(pixels.document(), allow_nan=False)))
+    assert found.regions_in_view(private) == pixels.regions_in_view(private)

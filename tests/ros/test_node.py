@@ -445,6 +445,19 @@ def test_what_was_given_in_pixels_follows_the_camera(bench, tmp_path):
     assert node._worker.options.scale.known_distances == (length,)
 
 
+def test_ignored_regions_follow_the_camera_and_stay(bench):
+    node, _ = calibrated(bench, ignore_regions='60 60 120 60 120 110 60 110')
+    node.view_changed(ViewReport(ViewCondition.MOVED, move=BUMP), START_NS)
+    ignored = node._worker._ignored
+    assert len(ignored) == 2 and ignored[:1] == node.options.ignored_polygons
+    # to the left and up by what 1 and 2 degrees are at 300 px, and a little wider
+    left, top = (min(point[axis] for point in ignored[1]) for axis in (0, 1))
+    assert (left, top) == pytest.approx((60 - 5.2, 60 - 10.5), abs=5)
+    assert node._pictures.ignored == ignored
+    node.view_changed(ViewReport(ViewCondition.STILL), START_NS)
+    assert len(node._worker._ignored) == 2  # the mended calibration is one of this view
+
+
 def test_calibration_without_a_stored_view_is_published_again_after_a_black_picture(bench):
     node, _ = calibrated(bench)
     node.view_changed(ViewReport(ViewCondition.BLIND, 20.0, fault=PictureFault.BLACK), START_NS)

@@ -14,10 +14,10 @@ from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, Qo
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
+from autocalib_ros.config import Polygons
 from autocalib_ros.errors import InputError, UsageError
 from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.offline.recordings.sources import Source, StoredImage, camera_name, image_topic
-from autocalib_ros.perception.ignore_regions import Polygons
 from autocalib_ros.perception.masked_messages import mask_message, require_maskable
 from autocalib_ros.results.calibration import Calibration
 
