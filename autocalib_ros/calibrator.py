@@ -14,6 +14,7 @@ from autocalib_ros.estimation.observations.selection import drop_pedestrians
 from autocalib_ros.estimation.verification.readiness import check_steady, outlook, requirements
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.evidence.solution_schedule import SolutionSchedule
+from autocalib_ros.evidence.stillness import ViewChange
 from autocalib_ros.perception.detector.detector import VehicleDetector, open_detector
 from autocalib_ros.perception.frame_clock import ClockSummary
 from autocalib_ros.perception.image_stream import ImageStream
@@ -186,6 +187,12 @@ class AutoCalibrator:
         if moving:
             return CalibrationProgress(100.0 * scarcest, (moving.message, *missing))
         return CalibrationProgress(100.0 * scarcest, missing, outlook(evidence, scarcest))
+
+    @property
+    def newest_change(self) -> tuple[ViewChange, int] | None:
+        """The newest change of the view, in image terms, and the number of the present view; None without a change."""
+        change = None if self._stream is None else self._stream.observer.newest_change
+        return None if change is None or self._stream is None else (change, self._stream.observer.view)
 
     @property
     def repeated(self) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from enum import IntEnum
 
@@ -65,6 +66,20 @@ class ViewChange:
     amount: float = 0.0
     """Zoom factor, or displacement in pixels of the full image; 0 for a cut."""
 
+    def enlarged(self, factor: float) -> ViewChange:
+        """Return the same for an image of `factor` times the width."""
+        return self if self.kind is ViewChangeKind.ZOOM else replace(self, amount=self.amount * factor)
+
+    @property
+    def displacement_px(self) -> float:
+        """By how much the picture was displaced; infinite where nothing of it is as it was."""
+        return math.inf if self.kind in (ViewChangeKind.CUT, ViewChangeKind.ZOOM) else self.amount
+
+    def __str__(self) -> str:
+        if self.kind is ViewChangeKind.CUT:
+            return 'another view'
+        return f'zoom {self.amount:.2f}' if self.kind is ViewChangeKind.ZOOM else f'the picture by {self.amount:.1f} px'
+
 
 @dataclass(frozen=True)
 class Stillness:
@@ -93,10 +108,7 @@ class Stillness:
 
     def enlarged(self, factor: float) -> Stillness:
         """Return the same for an image of `factor` times the width."""
-        changes = tuple(
-            change if change.kind is ViewChangeKind.ZOOM else replace(change, amount=change.amount * factor)
-            for change in self.changes
-        )
+        changes = tuple(change.enlarged(factor) for change in self.changes)
         return replace(self, sway_px=self.sway_px * factor, travel_px=self.travel_px * factor, changes=changes)
 
     def as_array(self) -> np.ndarray:

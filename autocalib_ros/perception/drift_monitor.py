@@ -324,6 +324,11 @@ class DriftMonitor:
         self._lowest, self._highest = np.minimum(self._lowest, place), np.maximum(self._highest, place)
 
     @property
+    def newest_change(self) -> ViewChange | None:
+        """The newest change of the view, in pixels of the images passed to `update`; None without one."""
+        return self._changes[-1] if self._changes else None
+
+    @property
     def drift_px(self) -> float:
         """Largest lasting displacement of the present view, pixels of the images passed to `update`."""
         return 0.0 if self._view is None else self._drift_px(self._view)

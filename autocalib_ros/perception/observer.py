@@ -13,7 +13,7 @@ from autocalib_ros.config import GateOptions, Options, Polygons
 from autocalib_ros.evidence.landmarks import Landmarks
 from autocalib_ros.evidence.picture import Picture
 from autocalib_ros.evidence.snapshot import Edges, Outlines, Segments, Track, TrackKind
-from autocalib_ros.evidence.stillness import MIN_REPORTED_SWAY_PX, Stillness, drift_limit_px, sway_limit_px
+from autocalib_ros.evidence.stillness import MIN_REPORTED_SWAY_PX, Stillness, ViewChange, drift_limit_px, sway_limit_px
 from autocalib_ros.perception.background import Background, median
 from autocalib_ros.perception.detector.detector import VehicleDetector
 from autocalib_ros.perception.detector_tracks import DetectorTracks
@@ -301,6 +301,12 @@ class Observer:
     def drift_px(self) -> float:
         """Largest lasting displacement of the background of the present view, pixels of the full image."""
         return self._drift_monitor.drift_px * self._reduction
+
+    @property
+    def newest_change(self) -> ViewChange | None:
+        """The newest change of the view, in pixels of the full image; None without one."""
+        change = self._drift_monitor.newest_change
+        return None if change is None else change.enlarged(self._reduction)
 
     @property
     def view(self) -> int:

@@ -28,6 +28,9 @@ it by half a pixel."""
 OUTLINE_SIGMAS, OUTLINE_MARGIN_PX = 3.0, 1.0
 """Standard deviations, and pixels for the pieces, by which a region that was carried along is made wider."""
 
+MAX_POINTS_DISPLACED_PX = 1.0
+"""Displacement of the picture up to which control points are used, pixels: a person clicks as exactly."""
+
 
 @dataclass(frozen=True, eq=False)
 class GivenPixels:
@@ -41,6 +44,8 @@ class GivenPixels:
     """Standard deviation that the moves of the camera have added to each coordinate."""
     outlines: tuple[int, ...] = ()
     """Number of pixels of each ignored region."""
+    displaced_px: float = 0.0
+    """By how much the picture was displaced since, by turns that were not measured."""
 
     @classmethod
     def of(cls, options: Options, points: ControlPoints | None = None) -> GivenPixels:
@@ -88,6 +93,15 @@ class GivenPixels:
             followed.append(tuple((float(u), float(v)) for u, v in wider))
         return (*options.ignored_polygons, *followed)
 
+    def displaced(self, displacement_px: float) -> GivenPixels:
+        """Return the pixels after a move that only the picture tells, by its displacement: so much less certain.
+
+        Infinite where nothing is as it was.
+        """
+        if not math.isfinite(displacement_px):
+            return self.unknown()
+        return replace(self, displaced_px=self.displaced_px + displacement_px)
+
     def unknown(self) -> GivenPixels:
         """Return the pixels in a view of which nothing is known."""
         return replace(self, in_view=np.full_like(self.in_view, np.nan))
@@ -102,10 +116,10 @@ class GivenPixels:
         first = sum(self.outlines)
         rows = slice(first, first + 2 * len(known))
         ends = self.in_view[rows].reshape(-1, 4)
-        if np.array_equal(ends, self.as_given[rows].reshape(-1, 4)):
+        if not self.displaced_px and np.array_equal(ends, self.as_given[rows].reshape(-1, 4)):
             return options
         limit = np.tile(image_size, 2) - 0.5
-        sigma_px = float(np.hypot(scale.pixel_sigma_px, self.sigma_px))
+        sigma_px = float(np.linalg.norm([scale.pixel_sigma_px, self.sigma_px, self.displaced_px]))
         apart = np.hypot(*(ends[:, 2:] - ends[:, :2]).T) > max(MIN_PIXEL_SEPARATION_SIGMAS * sigma_px, 1.0)
         usable = ((ends >= -0.5) & (ends <= limit)).all(axis=1) & apart
         texts = [
@@ -127,7 +141,8 @@ class GivenPixels:
     def points_in_view(self, points: ControlPoints) -> ControlPoints | None:
         """Return control points where they are in the view; None if that is unknown."""
         pixels = self.in_view[len(self.in_view) - len(points.pixels) :]
-        return replace(points, pixels=pixels) if np.isfinite(pixels).all() else None
+        is_known = np.isfinite(pixels).all() and self.displaced_px <= MAX_POINTS_DISPLACED_PX
+        return replace(points, pixels=pixels) if is_known else None
 
     def document(self) -> dict[str, Any]:
         """Return this for a JSON file; a place that is unknown is null."""
@@ -137,6 +152,7 @@ class GivenPixels:
             'in_view': in_view,
             'sigma_px': self.sigma_px,
             'outlines': list(self.outlines),
+            'displaced_px': self.displaced_px,
         }
 
     @classmethod
@@ -149,11 +165,13 @@ class GivenPixels:
                 np.array([unknown if pixel is None else pixel for pixel in document['in_view']], float).reshape(-1, 2),
                 float(document['sigma_px']),
                 tuple(int(count) for count in document.get('outlines', ())),
+                float(document.get('displaced_px', 0.0)),
             )
         except (LookupError, TypeError, ValueError) as error:
             raise InputError(f'its given_pixels are damaged ({type(error).__name__}: {error})') from error
         counts = min(found.outlines, default=0) >= 0 and sum(found.outlines) <= len(found.as_given)
-        if found.as_given.shape != found.in_view.shape or not 0 <= found.sigma_px < np.inf or not counts:
+        finite = 0 <= found.sigma_px < np.inf and 0 <= found.displaced_px < np.inf
+        if found.as_given.shape != found.in_view.shape or not finite or not counts:
             raise InputError('its given_pixels are damaged')
         return found
 
@@ -186,6 +204,11 @@ class FollowedPixels:
         with self._lock:
             before = self._in_force
             self._present = before.unknown() if result is None else before.turned(result, move)
+
+    def displaced(self, displacement_px: float) -> None:
+        """Note that the picture was displaced, by an unknown turn."""
+        with self._lock:
+            self._present = self._present.displaced(displacement_px)
 
     def is_back(self) -> None:
         """Note that the present view is that of the calibration in force."""

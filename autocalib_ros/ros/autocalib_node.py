@@ -21,6 +21,7 @@ from std_srvs.srv import Trigger
 from autocalib_ros.calibrator import AutoCalibrator
 from autocalib_ros.config import NodeOptions, Options
 from autocalib_ros.errors import AutocalibError, InputError
+from autocalib_ros.evidence.stillness import ViewChange
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.lens.camera_info import camera_info
 from autocalib_ros.lens.camera_info_yaml import read_camera_info
@@ -543,6 +544,19 @@ class AutocalibNode(Node):
         """Append a version to the history, beside the stored calibration."""
         if self._store is not None and self.node_options.autosave:
             self._side_files.remember(self._store, version_entry(result, cause, time.time()))
+
+    def picture_moved(self, change: ViewChange, view: int, stamp_ns: int) -> None:
+        """Tell a move of which no calibration tells degrees; pixels that were given are less certain by it."""
+        if view == 0:
+            self._pixels.is_back()
+        else:
+            self._pixels.displaced(change.displacement_px)
+        then = 'the first view is back' if view == 0 else 'evidence from before is not used, collecting begins anew'
+        self._told.tell_event(
+            f'picture moved {change.kind.name}',
+            f'the camera moved until {clock_text(stamp_ns * 1e-9)}: {change}; no lens tells the degrees; {then}',
+        )
+        self._follow_pixels()
 
     def view_changed(self, report: ViewReport, stamp_ns: int) -> Calibration | None:
         """Publish, withhold or mend the calibration by what the newest image says about the view."""

@@ -35,7 +35,7 @@ from autocalib_ros.util.threads import limit_blas_threads
 
 MOST_WAITING = 4
 """Images that may wait for the perception thread: half of its queue, so that none is dropped."""
-SOLVING_PAUSE_S = 2.0
+SOLVING_PAUSE_S = 0.5
 """Longest pause between two images during a solution, real seconds: the node tells a stream that stops for longer."""
 POLL_S = 0.0005
 """Real seconds between two looks whether the node can take another image: a fraction of the time of one."""

@@ -25,6 +25,7 @@ from autocalib_ros.calibrator import AutoCalibrator, CalibrationProgress, ImageI
 from autocalib_ros.config import Options, Polygons
 from autocalib_ros.errors import AutocalibError
 from autocalib_ros.evidence.snapshot import Evidence
+from autocalib_ros.evidence.stillness import ViewChange
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.perception.detector.detector import VehicleDetector
 from autocalib_ros.perception.frame_clock import ClockSummary
@@ -83,6 +84,12 @@ class Listener(Protocol):
 
     def view_changed(self, report: ViewReport, stamp_ns: int) -> Calibration | None:
         """Take what the newest image says about the view; return the calibration if it was mended by its move."""
+
+    def picture_moved(self, change: ViewChange, view: int, stamp_ns: int) -> None:
+        """Take a change of the view that no calibration measures, in image terms, and the number of the present view.
+
+        The first view of a stream has the number 0, and again when it is back.
+        """
 
 
 @dataclass
@@ -175,6 +182,7 @@ class CalibrationWorker:
         """The calibration whose view is watched, with images of that view for the next start."""
         self._watched: Calibration | None = None
         self._ignored = options.ignored_polygons
+        self._newest_change: tuple[ViewChange, int] | None = None
         self.solved_view: KnownView | None = None
         """View of the result that the listener is handling; None otherwise."""
         self._threads = [
@@ -367,6 +375,7 @@ class CalibrationWorker:
             self._unsolved_images += self._generation == self._calibrator_generation
         self._listener.image_accepted(width, height)
         self._guarded(partial(self._watch_view, stamp_ns, image))
+        self._guarded(partial(self._tell_unmeasured, stamp_ns))
         if self._viewer is not None:
             self._guarded(partial(self._viewer.image_used, message, image, self._calibrator.followed))
         accepted, self._accepted_tracks = self._accepted_tracks, 0
@@ -407,6 +416,13 @@ class CalibrationWorker:
                     self._watch.rebase(move)
                     self._watched, self.view = mended, self._watch.report
         self.known = (self._watched, self._watch.views)
+
+    def _tell_unmeasured(self, stamp_ns: int) -> None:
+        """Tell a change of the view that the perception found, where no view of a calibration is watched."""
+        newest = self._calibrator.newest_change
+        if newest is not None and newest != self._newest_change and not self._watch.report.is_watched:
+            self._listener.picture_moved(*newest, stamp_ns)
+        self._newest_change = newest
 
     def _submit(self, evidence: Evidence | None, requests: list[Future]) -> None:
         """Hand a snapshot to the solver thread; it replaces a waiting one and takes over its callers."""

@@ -171,3 +171,25 @@ def test_ignored_regions_survive_a_restart(result: Calibration, options: Options
     pixels = GivenPixels.of(private).turned(result, BUMP)
     found = GivenPixels.from_document(json.loads(json.dumps(pixels.document(), allow_nan=False)))
     assert found.regions_in_view(private) == pixels.regions_in_view(private)
+
+
+def test_lengths_are_less_certain_after_a_move_that_only_the_picture_tells(options: Options) -> None:
+    points = ControlPoints(('a', 'b'), np.array([[10.0, 20.0], [200.0, 180.0]]), np.array([[0.0, 0.0], [4.0, 1.0]]))
+    given = GivenPixels.of(options, points)
+    little = given.displaced(1.0)
+    scale = little.options_in_view(options, SIZE).scale
+    assert len(scale.known_distances) == 2
+    assert scale.pixel_sigma_px == pytest.approx(np.hypot(options.scale.pixel_sigma_px, 1.0))
+    assert little.points_in_view(points) is not None
+    much = little.displaced(40.0)  # the lengths are 100 px or so
+    assert not much.options_in_view(options, SIZE).scale.known_distances
+    assert much.points_in_view(points) is None
+    assert GivenPixels.from_document(much.document()).displaced_px == 41.0
+    assert given.displaced(np.inf).points_in_view(points) is None
+
+
+def test_pixels_are_as_given_when_the_first_view_is_back(options: Options) -> None:
+    followed = FollowedPixels(GivenPixels.of(options))
+    followed.displaced(40.0)
+    followed.is_back()
+    assert followed.present.options_in_view(options, SIZE) is options

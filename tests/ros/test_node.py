@@ -15,6 +15,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage
 
 from autocalib_ros.errors import UsageError
 from autocalib_ros.estimation.publish import with_requested_model
+from autocalib_ros.evidence.stillness import ViewChange, ViewChangeKind
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.lens.camera_info import camera_info
 from autocalib_ros.lens.camera_info_yaml import write_camera_info_yaml
@@ -443,6 +444,15 @@ def test_what_was_given_in_pixels_follows_the_camera(bench, tmp_path):
     wait_for(is_cleared, 'the place in the map to be taken back')
     node.view_changed(ViewReport(ViewCondition.STILL), START_NS)
     assert node._worker.options.scale.known_distances == (length,)
+
+
+def test_lengths_are_not_used_after_a_move_before_the_first_calibration(bench):
+    node = bench.start(camera_height=8.0, idle_solve_s=1000.0, scale__distances='100 180 220 180 8')
+    publish_until(bench.connected(bench.publisher()), lambda: used(node), 'an image')
+    node.picture_moved(ViewChange(ViewChangeKind.TURN, 10.0, 12.0, 60.0), 1, START_NS)
+    assert not node._worker.options.scale.known_distances
+    node.picture_moved(ViewChange(ViewChangeKind.CUT, 20.0, 22.0), 0, START_NS)
+    assert len(node._worker.options.scale.known_distances) == 1
 
 
 def test_ignored_regions_follow_the_camera_and_stay(bench):

@@ -11,6 +11,7 @@ from drawn_pictures import noisy
 
 from autocalib_ros.config import Options
 from autocalib_ros.errors import InputError
+from autocalib_ros.evidence.stillness import ViewChangeKind
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.perception.view_watch import KnownView, ViewCondition
 from autocalib_ros.ros.worker import IMAGE_QUEUE_SIZE, CalibrationWorker
@@ -25,7 +26,7 @@ class Heard:
 
     def __init__(self):
         self.sizes, self.unreadable, self.results, self.faults, self.anew = [], [], [], [], []
-        self.reports, self.mend = [], None
+        self.reports, self.mend, self.moved = [], None, []
 
     def image_accepted(self, width, height):
         self.sizes.append((width, height))
@@ -41,6 +42,9 @@ class Heard:
 
     def failed(self, error):
         self.faults.append(error)
+
+    def picture_moved(self, change, view, stamp_ns):
+        self.moved.append((change, view))
 
     def view_changed(self, report, stamp_ns):
         self.reports.append(report)
@@ -397,3 +401,19 @@ def test_move_is_told_mended_and_begins_other_evidence(start, heard):
     assert worker.view.condition in (ViewCondition.STILL, ViewCondition.SWAYING)
     assert worker.known[0] is result
     assert worker._calibrator.snapshot().first_stamp_ns >= 15 * step_ns
+
+
+def test_a_move_before_the_first_calibration_is_told_in_image_terms(start, heard):
+    """No lens measures it, and evidence of both views is never mixed."""
+    road = cv2.GaussianBlur(np.random.default_rng(1).uniform(0, 255, (180, 320)), (0, 0), 2.0)
+    road = cv2.normalize(road, None, 40, 200, cv2.NORM_MINMAX).astype(np.uint8)
+    noise = np.random.default_rng(3).integers(0, 9, (2, 180, 320)).astype(np.uint8)
+    worker = start(calibration)
+    for number in range(70):
+        picture = road if number < 30 else np.roll(road, (4, 7), axis=(0, 1))
+        worker.offer(number * 10**9, cv2.add(picture, noise[number % 2]))
+        wait_for(lambda wanted=number + 1: len(heard.sizes) >= wanted, f'image {number}')
+    ((change, view),) = heard.moved
+    assert (change.kind, view) == (ViewChangeKind.TURN, 1)
+    assert change.displacement_px == pytest.approx(np.hypot(4, 7), abs=0.5)
+    assert result_of(worker.solve_now()).evidence.frames < 45

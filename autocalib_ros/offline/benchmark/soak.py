@@ -31,8 +31,9 @@ from autocalib_ros.errors import AutocalibError, InputError
 from autocalib_ros.offline.benchmark.long_stream import LongStream, ShortRecording
 from autocalib_ros.offline.benchmark.repeated_traffic import RepeatedTraffic
 
-DENSE_HZ, SPARSE_S = 5.0, 2.0
-"""Rate of the images with traffic in them, and the interval of the others, seconds: that of the registrations or so."""
+DENSE_HZ, SPARSE_S = 5.0, 1.8
+"""Rate of the images with traffic in them, and the interval of the others, seconds: eight are in the time over which
+the watch of the view averages, as many as it needs."""
 SLICES = 4
 """Parts into which the hours with traffic in the images are cut, evenly over the run: by day and by night."""
 MOST_LEARNT_S = 180.0
