@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 
 from autocalib_ros.perception.background import median
-from autocalib_ros.perception.background_motion import PictureMotion, ReferenceImage
+from autocalib_ros.perception.background_motion import AGREEMENT_PX, PictureMotion, ReferenceImage
+from autocalib_ros.perception.view_registration import normalised
 
 REST_S = 10.0
 """Time over which offsets are averaged to the rest position, seconds: two periods of the slowest sway, 0.2 Hz, which a
@@ -43,6 +44,8 @@ Judgement."""
 RENEWAL_S = 30.0
 """Least interval between two renewals, seconds: light changes more slowly, and each adds an error of hundredths of a
 pixel."""
+MAX_ANCHORS = 4
+"""References in memory that later ones are placed by, besides the first: of day, dusk and night."""
 AMPLITUDE_BINS, AMPLITUDE_STEP_PX = 400, 0.05
 """Bins of the histogram of sway, and their width in pixels of the image measured in."""
 
@@ -76,6 +79,8 @@ class StillView:
         self._rest_due_s, self._sway_due_s, self._sample_due_s = time_s, time_s, time_s
         self._samples: list[np.ndarray] = []
         self._first_share, self._renewed_s = 0.0, -np.inf
+        self._anchors: list[tuple[ReferenceImage, PictureMotion]] = []
+        """References of one local contrast, by which later ones are placed, oldest first, and the motion to each."""
         self.is_swaying = False
         """Whether images are compensated."""
         self._anchor, self._anchored = PictureMotion(), False
@@ -85,6 +90,7 @@ class StillView:
         """Replace the mask of pixels where the reference has no corners, uint8 (h, w)."""
         self._ignored = ignored
         self.reference = ReferenceImage(self.reference.image, ignored)
+        self._anchors = [(ReferenceImage(one.image, ignored), base) for one, base in self._anchors]
 
     @property
     def size(self) -> tuple[int, int]:
@@ -256,13 +262,30 @@ class StillView:
         self._samples, self._first_share = [], 0.0
 
     def _renew(self, image: np.ndarray, motion: PictureMotion, time_s: float) -> None:
-        """Replace the reference by the median of the samples; the newest of them shows `motion`, which goes on."""
+        """Replace the reference by the median of the samples; the newest of them shows `motion`, which goes on.
+
+        Its place is that by the oldest reference that still recognises it. A chain from each to the next one would
+        drift: shadows take the corners at their edges along, by less than agrees from one to the next, and by more than
+        that from the oldest one. Where it says something else by more than agrees, it follows the shadows itself.
+        """
         self._renewed_s = time_s
         reference = ReferenceImage(median(self._samples), self._ignored)
         shown = reference.motion_to(image, PictureMotion())
-        if shown is not None:
-            self.reference, self._first_share = reference, shown.share
-            self.base = shown.inverse().after(motion)
+        if shown is None:
+            return
+        base, pattern = shown.inverse().after(motion), normalised(reference.image)
+        for anchor, place in self._anchors:
+            found = anchor.motion_to(pattern, base.after(place.inverse()))
+            if found is not None and self.distance_px(found.after(place), base) < AGREEMENT_PX:
+                base = found.after(place)
+                break
+        else:
+            self._anchors = [
+                *self._anchors[:1],
+                *self._anchors[1:][1 - MAX_ANCHORS :],
+                (ReferenceImage(pattern, self._ignored), base),
+            ]
+        self.reference, self._first_share, self.base = reference, shown.share, base
 
 
 def warped(image: np.ndarray, motion: PictureMotion) -> np.ndarray:

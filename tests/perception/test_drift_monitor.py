@@ -130,6 +130,22 @@ def night(time_s: float) -> np.ndarray:
     return scene
 
 
+def test_shadows_that_wander_for_minutes_do_not_take_the_picture_along() -> None:
+    """Each reference is placed by the oldest that recognises it: from one to the next shadows would add up to 2 px."""
+    generator, size = np.random.default_rng(0), (180, 320)
+    road = cv2.GaussianBlur(generator.normal(size=size).astype(np.float32), (0, 0), 1.5)
+    wide = cv2.GaussianBlur(generator.normal(size=(size[0], 2 * size[1])).astype(np.float32), (0, 0), 6.0)
+    shadows = (wide > 0.3 * wide.std()).astype(np.float32)
+    monitor = DriftMonitor()
+    for second in range(600):
+        by_px = np.array([[1.0, 0.0, -0.05 * second], [0.0, 1.0, 0.0]])
+        shade = cv2.GaussianBlur(cv2.warpAffine(shadows, by_px, size[::-1]), (0, 0), 0.8)
+        scene = (130.0 + 24.0 * road / road.std()) * (1.0 - 0.45 * shade)
+        monitor.update(noisy(scene, 1.5, second), float(second))
+    assert monitor._view is not None and monitor._view.number == 0
+    assert abs(monitor._view.base.shift) < 0.3
+
+
 def test_lamps_that_creep_on_by_night_are_no_motion_of_the_camera() -> None:
     poses, monitor = watched(night, 20.0, noise=1.5)
     assert all(pose.is_usable for pose in poses) and monitor.drift_px < 0.3
