@@ -36,6 +36,8 @@ MIN_RAYS = 10
 MIN_NEAR_CELLS, MIN_FAR_CELLS = 5, 6
 """Least cells of the picture with rays that agree: near the last pose, and anywhere else. A lorry that drives by shows
 in one or two, a jam leaves the borders."""
+MIN_PART_CELLS = 4
+"""The same in a half of the picture, which has twelve."""
 MIN_NEAR_SHARE = 0.5
 """Share of the best agreement that the last pose needs to be kept as the start: traffic that moves together may outvote
 the few corners that a jam leaves."""
@@ -141,6 +143,13 @@ class ViewReference:
 
         `own` replaces the normalised image of the reference.
         """
+        found = self._followed(pattern, last, own)
+        return None if found is None else self._agreed(*found, last)
+
+    def _followed(
+        self, pattern: np.ndarray, last: ViewPose, own: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return the corners (n,) that are found in a normalised image near a last pose, and their places (n, 2)."""
         if not self.is_registrable:
             return None
         guess, seen = self._projected(last.rotation, last.log_zoom)
@@ -161,7 +170,40 @@ class ViewReference:
         )
         found = status.ravel() == 1
         rows = np.flatnonzero(inside)[found]
-        return self._agreed(rows, ends[found, 0].astype(float), last)
+        return rows, ends[found, 0].astype(float)
+
+    def parallax(self, pattern: np.ndarray, pose: ViewPose) -> tuple[float, float] | None:
+        """Return the angle between the turns that the lower and the upper half of the picture show, and its sigma.
+
+        Radians; None if one of them shows too little. A camera that turned about its centre gives 0: what is below, and
+        near, turns as what is far does. One that was shifted sees it turn by the shift over the distance besides.
+        `pattern` is a normalised image (H, W) near `pose`.
+        """
+        found = self._followed(pattern, pose)
+        if found is None:
+            return None
+        rows, ends = found
+        lower = self.corners_px[rows, 1] > 0.5 * pattern.shape[0]
+        poses = [self._turn_of_part(rows[part], ends[part], pose) for part in (lower, ~lower)]
+        if poses[0] is None or poses[1] is None:
+            return None
+        below, above = (each.without_zoom() for each in poses if each is not None)
+        difference = turn_of_rotation(below.rotation @ above.rotation.T)
+        covariance = below.covariance[:3, :3] + above.covariance[:3, :3]
+        angle = float(np.linalg.norm(difference))
+        along = difference / max(angle, 1e-12)
+        return angle, float(np.sqrt(along @ covariance @ along))
+
+    def _turn_of_part(self, rows: np.ndarray, ends: np.ndarray, pose: ViewPose) -> ViewPose | None:
+        """Return the pose that most corners of a part of the picture agree on; None if they are too few."""
+        if len(rows) < MIN_RAYS:
+            return None
+        bearings, cells = self.bearings[rows], self._cells[rows]
+        start = _best_hypothesis(self.camera, bearings, ends, (float(np.exp(pose.log_zoom)),), cells)
+        fitted = self._refined(bearings, ends, start, AGREEMENT_RAYS_PX)
+        if fitted is None or len(np.unique(cells[fitted[1]])) < MIN_PART_CELLS:
+            return None
+        return fitted[0]
 
     def anywhere(self, pattern: np.ndarray) -> ViewPose | None:
         """Return the pose of a normalised image (H, W), wherever the camera points; None if it shows another view."""

@@ -29,7 +29,14 @@ from autocalib_ros.perception.picture_faults import (
     exposure_fault,
 )
 from autocalib_ros.perception.view_registration import ViewPose, ViewReference, normalised, registered_image
-from autocalib_ros.results.camera_move import MIN_MOVE_ZOOM, CameraMove, MoveKind, kind_of_move, rotation_angle_deg
+from autocalib_ros.results.camera_move import (
+    MAX_BUMP_DEG,
+    MIN_MOVE_ZOOM,
+    CameraMove,
+    MoveKind,
+    kind_of_move,
+    rotation_angle_deg,
+)
 
 CHECK_S = 1.2
 """Mean interval between two registrations, seconds."""
@@ -49,6 +56,12 @@ MOVE_WINDOW_S, MIN_MOVE_SAMPLES = 15.0, 8
 which a move is to be told."""
 LARGE_MOVE_FACTOR, LARGE_MOVE_S, MIN_LARGE_SAMPLES = 3.0, 6.0, 4
 """Moves larger than this multiple of the least one are told after this many seconds."""
+MIN_PARALLAX_DEG, PARALLAX_SIGMAS, PARALLAX_BY_LENS = 0.1, 5.0, 0.02
+"""Least angle between the turns of near and far that tells a shift, degrees: 3 cm at 15 m, and five times what turns by
+up to 3 degrees of rendered scenes show without one; in its standard deviations; and relative to the turn."""
+NO_COMMON_TURN_DEG, NO_COMMON_SHARE = 1.5, 0.5
+"""Angle that stands for a half of the picture in which no turn is common, degrees, more than 0.3 m show at 12 m; and
+the part of the corners that agreed before below which that is so: a jam in the way covers fewer."""
 MOVE_SIGMAS = 5.0
 """A move is larger than this number of standard errors of the mean: in 36,000 registrations, which are not independent,
 less than one exceeds them by chance."""
@@ -572,6 +585,8 @@ class ViewWatch:
         spread = turns.std(axis=0, ddof=1) / root
         sigma = np.sqrt(spread**2 + np.degrees(np.degrees(np.diag(covariance)[:3])))
         pan, tilt, roll = (float(value) for value in mean)
+        parallax_deg = self._parallax_deg(move.time_s, size) if zoom == 1.0 else 0.0
+        sigma = np.hypot(sigma, parallax_deg)
         measured = CameraMove(
             kind_of_move(size, zoom),
             move.time_s,
@@ -580,12 +595,31 @@ class ViewWatch:
             roll,
             zoom,
             (float(sigma[0]), float(sigma[1]), float(sigma[2])),
+            parallax_deg,
         )
         if move.is_measured and move.kind is measured.kind:
             angle_deg = rotation_angle_deg(measured.rotation @ move.rotation.T)
             if angle_deg < self._least_move_deg and abs(math.log(zoom / move.zoom)) < math.log(MIN_MOVE_ZOOM):
                 return before
         return self._changed(ViewCondition.MOVED, before.since_s, move=measured)
+
+    def _parallax_deg(self, since_s: float, turn_deg: float) -> float:
+        """Return the significant angle by which what is near turned otherwise than what is far, degrees; else 0."""
+        shown = self.newest_view(since_s)
+        if shown is None or turn_deg > MAX_BUMP_DEG:
+            return 0.0
+        first = self._references[0]
+        found = first.view.parallax(normalised(shown.image), self._last.after(_inverse(first.known.pose)))
+        if found is None:
+            before, after = (
+                [one.pose.share for one in self._samples if (one.time_s > since_s) == is_after]
+                for is_after in (False, True)
+            )
+            lost = bool(before) and float(np.median(after)) < NO_COMMON_SHARE * float(np.median(before))
+            return NO_COMMON_TURN_DEG if lost else 0.0
+        angle_deg, sigma_deg = (math.degrees(value) for value in found)
+        least = max(MIN_PARALLAX_DEG, PARALLAX_SIGMAS * sigma_deg, PARALLAX_BY_LENS * turn_deg)
+        return angle_deg if angle_deg > least else 0.0
 
     def _is_verified(self) -> bool:
         """Whether the newest registrations show the pose of the calibration."""

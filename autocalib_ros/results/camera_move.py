@@ -49,6 +49,9 @@ class CameraMove:
     """Focal length now over that before."""
     sigma_deg: tuple[float, float, float] | None = None
     """Standard deviations of pan, tilt and roll by the registration; None if nothing was measured."""
+    parallax_deg: float = 0.0
+    """Angle by which what is near turned otherwise than what is far, where that is significant: the camera was shifted
+    as well, by this angle times the distance of what is near."""
 
     @property
     def rotation(self) -> np.ndarray:
@@ -75,7 +78,8 @@ class CameraMove:
             )
         )
         zoom = f', zoom {self.zoom:.3f}' if self.kind is MoveKind.ZOOM else ''
-        return f'{self.kind.value}: {turn} degrees{zoom}'
+        shifted = f', and shifted: the near part turned by {self.parallax_deg:.2f} more' if self.parallax_deg else ''
+        return f'{self.kind.value}: {turn} degrees{zoom}{shifted}'
 
 
 def rotation_from_turn(turn_rad: np.ndarray) -> np.ndarray:

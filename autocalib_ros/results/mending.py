@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from autocalib_ros.geometry.ground_plane import GroundPlane, tilt_and_roll_deg
+from autocalib_ros.lens.camera import Camera
 from autocalib_ros.results.calibration import (
     COVARIANCE_PARAMETERS,
     GRADED_DISTANCE_M,
@@ -20,6 +21,11 @@ from autocalib_ros.results.statements import assumption
 
 BEST_MENDED_GRADE = 'fair'
 """Best grade of a mended pose, as of all that rests on an assumption: here that the camera turned and did not shift."""
+SHIFTED_GRADE = 'coarse'
+"""Best grade where near and far turned otherwise: the shift is not measured, height and place are off by it."""
+NEAR_ROWS, NEAREST_DOWN = 0.75, 0.1
+"""Row in the middle of the lower half of the picture, as a fraction of the height, whose distance stands for what is
+near; and the least slope of its ray, a tenth: farther away nothing is near."""
 STEP_DEG = 1e-3
 """Step of numerical derivatives of tilt and roll."""
 POSE = slice(COVARIANCE_PARAMETERS.index('tilt_deg'), COVARIANCE_PARAMETERS.index('roll_deg') + 1)
@@ -49,14 +55,19 @@ def mended(result: Calibration, move: CameraMove, stamp_ns: int) -> Calibration:
         road_directions=result.road_directions @ turn.T,
         newest_stamp_ns=max(stamp_ns, result.newest_stamp_ns),
     )
+    if move.parallax_deg:
+        moved = replace(
+            moved, assumptions=(*moved.assumptions, assumption('shifted_camera', parallax_deg=move.parallax_deg))
+        )
     if result.ground is None:
         return moved
     ground = replace(result.ground, rotation=result.ground.rotation @ turn.T)
     registration = _registration_covariance(result, move)
     carry, measure = _pose_derivatives(result.ground, ground, turn)
     added = measure @ registration @ measure.T
-    stddev = _with_registration(result, carry, added)
-    limits = [result.grade, BEST_MENDED_GRADE, *([] if stddev.ground is None else [stddev.ground.grade])]
+    stddev = _with_shift(_with_registration(result, carry, added), ground, result.camera, move)
+    best = SHIFTED_GRADE if move.parallax_deg else BEST_MENDED_GRADE
+    limits = [result.grade, best, *([] if stddev.ground is None else [stddev.ground.grade])]
     return replace(
         moved,
         ground=ground,
@@ -64,6 +75,24 @@ def mended(result: Calibration, move: CameraMove, stamp_ns: int) -> Calibration:
         stddev=stddev,
         covariance=_carried_covariance(result.covariance, carry, added),
     )
+
+
+def _with_shift(sigma: StandardDeviations, ground: GroundPlane, camera: Camera, move: CameraMove) -> StandardDeviations:
+    """Return the standard deviations where the camera was shifted by an unknown way: height and places have it."""
+    if not move.parallax_deg:
+        return sigma
+    below = np.array([[camera.principal_point_px[0], NEAR_ROWS * camera.height]])
+    bearing = camera.unproject(below)[0][0]
+    down = -float(bearing @ ground.normal_in_camera)
+    distance = ground.height_m / max(down, NEAREST_DOWN)
+    shift = float(np.radians(move.parallax_deg)) * distance
+    points = tuple(None if value is None else float(np.hypot(value, shift)) for value in sigma.ground_point_m)
+    relative = shift / ground.height_m
+    lengths = sigma.ground and GroundSigma(
+        float(np.hypot(sigma.ground.along, relative)), float(np.hypot(sigma.ground.across, relative))
+    )
+    height_m = float(np.hypot(sigma.height_m or 0.0, shift))
+    return replace(sigma, height_m=height_m, ground_point_m=points, ground=lengths)
 
 
 def _registration_covariance(result: Calibration, move: CameraMove) -> np.ndarray:

@@ -297,6 +297,8 @@ ASSUMPTIONS: dict[str, Wording] = {
     'scale_combined': 'scale from {sources} measures together: camera height {height_m:.3f} ± {height_sigma_m:.2g} m',
     'mended_pose': 'pose turned with the camera, by what the picture shows: pan {pan_deg:+.2f}, tilt {tilt_deg:+.2f}, '
     'roll {roll_deg:+.2f} degrees (± {sigma_deg:.2f})',
+    'shifted_camera': 'the camera was shifted as well: what is near turned by {parallax_deg:.2f} degrees more than '
+    'what is far; its height and place are off by the shift, which is not measured',
     'paper_lens': 'equidistant lens with the principal point at the centre of the picture',
     'paper_roads': 'the two roads are perpendicular',
     'paper_uncertainty': 'the published method gives no uncertainty',

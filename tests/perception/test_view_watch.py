@@ -232,3 +232,35 @@ def test_ignored_regions_are_black_in_the_views_that_are_added() -> None:
     assert not added.image[60:120, 100:180].any() and added.image[60:120, 200:280].all()
     shown = watch.newest_view(30.0)
     assert shown is not None and not shown.image[60:120, 100:180].any()
+
+
+def with_near_part(far: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """Return a picture whose lower half is near: a shifted camera sees it turned otherwise."""
+    return np.vstack([far[: HEIGHT // 2], near[HEIGHT // 2 :]])
+
+
+@pytest.mark.parametrize('turn_deg', [(1.0, 0.5, 0.0), (0.0, -2.0, 1.0)])
+def test_near_and_far_turn_alike_where_the_camera_turned_about_its_centre(
+    turn_deg: tuple[float, float, float],
+) -> None:
+    report = played(calm(), lambda _: seen(turn_deg), 20, 50)[-1]
+    assert report.move is not None and report.move.is_measured
+    assert report.move.parallax_deg == 0.0
+
+
+def test_a_camera_that_was_shifted_as_well_is_told_by_near_and_far() -> None:
+    """Half a degree between what is near and what is far: 10 cm at 12 m."""
+    far, near = (1.0, 0.0, 0.0), (1.5, 0.0, 0.0)
+    scene = with_near_part(seen(far), seen(near))
+    report = played(calm(), lambda _: scene, 20, 50)[-1]
+    assert report.move is not None
+    assert report.move.parallax_deg == pytest.approx(0.5, abs=0.1)
+    assert report.move.sigma_deg is not None and min(report.move.sigma_deg) > 0.4
+    assert 'shifted' in str(report.move)
+
+
+def calm() -> ViewWatch:
+    """Return a watch that saw the road for 20 s."""
+    watch = watching()
+    played(watch, lambda _: ROAD, 0, 20)
+    return watch

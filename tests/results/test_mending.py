@@ -61,3 +61,16 @@ def test_grade_and_assumptions_say_so() -> None:
 def test_zoom_mends_nothing() -> None:
     with pytest.raises(ValueError, match='zoom'):
         mended(KEPT, replace(BUMP, kind=MoveKind.ZOOM, zoom=1.1), 0)
+
+
+def test_a_shift_widens_height_and_places_and_lowers_the_grade() -> None:
+    """What is near turned by half a degree more: a shift by a hundredth of its distance, in a direction unknown."""
+    shifted = replace(BUMP, parallax_deg=0.5)
+    turned, now = mended(KEPT, BUMP, 0), mended(KEPT, shifted, 0)
+    assert now.grade == 'coarse'
+    assert [one.kind for one in now.assumptions[-2:]] == ['mended_pose', 'shifted_camera']
+    assert now.ground is not None and now.stddev.height_m is not None
+    least_m = np.radians(0.5) * now.ground.height_m  # no place on the road is nearer than the camera is high
+    assert now.stddev.height_m > max(least_m, turned.stddev.height_m or 0.0)
+    for after, before in zip(now.stddev.ground_point_m, turned.stddev.ground_point_m, strict=True):
+        assert after is None or before is None or after > before

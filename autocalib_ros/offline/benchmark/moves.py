@@ -170,6 +170,7 @@ def format_move(run: MoveRun) -> str:
     zoom = '-' if found is None else f'{found.zoom:.3f}'
     mended = '-' if run.zoom != 1.0 else f'{run.rest_deg:.3f}'
     flags = f'  {run.false_flags} false flags' if run.false_flags else ''
+    flags += f'  shifted: {found.parallax_deg:.2f}' if found is not None and found.parallax_deg else ''
     return (
         f'{run.recording[-27:]:<28}{run.name:<11}{told:>11}{true:>24}{measured:>26}{zoom:>8}{run.error_deg:>8.3f}{mended:>9}'
         f'{flags}'
