@@ -14,6 +14,7 @@ from autocalib_ros.pictures.drawing import INK
 from autocalib_ros.report.canvas import PANEL_COLOUR, chart, road_colour
 
 FIGURE_HEIGHT_IN = 8.6
+HOURS_BETWEEN_TICKS = 3.0
 NIGHT_BELOW = 0.5
 """Share of daylight below which the figure is shaded."""
 
@@ -43,6 +44,8 @@ def write_soak_figure(path: Path, samples: Sequence[SoakSample]) -> None:
             axes.set_ylabel(label, color=INK)
             axes.legend(loc='upper right', frameon=False, ncols=2, labelcolor=INK)
         axes_of[-1].set_xlim(0.0, hours[-1])
+        if hours[-1] > HOURS_BETWEEN_TICKS:
+            axes_of[-1].set_xticks(np.arange(0.0, hours[-1] + 0.1, HOURS_BETWEEN_TICKS))
         axes_of[-1].set_xlabel('simulated hours; nights are grey', color=INK)
         figure.savefig(path, metadata={'Date': None} if path.suffix == '.svg' else None)
 
