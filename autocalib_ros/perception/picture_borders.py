@@ -203,7 +203,9 @@ def _fitted_circle(points: np.ndarray) -> tuple[float, float, float] | None:
 
 
 def _least_squares_circle(points: np.ndarray) -> tuple[float, float, float] | None:
-    """Return the algebraic least squares circle of points (n, 2); None if they lie on a line."""
+    """Return the algebraic least squares circle of points (n, 2); None if they are too few or lie on a line."""
+    if len(points) < 3:
+        return None
     shift = points.mean(axis=0)
     x, y = (points - shift).T
     solution, _, rank, _ = np.linalg.lstsq(np.column_stack([x, y, np.ones(len(x))]), x * x + y * y, rcond=None)

@@ -13,7 +13,7 @@ from autocalib_ros.perception.ignore_regions import black_out
 from autocalib_ros.perception.overlay_boxes import find_boxes
 from autocalib_ros.perception.overlay_text import find_text
 from autocalib_ros.perception.picture_area import PictureArea
-from autocalib_ros.perception.picture_borders import find_circle, find_rectangle
+from autocalib_ros.perception.picture_borders import _least_squares_circle, find_circle, find_rectangle
 
 WIDTH, HEIGHT = 320, 240
 JPEG_QUALITY = 60
@@ -228,3 +228,9 @@ def test_a_view_that_begins_late_is_looked_at_as_often_as_the_first() -> None:
         found.append(area.mask is not None)
     assert not any(found[:3])
     assert found[-1]
+
+
+@pytest.mark.parametrize('count', [0, 2])
+def test_no_circle_goes_through_fewer_than_three_points(count: int) -> None:
+    """By night the rim of what is lit may lie on no circle at all."""
+    assert _least_squares_circle(np.zeros((count, 2))) is None
