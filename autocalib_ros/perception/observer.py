@@ -155,10 +155,11 @@ class Observer:
     def ignore(self, polygons: Polygons) -> None:
         """Ignore other regions from the next image on, in pixels of the full image.
 
-        Lines of the still scene follow with the next view: regions change when the camera has moved.
+        Lines, bars and borders of the picture are looked for anew: those of the new regions are none.
         """
         self.ignored = polygons
         self._ignored, self._excluded_by_options = self._masks()
+        self._scenes = {view: self._new_scene(scene.background) for view, scene in self._scenes.items()}
         self._exclude_no_picture()
 
     def _masks(self) -> tuple[np.ndarray | None, np.ndarray | None]:
@@ -172,9 +173,9 @@ class Observer:
         limits = (drift_limit_px(width, gate), sway_limit_px(width, gate), MIN_REPORTED_SWAY_PX)
         return DriftLimits(*(limit / self._reduction for limit in limits))
 
-    def _new_scene(self) -> _Scene:
+    def _new_scene(self, background: Background | None = None) -> _Scene:
         return _Scene(
-            Background(),
+            background or Background(),
             LineSegmentDetector(self._excluded_by_options),
             StripeDetector(self._excluded_by_options),
             PictureArea(self._image_size, self._tracked_size, self.ignored),

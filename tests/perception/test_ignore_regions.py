@@ -118,6 +118,11 @@ def test_other_regions_are_ignored_from_the_next_image_on() -> None:
         calibrator.add_image(10**9 + index * 10**8, scene(0.1 * index, ()))
     background = calibrator.background()
     assert not background[ignored_mask(moved, (WIDTH, HEIGHT))].any()
+    evidence = calibrator.snapshot()
+    assert evidence is not None
+    middles = evidence.still_lines_px.reshape(-1, 2, 2).mean(axis=1)
+    near = (middles > (290.0, 10.0)).all(axis=1) & (middles < (390.0, 100.0)).all(axis=1)
+    assert not near.any()  # the border of a black region is no line of the scene
     # a clock that is set by a day begins anew, and regions do not
     calibrator.add_image(10**9 + 2 * 86_400 * 10**9, scene(0.0, ()))
     calibrator.add_image(10**9 + 2 * 86_400 * 10**9 + 10**8, scene(0.1, ()))
