@@ -56,7 +56,8 @@ class FigureProcess:
     def close(self) -> None:
         """End the process."""
         if self._pool is not None:
-            self._pool.shutdown(wait=False, cancel_futures=True)
+            # waits, since Python may fail to end what ends at the same time as itself
+            self._pool.shutdown(cancel_futures=True)
 
 
 def _prepare() -> None:
