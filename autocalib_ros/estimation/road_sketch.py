@@ -14,13 +14,15 @@ from autocalib_ros.estimation.observations.track_set import TrackSet, select_tra
 from autocalib_ros.estimation.single_road.barrel_lens import LensChoice
 from autocalib_ros.estimation.single_road.road_solution import most_followed, roads_through
 from autocalib_ros.evidence.snapshot import Evidence
-from autocalib_ros.geometry.ground_plane import orient_upward
+from autocalib_ros.geometry.ground_plane import MIN_FRACTION_BELOW_HORIZON, orient_upward
 from autocalib_ros.lens.camera import Camera
 
 MAX_SKETCHED_TRACKS = 150
 """Tracks in a sketch, spread over the picture: its roads need no precision."""
 MIN_SKETCHED_TRACKS = 8
 """Fewest tracks that show where a road leads; as many vehicles as a single road needs."""
+MAX_SKETCHED_ROLL_DEG = 45.0
+"""Largest roll of a horizon that is shown, degrees: nobody mounts a camera on its side and then looks for a horizon."""
 MIN_SHARE = 0.15
 """Least share of the vehicles on a road that is shown: on bends fewer follow any straight line, by chance."""
 
@@ -32,8 +34,10 @@ class RoadSketch:
     camera: Camera
     directions: np.ndarray
     """Unit vectors of the roads, camera frame, shape (roads, 3)."""
-    horizon: np.ndarray
-    """Unit normal (3,) of the plane, camera frame, up: of two roads; of a level camera if there is one."""
+    horizon: np.ndarray | None
+    """Unit normal (3,) of the plane, camera frame, up; None if no horizon has the traffic below it."""
+    is_of_two_roads: bool
+    """Whether the horizon is that of two roads, and not of one road and a camera without roll."""
     shares: tuple[float, ...]
     """Share of the vehicles that follow each road."""
     labels: np.ndarray
@@ -65,7 +69,15 @@ def _sketched(fit: Adjustment, tracks: TrackSet, count: int) -> RoadSketch | Non
     for index, road in enumerate(shown):
         labels[tracks.indices[followed & (fit.labels == road)]] = index
     directions = fit.state.directions[shown]
-    normal = fit.state.rotation[:, 2] if len(shown) > 1 else level_normal(directions[0])
     bearings, _ = fit.state.camera.unproject(tracks.pixels.reshape(-1, 2))
-    up, _ = orient_upward(normal, bearings)
-    return RoadSketch(fit.state.camera, directions, up, tuple(shares[road] for road in shown), labels)
+    of_roads = plausible_horizon(fit.state.rotation[:, 2], bearings) if len(shown) > 1 else None
+    horizon = plausible_horizon(level_normal(directions[0]), bearings) if of_roads is None else of_roads
+    sizes = tuple(shares[road] for road in shown)
+    return RoadSketch(fit.state.camera, directions, horizon, of_roads is not None, sizes, labels)
+
+
+def plausible_horizon(normal: np.ndarray, bearings: np.ndarray) -> np.ndarray | None:
+    """Return the upward normal (3,) of a plane with a nearly level horizon above the bearings (n, 3), else None."""
+    up, below = orient_upward(normal, bearings)
+    is_level = -up[1] >= np.hypot(up[0], up[1]) * np.cos(np.radians(MAX_SKETCHED_ROLL_DEG))
+    return up if is_level and below >= MIN_FRACTION_BELOW_HORIZON else None

@@ -39,7 +39,7 @@ MUTED_COLOUR, PANEL_COLOUR, WHITE = '#8a97a3', '#e9edf0', '#ffffff'
 OTHER_COLOURS = {NOT_USED: '#8a97a3', REJECTED: '#222222'}
 LEGEND_LINE = 2.5
 """Least width of lines in the legend, points."""
-LegendPlace = Literal['best', 'upper right', 'upper left', 'upper center']
+LegendPlace = Literal['best', 'lower right', 'upper right', 'upper left', 'upper center']
 TURNING_COLOUR = '#7733aa'
 """Colour of turning vehicles."""
 HALO: list[AbstractPathEffect] = [withStroke(linewidth=3, foreground=WHITE)]

@@ -81,7 +81,7 @@ def directions(scene: ReportScene) -> Figure | None:
         _draw_direction(axes, camera, direction, index)
     if ground is not None:
         plot_paths(axes, project_great_circle(camera, ground.normal_in_camera), HORIZON_COLOUR, 'horizon', width=2.5)
-    draw_legend(axes)
+    draw_legend(axes, 'lower right')  # roads vanish above
     return figure
 
 

@@ -18,7 +18,7 @@ from autocalib_ros.results.calibration_json import calibration_from_json, read_j
 from autocalib_ros.util.files import write_atomically
 
 RESULT, REPORT_PAGE = 'calibration.json', 'report.html'
-THUMBNAILS = ('ground_grid', 'coverage', 'all_tracks')
+THUMBNAILS = ('ground_grid', 'kept_tracks', 'all_tracks')
 """Figures of a report of which the first one that exists is shown."""
 THUMBNAIL_PX = 320
 MAX_PICTURES = 1000
@@ -28,10 +28,12 @@ ORDER = ('refused', 'unreadable', 'partial', 'calibrated')
 STATE_WORDS = {
     'refused': 'refused',
     'unreadable': 'unreadable',
-    'partial': 'with an assumption, or without a scale',
+    'partial': 'calibrated in part',
     'calibrated': 'calibrated',
 }
 """What the states are called on the page."""
+PARTIAL_WORDS = {'lens': 'lens only, no ground plane', 'unit_scale': 'calibrated, without a scale'}
+"""What a camera of a lesser grade is called; of others the grade is told."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,8 @@ class CameraEntry:
     name: str
     state: str
     """One of `ORDER`."""
-    grade: str
+    words: str
+    """The state in words."""
     focal: str
     tilt: str
     height: str
@@ -88,14 +91,16 @@ def _entry(path: Path, folder: Path) -> CameraEntry:
     report = path.with_name(REPORT_PAGE)
     address = quote(os.path.relpath(report, folder)) if report.exists() else ''
     common: dict[str, Any] = {'name': name, 'when': when, 'report': address, 'figures': path.parent / 'figures'}
-    nothing: dict[str, Any] = dict.fromkeys(('grade', 'focal', 'tilt', 'height', 'lengths'), '')
+    nothing: dict[str, Any] = dict.fromkeys(('focal', 'tilt', 'height', 'lengths'), '')
     try:
         document = read_json_object(path)
         if document.get('state') == 'refused':
-            return CameraEntry(**common, **nothing, state='refused', note=str(document['refusal']['message']))
+            return CameraEntry(
+                **common, **nothing, state='refused', words='refused', note=str(document['refusal']['message'])
+            )
         return CameraEntry(**common, **_numbers(calibration_from_json(document)))
     except (AutocalibError, LookupError, TypeError) as error:
-        return CameraEntry(**common, **nothing, state='unreadable', note=str(error))
+        return CameraEntry(**common, **nothing, state='unreadable', words='unreadable', note=str(error))
 
 
 def _numbers(result: Calibration) -> dict[str, Any]:
@@ -105,17 +110,25 @@ def _numbers(result: Calibration) -> dict[str, Any]:
     lengths = '' if sigma.ground is None else f'± {100 * sigma.ground.worst:.1f} %'
     return {
         'state': 'calibrated' if result.grade == 'full' else 'partial',
-        'grade': result.grade,
+        'words': PARTIAL_WORDS.get(result.grade, f'calibrated, grade {result.grade}'),
         'focal': _with_sigma(result.camera.focal_px, sigma.focal_px, 'px', 0),
         'tilt': '' if tilt_deg is None else _with_sigma(tilt_deg, sigma.tilt_deg, '°', 1),
         'height': _with_sigma(ground.height_m, sigma.height_m, 'm', 2) if ground is not None and metric else '',
         'lengths': lengths,
-        'note': result.helpful.text if result.helpful else '',
+        'note': _note(result),
     }
 
 
 def _with_sigma(value: float, sigma: float | None, unit: str, digits: int) -> str:
-    return f'{value:.{digits}f} {unit}' + (f' ± {sigma:.{max(digits, 1)}f}' if sigma else '')
+    spread = f' ± {sigma:.{digits if sigma >= 10 else max(digits, 1)}f}' if sigma else ''
+    return f'{value:.{digits}f}{spread}{"" if unit == "°" else " "}{unit}'
+
+
+def _note(result: Calibration) -> str:
+    """Return why there is no ground plane, else what would help."""
+    if result.ground_refusal is not None:
+        return result.ground_refusal.message
+    return result.helpful.text if result.helpful else ''
 
 
 def _thumbnail(figures: Path) -> str:

@@ -43,6 +43,7 @@ from autocalib_ros.report.text import (
     number_rows,
 )
 from autocalib_ros.results.calibration import Calibration, Refusal
+from autocalib_ros.results.verification_table import summarise_verification
 from autocalib_ros.util.files import NOT_FOR_OTHERS, write_atomically, write_picture_bytes
 
 JPEG_SAVES = 1.5
@@ -361,6 +362,8 @@ def _page(scene: ReportScene, drawn: list[DrawnFigure]) -> str:
         assumptions=tuple(map(str, found.assumptions)) if found else (),
         checks=tuple(map(str, found.checks)) if found else (),
         verification=found.verification if found else (),
+        passed=summarise_verification(found.verification) if found else '',
+        all_passed=all(row.passed for row in found.verification) if found else True,
         chapters=[(chapter, figures) for chapter, figures in chapters if figures],
         ruler=ruler_data(scene),
         ruler_script=template_text('ruler.js'),

@@ -65,7 +65,10 @@ def needs(result: Calibration | Refusal, evidence: Evidence, gate: GateOptions) 
         )
     )
     further = _of_code(str(refusal.values.get('further', '')), _further_numbers(refusal.values))
-    return rows if further is None or further == rows[-1] else [*rows, further]
+    if further is None:
+        return rows
+    # of two values of one requirement the last strategy's, which the message tells
+    return [*(rows[:-1] if further.name == rows[-1].name else rows), further]
 
 
 def _recorded(result: Calibration | Refusal) -> ReportRequirement:

@@ -30,8 +30,9 @@ def roads_so_far(scene: ReportScene) -> Figure | None:
         name = f'road {road + 1}: {share:.0%} of the vehicles'
         plot_paths(axes, _labelled(scene, sketch.labels, road), road_colour(road), name, width=1.0, alpha=0.7)
         draw_vanishing_points(axes, sketch.camera, sketch.directions[road], road)
-    plot_paths(axes, project_great_circle(sketch.camera, sketch.horizon), HORIZON_COLOUR, 'horizon', width=2.5)
-    draw_legend(axes)
+    if sketch.horizon is not None:
+        plot_paths(axes, project_great_circle(sketch.camera, sketch.horizon), HORIZON_COLOUR, 'horizon', width=2.5)
+    draw_legend(axes, 'lower right')  # roads vanish above
     return figure
 
 
@@ -41,8 +42,10 @@ def sketch_note(scene: ReportScene) -> str:
     if sketch is None:
         return ''
     view_deg = field_of_view_deg(sketch.camera)[0]
-    by = 'both roads' if len(sketch.shares) > 1 else 'a camera without roll'
-    return f'Through an assumed lens that sees {view_deg:.0f} degrees; the horizon is that of {by}.'
+    lens = f'Through an assumed lens that sees {view_deg:.0f} degrees'
+    if sketch.horizon is None:
+        return f'{lens}; no horizon has the traffic below it.'
+    return f'{lens}; the horizon is that of {"both roads" if sketch.is_of_two_roads else "a camera without roll"}.'
 
 
 def still_lines(scene: ReportScene) -> Figure | None:

@@ -35,7 +35,7 @@ def test_each_camera_has_a_card_and_what_needs_attention_comes_first(site):
     assert re.findall('<li class="([a-z]+)">', page) == ['refused', 'unreadable', 'partial', 'calibrated']
     assert 'href="south/cam%202/report.html"' in page and '&lt;b&gt;' in page and '<b>' not in page
     assert 'data:image/jpeg;base64,' in page and 'it is not JSON' in page
-    assert '140 px' in page and '8.00 m' in page
+    assert '140 ± 1.5 px' in page and '8.00 ± 0.05 m' in page
 
 
 def test_the_command_says_what_it_wrote(site, tmp_path, capsys):

@@ -11,7 +11,7 @@ import pytest
 
 from autocalib_ros.cli import _parse_arguments
 from autocalib_ros.config import LensOptions, Options, ScaleOptions
-from autocalib_ros.estimation.road_sketch import sketch_roads
+from autocalib_ros.estimation.road_sketch import plausible_horizon, sketch_roads
 from autocalib_ros.estimation.solution import append_reason
 from autocalib_ros.geometry.ground_plane import GroundPlane
 from autocalib_ros.offline.synthetic.junction import Junction, pose
@@ -80,6 +80,8 @@ def test_the_same_reason_twice_is_told_once() -> None:
     most, more = (reason('turning_traffic', fraction=share, limit=0.5, roads=2) for share in (0.1, 0.4))
     why = append_reason(most, more, asks_less=True)
     assert isinstance(why, Reason) and why.message == more.message and ';' not in headline(refusal(why))
+    rows = needs(refusal(why), evidence_once(ROAD), OPTIONS.gate)
+    assert [row.found for row in rows if row.name == 'vehicles that follow straight roads'] == ['40%']
 
 
 def test_each_requirement_shows_how_near_it_is(joined: Reason) -> None:
@@ -111,6 +113,15 @@ def test_a_sketch_shows_where_the_road_vanishes() -> None:
     found, _ = sketch.camera.project(np.array([sketch.directions[0], -sketch.directions[0]]))
     assert np.hypot(*(found - along).T).min() < 0.1 * ROAD.camera.width
     assert roads_so_far(scene(OPEN)) is not None and 'a camera without roll' in sketch_note(scene(OPEN))
+
+
+@pytest.mark.parametrize(('roll_deg', 'is_shown'), [(0.0, True), (40.0, True), (60.0, False), (180.0, False)])
+def test_a_horizon_is_sketched_if_it_is_nearly_level_and_the_traffic_below_it(roll_deg: float, is_shown: bool) -> None:
+    roll = np.radians(roll_deg)
+    up = np.array([np.sin(roll), -np.cos(roll), 0.0])
+    below = np.array([[-np.sin(roll), np.cos(roll), 2.0]])
+    assert (plausible_horizon(up, below) is not None) == is_shown
+    assert plausible_horizon(up, np.concatenate([below, -below])) is None
 
 
 def test_too_little_traffic_has_no_sketch() -> None:
