@@ -14,7 +14,7 @@ from difflib import get_close_matches
 from typing import NoReturn
 
 from autocalib_ros import __version__
-from autocalib_ros.commands import INTERRUPTED, WRONG_USE
+from autocalib_ros.commands import INTERRUPTED, NOBODY_READS, WRONG_USE
 from autocalib_ros.commands import benchmark_command as benchmark
 from autocalib_ros.commands import compare_command as compare
 from autocalib_ros.commands import demo_command as demo
@@ -54,7 +54,7 @@ COMPLETION = '_ARGCOMPLETE'
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a sub-command and return the exit status.
 
-    0 calibrated or done, 3 refused, 2 wrong usage or unreadable input, 130 interrupted.
+    0 calibrated or done, 3 refused, 2 wrong usage or unreadable input, 130 interrupted, 141 nobody reads the output.
     """
     limit_blas_threads()
     _silence_libraries()
@@ -66,13 +66,18 @@ def main(argv: Sequence[str] | None = None) -> int:
                 _parsers(())[0].print_help()
                 return WRONG_USE
             arguments = _parse_arguments(words)
-            return arguments.run(arguments)
+            status: int = arguments.run(arguments)
+            sys.stdout.flush()  # here, where a broken pipe is caught
+            return status
     except AutocalibError as error:
         print(f'autocalib: error: {error}', file=sys.stderr)
         return WRONG_USE
     except KeyboardInterrupt:
         print(file=sys.stderr)
         return INTERRUPTED
+    except BrokenPipeError:  # as of `autocalib ... | head`; what is left goes nowhere, Python would complain at its end
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return NOBODY_READS
     except SystemExit as leave:  # argparse after --help and --version
         return int(leave.code or 0)
 

@@ -103,6 +103,15 @@ def test_shells_complete_commands_and_options(tmp_path):
 
 
 @pytest.mark.dds
+def test_a_reader_that_goes_away_is_no_error(tmp_path):
+    command = [sys.executable, '-m', 'autocalib_ros', 'replay', '--print-params']
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=tmp_path, text=True) as done:
+        done.stdout.close()
+        assert done.stderr.read() == ''
+    assert done.returncode == 141
+
+
+@pytest.mark.dds
 def test_help_imports_nothing_heavy(tmp_path):
     code = (
         "import sys; from autocalib_ros.cli import main; main(['--help']);"

@@ -30,6 +30,22 @@ MEASURED = {
 """How a helpful measure is told, by its kind."""
 
 
+FLAGS = {
+    'camera_height': '--camera-height',
+    'camera_height_sigma': '--camera-height-sigma',
+    'scale.speed_km_h': '--scale-speed',
+    'lanes.country': '--lanes',
+    'lanes.width_m': '--lane-width',
+    'lanes.dash_period_m': '--dash-period',
+    'lens.focal_px': '--focal-px',
+    'lens.focal_sigma_px': '--focal-sigma-px',
+    'lens.hfov_deg': '--hfov-deg',
+    'joint.roll_prior_deg': '--roll-sigma-deg',
+    'method': '--method',
+}
+"""Options that have a flag of their own, with one value."""
+
+
 def next_command(result: Calibration | Refusal, options: Options, folder: Path | None) -> str:
     """Return the command that follows the remedy, words in capitals to be replaced; '' if nothing is to be tried.
 
@@ -72,7 +88,7 @@ def _told_so_far(options: Options, replaced: str) -> str:
 
 
 def _argument(name: str, value: object) -> str:
-    if name == 'camera_height':
-        return f'--camera-height {value:g}'
+    if name in FLAGS:
+        return f'{FLAGS[name]} {value:g}' if isinstance(value, float) else f'{FLAGS[name]} {value}'
     text = str(value).lower() if isinstance(value, bool) else str(value)
     return f'-p {shlex.quote(f"{name}:={text}")}'

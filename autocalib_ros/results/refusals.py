@@ -334,7 +334,8 @@ REFUSALS = (
         '± {along:.0%}, across it ± {across:.0%}',
         variants={
             'lens': (
-                'the lens alone is known, and its focal length to ± {focal:.0%} only (10 % without a ground plane)',
+                'the lens alone is known, and its focal length to {focal:±.1%} only (at most ± 10 % without a ground '
+                'plane)',
                 '{helpful}',
             ),
             'no_road_ahead': (

@@ -143,7 +143,7 @@ def test_too_little_traffic_has_no_sketch() -> None:
         (
             reason('no_height'),
             Options(lens=LensOptions(hfov_deg=60.0)),
-            'autocalib evidence out/evidence.npz -p lens.hfov_deg:=60.0 --camera-height METRES --out out',
+            'autocalib evidence out/evidence.npz --hfov-deg 60 --camera-height METRES --out out',
         ),
         (
             reason('distortion_model', misfit='', instead=''),
