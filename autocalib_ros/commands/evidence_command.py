@@ -64,7 +64,7 @@ def run(arguments: argparse.Namespace) -> int:
     if out is not None:
         outputs.prepare_output_dir(out)
     if not arguments.quiet:
-        warn_missing_scale(options, lens)
+        warn_missing_scale(options)
     solved = solve_evidence(evidence, options, lens)
     first, more = arguments.files[0], len(arguments.files) - 1
     name = f'{first.name} and {more} more' if more else first.name

@@ -58,7 +58,7 @@ def replay_and_report(
     from autocalib_ros.solver_process import BackgroundSolver
 
     if not quiet:
-        warn_missing_scale(options, lens)
+        warn_missing_scale(options)
     file, stop = EvidenceFile(out), stop or StopRequest()
     totals = [source.total for source in sources]
     total = None if None in totals else sum(one for one in totals if one is not None)
@@ -118,15 +118,18 @@ def write_ground_tracks(path: Path, replayed: ReplayResult, *, quiet: bool) -> N
         print_stderr(f'{path}: {vehicles} road users, {len(tracks.time_s)} rows')
 
 
-def warn_missing_scale(options: Options, lens: Camera | None) -> None:
-    """Warn on stderr if no metric scale is given: the result has no metric ground plane."""
-    if not options.gives_scale:
-        scale = 'is given in units of that height' if options.allow_unit_scale else 'is left out'
-        calibrated = 'the lens is calibrated' if lens is None else 'the lens is known'
-        print_stderr(
-            f'No camera height given: {calibrated}, the ground plane {scale} (see --camera-height, --distance,'
-            ' --scale-speed and --lanes).'
+def warn_missing_scale(options: Options) -> None:
+    """Warn on stderr if no metric scale is given: the vehicles give a rough one at best."""
+    if options.gives_scale:
+        return
+    if options.allow_unit_scale:
+        otherwise = 'the ground plane is given in units of that height'
+    else:
+        otherwise = (
+            'the size of the vehicles gives the scale, to 14 % at best, if enough are seen; else the ground plane is '
+            'left out'
         )
+    print_stderr(f'No camera height given: {otherwise} (see --camera-height, --distance, --scale-speed and --lanes).')
 
 
 def print_result(

@@ -117,10 +117,16 @@ def test_quiet_leaves_only_the_reason(evidence):
     assert stderr.startswith('Not calibrated: ') and stderr.count('\n') == 1
 
 
-def test_no_height_is_said(saved, lens_file, capsys):
-    for more, message in (([], 'the lens is calibrated'), (['--camera-info', str(lens_file)], 'the lens is known')):
-        assert main(['evidence', str(saved), *REFUSE, *more]) == 3
-        assert f'No camera height given: {message}, the ground plane is left out' in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ('more', 'message'),
+    [
+        ([], 'the size of the vehicles gives the scale, to 14 % at best'),
+        (['--allow-unit-scale'], 'the ground plane is given in units of that height'),
+    ],
+)
+def test_no_height_is_said(saved, capsys, more, message):
+    assert main(['evidence', str(saved), *REFUSE, *more]) == 3
+    assert f'No camera height given: {message}' in capsys.readouterr().err
 
 
 def test_a_known_lens_is_kept_and_the_pose_is_found(evidence, lens_file):
