@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import pickle
 import signal
 from collections.abc import Callable
@@ -28,7 +29,9 @@ class FigureProcess:
 
     def start(self) -> None:
         """Start the process while there is something else to do: it takes a second to load Matplotlib."""
-        if self._pool is None and usable_processors() > 1:
+        if self._pool is not None or usable_processors() < 2:
+            return
+        with contextlib.suppress(NotImplementedError, OSError):  # without semaphores, as in some sandboxes, none starts
             # spawn, not fork: a fork would copy locks held by the other threads
             self._pool = ProcessPoolExecutor(1, mp_context=get_context('spawn'), initializer=_prepare)
             self._pool.submit(_load)
