@@ -72,7 +72,9 @@ class StreamSource:
             while not self._should_stop():
                 frame = reader.next_frame()
                 if frame is None:
-                    if reader.has_ended:
+                    # the duration passes without images too, as where a stream has ended
+                    is_over = first_ns is not None and stop_ns is not None and time.time_ns() - first_ns >= stop_ns
+                    if reader.has_ended or is_over:
                         break
                     continue
                 first_ns = frame.stamp_ns if first_ns is None else first_ns

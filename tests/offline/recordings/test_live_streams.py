@@ -44,6 +44,13 @@ def test_a_source_says_whether_it_is_live(tmp_path, write_video):
     assert not open_source(write_video(tmp_path / 'drive.avi')).is_live
 
 
+def test_the_duration_passes_without_images_too():
+    with mjpeg_server(shades(40), fps=100.0) as address:
+        began = time.monotonic()
+        frames = list(open_source(address, duration_s=1.5).frames())
+    assert frames and time.monotonic() - began < live_streams.TIMEOUT_S
+
+
 def test_a_dropped_connection_is_made_again(monkeypatch, caplog):
     monkeypatch.setattr(live_streams, 'RECONNECT_S', (0.01,))
     monkeypatch.setattr(live_streams, 'GIVE_UP_S', 0.1)
