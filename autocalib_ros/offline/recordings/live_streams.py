@@ -29,6 +29,8 @@ RECONNECT_S = (0.5, 1.0, 2.0, 5.0, 10.0)
 """Pauses before a stream is connected again, seconds; the last one is repeated."""
 GIVE_UP_S = 300.0
 """Time without an image after which a stream is taken to have ended: cameras restart within five minutes."""
+LATE_S = 1.0
+"""Time after the end of the duration for which its last images are waited for, seconds: decoding takes a part of it."""
 MAX_WAITING_BYTES = 400_000_000
 """Most bytes of images that wait to be processed: 10 s of 720p at 15 images a second."""
 TIMED_SCHEMES = ('rtsp', 'rtsps', 'rtp', 'srt')
@@ -72,9 +74,7 @@ class StreamSource:
             while not self._should_stop():
                 frame = reader.next_frame()
                 if frame is None:
-                    # the duration passes without images too, as where a stream has ended
-                    is_over = first_ns is not None and stop_ns is not None and time.time_ns() - first_ns >= stop_ns
-                    if reader.has_ended or is_over:
+                    if reader.has_ended or _is_over(first_ns, stop_ns):
                         break
                     continue
                 first_ns = frame.stamp_ns if first_ns is None else first_ns
@@ -91,6 +91,11 @@ class StreamSource:
     def stored(self) -> Iterator[StoredImage]:
         """Raise UsageError: a stream cannot be read twice."""
         raise UsageError(f'{self.name} is a live stream and cannot be written as a bag: record it first')
+
+
+def _is_over(first_ns: int | None, stop_ns: int | None) -> bool:
+    """Whether the duration has passed without an image behind it, as where a stream has ended."""
+    return first_ns is not None and stop_ns is not None and time.time_ns() - first_ns >= stop_ns + round(1e9 * LATE_S)
 
 
 @dataclass(frozen=True)
