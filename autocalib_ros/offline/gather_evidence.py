@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import inf
@@ -25,8 +26,8 @@ from autocalib_ros.results.calibration import Calibration
 
 LOG = logging.getLogger(__name__)
 
-PROGRESS_EVERY_FRAMES = 15
-"""Frames between progress updates."""
+NOTE_EVERY_S = 1.0
+"""Real seconds between two notes of what is missing: each costs as much as an image, and is read by people."""
 CHECKPOINT_EVERY_S = 120.0
 """Seconds of recording after which its evidence so far is stored: as much is lost at most, and storing takes a second
 at the most."""
@@ -44,9 +45,10 @@ class ReplayControl:
     """Receives the evidence so far every `CHECKPOINT_EVERY_S` of recording, and before the last solution."""
     start_solving: StartSolving | None = None
     """Solves the evidence on the way while images are read; None solves it in between."""
-
     on_accepted: Callable[[Calibration, np.ndarray], None] | None = None
     """Receives the first calibration that is accepted while the recording is read, and the newest image."""
+    clock: Callable[[], float] = time.monotonic
+    """Real seconds, for the pace of the notes alone."""
 
     def report(self, frames: int, note: str) -> None:
         """Report progress."""
@@ -90,6 +92,7 @@ def gather_evidence(
     calibrator, moves = AutoCalibrator(options, detector), MoveLog()
     trials = SolutionTrials(options, control.start_solving or solved_in_between)
     count, note, stopped, shown, checkpoint_s, first_ns, seen_s = 0, '', False, False, CHECKPOINT_EVERY_S, 0, 0.0
+    note_due_s = -inf
     for count, frame in enumerate(prefetched(source.frames()), start=1):
         scaled_lens = scaled(lens, (frame.image.shape[1], frame.image.shape[0]))
         calibrator.add_image(frame.stamp_ns, frame.image)
@@ -109,8 +112,8 @@ def gather_evidence(
         if control.on_checkpoint is not None and seen_s >= checkpoint_s:
             checkpoint_s = seen_s + CHECKPOINT_EVERY_S
             control.on_checkpoint(_longest_part(calibrator, source, source.window.start_s + seen_s))
-        if control.on_progress is not None and count % PROGRESS_EVERY_FRAMES == 1:
-            note = _progress_note(calibrator, trials)
+        if control.on_progress is not None and control.clock() >= note_due_s:
+            note, note_due_s = _progress_note(calibrator, trials), control.clock() + NOTE_EVERY_S
         control.report(frames_before + count, note)
         if control.should_stop():
             stopped = True
