@@ -92,7 +92,7 @@ def gather_evidence(
     calibrator, moves = AutoCalibrator(options, detector), MoveLog()
     trials = SolutionTrials(options, control.start_solving or solved_in_between)
     count, note, stopped, shown, checkpoint_s, first_ns, seen_s = 0, '', False, False, CHECKPOINT_EVERY_S, 0, 0.0
-    note_due_s = -inf
+    note_due_s, told = -inf, trials.latest
     for count, frame in enumerate(prefetched(source.frames()), start=1):
         scaled_lens = scaled(lens, (frame.image.shape[1], frame.image.shape[0]))
         calibrator.add_image(frame.stamp_ns, frame.image)
@@ -112,8 +112,8 @@ def gather_evidence(
         if control.on_checkpoint is not None and seen_s >= checkpoint_s:
             checkpoint_s = seen_s + CHECKPOINT_EVERY_S
             control.on_checkpoint(_longest_part(calibrator, source, source.window.start_s + seen_s))
-        if control.on_progress is not None and control.clock() >= note_due_s:
-            note, note_due_s = _progress_note(calibrator, trials), control.clock() + NOTE_EVERY_S
+        if control.on_progress is not None and (control.clock() >= note_due_s or told is not trials.latest):
+            note, note_due_s, told = _progress_note(calibrator, trials), control.clock() + NOTE_EVERY_S, trials.latest
         control.report(frames_before + count, note)
         if control.should_stop():
             stopped = True
