@@ -22,7 +22,7 @@ from autocalib_ros.offline.recordings.sources import Source
 from autocalib_ros.offline.solution_trials import SolutionTrials, StartSolving, solved_in_between
 from autocalib_ros.perception.detector.detector import VehicleDetector
 from autocalib_ros.perception.frame_clock import ClockSummary
-from autocalib_ros.results.calibration import Calibration
+from autocalib_ros.results.calibration import Calibration, Refusal
 
 LOG = logging.getLogger(__name__)
 
@@ -91,8 +91,8 @@ def gather_evidence(
     """
     calibrator, moves = AutoCalibrator(options, detector), MoveLog()
     trials = SolutionTrials(options, control.start_solving or solved_in_between)
-    count, note, stopped, shown, checkpoint_s, first_ns, seen_s = 0, '', False, False, CHECKPOINT_EVERY_S, 0, 0.0
-    note_due_s, told = -inf, trials.latest
+    notes = _Notes(control)
+    count, stopped, shown, checkpoint_s, first_ns, seen_s = 0, False, False, CHECKPOINT_EVERY_S, 0, 0.0
     for count, frame in enumerate(prefetched(source.frames()), start=1):
         scaled_lens = scaled(lens, (frame.image.shape[1], frame.image.shape[0]))
         calibrator.add_image(frame.stamp_ns, frame.image)
@@ -112,9 +112,7 @@ def gather_evidence(
         if control.on_checkpoint is not None and seen_s >= checkpoint_s:
             checkpoint_s = seen_s + CHECKPOINT_EVERY_S
             control.on_checkpoint(_longest_part(calibrator, source, source.window.start_s + seen_s))
-        if control.on_progress is not None and (control.clock() >= note_due_s or told is not trials.latest):
-            note, note_due_s, told = _progress_note(calibrator, trials), control.clock() + NOTE_EVERY_S, trials.latest
-        control.report(frames_before + count, note)
+        control.report(frames_before + count, notes.newest(calibrator, trials))
         if control.should_stop():
             stopped = True
             break
@@ -160,6 +158,22 @@ def _completed(evidence: Evidence, calibrator: AutoCalibrator) -> Callable[[], E
 def _as_recorded(evidence: Evidence, source: Source) -> Evidence:
     """Return evidence with the pixel aspect that its recording says."""
     return replace(evidence, pixel_aspect=source.pixel_aspect)
+
+
+class _Notes:
+    """Notes of what is missing, a new one every `NOTE_EVERY_S` and when a solution has ended."""
+
+    def __init__(self, control: ReplayControl) -> None:
+        self._control, self._note, self._due_s = control, '', -inf
+        self._solved: Calibration | Refusal | None = None
+
+    def newest(self, calibrator: AutoCalibrator, trials: SolutionTrials) -> str:
+        """Return the newest note, '' if nobody reads it."""
+        now_s = self._control.clock()
+        if self._control.on_progress is not None and (now_s >= self._due_s or self._solved is not trials.latest):
+            self._note, self._due_s = _progress_note(calibrator, trials), now_s + NOTE_EVERY_S
+            self._solved = trials.latest
+        return self._note
 
 
 def _progress_note(calibrator: AutoCalibrator, trials: SolutionTrials) -> str:
