@@ -74,7 +74,7 @@ def needs(result: Calibration | Refusal, evidence: Evidence, gate: GateOptions) 
 def _recorded(result: Calibration | Refusal) -> ReportRequirement:
     seconds = result.evidence.seconds
     return ReportRequirement(
-        'recording', f'{seconds:.0f} s', f'about {USUAL_RECORDING_S:g} s', round(seconds) >= USUAL_RECORDING_S
+        'recording', f'{seconds:.0f} s', f'about {USUAL_RECORDING_S:g} s or more', round(seconds) >= USUAL_RECORDING_S
     )
 
 
