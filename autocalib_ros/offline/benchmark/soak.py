@@ -265,8 +265,8 @@ def format_soak_sample(each: SoakSample) -> str:
     return (
         f'{each.hour:>6.2f}{each.daylight:>9.2f}{each.real_s:>8.0f}{each.memory_mb:>9.0f}{each.solver_mb:>8.0f}'
         f'{each.descriptors:>6}{each.threads:>8}{each.log_lines:>7}{each.files_kb:>8.0f}{each.ms_per_image:>10.1f}'
-        f'{each.images:>8}{each.lost:>6}  {each.state:<11}{each.focal_px:>8.1f} +- {each.focal_sigma_px:<6.2f}'
-        f'{each.tilt_deg:>8.2f} +- {each.tilt_sigma_deg:<6.3f}{each.tracks:>6}  {each.view}'
+        f'{each.images:>8}{each.lost:>6}  {each.state:<11}{each.focal_px:>8.1f} ± {each.focal_sigma_px:<6.2f}'
+        f'{each.tilt_deg:>8.2f} ± {each.tilt_sigma_deg:<6.3f}{each.tracks:>6}  {each.view}'
     )
 
 
