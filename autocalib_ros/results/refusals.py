@@ -252,7 +252,7 @@ REFUSALS = (
             ),
             'focal_and_k1': (
                 'the traffic contradicts the given lens: its focal length is {given_px:.1f} px with k1 = '
-                '{given_k1:.3f}, the traffic gives {traffic_px:.1f} +- {sigma_px:.1f} px with {traffic_k1:.3f} +- '
+                '{given_k1:.3f}, the traffic gives {traffic_px:.1f} ± {sigma_px:.1f} px with {traffic_k1:.3f} ± '
                 '{k1_sigma:.3f}',
                 '',
             ),
