@@ -44,9 +44,9 @@ from autocalib_ros.estimation.strategies import (
     estimate_from_straight_traffic,
     estimate_from_turning_traffic,
     sharpen_with_lane_markings,
+    with_cut_picture,
     with_single_road,
 )
-from autocalib_ros.estimation.verification.cut_picture import with_cut_picture
 from autocalib_ros.estimation.verification.readiness import check_readiness
 from autocalib_ros.estimation.verification.scale import is_unusual
 from autocalib_ros.estimation.verification.stated_family import verify_stated_family

@@ -32,7 +32,7 @@ from autocalib_ros.estimation.verification.ground_normal import AGREEMENT_SIGMAS
 from autocalib_ros.estimation.verification.identifiability import lens_assumptions
 from autocalib_ros.geometry.ground_plane import unsigned_angle_deg
 from autocalib_ros.results.refusals import Reason, reason
-from autocalib_ros.results.statements import Statement, check
+from autocalib_ros.results.statements import Statement, assumption, check
 from autocalib_ros.results.verification_table import VerificationRow, verified
 
 MAX_CONFIRMING_SIGMA_DEG = 4.5
@@ -265,3 +265,19 @@ def _difference_from(by_markings: Adjustment, plane: PlaneEstimate) -> tuple[flo
         for fit in (plane.fit, by_markings)
     )
     return angle, own, other, 'road'
+
+
+def with_cut_picture(loose: Solution | Reason, centred: Solution) -> Solution:
+    """Return the solution of a picture that was cut off, and say so; the centred one, which covers it, if that failed.
+
+    Either has the grade of an assumption: by what the picture was cut off is taken from the traffic alone.
+    """
+    if isinstance(loose, Reason) or loose.single_road:
+        return replace(centred, reduced=True)
+    camera, prior = loose.fit.state.camera, loose.fit.problem.config.prior
+    away = np.subtract(camera.principal_point_px, prior.centre.principal_point_px)
+    sigmas = loose.fit.sigma(lambda state: np.array(state.camera.principal_point_px))
+    statement = assumption(
+        'cut_picture', right_px=away[0], down_px=away[1], sigma_px=sigmas[0], sigma_down_px=sigmas[1]
+    )
+    return replace(loose, reduced=True, assumptions=(*loose.assumptions, statement))

@@ -175,6 +175,13 @@ REFUSALS = (
         remedy=WAIT_STRAIGHT + OR + STRAIGHT_ROAD,
         missing='traffic below the horizon',
         message='{fraction:.0%} of the tracked points lie above the horizon of the estimated plane (limit {limit:.0%})',
+        variants={
+            'upside_down': (
+                'through the ground plane that fits the traffic the camera would hang upside down (roll '
+                '{roll_deg:.0f} degrees): the picture is, or the roads that were found are none',
+                '',
+            )
+        },
     ),
     RefusalCode(
         code='too_little_curvature',

@@ -469,6 +469,7 @@ NOT_TRIED = {
     'plane_uncertain-edges_and_level': 'tried in vehicle_edges/test_transverse_edges.py',
     'plane_uncertain-lane_changes': 'two estimates that disagree by chance: more traffic settles it',
     'no_height-no_dashes': 'the remedies are those of no_height',
+    'no_height-no_lanes': 'likewise',
     'distortion_model-misfit': 'the only message of distortion_model',
 }
 """Codes, and causes with a remedy of their own, that no trial makes, and why."""

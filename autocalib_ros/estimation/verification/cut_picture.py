@@ -14,10 +14,7 @@ import numpy as np
 from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment, adjust
 from autocalib_ros.estimation.adjustment.model_selection import laplace_cost
 from autocalib_ros.estimation.observations.track_set import TrackSet
-from autocalib_ros.estimation.solution import Solution
 from autocalib_ros.estimation.verification.focal_modes import overdispersion
-from autocalib_ros.results.refusals import Reason
-from autocalib_ros.results.statements import assumption
 
 CUT_PROBABILITY = 0.05
 """Prior probability of a picture that was cut off or zoomed away from its centre: one in twenty. Judgement."""
@@ -76,19 +73,3 @@ def compare_cut_picture(fit: Adjustment, tracks: TrackSet) -> CutPicture | None:
     gain = 0.5 * (laplace_cost(fit, tracks, scales) - laplace_cost(loose, tracks, scales)) / overdispersion(fit)
     log_odds = gain + float(np.log(CUT_PROBABILITY / (1.0 - CUT_PROBABILITY)))
     return CutPicture(fit, loose, float(np.clip(log_odds, -MAX_CUT_NATS, MAX_CUT_NATS)))
-
-
-def with_cut_picture(loose: Solution | Reason, centred: Solution) -> Solution:
-    """Return the solution of a picture that was cut off, and say so; the centred one, which covers it, if that failed.
-
-    Either has the grade of an assumption: by what the picture was cut off is taken from the traffic alone.
-    """
-    if isinstance(loose, Reason) or loose.single_road:
-        return replace(centred, reduced=True)
-    camera, prior = loose.fit.state.camera, loose.fit.problem.config.prior
-    away = np.subtract(camera.principal_point_px, prior.centre.principal_point_px)
-    sigmas = loose.fit.sigma(lambda state: np.array(state.camera.principal_point_px))
-    statement = assumption(
-        'cut_picture', right_px=away[0], down_px=away[1], sigma_px=sigmas[0], sigma_down_px=sigmas[1]
-    )
-    return replace(loose, reduced=True, assumptions=(*loose.assumptions, statement))

@@ -33,12 +33,15 @@ from autocalib_ros.estimation.verification.consistency import (
 from autocalib_ros.estimation.verification.ground_normal import LevelCamera, PlaneEstimate, orient_above_traffic
 from autocalib_ros.estimation.verification.half_starts import turned_start
 from autocalib_ros.evidence.snapshot import Evidence
-from autocalib_ros.geometry.ground_plane import MIN_FRACTION_BELOW_HORIZON
+from autocalib_ros.geometry.ground_plane import MIN_FRACTION_BELOW_HORIZON, tilt_and_roll_deg
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.results.refusals import Reason, reason
 from autocalib_ros.results.statements import UNDETERMINED, Statement, check
 from autocalib_ros.results.verification_table import VerificationRow, verified
 
+MAX_DOWN_IN_IMAGE = float(np.sin(np.radians(10.0)))
+"""Component of the upward normal down the image above which the picture is upside down. Looking straight down, within
+ten degrees, there is no upright picture."""
 MIN_STRAIGHT_FRACTION = 0.25
 """Fraction of the vehicles that have to follow the roads. Below it the traffic turns, and the common direction is that
 of a turn. Judgement."""
@@ -120,8 +123,12 @@ def check_markings_view(fit: Adjustment, tracks: TrackSet) -> Reason | None:
 
 
 def _check_horizon(fit: Adjustment, tracks: TrackSet) -> Reason | None:
-    _, fraction_below_horizon = orient_above_traffic(fit.state.rotation[:, 2], fit.state.camera, tracks)
-    return check_below_horizon(fraction_below_horizon) if fit.plane_known else None
+    if not fit.plane_known:
+        return None
+    up, fraction_below_horizon = orient_above_traffic(fit.state.rotation[:, 2], fit.state.camera, tracks)
+    if up[1] > MAX_DOWN_IN_IMAGE:
+        return reason('horizon', 'upside_down', roll_deg=abs(tilt_and_roll_deg(up)[1]))
+    return check_below_horizon(fraction_below_horizon)
 
 
 def check_below_horizon(fraction: float) -> Reason | None:

@@ -277,7 +277,7 @@ def test_traffic_that_shows_another_plane_contradicts_lines() -> None:
     lines = painted_lines(elsewhere, np.random.default_rng(1))
     fit, tracks, _ = fit_of(seen(LONE_ROAD, lines))
     assert abs(focal_error(fit, LONE_ROAD)) < 0.05
-    plane = by_traffic(driven(LONE_ROAD), tracks, fit.state.camera).plane
+    plane = by_traffic(driven(LONE_ROAD), tracks, LONE_ROAD.camera).plane
     doubt = verify_with_traffic(fit, [plane])
     assert isinstance(doubt, Reason) and doubt.code == 'markings_contradicted'
     assert 'the road of the traffic and the markings along it differ by ' in doubt.message
