@@ -18,6 +18,7 @@ import numpy as np
 from autocalib_ros.estimation.adjustment.lens_prior import LensPrior
 from autocalib_ros.estimation.markings.grid_mixture import MIN_DEPRESSION_SINE, MarkingGrid, annealed_costs, refine_grid
 from autocalib_ros.estimation.markings.road_segments import RoadSegments, all_within, sample_segments, traffic_cells
+from autocalib_ros.estimation.verification.cut_picture import CUT_LOG_ODDS
 from autocalib_ros.evidence.snapshot import Evidence
 from autocalib_ros.geometry.great_circles import unproject_rays
 from autocalib_ros.lens.camera import Camera
@@ -38,7 +39,8 @@ indistinguishable from segments, so there are several local minima, each held by
 MAX_GRID_STARTS = 6
 """Most initial values that are refined."""
 MIN_EVIDENCE_GAIN_NATS = 4.5
-"""Log-evidence by which a less usual lens family must be better: 3 sigma."""
+"""Log-evidence by which a less usual lens family must be better: 3 sigma. One of a picture that was cut off must be as
+probable with its prior odds."""
 MIN_START_LOG_FOCAL, MIN_START_NORMAL_RAD = 0.3, np.radians(8.0)
 """Initial values differ by at least this in log focal length, or in the normal."""
 
@@ -60,10 +62,15 @@ def find_grids(segments: RoadSegments, priors: list[LensPrior]) -> list[MarkingG
     for prior in priors[1:]:
         lens = replace(prior.start(best.camera.focal_px), principal_point_px=best.camera.principal_point_px)
         grids.append(refine_grid(segments, prior, lens, best.rotation, ANNEALING_WIDTHS_RAD))
-    return sorted(
-        grids,
-        key=lambda grid: grid.negative_log_evidence + (MIN_EVIDENCE_GAIN_NATS if grid.prior is not priors[0] else 0.0),
-    )
+    return sorted(grids, key=lambda grid: grid.negative_log_evidence + _needed_gain(grid.prior, priors[0]))
+
+
+def _needed_gain(prior: LensPrior, usual: LensPrior) -> float:
+    """Return the log-evidence by which a lens family must be better than the usual one, nats."""
+    if prior is usual:
+        return 0.0
+    cut_off = bool((prior.sigma[1:3] > usual.sigma[1:3]).any())
+    return MIN_EVIDENCE_GAIN_NATS - (CUT_LOG_ODDS if cut_off else 0.0)
 
 
 def _most_probable(grids: list[MarkingGrid]) -> MarkingGrid:

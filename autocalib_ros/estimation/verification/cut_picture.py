@@ -18,6 +18,8 @@ from autocalib_ros.estimation.verification.focal_modes import overdispersion
 
 CUT_PROBABILITY = 0.05
 """Prior probability of a picture that was cut off or zoomed away from its centre: one in twenty. Judgement."""
+CUT_LOG_ODDS = float(np.log(CUT_PROBABILITY / (1.0 - CUT_PROBABILITY)))
+"""The same as log odds."""
 CLEARLY_CUT_NATS = 4.5
 """Log odds of such a picture from which on it is taken for one: 1 in 90 is wrong."""
 MAX_CUT_NATS = 50.0
@@ -71,5 +73,4 @@ def compare_cut_picture(fit: Adjustment, tracks: TrackSet) -> CutPicture | None:
         return None
     scales = np.minimum(fit.scales, loose.scales)
     gain = 0.5 * (laplace_cost(fit, tracks, scales) - laplace_cost(loose, tracks, scales)) / overdispersion(fit)
-    log_odds = gain + float(np.log(CUT_PROBABILITY / (1.0 - CUT_PROBABILITY)))
-    return CutPicture(fit, loose, float(np.clip(log_odds, -MAX_CUT_NATS, MAX_CUT_NATS)))
+    return CutPicture(fit, loose, float(np.clip(gain + CUT_LOG_ODDS, -MAX_CUT_NATS, MAX_CUT_NATS)))
