@@ -63,6 +63,8 @@ SINGLE_ROAD_CODES = (
     'one_direction',
 )
 """Reasons that one straight road without visible curvature gives; other ones contradict something."""
+CUT_CONTRADICTIONS = ('horizon', 'lens_model', 'halves_disagree')
+"""Refusals of a centred picture after which one that was cut off is tried: those that its wrong centre causes."""
 COMPARED_FAMILIES = ('equidistant', 'distortion_free')
 """Lens families that exclude each other."""
 PLENTY = 2.0
@@ -179,7 +181,7 @@ def find_solution(
         families = lens_priors(evidence.image_size, joint, evidence.picture, aspect, options.lens)
         families = [prior.with_pixel_aspect(aspect, sigma) for prior in families]
         found = estimate_under(families)
-        if isinstance(found, Reason) or not found.clearly_cut:
+        if found.code not in CUT_CONTRADICTIONS if isinstance(found, Reason) else not found.clearly_cut:
             return found
         return with_cut_picture(estimate_under([prior.with_loose_centre() for prior in families]), found)
 

@@ -95,6 +95,11 @@ class Solution:
         return replace(self, comparisons=(*(row for row in self.comparisons if row.kind not in kinds), *rows))
 
     @property
+    def by_traffic(self) -> bool:
+        """Whether roads or turning vehicles give lens and plane, alone or together with lane markings."""
+        return not self.single_road and (not self.from_markings or self.of_traffic is not None)
+
+    @property
     def assumed(self) -> bool:
         """Whether the plane rests on one of the assumptions."""
         return self.plane.assumed is not None or self.reduced

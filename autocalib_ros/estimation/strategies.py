@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment, adjust, road_support
-from autocalib_ros.estimation.adjustment.lens_prior import LensPrior, known_lens
+from autocalib_ros.estimation.adjustment.lens_prior import PRINCIPAL_POINT_SIGMA_FRACTION, LensPrior, known_lens
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig
 from autocalib_ros.estimation.markings.markings_solution import (
     condition_on_lens,
@@ -19,6 +19,7 @@ from autocalib_ros.estimation.one_road import PLANE_TOLERANCE_DEG, CrossTraffic
 from autocalib_ros.estimation.refinement import refine_and_verify, select_noise_model
 from autocalib_ros.estimation.single_road.road_solution import SingleRoad, solve_single_road
 from autocalib_ros.estimation.solution import SHARP_FOCAL_SIGMA, Observations, Solution, append_reason, is_better
+from autocalib_ros.estimation.solution_rows import MAX_PRINCIPAL_POINT_SIGMAS
 from autocalib_ros.estimation.straight.initialisation import solve_from_consensus
 from autocalib_ros.estimation.straight.roads import (
     add_further_roads,
@@ -267,16 +268,20 @@ def _difference_from(by_markings: Adjustment, plane: PlaneEstimate) -> tuple[flo
     return angle, own, other, 'road'
 
 
-def with_cut_picture(loose: Solution | Reason, centred: Solution) -> Solution:
+def with_cut_picture(loose: Solution | Reason, centred: Solution | Reason) -> Solution | Reason:
     """Return the solution of a picture that was cut off, and say so; the centred one, which covers it, if that failed.
 
-    Either has the grade of an assumption: by what the picture was cut off is taken from the traffic alone.
+    Either has the grade of an assumption: by what the picture was cut off is taken from the traffic alone. Where a
+    centred picture was refused, the traffic has to put the optical axis off its centre for sure.
     """
-    if isinstance(loose, Reason) or loose.single_road:
-        return replace(centred, reduced=True)
+    if isinstance(loose, Reason) or not loose.by_traffic:
+        return centred if isinstance(centred, Reason) else replace(centred, reduced=True)
     camera, prior = loose.fit.state.camera, loose.fit.problem.config.prior
     away = np.subtract(camera.principal_point_px, prior.centre.principal_point_px)
     sigmas = loose.fit.sigma(lambda state: np.array(state.camera.principal_point_px))
+    expected = np.hypot(sigmas, PRINCIPAL_POINT_SIGMA_FRACTION * camera.width)
+    if isinstance(centred, Reason) and not (np.abs(away) > MAX_PRINCIPAL_POINT_SIGMAS * expected).any():
+        return centred
     statement = assumption(
         'cut_picture', right_px=away[0], down_px=away[1], sigma_px=sigmas[0], sigma_down_px=sigmas[1]
     )

@@ -11,13 +11,17 @@ from many_cases import one_and_exhaustive
 from autocalib_ros.config import LensOptions, Options
 from autocalib_ros.estimation.adjustment.lens_prior import lens_priors
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig
+from autocalib_ros.estimation.estimate import find_solution
 from autocalib_ros.estimation.observations.track_set import select_tracks
+from autocalib_ros.estimation.solution import Solution
 from autocalib_ros.estimation.straight.initialisation import solve_from_consensus
+from autocalib_ros.estimation.strategies import with_cut_picture
 from autocalib_ros.estimation.verification.cut_picture import compare_cut_picture
 from autocalib_ros.lens.camera import Camera
 from autocalib_ros.offline.benchmark.monte_carlo import draw_evidence
 from autocalib_ros.offline.synthetic.junction import Junction
 from autocalib_ros.results.calibration import Calibration
+from autocalib_ros.results.refusals import reason
 from solved_once import ONE_FAMILY, evidence_once, solve_once
 
 pytestmark = pytest.mark.solve
@@ -69,6 +73,20 @@ def test_bars_that_nothing_else_shows_are_inside_the_standard_deviations(run: in
     if isinstance(result, Calibration):
         error = abs(np.log(result.camera.focal_px / junction.camera.focal_px))
         assert error < 3.0 * result.stddev.focal_px / result.camera.focal_px
+
+
+def test_after_a_refusal_the_axis_has_to_be_off_the_centre_for_sure() -> None:
+    refusal = reason('horizon', fraction=0.1, limit=0.05)
+    for right_px, kind in ((-100.0, 'cut_picture'), (0.0, '')):
+        evidence = evidence_once(off_centre(right_px))
+        found = find_solution(evidence, select_tracks(evidence, 240), SQUARE)
+        assert isinstance(found, Solution) and found.by_traffic
+        taken = with_cut_picture(replace(found, assumptions=()), refusal)
+        if kind:
+            assert isinstance(taken, Solution) and taken.reduced
+            assert [statement.kind for statement in taken.assumptions] == [kind]
+        else:
+            assert taken is refusal
 
 
 def test_the_covariance_is_the_mean_over_both_by_their_probability() -> None:
