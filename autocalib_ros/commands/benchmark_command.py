@@ -131,12 +131,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'measured to 0.3 degrees, and nothing is detected without a move, 3 otherwise.',
     )
     moves.add_argument('recordings', metavar='RECORDING', nargs='+', type=Path, help='recordings of still cameras')
-    moves.add_argument(
-        '--width', type=int, default=1280, metavar='PX', help='largest width of the images (default: %(default)s)'
-    )
+    _add_width(moves, 1280)
     still = what.add_parser(
         'still',
-        help='hours of images of a camera that stands: moves and faults told all the same',
+        help='false alarms in hours of images of a camera that stands still',
         description='Play recordings of still cameras for hours in the light and weather of days, with sway, jams and '
         'noise, and show them to the watch of the view; in the first hours also to the perception. Exit status: 0 '
         'unless more than one move, fault or further view is told, 3 otherwise.',
@@ -149,9 +147,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     still.add_argument(
         '--day-hours', type=float, default=5.0, metavar='H', help='hours of a day (default: %(default)s)'
     )
-    still.add_argument(
-        '--width', type=int, default=640, metavar='PX', help='largest width of the images (default: %(default)s)'
-    )
+    _add_width(still, 640)
     soaked = what.add_parser(
         'soak',
         help='a day and a night of a live node, faster than real time (needs ROS)',
@@ -172,9 +168,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     soaked.add_argument(
         '--day-hours', type=float, default=24.0, metavar='H', help='hours of a day and a night (default: %(default)s)'
     )
-    soaked.add_argument(
-        '--width', type=int, default=640, metavar='PX', help='largest width of the images (default: %(default)s)'
-    )
+    _add_width(soaked, 640)
     _add_camera_height(soaked)
     soaked.add_argument('--log', type=Path, default=Path('soak.log'), metavar='FILE', help='log of the node to write')
     soaked.add_argument('--csv', type=Path, metavar='FILE', help='samples to write')
@@ -198,6 +192,12 @@ def _add_jobs(parser: argparse.ArgumentParser) -> None:
 
 def _add_seed(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--seed', type=int, default=0, metavar='S', help='seed of the draws (default: %(default)s)')
+
+
+def _add_width(parser: argparse.ArgumentParser, default: int) -> None:
+    parser.add_argument(
+        '--width', type=int, default=default, metavar='PX', help='largest width of the images (default: %(default)s)'
+    )
 
 
 def _add_camera_height(parser: argparse.ArgumentParser) -> None:

@@ -12,7 +12,7 @@ from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig
 from autocalib_ros.estimation.given_lens import check_view, verify_given_lens
 from autocalib_ros.estimation.known_lengths import adjust_to_lengths, scale_of, with_seen_lengths
 from autocalib_ros.estimation.observations.selection import drop_pedestrians
-from autocalib_ros.estimation.observations.track_set import TrackSet, evenly_spaced, long_tracks, select_tracks
+from autocalib_ros.estimation.observations.track_set import TrackSet, long_tracks, select_tracks
 from autocalib_ros.estimation.observations.two_frame_windows import ResampledTracks, find_windows
 from autocalib_ros.estimation.paper.intrinsics import paper_intrinsics
 from autocalib_ros.estimation.paper.published_method import solve_paper
@@ -181,7 +181,7 @@ def find_solution(
         families = lens_priors(evidence.image_size, joint, evidence.picture, aspect, options.lens)
         families = [prior.with_pixel_aspect(aspect, sigma) for prior in families]
         found = estimate_under(families)
-        if found.code not in CUT_CONTRADICTIONS if isinstance(found, Reason) else not found.clearly_cut:
+        if not _may_be_cut(found):
             return found
         return with_cut_picture(estimate_under([prior.with_loose_centre() for prior in families]), found)
 
@@ -197,6 +197,11 @@ def find_solution(
     return _with_stated_family(found, evidence, tracks, options, height_m)
 
 
+def _may_be_cut(found: Solution | Reason) -> bool:
+    """Whether the traffic shows a picture that was cut off, or refuses a centred one as a wrong centre would."""
+    return found.code in CUT_CONTRADICTIONS if isinstance(found, Reason) else found.clearly_cut
+
+
 def _with_stated_family(
     found: Solution | Reason, evidence: Evidence, tracks: TrackSet, options: Options, height_m: float
 ) -> Solution | Reason:
@@ -204,20 +209,20 @@ def _with_stated_family(
 
     The family between the others, which contains both, is not compared.
     """
-    joint, fit = options.joint, None if isinstance(found, Reason) else found.of_traffic or found.fit
+    joint = options.joint
+    if joint.lens_prior not in COMPARED_FAMILIES:
+        return found
+    fit = None if isinstance(found, Reason) else found.of_traffic or found.fit
     aspect = options.lens.pixel_aspect_or(evidence.pixel_aspect) if fit is None else fit.state.camera.pixel_aspect
 
     def priors(family: str) -> list[LensPrior]:
         stated = replace(joint, lens_prior=family)
         return lens_priors(evidence.image_size, stated, evidence.picture, aspect, options.lens)
 
-    if joint.lens_prior not in COMPARED_FAMILIES:
-        return found
     others = [prior for family in COMPARED_FAMILIES if family != joint.lens_prior for prior in priors(family)]
     config = AdjustmentConfig(priors(joint.lens_prior)[0], joint, height_m, joint.crossing_rad)
-    some = tracks.subset(evenly_spaced(len(tracks), MAX_SUBSAMPLE_TRACKS))
     generator = np.random.default_rng(options.random_seed)
-    compared = verify_stated_family(fit, config, others, tracks, some, generator)
+    compared = verify_stated_family(fit, config, others, tracks, tracks.at_most(MAX_SUBSAMPLE_TRACKS), generator)
     if isinstance(compared, Reason):
         return compared
     return found if compared is None or isinstance(found, Reason) else found.compared(compared)

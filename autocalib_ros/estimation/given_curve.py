@@ -10,6 +10,7 @@ import numpy as np
 from scipy import special
 
 from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment
+from autocalib_ros.estimation.adjustment.combination import log_density
 from autocalib_ros.estimation.released_lens import ReleasedLens, step_of_released, step_to_released
 from autocalib_ros.estimation.solution import Solution
 from autocalib_ros.lens.camera import Camera
@@ -74,7 +75,7 @@ def steps_with_curve(found: Solution, release: ReleasedLens) -> np.ndarray:
     if not (np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance)[0] > 0.0):
         return np.zeros((3, len(step)))
     wrong = covariance + np.diag(np.square(WRONG_CURVE_SIGMAS))
-    log_odds = special.logit(WRONG_LENS) + _log_density(change, wrong) - _log_density(change, covariance)
+    log_odds = special.logit(WRONG_LENS) + log_density(change, wrong) - log_density(change, covariance)
     exceeding = 1.0 - 2.0 / sigmas**2 if sigmas > CURVE_DOUBT_SIGMAS else 0.0
     with_lens = release.fit.covariance[:, :2] @ np.linalg.inv(np.linalg.cholesky(release.fit.covariance[:2, :2])).T
     spread = [step_of_released(found, release, each) for each in with_lens.T]
@@ -84,8 +85,3 @@ def steps_with_curve(found: Solution, release: ReleasedLens) -> np.ndarray:
 def _focal_and_k1(camera: Camera) -> np.ndarray:
     """Return log focal length and k1 (2,)."""
     return np.array([np.log(camera.focal_px), camera.k[0]])
-
-
-def _log_density(change: np.ndarray, covariance: np.ndarray) -> float:
-    """Return the log density (up to a constant) of a normal distribution about zero."""
-    return float(-0.5 * (change @ np.linalg.solve(covariance, change) + np.linalg.slogdet(covariance)[1]))

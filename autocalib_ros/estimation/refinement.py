@@ -9,7 +9,7 @@ import numpy as np
 from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment, adjust, regroup_vehicles
 from autocalib_ros.estimation.adjustment.model_selection import noise_cost
 from autocalib_ros.estimation.adjustment.noise_model import DEFAULT_CAMERA_HEIGHT_M
-from autocalib_ros.estimation.observations.track_set import TrackSet, evenly_spaced
+from autocalib_ros.estimation.observations.track_set import TrackSet
 from autocalib_ros.estimation.one_road import CrossTraffic, complete_one_road
 from autocalib_ros.estimation.people.pedestrians import people
 from autocalib_ros.estimation.solution import MAX_SUBSAMPLE_TRACKS, Observations, Solution
@@ -85,7 +85,7 @@ def refine_and_verify(
     fit = widen_by_point_slip(fit, observations.windows)
     fit = widen_by_tracklet_difference(fit, tracklets)
     # Other focal lengths that are about as probable widen it, too.
-    some = tracks.subset(evenly_spaced(len(tracks), MAX_SUBSAMPLE_TRACKS))
+    some = tracks.at_most(MAX_SUBSAMPLE_TRACKS)
     fit = widen_by_focal_profile(widen_by_focal_modes(fit, some), some)
     # A picture that was cut off away from its centre, too.
     cut = compare_cut_picture(fit, tracks)

@@ -13,7 +13,7 @@ from autocalib_ros.estimation.adjustment.parameters import AdjustmentState
 from autocalib_ros.estimation.certainty import certainty_of_lengths
 from autocalib_ros.estimation.lanes.lane_dashes import LanePattern
 from autocalib_ros.estimation.lanes.lane_spacing import LaneSpacing
-from autocalib_ros.estimation.observations.track_set import TrackSet, evenly_spaced
+from autocalib_ros.estimation.observations.track_set import TrackSet
 from autocalib_ros.estimation.observations.two_frame_windows import ResampledTracks, TwoFrameWindows
 from autocalib_ros.estimation.verification.ground_normal import PlaneEstimate
 from autocalib_ros.estimation.verification.scale import UNIT_SCALE, Scale
@@ -50,7 +50,7 @@ class Observations:
     @property
     def subsample(self) -> TrackSet:
         """At most `MAX_SUBSAMPLE_TRACKS` of the tracks."""
-        return self.tracks.subset(evenly_spaced(len(self.tracks), MAX_SUBSAMPLE_TRACKS))
+        return self.tracks.at_most(MAX_SUBSAMPLE_TRACKS)
 
 
 @dataclass(frozen=True)

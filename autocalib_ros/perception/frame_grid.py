@@ -84,19 +84,22 @@ def find_grid(stamps_ns: np.ndarray, exact: bool = False) -> FrameGrid | None:
     since_ns = (stamps_ns[-MAX_IMAGES:] - stamps_ns[-1]).astype(float)
     if len(since_ns) < MIN_IMAGES or (np.diff(since_ns) <= 0).any():
         return None
-    candidates = _candidates(since_ns)
-    if _is_in_bursts(since_ns):
-        found = _by_bursts(since_ns)
-    elif len(since_ns) < MIN_JITTERED_IMAGES:
-        found = _by_phase(since_ns, candidates, EXACT if exact else EVEN, SLOTS_PER_IMAGE['few'])
-    else:
-        present = PRESENT + PRESENT_FEW / len(since_ns)
-        found = (
-            _by_phase(since_ns, candidates, EXACT, SLOTS_PER_IMAGE['some'])
-            or _by_count(since_ns, candidates)
-            or _by_phase(since_ns, candidates, present, SLOTS_PER_IMAGE['most'])
-        )
+    ends = _ends_of_bursts(since_ns)
+    found = _by_times(since_ns, exact) if ends is None else _by_bursts(since_ns, ends)
     return None if found is None else found.shifted(int(stamps_ns[-1]))
+
+
+def _by_times(since_ns: np.ndarray, exact: bool) -> FrameGrid | None:
+    """Return the grid of images that come one by one, some late and some not at all, if there is one."""
+    candidates = _candidates(since_ns)
+    if len(since_ns) < MIN_JITTERED_IMAGES:
+        return _by_phase(since_ns, candidates, EXACT if exact else EVEN, SLOTS_PER_IMAGE['few'])
+    present = PRESENT + PRESENT_FEW / len(since_ns)
+    return (
+        _by_phase(since_ns, candidates, EXACT, SLOTS_PER_IMAGE['some'])
+        or _by_count(since_ns, candidates)
+        or _by_phase(since_ns, candidates, present, SLOTS_PER_IMAGE['most'])
+    )
 
 
 def fit_grid(grid: FrameGrid, slots: np.ndarray, stamps_ns: np.ndarray, counts: np.ndarray) -> FrameGrid:
@@ -136,20 +139,21 @@ def _fresh(since_ns: np.ndarray, period: float) -> np.ndarray:
     return np.append(np.diff(since_ns) >= QUEUED * period, True)
 
 
-def _is_in_bursts(since_ns: np.ndarray) -> bool:
-    """Return whether most images follow the one before at once, and more than one burst is there."""
+def _ends_of_bursts(since_ns: np.ndarray) -> np.ndarray | None:
+    """Return the indices of the last image of each whole burst; None unless most images follow the one before at once.
+
+    The last burst may go on.
+    """
     steps = np.diff(since_ns)
     within = steps < WITHIN_BURST * steps.mean()
-    return bool(within.mean() > MIN_QUEUED)
+    return np.flatnonzero(~within) if within.mean() > MIN_QUEUED else None
 
 
-def _by_bursts(since_ns: np.ndarray) -> FrameGrid | None:
+def _by_bursts(since_ns: np.ndarray, ends: np.ndarray) -> FrameGrid | None:
     """Return the grid with one slot for each image through the ends of bursts, if these are `MIN_BURSTS` and agree.
 
     Bursts at equal intervals lie on many grids with lost images as well: the phases of their ends tell nothing.
     """
-    steps = np.diff(since_ns)
-    ends = np.flatnonzero(steps >= WITHIN_BURST * steps.mean())  # the last burst may go on
     if len(ends) < MIN_BURSTS:
         return None
     slots, times = (ends - ends[-1]).astype(float), since_ns[ends] - since_ns[ends[-1]]

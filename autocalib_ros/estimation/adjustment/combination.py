@@ -111,9 +111,9 @@ def _log_densities(fit: Adjustment, step: np.ndarray, shared: np.ndarray, mode: 
     unmodelled = np.concatenate([np.full(len(focal), UNMODELLED_FOCAL), np.full(len(tilts), UNMODELLED_RAD)])
     wrong = np.concatenate([np.full(len(focal), WRONG_FOCAL), np.full(len(tilts), WRONG_RAD)])
     expected = fit.covariance[np.ix_(compared, compared)] + mode.covariance[np.ix_(at, at)] + np.diag(unmodelled**2)
-    return _log_density(step[compared], expected), _log_density(step[compared], expected + np.diag(wrong**2))
+    return log_density(step[compared], expected), log_density(step[compared], expected + np.diag(wrong**2))
 
 
-def _log_density(difference: np.ndarray, covariance: np.ndarray) -> float:
+def log_density(difference: np.ndarray, covariance: np.ndarray) -> float:
     """Return the log density, up to a constant, of a normal distribution about zero."""
     return float(-0.5 * (difference @ np.linalg.solve(covariance, difference) + np.linalg.slogdet(covariance)[1]))

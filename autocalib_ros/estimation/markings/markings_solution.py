@@ -73,16 +73,17 @@ def fit_to_markings(
     if isinstance(accepted, Reason):
         return accepted
     segments, best = accepted
-    free_aspect = best.prior.with_pixel_aspect(best.camera.pixel_aspect, np.inf)
-    with_free_aspect = refine_grid(segments, free_aspect, best.camera, best.rotation, ANNEALING_WIDTHS_RAD[-1:])
     fit = _adjustment_of(_covering_others(segments, best, grids), tracks, config)
     if not fit.focal_sigma <= gate.max_sigma_focal_rel:
         return reason(
             'no_markings', 'focal_length', sigma=min(fit.focal_sigma, UNDETERMINED), limit=gate.max_sigma_focal_rel
         )
-    return check_markings_view(fit, tracks) or MarkingsFit(
-        fit, _adjustment_of(with_free_aspect, tracks, config), _describe(segments, best)
-    )
+    against = check_markings_view(fit, tracks)
+    if against:
+        return against
+    prior = best.prior.with_pixel_aspect(best.camera.pixel_aspect, np.inf)
+    with_free_aspect = refine_grid(segments, prior, best.camera, best.rotation, ANNEALING_WIDTHS_RAD[-1:])
+    return MarkingsFit(fit, _adjustment_of(with_free_aspect, tracks, config), _describe(segments, best))
 
 
 def _adjustment_of(grid: MarkingGrid, tracks: TrackSet, config: AdjustmentConfig) -> Adjustment:

@@ -45,6 +45,10 @@ class TrackSet:
             self.pixels[keep], self.weights[keep], self.vehicles[keep], self.sample_times_s[keep], self.indices[keep]
         )
 
+    def at_most(self, limit: int) -> TrackSet:
+        """Return at most `limit` of the tracks, evenly spaced in their list."""
+        return self.subset(evenly_spaced(len(self), limit))
+
     @cached_property
     def unprojected(self) -> dict[Camera, UnprojectedTracks]:
         """The tracks through one lens: adjustments ask for the same again after a step, and where the lens is fixed."""

@@ -12,7 +12,7 @@ from autocalib_ros.estimation.adjustment.bundle_adjustment import Adjustment, ad
 from autocalib_ros.estimation.adjustment.lens_prior import DISTORTION_FREE, known_lens
 from autocalib_ros.estimation.adjustment.parameters import AdjustmentConfig, AdjustmentState
 from autocalib_ros.estimation.markings.road_segments import LINE_CORRELATION, group_segments
-from autocalib_ros.estimation.observations.track_set import TrackSet, evenly_spaced, kish_weight
+from autocalib_ros.estimation.observations.track_set import TrackSet, kish_weight
 from autocalib_ros.estimation.single_road.barrel_lens import USUAL_VIEW_DEG, USUAL_VIEW_FACTOR, LensChoice
 from autocalib_ros.estimation.single_road.direction_mixture import STILL_SEGMENTS, VEHICLE_EDGES, DirectionMixture
 from autocalib_ros.estimation.single_road.posterior import road_posterior
@@ -95,7 +95,7 @@ def solve_single_road(
 ) -> SingleRoad | Reason:
     """Estimate lens and plane from one straight road, the scene along it, and wide priors; a reason if that fails."""
     choice = LensChoice(config.prior, config.options)
-    subsample = tracks.subset(evenly_spaced(len(tracks), MAX_COMPARED_TRACKS))
+    subsample = tracks.at_most(MAX_COMPARED_TRACKS)
     road = _find_road(choice, subsample, config, generator)
     if road is None:
         return reason('no_direction', tracks=len(tracks))
