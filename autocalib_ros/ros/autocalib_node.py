@@ -41,7 +41,7 @@ from autocalib_ros.ros.diagnostics import Diagnostics
 from autocalib_ros.ros.driver_info import DriverInfo
 from autocalib_ros.ros.driver_upload import DriverUpload
 from autocalib_ros.ros.headers import DEFAULT_FRAME, Headers
-from autocalib_ros.ros.image_input import ImageInput, node_name
+from autocalib_ros.ros.image_input import UNNAMED, ImageInput, node_name
 from autocalib_ros.ros.live_parameters import LiveParameters
 from autocalib_ros.ros.live_pictures import LivePictures
 from autocalib_ros.ros.log_text import describe, describe_briefly, describe_progress
@@ -392,7 +392,8 @@ class AutocalibNode(Node):
         if not names:
             names, remedy = {'a second node of this name'}, 'end one of the two, or give it -r __ns:=/OTHER'
         text = f'{", ".join(sorted(names))} also publishes {topic}: {remedy}'
-        self._told.tell_state('other publishers', text, error=False)
+        if UNNAMED not in names:  # the line that names it would have to wait a minute for that which does not
+            self._told.tell_state('other publishers', text, error=False)
         return text
 
     def _log_progress(self) -> None:

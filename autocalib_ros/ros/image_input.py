@@ -33,6 +33,8 @@ MAX_ENCODING = 100
 """Most characters of an encoding that are told; those of compressed images have up to 40."""
 UNKNOWN = '_UNKNOWN_'
 """Part of the name that rmw gives a node of which it has only seen a topic."""
+UNNAMED = 'a node whose name is not known yet'
+"""How such a node is called for the seconds until its name is known."""
 RELIABILITY = {'reliable': ReliabilityPolicy.RELIABLE, 'best_effort': ReliabilityPolicy.BEST_EFFORT}
 
 
@@ -165,7 +167,7 @@ class ImageInput:
 def node_name(endpoint: Any) -> str:
     """Return the full name of the node of a publisher or subscription; it may not be known for some seconds."""
     if UNKNOWN in endpoint.node_name:
-        return 'a node whose name is not known yet'
+        return UNNAMED
     return f'{endpoint.node_namespace.rstrip("/")}/{endpoint.node_name}'
 
 
